@@ -1,0 +1,1 @@
+"""A differentiable vertex model of epithelial tissue."""
