@@ -1,0 +1,77 @@
+"""The space a tissue lives in."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+class AbstractBoundary(eqx.Module):
+    """The space a tissue lives in: how lattice images are placed and which motions cost nothing."""
+
+    @abc.abstractmethod
+    def translation(self, image: Int[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+        """Displacement of an integer lattice image from the home box."""
+
+    @abc.abstractmethod
+    def drift(
+        self, vertices: Float[Array, "vertices 2"], reference: Float[Array, "vertices 2"]
+    ) -> Float[Array, " modes"]:
+        """How far a configuration moved along the motions that change no shape.
+
+        One number for each zero mode, in units of length times the square root of the number of
+        vertices: the norm of the part of the displacement that lies along that mode.
+        """
+
+
+class Periodic(AbstractBoundary):
+    """A periodic box spanned by two lattice vectors; differentiable, sheared boxes included.
+
+    Its two zero modes are the translations.
+
+    **Arguments:**
+
+    - `lattice`: the two lattice vectors as rows, in units of length; right-handed.
+
+    **Raises:**
+
+    - `ValueError` if the lattice is not finite, or not right-handed with a positive area.
+    """
+
+    lattice: Float[Array, "2 2"]
+
+    def __init__(self, lattice: Float[Array | np.ndarray, "2 2"]):
+        lattice = jnp.asarray(lattice)
+        if lattice.shape != (2, 2):
+            raise ValueError(
+                "Argument `lattice` must hold two lattice vectors as rows, shape (2, 2), but its shape "
+                f"is {lattice.shape}. For a rectangle pass jnp.diag(jnp.array([width, height]))."
+            )
+        if not isinstance(lattice, jax.core.Tracer):
+            rows = np.asarray(lattice, float)
+            if not np.isfinite(rows).all() or np.linalg.det(rows) <= 0:
+                raise ValueError(
+                    "Argument `lattice` must be finite and right-handed (positive determinant), but is "
+                    f"{rows.tolist()}."
+                )
+        self.lattice = lattice
+
+    @property
+    def area(self) -> Float[Array, ""]:
+        """Area of the box."""
+        return jnp.linalg.det(self.lattice)
+
+    def translation(self, image: Int[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:  # noqa: D102
+        # Written out: a matrix product would run in reduced precision on some accelerators.
+        image = image.astype(self.lattice.dtype)
+        return image[..., :1] * self.lattice[0] + image[..., 1:] * self.lattice[1]
+
+    def drift(  # noqa: D102
+        self, vertices: Float[Array, "vertices 2"], reference: Float[Array, "vertices 2"]
+    ) -> Float[Array, " modes"]:
+        return jnp.mean(vertices - reference, axis=0) * jnp.sqrt(1.0 * vertices.shape[0])
