@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, ArrayLike, Float, Num
 
 
 class AbstractBoundary(eqx.Module):
@@ -40,7 +40,7 @@ class Periodic(AbstractBoundary):
 
     **Arguments:**
 
-    - `lattice`: the two lattice vectors as rows, in units of length; right-handed.
+    - `lattice`, shape `(2, 2)`: the two lattice vectors as rows, in units of length; right-handed.
 
     **Raises:**
 
@@ -49,7 +49,7 @@ class Periodic(AbstractBoundary):
 
     lattice: Float[Array, "2 2"]
 
-    def __init__(self, lattice: Float[Array | np.ndarray, "2 2"]):
+    def __init__(self, lattice: ArrayLike):
         lattice = jnp.asarray(lattice)
         if lattice.shape != (2, 2):
             raise ValueError(

@@ -6,8 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
+from vertax._misc import compiled_property
 from vertax._boundary import AbstractBoundary
 from vertax._topology import Topology, clockwise, edge_neighbourhood, source, take
 
@@ -19,7 +20,7 @@ class Tissue(eqx.Module):
 
     **Arguments:**
 
-    - `vertices`: positions, in units of length; they may lie outside the periodic box.
+    - `vertices`, shape `(vertices, 2)`: positions, in units of length; they may lie outside the periodic box.
     - `topology`: the [`Topology`][vertax.Topology].
     - `boundary`: the space, e.g. [`Periodic`][vertax.Periodic].
     - `softening`: the length $\varepsilon$ below which an edge is rounded off,
@@ -39,12 +40,12 @@ class Tissue(eqx.Module):
 
     def __init__(
         self,
-        vertices: Float[Array | np.ndarray, "vertices 2"],
+        vertices: ArrayLike,
         topology: Topology,
         boundary: AbstractBoundary,
         softening: float | Float[Array, ""] | None = None,
     ):
-        vertices = jnp.asarray(vertices)
+        vertices = jnp.asarray(vertices, jnp.result_type(vertices, jnp.float32))
         if vertices.shape != (topology.n_vertices, 2):
             raise ValueError(
                 f"Argument `vertices` must have shape ({topology.n_vertices}, 2) to match the topology, "
@@ -78,12 +79,12 @@ class Tissue(eqx.Module):
         """Number of vertices."""
         return self.topology.n_vertices
 
-    @property
+    @compiled_property
     def neighbour_counts(self) -> Int[Array, " cells"]:
         """Number of sides of each cell."""
         return self.topology.neighbour_counts
 
-    @property
+    @compiled_property
     def edge_segments(self) -> tuple[Float[Array, "edges 2"], Float[Array, "edges 2"]]:
         """First vertex of each edge, and the edge as a vector from there across periodic boundaries."""
         m = self.topology
@@ -93,33 +94,33 @@ class Tissue(eqx.Module):
         last = take(self.vertices, source(twin))
         return first, last + self.boundary.translation(offset) - first
 
-    @property
+    @compiled_property
     def edge_vectors(self) -> Float[Array, "edges 2"]:
         """Each edge as a vector, from its first to its second vertex across periodic boundaries."""
         return self.edge_segments[1]
 
-    @property
+    @compiled_property
     def edge_lengths(self) -> Float[Array, " edges"]:
         """Length of each edge (softened, see the class)."""
         return self._lengths(self.edge_vectors)
 
-    @property
+    @compiled_property
     def areas(self) -> Float[Array, " cells"]:
         """Signed area of each cell, positive for an upright (counter-clockwise) polygon."""
         return self._cell_sums(self._area_shares())[:, 0]
 
-    @property
+    @compiled_property
     def perimeters(self) -> Float[Array, " cells"]:
         """Perimeter of each cell (softened, see the class)."""
         lengths = self.edge_lengths[:, None]
         return self._cell_sums((lengths, lengths))[:, 0]
 
-    @property
+    @compiled_property
     def shape_factors(self) -> Float[Array, " cells"]:
         r"""Observed shape factor $P/\sqrt{A}$ of each cell (Bi et al. 2015, doi:10.1038/nphys3471)."""
         return self.perimeters / jnp.sqrt(self.areas)
 
-    @property
+    @compiled_property
     def corners(self) -> Float[Array, "halfedges 2"]:
         """Source of each half-edge, in the frame of the cell on its left.
 
@@ -127,7 +128,7 @@ class Tissue(eqx.Module):
         """
         return jnp.repeat(self.vertices, 3, axis=0) + self.boundary.translation(self.topology.frame)
 
-    @property
+    @compiled_property
     def centroids(self) -> Float[Array, "cells 2"]:
         """Centre of area of each cell, in the frame of the cell."""
         # Relative to the mean corner: the polygon formula loses digits far from the origin.

@@ -6,9 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Int, Shaped
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+from vertax._misc import compiled_property
 
 
 # Every vertex joins exactly three edges, so half-edge h = 3 v + k is the k-th edge leaving vertex v in
@@ -35,11 +37,12 @@ class Topology(eqx.Module):
 
     **Arguments:**
 
-    - `twin`: the half-edge in the opposite direction, an involution without fixed points.
-    - `cell`: the cell on the left of each half-edge, `0 … n_cells - 1`.
-    - `frame`: integer lattice image of each half-edge's source, in the frame of the cell on its left.
-        Zero where there is no periodicity.
-    - `edge`: an edge number for each half-edge, shared with its twin. Numbered in the order of the
+    - `twin`, shape `(halfedges,)`: the half-edge in the opposite direction, an involution without fixed
+        points.
+    - `cell`, shape `(halfedges,)`: the cell on the left of each half-edge, `0 … n_cells - 1`.
+    - `frame`, shape `(halfedges, 2)`: integer lattice image of each half-edge's source, in the frame of
+        the cell on its left. Zero where there is no periodicity.
+    - `edge`, shape `(halfedges,)`: an edge number for each half-edge, shared with its twin. Numbered in the order of the
         half-edges when left out.
 
     **Raises:**
@@ -59,10 +62,10 @@ class Topology(eqx.Module):
 
     def __init__(
         self,
-        twin: Int[Array | np.ndarray, " halfedges"],
-        cell: Int[Array | np.ndarray, " halfedges"],
-        frame: Int[Array | np.ndarray, "halfedges 2"],
-        edge: Int[Array | np.ndarray, " halfedges"] | None = None,
+        twin: ArrayLike,
+        cell: ArrayLike,
+        frame: ArrayLike,
+        edge: ArrayLike | None = None,
     ):
         twin, cell, frame = (np.asarray(x) for x in (twin, cell, frame))
         if twin.ndim != 1 or twin.size == 0 or twin.size % 6 != 0:
@@ -110,44 +113,44 @@ class Topology(eqx.Module):
         """Number of edges."""
         return self.n_half_edges // 2
 
-    @property
+    @compiled_property
     def source(self) -> Int[Array, " halfedges"]:
         """Vertex that each half-edge leaves."""
         return source(jnp.arange(self.n_half_edges, dtype=self.twin.dtype))
 
-    @property
+    @compiled_property
     def target(self) -> Int[Array, " halfedges"]:
         """Vertex that each half-edge reaches."""
         return source(self.twin)
 
-    @property
+    @compiled_property
     def next(self) -> Int[Array, " halfedges"]:
         """Following half-edge, counter-clockwise around the cell on the left."""
         return clockwise(self.twin)
 
-    @property
+    @compiled_property
     def previous(self) -> Int[Array, " halfedges"]:
         """Preceding half-edge around the cell on the left."""
         here = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
         return take(self.twin, counter_clockwise(here))
 
-    @property
+    @compiled_property
     def offset(self) -> Int[Array, "halfedges 2"]:
         """Lattice image of each half-edge's target, relative to its source."""
         return take(self.frame, self.next) - self.frame
 
-    @property
+    @compiled_property
     def edge_vertices(self) -> Int[Array, "edges 2"]:
         """The two ends of each edge, from → to."""
         return source(jnp.stack([self.half_edge, take(self.twin, self.half_edge)], axis=-1))
 
-    @property
+    @compiled_property
     def edge_cells(self) -> Int[Array, "edges 2"]:
         """The cells on the left and on the right of each edge."""
         h = self.half_edge
         return jnp.stack([take(self.cell, h), take(self.cell, take(self.twin, h))], axis=-1)
 
-    @property
+    @compiled_property
     def neighbour_counts(self) -> Int[Array, " cells"]:
         """Number of sides of each cell."""
         ones = jnp.ones_like(self.cell)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vertax._tissue import Tissue
-from vertax.energies._energy import AbstractLocalEnergy, per_cell
+from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_cell
 
 
 class ShapeFactorEnergy(AbstractLocalEnergy):
@@ -25,14 +24,14 @@ class ShapeFactorEnergy(AbstractLocalEnergy):
     - `mean_area`: $A_0$, in units of length squared; scalar or one a cell.
     """
 
-    target_shape_factor: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
-    mean_area: Float[Array, "*cells"] = eqx.field(default=1.0, converter=jnp.asarray)
+    target_shape_factor: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
+    mean_area: float | Float[Array, "*cells"] = eqx.field(default=1.0, converter=as_parameter)
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""
         target = per_cell(self.target_shape_factor, tissue, "target_shape_factor")
         area = per_cell(self.mean_area, tissue, "mean_area")
-        return (tissue.areas / area - 1) ** 2 + (tissue.perimeters / jnp.sqrt(area) - target) ** 2
+        return (tissue.areas / area - 1) ** 2 + (tissue.perimeters / area**0.5 - target) ** 2
 
 
 class AreaElasticity(AbstractLocalEnergy):
@@ -46,8 +45,8 @@ class AreaElasticity(AbstractLocalEnergy):
     - `target_area`: $A^0$; scalar or one a cell.
     """
 
-    stiffness: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
-    target_area: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+    stiffness: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
+    target_area: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""
@@ -67,8 +66,8 @@ class PerimeterElasticity(AbstractLocalEnergy):
     - `target_perimeter`: $P^0$; scalar or one a cell.
     """
 
-    stiffness: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
-    target_perimeter: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+    stiffness: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
+    target_perimeter: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import abc
+from typing import TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from vertax._tissue import Tissue
 
@@ -24,7 +25,8 @@ class AbstractEnergy(eqx.Module):
             return 0.5 * jnp.sum(self.strength * tissue.perimeters**2)
     ```
 
-    Energies add: `AreaElasticity(...) + LineTension(...)`. An energy that is a sum over cells and edges
+    Fields that are arrays are parameters, which a fit adjusts by default; plain Python numbers are
+    constants. Energies add: `AreaElasticity(...) + LineTension(...)`. An energy that is a sum over cells and edges
     is better a subclass of [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]: T1 transitions are then
     judged many at a time.
 
@@ -94,20 +96,29 @@ def _terms(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:
     return energy.terms if isinstance(energy, Sum | LocalSum) else (energy,)
 
 
-def per_cell(values: Float[Array, "*shape"], tissue: Tissue, name: str) -> Float[Array, "*shape"]:
+Parameter: TypeAlias = float | Float[Array, "*shape"]
+"""A parameter of an energy: an array, which is what a fit adjusts by default, or a constant float."""
+
+
+def as_parameter(value: ArrayLike) -> Parameter:
+    """A Python number stays one, a constant; anything else becomes an array."""
+    return float(value) if isinstance(value, int | float) else jnp.asarray(value)
+
+
+def per_cell(values: Parameter, tissue: Tissue, name: str) -> Parameter:
     """Check that a parameter is a scalar or has one entry a cell."""
     return _check(values, tissue.n_cells, name, "cell")
 
 
-def per_edge(values: Float[Array, "*shape"], tissue: Tissue, name: str) -> Float[Array, "*shape"]:
+def per_edge(values: Parameter, tissue: Tissue, name: str) -> Parameter:
     """Check that a parameter is a scalar or has one entry an edge."""
     return _check(values, tissue.n_edges, name, "edge")
 
 
-def _check(values: Array, size: int, name: str, what: str) -> Array:
-    if values.shape not in ((), (size,)):
+def _check(values: Parameter, size: int, name: str, what: str) -> Parameter:
+    if jnp.shape(values) not in ((), (size,)):
         raise ValueError(
             f"Parameter `{name}` must be a scalar or have one entry a {what}, shape ({size},), but its "
-            f"shape is {values.shape}."
+            f"shape is {jnp.shape(values)}."
         )
     return values

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vertax._tissue import Tissue
-from vertax.energies._energy import AbstractLocalEnergy, per_edge
+from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_edge
 
 
 class LineTension(AbstractLocalEnergy):
@@ -21,7 +20,7 @@ class LineTension(AbstractLocalEnergy):
     - `tension`: line tension $\gamma$, energy per length; scalar or one an edge.
     """
 
-    tension: Float[Array, "*edges"] = eqx.field(converter=jnp.asarray)
+    tension: float | Float[Array, "*edges"] = eqx.field(converter=as_parameter)
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
         """Energy of each edge."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import ArrayLike, PRNGKeyArray
 from scipy.spatial import Delaunay, cKDTree
 
 from vertax._boundary import Periodic
@@ -17,9 +17,9 @@ from vertax.initialise._order import spatial_order
 def periodic_voronoi(
     n_cells: int | None = None,
     *,
-    seeds: Float[Array | np.ndarray, "cells 2"] | None = None,
+    seeds: ArrayLike | None = None,
     key: PRNGKeyArray | None = None,
-    lattice: Float[Array | np.ndarray, "2 2"] | None = None,
+    lattice: ArrayLike | None = None,
     lloyd_steps: int = 0,
     softening: float | None = None,
 ) -> Tissue:
@@ -30,9 +30,9 @@ def periodic_voronoi(
     **Arguments:**
 
     - `n_cells`: number of random seeds, uniform in the box; needs `key`. Or
-    - `seeds`: the seeds themselves; they may lie outside the box.
+    - `seeds`, shape `(cells, 2)`: the seeds themselves; they may lie outside the box.
     - `key`: a key from `jax.random.key`, for random seeds.
-    - `lattice`: the two lattice vectors of the box as rows; by default a square of side $\sqrt N$,
+    - `lattice`, shape `(2, 2)`: the two lattice vectors of the box as rows; by default a square of side $\sqrt N$,
         so that the mean cell area is 1. Sheared boxes are fine.
     - `lloyd_steps`: number of Lloyd iterations (each seed moves to the mean of its cell's corners),
         which make the tissue more regular.

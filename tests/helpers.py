@@ -1,0 +1,82 @@
+"""Shared by the tests: tissues, the list of solvers, finite differences."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+from hypothesis import strategies as st
+
+import vertax as vx
+
+# A new solver is one row here: (name, solver, force that it reaches within 3000 steps).
+SOLVERS = [
+    ("newton_cg", vx.solvers.NewtonCG(), 1e-10),
+    ("lbfgs", vx.solvers.LBFGS(), 1e-6),
+    ("fire", vx.solvers.FIRE(), 1e-8),
+    ("gradient_descent", vx.solvers.GradientDescent(learning_rate=5e-3), 1e-5),
+    ("optax_adam", vx.solvers.Optax(optax.adam(optax.exponential_decay(1e-2, 100, 0.7))), 1e-4),
+    ("optimistix_bfgs", optx.BFGS(rtol=0.0, atol=0.0), 1e-6),
+    ("optimistix_nonlinear_cg", optx.NonlinearCG(rtol=0.0, atol=0.0), 1e-5),
+]
+
+
+def random_tissue(n_cells: int, seed: int = 0, **options) -> vx.Tissue:
+    return vx.initialise.periodic_voronoi(n_cells, key=jax.random.key(seed), **options)
+
+
+def shape_factors(n_cells: int, mean: float, deviation: float, seed: int = 0) -> jax.Array:
+    return mean + deviation * jax.random.normal(jax.random.key(seed + 1000), (n_cells,))
+
+
+def relaxed(n_cells: int, seed: int = 0, mean: float = 3.7) -> tuple[vx.Tissue, vx.AbstractEnergy]:
+    energy = vx.energies.ShapeFactorEnergy(shape_factors(n_cells, mean, 0.1, seed))
+    return vx.equilibrate(random_tissue(n_cells, seed), energy).tissue, energy
+
+
+def central_difference(f, x, direction, step=1e-5):
+    """Derivative of `f` at the pytree `x` along `direction`."""
+    at = lambda s: f(jax.tree.map(lambda a, b: a + s * b, x, direction))
+    return (at(step) - at(-step)) / (2 * step)
+
+
+def random_like(x, seed=0):
+    leaves, structure = jax.tree.flatten(x)
+    keys = jax.random.split(jax.random.key(seed), len(leaves))
+    return jax.tree.unflatten(
+        structure, [jax.random.normal(k, a.shape, a.dtype) for k, a in zip(keys, leaves, strict=True)]
+    )
+
+
+@st.composite
+def lattices(draw, n_cells: int):
+    """Boxes of mean cell area 1, stretched and sheared."""
+    stretch = draw(st.floats(0.7, 1.4))
+    shear = draw(st.floats(-0.6, 0.6))
+    side = np.sqrt(n_cells)
+    return side * np.array([[stretch, 0.0], [shear * stretch, 1 / stretch]])
+
+
+@st.composite
+def tissues(draw, min_cells: int = 1, max_cells: int = 30):
+    """Recipes of random Voronoi tissues in boxes of all kinds: call one to make its tissue."""
+    n = draw(st.sampled_from([n for n in (1, 2, 3, 5, 12, 30) if min_cells <= n <= max_cells]))
+    seed, lattice = draw(st.integers(0, 2**16)), draw(lattices(n))
+    return functools.partial(random_tissue, n, seed, lattice=lattice)
+
+
+def dense_hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> np.ndarray:
+    f = lambda y: energy(tissue.with_configuration(y.reshape(tissue.vertices.shape)))
+    return np.asarray(eqx.filter_jit(jax.hessian(f))(tissue.vertices.ravel()))
+
+
+def edge_cell_sets(tissue: vx.Tissue) -> list[tuple[int, int]]:
+    """Unordered pair of cells on the two sides of each edge."""
+    return [tuple(sorted(pair)) for pair in np.asarray(tissue.topology.edge_cells).tolist()]
+
+
+def hexagon_index() -> float:
+    return float(jnp.sqrt(8 * jnp.sqrt(3.0)))

@@ -1,0 +1,172 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from helpers import SOLVERS, dense_hessian, random_tissue, relaxed, shape_factors
+
+import vertax as vx
+from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
+
+solvers = pytest.mark.parametrize(
+    ("solver", "force"), [row[1:] for row in SOLVERS], ids=[row[0] for row in SOLVERS]
+)
+
+
+@pytest.fixture(scope="module")
+def disturbed():
+    """A tissue near equilibrium, in the equilibrium's topology."""
+    tissue, energy = relaxed(12, seed=1)
+    nudge = 0.03 * jax.random.normal(jax.random.key(0), tissue.vertices.shape)
+    return tissue.with_configuration(tissue.vertices + nudge), energy, tissue
+
+
+@solvers
+def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
+    start, energy, reference = disturbed
+    found = vx.equilibrate(
+        start, energy, solver=solver, transitions=None, tolerance=force, max_steps=3000
+    )
+    assert found.converged
+    assert found.max_force < force
+    actual = jax.grad(lambda x: energy(found.tissue.with_configuration(x)))(found.tissue.vertices)
+    assert jnp.abs(actual).max() < force
+    assert found.energy == pytest.approx(float(energy(reference)), abs=10 * force**2 + 1e-9)
+
+
+@solvers
+def test_every_solver_works_in_float32(solver, force, disturbed):
+    to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
+    start, energy, reference = disturbed
+    found = vx.equilibrate(
+        *jax.tree.map(to32, (start, energy)), solver=solver, transitions=None, tolerance=1e-3
+    )
+    assert found.tissue.vertices.dtype == jnp.float32
+    assert found.max_force < 1e-3
+    assert found.energy == pytest.approx(float(energy(reference)), rel=1e-3)
+
+
+@pytest.mark.parametrize("p0", [3.5, 3.7, 3.8, 3.9])
+def test_random_tissues_reach_true_equilibria(p0):
+    batch = [random_tissue(64, s) for s in range(6)]
+    tissues = jax.tree.map(lambda *x: jnp.stack(x), *batch)
+    targets = jnp.stack([shape_factors(64, p0, 0.1, s) for s in range(6)])
+    found = eqx.filter_vmap(lambda t, p: vx.equilibrate(t, ShapeFactorEnergy(p), tolerance=1e-8))(
+        tissues, targets
+    )
+    assert found.converged.all()
+    assert (found.max_force < 1e-8).all()
+    assert found.num_t1.sum() > 30
+    for k in range(6):
+        one = jax.tree.map(lambda x, k=k: x[k], found.tissue)
+        one.topology.validate()
+        assert one.areas.sum() == pytest.approx(64)
+        spectrum = np.linalg.eigvalsh(dense_hessian(one, ShapeFactorEnergy(targets[k])))
+        assert spectrum[0] > -1e-6 * spectrum[-1]  # a minimum, not a saddle
+
+
+def test_vmap_and_single_runs_agree():
+    batch = [random_tissue(16, s) for s in range(3)]
+    energy = AreaElasticity(20.0, 1.0) + LineTension(jnp.full(48, 0.5))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *batch)
+    together = eqx.filter_vmap(lambda t: vx.equilibrate(t, energy))(stacked)
+    for k, tissue in enumerate(batch):
+        alone = vx.equilibrate(tissue, energy)
+        np.testing.assert_array_equal(alone.num_t1, together.num_t1[k])
+        np.testing.assert_allclose(alone.tissue.vertices, together.tissue.vertices[k], atol=1e-9)
+
+
+def test_relaxation_does_not_drift():
+    tissue = random_tissue(20, 3)
+    found = vx.equilibrate(tissue, ShapeFactorEnergy(3.7))
+    np.testing.assert_allclose(found.tissue.vertices.mean(0), tissue.vertices.mean(0), atol=1e-12)
+
+
+def test_equilibrium_does_not_depend_on_where_the_box_is():
+    tissue = random_tissue(20, 3)
+    moved = tissue.with_configuration(tissue.vertices + jnp.array([3.3, -7.1]))
+    energy = ShapeFactorEnergy(shape_factors(20, 3.7, 0.1))
+    a, b = vx.equilibrate(tissue, energy), vx.equilibrate(moved, energy)
+    np.testing.assert_allclose(a.tissue.areas, b.tissue.areas, atol=1e-7)
+
+
+def test_units_do_not_matter():
+    # The same physics in micrometres and with another unit of energy.
+    tissue = random_tissue(20, 3)
+    scale = 37.0
+    large = vx.initialise.periodic_voronoi(
+        20, key=jax.random.key(3), lattice=scale * tissue.boundary.lattice
+    )
+    p0 = shape_factors(20, 3.7, 0.1)
+    a = vx.equilibrate(tissue, ShapeFactorEnergy(p0))
+    b = vx.equilibrate(
+        large, ShapeFactorEnergy(p0, scale**2), transitions=vx.T1(5e-3 * scale), tolerance=1e-10
+    )
+    np.testing.assert_allclose(b.tissue.areas, scale**2 * a.tissue.areas, rtol=1e-6)
+
+
+def test_patience_counts_consecutive_steps():
+    tissue, energy = relaxed(12, seed=1)
+    run = lambda patience: vx.equilibrate(
+        tissue, energy, solver=vx.solvers.GradientDescent(1e-3), tolerance=1e-6, patience=patience
+    )
+    assert run(1).num_steps == 0
+    assert run(10).num_steps == 9
+
+
+def test_the_protocol_of_the_paper_runs_and_says_that_it_did_not_converge():
+    found = vx.equilibrate(
+        random_tissue(20, 0),
+        ShapeFactorEnergy(shape_factors(20, 3.7, 0.1)),
+        solver=vx.solvers.GradientDescent(1e-2),
+        tolerance=1e-3,
+        patience=10,
+        max_steps=1000,
+        transitions=vx.T1(5e-3),
+        throw=False,
+    )
+    assert found.num_steps <= 1000
+    assert found.converged == (found.max_force < 1e-3)
+
+
+def test_no_convergence_is_an_error_by_default_and_a_result_otherwise():
+    tissue, energy = random_tissue(12, 0), ShapeFactorEnergy(3.7)
+    with pytest.raises(Exception, match="maximum number of steps"):
+        vx.equilibrate(tissue, energy, max_steps=2).energy.block_until_ready()
+    found = vx.equilibrate(tissue, energy, max_steps=2, throw=False)
+    assert not found.converged
+    assert found.num_steps == 2
+    assert found.result == optx.RESULTS.nonlinear_max_steps_reached
+
+
+def test_a_parameter_that_is_not_a_number_is_reported():
+    found = vx.equilibrate(random_tissue(12, 0), ShapeFactorEnergy(jnp.array(jnp.nan)), throw=False)
+    assert found.result == optx.RESULTS.nonfinite
+    assert found.num_steps == 0
+
+
+@pytest.mark.parametrize(
+    "options", [{"tolerance": 0.0}, {"tolerance": -1e-3}, {"patience": 0}, {"max_steps": 0}]
+)
+def test_bad_settings_are_refused(options):
+    with pytest.raises(ValueError, match="must be"):
+        vx.equilibrate(random_tissue(5), ShapeFactorEnergy(3.7), **options)
+
+
+def test_no_retracing_between_calls():
+    traces = []
+
+    class Counting(vx.AbstractEnergy):
+        p0: jax.Array
+
+        def __call__(self, tissue):
+            traces.append(1)
+            return ShapeFactorEnergy(self.p0)(tissue)
+
+    for k in range(4):
+        vx.equilibrate(random_tissue(10, k), Counting(jnp.array(3.6 + 0.01 * k)))
+        if k == 0:
+            first = len(traces)
+    # Evaluating the final energy outside of the compiled part would count here too.
+    assert len(traces) == first

@@ -1,0 +1,287 @@
+"""The inverse problem: parameters whose equilibrium minimises a cost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+from tqdm.auto import tqdm
+
+from vertax._equilibrium import Equilibrium, equilibrate
+from vertax._tissue import Tissue
+from vertax._transitions import T1, AbstractTransitions
+from vertax.costs import AbstractCost
+from vertax.energies import AbstractEnergy
+
+
+class InverseProblem(eqx.Module):
+    r"""Find the parameters whose equilibrium minimises a cost (paper, "Bilevel optimization").
+
+    $$\min_\theta C(X^*_\theta, \theta) \quad \text{subject to} \quad
+      X^*_\theta \in \arg\min_X E(X, \theta)$$
+
+    **Arguments:**
+
+    - `tissue`: where the first relaxation starts.
+    - `energy`: the energy, with the first guess of its parameters.
+    - `cost`: what to minimise.
+    - `trainable`: which leaves of the energy are fitted: a predicate of a leaf, or a pytree of booleans
+        shaped like the energy (as in `equinox.partition`). By default every floating-point array;
+        Python floats are constants.
+    - `adjoint`, `solver`, `transitions`, `tolerance`, `patience`, `max_steps`: passed on to
+        [`equilibrate`][vertax.equilibrate].
+    """
+
+    tissue: Tissue
+    energy: AbstractEnergy
+    cost: AbstractCost
+    trainable: PyTree[Bool] | Callable[[Any], bool] = eqx.is_inexact_array
+    adjoint: optx.AbstractAdjoint | None = None
+    solver: optx.AbstractMinimiser | None = None
+    transitions: AbstractTransitions | None = T1()
+    tolerance: float | Float[Array, ""] | None = None
+    patience: int = 1
+    max_steps: int = 2000
+
+    def __call__(
+        self, energy: AbstractEnergy | None = None, tissue: Tissue | None = None
+    ) -> tuple[Float[Array, ""], Equilibrium]:
+        """Cost and equilibrium for some parameters.
+
+        **Arguments:**
+
+        - `energy`: the energy, by default the problem's.
+        - `tissue`: where the relaxation starts, by default the problem's tissue.
+
+        **Returns:** the cost, differentiable in `energy`, and the equilibrium.
+        """
+        energy = self.energy if energy is None else energy
+        equilibrium = equilibrate(
+            self.tissue if tissue is None else tissue,
+            energy,
+            solver=self.solver,
+            adjoint=self.adjoint,
+            transitions=self.transitions,
+            tolerance=self.tolerance,
+            patience=self.patience,
+            max_steps=self.max_steps,
+            throw=False,
+        )
+        return self.cost(equilibrium.tissue, energy), equilibrium
+
+
+class History(eqx.Module):
+    """What happened in each epoch of a fit."""
+
+    cost: Float[np.ndarray, " epochs"]
+    """Cost at the parameters that the epoch began with."""
+    max_force: Float[np.ndarray, " epochs"]
+    """Largest force of the equilibrium."""
+    converged: Bool[np.ndarray, " epochs"]
+    """Whether the relaxation reached equilibrium."""
+    num_steps: Int[np.ndarray, " epochs"]
+    """Steps of the relaxation."""
+    num_t1: Int[np.ndarray, " epochs"]
+    """T1 transitions of the relaxation."""
+    gradient_norm: Float[np.ndarray, " epochs"]
+    """Norm of the hypergradient."""
+    relative_error: Float[np.ndarray, " epochs"]
+    """Mean of |inferred - true| / |true| over all parameters; NaN if the truth is not known."""
+    seconds: Float[np.ndarray, " epochs"]
+    """Wall-clock time of each epoch; the first one includes compilation."""
+
+
+class Fit(eqx.Module):
+    """The outcome of a fit: the best parameters, their equilibrium, and the way there."""
+
+    energy: AbstractEnergy
+    """The energy with the parameters of lowest cost."""
+    tissue: Tissue
+    """The equilibrium of these parameters."""
+    cost: Float[Array, ""]
+    """Its cost."""
+    max_force: Float[Array, ""]
+    """Largest force at this equilibrium."""
+    best_epoch: int
+    """The epoch that they come from."""
+    history: History
+    """One entry an epoch."""
+
+
+class FitError(RuntimeError):
+    """A fit that could not go on; `fit` holds what there was until then, if anything."""
+
+    def __init__(self, message: str, fit: Fit | None):
+        super().__init__(message)
+        self.fit = fit
+
+
+class _State(eqx.Module):
+    parameters: PyTree[Array]
+    optimiser: PyTree
+    tissue: Tissue
+
+
+class _Record(eqx.Module):
+    parameters: PyTree[Array]  # at which the cost was evaluated
+    tissue: Tissue
+    cost: Float[Array, ""]
+    max_force: Float[Array, ""]
+    converged: Bool[Array, ""]
+    num_steps: Int[Array, ""]
+    num_t1: Int[Array, ""]
+    gradient_norm: Float[Array, ""]
+    relative_error: Float[Array, ""]
+
+
+def fit(
+    problem: InverseProblem,
+    optimiser: optax.GradientTransformation,
+    epochs: int,
+    *,
+    truth: AbstractEnergy | None = None,
+    progress: bool = True,
+    callback: Callable[[int, _Record], None] | None = None,
+) -> Fit:
+    """Solve an inverse problem with an Optax optimiser.
+
+    Each epoch relaxes the tissue from the last equilibrium, takes the gradient of the cost through it
+    and lets the optimiser, whose state lives through all epochs, update the parameters.
+
+    **Arguments:**
+
+    - `problem`: the inverse problem.
+    - `optimiser`: e.g. `optax.adam(1e-2)`, or `optax.nadam(1e-3)` as in the paper.
+    - `epochs`: number of updates.
+    - `truth`: the energy with the true parameters where they are known, to record the error.
+    - `progress`: show a progress bar (only on a terminal).
+    - `callback`: called with the number and the record of each epoch.
+
+    **Returns:** a [`Fit`][vertax.Fit] with the parameters of lowest cost among the epochs that reached
+    equilibrium. An interrupt from the keyboard ends the fit early and keeps what it has.
+
+    **Raises:**
+
+    - `ValueError` if there is nothing to fit, or for less than one epoch.
+    - [`FitError`][vertax.FitError] if cost or gradient are not finite, or if no epoch reached
+        equilibrium; it carries the fit so far.
+    """
+    if epochs < 1:
+        raise ValueError(f"Argument `epochs` must be at least 1, but is {epochs}.")
+    parameters, constants = eqx.partition(problem.energy, problem.trainable)
+    if not jax.tree.leaves(parameters):
+        raise ValueError(
+            "There is nothing to fit: no leaf of the energy is selected by `trainable`. Parameters are "
+            "arrays, as in LineTension(jnp.full(n_edges, 1.0)); Python floats are constants."
+        )
+    # Weakly typed arrays (jnp.full(20, 3.7)) turn into strong ones at the first update, and each change
+    # of type would compile the epoch anew.
+    parameters = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
+    true = None if truth is None else eqx.filter(truth, problem.trainable)
+    state = _State(parameters, optimiser.init(parameters), problem.tissue)
+    best: tuple[int, _Record] | None = None
+    rows: list[tuple] = []
+    stopped = None
+    bar = tqdm(range(epochs), unit="epoch", disable=None if progress else True)
+    try:
+        for epoch in bar:
+            began = time.perf_counter()
+            state, record = _epoch(problem, optimiser, constants, true, state)
+            cost, slope = float(record.cost), float(record.gradient_norm)
+            rows.append(
+                (
+                    cost,
+                    float(record.max_force),
+                    bool(record.converged),
+                    int(record.num_steps),
+                    int(record.num_t1),
+                    slope,
+                    float(record.relative_error),
+                    time.perf_counter() - began,
+                )
+            )
+            if not (np.isfinite(cost) and np.isfinite(slope)):
+                stopped = f"cost ({cost}) or gradient ({slope}) is not finite in epoch {epoch}"
+                break
+            if record.converged and (best is None or cost < float(best[1].cost)):
+                best = epoch, record
+            bar.set_postfix(cost=f"{cost:.3e}", force=f"{rows[-1][1]:.1e}", t1=rows[-1][4])
+            if callback is not None:
+                callback(epoch, record)
+    except KeyboardInterrupt:
+        if best is None:
+            raise
+    history = History(*(np.asarray(column) for column in zip(*rows, strict=True)))
+    if best is None:
+        raise FitError(
+            "No epoch of the fit reached equilibrium: raise `max_steps`, loosen `tolerance`, or use the "
+            f"default solver (largest force: {history.max_force.min():.1e}). Stopped because "
+            f"{stopped or 'all epochs were done'}.",
+            None,
+        )
+    epoch, record = best
+    outcome = Fit(
+        eqx.combine(record.parameters, constants),
+        record.tissue,
+        record.cost,
+        record.max_force,
+        epoch,
+        history,
+    )
+    if stopped is not None:
+        raise FitError(f"The fit stopped: {stopped}. Try a smaller step of the optimiser.", outcome)
+    return outcome
+
+
+@eqx.filter_jit
+def _epoch(
+    problem: InverseProblem,
+    optimiser: optax.GradientTransformation,
+    constants: PyTree,
+    true: PyTree[Array] | None,
+    state: _State,
+) -> tuple[_State, _Record]:
+    """One relaxation, gradient and update."""
+
+    def cost(parameters: PyTree[Array]) -> tuple[Array, Equilibrium]:
+        return problem(eqx.combine(parameters, constants), state.tissue)
+
+    (value, equilibrium), gradient = jax.value_and_grad(cost, has_aux=True)(state.parameters)
+    updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
+        gradient, state.optimiser, state.parameters, value=value, grad=gradient
+    )
+    parameters = eqx.apply_updates(state.parameters, updates)
+    record = _Record(
+        parameters=state.parameters,
+        tissue=equilibrium.tissue,
+        cost=value,
+        max_force=equilibrium.max_force,
+        converged=equilibrium.converged,
+        num_steps=equilibrium.num_steps,
+        num_t1=equilibrium.num_t1,
+        gradient_norm=optax.tree.norm(gradient),
+        relative_error=_relative_error(state.parameters, true),
+    )
+    # A relaxation that broke down must not be where the next one starts.
+    finite = jnp.all(jnp.isfinite(equilibrium.tissue.vertices))
+    warm = jax.tree.map(
+        lambda new, old: jnp.where(finite, new, old),
+        *(eqx.filter(t, eqx.is_array) for t in (equilibrium.tissue, state.tissue)),
+    )
+    tissue = eqx.combine(warm, equilibrium.tissue)
+    return _State(parameters, optimiser_state, tissue), record
+
+
+def _relative_error(parameters: PyTree[Array], true: PyTree[Array] | None) -> Float[Array, ""]:
+    if true is None:
+        return jnp.array(jnp.nan)
+    errors = jax.tree.map(lambda p, q: jnp.ravel(jnp.abs(p - q) / jnp.abs(q)), parameters, true)
+    return jnp.mean(jnp.concatenate(jax.tree.leaves(errors)))

@@ -1,0 +1,22 @@
+"""Small tools used in several rooms; the only place that reaches around other libraries' habits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+
+if TYPE_CHECKING:
+    compiled_property = property  # so that type checkers see the type of each property
+else:
+
+    class compiled_property(property):  # noqa: N801
+        """A property of an Equinox module that is compiled as one function.
+
+        Outside `jax.jit` a property of thirty array operations would otherwise compile thirty functions
+        when it is first used; inside, it is inlined.
+        """
+
+        def __init__(self, method: Callable[[Any], Any]):
+            super().__init__(eqx.filter_jit(method, inline=True), doc=method.__doc__)
