@@ -7,15 +7,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Array, Real
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from vertax.plotting import _style
 
-# What a history may hold, in the order of the panels.
+# What a history may hold, in the order of the panels: its name there, and the scale of its axis.
 _CURVES = {
-    "cost": "cost",
-    "parameter_error": "parameter error",
-    "max_force": "largest force",
-    "transitions": "T1 transitions",
+    "cost": ("cost", "log"),
+    "parameter_error": ("parameter error", "log"),
+    "max_force": ("largest force", "log"),
+    "transitions": ("T1 transitions", "linear"),
 }
 
 
@@ -46,7 +47,8 @@ def plot_history(
     """
     if "cost" not in history:
         raise ValueError(
-            f"Argument `history` must hold `cost`, but holds {', '.join(map(str, history)) or 'nothing'}."
+            "Argument `history` must hold `cost`, but holds "
+            f"{', '.join(map(str, history)) or 'nothing'}."
         )
     curves = {name: np.asarray(history[name], float) for name in _CURVES if name in history}
     shapes = {name: curve.shape for name, curve in curves.items()}
@@ -56,14 +58,16 @@ def plot_history(
         )
     if axes is not None and len(axes) != len(curves):
         raise ValueError(
-            f"Argument `axes` must have one entry for each of {', '.join(curves)}, but has {len(axes)}."
+            f"Argument `axes` must have one entry for each of {', '.join(curves)}, but has "
+            f"{len(axes)}."
         )
     with _style.house_style():
         panels = _style.new_axes(len(curves), width=2.3, height=2.0) if axes is None else list(axes)
         for panel, (name, curve) in zip(panels, curves.items(), strict=True):
             colour = _style.SERIES[len(panel.lines) % len(_style.SERIES)]
             epochs = np.arange(len(curve))
-            logarithmic = not np.any(curve < 0) and np.any(curve > 0)
+            title, scale = _CURVES[name]
+            logarithmic = scale == "log" and not np.any(curve < 0) and np.any(curve > 0)
             # Zeros have no place on a logarithmic axis: gaps, like missing values.
             values = np.where(curve > 0, curve, np.nan) if logarithmic else curve
             # A curve of one epoch, or between two gaps, shows as points only.
@@ -71,7 +75,7 @@ def plot_history(
             panel.plot(epochs, values, color=colour, label=label, **few)
             panel.set_yscale("log" if logarithmic else "linear")
             panel.set_xlabel("epoch")
-            panel.set_ylabel(_CURVES[name])
+            panel.set_ylabel(title)
         if label is not None:
             panels[0].legend()
     return panels
@@ -113,7 +117,8 @@ def plot_recovery(
             )
     if true.ndim != 1 or true.size == 0:
         raise ValueError(
-            f"Argument `true` must hold a list of at least one parameter, but has shape {true.shape}."
+            f"Argument `true` must hold a list of at least one parameter, but has shape "
+            f"{true.shape}."
         )
     with _style.house_style():
         if ax is None:
@@ -131,6 +136,8 @@ def plot_recovery(
         ax.plot(ends, ends, color=vermilion, lw=0.8, ls=(0, (4, 3)), zorder=1)
         ax.set(xlim=ends, ylim=ends, xlabel=f"true {name}", ylabel=f"inferred {name}")
         ax.set_aspect("equal")
+        ax.xaxis.set_major_locator(MaxNLocator(5))
+        ax.yaxis.set_major_locator(MaxNLocator(5))
         ax.text(
             0.04,
             0.97,

@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 MISSING = "0.85"
 """Faces of cells without a value."""
@@ -18,9 +19,9 @@ INK = "0.15"
 HIGHLIGHT = "#ffb000"
 """Membranes over a grey image."""
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-"""Blue, vermilion, green, purple of Okabe and Ito: told apart with any colour vision, and in grey."""
+"""Blue, vermilion, green, purple of Okabe and Ito, told apart with any colour vision."""
 
-_STYLE = {
+_STYLE: Any = {
     "font.size": 8,
     "axes.labelsize": 8,
     "axes.titlesize": 9,
@@ -57,8 +58,12 @@ def new_axes(n: int = 1, *, width: float, height: float) -> list[Axes]:
     """A new figure of `n` axes side by side, each `width` × `height` inches."""
     import matplotlib.pyplot as plt  # here: it picks a window system
 
-    figure, axes = plt.subplots(
-        1, n, figsize=(n * width, height), layout="constrained", squeeze=False
+    _, axes = plt.subplots(
+        1,
+        n,
+        figsize=(n * width, height),
+        layout=ConstrainedLayoutEngine(w_pad=0.06),
+        squeeze=False,
     )
     return list(axes[0])
 

@@ -5,19 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Real, UInt8
+from jaxtyping import Array, Bool, Real
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Colormap, ListedColormap, Normalize
+from matplotlib.lines import Line2D
 
 from vertax._tissue import Tissue
 from vertax.plotting import _style
-from vertax.plotting._polygons import box_outline, cell_polygons, cell_sides
+from vertax.plotting._polygons import Drawing
 
-# The light end of inferno would vanish on the pale faces under it.
-_EDGE_COLOURS = ListedColormap(colormaps["inferno"](np.linspace(0, 0.82, 256)), "inferno_dark")
+# Of inferno, the light end would vanish on pale faces, and the dark end on an image.
+_EDGES_ON_PALE = ListedColormap(colormaps["inferno"](np.linspace(0, 0.82, 256)), "inferno_dark")
+_EDGES_ON_DARK = ListedColormap(colormaps["inferno"](np.linspace(0.38, 1, 256)), "inferno_light")
 
 
 def plot_tissue(
@@ -31,14 +33,14 @@ def plot_tissue(
     vmin: float | None = None,
     vmax: float | None = None,
     label: str | None = None,
-    edge_cmap: str | Colormap = _EDGE_COLOURS,
+    edge_cmap: str | Colormap | None = None,
     edge_vmin: float | None = None,
     edge_vmax: float | None = None,
     edge_label: str | None = None,
     colorbar: bool = True,
     alpha: float | None = None,
     linewidth: float | None = None,
-    image: Real[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns rgb"] | None = None,
+    image: Real[np.ndarray, " ..."] | None = None,
     pixel_size: float = 1.0,
 ) -> Axes:
     """Draw a tissue, its cells and edges coloured by values.
@@ -70,8 +72,9 @@ def plot_tissue(
     - `alpha`: opacity of the faces, from 0 to 1; by default 1, or 0.5 over an image.
     - `linewidth`: of the cell outlines, in points; by default it follows the size of a cell.
         Coloured edges are three times as wide.
-    - `image`: a grey image, shown with robust contrast, or a colour image (8 bits, red green blue).
-        The pixel in row r and column c covers [c, c + 1] × [r, r + 1] `pixel_size`.
+    - `image`: a grey image, shown with robust contrast, or a colour image (red, green, blue; 8
+        bits, or floats in 0 … 1). The pixel in row r and column c covers [c, c + 1] × [r, r + 1],
+        in units of `pixel_size`.
     - `pixel_size`: size of a pixel, in the tissue's units of length.
 
     **Returns:** the axes.
@@ -89,34 +92,41 @@ def plot_tissue(
         raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
     if alpha is not None and not 0 <= alpha <= 1:
         raise ValueError(f"Argument `alpha` must lie in 0 … 1, but is {alpha}.")
-    if image is not None and (0 in image.shape or image.ndim not in (2, 3)):
+    if image is not None and (
+        0 in image.shape or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3)
+    ):
         raise ValueError(
             "Argument `image` must have shape (rows, columns) or (rows, columns, 3), but has "
             f"{image.shape}."
         )
 
-    polygons, _ = cell_polygons(tissue)
-    polygons = polygons[shown]
-    segments, half_edges = cell_sides(tissue, shown)
+    drawing = Drawing(tissue)
+    polygons = drawing.polygons()[0][shown]
+    segments, segment_edges = drawing.sides(shown)
+    n_bars = colorbar * ((cells is not None) + (edges is not None))
+    if image is None:
+        outline = drawing.box
+        low, high = _view(polygons, outline)
+    else:
+        outline = None
+        low, high = np.zeros(2), pixel_size * np.array(image.shape[1::-1])
     with _style.house_style():
         if ax is None:
-            (ax,) = _style.new_axes(width=3.8, height=3.2)
+            width, height = _size(high - low)
+            # The room for bars is ample: their height is then that of the tissue.
+            (ax,) = _style.new_axes(width=width + 0.1 + 0.8 * n_bars, height=height + 0.1)
+        ax.set_aspect("equal")
+        ax.set_axis_off()
         if image is not None:
-            _draw_image(ax, image, pixel_size)
-        outline = None if image is not None else box_outline(tissue)
-        _set_view(ax, polygons, outline, image is not None)
+            _draw_image(ax, image, high)
+        ax.set_xlim(low[0], high[0])
+        ax.set_ylim(*((low[1], high[1]) if image is None else (high[1], low[1])))
         if linewidth is None:
-            linewidth = _line_width(ax, tissue)
+            # A few per cent of a cell, within what prints well.
+            linewidth = float(np.clip(0.035 * drawing.cell_size * _scale(ax), 0.2, 1.0))
         if outline is not None:
-            ax.plot(
-                *outline.T,
-                color="0.45",
-                lw=0.6,
-                ls=(0, (5, 4)),
-                zorder=3,
-                scalex=False,
-                scaley=False,
-            )
+            dashes = (0, (5, 4))
+            ax.add_line(Line2D(*outline.T, color="0.45", lw=0.6, ls=dashes, zorder=3))
 
         faces = PolyCollection(list(polygons), closed=True, linewidths=0, zorder=1)
         bars: list[tuple[ScalarMappable, np.ndarray, str | None]] = []
@@ -131,17 +141,25 @@ def plot_tissue(
 
         lines = LineCollection(list(segments), capstyle="round", zorder=2)
         if edge_values is not None:
-            drawn = edge_values[np.asarray(tissue.topology.edge)[half_edges]]
+            drawn = edge_values[segment_edges]
+            if edge_cmap is None:
+                edge_cmap = _EDGES_ON_PALE if image is None else _EDGES_ON_DARK
             _colour(lines, drawn, edge_cmap, edge_vmin, edge_vmax)
+            if cell_values is not None:  # a casing sets coloured lines off from coloured faces
+                casing = LineCollection(list(segments), colors="w", linewidths=4.5 * linewidth)
+                casing.set(capstyle="round", zorder=1.5)
+                ax.add_collection(casing, autolim=False)
             lines.set_linewidth(3 * linewidth)
             bars.append((lines, drawn, edge_label))
         else:
             lines.set_color(_style.INK if image is None else _style.HIGHLIGHT)
             lines.set_linewidth(linewidth)
         ax.add_collection(lines, autolim=False)
-        if colorbar:
-            for place, bar in enumerate(bars):
-                _colour_bar(ax, *bar, place=place, places=len(bars))
+        if n_bars:
+            # A later bar goes between the axes and an earlier one.
+            for place, bar in enumerate(reversed(bars)):
+                _colour_bar(ax, *bar, place=place)
+            ax.set_anchor("E")  # next to its bars
     return ax
 
 
@@ -154,46 +172,42 @@ def _values(name: str, values: Any, n: int) -> np.ndarray | None:
     return values
 
 
-def _draw_image(ax: Axes, image: np.ndarray, pixel_size: float) -> None:
-    rows, columns = image.shape[:2]
+def _draw_image(ax: Axes, image: np.ndarray, size: np.ndarray) -> None:
     grey: dict[str, Any] = {}
     if image.ndim == 2:
         # A few saturated or dead pixels must not set the contrast.
-        low, high = np.nanpercentile(image, [1, 99.7])
-        grey = {"cmap": "gray", "vmin": low, "vmax": max(high, np.nextafter(low, np.inf))}
-    extent = (0.0, columns * pixel_size, rows * pixel_size, 0.0)
+        dark, bright = np.nanpercentile(image, [1, 99.7])
+        grey = {"cmap": "gray", "vmin": dark, "vmax": max(bright, np.nextafter(dark, np.inf))}
+    # Row 0 is at the top, so the y axis points down.
+    extent = (0.0, float(size[0]), float(size[1]), 0.0)
     ax.imshow(image, origin="upper", extent=extent, zorder=0, **grey)
 
 
-def _set_view(
-    ax: Axes,
-    polygons: Float[np.ndarray, "cells sides 2"],
-    outline: np.ndarray | None,
-    over_image: bool,
-) -> None:
-    ax.set_aspect("equal")
-    ax.set_axis_off()
-    if over_image:
-        return  # the view is the image
+def _view(polygons: np.ndarray, outline: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of the part of the plane to show."""
     points = polygons.reshape(-1, 2)
-    if outline is not None:
-        points = np.concatenate([points, outline])
+    points = points if outline is None else np.concatenate([points, outline])
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
-        return
+        return np.zeros(2), np.ones(2)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.02 * (high - low).max()
-    ax.set_xlim(low[0] - margin, high[0] + margin)
-    ax.set_ylim(low[1] - margin, high[1] + margin)
+    return low - margin, high + margin
 
 
-def _line_width(ax: Axes, tissue: Tissue) -> float:
-    """Width of outlines in points: a few per cent of a cell, within what prints well."""
-    box = ax.get_window_extent()
-    width, height = np.array([box.width, box.height]) * 72 / _style.figure_of(ax).dpi
+def _size(extent: np.ndarray) -> tuple[float, float]:
+    """Width and height of a new picture in inches: of one area, whatever its shape."""
+    ratio = float(np.clip(extent[1] / extent[0], 0.25, 4))
+    return 3.0 / np.sqrt(ratio), 3.0 * np.sqrt(ratio)
+
+
+def _scale(ax: Axes) -> float:
+    """Points on paper for each unit of length."""
+    figure = _style.figure_of(ax)
+    box = ax.get_position(original=True)
+    inches = np.array([box.width, box.height]) * figure.get_size_inches()
     (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
-    points_per_length = min(width / abs(x1 - x0), height / abs(y1 - y0))
-    cell = float(np.sqrt(np.mean(np.abs(np.asarray(tissue.areas, float)))))
-    return float(np.clip(0.035 * cell * points_per_length, 0.2, 1.0))
+    return float(72 * np.min(inches / np.abs([x1 - x0, y1 - y0])))
 
 
 def _colour(
@@ -212,26 +226,32 @@ def _colour(
 
 
 def _colour_bar(
-    ax: Axes,
-    mappable: ScalarMappable,
-    values: np.ndarray,
-    label: str | None,
-    *,
-    place: int,
-    places: int,
+    ax: Axes, mappable: ScalarMappable, values: np.ndarray, label: str | None, *, place: int
 ) -> None:
-    """A colour bar right of the axes, as high as they are; two of them share the height."""
-    # An inset of the axes themselves follows their equal aspect and takes no room from others.
-    gap = 0.1
-    height = (1 - gap * (places - 1)) / places
-    inset = ax.inset_axes((1.02, (places - 1 - place) * (height + gap), 0.035, height))
-    norm = mappable.norm
+    """A colour bar right of the axes, about as high as the tissue."""
+    figure = _style.figure_of(ax)
     finite = values[np.isfinite(values)]
-    below = finite.size and finite.min() < norm.vmin
-    above = finite.size and finite.max() > norm.vmax
-    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
-    bar = _style.figure_of(ax).colorbar(
-        mappable, cax=inset, extend=extend[bool(below), bool(above)], label=label or ""
+    below = bool(finite.size and finite.min() < mappable.norm.vmin)
+    above = bool(finite.size and finite.max() > mappable.norm.vmax)
+    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
+    # In a place that is higher than the tissue is, an equal aspect leaves room above and below. The
+    # bar, its ticks and label take about 0.7 inches off the width.
+    box = ax.get_position(original=True)
+    width, height = np.array([box.width, box.height]) * figure.get_size_inches()
+    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+    tissue_height = max(width - 0.7, 0.3) * abs((y1 - y0) / (x1 - x0))
+    # Only a layout engine knows how much room the ticks and the label of another bar take.
+    pad = 0.02 if place == 0 or figure.get_layout_engine() is not None else 0.25
+    bar = figure.colorbar(
+        mappable,
+        ax=ax,
+        extend=extend,
+        fraction=0.05,
+        pad=pad,
+        aspect=22,
+        shrink=min(1.0, tissue_height / height),
+        label=label or "",
     )
     bar.outline.set_linewidth(0.4)
-    bar.solids.set_alpha(1)
+    if bar.solids is not None:
+        bar.solids.set_alpha(1)
