@@ -1,0 +1,216 @@
+"""Topology moves: T1 transitions."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax._tissue import Tissue
+from vertax._topology import edge_neighbourhood, flip_edges
+from vertax.energies import AbstractEnergy, AbstractLocalEnergy
+
+
+class AbstractTransitions(eqx.Module):
+    """A rule by which a tissue changes its topology while it relaxes."""
+
+    @abc.abstractmethod
+    def init(self, tissue: Tissue) -> Int[Array, " edges"]:
+        """How often each edge took part in a transition: never yet."""
+
+    @abc.abstractmethod
+    def sweep(
+        self, tissue: Tissue, energy: AbstractEnergy, counts: Int[Array, " edges"]
+    ) -> tuple[Tissue, Int[Array, " edges"]]:
+        """Try every candidate once; returns the new tissue and the updated counts."""
+
+
+class T1(AbstractTransitions):
+    r"""T1 transitions by the rule of the paper (Methods, "T1 transitions").
+
+    An edge shorter than the threshold is compared in two configurations of the same length: stretched
+    along itself, and flipped (the two cells at its ends become neighbours). If the flipped one has the
+    lower energy it is taken; otherwise the vertices stay where they are. Edges that a large step has
+    turned inside out are candidates too. All candidates of a sweep that share no cell are tried
+    together, shortest first.
+
+    A flip that would leave a cell with two sides, or an edge with one cell on both sides, is refused.
+
+    **Arguments:**
+
+    - `threshold`: length below which an edge may flip, in units of length.
+    - `max_flips`: how often one edge may flip in a relaxation: the guard against an edge flipping to
+        and fro for ever.
+
+    **Raises:**
+
+    - `ValueError` for a threshold that is not positive, or `max_flips` below 1.
+    """
+
+    threshold: float = 5e-3
+    max_flips: int = eqx.field(static=True, default=20)
+
+    def __check_init__(self):
+        if not isinstance(self.threshold, jax.core.Tracer) and not self.threshold > 0:
+            raise ValueError(
+                f"Argument `threshold` must be positive, but is {self.threshold}. To switch T1 "
+                "transitions off pass `transitions=None`."
+            )
+        if self.max_flips < 1:
+            raise ValueError(f"Argument `max_flips` must be at least 1, but is {self.max_flips}.")
+
+    def init(self, tissue: Tissue) -> Int[Array, " edges"]:
+        """How often each edge flipped: never yet."""
+        return jnp.zeros(tissue.n_edges, jnp.int32)
+
+    def sweep(
+        self, tissue: Tissue, energy: AbstractEnergy, counts: Int[Array, " edges"]
+    ) -> tuple[Tissue, Int[Array, " edges"]]:
+        """Try every independent candidate once; returns the new tissue and the updated counts."""
+        corner = _EdgeFrames(tissue)
+        candidates = (corner.length < self.threshold) | corner.inside_out
+        candidates &= corner.can_flip & (counts < self.max_flips)
+        chosen = _independent(candidates, corner, tissue.n_cells)
+
+        def judge() -> tuple[Tissue, Bool[Array, " edges"]]:
+            length = jnp.maximum(corner.length, self.threshold)
+            stretch = lambda which: corner.place(tissue, which, corner.along, length)
+            flip = lambda which: eqx.tree_at(
+                lambda t: t.topology,
+                corner.place(tissue, which, corner.across, length),
+                flip_edges(tissue.topology, which),
+            )
+            judge_all = _judge_local if isinstance(energy, AbstractLocalEnergy) else _judge_total
+            accepted = judge_all(energy, chosen, corner, stretch, flip)
+            return flip(accepted), accepted
+
+        new, accepted = jax.lax.cond(
+            jnp.any(chosen), judge, lambda: (tissue, jnp.zeros_like(chosen))
+        )
+        return new, counts + accepted
+
+
+class _EdgeFrames(eqx.Module):
+    """The surroundings of every edge: its cells, its length and the directions a T1 places it in."""
+
+    start: Int[Array, " edges"]
+    end: Int[Array, " edges"]
+    cells: Int[Array, "edges 4"]  # left, right, at the start, at the end
+    edges: Int[Array, "edges 5"]  # the edge itself and its four neighbours
+    vector: Float[Array, "edges 2"]
+    length: Float[Array, " edges"]
+    along: Float[Array, "edges 2"]
+    across: Float[Array, "edges 2"]
+    inside_out: Bool[Array, " edges"]
+    can_flip: Bool[Array, " edges"]
+
+    def __init__(self, tissue: Tissue):
+        m = tissue.topology
+        h = m.half_edge
+        t, a, b, c, d = edge_neighbourhood(m)
+        self.start, self.end = h // 3, t // 3
+        self.cells = jnp.stack([m.cell[h], m.cell[t], m.cell[a], m.cell[c]], axis=-1)
+        self.edges = jnp.stack([m.edge[s] for s in (h, a, b, c, d)], axis=-1)
+        forward = tissue.edge_vectors
+        # Half-edge vectors: an edge's own vector or its opposite.
+        sign = jnp.where(h[m.edge] == jnp.arange(m.n_half_edges), 1, -1)
+        outward = forward[m.edge] * sign[:, None].astype(forward.dtype)
+        self.vector = forward
+        self.length = jnp.sqrt(jnp.sum(forward**2, axis=-1))
+        # At a short edge the far ends of the four neighbours show which way the edge ought to point;
+        # its own vector may have shrunk to nothing or turned around.
+        axis = outward[c] + outward[d] - outward[a] - outward[b] + 2 * forward
+        upright = jnp.sum(axis * forward, axis=-1) >= 0
+        direction = jnp.where((self.length > 0)[:, None], forward, axis)
+        direction = jnp.where(upright[:, None], direction, -direction)
+        norm = jnp.sqrt(jnp.sum(direction**2, axis=-1, keepdims=True))
+        self.along = direction / jnp.where(norm > 0, norm, 1)
+        # A flipped half-edge has turned clockwise, see `flip_edges`.
+        self.across = jnp.stack([self.along[:, 1], -self.along[:, 0]], axis=-1)
+        # Three directions are in counter-clockwise order if at least two of their consecutive cross
+        # products are positive. An edge that passed through length 0 spoils that order at both ends.
+        u = outward.reshape(-1, 3, 2)
+        v = jnp.roll(u, -1, axis=1)
+        disordered = jnp.sum(u[..., 0] * v[..., 1] < u[..., 1] * v[..., 0], axis=1) >= 2
+        self.inside_out = disordered[self.start] & disordered[self.end] & ~upright
+        left, right, at_start, at_end = self.cells.T
+        sides = m.neighbour_counts
+        losses = jnp.where(left == right, 2, 1)
+        self.can_flip = (
+            (sides[left] - losses >= 3)
+            & (sides[right] - losses >= 3)
+            & (at_start != at_end)
+            & (self.start != self.end)
+        )
+
+    def place(
+        self,
+        tissue: Tissue,
+        which: Bool[Array, " edges"],
+        direction: Float[Array, "edges 2"],
+        length: Float[Array, " edges"],
+    ) -> Tissue:
+        """Lay the marked edges in a direction, about their midpoint, with a given length."""
+        half = 0.5 * (direction * length[:, None] - self.vector)
+        half = jnp.where(which[:, None], half, 0)
+        vertices = tissue.vertices.at[self.start].add(-half).at[self.end].add(half)
+        return eqx.tree_at(lambda t: t.vertices, tissue, vertices)
+
+
+def _independent(
+    candidates: Bool[Array, " edges"], corner: _EdgeFrames, n_cells: int
+) -> Bool[Array, " edges"]:
+    """The candidates that are the shortest of all candidates at each of their four cells."""
+    # Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute.
+    n = candidates.shape[0]
+    rank = jnp.zeros(n, jnp.int32).at[jnp.argsort(corner.length)].set(jnp.arange(n, dtype=jnp.int32))
+    rank = jnp.where(candidates, rank, n)
+    best = jnp.full(n_cells, n, jnp.int32).at[corner.cells].min(rank[:, None])
+    return candidates & jnp.all(best[corner.cells] == rank[:, None], axis=-1)
+
+
+_Trial = Callable[[Bool[Array, " edges"]], Tissue]
+
+
+def _judge_local(
+    energy: AbstractLocalEnergy,
+    chosen: Bool[Array, " edges"],
+    corner: _EdgeFrames,
+    stretch: _Trial,
+    flip: _Trial,
+) -> Bool[Array, " edges"]:
+    """Which flips lower a local energy: all at once, each by the terms of its own cells and edges."""
+    stretched, flipped = stretch(chosen), flip(chosen)
+    by_cell = energy.cell_terms(flipped) - energy.cell_terms(stretched)
+    by_edge = energy.edge_terms(flipped) - energy.edge_terms(stretched)
+    # In a very small tissue one cell can be two of the four: count it once.
+    cells = corner.cells
+    repeated = [jnp.zeros(cells.shape[0], bool)]
+    for k in range(1, 4):
+        repeated.append(jnp.any(cells[:, :k] == cells[:, k : k + 1], axis=-1))
+    change = jnp.where(jnp.stack(repeated, axis=-1), 0, by_cell[cells])
+    return chosen & (jnp.sum(change, axis=-1) + jnp.sum(by_edge[corner.edges], axis=-1) < 0)
+
+
+def _judge_total(
+    energy: AbstractEnergy,
+    chosen: Bool[Array, " edges"],
+    corner: _EdgeFrames,
+    stretch: _Trial,
+    flip: _Trial,
+) -> Bool[Array, " edges"]:
+    """Which flips lower an arbitrary energy: one candidate after the other, by the total."""
+    edges = jnp.arange(chosen.shape[0])
+    order = jnp.argsort(jnp.where(chosen, corner.length, jnp.inf))
+
+    def body(i: Array, accepted: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
+        # The candidates share no cell, so settled ones need not be flipped to judge the next.
+        this = edges == order[i]
+        return accepted | (this & (energy(flip(this)) < energy(stretch(this))))
+
+    return jax.lax.fori_loop(0, jnp.sum(chosen), body, jnp.zeros_like(chosen))
+

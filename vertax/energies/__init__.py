@@ -1,0 +1,14 @@
+"""Energies: how a tissue wants to deform."""
+
+from vertax.energies._elasticity import (
+    AreaElasticity as AreaElasticity,
+    PerimeterElasticity as PerimeterElasticity,
+    ShapeFactorEnergy as ShapeFactorEnergy,
+)
+from vertax.energies._energy import (
+    AbstractEnergy as AbstractEnergy,
+    AbstractLocalEnergy as AbstractLocalEnergy,
+    LocalSum as LocalSum,
+    Sum as Sum,
+)
+from vertax.energies._tension import LineTension as LineTension

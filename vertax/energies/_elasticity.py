@@ -1,0 +1,77 @@
+"""Elastic cells: areas, perimeters and shape factors with targets."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vertax._tissue import Tissue
+from vertax.energies._energy import AbstractLocalEnergy, per_cell
+
+
+class ShapeFactorEnergy(AbstractLocalEnergy):
+    r"""Dimensionless area and perimeter elasticity with a target shape factor for each cell.
+
+    $$E_1 = \sum_c \left(\frac{A_c}{A_0} - 1\right)^2
+          + \sum_c \left(\frac{P_c}{\sqrt{A_0}} - p^0_c\right)^2$$
+
+    The paper's first energy; Bi et al. 2015, doi:10.1038/nphys3471, at equal moduli. Tissues of equal
+    cells are rigid for $p_0$ below about 3.81 and fluid-like above.
+
+    **Arguments:**
+
+    - `target_shape_factor`: $p^0$, dimensionless; scalar or one a cell.
+    - `mean_area`: $A_0$, in units of length squared; scalar or one a cell.
+    """
+
+    target_shape_factor: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+    mean_area: Float[Array, "*cells"] = eqx.field(default=1.0, converter=jnp.asarray)
+
+    def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
+        """Energy of each cell."""
+        target = per_cell(self.target_shape_factor, tissue, "target_shape_factor")
+        area = per_cell(self.mean_area, tissue, "mean_area")
+        return (tissue.areas / area - 1) ** 2 + (tissue.perimeters / jnp.sqrt(area) - target) ** 2
+
+
+class AreaElasticity(AbstractLocalEnergy):
+    r"""$\tfrac12\sum_c K_c\,(A_c - A^0_c)^2$ (Farhadifar et al. 2007, doi:10.1016/j.cub.2007.11.049).
+
+    Together with [`LineTension`][vertax.energies.LineTension] the paper's second energy.
+
+    **Arguments:**
+
+    - `stiffness`: $K$, energy per area squared; scalar or one a cell.
+    - `target_area`: $A^0$; scalar or one a cell.
+    """
+
+    stiffness: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+    target_area: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+
+    def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
+        """Energy of each cell."""
+        stiffness = per_cell(self.stiffness, tissue, "stiffness")
+        target = per_cell(self.target_area, tissue, "target_area")
+        return 0.5 * stiffness * (tissue.areas - target) ** 2
+
+
+class PerimeterElasticity(AbstractLocalEnergy):
+    r"""$\tfrac12\sum_c K_c\,(P_c - P^0_c)^2$ (Farhadifar et al. 2007, doi:10.1016/j.cub.2007.11.049).
+
+    With `target_perimeter = 0` the perimeter contractility $\tfrac12\Gamma P^2$.
+
+    **Arguments:**
+
+    - `stiffness`: $K$, energy per length squared; scalar or one a cell.
+    - `target_perimeter`: $P^0$; scalar or one a cell.
+    """
+
+    stiffness: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+    target_perimeter: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+
+    def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
+        """Energy of each cell."""
+        stiffness = per_cell(self.stiffness, tissue, "stiffness")
+        target = per_cell(self.target_perimeter, tissue, "target_perimeter")
+        return 0.5 * stiffness * (tissue.perimeters - target) ** 2

@@ -1,0 +1,113 @@
+"""What every energy is, and how energies add up."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vertax._tissue import Tissue
+
+
+class AbstractEnergy(eqx.Module):
+    """The energy of a tissue as a function of its geometry and of parameters held in fields.
+
+    Subclass it, put the parameters into fields and write `__call__`:
+
+    ```python
+    class Contractility(vx.AbstractEnergy):
+        strength: Float[Array, " cells"]
+
+        def __call__(self, tissue):
+            return 0.5 * jnp.sum(self.strength * tissue.perimeters**2)
+    ```
+
+    Energies add: `AreaElasticity(...) + LineTension(...)`. An energy that is a sum over cells and edges
+    is better a subclass of [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]: T1 transitions are then
+    judged many at a time.
+
+    `jax.custom_vjp` must not be used inside: implicit differentiation needs forward mode through the
+    gradient (`jax.custom_jvp` is fine).
+    """
+
+    @abc.abstractmethod
+    def __call__(self, tissue: Tissue) -> Float[Array, ""]:
+        """Energy of a tissue."""
+
+    def __add__(self, other: AbstractEnergy) -> AbstractEnergy:
+        """The sum of two energies."""
+        if not isinstance(other, AbstractEnergy):
+            return NotImplemented
+        terms = (*_terms(self), *_terms(other))
+        if all(isinstance(term, AbstractLocalEnergy) for term in terms):
+            return LocalSum(terms)
+        return Sum(terms)
+
+
+class AbstractLocalEnergy(AbstractEnergy):
+    """An energy that is a sum of one term a cell and one term an edge.
+
+    Override `cell_terms`, `edge_terms` or both. Each term may depend on the geometry of its own cell
+    (or edge) alone; that is what lets T1 transitions be judged by local differences.
+    """
+
+    def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
+        """Energy of each cell."""
+        return jnp.zeros(tissue.n_cells, tissue.vertices.dtype)
+
+    def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
+        """Energy of each edge."""
+        return jnp.zeros(tissue.n_edges, tissue.vertices.dtype)
+
+    def __call__(self, tissue: Tissue) -> Float[Array, ""]:
+        """Energy of a tissue: the sum of all terms."""
+        return jnp.sum(self.cell_terms(tissue)) + jnp.sum(self.edge_terms(tissue))
+
+
+class Sum(AbstractEnergy):
+    """A sum of energies; made by `+`."""
+
+    terms: tuple[AbstractEnergy, ...]
+
+    def __call__(self, tissue: Tissue) -> Float[Array, ""]:
+        """Energy of a tissue."""
+        return sum((term(tissue) for term in self.terms), jnp.zeros((), tissue.vertices.dtype))
+
+
+class LocalSum(AbstractLocalEnergy):
+    """A sum of local energies; made by `+`, and local itself."""
+
+    terms: tuple[AbstractLocalEnergy, ...]
+
+    def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
+        """Energy of each cell."""
+        return sum((term.cell_terms(tissue) for term in self.terms), jnp.zeros(()))
+
+    def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
+        """Energy of each edge."""
+        return sum((term.edge_terms(tissue) for term in self.terms), jnp.zeros(()))
+
+
+def _terms(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:
+    return energy.terms if isinstance(energy, Sum | LocalSum) else (energy,)
+
+
+def per_cell(values: Float[Array, "*shape"], tissue: Tissue, name: str) -> Float[Array, "*shape"]:
+    """Check that a parameter is a scalar or has one entry a cell."""
+    return _check(values, tissue.n_cells, name, "cell")
+
+
+def per_edge(values: Float[Array, "*shape"], tissue: Tissue, name: str) -> Float[Array, "*shape"]:
+    """Check that a parameter is a scalar or has one entry an edge."""
+    return _check(values, tissue.n_edges, name, "edge")
+
+
+def _check(values: Array, size: int, name: str, what: str) -> Array:
+    if values.shape not in ((), (size,)):
+        raise ValueError(
+            f"Parameter `{name}` must be a scalar or have one entry a {what}, shape ({size},), but its "
+            f"shape is {values.shape}."
+        )
+    return values

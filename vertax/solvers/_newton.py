@@ -1,0 +1,124 @@
+"""Trust-region Newton minimisation with truncated conjugate gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from vertax.solvers._solver import AbstractSolver, axpy, count, dot, select, value_and_gradient
+
+
+class _NewtonState(eqx.Module):
+    value: Float[Array, ""]
+    gradient: PyTree[Float[Array, "..."]]
+    radius: Float[Array, ""]
+    num_products: Int[Array, ""]
+    aux: PyTree
+
+
+class NewtonCG(AbstractSolver):
+    r"""Newton's method in a trust region, each step by truncated conjugate gradients (Steihaug).
+
+    A step minimises the quadratic model $g \cdot p + \tfrac12 p \cdot H p$ over $|p| \le \Delta$ with
+    Hessian-vector products only. Directions of negative curvature are followed to the edge of the
+    region, so the Hessian may be indefinite far from equilibrium. Converges quadratically: the way to a
+    *true* equilibrium. (Steihaug 1983, doi:10.1137/0720042; Nocedal & Wright 2006, alg. 4.1 and 7.2,
+    doi:10.1007/978-0-387-40065-5.)
+
+    **Arguments:**
+
+    - `max_displacement`: the furthest one vertex may move in a step, in units of the length scale (in
+        [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
+    - `max_products`: most Hessian-vector products in one step.
+    """
+
+    max_displacement: float = 0.2
+    max_products: int = eqx.field(static=True, default=200)
+
+    def init(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> _NewtonState:
+        value, gradient, aux = value_and_gradient(fn, y, args)
+        # The 2-norm of a step in which every coordinate moves as far as it may.
+        reach = self.max_displacement * options.get("length_scale", 1.0)
+        radius = reach * jnp.sqrt(jnp.asarray(count(y), value.dtype))
+        return _NewtonState(value, gradient, radius, jnp.array(0), aux)
+
+    def step(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
+    ) -> tuple[Any, _NewtonState, Any]:
+        reach = self.max_displacement * options.get("length_scale", 1.0)
+        g = state.gradient
+        _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], y)
+        p, hp, products = self._truncated_cg(hessian, g, state.radius)
+        # The region bounds the 2-norm; no single vertex may jump far either.
+        largest = jax.tree.reduce(jnp.maximum, jax.tree.map(lambda x: jnp.max(jnp.abs(x)), p))
+        shrink = jnp.minimum(1.0, reach / jnp.where(largest > 0, largest, 1))
+        p = jax.tree.map(lambda x: shrink * x, p)
+        predicted = -(dot(g, p) + 0.5 * shrink * dot(p, hp))
+
+        trial = axpy(1.0, p, y)
+        value, gradient, aux = value_and_gradient(fn, trial, args)
+        actual = state.value - value
+        # Near equilibrium the gain drowns in the rounding of E; there a step is good if it lowers the
+        # force.
+        noise = 20 * jnp.finfo(value.dtype).eps * jnp.abs(value)
+        lost = predicted <= noise
+        lower_force = dot(gradient, gradient) < dot(g, g)
+        ratio = actual / jnp.where(predicted > 0, predicted, 1)
+        finite = jnp.isfinite(value) & jnp.isfinite(dot(gradient, gradient))
+        accept = finite & jnp.where(lost, lower_force, ratio > 1e-4)
+
+        length = jnp.sqrt(dot(p, p))
+        at_edge = length > 0.9 * state.radius
+        radius = jnp.where(
+            accept & (lost | (ratio > 0.25)),
+            jnp.where(at_edge & (ratio > 0.75), 2 * state.radius, state.radius),
+            0.25 * length,
+        )
+        kept = (y, state.value, g, state.aux)
+        y, value, g, aux = select(accept, (trial, value, gradient, aux), kept)
+        return y, _NewtonState(value, g, radius, state.num_products + products, aux), aux
+
+    def gradient(self, state: _NewtonState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+        return state.gradient
+
+    def _truncated_cg(
+        self, hessian: Any, g: PyTree, radius: Float[Array, ""]
+    ) -> tuple[PyTree, PyTree, Int[Array, ""]]:
+        """A step `p` inside the trust region, and `H p`."""
+        # Conjugate gradients on H p = -g from p = 0; |p| grows from iterate to iterate, so the first
+        # one to leave the region, or to meet negative curvature, ends on its edge.
+        squared = dot(g, g)
+        size = jnp.sqrt(squared)
+        forcing = jnp.minimum(0.1, jnp.sqrt(size))
+        zero = jax.tree.map(jnp.zeros_like, g)
+        first = jax.tree.map(jnp.negative, g)
+
+        def unfinished(carry: tuple) -> Bool[Array, ""]:
+            *_, rr, done, k = carry
+            return ~done & (jnp.sqrt(rr) > forcing * size) & (k < self.max_products)
+
+        def iterate(carry: tuple) -> tuple:
+            p, hp, r, d, rr, _, k = carry
+            hd = hessian(d)
+            curvature = dot(d, hd)
+            convex = curvature > 0
+            alpha = rr / jnp.where(convex, curvature, 1)
+            pp, pd, dd = dot(p, p), dot(p, d), dot(d, d)
+            leaves = pp + 2 * alpha * pd + alpha**2 * dd >= radius**2
+            done = leaves | ~convex
+            to_edge = (-pd + jnp.sqrt(jnp.maximum(pd**2 + dd * (radius**2 - pp), 0))) / dd
+            alpha = jnp.where(done, to_edge, alpha)
+            p, hp, r = axpy(alpha, d, p), axpy(alpha, hd, hp), axpy(alpha, hd, r)
+            new = dot(r, r)
+            d = jax.tree.map(lambda a, b: -a + (new / rr) * b, r, d)
+            return p, hp, r, d, new, done, k + 1
+
+        start = (zero, zero, g, first, squared, squared == 0, jnp.array(0))
+        p, hp, *_, products = jax.lax.while_loop(unfinished, iterate, start)
+        return p, hp, products

@@ -1,0 +1,69 @@
+"""What every minimiser here knows: the force at the point it returns."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, PyTree
+
+
+class AbstractSolver(optx.AbstractMinimiser):
+    """An Optimistix minimiser that judges convergence by the largest force.
+
+    Its state holds the gradient at the point that the last step returned, so the force is known there
+    and costs nothing extra. It stops when the norm of the gradient (by default the largest component)
+    falls below `atol`; [`equilibrate`][vertax.equilibrate] uses its own `tolerance` instead.
+    """
+
+    rtol: float = eqx.field(default=0.0, kw_only=True)
+    atol: float = eqx.field(default=1e-8, kw_only=True)
+    norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(
+        default=optx.max_norm, kw_only=True, static=True
+    )
+
+    @abc.abstractmethod
+    def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
+        """Gradient at the point that the last step (or `init`) returned; infinite if not known yet."""
+
+    def terminate(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        return self.norm(self.gradient(state)) < self.atol, optx.RESULTS.successful
+
+    def postprocess(  # noqa: D102
+        self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        return y, aux, {}
+
+
+def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, PyTree, PyTree]:
+    """Value, gradient and auxiliary output of an Optimistix objective `fn(y, args) -> (value, aux)`."""
+    (value, aux), gradient = jax.value_and_grad(fn, has_aux=True)(y, args)
+    return value, gradient, aux
+
+
+def dot(a: PyTree, b: PyTree) -> Float[Array, ""]:
+    """Inner product of two pytrees of arrays."""
+    products = jax.tree.map(lambda x, y: jnp.sum(x * y), a, b)
+    return jax.tree.reduce(jnp.add, products)
+
+
+def axpy(scale: Float[Array, ""] | float, x: PyTree, y: PyTree) -> PyTree:
+    """`y + scale * x`, leaf by leaf."""
+    return jax.tree.map(lambda p, q: q + scale * p, x, y)
+
+
+def select(condition: Bool[Array, ""], a: PyTree, b: PyTree) -> PyTree:
+    """`a` where the condition holds, else `b`, leaf by leaf."""
+    return jax.tree.map(lambda p, q: jnp.where(condition, p, q), a, b)
+
+
+def count(tree: PyTree) -> int:
+    """Number of entries of a pytree of arrays."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
