@@ -107,7 +107,8 @@ def from_tables(tables: Tables, *, softening: float | None = None) -> Tissue:
     topology = eqx.tree_at(
         lambda m: m.half_edge, topology, jnp.asarray(number[first_rows], topology.half_edge.dtype)
     )
-    dtype = jnp.result_type(vert_table.dtype if vert_table.dtype.kind == "f" else float)
+    # Positions in float32 stay so; all others get the precision that JAX is set to.
+    dtype = np.float32 if vert_table.dtype == np.float32 else jnp.result_type(float)
     lattice = np.diag([width, height])
     tissue = Tissue(
         jnp.asarray(vert_table, dtype), topology, Periodic(jnp.asarray(lattice, dtype)), softening

@@ -132,9 +132,9 @@ def load_tissue(path: str | os.PathLike[str]) -> Tissue:
                 f"{name} is broken: `{key}` has shape {array.shape} and type {array.dtype}, but "
                 f"must have shape {wanted} and hold {what}."
             )
-        if array.dtype == np.float64 and jnp.result_type(array.dtype) != np.float64:
+        if array.dtype.kind == "f" and jnp.asarray(array).dtype != array.dtype:
             raise ValueError(
-                f"{name} holds float64 numbers, but JAX is limited to float32, which would "
+                f"{name} holds {array.dtype} numbers, but JAX is limited to float32, which would "
                 'round them. Call jax.config.update("jax_enable_x64", True) first.'
             )
         return array

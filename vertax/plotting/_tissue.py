@@ -158,7 +158,7 @@ def plot_tissue(
         if n_bars:
             # A later bar goes between the axes and an earlier one.
             for place, bar in enumerate(reversed(bars)):
-                _colour_bar(ax, *bar, place=place)
+                _colour_bar(ax, *bar, innermost=place == len(bars) - 1)
             ax.set_anchor("E")  # next to its bars
     return ax
 
@@ -226,7 +226,7 @@ def _colour(
 
 
 def _colour_bar(
-    ax: Axes, mappable: ScalarMappable, values: np.ndarray, label: str | None, *, place: int
+    ax: Axes, mappable: ScalarMappable, values: np.ndarray, label: str | None, *, innermost: bool
 ) -> None:
     """A colour bar right of the axes, about as high as the tissue."""
     figure = _style.figure_of(ax)
@@ -240,8 +240,8 @@ def _colour_bar(
     width, height = np.array([box.width, box.height]) * figure.get_size_inches()
     (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
     tissue_height = max(width - 0.7, 0.3) * abs((y1 - y0) / (x1 - x0))
-    # Only a layout engine knows how much room the ticks and the label of another bar take.
-    pad = 0.02 if place == 0 or figure.get_layout_engine() is not None else 0.25
+    # Only a layout engine knows how much room the ticks and the label of another bar will take.
+    pad = 0.02 if innermost or figure.get_layout_engine() is not None else 0.25
     bar = figure.colorbar(
         mappable,
         ax=ax,
