@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from vertax._boundary import Periodic
 from vertax._tissue import Tissue
-from vertax._topology import Topology
+from vertax._topology import Topology, clockwise, counter_clockwise
 
 
 class Tables(NamedTuple):
@@ -159,18 +159,20 @@ def to_tables(tissue: Tissue) -> Tables:
     image = np.floor(vertices / size).astype(int)
     wrapped = np.where(image == 0, vertices, vertices - image.astype(size.dtype) * size)
     # Rows 2 e and 2 e + 1 are the two half-edges of edge e.
-    half_edge, twin = np.asarray(m.half_edge), np.asarray(m.twin)
+    half_edge, twin, frame = (np.asarray(x) for x in (m.half_edge, m.twin, m.frame))
     order = np.stack([half_edge, twin[half_edge]], axis=1).ravel()
     row = np.argsort(order)
-    source, target = np.asarray(m.source), np.asarray(m.target)
-    offset = np.asarray(m.offset) + image[target] - image[source]
+    h = np.arange(m.n_half_edges)
+    source, target = h // 3, twin // 3
+    following, previous = clockwise(twin), twin[counter_clockwise(h)]
+    offset = frame[following] - frame + image[target] - image[source]
     if np.abs(offset).max() > 1:
-        h = int(np.argmax(np.abs(offset).max(axis=1)))
+        far = int(np.argmax(np.abs(offset).max(axis=1)))
         raise ValueError(
             "Tables hold edges that reach into a neighbouring box at most, but the edge from "
-            f"vertex {source[h]} to vertex {target[h]} goes {offset[h].tolist()} boxes."
+            f"vertex {source[far]} to vertex {target[far]} goes {offset[far].tolist()} boxes."
         )
-    columns = [row[np.asarray(m.previous)], row[np.asarray(m.next)], row[twin]]
+    columns = [row[previous], row[following], row[twin]]
     columns += [source, target, np.asarray(m.cell), offset[:, 0], offset[:, 1]]
     he_table = np.stack(columns, axis=1)[order].astype(np.int32)
     face_table = np.unique(he_table[:, 5], return_index=True)[1].astype(np.int32)

@@ -21,9 +21,9 @@ _CURVES = {
 
 
 def plot_history(
-    history: Mapping[str, Real[Array | np.ndarray, " epochs"]],
+    history: Mapping[str, Real[Array | np.ndarray, " ..."]],
     *,
-    axes: Sequence[Axes] | None = None,
+    axes: Sequence[Axes] | np.ndarray | None = None,
     label: str | None = None,
 ) -> list[Axes]:
     """Draw how a fit converged: one panel for each curve that the history holds.
@@ -82,9 +82,9 @@ def plot_history(
 
 
 def plot_recovery(
-    true: Real[Array | np.ndarray, " parameters"],
-    inferred: Real[Array | np.ndarray, " parameters"],
-    initial: Real[Array | np.ndarray, " parameters"] | None = None,
+    true: Real[Array | np.ndarray, " ..."],
+    inferred: Real[Array | np.ndarray, " ..."],
+    initial: Real[Array | np.ndarray, " ..."] | None = None,
     *,
     ax: Axes | None = None,
     name: str = "parameter",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 from jaxtyping import Array, Bool, Real
@@ -30,18 +30,18 @@ def plot_tissue(
     ax: Axes | None = None,
     mask: Bool[Array | np.ndarray, " ..."] | None = None,
     cmap: str | Colormap = "viridis",
-    vmin: float | None = None,
-    vmax: float | None = None,
+    vmin: SupportsFloat | None = None,
+    vmax: SupportsFloat | None = None,
     label: str | None = None,
     edge_cmap: str | Colormap | None = None,
-    edge_vmin: float | None = None,
-    edge_vmax: float | None = None,
+    edge_vmin: SupportsFloat | None = None,
+    edge_vmax: SupportsFloat | None = None,
     edge_label: str | None = None,
     colorbar: bool = True,
-    alpha: float | None = None,
-    linewidth: float | None = None,
+    alpha: SupportsFloat | None = None,
+    linewidth: SupportsFloat | None = None,
     image: Real[np.ndarray, " ..."] | None = None,
-    pixel_size: float = 1.0,
+    pixel_size: SupportsFloat = 1.0,
 ) -> Axes:
     """Draw a tissue, its cells and edges coloured by values.
 
@@ -88,12 +88,14 @@ def plot_tissue(
     edge_values = _values("edges", edges, tissue.n_edges)
     shown = _values("mask", mask, tissue.n_cells)
     shown = np.ones(tissue.n_cells, bool) if shown is None else shown.astype(bool)
+    opacity = float(alpha if alpha is not None else 1 if image is None else 0.5)
+    if not 0 <= opacity <= 1:
+        raise ValueError(f"Argument `alpha` must lie in 0 … 1, but is {opacity}.")
+    pixel_size = float(pixel_size)
     if not (np.isfinite(pixel_size) and pixel_size > 0):
         raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
-    if alpha is not None and not 0 <= alpha <= 1:
-        raise ValueError(f"Argument `alpha` must lie in 0 … 1, but is {alpha}.")
     if image is not None and (
-        0 in image.shape or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3)
+        image.size == 0 or image.ndim < 2 or image.shape[2:] not in ((), (3,))
     ):
         raise ValueError(
             "Argument `image` must have shape (rows, columns) or (rows, columns, 3), but has "
@@ -124,6 +126,7 @@ def plot_tissue(
         if linewidth is None:
             # A few per cent of a cell, within what prints well.
             linewidth = float(np.clip(0.035 * drawing.cell_size * _scale(ax), 0.2, 1.0))
+        linewidth = float(linewidth)
         if outline is not None:
             dashes = (0, (5, 4))
             ax.add_line(Line2D(*outline.T, color="0.45", lw=0.6, ls=dashes, zorder=3))
@@ -136,7 +139,7 @@ def plot_tissue(
             bars.append((faces, drawn, label))
         else:
             faces.set_facecolor(_style.BLANK if image is None else "none")
-        faces.set_alpha(alpha if alpha is not None else 1 if image is None else 0.5)
+        faces.set_alpha(opacity)
         ax.add_collection(faces, autolim=False)
 
         lines = LineCollection(list(segments), capstyle="round", zorder=2)
@@ -214,14 +217,15 @@ def _colour(
     artist: PolyCollection | LineCollection,
     values: np.ndarray,
     cmap: str | Colormap,
-    vmin: float | None,
-    vmax: float | None,
+    vmin: SupportsFloat | None,
+    vmax: SupportsFloat | None,
 ) -> None:
     colours = (colormaps[cmap] if isinstance(cmap, str) else cmap).with_extremes(bad=_style.MISSING)
     finite = values[np.isfinite(values)]
     low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
     artist.set_cmap(colours)
-    artist.set_norm(Normalize(low if vmin is None else vmin, high if vmax is None else vmax))
+    limits = [x if given is None else float(given) for x, given in ((low, vmin), (high, vmax))]
+    artist.set_norm(Normalize(*limits))
     artist.set_array(np.ma.masked_invalid(values))
 
 
