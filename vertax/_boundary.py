@@ -8,15 +8,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Num
 
 
 class AbstractBoundary(eqx.Module):
     """The space a tissue lives in: how lattice images are placed and which motions cost nothing."""
 
     @abc.abstractmethod
-    def translation(self, image: Int[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+    def translation(self, image: Num[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
         """Displacement of an integer lattice image from the home box."""
+
+    @abc.abstractmethod
+    def shortest(self, displacement: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+        """The shortest of all displacements that lead to an image of the same point."""
 
     @abc.abstractmethod
     def drift(
@@ -66,10 +70,26 @@ class Periodic(AbstractBoundary):
         """Area of the box."""
         return jnp.linalg.det(self.lattice)
 
-    def translation(self, image: Int[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:  # noqa: D102
+    def translation(self, image: Num[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:  # noqa: D102
         # Written out: a matrix product would run in reduced precision on some accelerators.
-        image = image.astype(self.lattice.dtype)
+        image = jnp.asarray(image, self.lattice.dtype)
         return image[..., :1] * self.lattice[0] + image[..., 1:] * self.lattice[1]
+
+    def shortest(self, displacement: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+        """The shortest of all displacements that lead to an image of the same point.
+
+        Exact for boxes that lean by at most half their width (for others as long as the shortest
+        displacement is shorter than half the distance between opposite sides).
+        """
+        # Rounding the fractions finds the image within the parallelogram around 0; in a leaning box one
+        # of its neighbours may still be closer.
+        inverse = jnp.linalg.inv(self.lattice)
+        nearest = jax.lax.stop_gradient(jnp.round(displacement @ inverse))
+        steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        images = nearest[..., None, :] + jnp.asarray(steps, nearest.dtype)
+        choices = displacement[..., None, :] - self.translation(images)
+        best = jnp.argmin(jnp.sum(choices**2, axis=-1), axis=-1)
+        return jnp.take_along_axis(choices, best[..., None, None], axis=-2)[..., 0, :]
 
     def drift(  # noqa: D102
         self, vertices: Float[Array, "vertices 2"], reference: Float[Array, "vertices 2"]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vertax._boundary import AbstractBoundary
-from vertax._topology import Topology, clockwise, edge_neighbourhood
+from vertax._topology import Topology, clockwise, edge_neighbourhood, source, take
 
 
 class Tissue(eqx.Module):
@@ -84,9 +84,19 @@ class Tissue(eqx.Module):
         return self.topology.neighbour_counts
 
     @property
+    def edge_segments(self) -> tuple[Float[Array, "edges 2"], Float[Array, "edges 2"]]:
+        """First vertex of each edge, and the edge as a vector from there across periodic boundaries."""
+        m = self.topology
+        twin, _, _, _, following = edge_neighbourhood(m)
+        offset = take(m.frame, following) - take(m.frame, m.half_edge)
+        first = take(self.vertices, source(m.half_edge))
+        last = take(self.vertices, source(twin))
+        return first, last + self.boundary.translation(offset) - first
+
+    @property
     def edge_vectors(self) -> Float[Array, "edges 2"]:
         """Each edge as a vector, from its first to its second vertex across periodic boundaries."""
-        return self._edges()[1]
+        return self.edge_segments[1]
 
     @property
     def edge_lengths(self) -> Float[Array, " edges"]:
@@ -124,8 +134,8 @@ class Tissue(eqx.Module):
         corners, cell = self.corners, self.topology.cell
         counts = self.topology.neighbour_counts[:, None].astype(corners.dtype)
         centre = jax.ops.segment_sum(corners, cell, self.n_cells) / counts
-        p = corners - centre[cell]
-        q = p[self.topology.next]
+        p = corners - take(centre, cell)
+        q = take(p, self.topology.next)
         twice_area = _cross(p, q)
         moment = jax.ops.segment_sum((p + q) * twice_area[:, None] / 6, cell, self.n_cells)
         return centre + moment / (jax.ops.segment_sum(twice_area, cell, self.n_cells) / 2)[:, None]
@@ -143,14 +153,6 @@ class Tissue(eqx.Module):
         """The same vertices, connected in another way."""
         return eqx.tree_at(lambda t: t.topology, self, topology)
 
-    def _edges(self) -> tuple[Float[Array, "edges 2"], Float[Array, "edges 2"]]:
-        """First vertex of each edge in its home box, and the edge as a vector."""
-        m = self.topology
-        twin, _, _, _, following = edge_neighbourhood(m)
-        offset = m.frame[following] - m.frame[m.half_edge]
-        first = self.vertices[m.half_edge // 3]
-        return first, self.vertices[twin // 3] + self.boundary.translation(offset) - first
-
     def _lengths(self, vectors: Float[Array, "edges 2"]) -> Float[Array, " edges"]:
         squared = vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + self.softening**2
         # An edge of length exactly 0 without softening has no direction; the inner `where` keeps the
@@ -161,10 +163,10 @@ class Tissue(eqx.Module):
     def _area_shares(self) -> tuple[Float[Array, "edges 1"], Float[Array, "edges 1"]]:
         """What each edge contributes to the areas of its left and right cell (shoelace formula)."""
         m = self.topology
-        first, vector = self._edges()
-        left = first + self.boundary.translation(m.frame[m.half_edge])
+        first, vector = self.edge_segments
+        left = first + self.boundary.translation(take(m.frame, m.half_edge))
         # The right cell's corner at the first vertex is one slot clockwise.
-        right = first + self.boundary.translation(m.frame[clockwise(m.half_edge)])
+        right = first + self.boundary.translation(take(m.frame, clockwise(m.half_edge)))
         return 0.5 * _cross(left, vector)[:, None], -0.5 * _cross(right, vector)[:, None]
 
     def _cell_sums(

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, Shaped
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -113,12 +113,12 @@ class Topology(eqx.Module):
     @property
     def source(self) -> Int[Array, " halfedges"]:
         """Vertex that each half-edge leaves."""
-        return jnp.arange(self.n_half_edges, dtype=self.twin.dtype) // 3
+        return source(jnp.arange(self.n_half_edges, dtype=self.twin.dtype))
 
     @property
     def target(self) -> Int[Array, " halfedges"]:
         """Vertex that each half-edge reaches."""
-        return self.twin // 3
+        return source(self.twin)
 
     @property
     def next(self) -> Int[Array, " halfedges"]:
@@ -128,22 +128,24 @@ class Topology(eqx.Module):
     @property
     def previous(self) -> Int[Array, " halfedges"]:
         """Preceding half-edge around the cell on the left."""
-        return self.twin[counter_clockwise(jnp.arange(self.n_half_edges, dtype=self.twin.dtype))]
+        here = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
+        return take(self.twin, counter_clockwise(here))
 
     @property
     def offset(self) -> Int[Array, "halfedges 2"]:
         """Lattice image of each half-edge's target, relative to its source."""
-        return self.frame[self.next] - self.frame
+        return take(self.frame, self.next) - self.frame
 
     @property
     def edge_vertices(self) -> Int[Array, "edges 2"]:
         """The two ends of each edge, from → to."""
-        return jnp.stack([self.half_edge, self.twin[self.half_edge]], axis=-1) // 3
+        return source(jnp.stack([self.half_edge, take(self.twin, self.half_edge)], axis=-1))
 
     @property
     def edge_cells(self) -> Int[Array, "edges 2"]:
         """The cells on the left and on the right of each edge."""
-        return jnp.stack([self.cell[self.half_edge], self.cell[self.twin[self.half_edge]]], axis=-1)
+        h = self.half_edge
+        return jnp.stack([take(self.cell, h), take(self.cell, take(self.twin, h))], axis=-1)
 
     @property
     def neighbour_counts(self) -> Int[Array, " cells"]:
@@ -182,7 +184,7 @@ class Topology(eqx.Module):
         sides = np.bincount(cell, minlength=n_cells)
         require(sides > 0, "every cell must have half-edges, at cells")
 
-        following = np.asarray(clockwise(twin))
+        following = np.where(twin % 3 == 0, twin + 2, twin - 1)
         require(cell[following] == cell, "`cell` must be the same all around a face, at half-edges")
         n_faces, face = connected_components(
             coo_array((np.ones(n_half, bool), (h, following)), shape=(n_half, n_half)), directed=False
@@ -244,27 +246,31 @@ def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
     n = topology.n_half_edges
     identity = jnp.arange(n, dtype=h.dtype)
 
-    def put(array, index, values):  # only at flipped edges; the others point outside and are dropped
-        return array.at[jnp.where(flip, index, n)].set(values, mode="drop")
+    def put(array: Array, index: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
+        # Only at flipped edges: the other indices point outside, and are dropped.
+        where = jnp.concatenate([jnp.where(flip, i, n) for i in index])
+        return array.at[where].set(jnp.concatenate(values), mode="drop")
 
-    roll, unroll = identity, identity
-    for origin, destination in ((a, b), (b, c), (c, d), (d, a)):
-        roll = put(roll, origin, destination)
-        unroll = put(unroll, destination, origin)
-    cell = topology.cell[unroll]
-    cell = put(cell, h, topology.cell[c])
-    cell = put(cell, t, topology.cell[a])
+    roll = put(identity, (a, b, c, d), (b, c, d, a))
+    unroll = put(identity, (b, c, d, a), (a, b, c, d))
+    at = lambda array, index: take(array, index)
+    cell = at(topology.cell, unroll)
+    cell = put(cell, (h, t), (at(topology.cell, c), at(topology.cell, a)))
     # Corners: v stays a corner of L and V and becomes one of W; w stays one of R and W and becomes one
     # of V. A new corner is one step of the flipped edge away from the other end's.
-    f = topology.frame
-    step = f[d] - f[h]
-    frame = f[unroll]
-    for slot, value in ((h, f[c] - step), (a, f[h]), (b, f[a]), (t, f[a] + step), (c, f[t]), (d, f[c])):
-        frame = put(frame, slot, value)
+    fh, ft, fa, fc, fd = (at(topology.frame, slot) for slot in (h, t, a, c, d))
+    step = fd - fh
+    frame = put(topology.frame, (h, a, b, t, c, d), (fc - step, fh, fa, fa + step, ft, fc))
     return eqx.tree_at(
         lambda m: (m.twin, m.cell, m.frame, m.edge, m.half_edge),
         topology,
-        (roll[topology.twin[unroll]], cell, frame, topology.edge[unroll], roll[h]),
+        (
+            at(roll, at(topology.twin, unroll)),
+            cell,
+            frame,
+            at(topology.edge, unroll),
+            at(roll, h),
+        ),
     )
 
 
@@ -274,5 +280,31 @@ def edge_neighbourhood(topology: Topology) -> tuple[Int[Array, " edges"], ...]:
     Counter-clockwise: `a`, `b` leave the source of the edge, `c`, `d` its target.
     """
     h = topology.half_edge
-    t = topology.twin[h]
+    t = take(topology.twin, h)
     return t, counter_clockwise(h), clockwise(h), counter_clockwise(t), clockwise(t)
+
+
+# Written for speed of compilation as much as of execution: `//`, `%` and `[]` of jax.numpy each expand
+# into a dozen operations that guard against signs and bounds, and every property uses these.
+
+
+def source(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
+    """The vertex that a half-edge leaves."""
+    return jax.lax.div(h, jnp.asarray(3, h.dtype))
+
+
+def clockwise(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
+    """The half-edge one slot clockwise around the same vertex."""
+    slot = jax.lax.rem(h, jnp.asarray(3, h.dtype))
+    return h + jax.lax.select(slot == 0, jnp.full_like(h, 2), jnp.full_like(h, -1))
+
+
+def counter_clockwise(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
+    """The half-edge one slot counter-clockwise around the same vertex."""
+    slot = jax.lax.rem(h, jnp.asarray(3, h.dtype))
+    return h + jax.lax.select(slot == 2, jnp.full_like(h, -2), jnp.full_like(h, 1))
+
+
+def take(array: Shaped[Array, "n *shape"], index: Int[Array, "..."]) -> Shaped[Array, "..."]:
+    """`array[index]` for indices known to be valid."""
+    return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)

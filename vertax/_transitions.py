@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._tissue import Tissue
-from vertax._topology import edge_neighbourhood, flip_edges
+from vertax._topology import edge_neighbourhood, flip_edges, source, take
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 
 
@@ -112,18 +112,21 @@ class _EdgeFrames(eqx.Module):
         m = tissue.topology
         h = m.half_edge
         t, a, b, c, d = edge_neighbourhood(m)
-        self.start, self.end = h // 3, t // 3
-        self.cells = jnp.stack([m.cell[h], m.cell[t], m.cell[a], m.cell[c]], axis=-1)
-        self.edges = jnp.stack([m.edge[s] for s in (h, a, b, c, d)], axis=-1)
+        self.start, self.end = source(h), source(t)
+        self.cells = take(m.cell, jnp.stack([h, t, a, c], axis=-1))
+        self.edges = take(m.edge, jnp.stack([h, a, b, c, d], axis=-1))
         forward = tissue.edge_vectors
         # Half-edge vectors: an edge's own vector or its opposite.
-        sign = jnp.where(h[m.edge] == jnp.arange(m.n_half_edges), 1, -1)
-        outward = forward[m.edge] * sign[:, None].astype(forward.dtype)
+        own = take(h, m.edge) == jnp.arange(m.n_half_edges, dtype=h.dtype)
+        outward = take(forward, m.edge)
+        outward = jnp.where(own[:, None], outward, -outward)
         self.vector = forward
         self.length = jnp.sqrt(jnp.sum(forward**2, axis=-1))
         # At a short edge the far ends of the four neighbours show which way the edge ought to point;
         # its own vector may have shrunk to nothing or turned around.
-        axis = outward[c] + outward[d] - outward[a] - outward[b] + 2 * forward
+        ahead = take(outward, c) + take(outward, d)
+        behind = take(outward, a) + take(outward, b)
+        axis = ahead - behind + 2 * forward
         upright = jnp.sum(axis * forward, axis=-1) >= 0
         direction = jnp.where((self.length > 0)[:, None], forward, axis)
         direction = jnp.where(upright[:, None], direction, -direction)
@@ -136,16 +139,11 @@ class _EdgeFrames(eqx.Module):
         u = outward.reshape(-1, 3, 2)
         v = jnp.roll(u, -1, axis=1)
         disordered = jnp.sum(u[..., 0] * v[..., 1] < u[..., 1] * v[..., 0], axis=1) >= 2
-        self.inside_out = disordered[self.start] & disordered[self.end] & ~upright
-        left, right, at_start, at_end = self.cells.T
-        sides = m.neighbour_counts
+        self.inside_out = take(disordered, self.start) & take(disordered, self.end) & ~upright
+        left, right, at_start, at_end = (self.cells[:, k] for k in range(4))
+        fewest = jnp.min(take(m.neighbour_counts, self.cells[:, :2]), axis=-1)
         losses = jnp.where(left == right, 2, 1)
-        self.can_flip = (
-            (sides[left] - losses >= 3)
-            & (sides[right] - losses >= 3)
-            & (at_start != at_end)
-            & (self.start != self.end)
-        )
+        self.can_flip = (fewest - losses >= 3) & (at_start != at_end) & (self.start != self.end)
 
     def place(
         self,
@@ -170,7 +168,7 @@ def _independent(
     rank = jnp.zeros(n, jnp.int32).at[jnp.argsort(corner.length)].set(jnp.arange(n, dtype=jnp.int32))
     rank = jnp.where(candidates, rank, n)
     best = jnp.full(n_cells, n, jnp.int32).at[corner.cells].min(rank[:, None])
-    return candidates & jnp.all(best[corner.cells] == rank[:, None], axis=-1)
+    return candidates & jnp.all(take(best, corner.cells) == rank[:, None], axis=-1)
 
 
 _Trial = Callable[[Bool[Array, " edges"]], Tissue]
@@ -192,8 +190,8 @@ def _judge_local(
     repeated = [jnp.zeros(cells.shape[0], bool)]
     for k in range(1, 4):
         repeated.append(jnp.any(cells[:, :k] == cells[:, k : k + 1], axis=-1))
-    change = jnp.where(jnp.stack(repeated, axis=-1), 0, by_cell[cells])
-    return chosen & (jnp.sum(change, axis=-1) + jnp.sum(by_edge[corner.edges], axis=-1) < 0)
+    change = jnp.where(jnp.stack(repeated, axis=-1), 0, take(by_cell, cells))
+    return chosen & (jnp.sum(change, axis=-1) + jnp.sum(take(by_edge, corner.edges), axis=-1) < 0)
 
 
 def _judge_total(

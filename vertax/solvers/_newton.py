@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax.solvers._solver import AbstractSolver, axpy, count, dot, select, value_and_gradient
+from optax import tree
+
+from vertax.solvers._solver import AbstractSolver, value_and_gradient
 
 
 class _NewtonState(eqx.Module):
@@ -45,7 +47,7 @@ class NewtonCG(AbstractSolver):
         value, gradient, aux = value_and_gradient(fn, y, args)
         # The 2-norm of a step in which every coordinate moves as far as it may.
         reach = self.max_displacement * options.get("length_scale", 1.0)
-        radius = reach * jnp.sqrt(jnp.asarray(count(y), value.dtype))
+        radius = reach * jnp.sqrt(jnp.asarray(tree.size(y), value.dtype))
         return _NewtonState(value, gradient, radius, jnp.array(0), aux)
 
     def step(  # noqa: D102
@@ -56,24 +58,24 @@ class NewtonCG(AbstractSolver):
         _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], y)
         p, hp, products = self._truncated_cg(hessian, g, state.radius)
         # The region bounds the 2-norm; no single vertex may jump far either.
-        largest = jax.tree.reduce(jnp.maximum, jax.tree.map(lambda x: jnp.max(jnp.abs(x)), p))
+        largest = tree.norm(p, ord=jnp.inf)
         shrink = jnp.minimum(1.0, reach / jnp.where(largest > 0, largest, 1))
-        p = jax.tree.map(lambda x: shrink * x, p)
-        predicted = -(dot(g, p) + 0.5 * shrink * dot(p, hp))
+        p = tree.scale(shrink, p)
+        predicted = -(tree.vdot(g, p) + 0.5 * shrink * tree.vdot(p, hp))
 
-        trial = axpy(1.0, p, y)
+        trial = tree.add(y, p)
         value, gradient, aux = value_and_gradient(fn, trial, args)
         actual = state.value - value
         # Near equilibrium the gain drowns in the rounding of E; there a step is good if it lowers the
         # force.
         noise = 20 * jnp.finfo(value.dtype).eps * jnp.abs(value)
         lost = predicted <= noise
-        lower_force = dot(gradient, gradient) < dot(g, g)
+        lower_force = tree.vdot(gradient, gradient) < tree.vdot(g, g)
         ratio = actual / jnp.where(predicted > 0, predicted, 1)
-        finite = jnp.isfinite(value) & jnp.isfinite(dot(gradient, gradient))
+        finite = jnp.isfinite(value) & jnp.isfinite(tree.vdot(gradient, gradient))
         accept = finite & jnp.where(lost, lower_force, ratio > 1e-4)
 
-        length = jnp.sqrt(dot(p, p))
+        length = jnp.sqrt(tree.vdot(p, p))
         at_edge = length > 0.9 * state.radius
         radius = jnp.where(
             accept & (lost | (ratio > 0.25)),
@@ -81,7 +83,7 @@ class NewtonCG(AbstractSolver):
             0.25 * length,
         )
         kept = (y, state.value, g, state.aux)
-        y, value, g, aux = select(accept, (trial, value, gradient, aux), kept)
+        y, value, g, aux = tree.where(accept, (trial, value, gradient, aux), kept)
         return y, _NewtonState(value, g, radius, state.num_products + products, aux), aux
 
     def gradient(self, state: _NewtonState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
@@ -93,11 +95,11 @@ class NewtonCG(AbstractSolver):
         """A step `p` inside the trust region, and `H p`."""
         # Conjugate gradients on H p = -g from p = 0; |p| grows from iterate to iterate, so the first
         # one to leave the region, or to meet negative curvature, ends on its edge.
-        squared = dot(g, g)
+        squared = tree.vdot(g, g)
         size = jnp.sqrt(squared)
         forcing = jnp.minimum(0.1, jnp.sqrt(size))
-        zero = jax.tree.map(jnp.zeros_like, g)
-        first = jax.tree.map(jnp.negative, g)
+        zero = tree.zeros_like(g)
+        first = tree.scale(-1, g)
 
         def unfinished(carry: tuple) -> Bool[Array, ""]:
             *_, rr, done, k = carry
@@ -106,17 +108,17 @@ class NewtonCG(AbstractSolver):
         def iterate(carry: tuple) -> tuple:
             p, hp, r, d, rr, _, k = carry
             hd = hessian(d)
-            curvature = dot(d, hd)
+            curvature = tree.vdot(d, hd)
             convex = curvature > 0
             alpha = rr / jnp.where(convex, curvature, 1)
-            pp, pd, dd = dot(p, p), dot(p, d), dot(d, d)
+            pp, pd, dd = tree.vdot(p, p), tree.vdot(p, d), tree.vdot(d, d)
             leaves = pp + 2 * alpha * pd + alpha**2 * dd >= radius**2
             done = leaves | ~convex
             to_edge = (-pd + jnp.sqrt(jnp.maximum(pd**2 + dd * (radius**2 - pp), 0))) / dd
             alpha = jnp.where(done, to_edge, alpha)
-            p, hp, r = axpy(alpha, d, p), axpy(alpha, hd, hp), axpy(alpha, hd, r)
-            new = dot(r, r)
-            d = jax.tree.map(lambda a, b: -a + (new / rr) * b, r, d)
+            p, hp, r = tree.add_scale(p, alpha, d), tree.add_scale(hp, alpha, hd), tree.add_scale(r, alpha, hd)
+            new = tree.vdot(r, r)
+            d = tree.sub(tree.scale(new / rr, d), r)
             return p, hp, r, d, new, done, k + 1
 
         start = (zero, zero, g, first, squared, squared == 0, jnp.array(0))

@@ -8,7 +8,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -29,7 +28,7 @@ class AbstractSolver(optx.AbstractMinimiser):
 
     @abc.abstractmethod
     def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
-        """Gradient at the point that the last step (or `init`) returned; infinite if not known yet."""
+        """Gradient at the point that the last step (or `init`) returned."""
 
     def terminate(  # noqa: D102
         self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any
@@ -47,23 +46,3 @@ def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, Py
     (value, aux), gradient = jax.value_and_grad(fn, has_aux=True)(y, args)
     return value, gradient, aux
 
-
-def dot(a: PyTree, b: PyTree) -> Float[Array, ""]:
-    """Inner product of two pytrees of arrays."""
-    products = jax.tree.map(lambda x, y: jnp.sum(x * y), a, b)
-    return jax.tree.reduce(jnp.add, products)
-
-
-def axpy(scale: Float[Array, ""] | float, x: PyTree, y: PyTree) -> PyTree:
-    """`y + scale * x`, leaf by leaf."""
-    return jax.tree.map(lambda p, q: q + scale * p, x, y)
-
-
-def select(condition: Bool[Array, ""], a: PyTree, b: PyTree) -> PyTree:
-    """`a` where the condition holds, else `b`, leaf by leaf."""
-    return jax.tree.map(lambda p, q: jnp.where(condition, p, q), a, b)
-
-
-def count(tree: PyTree) -> int:
-    """Number of entries of a pytree of arrays."""
-    return sum(leaf.size for leaf in jax.tree.leaves(tree))

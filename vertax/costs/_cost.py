@@ -1,0 +1,57 @@
+"""What every cost is, and how costs are weighted and added."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vertax._tissue import Tissue
+from vertax.energies import AbstractEnergy
+
+
+class AbstractCost(eqx.Module):
+    """What we want of an equilibrium, as a number to minimise.
+
+    Subclass it and write `__call__`; data and settings are fields. Weighted sums are written as such:
+    `0.99 * cost_a + 0.01 * cost_b`.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
+        """Cost of a relaxed tissue and the energy that it minimises."""
+
+    def __add__(self, other: AbstractCost) -> AbstractCost:
+        """The sum of two costs."""
+        if not isinstance(other, AbstractCost):
+            return NotImplemented
+        (weights, costs), (more_weights, more_costs) = _parts(self), _parts(other)
+        return WeightedSum(jnp.concatenate([weights, more_weights]), costs + more_costs)
+
+    def __mul__(self, weight: float | Float[Array, ""]) -> AbstractCost:
+        """The cost times a number."""
+        if isinstance(weight, AbstractCost):
+            return NotImplemented
+        weights, costs = _parts(self)
+        return WeightedSum(weight * weights, costs)
+
+    __rmul__ = __mul__
+
+
+class WeightedSum(AbstractCost):
+    """A weighted sum of costs; made by `*` and `+`."""
+
+    weights: Float[Array, " costs"]
+    costs: tuple[AbstractCost, ...]
+
+    def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
+        """Weighted sum of the costs."""
+        return jnp.sum(self.weights * jnp.stack([cost(tissue, energy) for cost in self.costs]))
+
+
+def _parts(cost: AbstractCost) -> tuple[Float[Array, " costs"], tuple[AbstractCost, ...]]:
+    if isinstance(cost, WeightedSum):
+        return cost.weights, cost.costs
+    return jnp.ones(1), (cost,)

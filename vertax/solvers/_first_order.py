@@ -1,0 +1,160 @@
+"""First-order minimisers: gradient descent and every Optax optimiser."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PyTree
+
+from vertax.solvers._solver import AbstractSolver, value_and_gradient
+
+
+class _State(eqx.Module):
+    value: Float[Array, ""]
+    gradient: PyTree[Float[Array, "..."]]
+    optimiser: PyTree
+    aux: PyTree
+
+
+class GradientDescent(AbstractSolver):
+    r"""Gradient descent with a fixed step, $X \leftarrow X - \eta\,\nabla E$ (paper, Methods).
+
+    Here for comparison with the paper: it ends in two-cycles wherever an eigenvalue of the Hessian
+    exceeds $2/\eta$.
+
+    **Arguments:**
+
+    - `learning_rate`: step $\eta$, length squared per energy.
+    """
+
+    learning_rate: float | Float[Array, ""] = 1e-2
+
+    def init(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> _State:
+        value, gradient, aux = value_and_gradient(fn, y, args)
+        return _State(value, gradient, None, aux)
+
+    def step(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
+    ) -> tuple[Any, _State, Any]:
+        y = optax.tree.add_scale(y, -self.learning_rate, state.gradient)
+        value, gradient, aux = value_and_gradient(fn, y, args)
+        return y, _State(value, gradient, None, aux), aux
+
+    def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+        return state.gradient
+
+
+class Optax(AbstractSolver):
+    """Any Optax optimiser as the minimiser of the energy.
+
+    **Arguments:**
+
+    - `optimiser`: e.g. `optax.adam(1e-2)`; schedules work, and so do optimisers with a line search
+        (`optax.lbfgs()`), which are passed the value, gradient and value function.
+    """
+
+    optimiser: optax.GradientTransformation = eqx.field(static=True)
+
+    def init(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> _State:
+        value, gradient, aux = value_and_gradient(fn, y, args)
+        return _State(value, gradient, self.optimiser.init(y), aux)
+
+    def step(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
+    ) -> tuple[Any, _State, Any]:
+        update = optax.with_extra_args_support(self.optimiser).update
+        updates, optimiser = update(
+            state.gradient,
+            state.optimiser,
+            y,
+            value=state.value,
+            grad=state.gradient,
+            value_fn=lambda x: fn(x, args)[0],
+        )
+        y = optax.apply_updates(y, updates)
+        value, gradient, aux = value_and_gradient(fn, y, args)
+        return y, _State(value, gradient, optimiser, aux), aux
+
+    def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+        return state.gradient
+
+
+class _FIREState(eqx.Module):
+    value: Float[Array, ""]
+    gradient: PyTree[Float[Array, "..."]]
+    velocity: PyTree[Float[Array, "..."]]
+    time_step: Float[Array, ""]
+    mixing: Float[Array, ""]
+    downhill: Float[Array, ""]
+    aux: PyTree
+
+
+class FIRE(AbstractSolver):
+    r"""Fast inertial relaxation engine (Bitzek et al. 2006, doi:10.1103/PhysRevLett.97.170201).
+
+    Damped dynamics that speeds up while the power $F \cdot v$ is positive and stops dead when it turns
+    negative; semi-implicit Euler steps (Guénolé et al. 2020, doi:10.1016/j.commatsci.2020.109584).
+
+    **Arguments:**
+
+    - `time_step`: first and smallest useful time step, for unit mass.
+    - `max_time_step`: largest time step.
+    - `max_displacement`: furthest that one vertex may move in a step, in units of the length scale (in
+        [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
+    """
+
+    time_step: float = 0.02
+    max_time_step: float = 0.2
+    max_displacement: float = 0.1
+
+    def init(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> _FIREState:
+        value, gradient, aux = value_and_gradient(fn, y, args)
+        scalar = lambda x: jnp.asarray(x, value.dtype)
+        rest = optax.tree.zeros_like(y)
+        return _FIREState(
+            value, gradient, rest, scalar(self.time_step), scalar(_MIXING), scalar(0), aux
+        )
+
+    def step(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, state: _FIREState, tags: Any
+    ) -> tuple[Any, _FIREState, Any]:
+        force = optax.tree.scale(-1, state.gradient)
+        power = optax.tree.vdot(force, state.velocity)
+        downhill = power > 0
+        n_downhill = jnp.where(downhill, state.downhill + 1, 0)
+        fast = n_downhill > _DELAY
+        dt = jnp.where(downhill, state.time_step, 0.5 * state.time_step)
+        dt = jnp.where(fast, jnp.minimum(1.1 * dt, self.max_time_step), dt)
+        # Without a floor a long uphill passage could shrink the step to nothing.
+        dt = jnp.maximum(dt, 0.02 * self.time_step)
+        mixing = jnp.where(downhill, jnp.where(fast, 0.99 * state.mixing, state.mixing), _MIXING)
+
+        velocity = jax.tree.map(lambda v: jnp.where(downhill, v, 0), state.velocity)
+        velocity = optax.tree.add_scale(velocity, dt, force)
+        speed, strength = optax.tree.norm(velocity), optax.tree.norm(force)
+        steer = mixing * speed / jnp.where(strength > 0, strength, 1)
+        velocity = jax.tree.map(lambda v, f: (1 - mixing) * v + steer * f, velocity, force)
+        reach = self.max_displacement * options.get("length_scale", 1.0)
+        furthest = dt * optax.tree.norm(velocity, ord=jnp.inf)
+        limit = jnp.minimum(1.0, reach / jnp.where(furthest > 0, furthest, 1))
+        y = optax.tree.add_scale(y, limit * dt, velocity)
+        value, gradient, aux = value_and_gradient(fn, y, args)
+        return y, _FIREState(value, gradient, velocity, dt, mixing, n_downhill, aux), aux
+
+    def gradient(self, state: _FIREState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+        return state.gradient
+
+
+# Bitzek et al.: α_start = 0.1, and acceleration begins after five steps downhill.
+_MIXING = 0.1
+_DELAY = 5

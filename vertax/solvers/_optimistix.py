@@ -1,0 +1,62 @@
+"""Optimistix's own minimisers, with the force they leave out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import optimistix as optx
+from jaxtyping import Float, PyTree
+
+from vertax.solvers._solver import AbstractSolver, value_and_gradient
+
+
+class _WrappedState(eqx.Module):
+    inner: PyTree
+    gradient: PyTree[Float[Array, "..."]]
+
+
+class Wrapped(AbstractSolver):
+    """A minimiser of Optimistix, judged by its force.
+
+    [`equilibrate`][vertax.equilibrate] wraps Optimistix minimisers by itself. The minimiser's own
+    termination is ignored. The force costs one gradient a step, except for quasi-Newton minimisers,
+    whose state already holds it.
+
+    **Arguments:**
+
+    - `solver`: any `optimistix.AbstractMinimiser`, e.g. `optimistix.BFGS(rtol=0.0, atol=0.0)`.
+    """
+
+    solver: optx.AbstractMinimiser
+
+    def init(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> _WrappedState:
+        inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
+        return _WrappedState(inner, value_and_gradient(fn, y, args)[1])
+
+    def step(  # noqa: D102
+        self, fn: Any, y: Any, args: Any, options: Any, state: _WrappedState, tags: Any
+    ) -> tuple[Any, _WrappedState, Any]:
+        y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
+        if isinstance(self.solver, optx.AbstractQuasiNewton):
+            gradient = inner.f_info.grad  # of the last accepted point, which is the one returned
+        else:
+            gradient = value_and_gradient(fn, y, args)[1]
+        return y, _WrappedState(inner, gradient), aux
+
+    def gradient(self, state: _WrappedState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+        return state.gradient
+
+
+def LBFGS(history: int = 10) -> Wrapped:
+    """Limited-memory BFGS (Optimistix's), judged by its force.
+
+    Stalls near forces of 1e-8 in float64, from rounding of the energy in its line search.
+
+    **Arguments:**
+
+    - `history`: number of past steps that shape the metric.
+    """
+    return Wrapped(optx.LBFGS(rtol=0.0, atol=0.0, history_length=history))
