@@ -98,6 +98,9 @@ class TestRefusedToSave:
             def translation(self, image):
                 return 0.0 * image
 
+            def shortest(self, displacement):
+                return displacement
+
             def drift(self, vertices, reference):
                 return jnp.zeros(0)
 

@@ -227,6 +227,11 @@ class TestTissue:
             plot_tissue(tissue, **arguments)
         assert plt.get_fignums() == []
 
+    def test_batches_are_refused(self, tissue):
+        batch = jax.tree.map(lambda x: np.stack([x, x]), tissue)
+        with pytest.raises(ValueError, match="must be a single tissue"):
+            plot_tissue(batch)
+
 
 class TestOverlay:
     IMAGE = np.arange(60 * 80, dtype=np.uint16).reshape(60, 80)

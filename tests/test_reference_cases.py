@@ -167,6 +167,9 @@ def test_any_order_of_rows_is_read(tissue):
     assert_same_to_rounding(geometry(again).areas, geometry(tissue).areas)
     vectors = np.asarray(geometry(tissue).edge_vectors)[tables.edges]
     other = np.asarray(geometry(again).edge_vectors)[shuffled.edges][new]
+    # The first row of a vertex is its first half-edge.
+    first = np.unique(he_table[:, 3], return_index=True)[1]
+    np.testing.assert_array_equal(shuffled.half_edges[first], 3 * np.arange(tissue.n_vertices))
     # Which of the twins gives the direction may differ, and with it the rounding.
     assert_same_to_rounding(np.abs(other), np.abs(vectors))
 
@@ -200,6 +203,11 @@ def test_edges_longer_than_the_box_cannot_be_written(tissue):
     stretched = tissue.with_configuration(tissue.vertices * jnp.array([5.0, 1.0]))
     with pytest.raises(ValueError, match="reach into a neighbouring box at most"):
         to_tables(stretched)
+
+
+def test_batches_cannot_be_written(tissue):
+    with pytest.raises(ValueError, match="must be a single tissue"):
+        to_tables(jax.tree.map(lambda x: jnp.stack([x, x]), tissue))
 
 
 def test_sheared_boxes_cannot_be_written():

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from vertax._boundary import Periodic
 from vertax._tissue import Tissue
-from vertax._topology import Topology, clockwise, counter_clockwise
+from vertax._topology import Topology
 
 
 class Tables(NamedTuple):
@@ -139,9 +139,14 @@ def to_tables(tissue: Tissue) -> Tables:
 
     **Raises:**
 
-    - `ValueError` if the boundary is not periodic, the box is sheared or its first vector is not
-        along x, or an edge reaches beyond the neighbouring box.
+    - `ValueError` for a batch of tissues, if the boundary is not periodic, the box is sheared or
+        its first vector is not along x, or an edge reaches beyond the neighbouring box.
     """
+    if tissue.vertices.ndim != 2:
+        raise ValueError(
+            "Argument `tissue` must be a single tissue, but its vertices have shape "
+            f"{tissue.vertices.shape}."
+        )
     boundary = tissue.boundary
     if not isinstance(boundary, Periodic):
         raise ValueError(
@@ -162,9 +167,9 @@ def to_tables(tissue: Tissue) -> Tables:
     half_edge, twin, frame = (np.asarray(x) for x in (m.half_edge, m.twin, m.frame))
     order = np.stack([half_edge, twin[half_edge]], axis=1).ravel()
     row = np.argsort(order)
-    h = np.arange(m.n_half_edges)
-    source, target = h // 3, twin // 3
-    following, previous = clockwise(twin), twin[counter_clockwise(h)]
+    source, target = np.arange(m.n_half_edges) // 3, twin // 3
+    following = np.asarray(m.next)
+    previous = np.argsort(following)  # the inverse permutation
     offset = frame[following] - frame + image[target] - image[source]
     if np.abs(offset).max() > 1:
         far = int(np.argmax(np.abs(offset).max(axis=1)))

@@ -81,9 +81,14 @@ def plot_tissue(
 
     **Raises:**
 
-    - `ValueError`, naming the argument, for values of the wrong length, an image that is not one,
-        or a `pixel_size` or `alpha` out of range.
+    - `ValueError`, naming the argument, for a batch of tissues, values of the wrong length, an
+        image that is not one, or a `pixel_size` or `alpha` out of range.
     """
+    if tissue.vertices.ndim != 2:
+        raise ValueError(
+            "Argument `tissue` must be a single tissue, but its vertices have shape "
+            f"{tissue.vertices.shape}."
+        )
     cell_values = _values("cells", cells, tissue.n_cells)
     edge_values = _values("edges", edges, tissue.n_edges)
     shown = _values("mask", mask, tissue.n_cells)
@@ -224,8 +229,9 @@ def _colour(
     finite = values[np.isfinite(values)]
     low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
     artist.set_cmap(colours)
-    limits = [x if given is None else float(given) for x, given in ((low, vmin), (high, vmax))]
-    artist.set_norm(Normalize(*limits))
+    low = low if vmin is None else float(vmin)
+    high = high if vmax is None else float(vmax)
+    artist.set_norm(Normalize(low, high))
     artist.set_array(np.ma.masked_invalid(values))
 
 
