@@ -214,16 +214,6 @@ class Topology(eqx.Module):
         )
 
 
-def clockwise(h: Array | np.ndarray) -> Array | np.ndarray:
-    """The half-edge one slot clockwise around the same vertex."""
-    return 3 * (h // 3) + (h % 3 + 2) % 3
-
-
-def counter_clockwise(h: Array | np.ndarray) -> Array | np.ndarray:
-    """The half-edge one slot counter-clockwise around the same vertex."""
-    return 3 * (h // 3) + (h % 3 + 1) % 3
-
-
 def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
     """Flip the marked edges (the topological part of a T1 transition).
 

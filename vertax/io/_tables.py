@@ -1,0 +1,282 @@
+"""The paper's tables: `vertTable`, `heTable` and `faceTable` of a periodic rectangle."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from vertax._boundary import Periodic
+from vertax._tissue import Tissue
+from vertax._topology import Topology
+
+
+class Tables(NamedTuple):
+    """A periodic rectangular tissue in the form of the paper's files.
+
+    NumPy arrays; rows of `he_table` are half-edges, in any order.
+
+    **Arguments:**
+
+    - `vert_table`: positions of the vertices, in units of length.
+    - `he_table`: the columns are previous, next and twin half-edge, source and target vertex, the
+        face on the left, and the offset of the target in x and in y, in boxes (−1, 0, +1) relative
+        to the source. Faces are counter-clockwise.
+    - `face_table`: one half-edge of each face.
+    - `width`, `height`: the box, with a corner at the origin.
+    """
+
+    vert_table: Float[np.ndarray, "vertices 2"]
+    he_table: Int[np.ndarray, "halfedges 8"]
+    face_table: Int[np.ndarray, " faces"]
+    width: float
+    height: float
+
+    @property
+    def edges(self) -> Int[np.ndarray, " halfedges"]:
+        """Edge number of each row of `he_table` in the tissue that `from_tables` makes.
+
+        Edges are numbered by their first row. So values per half-edge become values per edge as
+        `per_edge[tables.edges] = values` (where twins agree), and `per_edge[tables.edges]` leads
+        back.
+        """
+        twin = np.asarray(self.he_table)[:, 2]
+        first = np.minimum(np.arange(len(twin)), twin)
+        return np.unique(first, return_inverse=True)[1]
+
+    @property
+    def half_edges(self) -> Int[np.ndarray, " halfedges"]:
+        """Half-edge that each row of `he_table` is in the tissue that `from_tables` makes."""
+        previous, _, twin, source = np.asarray(self.he_table)[:, :4].T
+        rows = np.arange(len(source))
+        # The first row that leaves a vertex takes its first slot, the others follow
+        # counter-clockwise.
+        first = np.full(len(source) // 3, -1)
+        first[source[::-1]] = rows[::-1]
+        half_edges = np.empty_like(rows)
+        row = first
+        for slot in range(3):
+            half_edges[row] = 3 * np.arange(len(first)) + slot
+            row = twin[previous[row]]
+        return half_edges
+
+
+def from_tables(tables: Tables, *, softening: float | None = None) -> Tissue:
+    """Make a tissue from the paper's tables.
+
+    Vertices and cells keep their numbers. Edges are numbered and directed by their first row of
+    `he_table`; [`Tables.edges`][vertax.io.Tables] and `Tables.half_edges` map arrays along the rows
+    to the tissue's edges and half-edges.
+
+    ```python
+    data = np.load("paper.npz")
+    tables = vx.io.Tables(
+        data["vertTable"], data["heTable"], data["faceTable"], data["width"], data["height"]
+    )
+    tissue = vx.io.from_tables(tables)
+    ```
+
+    **Arguments:**
+
+    - `tables`: the [`Tables`][vertax.io.Tables].
+    - `softening`: passed on to [`Tissue`][vertax.Tissue]; the paper's code has none, that is 0.
+
+    **Returns:** a [`Tissue`][vertax.Tissue] with a rectangular [`Periodic`][vertax.Periodic]
+    boundary.
+
+    **Raises:**
+
+    - `ValueError` naming the table and the first rows at fault, if tables have the wrong shape or
+        contradict themselves or each other, if a vertex does not join exactly three edges, or if
+        the faces are not counter-clockwise and cover the box once.
+    """
+    tables = _checked(tables)
+    vert_table, he_table, face_table, width, height = tables
+    _check_rows(tables)
+    following, twin, face = he_table[:, 1], he_table[:, 2], he_table[:, 5]
+    frame = _frames(following, face_table, he_table[:, 6:], np.bincount(face))
+    # Row r of the table is half-edge number[r]; `row` is the inverse.
+    number = tables.half_edges
+    row = np.argsort(number)
+    edges = tables.edges
+    topology = Topology(number[twin][row], face[row], frame[row], edges[row])
+    first_rows = np.unique(edges, return_index=True)[1]
+    topology = eqx.tree_at(
+        lambda m: m.half_edge, topology, jnp.asarray(number[first_rows], topology.half_edge.dtype)
+    )
+    # The faces of a torus cover it a whole number of times, whatever their shapes: -1 if they all
+    # run clockwise, and something else if offsets are wrong in a way that happens to close around
+    # each face. (Shoelace formula, in NumPy: it would be a dozen small compilations.)
+    x, y = (vert_table[he_table[:, 3]] + frame * [width, height]).T
+    cover = 0.5 * np.sum(x * y[following] - y * x[following]) / (width * height)
+    if abs(cover - 1) > 1e-2:
+        raise ValueError(
+            "The faces of `he_table` must run counter-clockwise and cover the box once, but their "
+            f"signed areas sum to {cover:.3g} boxes."
+        )
+    # Positions in float32 stay so; all others get the precision that JAX is set to.
+    dtype = np.float32 if vert_table.dtype == np.float32 else jnp.result_type(float)
+    lattice = jnp.asarray(np.diag([width, height]), dtype)
+    return Tissue(jnp.asarray(vert_table, dtype), topology, Periodic(lattice), softening)
+
+
+def to_tables(tissue: Tissue) -> Tables:
+    """Write a tissue as the paper's tables.
+
+    Vertices and cells keep their numbers; edge `e` becomes rows `2 e` (in the edge's direction) and
+    `2 e + 1`, as in the paper's files, so `np.repeat(values, 2)` takes values per edge to the rows.
+    Vertices outside the box are moved into it by whole boxes; the others keep their bits. The
+    tables have no softening.
+
+    **Arguments:**
+
+    - `tissue`: a [`Tissue`][vertax.Tissue] in a rectangular periodic box.
+
+    **Returns:** the [`Tables`][vertax.io.Tables].
+
+    **Raises:**
+
+    - `ValueError` for a batch of tissues, if the boundary is not periodic, the box is sheared or
+        its first vector is not along x, or an edge reaches beyond the neighbouring box.
+    """
+    if tissue.vertices.ndim != 2:
+        raise ValueError(
+            "Argument `tissue` must be a single tissue, but its vertices have shape "
+            f"{tissue.vertices.shape}."
+        )
+    boundary = tissue.boundary
+    if not isinstance(boundary, Periodic):
+        raise ValueError(
+            f"Tables hold periodic tissues only, but the boundary is {type(boundary).__name__}."
+        )
+    lattice = np.asarray(boundary.lattice)
+    if lattice[0, 1] != 0 or lattice[1, 0] != 0:
+        raise ValueError(
+            "Tables hold rectangular boxes only (lattice vectors along x and y), but the lattice "
+            f"is {lattice.tolist()}. Use `save_tissue`, which keeps any lattice."
+        )
+    size = np.diag(lattice)
+    m = tissue.topology
+    vertices = np.asarray(tissue.vertices)
+    image = np.floor(vertices / size).astype(int)
+    wrapped = np.where(image == 0, vertices, vertices - image.astype(size.dtype) * size)
+    # Rows 2 e and 2 e + 1 are the two half-edges of edge e.
+    half_edge, twin, frame = (np.asarray(x) for x in (m.half_edge, m.twin, m.frame))
+    order = np.stack([half_edge, twin[half_edge]], axis=1).ravel()
+    row = np.argsort(order)
+    source, target = np.arange(m.n_half_edges) // 3, twin // 3
+    following = np.asarray(m.next)
+    previous = np.argsort(following)  # the inverse permutation
+    offset = frame[following] - frame + image[target] - image[source]
+    if np.abs(offset).max() > 1:
+        far = int(np.argmax(np.abs(offset).max(axis=1)))
+        raise ValueError(
+            "Tables hold edges that reach into a neighbouring box at most, but the edge from "
+            f"vertex {source[far]} to vertex {target[far]} goes {offset[far].tolist()} boxes."
+        )
+    columns = [row[previous], row[following], row[twin]]
+    columns += [source, target, np.asarray(m.cell), offset[:, 0], offset[:, 1]]
+    he_table = np.stack(columns, axis=1)[order].astype(np.int32)
+    face_table = np.unique(he_table[:, 5], return_index=True)[1].astype(np.int32)
+    return Tables(wrapped, he_table, face_table, float(size[0]), float(size[1]))
+
+
+def _checked(tables: Tables) -> Tables:
+    """The tables as arrays of the right shapes and types."""
+    v, he, f = (np.asarray(table) for table in tables[:3])
+    width, height = float(tables.width), float(tables.height)
+    if v.ndim != 2 or v.shape[1] != 2 or v.dtype.kind not in "fi" or not np.isfinite(v).all():
+        raise ValueError(
+            "Table `vert_table` must hold finite positions, shape (vertices, 2), but has shape "
+            f"{v.shape} and type {v.dtype}."
+        )
+    if he.ndim != 2 or he.shape[1] != 8 or he.dtype.kind not in "iu":
+        raise ValueError(
+            "Table `he_table` must hold integers, shape (half-edges, 8), but has shape "
+            f"{he.shape} and type {he.dtype}."
+        )
+    if f.ndim != 1 or f.size == 0 or f.dtype.kind not in "iu":
+        raise ValueError(
+            f"Table `face_table` must hold integers, shape (faces,), but has shape {f.shape} and "
+            f"type {f.dtype}. (Tables of bounded tissues are another form.)"
+        )
+    if not (np.isfinite([width, height]).all() and width > 0 and height > 0):
+        raise ValueError(f"The width and height must be positive, but are {width} and {height}.")
+    return Tables(v, he.astype(int), f.astype(int), width, height)
+
+
+def _check_rows(tables: Tables) -> None:
+    """Check that the columns are within range and agree with each other."""
+    previous, following, twin, source, target, face, *_ = tables.he_table.T
+    offset = tables.he_table[:, 6:]
+    n_rows, n_vertices, n_faces = len(source), len(tables.vert_table), len(tables.face_table)
+    rows = np.arange(n_rows)
+
+    def require(ok: np.ndarray, what: str, table: str = "he_table", at: str = "rows"):
+        if not np.all(ok):
+            bad = np.flatnonzero(~ok)[:3].tolist()
+            raise ValueError(f"Table `{table}` is broken: {what} (first offenders: {at} {bad}).")
+
+    for column, bound, name in (
+        (previous, n_rows, "previous"),
+        (following, n_rows, "next"),
+        (twin, n_rows, "twin"),
+        (source, n_vertices, "source"),
+        (target, n_vertices, "target"),
+        (face, n_faces, "face"),
+    ):
+        require((column >= 0) & (column < bound), f"`{name}` must lie in 0 … {bound - 1}")
+    edges_at_vertex = np.bincount(source, minlength=n_vertices)
+    require(
+        edges_at_vertex == 3,
+        "every vertex must join exactly three edges, so the tissue can hold no rosettes",
+        at="vertices",
+    )
+    require((twin[twin] == rows) & (twin != rows), "`twin` must pair up the rows")
+    require(previous[following] == rows, "`previous` must undo `next`")
+    require(source[twin] == target, "`target` must be the source of the twin")
+    require(source[following] == target, "`next` must leave from `target`")
+    require(face[following] == face, "`face` must be the same all around a face")
+    require(np.all(offset[twin] == -offset, axis=1), "twins must have opposite offsets")
+    # `twin[previous]` turns around a vertex and permutes its three rows; without a fixed point that
+    # is a full turn.
+    require(twin[previous] != rows, "no row may follow its own twin")
+    require(
+        (tables.face_table >= 0) & (tables.face_table < n_rows),
+        f"entries must lie in 0 … {n_rows - 1}",
+        table="face_table",
+        at="faces",
+    )
+    require(
+        face[tables.face_table] == np.arange(n_faces),
+        "each entry must be a half-edge of its face",
+        table="face_table",
+        at="faces",
+    )
+
+
+def _frames(
+    following: np.ndarray, start: np.ndarray, offset: np.ndarray, sides: np.ndarray
+) -> np.ndarray:
+    """Box that each row's source lies in, seen from its face's first row (`start`).
+
+    Walks around all faces at once, one side at a time, adding up offsets.
+    """
+    frame = np.zeros_like(offset)
+    row, here = start, np.zeros((len(start), 2), offset.dtype)
+    for _ in range(sides.max()):
+        frame[row] = here
+        here = here + offset[row]
+        row = following[row]
+        # A face that is back at its first row has to be back in its first box.
+        back = row == start
+        torn = np.flatnonzero(back & np.any(here != 0, axis=1))
+        if torn.size:
+            raise ValueError(
+                "Table `he_table` is broken: offsets must add up to zero around every face (first "
+                f"offenders: faces {torn[:3].tolist()})."
+            )
+    return frame

@@ -1,0 +1,185 @@
+"""One tissue, one file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from vertax._boundary import AbstractBoundary, Periodic
+from vertax._tissue import Tissue
+from vertax._topology import Topology
+from vertax.io._atomic import atomic_write
+
+_FORMAT = "vertax-tissue"
+_VERSION = 1
+
+
+class _BoundaryRecord(NamedTuple):
+    """How one class of boundary is written: its arrays by field name, handed back as keywords."""
+
+    build: Callable[..., AbstractBoundary]
+    fields: dict[str, tuple[int | None, ...]]
+    """Shape of each array; None is any length."""
+
+
+# A new boundary class is one more entry. Names and fields are part of the file format: they stay.
+_BOUNDARIES: dict[str, _BoundaryRecord] = {
+    "periodic": _BoundaryRecord(Periodic, {"lattice": (2, 2)}),
+}
+
+
+def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
+    """Save a tissue to a file, exactly: every number keeps its bits and its precision.
+
+    The file is a NumPy `.npz` archive without pickles, so other programs can read it. It holds
+    `format`, `version` and `boundary` (the header), `vertices`, `softening`, the arrays of the
+    [`Topology`][vertax.Topology] by name, and those of the boundary as `boundary_…`. It is written
+    atomically: an interrupted save leaves the old file, if any, as it was.
+
+    **Arguments:**
+
+    - `path`: the file, by custom with the ending `.npz`; taken as it is.
+    - `tissue`: the [`Tissue`][vertax.Tissue].
+
+    **Raises:**
+
+    - `ValueError` for a batch of tissues, for a precision NumPy does not know, or for a boundary
+        that has no place in the format.
+    - `OSError` if the file cannot be written.
+    """
+    topology = tissue.topology
+    kind, record = _record_of(tissue.boundary)
+    arrays: dict[str, Any] = {
+        "vertices": tissue.vertices,
+        "softening": tissue.softening,
+        "twin": topology.twin,
+        "cell": topology.cell,
+        "frame": topology.frame,
+        "edge": topology.edge,
+        "half_edge": topology.half_edge,
+    }
+    arrays |= {f"boundary_{name}": getattr(tissue.boundary, name) for name in record.fields}
+    arrays = {name: np.asarray(array) for name, array in arrays.items()}
+    if arrays["vertices"].ndim != 2:
+        raise ValueError(
+            "Argument `tissue` must be a single tissue, but its vertices have shape "
+            f"{arrays['vertices'].shape}. Save the members of a batch one by one."
+        )
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fi":  # bfloat16 and the like come back from a file as raw bytes
+            raise ValueError(
+                "Argument `tissue` must hold numbers of a type NumPy knows, but "
+                f"`{name}` is {array.dtype}."
+            )
+    header = {"format": _FORMAT, "version": _VERSION, "boundary": kind}
+    with atomic_write(path, "wb") as file:
+        np.savez_compressed(file, **{k: np.asarray(v) for k, v in header.items()}, **arrays)
+
+
+def load_tissue(path: str | os.PathLike[str]) -> Tissue:
+    """Load a tissue that [`save_tissue`][vertax.io.save_tissue] wrote.
+
+    **Arguments:**
+
+    - `path`: the file.
+
+    **Returns:** the [`Tissue`][vertax.Tissue], bit for bit as it was saved.
+
+    **Raises:**
+
+    - `FileNotFoundError` if there is no such file.
+    - `ValueError`, with the file's name, if it is not a tissue file, is truncated or damaged, was
+        written by a newer version, contradicts itself, or holds float64 numbers while JAX is
+        limited to float32 (nothing is rounded silently: enable `jax_enable_x64`).
+    """
+    name = os.fspath(path)
+    arrays = _read(name)
+    if "format" not in arrays or str(arrays["format"]) != _FORMAT:
+        raise ValueError(f"{name} is not a vertax tissue file: it has no header saying so.")
+    version = arrays.get("version", np.asarray(""))
+    if version.shape != () or version.dtype.kind != "i" or version < 1:
+        raise ValueError(f"{name} has a broken header: its version is {version}.")
+    if version > _VERSION:
+        raise ValueError(
+            f"{name} has version {version} of the tissue format, but this vertax reads up to "
+            f"version {_VERSION}. Update vertax."
+        )
+    kind = str(arrays.get("boundary"))
+    if kind not in _BOUNDARIES:
+        raise ValueError(
+            f"{name} has a boundary of an unknown kind, {kind!r}; known are: "
+            f"{', '.join(_BOUNDARIES)}."
+        )
+    record = _BOUNDARIES[kind]
+
+    def get(key: str, kinds: str, *shape: int | None) -> np.ndarray:
+        """The array `key`, of a dtype among `kinds` and of the given shape (None: any length)."""
+        if key not in arrays:
+            raise ValueError(f"{name} is incomplete: it has no array `{key}`.")
+        array = arrays[key]
+        fits = len(shape) == array.ndim and all(
+            want in (None, have) for want, have in zip(shape, array.shape, strict=True)
+        )
+        if array.dtype.kind not in kinds or not fits:
+            wanted = f"({', '.join('any' if n is None else str(n) for n in shape)})"
+            what = "integers" if kinds == "i" else "real numbers"
+            raise ValueError(
+                f"{name} is broken: `{key}` has shape {array.shape} and type {array.dtype}, but "
+                f"must have shape {wanted} and hold {what}."
+            )
+        if array.dtype.kind == "f" and jnp.asarray(array).dtype != array.dtype:
+            raise ValueError(
+                f"{name} holds {array.dtype} numbers, but JAX is limited to float32, which would "
+                'round them. Call jax.config.update("jax_enable_x64", True) first.'
+            )
+        return array
+
+    twin = get("twin", "i", None)
+    n_half = len(twin)
+    cell, frame = get("cell", "i", n_half), get("frame", "i", n_half, 2)
+    edge, half_edge = get("edge", "i", n_half), get("half_edge", "i", n_half // 2)
+    vertices, softening = get("vertices", "f", n_half // 3, 2), get("softening", "f")
+    fields = {
+        field: get(f"boundary_{field}", "f", *shape) for field, shape in record.fields.items()
+    }
+    try:
+        topology = Topology(twin, cell, frame, edge)
+        # The direction of an edge is not in the other arrays: after a T1 it need not be the first
+        # half-edge of the pair.
+        topology = eqx.tree_at(
+            lambda m: m.half_edge, topology, jnp.asarray(half_edge, topology.half_edge.dtype)
+        )
+        topology.validate()
+        boundary = record.build(**{field: jnp.asarray(array) for field, array in fields.items()})
+        return Tissue(jnp.asarray(vertices), topology, boundary, jnp.asarray(softening))
+    except ValueError as error:
+        raise ValueError(f"{name} is broken: {error}") from error
+
+
+def _record_of(boundary: AbstractBoundary) -> tuple[str, _BoundaryRecord]:
+    for kind, record in _BOUNDARIES.items():
+        if type(boundary) is record.build:
+            return kind, record
+    raise ValueError(
+        f"The tissue format has no place for a boundary of class {type(boundary).__name__}; it "
+        f"knows: {', '.join(_BOUNDARIES)}."
+    )
+
+
+def _read(name: str) -> dict[str, np.ndarray]:
+    """All arrays of an archive, read in full so that damage shows here."""
+    with open(name, "rb") as file:
+        if file.read(2) not in (b"PK", b""):
+            raise ValueError(f"{name} is not a vertax tissue file (nor any .npz archive).")
+        file.seek(0)
+        try:
+            with np.load(file, allow_pickle=False) as archive:
+                return {key: np.asarray(archive[key]) for key in archive.files}
+        # The archive reader fails in a dozen ways, depending on which byte is wrong.
+        except Exception as error:
+            raise ValueError(f"{name} is truncated or damaged: {error}") from error

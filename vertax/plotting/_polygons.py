@@ -1,0 +1,110 @@
+"""Cells as polygons, for drawing."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax._boundary import Periodic
+from vertax._tissue import Tissue
+
+
+class Drawing(eqx.Module):
+    """The geometry that pictures need, each cell placed with its centroid in the home box.
+
+    **Arguments:**
+
+    - `tissue`: the [`Tissue`][vertax.Tissue].
+    """
+
+    corners: Float[np.ndarray, "halfedges 2"]
+    """Source of each half-edge, where the cell on its left is drawn."""
+    image: Int[np.ndarray, "halfedges 2"]
+    """Lattice image of that corner."""
+    cell: Int[np.ndarray, " halfedges"]
+    following: Int[np.ndarray, " halfedges"]
+    twin: Int[np.ndarray, " halfedges"]
+    half_edge: Int[np.ndarray, " edges"]
+    edge: Int[np.ndarray, " halfedges"]
+    cell_size: float
+    """Root of the mean area."""
+    box: Float[np.ndarray, "5 2"] | None
+    """Outline of the periodic box, closed; None without one."""
+
+    def __init__(self, tissue: Tissue):
+        m = tissue.topology
+        corners, centroids, areas, following = (np.asarray(x) for x in _geometry(tissue))
+        image = np.zeros((tissue.n_cells, 2), int)
+        shift = np.zeros((tissue.n_cells, 2))
+        self.box = None
+        if isinstance(tissue.boundary, Periodic):
+            lattice = np.asarray(tissue.boundary.lattice, float)
+            fractions = centroids.astype(float) @ np.linalg.inv(lattice)
+            # The margin keeps a centroid on the side of the box (a regular lattice, say) from
+            # jumping to the other side by rounding. A cell of area 0 has no centroid and stays put.
+            fractions = np.nan_to_num(fractions, posinf=0, neginf=0)
+            image = -np.floor(fractions + 1e-6).astype(int)
+            shift = image @ lattice
+            first, second = lattice
+            self.box = np.stack([0 * first, first, first + second, second, 0 * first])
+        self.cell = np.asarray(m.cell)
+        self.corners = corners.astype(float) + shift[self.cell]
+        self.image = np.asarray(m.frame) + image[self.cell]
+        self.following = following
+        self.twin = np.asarray(m.twin)
+        self.half_edge = np.asarray(m.half_edge)
+        self.edge = np.asarray(m.edge)
+        self.cell_size = float(np.sqrt(np.mean(np.abs(areas.astype(float)))))
+
+    def polygons(self) -> tuple[Float[np.ndarray, "cells sides 2"], Int[np.ndarray, " cells"]]:
+        """Corners of all cells and their numbers of sides, see `cell_polygons`."""
+        sides = np.bincount(self.cell)
+        half_edge = np.unique(self.cell, return_index=True)[1]
+        polygons = np.repeat(self.corners[half_edge][:, None], sides.max(), axis=1)
+        # All cells at once, one side at a time.
+        for k in range(1, sides.max()):
+            half_edge = self.following[half_edge]
+            more = k < sides
+            polygons[more, k] = self.corners[half_edge[more]]
+        return polygons, sides
+
+    def sides(
+        self, mask: Bool[np.ndarray, " cells"]
+    ) -> tuple[Float[np.ndarray, "segments 2 2"], Int[np.ndarray, " segments"]]:
+        """Line segments that show each side of each marked cell once, and the edge of each.
+
+        An edge between two cells drawn side by side is one segment; one across the periodic
+        boundary shows at both cells, in two places.
+        """
+        segments = np.stack([self.corners, self.corners[self.following]], axis=1)
+        first, other = self.half_edge, self.twin[self.half_edge]
+        # Both cells of an edge draw it in the same place if they see its first vertex in the same
+        # image.
+        apart = np.any(self.image[first] != self.image[self.following[other]], axis=1)
+        left, right = mask[self.cell[first]], mask[self.cell[other]]
+        shown = np.concatenate([first[left], other[right & (apart | ~left)]])
+        return segments[shown], self.edge[shown]
+
+
+def cell_polygons(
+    tissue: Tissue,
+) -> tuple[Float[np.ndarray, "cells sides 2"], Int[np.ndarray, " cells"]]:
+    """Corners of all cells, counter-clockwise, each cell whole.
+
+    In a periodic tissue each cell is placed so that its centroid lies in the home box; its corners
+    may stick out.
+
+    **Arguments:**
+
+    - `tissue`: the [`Tissue`][vertax.Tissue].
+
+    **Returns:** the corners, in units of length, where rows of cells with fewer sides than others
+    are filled up with their first corner; and the number of sides of each cell.
+    """
+    return Drawing(tissue).polygons()
+
+
+@eqx.filter_jit  # one compilation instead of one for each operation
+def _geometry(tissue: Tissue) -> tuple[Array, Array, Array, Array]:
+    return tissue.corners, tissue.centroids, tissue.areas, tissue.topology.next
