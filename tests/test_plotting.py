@@ -276,7 +276,7 @@ class TestHistory:
     HISTORY: ClassVar = {
         "cost": np.array([1.0, 0.1, np.nan, 0.0]),
         "max_force": np.array([1e-8, 1e-9, 1e-8, 1e-9]),
-        "transitions": np.array([3, 0, 1, 0]),
+        "num_t1": np.array([3, 0, 1, 0]),
         "seconds": np.ones(7),
     }
 

@@ -1,13 +1,36 @@
 """A differentiable vertex model of epithelial tissue, on JAX and Equinox."""
 
-from vertax import energies as energies, initialise as initialise, solvers as solvers
+from vertax import (
+    adjoints as adjoints,
+    costs as costs,
+    energies as energies,
+    initialise as initialise,
+    io as io,
+    plotting as plotting,
+    solvers as solvers,
+)
+from vertax._bilevel import (
+    Fit as Fit,
+    FitError as FitError,
+    History as History,
+    InverseProblem as InverseProblem,
+    fit as fit,
+)
 from vertax._boundary import AbstractBoundary as AbstractBoundary, Periodic as Periodic
 from vertax._equilibrium import Equilibrium as Equilibrium, equilibrate as equilibrate
 from vertax._tissue import Tissue as Tissue
 from vertax._topology import Topology as Topology
 from vertax._transitions import T1 as T1, AbstractTransitions as AbstractTransitions
 from vertax.adjoints import ImplicitDifferentiation as ImplicitDifferentiation
+from vertax.costs import AbstractCost as AbstractCost
 from vertax.energies import (
     AbstractEnergy as AbstractEnergy,
     AbstractLocalEnergy as AbstractLocalEnergy,
 )
+from vertax.io import load_tissue as load_tissue, save_tissue as save_tissue
+from vertax.plotting import (
+    plot_history as plot_history,
+    plot_recovery as plot_recovery,
+    plot_tissue as plot_tissue,
+)
+from vertax.solvers import MINRES as MINRES

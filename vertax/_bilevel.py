@@ -36,6 +36,8 @@ class InverseProblem(eqx.Module):
     - `trainable`: which leaves of the energy are fitted: a predicate of a leaf, or a pytree of booleans
         shaped like the energy (as in `equinox.partition`). By default every floating-point array;
         Python floats are constants.
+    - `fit_position`: fit also where the whole tissue lies. No parameter of an energy moves the centroid
+        of a tissue, so a cost that sees positions (an image) needs this unless they are known.
     - `adjoint`, `solver`, `transitions`, `tolerance`, `patience`, `max_steps`: passed on to
         [`equilibrate`][vertax.equilibrate].
     """
@@ -44,6 +46,7 @@ class InverseProblem(eqx.Module):
     energy: AbstractEnergy
     cost: AbstractCost
     trainable: PyTree[Bool] | Callable[[Any], bool] = eqx.is_inexact_array
+    fit_position: bool = False
     adjoint: optx.AbstractAdjoint | None = None
     solver: optx.AbstractMinimiser | None = None
     transitions: AbstractTransitions | None = T1()
@@ -52,7 +55,10 @@ class InverseProblem(eqx.Module):
     max_steps: int = 2000
 
     def __call__(
-        self, energy: AbstractEnergy | None = None, tissue: Tissue | None = None
+        self,
+        energy: AbstractEnergy | None = None,
+        tissue: Tissue | None = None,
+        shift: Float[Array, "2"] | None = None,
     ) -> tuple[Float[Array, ""], Equilibrium]:
         """Cost and equilibrium for some parameters.
 
@@ -60,8 +66,9 @@ class InverseProblem(eqx.Module):
 
         - `energy`: the energy, by default the problem's.
         - `tissue`: where the relaxation starts, by default the problem's tissue.
+        - `shift`: a displacement of the relaxed tissue as a whole, by default none.
 
-        **Returns:** the cost, differentiable in `energy`, and the equilibrium.
+        **Returns:** the cost, differentiable in `energy` and `shift`, and the equilibrium.
         """
         energy = self.energy if energy is None else energy
         equilibrium = equilibrate(
@@ -75,6 +82,9 @@ class InverseProblem(eqx.Module):
             max_steps=self.max_steps,
             throw=False,
         )
+        if shift is not None:
+            placed = equilibrium.tissue.with_configuration(equilibrium.tissue.vertices + shift)
+            equilibrium = eqx.tree_at(lambda e: e.tissue, equilibrium, placed)
         return self.cost(equilibrium.tissue, energy), equilibrium
 
 
@@ -186,7 +196,9 @@ def fit(
     # of type would compile the epoch anew.
     parameters = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
     true = None if truth is None else eqx.filter(truth, problem.trainable)
-    state = _State(parameters, optimiser.init(parameters), problem.tissue)
+    # The position is counted from the last equilibrium: an update displaces, and is forgotten.
+    shift = jnp.zeros(2, problem.tissue.vertices.dtype) if problem.fit_position else None
+    state = _State(parameters, optimiser.init((parameters, shift)), problem.tissue)
     best: tuple[int, _Record] | None = None
     rows: list[tuple] = []
     stopped = None
@@ -251,14 +263,20 @@ def _epoch(
 ) -> tuple[_State, _Record]:
     """One relaxation, gradient and update."""
 
-    def cost(parameters: PyTree[Array]) -> tuple[Array, Equilibrium]:
-        return problem(eqx.combine(parameters, constants), state.tissue)
+    def cost(fitted: tuple[PyTree[Array], Array | None]) -> tuple[Array, Equilibrium]:
+        parameters, shift = fitted
+        return problem(eqx.combine(parameters, constants), state.tissue, shift)
 
-    (value, equilibrium), gradient = jax.value_and_grad(cost, has_aux=True)(state.parameters)
+    here = jnp.zeros(2, state.tissue.vertices.dtype) if problem.fit_position else None
+    fitted = (state.parameters, here)
+    (value, equilibrium), gradient = jax.value_and_grad(cost, has_aux=True)(fitted)
     updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
-        gradient, state.optimiser, state.parameters, value=value, grad=gradient
+        gradient, state.optimiser, fitted, value=value, grad=gradient
     )
-    parameters = eqx.apply_updates(state.parameters, updates)
+    parameters, shift = eqx.apply_updates(fitted, updates)
+    following = equilibrium.tissue
+    if shift is not None:
+        following = following.with_configuration(following.vertices + shift)
     record = _Record(
         parameters=state.parameters,
         tissue=equilibrium.tissue,
@@ -274,9 +292,9 @@ def _epoch(
     finite = jnp.all(jnp.isfinite(equilibrium.tissue.vertices))
     warm = jax.tree.map(
         lambda new, old: jnp.where(finite, new, old),
-        *(eqx.filter(t, eqx.is_array) for t in (equilibrium.tissue, state.tissue)),
+        *(eqx.filter(t, eqx.is_array) for t in (following, state.tissue)),
     )
-    tissue = eqx.combine(warm, equilibrium.tissue)
+    tissue = eqx.combine(warm, following)
     return _State(parameters, optimiser_state, tissue), record
 
 

@@ -14,9 +14,9 @@ from vertax.plotting import _style
 # What a history may hold, in the order of the panels: its name there, and the scale of its axis.
 _CURVES = {
     "cost": ("cost", "log"),
-    "parameter_error": ("parameter error", "log"),
+    "relative_error": ("relative error of parameters", "log"),
     "max_force": ("largest force", "log"),
-    "transitions": ("T1 transitions", "linear"),
+    "num_t1": ("T1 transitions", "linear"),
 }
 
 
@@ -33,8 +33,8 @@ def plot_history(
 
     **Arguments:**
 
-    - `history`: values per epoch under the names `cost`, and if there `parameter_error`,
-        `max_force` and `transitions`; other entries are left out.
+    - `history`: values per epoch under the names `cost`, and if there `relative_error`,
+        `max_force` and `num_t1`; other entries are left out.
     - `axes`: where to draw, one for each panel, to compare several fits; by default a new figure.
     - `label`: name of this fit in the legend.
 
