@@ -74,6 +74,9 @@ def plot_history(
             few = {"marker": "o", "markersize": 2.5} if len(curve) < 15 else {}
             panel.plot(epochs, values, color=colour, label=label, **few)
             panel.set_yscale("log" if logarithmic else "linear")
+            if np.issubdtype(np.asarray(history[name]).dtype, np.integer):
+                panel.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
+                panel.set_ylim(bottom=0, top=None if np.any(values) else 1)
             panel.set_xlabel("epoch")
             panel.set_ylabel(title)
         if label is not None:
