@@ -18,5 +18,6 @@ from vertax.experiments._registry import (
 from vertax.experiments._run import (
     RunFolder as RunFolder,
     RunFolderError as RunFolderError,
+    installed_version as installed_version,
     summary as summary,
 )

@@ -19,7 +19,7 @@ class ConfigError(ValueError):
     """A configuration that cannot be used; the message says where and what would be right."""
 
 
-class Section(pydantic.BaseModel, frozen=True):
+class Section(pydantic.BaseModel):
     """A table of a configuration file.
 
     Subclass it; each key is a field with a type, a default and a docstring below. Unknown keys and
@@ -29,16 +29,18 @@ class Section(pydantic.BaseModel, frozen=True):
     model_config = pydantic.ConfigDict(
         extra="forbid",
         strict=True,
+        frozen=True,
         allow_inf_nan=False,
         use_attribute_docstrings=True,
     )
 
 
 class ExperimentConfig(Section):
-    """The keys that every experiment has."""
+    """The keys that every experiment has.
 
-    experiment: str
-    """Which experiment this is; `vertax list` names them all."""
+    Subclasses add a key `experiment`, a literal with the name of theirs.
+    """
+
     seed: int = pydantic.Field(default=0, ge=0)
     """Seed of everything random."""
     precision: Literal["float64", "float32"] = "float64"
@@ -132,7 +134,8 @@ def validate(
     except pydantic.ValidationError as error:
         known = fields(model)
         lines = [_explain(known, mistake) for mistake in error.errors(include_url=False)]
-        raise ConfigError(f"In {where}: " + "\n".join(lines)) from None
+        listed = "\n  ".join(["", *lines]) if len(lines) > 1 else f" {lines[0]}"
+        raise ConfigError(f"In {where}:{listed}") from None
 
 
 def fields(model: type[Section], prefix: str = "") -> dict[str, FieldInfo]:
@@ -245,9 +248,9 @@ def _template_lines(model: type[Section], prefix: str) -> Iterator[str]:
         elif name != "experiment":
             yield f"# {_one_line(field.description)} ({allowed(field)})"
             if field.is_required():
-                yield f"{name} = "
+                yield f"{name} ="
             elif (default := field.get_default(call_default_factory=True)) is None:
-                yield f"# {name} = "
+                yield f"# {name} ="
             else:
                 yield f"{name} = {_in_toml(default)}"
     for name, section, field in sections:

@@ -151,7 +151,6 @@ def new_figure(
     **Returns:** the figure and its axes.
     """
     # Not pyplot: it keeps every figure open, and on a screen would open windows.
-    figure = Figure(
-        figsize=(n * width + room, height), layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06)
-    )
+    layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06)
+    figure = Figure(figsize=(n * width + room, height), layout=layout)
     return figure, list(figure.subplots(1, n, squeeze=False)[0])

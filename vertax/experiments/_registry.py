@@ -27,19 +27,23 @@ class RunFunction(Protocol):
 class Experiment(NamedTuple):
     """One experiment: what configures it and what runs it."""
 
+    name: str
     config: type[ExperimentConfig]
     run: RunFunction
     summary: str
 
 
-# One module an experiment, and one row here.
-EXPERIMENTS: dict[str, Experiment] = {
-    "infer_shape_factors": Experiment(
+# One module an experiment, and one entry here.
+_ALL = (
+    Experiment(
+        "infer_shape_factors",
         infer_shape_factors.Config,
         infer_shape_factors.run,
         "Recover hidden target shape factors of a synthetic tissue from its vertices or an image.",
     ),
-}
+)
+
+EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _ALL}
 
 
 def find_experiment(name: Any) -> Experiment:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import importlib.metadata
 import json
 import math
 import os
+import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -97,7 +99,9 @@ class RunFolder:
         """
         # TOML has no null: a key that is None by default is left out.
         content = config.model_dump(mode="json", exclude_none=True)
+        programs = [f"{name} {installed_version(name)}" for name in ("vertax", "jax", "numpy")]
         with atomic_write(self.path / CONFIG) as file:
+            file.write(f"# Run by {', '.join(programs)}; Python {platform.python_version()}.\n")
             file.write(tomli_w.dumps(content))
 
     def save_tissue(self, name: str, tissue: Tissue) -> None:
@@ -157,8 +161,8 @@ class RunFolder:
 
         **Arguments:**
 
-        - `metrics`: numbers, texts, lists and mappings; NaN and infinity, which strict JSON does not
-            have, become null.
+        - `metrics`: numbers, texts, lists and mappings; NaN and infinity, which strict JSON does
+            not have, become null.
         """
         with atomic_write(self.path / METRICS) as file:
             json.dump(_plain(metrics), file, indent=2, allow_nan=False)
@@ -185,6 +189,21 @@ def history_columns(history: Any, **labels: str) -> dict[str, Any]:
     curves = {f.name: np.asarray(getattr(history, f.name)) for f in dataclasses.fields(history)}
     n = len(curves["cost"])
     return {name: [text] * n for name, text in labels.items()} | {"epoch": np.arange(n)} | curves
+
+
+def installed_version(name: str) -> str:
+    """Version of an installed package.
+
+    **Arguments:**
+
+    - `name`: of the package.
+
+    **Returns:** its version, or `"(not installed)"` for one that runs from its source folder.
+    """
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "(not installed)"
 
 
 def summary(metrics: Mapping[str, Any]) -> str:

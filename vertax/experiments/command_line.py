@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -27,7 +26,9 @@ def main() -> None:
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"vertax {version('vertax')}")
+        from vertax.experiments import installed_version
+
+        typer.echo(f"vertax {installed_version('vertax')}")
         raise typer.Exit
 
 
@@ -109,7 +110,7 @@ def run(
         folder = RunFolder.claim(config.stem, output, overwrite=overwrite)
         folder.save_config(settings)
         if not quiet:
-            typer.echo(f"{settings.experiment}: {config} → {folder.path}")
+            typer.echo(f"{experiment.name}: {config} → {folder.path}")
         metrics = experiment.run(settings, folder, progress=not quiet)
         folder.save_metrics(metrics)
     # What a user can cause and mend gets a message; anything else is our fault, with a traceback.

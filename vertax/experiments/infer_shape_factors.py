@@ -251,10 +251,8 @@ def _save_fit(config: Config, scene: _Scene, source: str, outcome: Fit, folder: 
     if source == "image" and scene.image is not None:
         overlays = {"image": None, "initial guess": scene.initial, "fitted": outcome.tissue}
         pixel = _pixel_size(scene.target, config.image)
-        folder.save_figure(
-            f"overlay{ending}",
-            _figures.overlays(scene.image, overlays, pixel_size=pixel, upright=True),
-        )
+        figure = _figures.overlays(scene.image, overlays, pixel_size=pixel, upright=True)
+        folder.save_figure(f"overlay{ending}", figure)
 
 
 def _parameters(energy: AbstractEnergy) -> Float[np.ndarray, " cells"]:
