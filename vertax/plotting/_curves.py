@@ -76,7 +76,8 @@ def plot_history(
             panel.set_yscale("log" if logarithmic else "linear")
             if np.issubdtype(np.asarray(history[name]).dtype, np.integer):
                 panel.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
-                panel.set_ylim(bottom=0, top=None if np.any(values) else 1)
+                top = max(1.0, panel.dataLim.y1)  # nothing but zeros would be an axis of fractions
+                panel.set_ylim(-0.03 * top, 1.05 * top)
             panel.set_xlabel("epoch")
             panel.set_ylabel(title)
         if label is not None:
