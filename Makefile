@@ -4,7 +4,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Tests compile a lot: two processes are nearly twice as fast as one, more need more memory.
+# Tests compile a lot: two processes are nearly twice as fast as one, more need more memory. A file of
+# tests stays in one process, so that what it shares is made once.
 WORKERS ?= 2
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -20,10 +21,10 @@ demo: $(VENV)/.base ## infer hidden shape factors of a synthetic tissue and show
 	$(BIN)/vertax run configs/demo.toml $(DEMO_OPTIONS)
 
 test: $(VENV)/.dev ## the tests that run on every change
-	$(BIN)/python -m pytest -n $(WORKERS) $(PYTEST_OPTIONS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_OPTIONS)
 
 test-slow: $(VENV)/.dev ## the longer scientific checks
-	$(BIN)/python -m pytest -n $(WORKERS) -m slow $(PYTEST_OPTIONS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m slow $(PYTEST_OPTIONS)
 
 lint: $(VENV)/.dev ## style and format
 	$(BIN)/ruff check .

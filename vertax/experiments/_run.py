@@ -222,6 +222,8 @@ def summary(metrics: Mapping[str, Any]) -> str:
     names = {n: None for group in groups.values() for n in group if _is_number(group[n])}
     rows = [["", *groups]] if any(groups) else []
     rows += [[n, *(_short(group.get(n)) for group in groups.values())] for n in names]
+    if not rows:
+        return ""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     first, *others = widths
     lines = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Literal
 
 import optax
@@ -66,5 +67,11 @@ class Fitting(Section):
 
         **Returns:** an Optax optimiser.
         """
-        named = {"adam": optax.adam, "nadam": optax.nadam}
-        return named[self.optimiser](self.learning_rate)
+        return _optimiser(self.optimiser, self.learning_rate)
+
+
+# JAX knows an Optax optimiser by identity: a second fit in a process is not compiled again if it gets
+# the very same one.
+@functools.cache
+def _optimiser(name: str, learning_rate: float) -> optax.GradientTransformation:
+    return {"adam": optax.adam, "nadam": optax.nadam}[name](learning_rate)

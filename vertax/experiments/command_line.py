@@ -24,12 +24,13 @@ def main() -> None:
     app()
 
 
-def _show_version(wanted: bool) -> None:
+def _show_version(wanted: bool) -> bool:
     if wanted:
         from vertax.experiments import installed_version
 
         typer.echo(f"vertax {installed_version('vertax')}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()

@@ -162,7 +162,13 @@ def _make_scene(config: Config) -> _Scene:
     )
     first = periodic_voronoi(n_cells, key=keys[2], lloyd_steps=config.tissue.lloyd_steps)
     # The hidden tissue is a true equilibrium, however coarsely the fit is told to relax.
-    target = equilibrate(first, truth).tissue
+    relaxed = equilibrate(first, truth, **Relaxation().options(), throw=False)
+    if not relaxed.converged:
+        raise ValueError(
+            f"The hidden tissue did not reach equilibrium (largest force {relaxed.max_force:.1e}): "
+            "choose another seed, or a smaller truth.mean or truth.deviation."
+        )
+    target = relaxed.tissue
     # The guess relaxes from the target's topology, because vertices are compared by number. A
     # coarse relaxation need not reach the tolerance here; the fit reports how often it did.
     initial = equilibrate(target, guess, **config.relaxation.options(), throw=False).tissue
