@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import optimistix as optx
 from jaxtyping import Float, PyTree
 
@@ -34,7 +35,12 @@ class Wrapped(AbstractSolver):
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _WrappedState:
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
-        return _WrappedState(inner, value_and_gradient(fn, y, args)[1])
+        value, gradient, _ = value_and_gradient(fn, y, args)
+        # Some minimisers start with history in the default precision, whatever that of y.
+        inner = jax.tree.map(
+            lambda x: x.astype(value.dtype) if eqx.is_inexact_array(x) else x, inner
+        )
+        return _WrappedState(inner, gradient)
 
     def step(  # noqa: D102
         self, fn: Any, y: Any, args: Any, options: Any, state: _WrappedState, tags: Any
