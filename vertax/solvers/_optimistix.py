@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
-import jax
 import optimistix as optx
 from jaxtyping import Float, PyTree
 
@@ -35,12 +34,7 @@ class Wrapped(AbstractSolver):
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _WrappedState:
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
-        value, gradient, _ = value_and_gradient(fn, y, args)
-        # Some minimisers start with history in the default precision, whatever that of y.
-        inner = jax.tree.map(
-            lambda x: x.astype(value.dtype) if eqx.is_inexact_array(x) else x, inner
-        )
-        return _WrappedState(inner, gradient)
+        return _WrappedState(inner, value_and_gradient(fn, y, args)[1])
 
     def step(  # noqa: D102
         self, fn: Any, y: Any, args: Any, options: Any, state: _WrappedState, tags: Any
@@ -55,14 +49,3 @@ class Wrapped(AbstractSolver):
     def gradient(self, state: _WrappedState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
         return state.gradient
 
-
-def LBFGS(history: int = 10) -> Wrapped:
-    """Limited-memory BFGS (Optimistix's), judged by its force.
-
-    Stalls near forces of 1e-8 in float64, from rounding of the energy in its line search.
-
-    **Arguments:**
-
-    - `history`: number of past steps that shape the metric.
-    """
-    return Wrapped(optx.LBFGS(rtol=0.0, atol=0.0, history_length=history))
