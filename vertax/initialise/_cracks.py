@@ -12,10 +12,10 @@ from scipy.sparse.csgraph import connected_components
 from vertax._topology import clockwise
 from vertax.initialise._order import spatial_order
 
-# A *crack* is the side between two pixels of different cells; cracks join at the corners of pixels. The
-# whole extraction is exact integer arithmetic on these corners, on the torus. Each corner has four
-# slots, counter-clockwise for x = column to the right and y = row downwards, and the pixel on the left
-# of slot d is the one between slots d and d + 1:
+# A *crack* is the side between two pixels of different cells; cracks join at the corners of pixels.
+# The whole extraction is exact integer arithmetic on these corners, on the torus. Each corner has
+# four slots, counter-clockwise for x = column to the right and y = row downwards, and the pixel on
+# the left of slot d is the one between slots d and d + 1:
 #
 #            NW  |3|  NE         slot 0: +x     left pixel SE
 #           --2-- o --0--        slot 1: +y     left pixel SW
@@ -26,7 +26,8 @@ from vertax.initialise._order import spatial_order
 # pixels of one cell are not joined through their corner, so faces are the 4-connected regions.
 _STEP = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 
-# _TURN[p, e]: first occupied slot clockwise of slot e at a corner whose occupied slots are the bits of p.
+# _TURN[p, e]: first occupied slot clockwise of slot e at a corner whose occupied slots are the bits
+# of p.
 _OCCUPIED = (np.arange(16)[:, None] >> np.arange(4)) & 1
 _CANDIDATES = (np.arange(4)[:, None] - np.arange(1, 5)) % 4
 _TURN = np.take_along_axis(
@@ -39,8 +40,8 @@ _TURN = np.take_along_axis(
 class CrackGraph(NamedTuple):
     """The cracks of a periodic image of cell numbers.
 
-    Crack `4 * corner + d` leaves `corner` through slot `d`; rows of cracks that are not `present` hold no
-    meaning.
+    Crack `4 * corner + d` leaves `corner` through slot `d`; rows of cracks that are not `present`
+    hold no meaning.
     """
 
     shape: tuple[int, int]
@@ -115,8 +116,8 @@ def enclosed_cells(graph: CrackGraph) -> dict[int, int]:
     n_parts, part = _components(n_corners, cracks // 4, graph.target[cracks])
     n_faces, face = _components(4 * n_corners, cracks, graph.following[cracks])
     face = face[cracks]
-    # A connected graph cuts the torus into disks if and only if vertices - edges + faces is 0, and no two
-    # disjoint graphs do. That part is the tissue; the others lie inside its cells.
+    # A connected graph cuts the torus into disks if and only if vertices - edges + faces is 0, and
+    # no two disjoint graphs do. That part is the tissue; the others lie inside its cells.
     part_of_crack = part[cracks // 4]
     first = np.unique(face, return_index=True)[1]
     euler = (
@@ -126,8 +127,9 @@ def enclosed_cells(graph: CrackGraph) -> dict[int, int]:
     )
     left, right = graph.interfaces()
     if not np.any(euler == 0):
-        # The outline of a disk makes four left turns in all, that of a hole four right turns, and an
-        # outline that goes around the torus none: cells without an outline of the first kind are to blame.
+        # The outline of a disk makes four left turns in all, that of a hole four right turns, and
+        # an outline that goes around the torus none: cells without an outline of the first kind are
+        # to blame.
         turn = (graph.following[cracks] % 4 - cracks % 4 + 1) % 4 - 1
         turns = np.bincount(face, turn, minlength=n_faces)
         raise NotADiskError(np.setdiff1d(left, left[turns[face] == 4]))
@@ -156,8 +158,8 @@ class NotADiskError(Exception):
 def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mesh:
     """The trivalent mesh of an image whose cells are disks.
 
-    `priority` ranks the cell on the left of each slot: where four different cells meet, the one of the
-    lowest rank gets to touch its opposite.
+    `priority` ranks the cell on the left of each slot: where four different cells meet, the one of
+    the lowest rank gets to touch its opposite.
     """
     degree = graph.present.sum(axis=1)
     triple, fourfold = np.flatnonzero(degree == 3), np.flatnonzero(degree == 4)
@@ -169,8 +171,8 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     #     u: slots s + 1, s + 2, new edge      with cells p[s + 1], p[s + 2], p[s]
     #     w: slots s + 3, s,     new edge      with cells p[s + 3], p[s],     p[s + 2]
     #
-    # If one opposite pair is a single cell, it is that pair which must be kept apart: the cell closes
-    # around the corner elsewhere, and would become a ring.
+    # If one opposite pair is a single cell, it is that pair which must be kept apart: the cell
+    # closes around the corner elsewhere, and would become a ring.
     p, rank = graph.left[fourfold], priority[fourfold]
     s = np.where(np.minimum(rank[:, 0], rank[:, 2]) < np.minimum(rank[:, 1], rank[:, 3]), 0, 1)
     s = np.where(p[:, 0] == p[:, 2], 1, np.where(p[:, 1] == p[:, 3], 0, s))[:, None]
@@ -182,7 +184,9 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     cell = np.concatenate([cell3, cell_u, cell_w])
     crack = np.full((len(at), 3), -1)
     crack[: len(triple)] = 4 * triple[:, None] + slot3
-    crack[len(triple) :, :2] = 4 * at[len(triple) :, None] + np.vstack([around[:, :2], around[:, 2:]])
+    crack[len(triple) :, :2] = 4 * at[len(triple) :, None] + np.vstack(
+        [around[:, :2], around[:, 2:]]
+    )
     partner = np.arange(len(at))
     u = np.arange(len(triple), len(triple) + len(fourfold))
     partner[u], partner[u + len(u)] = u + len(u), u
@@ -222,10 +226,10 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
 def _follow(
     pointer: Int[np.ndarray, " nodes"], value: Int[np.ndarray, "nodes 2"]
 ) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, "nodes 2"]]:
-    """End of every chain of pointers (a node that points to itself), and the sum of values before it.
+    """End of every chain of pointers (a node that points to itself), and the sum up to there.
 
-    Pointer doubling: as many passes as the longest chain has binary digits. Closed chains have no end;
-    theirs means nothing.
+    Pointer doubling: as many passes as the longest chain has binary digits. Closed chains have no
+    end; theirs means nothing.
     """
     total = np.where((pointer == np.arange(len(pointer)))[:, None], 0, value)
     for _ in range(len(pointer).bit_length()):

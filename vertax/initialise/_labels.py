@@ -28,8 +28,8 @@ _BOUNDARIES = ("mirrored", "periodic")
 class Segmentation(eqx.Module):
     """A tissue made from a label image, and how its cells relate to the image.
 
-    A pixel in row r and column c covers [c, c + 1] × [r, r + 1] times `pixel_size`: x grows with the
-    column, y with the *row*, so draw it with the y axis pointing down to see the image upright.
+    A pixel in row r and column c covers [c, c + 1] × [r, r + 1] times `pixel_size`: x grows with
+    the column, y with the *row*, so draw it with the y axis pointing down to see the image upright.
     """
 
     tissue: Tissue
@@ -37,14 +37,14 @@ class Segmentation(eqx.Module):
     labels: Int[np.ndarray, " cells"]
     """Label in the given mask of each cell; a mirrored cell carries the label of its original."""
     whole: Bool[np.ndarray, " cells"]
-    """True for the one copy of each label that lies in the original image and does not touch its border.
+    """True for the one copy of each label in the original image, if it does not touch its border.
 
     A periodic mask has no border: all its cells are whole.
     """
     absorbed: Int[np.ndarray, " absorbed"]
     """Labels that no cell stands for, because a trivalent mesh cannot hold them, ascending."""
     smoothed: Int[np.ndarray, " smoothed"]
-    """Labels of cells whose corners were moved, because their straight-sided polygon was inside out."""
+    """Labels of cells whose corners were moved, because their polygon had no area."""
     pixel_size: float
     """Length of a pixel side, in the tissue's unit of length."""
     image_shape: tuple[int, int] = eqx.field(static=True)
@@ -52,50 +52,53 @@ class Segmentation(eqx.Module):
 
 
 def from_labels(
-    mask: Shaped[np.ndarray | Array, "..."],
+    mask: Shaped[np.ndarray | Array, " *shape"],
     *,
     boundary: str = "mirrored",
     pixel_size: float | None = None,
     softening: float | None = None,
 ) -> Segmentation:
-    """Tissue with the cells and neighbours of a label image (paper, Methods, "Mesh initialization").
+    """Tissue with the cells and neighbours of a label image (paper, "Mesh initialization").
 
-    Vertices are the pixel corners where three cells meet; the edges between them are straight, and all
-    neighbourhoods are those of the image. Where four cells meet in one corner it becomes two vertices at
-    the same place: of the two opposite pairs, the one with the smallest label touches along an edge of
-    length 0.
+    Vertices are the pixel corners where three cells meet; the edges between them are straight, and
+    all neighbourhoods are those of the image. Where four cells meet in one corner it becomes two
+    vertices at the same place: of the two opposite pairs, the one with the smallest label touches
+    along an edge of length 0.
 
     Not every label image is a trivalent mesh. First it is repaired:
 
     - pixels with label 0 or less are gaps, and go to the nearest label;
-    - of a label in several pieces the largest stays (pixels hang together by their sides, not by their
-        corners); each other piece goes to the neighbour with the longest common interface;
+    - of a label in several pieces the largest stays (pixels hang together by their sides, not by
+        their corners); each other piece goes to the neighbour with the longest common interface;
     - a label inside another (alone or in a group) goes to the one around it;
-    - a label with only two sides goes to the neighbour with the longest common interface. In a mirrored
-        image this happens to small cells at the border, which gain no side by being mirrored.
+    - a label with only two sides goes to the neighbour with the longest common interface. In a
+        mirrored image this happens to small cells at the border, which gain no side by being
+        mirrored.
 
-    The last two steps are repeated until nothing is left to do. `absorbed` tells which labels are gone.
+    The last two steps are repeated until nothing is left to do. `absorbed` tells which labels are
+    gone.
 
-    A cell so concave that the polygon of its vertices has no area is rounded out: its vertices (and, as
-    far as needed, those around) move towards the mean of their neighbours; `smoothed` tells which cells.
+    A cell so concave that the polygon of its vertices has no area is rounded out: its vertices
+    (and, as far as needed, those around) move towards the mean of their neighbours; `smoothed`
+    tells which cells.
 
     **Arguments:**
 
     - `mask`: a label for each pixel, integers of shape (rows, columns).
     - `boundary`: how the mask becomes periodic. `"mirrored"` mirrors it about its right and bottom
-        border into a box of twice the width and height, as in the paper; cells at the border merge with
-        their mirror image. `"periodic"` takes a mask that wraps around already.
+        border into a box of twice the width and height, as in the paper; cells at the border merge
+        with their mirror image. `"periodic"` takes a mask that wraps around already.
     - `pixel_size`: length of a pixel side; by default such that the mean cell area is 1.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
 
-    **Returns:** a [`Segmentation`][vertax.initialise.Segmentation]. Cells of the original image come
-    first, in the order of their labels, then the mirrored ones.
+    **Returns:** a [`Segmentation`][vertax.initialise.Segmentation]. Cells of the original image
+    come first, in the order of their labels, then the mirrored ones.
 
     **Raises:**
 
     - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
-        labels, or has a cell that reaches around the (mirrored) image or around all other cells; for
-        an unknown `boundary` or a `pixel_size` that is not positive.
+        labels, or has a cell that reaches around the (mirrored) image or around all other cells;
+        for an unknown `boundary` or a `pixel_size` that is not positive.
     """
     if boundary not in _BOUNDARIES:
         raise ValueError(
@@ -112,11 +115,10 @@ def from_labels(
     n = len(values)
     while True:
         cells = image if periodic else _mirror(image, n)
-        graph = crack_graph(cells)
-        mesh, into = _mesh_or_repairs(graph, values)
-        if mesh is not None:
+        mesh = _mesh_or_repairs(crack_graph(cells), values)
+        if isinstance(mesh, Mesh):
             break
-        image = into[image]
+        image = mesh[image]
 
     label = mesh.cells % n
     size = np.array(cells.shape[::-1], float)
@@ -124,9 +126,9 @@ def from_labels(
     vertices, moved = _untangle(mesh, size, pixels)
     if vertices is None:
         raise ValueError(
-            "Argument `mask` must hold cells that polygons can stand for, but no polygons of positive area "
-            f"were found around the labels {_listed(values[label[moved]])}. Smooth their outlines or merge "
-            "them with a neighbour."
+            "Argument `mask` must hold cells that polygons can stand for, but no polygons of "
+            f"positive area were found around the labels {_listed(values[label[moved]])}. Smooth "
+            "their outlines or merge them with a neighbour."
         )
     if pixel_size is None:
         pixel_size = float(np.sqrt(len(label) / size.prod()))
@@ -151,7 +153,9 @@ def from_labels(
     )
 
 
-def _checked(mask: np.ndarray) -> tuple[Int[np.ndarray, " labels"], Int[np.ndarray, "rows columns"]]:
+def _checked(
+    mask: np.ndarray,
+) -> tuple[Int[np.ndarray, " labels"], Int[np.ndarray, "rows columns"]]:
     """The labels in ascending order, and the mask with each replaced by its rank; gaps are -1."""
     if mask.ndim != 2 or mask.size == 0:
         raise ValueError(
@@ -160,16 +164,17 @@ def _checked(mask: np.ndarray) -> tuple[Int[np.ndarray, " labels"], Int[np.ndarr
         )
     if mask.dtype.kind not in "iu":
         raise ValueError(
-            f"Argument `mask` must hold integer labels, but its dtype is {mask.dtype}. Number the cells "
-            "(scipy.ndimage.label does it for a binary mask) or convert the labels with mask.astype(int)."
+            f"Argument `mask` must hold integer labels, but its dtype is {mask.dtype}. Number the "
+            "cells (scipy.ndimage.label does it for a binary mask) or convert the labels with "
+            "mask.astype(int)."
         )
     values, image = np.unique(mask, return_inverse=True)
     n_gaps = int(np.count_nonzero(values <= 0))
     values = values[n_gaps:]
     if len(values) < 2:
         raise ValueError(
-            "Argument `mask` must hold at least two cells, labelled by positive integers, but holds "
-            f"{len(values)}: every cell needs its own label."
+            "Argument `mask` must hold at least two cells, labelled by positive integers, but "
+            f"holds {len(values)}: every cell needs its own label."
         )
     image = image.reshape(mask.shape).astype(np.int32) - n_gaps
     return values.astype(np.int64), np.maximum(image, -1)
@@ -182,12 +187,12 @@ def _fill_gaps(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.nda
         return image
     pad = np.zeros((2, 2), int)
     if periodic:
-        # The nearest label around the torus is no farther than the nearest within the image. (A mirror
-        # image is never nearer than its original, so a mirrored mask needs no such care.)
-        reach = np.ceil(distance_transform_edt(gap).max())
+        # The nearest label around the torus is no farther than the nearest within the image. (A
+        # mirror image is never nearer than its original, so a mirrored mask needs no such care.)
+        reach = np.ceil(np.asarray(distance_transform_edt(gap)).max())
         pad = np.repeat(np.minimum(reach, image.shape)[:, None], 2, axis=1).astype(int)
         gap = np.pad(gap, pad, mode="wrap")
-    y, x = distance_transform_edt(gap, return_distances=False, return_indices=True)
+    y, x = np.asarray(distance_transform_edt(gap, return_distances=False, return_indices=True))
     rows, columns = image.shape
     home = (slice(pad[0, 0], pad[0, 0] + rows), slice(pad[1, 0], pad[1, 0] + columns))
     return image[(y[home] - pad[0, 0]) % rows, (x[home] - pad[1, 0]) % columns]
@@ -195,8 +200,8 @@ def _fill_gaps(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.nda
 
 def _join_pieces(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.ndarray:
     """Keep the largest piece of each label, and give the others to their neighbours."""
-    # Runs of equal pixels along a row are the nodes: far fewer than pixels. Two runs in adjacent rows
-    # overlap where one of them starts.
+    # Runs of equal pixels along a row are the nodes: far fewer than pixels. Two runs in adjacent
+    # rows overlap where one of them starts.
     start = np.ones(image.shape, bool)
     start[:, 1:] = image[:, 1:] != image[:, :-1]
     run = np.cumsum(start.ravel()).reshape(image.shape) - 1
@@ -238,7 +243,7 @@ def _join_pieces(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.n
 def _longest_interface(
     a: Int[np.ndarray, " sides"], b: Int[np.ndarray, " sides"]
 ) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, " found"]]:
-    """For each number in `a`, the number in `b` it is paired with most often (the smallest of several)."""
+    """For each number in `a`, the number in `b` paired with it most often (or the smallest)."""
     pairs, counts = np.unique(np.stack([a, b]), axis=1, return_counts=True)
     order = np.lexsort((pairs[1], -counts, pairs[0]))
     first = order[np.unique(pairs[0][order], return_index=True)[1]]
@@ -258,14 +263,16 @@ def _touching(
 def _mirror(image: Int[np.ndarray, "rows columns"], n: int) -> np.ndarray:
     """The image and its three mirror images, with cell number `label + n * copy`.
 
-    A label that touches a border is one cell with its mirror image there: both carry the number of the
-    copy on the side of the original.
+    A label that touches a border is one cell with its mirror image there: both carry the number of
+    the copy on the side of the original.
     """
     top_bottom, left_right = _touching(image, n)
     label = np.arange(n, dtype=np.int32)
-    quadrant = lambda row, column: label + n * (
-        2 * np.where(top_bottom, 0, row) + np.where(left_right, 0, column)
-    ).astype(np.int32)
+
+    def quadrant(row: int, column: int) -> np.ndarray:
+        copy = 2 * np.where(top_bottom, 0, row) + np.where(left_right, 0, column)
+        return label + n * copy.astype(np.int32)
+
     flipped = image[:, ::-1]
     upper = np.hstack([quadrant(0, 0)[image], quadrant(0, 1)[flipped]])
     lower = np.hstack([quadrant(1, 0)[image], quadrant(1, 1)[flipped]])
@@ -274,15 +281,15 @@ def _mirror(image: Int[np.ndarray, "rows columns"], n: int) -> np.ndarray:
 
 def _mesh_or_repairs(
     graph: CrackGraph, values: Int[np.ndarray, " labels"]
-) -> tuple[Mesh, None] | tuple[None, Int[np.ndarray, " labels"]]:
+) -> Mesh | Int[np.ndarray, " labels"]:
     """The mesh, or which label each label must become first."""
     n = len(values)
     label = np.arange(n)
     left, right = (side % n for side in graph.interfaces())
     too_few = (
-        "Argument `mask` must hold enough cells for a mesh of cells with three sides and more, but of its "
-        f"{n} labels too few remain after those inside others or with two sides are absorbed. Give a "
-        "larger image, or a finer segmentation."
+        "Argument `mask` must hold enough cells for a mesh of cells with three sides and more, but "
+        f"of its {n} labels too few remain after those inside others or with two sides are "
+        "absorbed. Give a larger image, or a finer segmentation."
     )
     if len(left) == 0:
         raise ValueError(too_few)
@@ -290,19 +297,19 @@ def _mesh_or_repairs(
         inside = enclosed_cells(graph)
     except NotADiskError as error:
         raise ValueError(
-            "Argument `mask` must hold cells that do not surround the others or reach from one border of "
-            "the image to the opposite one (where they would meet themselves across the mirrored or "
-            f"periodic boundary), but the labels {_listed(values[error.cells % n])} do. Crop the image, "
-            "split them, or take a larger image."
+            "Argument `mask` must hold cells that do not surround the others or reach from one "
+            "border of the image to the opposite one (where they would meet themselves across the "
+            f"mirrored or periodic boundary), but the labels {_listed(values[error.cells % n])} "
+            "do. Crop the image, split them, or take a larger image."
         ) from None
     if inside:
         into = label.copy()
         into[np.array(list(inside)) % n] = np.array(list(inside.values())) % n
-        return None, into
+        return into
     mesh = build_mesh(graph, graph.left % n)
     sides = np.bincount(mesh.cell)
     if sides.min() >= 3:
-        return mesh, None
+        return mesh
     small = np.zeros(n, bool)
     small[mesh.cells[sides < 3] % n] = True
     found, host = _longest_interface(left[small[left]], right[small[left]])
@@ -315,11 +322,11 @@ def _mesh_or_repairs(
     into[found[first]] = host[first]
     while not np.array_equal(into[into], into):
         into = into[into]
-    return None, into
+    return into
 
 
 def _untangle(
-    mesh: Mesh, size: Float[np.ndarray, "2"], pixels: Int[np.ndarray, " cells"]
+    mesh: Mesh, size: Float[np.ndarray, " xy"], pixels: Int[np.ndarray, " cells"]
 ) -> tuple[Float[np.ndarray, "vertices 2"] | None, Bool[np.ndarray, " cells"]]:
     """Vertices such that every cell has a positive area, and the cells that had none at first.
 
@@ -331,9 +338,10 @@ def _untangle(
     moving = np.zeros(len(vertices), bool)
     ever = np.zeros(len(mesh.cells), bool)
     bad = ever
-    # Vertices at the mean of their neighbours make convex cells (Tutte 1963, doi:10.1112/plms/s3-13.1.743;
-    # on the torus Gortler et al. 2006, doi:10.1016/j.cagd.2005.05.002). So this must succeed in the end;
-    # to disturb little it starts with the corners of the bad cells, and spreads a ring every 8 steps.
+    # Vertices at the mean of their neighbours make convex cells (Tutte 1963,
+    # doi:10.1112/plms/s3-13.1.743; on the torus Gortler et al. 2006,
+    # doi:10.1016/j.cagd.2005.05.002). So this must succeed in the end; to disturb little it starts
+    # with the corners of the bad cells, and spreads a ring every 8 steps.
     for step in range(400):
         corners = np.repeat(vertices, 3, axis=0) + mesh.frame * size
         ends = corners[following]
