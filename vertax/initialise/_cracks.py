@@ -9,7 +9,6 @@ from jaxtyping import Bool, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vertax._topology import clockwise
 from vertax.initialise._order import spatial_order
 
 # A *crack* is the side between two pixels of different cells; cracks join at the corners of pixels.
@@ -71,6 +70,8 @@ class Mesh(NamedTuple):
 
     vertices: Int[np.ndarray, "vertices 2"]
     twin: Int[np.ndarray, " halfedges"]
+    following: Int[np.ndarray, " halfedges"]
+    """The next half-edge around the cell on the left."""
     cell: Int[np.ndarray, " halfedges"]
     frame: Int[np.ndarray, "halfedges 2"]
     cells: Int[np.ndarray, " cells"]
@@ -213,14 +214,14 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     offset = (source + displacement - source[twin]) // size
     # Frames add up the offsets along each face, from its first half-edge onwards.
     cells, cell = np.unique(cell.ravel(), return_inverse=True)
-    following = clockwise(twin)
+    following = 3 * (twin // 3) + (twin + 2) % 3  # one slot clockwise of the twin
     previous = np.empty_like(twin)
     previous[following] = np.arange(len(twin))
     step = offset[previous]
     first = np.unique(cell, return_index=True)[1]
     previous[first] = first
     frame = _follow(previous, step)[1]
-    return Mesh(position, twin, cell, frame, cells)
+    return Mesh(position, twin, following, cell, frame, cells)
 
 
 def _follow(
