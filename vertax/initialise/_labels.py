@@ -99,13 +99,7 @@ def from_labels(
         labels, or has a cell that reaches around the (mirrored) image or around all other cells;
         for an unknown `boundary` or a `pixel_size` that is not positive.
     """
-    if boundary not in _BOUNDARIES:
-        raise ValueError(
-            f"Argument `boundary` must be one of {', '.join(map(repr, _BOUNDARIES))}, but is "
-            f"{boundary!r}."
-        )
-    if pixel_size is not None and not (np.isfinite(pixel_size) and pixel_size > 0):
-        raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
+    check_options(boundary, pixel_size)
     values, image = _checked(np.asarray(mask))
     periodic = boundary == "periodic"
     image = _fill_gaps(image, periodic)
@@ -150,6 +144,17 @@ def from_labels(
         pixel_size=float(pixel_size),
         image_shape=(int(image.shape[0]), int(image.shape[1])),
     )
+
+
+def check_options(boundary: str, pixel_size: float | None) -> None:
+    """Refuse an unknown boundary or an impossible pixel size with a `ValueError`."""
+    if boundary not in _BOUNDARIES:
+        raise ValueError(
+            f"Argument `boundary` must be one of {', '.join(map(repr, _BOUNDARIES))}, but is "
+            f"{boundary!r}."
+        )
+    if pixel_size is not None and not (np.isfinite(pixel_size) and pixel_size > 0):
+        raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
 
 
 def _checked(

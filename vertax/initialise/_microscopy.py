@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Array, Int, Shaped
 
-from vertax.initialise._labels import Segmentation, from_labels
+from vertax.initialise._labels import Segmentation, check_options, from_labels
 from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
 
 
@@ -43,6 +43,7 @@ def from_microscopy(
         finds fewer than two cells; and as `from_labels` does.
     - `ImportError` if what the segmenter needs is not installed.
     """
+    check_options(boundary, pixel_size)
     pixels = check_image(image)
     segmenter = Watershed() if segmenter is None else segmenter
     if boundary == "periodic":
@@ -56,7 +57,12 @@ def from_microscopy(
             f"{n_cells}. Check that membranes are bright on dark cells, and that the segmenter "
             "knows the size of the cells."
         )
-    return from_labels(labels, boundary=boundary, pixel_size=pixel_size, softening=softening)
+    try:
+        return from_labels(labels, boundary=boundary, pixel_size=pixel_size, softening=softening)
+    except ValueError as error:
+        raise ValueError(
+            f"The labels that {type(segmenter).__name__} found in `image` make no tissue. {error}"
+        ) from error
 
 
 def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray, "rows columns"]:
@@ -87,6 +93,6 @@ def _segment_periodic(
     row, column = (np.bincount(label, z) / counts - z0 for z, z0 in ((y, top), (x, left)))
     home = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     keep = home[label]
-    periodic = np.zeros_like(labels)
+    periodic = np.zeros(image.shape, labels.dtype)
     periodic[(y[keep] - top) % rows, (x[keep] - left) % columns] = label[keep]
     return periodic

@@ -192,10 +192,11 @@ def check_image(image: Shaped[np.ndarray | Array, " *shape"]) -> Float[np.ndarra
 def estimate_cell_size(image: Float[np.ndarray, "rows columns"]) -> float:
     r"""Typical diameter of the cells of a membrane image, in pixels.
 
-    Cells of diameter $d$ are an almost periodic pattern: the power in each ring $|k|$ of the spectrum
-    peaks at $1/d$. Uneven illumination falls off from the lowest frequencies: the peak is sought
-    beyond the first minimum. White noise adds a constant power density, which is seen at the highest
-    frequencies and subtracted.
+    Cells of diameter $d$ are an almost periodic pattern: the power in each ring $|k|$ of the
+    spectrum peaks at $1/d$. Uneven illumination falls off from the lowest frequencies: the peak is
+    sought beyond the first minimum. White noise adds a constant power density, which is seen at the
+    highest frequencies and subtracted. The image should be at least five cells wide; with fewer the
+    peak and the illumination can merge.
     """
     side = min(image.shape)
     window = np.hanning(image.shape[0])[:, None] * np.hanning(image.shape[1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from pathlib import Path
 
@@ -31,7 +30,7 @@ def read_image(
     - `FileNotFoundError` if there is no such file.
     - `ValueError` if it is not an image, if it has channels or planes and none was chosen, or not
         the one that was.
-    - `ImportError` if scikit-image is not installed.
+    - `ImportError` for a TIFF file if tifffile is not installed.
     """
     file = Path(path)
     if not file.exists():
@@ -54,27 +53,34 @@ def read_image(
 def _read(file: Path) -> tuple[np.ndarray, str]:
     """The whole file, and a letter for each of its axes."""
     try:
-        reader = importlib.import_module(
-            "tifffile" if file.suffix.lower() in _TIFF else "skimage.io"
-        )
-    except ImportError as error:
-        raise ImportError(
-            f'Images need scikit-image: pip install "vertax[image]" ({error}).'
-        ) from error
-    try:
-        if file.suffix.lower() in _TIFF:
-            with reader.TiffFile(file) as tiff:
-                pixels, axes = tiff.series[0].asarray(), tiff.series[0].axes
-        else:
-            pixels = np.asarray(reader.imread(file))
-            axes = {2: "YX", 3: "YXS", 4: "TYXS"}[pixels.ndim]
-        if pixels.ndim != len(axes) or "Y" not in axes or "X" not in axes:
+        pixels, axes = (_read_tiff if file.suffix.lower() in _TIFF else _read_picture)(file)
+        if pixels.ndim != len(axes) or not {"Y", "X"} <= set(axes):
             raise ValueError(f"its axes are {axes} with shape {pixels.shape}")
-    except Exception as error:  # each reader has exceptions of its own for a file it cannot decode
+    except ImportError:
+        raise
+    except Exception as error:  # each reader has exceptions of its own for what it cannot decode
         raise ValueError(
             f"Argument `path` must name an image file, but {file} cannot be read as one: {error}"
         ) from error
     return pixels, axes
+
+
+def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
+    try:
+        import tifffile
+    except ImportError as error:
+        raise ImportError('TIFF files need tifffile: pip install "vertax[image]".') from error
+    with tifffile.TiffFile(file) as tiff:
+        return tiff.series[0].asarray(), tiff.series[0].axes
+
+
+def _read_picture(file: Path) -> tuple[np.ndarray, str]:
+    from PIL import Image  # comes with matplotlib
+
+    with Image.open(file) as picture:
+        # Palette indices are no intensities.
+        pixels = np.asarray(picture.convert("RGB") if picture.mode == "P" else picture)
+    return pixels, "YX" if pixels.ndim == 2 else "YXS"
 
 
 def _choose(name: str, index: int | None, n: int, file: Path) -> int:
