@@ -50,6 +50,18 @@ def test_small_pieces_of_a_label_go_to_their_neighbours():
     np.testing.assert_allclose(areas_of(got.tissue), areas_of(clean.tissue), rtol=1e-12)
 
 
+def test_a_piece_goes_to_the_neighbour_with_the_longest_interface():
+    mask = np.kron(honeycomb(), np.ones((2, 2), int))
+    y = np.argwhere(mask == 13)[:, 0].max() + 1  # below 13 two bricks meet at x
+    below = mask[y]
+    x = next(x for x in np.argwhere(mask[y - 1] == 13)[1:, 0] if below[x] != below[x - 1])
+    # 10 pixel sides with 13, 7 with the brick on the lower left, 3 with that on the lower right.
+    mask[y - 2 : y + 2, x - 5 : x + 1] = 1
+    got = make(mask)
+    assert [x, y + 2] in np.asarray(got.tissue.vertices).tolist()
+    assert [x, y] not in np.asarray(got.tissue.vertices).tolist()
+
+
 def test_an_island_is_absorbed_by_the_cell_around_it():
     mask = honeycomb()
     mask[13:16, 22:25] = 99  # inside a brick
@@ -125,22 +137,25 @@ def test_a_cell_meeting_itself_in_a_corner_is_kept_apart_there(flip):
     assert np.all(sides_of(got.tissue) == 6)
 
 
-def test_a_pocket_behind_a_corner_stays_if_its_cells_have_three_sides():
-    mask = np.kron(honeycomb(), np.ones((4, 4), int))
-    y, x = np.argwhere(mask == 13).min(axis=0)
-    # In a corner of brick 13 a pocket of three cells, which touches the neighbours on the left and
-    # above (brick 12 and one of row 1) in one pixel corner each way round only.
+# Where four different cells meet, labels decide who touches. Here they must not.
+@pytest.mark.parametrize("name", [1, 113, 999])
+def test_a_pocket_behind_a_corner_stays_if_its_cells_have_three_sides(name):
+    mask = np.kron(honeycomb() + 100, np.ones((4, 4), int))
+    y, x = np.argwhere(mask == 113).min(axis=0)
+    # In a corner of brick 113 a pocket of three cells, which touches the neighbours on the left and
+    # above (brick 112 and one of row 1) in one pixel corner each way round only.
     pocket = np.kron([[1, 1, 2, 2], [1, 1, 2, 2], [3, 3, 3, 3]], np.ones((4, 4), int))
     mask[y + 1 : y + 13, x + 1 : x + 17] = pocket + 200
-    mask[y, x] = 12
+    mask[y, x] = 112
+    mask[mask == 113] = name
     got = make(mask)
     assert got.absorbed.size == 0
     counts = dict(zip(got.labels.tolist(), sides_of(got.tissue).tolist(), strict=True))
     assert (counts[202], counts[203]) == (3, 3)
     assert counts[201] == 5  # one more corner on each side of the gate
     pairs = neighbours(got.tissue, got.labels)
-    assert pairs.count((12, 201)) == 1
-    assert (13, 13) not in pairs
+    assert pairs.count((112, 201)) == 1
+    assert (name, name) not in pairs
 
 
 def test_strongly_concave_cells_are_inflated():
