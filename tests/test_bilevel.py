@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,8 +74,6 @@ def test_only_chosen_leaves_are_fitted(hidden):
     target, _, guess, start = hidden
     energy = guess + LineTension(jnp.full(30, 0.01))
     which = jax.tree.map(lambda _: False, energy)
-    import equinox as eqx
-
     which = eqx.tree_at(lambda e: e.terms[0].target_shape_factor, which, True)
     problem = vx.InverseProblem(start, energy, VertexDistance(target), which)
     fit = vx.fit(problem, optax.adam(1e-2), 3, progress=False)
@@ -110,12 +109,12 @@ def test_the_optimiser_keeps_its_momentum_over_epochs(hidden):
     target, _, guess, start = hidden
     cost = VertexDistance(target)
     optimiser = optax.adam(1e-2)
-    energy, state, tissue = guess, optimiser.init(guess), start
+    energy, state, tissue = guess, optimiser.init(eqx.filter(guess, eqx.is_inexact_array)), start
     for _ in range(3):
         problem = vx.InverseProblem(tissue, energy, cost)
-        (_, found), gradient = jax.value_and_grad(lambda e: problem(e), has_aux=True)(energy)
-        updates, state = optimiser.update(gradient, state, energy)
-        energy, tissue = optax.apply_updates(energy, updates), found.tissue
+        (_, found), gradient = eqx.filter_value_and_grad(lambda e, p=problem: p(e), has_aux=True)(energy)
+        updates, state = optimiser.update(gradient, state)
+        energy, tissue = eqx.apply_updates(energy, updates), found.tissue
     fit = vx.fit(vx.InverseProblem(start, guess, cost), optimiser, 4, progress=False)
     # The parameters of lowest cost are those of the last epoch, after three updates.
     assert fit.best_epoch == 3
@@ -178,7 +177,7 @@ def test_an_interrupt_keeps_what_there_is(hidden):
 def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):
     target, _, guess, start = hidden
     problem = vx.InverseProblem(start, guess, VertexDistance(target), max_steps=300)
-    with pytest.raises(vx.FitError, match="not finite") as error:
+    with pytest.raises(vx.FitError, match="not finite|broke down") as error:
         vx.fit(problem, optax.sgd(1e300), 20, progress=False)
     assert error.value.fit is not None
     assert error.value.fit.best_epoch == 0
@@ -202,8 +201,6 @@ def test_bad_problems_are_refused(hidden):
 
 
 def test_shape_factors_in_float32(hidden):
-    import equinox as eqx
-
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     target, truth, guess, start = jax.tree.map(to32, hidden)
     problem = vx.InverseProblem(start, guess, VertexDistance(target))
