@@ -40,10 +40,10 @@ def test_every_solver_works_in_float32(solver, force, disturbed):
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     start, energy, reference = disturbed
     found = vx.equilibrate(
-        *jax.tree.map(to32, (start, energy)), solver=solver, transitions=None, tolerance=1e-3
+        *jax.tree.map(to32, (start, energy)), solver=solver, transitions=None, tolerance=5e-3
     )
     assert found.tissue.vertices.dtype == jnp.float32
-    assert found.max_force < 1e-3
+    assert found.max_force < 5e-3
     assert found.energy == pytest.approx(float(energy(reference)), rel=1e-3)
 
 
@@ -101,7 +101,7 @@ def test_units_do_not_matter():
     p0 = shape_factors(20, 3.7, 0.1)
     a = vx.equilibrate(tissue, ShapeFactorEnergy(p0))
     b = vx.equilibrate(
-        large, ShapeFactorEnergy(p0, scale**2), transitions=vx.T1(5e-3 * scale), tolerance=1e-10
+        large, ShapeFactorEnergy(p0, scale**2), transitions=vx.T1(0.02 * scale), tolerance=1e-10
     )
     np.testing.assert_allclose(b.tissue.areas, scale**2 * a.tissue.areas, rtol=1e-6)
 

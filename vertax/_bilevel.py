@@ -45,7 +45,7 @@ class InverseProblem(eqx.Module):
     tissue: Tissue
     energy: AbstractEnergy
     cost: AbstractCost
-    trainable: PyTree[Bool] | Callable[[Any], bool] = eqx.is_inexact_array
+    trainable: PyTree[bool] | Callable[[Any], bool] = eqx.is_inexact_array
     fit_position: bool = False
     adjoint: optx.AbstractAdjoint | None = None
     solver: optx.AbstractMinimiser | None = None
@@ -181,8 +181,8 @@ def fit(
     **Raises:**
 
     - `ValueError` if there is nothing to fit, or for less than one epoch.
-    - [`FitError`][vertax.FitError] if cost or gradient are not finite, or if no epoch reached
-        equilibrium; it carries the fit so far.
+    - [`FitError`][vertax.FitError] if cost or gradient are not finite, if the linear solve behind
+        the gradient fails, or if no epoch reached equilibrium; it carries the fit so far.
     """
     if epochs < 1:
         raise ValueError(f"Argument `epochs` must be at least 1, but is {epochs}.")
@@ -231,6 +231,10 @@ def fit(
     except KeyboardInterrupt:
         if best is None:
             raise
+    except eqx.EquinoxRuntimeError as error:
+        stopped = f"epoch {len(rows)} broke down ({_first_line(error)})"
+    if not rows:
+        raise FitError(f"The fit stopped: {stopped}.", None)
     history = History(*(np.asarray(column) for column in zip(*rows, strict=True)))
     if best is None:
         raise FitError(
@@ -251,6 +255,10 @@ def fit(
     if stopped is not None:
         raise FitError(f"The fit stopped: {stopped}. Try a smaller step of the optimiser.", outcome)
     return outcome
+
+
+def _first_line(error: Exception) -> str:
+    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 @eqx.filter_jit

@@ -19,23 +19,23 @@ from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
 
 
 class Equilibrium(eqx.Module):
-    """A relaxed tissue and how it got there."""
+    """A relaxed tissue and how it got there; under `jax.vmap` one entry for each of the batch."""
 
     tissue: Tissue
     """The relaxed tissue, differentiable with respect to the parameters of the energy."""
-    energy: Float[Array, ""]
+    energy: Float[Array, "*batch"]
     """Its energy."""
-    max_force: Float[Array, ""]
+    max_force: Float[Array, "*batch"]
     r"""Largest component of $|\nabla_X E|$."""
-    num_steps: Int[Array, ""]
+    num_steps: Int[Array, "*batch"]
     """Steps of the minimiser."""
-    num_t1: Int[Array, ""]
+    num_t1: Int[Array, "*batch"]
     """T1 transitions on the way."""
     result: optx.RESULTS
     """Outcome; `optimistix.RESULTS[result]` is its message."""
 
     @property
-    def converged(self) -> Bool[Array, ""]:
+    def converged(self) -> Bool[Array, "*batch"]:
         """Whether the largest force fell below the tolerance."""
         return self.result == optx.RESULTS.successful
 

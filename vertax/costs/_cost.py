@@ -6,7 +6,7 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from vertax._tissue import Tissue
 from vertax.energies import AbstractEnergy
@@ -30,12 +30,12 @@ class AbstractCost(eqx.Module):
         (weights, costs), (more_weights, more_costs) = _parts(self), _parts(other)
         return WeightedSum(jnp.concatenate([weights, more_weights]), costs + more_costs)
 
-    def __mul__(self, weight: float | Float[Array, ""]) -> AbstractCost:
+    def __mul__(self, weight: ArrayLike) -> AbstractCost:
         """The cost times a number."""
         if isinstance(weight, AbstractCost):
             return NotImplemented
         weights, costs = _parts(self)
-        return WeightedSum(weight * weights, costs)
+        return WeightedSum(jnp.asarray(weight) * weights, costs)
 
     __rmul__ = __mul__
 

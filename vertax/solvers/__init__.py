@@ -2,10 +2,11 @@
 
 from vertax.solvers._first_order import (
     FIRE as FIRE,
+    LBFGS as LBFGS,
     GradientDescent as GradientDescent,
     Optax as Optax,
 )
 from vertax.solvers._minres import MINRES as MINRES
 from vertax.solvers._newton import NewtonCG as NewtonCG
-from vertax.solvers._optimistix import LBFGS as LBFGS, Wrapped as Wrapped
+from vertax.solvers._optimistix import Wrapped as Wrapped
 from vertax.solvers._solver import AbstractSolver as AbstractSolver

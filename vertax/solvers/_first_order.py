@@ -87,6 +87,18 @@ class Optax(AbstractSolver):
         return state.gradient
 
 
+def LBFGS(history: int = 10) -> Optax:
+    """Limited-memory BFGS with a zoom line search (Optax's).
+
+    Stalls near forces of 1e-7 in float64, from rounding of the energy in its line search.
+
+    **Arguments:**
+
+    - `history`: number of past steps that shape the metric.
+    """
+    return Optax(optax.lbfgs(memory_size=history))
+
+
 class _FIREState(eqx.Module):
     value: Float[Array, ""]
     gradient: PyTree[Float[Array, "..."]]

@@ -49,14 +49,3 @@ class Wrapped(AbstractSolver):
     def gradient(self, state: _WrappedState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
         return state.gradient
 
-
-def LBFGS(history: int = 10) -> Wrapped:
-    """Limited-memory BFGS (Optimistix's), judged by its force.
-
-    Stalls near forces of 1e-8 in float64, from rounding of the energy in its line search.
-
-    **Arguments:**
-
-    - `history`: number of past steps that shape the metric.
-    """
-    return Wrapped(optx.LBFGS(rtol=0.0, atol=0.0, history_length=history))

@@ -1,0 +1,211 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from helpers import central_difference, random_like, random_tissue, relaxed
+from jaxtyping import Array, Float
+
+import vertax as vx
+from vertax.costs import MeshImage, VertexDistance, render
+from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
+
+
+@pytest.fixture(scope="module")
+def hidden():
+    """A relaxed tissue with hidden shape factors, and where inference begins."""
+    target, truth = relaxed(10, 1)
+    guess = ShapeFactorEnergy(jnp.full(10, 3.7))
+    return target, truth, guess, vx.equilibrate(target, guess).tissue
+
+
+def test_shape_factors_are_recovered_from_vertices(hidden):
+    target, truth, guess, start = hidden
+    problem = vx.InverseProblem(start, guess, VertexDistance(target))
+    fit = vx.fit(problem, optax.adam(1e-2), 200, truth=truth, progress=False)
+    np.testing.assert_allclose(fit.energy.target_shape_factor, truth.target_shape_factor, rtol=1e-4)
+    h = fit.history
+    assert h.converged.all()
+    assert h.relative_error[-1] < 1e-3 * h.relative_error[0]
+    assert h.cost[fit.best_epoch] == h.cost.min() == fit.cost
+    assert len(h.cost) == 200
+    # What is returned belongs together.
+    again, equilibrium = problem(fit.energy, fit.tissue)
+    assert again == pytest.approx(float(fit.cost), abs=1e-12)
+    assert equilibrium.num_steps <= 1
+
+
+def test_shape_factors_are_recovered_from_an_image_of_a_displaced_tissue(hidden):
+    target, truth, guess, start = hidden
+    image = render(target, (96, 96), 0.07)
+    displaced = start.with_configuration(start.vertices + jnp.array([0.02, -0.03]))
+    problem = vx.InverseProblem(displaced, guess, MeshImage(image, 0.07), fit_position=True)
+    fit = vx.fit(problem, optax.adam(1e-2), 250, truth=truth, progress=False)
+    np.testing.assert_allclose(fit.energy.target_shape_factor, truth.target_shape_factor, rtol=1e-3)
+    # Without fitting the position the parameters have to make up for it, and cannot.
+    fixed = vx.InverseProblem(displaced, guess, MeshImage(image, 0.07))
+    biased = vx.fit(fixed, optax.adam(1e-2), 250, truth=truth, progress=False)
+    assert biased.history.relative_error[-1] > 10 * fit.history.relative_error[-1]
+
+
+def test_the_loss_without_the_helper_is_plain_jax(hidden):
+    target, _, guess, start = hidden
+    cost, adjoint = VertexDistance(target), vx.ImplicitDifferentiation()
+    loss = lambda energy: cost(vx.equilibrate(start, energy, adjoint=adjoint).tissue, energy)
+    by_hand = jax.grad(loss)(guess)
+    problem = vx.InverseProblem(start, guess, cost)
+    by_problem = jax.grad(lambda energy: problem(energy)[0])(guess)
+    np.testing.assert_allclose(
+        by_hand.target_shape_factor, by_problem.target_shape_factor, rtol=1e-7
+    )
+
+
+def test_gradient_with_respect_to_the_position(hidden):
+    target, _, guess, start = hidden
+    problem = vx.InverseProblem(start, guess, VertexDistance(target))
+    f = lambda shift: problem(shift=shift)[0]
+    shift, direction = jnp.array([0.1, -0.05]), random_like(jnp.zeros(2))
+    slope = jnp.sum(jax.grad(f)(shift) * direction)
+    assert slope == pytest.approx(float(central_difference(f, shift, direction)), rel=1e-7)
+
+
+def test_only_chosen_leaves_are_fitted(hidden):
+    target, _, guess, start = hidden
+    energy = guess + LineTension(jnp.full(30, 0.01))
+    which = jax.tree.map(lambda _: False, energy)
+    which = eqx.tree_at(lambda e: e.terms[0].target_shape_factor, which, True)
+    problem = vx.InverseProblem(start, energy, VertexDistance(target), which)
+    fit = vx.fit(problem, optax.adam(1e-2), 3, progress=False)
+    np.testing.assert_array_equal(fit.energy.terms[1].tension, 0.01)
+    assert not np.allclose(fit.energy.terms[0].target_shape_factor, 3.7)
+
+
+def test_the_users_own_energy_is_fitted_like_any_other():
+    class Contractility(vx.AbstractEnergy):
+        strength: Float[Array, " cells"]
+
+        def __call__(self, tissue):
+            return 0.5 * jnp.sum(self.strength * tissue.perimeters**2)
+
+    area = AreaElasticity(20.0, 1.0)
+    strength = 0.3 + 0.1 * jax.random.uniform(jax.random.key(3), (10,))
+    truth = area + Contractility(strength)
+    target = vx.equilibrate(random_tissue(10, 4), truth).tissue
+    guess = area + Contractility(jnp.full(10, 0.35))
+    start = vx.equilibrate(target, guess).tissue
+    fit = vx.fit(
+        vx.InverseProblem(start, guess, VertexDistance(target)),
+        optax.adam(1e-2),
+        150,
+        truth=truth,
+        progress=False,
+    )
+    assert fit.history.relative_error[-1] < 0.1 * fit.history.relative_error[0]
+
+
+def test_the_optimiser_keeps_its_momentum_over_epochs(hidden):
+    # Three epochs of Adam by hand, with one state throughout.
+    target, _, guess, start = hidden
+    cost = VertexDistance(target)
+    optimiser = optax.adam(1e-2)
+    energy, state, tissue = guess, optimiser.init(eqx.filter(guess, eqx.is_inexact_array)), start
+    for _ in range(3):
+        problem = vx.InverseProblem(tissue, energy, cost)
+        (_, found), gradient = eqx.filter_value_and_grad(lambda e, p=problem: p(e), has_aux=True)(energy)
+        updates, state = optimiser.update(gradient, state)
+        energy, tissue = eqx.apply_updates(energy, updates), found.tissue
+    fit = vx.fit(vx.InverseProblem(start, guess, cost), optimiser, 4, progress=False)
+    # The parameters of lowest cost are those of the last epoch, after three updates.
+    assert fit.best_epoch == 3
+    np.testing.assert_allclose(
+        fit.energy.target_shape_factor, energy.target_shape_factor, rtol=1e-9
+    )
+
+
+def test_one_compilation_serves_all_epochs(hidden):
+    target, _, _, start = hidden
+    traces = []
+
+    class Counting(vx.AbstractEnergy):
+        p0: Float[Array, " cells"]
+
+        def __call__(self, tissue):
+            traces.append(1)
+            return ShapeFactorEnergy(self.p0)(tissue)
+
+    counts = []
+    vx.fit(
+        vx.InverseProblem(start, Counting(jnp.full(10, 3.7)), VertexDistance(target)),
+        optax.adam(1e-2),
+        5,
+        progress=False,
+        callback=lambda *_: counts.append(len(traces)),
+    )
+    assert counts[0] > 0
+    assert len(set(counts)) == 1
+
+
+def test_the_protocol_of_the_paper(hidden):
+    target, truth, guess, start = hidden
+    problem = vx.InverseProblem(
+        start,
+        guess,
+        VertexDistance(target),
+        solver=vx.solvers.GradientDescent(1e-2),
+        transitions=vx.T1(5e-3),
+        tolerance=1e-3,
+        patience=10,
+        max_steps=1000,
+    )
+    fit = vx.fit(problem, optax.nadam(1e-3), 60, truth=truth, progress=False)
+    assert fit.history.relative_error[-1] < fit.history.relative_error[0]
+
+
+def test_an_interrupt_keeps_what_there_is(hidden):
+    target, _, guess, start = hidden
+
+    def interrupt(epoch, _):
+        if epoch == 4:
+            raise KeyboardInterrupt
+
+    problem = vx.InverseProblem(start, guess, VertexDistance(target))
+    fit = vx.fit(problem, optax.adam(1e-2), 100, progress=False, callback=interrupt)
+    assert len(fit.history.cost) == 5
+
+
+def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):
+    target, _, guess, start = hidden
+    problem = vx.InverseProblem(start, guess, VertexDistance(target), max_steps=300)
+    with pytest.raises(vx.FitError, match="not finite|broke down") as error:
+        vx.fit(problem, optax.sgd(1e300), 20, progress=False)
+    assert error.value.fit is not None
+    assert error.value.fit.best_epoch == 0
+    assert jnp.isfinite(error.value.fit.tissue.vertices).all()
+
+
+def test_a_fit_without_any_equilibrium_is_an_error(hidden):
+    target, _, guess, _ = hidden
+    problem = vx.InverseProblem(random_tissue(10, 8), guess, VertexDistance(target), max_steps=1)
+    with pytest.raises(vx.FitError, match="No epoch of the fit reached equilibrium"):
+        vx.fit(problem, optax.adam(1e-9), 2, progress=False)
+
+
+def test_bad_problems_are_refused(hidden):
+    target, _, guess, start = hidden
+    cost = VertexDistance(target)
+    with pytest.raises(ValueError, match="nothing to fit"):
+        vx.fit(vx.InverseProblem(start, ShapeFactorEnergy(3.7), cost), optax.adam(1e-2), 3)
+    with pytest.raises(ValueError, match="`epochs`"):
+        vx.fit(vx.InverseProblem(start, guess, cost), optax.adam(1e-2), 0)
+
+
+def test_shape_factors_in_float32(hidden):
+    to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
+    target, truth, guess, start = jax.tree.map(to32, hidden)
+    problem = vx.InverseProblem(start, guess, VertexDistance(target))
+    fit = vx.fit(problem, optax.adam(1e-2), 80, truth=truth, progress=False)
+    assert fit.energy.target_shape_factor.dtype == jnp.float32
+    assert fit.history.relative_error[-1] < 0.1 * fit.history.relative_error[0]
+
+

@@ -1,0 +1,162 @@
+"""What the program must reproduce: closed results for lattices, and the physics of random tissues."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import dense_hessian, hexagon_index, random_tissue, shape_factors
+
+import vertax as vx
+from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity, ShapeFactorEnergy
+
+C = hexagon_index()
+
+
+def strained(tissue, deformation):
+    """Box and vertices deformed alike."""
+    moved = tissue.with_configuration(tissue.vertices @ deformation.T)
+    return eqx.tree_at(lambda t: t.boundary.lattice, moved, tissue.boundary.lattice @ deformation.T)
+
+
+def pure_shear(epsilon):
+    return jnp.diag(jnp.array([jnp.exp(epsilon), jnp.exp(-epsilon)]))
+
+
+@pytest.fixture(scope="module")
+def lattice():
+    return vx.initialise.hexagonal(4, 4, softening=0.0)
+
+
+@pytest.mark.parametrize("p0", [3.3, 3.6, 3.7])
+@pytest.mark.parametrize("epsilon", [0.02, 0.1])
+def test_perimeter_of_the_sheared_hexagonal_lattice(lattice, p0, epsilon):
+    # Relaxed at fixed area, P = P_hex cosh ε on the rigid side.
+    start = strained(lattice, pure_shear(epsilon))
+    found = vx.equilibrate(start, ShapeFactorEnergy(p0), transitions=None, tolerance=1e-11)
+    np.testing.assert_allclose(found.tissue.perimeters, C * np.cosh(epsilon), rtol=1e-9)
+    np.testing.assert_allclose(found.tissue.areas, 1, rtol=1e-9)
+
+
+@pytest.mark.parametrize("p0", [3.2, 3.6])
+def test_shear_modulus_of_the_hexagonal_lattice(lattice, p0):
+    k_p = 1.7
+    energy = AreaElasticity(1.0, 1.0) + PerimeterElasticity(k_p, p0)
+    per_cell = lambda tissue: energy(tissue) / tissue.n_cells
+
+    @jax.jit
+    def relaxed(epsilon):
+        start = strained(lattice, pure_shear(epsilon))
+        return per_cell(vx.equilibrate(start, energy, transitions=None, tolerance=1e-11).tissue)
+
+    affine = lambda epsilon: per_cell(strained(lattice, pure_shear(epsilon)))
+    # Pure shear by ε is a shear angle of 2 ε: e = 2 G ε².
+    h = 2e-3
+    modulus = (relaxed(h) - 2 * relaxed(0.0) + relaxed(-h)) / (4 * h**2)
+    assert modulus == pytest.approx(k_p * C * (C - p0) / 4, rel=1e-4)
+    assert jax.hessian(affine)(0.0) / 4 == pytest.approx(3 / 8 * k_p * C * (C - p0), rel=1e-8)
+
+
+def test_area_stiffness_of_the_hexagonal_lattice(lattice):
+    k_a, k_p, p0 = 2.0, 1.7, 3.5
+    energy = AreaElasticity(k_a, 1.0) + PerimeterElasticity(k_p, p0)
+
+    def of_area(area):
+        tissue = strained(lattice, jnp.sqrt(area) * jnp.eye(2))
+        return energy(tissue) / tissue.n_cells
+
+    assert jax.hessian(of_area)(1.0) == pytest.approx(k_a + k_p * C * p0 / 4, rel=1e-9)
+
+
+@pytest.mark.parametrize(("contractility", "expected"), [(0.0, 0.29246), (0.04, 0.17975), (0.08, 0.08704)])
+def test_collapse_of_the_hexagonal_ground_state(lattice, contractility, expected):
+    # Farhadifar et al. 2007: above this line tension the collapsed network has the lower energy.
+    scales = jnp.linspace(0.02, 1.3, 4000)
+
+    @jax.jit
+    def advantage(tension):
+        energy = (
+            AreaElasticity(1.0, 1.0)
+            + PerimeterElasticity(contractility, 0.0)
+            + LineTension(jnp.asarray(tension))
+        )
+        at = lambda s: energy(strained(lattice, s * jnp.eye(2))) / lattice.n_cells
+        return jnp.min(jax.lax.map(at, scales)) - at(0.0)
+
+    low, high = 0.0, 0.5
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (middle, high) if advantage(middle) < 0 else (low, middle)
+    assert low == pytest.approx(expected, abs=2e-5)
+
+
+def zero_modes(tissue, energy):
+    spectrum = np.linalg.eigvalsh(dense_hessian(tissue, energy))
+    return int(np.sum(np.abs(spectrum) < 1e-7 * spectrum[-1]))
+
+
+def test_zero_modes_count_rigid_and_fluid_states():
+    n = 64
+    rigid = ShapeFactorEnergy(shape_factors(n, 3.6, 0.05))
+    found = vx.equilibrate(random_tissue(n, 1), rigid, tolerance=1e-10)
+    assert found.energy > 1e-2
+    assert zero_modes(found.tissue, rigid) == 2  # the translations
+
+    fluid = ShapeFactorEnergy(jnp.array(4.1))
+    found = vx.equilibrate(random_tissue(n, 1), fluid, tolerance=1e-10)
+    assert found.energy < 1e-15
+    assert zero_modes(found.tissue, fluid) == 2 * n + 1
+
+
+def test_tissues_are_rigid_at_low_and_fluid_at_high_target_shape_factor():
+    # Random Voronoi tissues, quenched with T1s: all carry energy well below the transition near 3.81
+    # (Bi et al. 2015). Above 4.0 even cells with four sides (index 4 at best) reach their target; in
+    # between, a quench leaves a few of those and a little energy.
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *[random_tissue(64, s) for s in range(8)])
+    relax = eqx.filter_jit(
+        eqx.filter_vmap(
+            lambda t, p0: vx.equilibrate(t, ShapeFactorEnergy(p0), throw=False).energy,
+            in_axes=(eqx.if_array(0), None),
+        )
+    )
+    assert (relax(batch, jnp.array(3.7)) > 1e-2).all()
+    assert (relax(batch, jnp.array(4.1)) < 1e-12).all()
+
+
+def test_the_ordered_lattice_softens_at_the_index_of_the_hexagon(lattice):
+    modulus = lambda p0: jax.hessian(
+        lambda e: ShapeFactorEnergy(p0)(strained(lattice, pure_shear(e)))
+    )(0.0)
+    assert modulus(C - 0.1) > 0.1
+    assert modulus(C) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("p0", [3.6, 3.75])
+def test_stress_from_tensions_and_pressures_is_the_derivative_by_the_strain_of_the_box(p0):
+    # σ = (1/A_box) [Σ K_A (A - A0) A I + Σ_edges T l⊗l/|l|], T = γ + Σ over both cells K_P (P - P0).
+    n, k_a, k_p, gamma = 30, 3.0, 1.4, 0.2
+    energy = AreaElasticity(k_a, 1.1) + PerimeterElasticity(k_p, p0) + LineTension(jnp.array(gamma))
+    tissue = vx.equilibrate(random_tissue(n, 2), energy, tolerance=1e-11).tissue
+    pressure = jnp.sum(k_a * (tissue.areas - 1.1) * tissue.areas) * jnp.eye(2)
+    cells = tissue.topology.edge_cells
+    tension = gamma + k_p * jnp.sum(tissue.perimeters[cells] - p0, axis=1)
+    l = tissue.edge_vectors
+    outer = l[:, :, None] * l[:, None, :] / tissue.edge_lengths[:, None, None]
+    formula = (pressure + jnp.sum(tension[:, None, None] * outer, axis=0)) / tissue.boundary.area
+
+    def relaxed_energy(strain):
+        start = strained(tissue, jnp.eye(2) + strain)
+        return vx.equilibrate(start, energy, transitions=None, tolerance=1e-11).energy
+
+    derivative = jax.grad(relaxed_energy)(jnp.zeros((2, 2))) / tissue.boundary.area
+    np.testing.assert_allclose(derivative, formula, atol=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forces_sum_to_zero_and_areas_to_the_box(seed):
+    energy = ShapeFactorEnergy(shape_factors(40, 3.7, 0.2, seed))
+    tissue = random_tissue(40, seed)
+    force = jax.grad(lambda x: energy(tissue.with_configuration(x)))(tissue.vertices)
+    np.testing.assert_allclose(force.sum(0), 0, atol=1e-10)
+    found = vx.equilibrate(tissue, energy)
+    assert found.tissue.areas.sum() == pytest.approx(40, rel=1e-12)

@@ -1,0 +1,365 @@
+"""Tissues from label images (segmentation masks)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Shaped
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from vertax._boundary import Periodic
+from vertax._tissue import Tissue
+from vertax._topology import Topology
+from vertax.initialise._cracks import (
+    CrackGraph,
+    Mesh,
+    NotADiskError,
+    build_mesh,
+    crack_graph,
+    enclosed_cells,
+)
+
+_BOUNDARIES = ("mirrored", "periodic")
+
+
+class Segmentation(eqx.Module):
+    """A tissue made from a label image, and how its cells relate to the image.
+
+    A pixel in row r and column c covers [c, c + 1] × [r, r + 1] times `pixel_size`: x grows with
+    the column, y with the *row*, so draw it with the y axis pointing down to see the image upright.
+    """
+
+    tissue: Tissue
+    """The tissue. The original image lies at the origin of its box."""
+    labels: Int[np.ndarray, " cells"]
+    """Label in the given mask of each cell; a mirrored cell carries the label of its original."""
+    whole: Bool[np.ndarray, " cells"]
+    """True for the one copy of each label in the original image, if it does not touch its border.
+
+    A periodic mask has no border: all its cells are whole.
+    """
+    absorbed: Int[np.ndarray, " absorbed"]
+    """Labels that no cell stands for, because a trivalent mesh cannot hold them, ascending."""
+    inflated: Int[np.ndarray, " inflated"]
+    """Labels of cells whose corners were moved, because their polygon had next to no area."""
+    pixel_size: float
+    """Length of a pixel side, in the tissue's unit of length."""
+    image_shape: tuple[int, int] = eqx.field(static=True)
+    """Rows and columns of the given mask."""
+
+
+def from_labels(
+    mask: Shaped[np.ndarray | Array, " *shape"],
+    *,
+    boundary: str = "mirrored",
+    pixel_size: float | None = None,
+    softening: float | None = None,
+) -> Segmentation:
+    """Tissue with the cells and neighbours of a label image (paper, "Mesh initialization").
+
+    Vertices are the pixel corners where three cells meet; the edges between them are straight, and
+    all neighbourhoods are those of the image. Where four cells meet in one corner it becomes two
+    vertices at the same place: of the two opposite pairs, the one with the smallest label touches
+    along an edge of length 0.
+
+    Not every label image is a trivalent mesh. First it is repaired:
+
+    - pixels with label 0 or less are gaps, and go to the nearest label;
+    - of a label in several pieces the largest stays (pixels hang together by their sides, not by
+        their corners); each other piece goes to the neighbour with the longest common interface;
+    - a label inside another (alone or in a group) goes to the one around it;
+    - a label with only two sides goes to the neighbour with the longest common interface. In a
+        mirrored image this happens to small cells at the border, which gain no side by being
+        mirrored.
+
+    The last two steps are repeated until nothing is left to do. `absorbed` tells which labels are
+    gone.
+
+    A cell so concave that the polygon of its vertices has less than a hundredth of its area in the
+    image, or is inside out, is inflated a little by moving its vertices; `inflated` tells which.
+
+    **Arguments:**
+
+    - `mask`: a label for each pixel, integers of shape (rows, columns).
+    - `boundary`: how the mask becomes periodic. `"mirrored"` mirrors it about its right and bottom
+        border into a box of twice the width and height, as in the paper; cells at the border merge
+        with their mirror image. `"periodic"` takes a mask that wraps around already.
+    - `pixel_size`: length of a pixel side; by default such that the mean cell area is 1.
+    - `softening`: passed on to [`Tissue`][vertax.Tissue].
+
+    **Returns:** a [`Segmentation`][vertax.initialise.Segmentation]. Cells of the original image
+    come first, in the order of their labels, then the mirrored ones.
+
+    **Raises:**
+
+    - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
+        labels, or has a cell that reaches around the (mirrored) image or around all other cells;
+        for an unknown `boundary` or a `pixel_size` that is not positive.
+    """
+    check_options(boundary, pixel_size)
+    values, image = _checked(np.asarray(mask))
+    periodic = boundary == "periodic"
+    image = _fill_gaps(image, periodic)
+    image = _join_pieces(image, periodic)
+
+    n = len(values)
+    while True:
+        cells = image if periodic else _mirror(image, n)
+        mesh = _mesh_or_repairs(crack_graph(cells), values)
+        if isinstance(mesh, Mesh):
+            break
+        image = mesh[image]
+
+    label = mesh.cells % n
+    size = np.array(cells.shape[::-1], float)
+    pixels = np.bincount(cells.ravel(), minlength=4 * n)[mesh.cells]
+    vertices, moved = _untangle(mesh, size, pixels)
+    if vertices is None:
+        raise ValueError(
+            "Argument `mask` must hold cells that polygons can stand for, but no polygons of "
+            f"positive area were found around the labels {_listed(values[label[moved]])}. Smooth "
+            "their outlines or merge them with a neighbour."
+        )
+    if pixel_size is None:
+        pixel_size = float(np.sqrt(len(label) / size.prod()))
+    dtype = jnp.result_type(float)
+    whole = np.ones(len(label), bool)
+    if not periodic:
+        top_bottom, left_right = _touching(image, n)
+        whole = (mesh.cells < n) & ~(top_bottom | left_right)[label]
+    return Segmentation(
+        tissue=Tissue(
+            jnp.asarray(vertices * pixel_size, dtype),
+            Topology(mesh.twin, mesh.cell, mesh.frame),
+            Periodic(jnp.asarray(np.diag(size * pixel_size), dtype)),
+            softening,
+        ),
+        labels=values[label],
+        whole=whole,
+        absorbed=np.setdiff1d(values, values[label]),
+        inflated=np.unique(values[label[moved]]),
+        pixel_size=float(pixel_size),
+        image_shape=(int(image.shape[0]), int(image.shape[1])),
+    )
+
+
+def check_options(boundary: str, pixel_size: float | None) -> None:
+    """Refuse an unknown boundary or an impossible pixel size with a `ValueError`."""
+    if boundary not in _BOUNDARIES:
+        raise ValueError(
+            f"Argument `boundary` must be one of {', '.join(map(repr, _BOUNDARIES))}, but is "
+            f"{boundary!r}."
+        )
+    if pixel_size is not None and not (np.isfinite(pixel_size) and pixel_size > 0):
+        raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
+
+
+def _checked(
+    mask: np.ndarray,
+) -> tuple[Int[np.ndarray, " labels"], Int[np.ndarray, "rows columns"]]:
+    """The labels in ascending order, and the mask with each replaced by its rank; gaps are -1."""
+    if mask.ndim != 2 or mask.size == 0:
+        raise ValueError(
+            "Argument `mask` must have shape (rows, columns), one label a pixel, but its shape is "
+            f"{mask.shape}. Pass one plane of a stack, without a channel axis."
+        )
+    if mask.dtype.kind not in "iu":
+        raise ValueError(
+            f"Argument `mask` must hold integer labels, but its dtype is {mask.dtype}. Number the "
+            "cells (scipy.ndimage.label does it for a binary mask) or convert the labels with "
+            "mask.astype(int)."
+        )
+    values, image = np.unique(mask, return_inverse=True)
+    n_gaps = int(np.count_nonzero(values <= 0))
+    values = values[n_gaps:]
+    if len(values) < 2:
+        raise ValueError(
+            "Argument `mask` must hold at least two cells, labelled by positive integers, but "
+            f"holds {len(values)}: every cell needs its own label."
+        )
+    image = image.reshape(mask.shape).astype(np.int32) - n_gaps
+    return values.astype(np.int64), np.maximum(image, -1)
+
+
+def _fill_gaps(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.ndarray:
+    """Give each gap (-1) the nearest label."""
+    gap = image < 0
+    if not gap.any():
+        return image
+    pad = np.zeros((2, 2), int)
+    if periodic:
+        # The nearest label around the torus is no farther than the nearest within the image. (A
+        # mirror image is never nearer than its original, so a mirrored mask needs no such care.)
+        reach = np.ceil(np.asarray(distance_transform_edt(gap)).max())
+        pad = np.repeat(np.minimum(reach, image.shape)[:, None], 2, axis=1).astype(int)
+        gap = np.pad(gap, pad, mode="wrap")
+    y, x = np.asarray(distance_transform_edt(gap, return_distances=False, return_indices=True))
+    rows, columns = image.shape
+    home = (slice(pad[0, 0], pad[0, 0] + rows), slice(pad[1, 0], pad[1, 0] + columns))
+    return image[(y[home] - pad[0, 0]) % rows, (x[home] - pad[1, 0]) % columns]
+
+
+def _join_pieces(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.ndarray:
+    """Keep the largest piece of each label, and give the others to their neighbours."""
+    # Runs of equal pixels along a row are the nodes: far fewer than pixels. Two runs in adjacent
+    # rows overlap where one of them starts.
+    start = np.ones(image.shape, bool)
+    start[:, 1:] = image[:, 1:] != image[:, :-1]
+    run = np.cumsum(start.ravel()).reshape(image.shape) - 1
+    met = start[1:] | start[:-1]
+    above, below = [run[:-1][met]], [run[1:][met]]
+    if periodic:
+        above += [run[-1], run[:, -1]]
+        below += [run[0], run[:, 0]]
+    a, b = np.concatenate(above), np.concatenate(below)
+    label = image[start]
+    same = label[a] == label[b]
+    links = coo_array((np.ones(same.sum(), bool), (a[same], b[same])), shape=(len(label),) * 2)
+    n_pieces, piece = connected_components(links, directed=False)
+    n_labels = int(label.max()) + 1
+    if n_pieces == n_labels:
+        return image
+    label_of = np.zeros(n_pieces, int)
+    label_of[piece] = label
+    piece = piece[run]
+    sizes = np.bincount(piece.ravel(), minlength=n_pieces)
+    order = np.lexsort((np.arange(n_pieces), -sizes, label_of))
+    kept = np.zeros(n_pieces, bool)
+    kept[order[np.unique(label_of[order], return_index=True)[1]]] = True
+    a, b = piece[:, :-1].ravel(), piece[:, 1:].ravel()
+    c, d = piece[:-1].ravel(), piece[1:].ravel()
+    pairs = [np.stack([a, b])[:, a != b], np.stack([c, d])[:, c != d]]
+    if periodic:
+        pairs += [np.stack([piece[:, -1], piece[:, 0]]), np.stack([piece[-1], piece[0]])]
+    a, b = np.concatenate(pairs, axis=1)
+    a, b = np.concatenate([a, b]), np.concatenate([b, a])
+    while not kept.all():  # pieces among pieces wait until a neighbour has found its label
+        use = ~kept[a] & kept[b]
+        found, into = _longest_interface(a[use], label_of[b[use]])
+        label_of[found] = into
+        kept[found] = True
+    return label_of.astype(image.dtype)[piece]
+
+
+def _longest_interface(
+    a: Int[np.ndarray, " sides"], b: Int[np.ndarray, " sides"]
+) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, " found"]]:
+    """For each number in `a`, the number in `b` paired with it most often (or the smallest)."""
+    pairs, counts = np.unique(np.stack([a, b]), axis=1, return_counts=True)
+    order = np.lexsort((pairs[1], -counts, pairs[0]))
+    first = order[np.unique(pairs[0][order], return_index=True)[1]]
+    return pairs[0][first], pairs[1][first]
+
+
+def _touching(
+    image: Int[np.ndarray, "rows columns"], n: int
+) -> tuple[Bool[np.ndarray, " labels"], Bool[np.ndarray, " labels"]]:
+    """Which labels touch the top or bottom border, and which the left or right."""
+    top_bottom, left_right = np.zeros(n, bool), np.zeros(n, bool)
+    top_bottom[image[[0, -1]]] = True
+    left_right[image[:, [0, -1]]] = True
+    return top_bottom, left_right
+
+
+def _mirror(image: Int[np.ndarray, "rows columns"], n: int) -> np.ndarray:
+    """The image and its three mirror images, with cell number `label + n * copy`.
+
+    A label that touches a border is one cell with its mirror image there: both carry the number of
+    the copy on the side of the original.
+    """
+    top_bottom, left_right = _touching(image, n)
+    label = np.arange(n, dtype=np.int32)
+
+    def quadrant(row: int, column: int) -> np.ndarray:
+        copy = 2 * np.where(top_bottom, 0, row) + np.where(left_right, 0, column)
+        return label + n * copy.astype(np.int32)
+
+    flipped = image[:, ::-1]
+    upper = np.hstack([quadrant(0, 0)[image], quadrant(0, 1)[flipped]])
+    lower = np.hstack([quadrant(1, 0)[image], quadrant(1, 1)[flipped]])
+    return np.vstack([upper, lower[::-1]])
+
+
+def _mesh_or_repairs(
+    graph: CrackGraph, values: Int[np.ndarray, " labels"]
+) -> Mesh | Int[np.ndarray, " labels"]:
+    """The mesh, or which label each label must become first."""
+    n = len(values)
+    label = np.arange(n)
+    left, right = (side % n for side in graph.interfaces())
+    too_few = (
+        "Argument `mask` must hold enough cells for a mesh of cells with three sides and more, but "
+        f"of its {n} labels too few remain after those inside others or with two sides are "
+        "absorbed. Give a larger image, or a finer segmentation."
+    )
+    if len(left) == 0:
+        raise ValueError(too_few)
+    try:
+        inside = enclosed_cells(graph)
+    except NotADiskError as error:
+        raise ValueError(
+            "Argument `mask` must hold cells that do not surround the others or reach from one "
+            "border of the image to the opposite one (where they would meet themselves across the "
+            f"mirrored or periodic boundary), but the labels {_listed(values[error.cells % n])} "
+            "do. Crop the image, split them, or take a larger image."
+        ) from None
+    if inside:
+        into = label.copy()
+        into[np.array(list(inside)) % n] = np.array(list(inside.values())) % n
+        return into
+    mesh = build_mesh(graph, graph.left % n)
+    sides = np.bincount(mesh.cell)
+    if sides.min() >= 3:
+        return mesh
+    small = np.zeros(n, bool)
+    small[mesh.cells[sides < 3] % n] = True
+    found, host = _longest_interface(left[small[left]], right[small[left]])
+    # Two small cells must not go to each other: between them, the one with the shorter outline goes
+    # first. Then every chain of cells that are absorbed one into the other has an end.
+    outline = np.bincount(left, minlength=n)
+    first = ~small[host] | (outline[found] < outline[host])
+    first |= small[host] & (outline[found] == outline[host]) & (found > host)
+    into = label.copy()
+    into[found[first]] = host[first]
+    while not np.array_equal(into[into], into):
+        into = into[into]
+    return into
+
+
+def _untangle(
+    mesh: Mesh, size: Float[np.ndarray, " xy"], pixels: Int[np.ndarray, " cells"]
+) -> tuple[Float[np.ndarray, "vertices 2"] | None, Bool[np.ndarray, " cells"]]:
+    """Vertices such that every cell has a positive area, and the cells that had next to none.
+
+    Without vertices, the cells that are left over.
+    """
+    vertices = mesh.vertices.astype(float)
+    before = np.empty_like(mesh.following)
+    before[mesh.following] = np.arange(len(before))
+    # Each cell that has less than a hundredth of its pixels gets the smallest displacement of its
+    # corners that makes this two hundredths, to first order: goal - A = sum of (dA/dp) . dp has the
+    # least-norm solution dp = (goal - A) dA/dp / sum of |dA/dp|^2. A few rounds settle what cells
+    # take from each other.
+    least, goal = 0.01 * pixels, 0.02 * pixels
+    ever = bad = np.zeros(len(pixels), bool)
+    for _ in range(300):
+        corners = np.repeat(vertices, 3, axis=0) + mesh.frame * size
+        ends, starts = corners[mesh.following], corners[before]
+        areas = 0.5 * np.bincount(mesh.cell, np.linalg.det(np.stack([corners, ends], axis=1)))
+        bad = areas < least
+        if not bad.any():
+            return vertices, ever
+        ever = ever | bad
+        slope = 0.5 * (ends - starts)[:, ::-1] * [1, -1]
+        norm = np.bincount(mesh.cell, (slope**2).sum(axis=1))
+        factor = np.where(bad, (goal - areas) / np.maximum(norm, 1e-3), 0.0)
+        vertices = vertices + (factor[mesh.cell, None] * slope).reshape(-1, 3, 2).sum(axis=1)
+    return None, bad
+
+
+def _listed(labels: Int[np.ndarray, " labels"]) -> str:
+    unique = np.unique(labels).tolist()
+    return ", ".join(map(str, unique[:10])) + (" and more" if len(unique) > 10 else "")

@@ -1,0 +1,98 @@
+"""Tissues from microscopy images."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Array, Int, Shaped
+
+from vertax.initialise._labels import Segmentation, check_options, from_labels
+from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
+
+
+def from_microscopy(
+    image: Shaped[np.ndarray | Array, " *shape"],
+    *,
+    segmenter: AbstractSegmenter | None = None,
+    boundary: str = "mirrored",
+    pixel_size: float | None = None,
+    softening: float | None = None,
+) -> Segmentation:
+    """Tissue seen in a membrane image.
+
+    It is segmented, and then handed to [`from_labels`][vertax.initialise.from_labels].
+
+    The paper mirrors the image and then segments it (Methods, "Mesh initialization"); here it is
+    segmented once and the labels are mirrored, which is the same with a symmetric segmenter, and
+    makes the tissue symmetric with any.
+
+    **Arguments:**
+
+    - `image`: intensities of shape (rows, columns), e.g. from
+        [`vertax.io.read_image`][vertax.io.read_image].
+    - `segmenter`: [`Watershed`][vertax.initialise.Watershed] by default, or
+        [`Cellpose`][vertax.initialise.Cellpose], or one of your own.
+    - `boundary`, `pixel_size`, `softening`: as for `from_labels`. With `boundary="periodic"` cells
+        are found across the border of the image.
+
+    **Returns:** a [`Segmentation`][vertax.initialise.Segmentation].
+
+    **Raises:**
+
+    - `ValueError` for an image that is not a 2-D array of finite numbers, is smaller than 16 × 16
+        or constant; for a segmenter that returns something else than an integer for each pixel, or
+        finds fewer than two cells; and as `from_labels` does.
+    - `ImportError` if what the segmenter needs is not installed.
+    """
+    check_options(boundary, pixel_size)
+    pixels = check_image(image)
+    segmenter = Watershed() if segmenter is None else segmenter
+    if boundary == "periodic":
+        labels = _segment_periodic(pixels, segmenter)
+    else:
+        labels = _segment(pixels, segmenter)
+    n_cells = len(np.unique(labels[labels > 0]))
+    if n_cells < 2:
+        raise ValueError(
+            f"Argument `image` must show at least two cells, but {type(segmenter).__name__} found "
+            f"{n_cells}. Check that membranes are bright on dark cells, and that the segmenter "
+            "knows the size of the cells."
+        )
+    try:
+        return from_labels(labels, boundary=boundary, pixel_size=pixel_size, softening=softening)
+    except ValueError as error:
+        raise ValueError(
+            f"The labels that {type(segmenter).__name__} found in `image` make no tissue. {error}"
+        ) from error
+
+
+def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray, "rows columns"]:
+    labels = np.asarray(segmenter(image))
+    if labels.shape != image.shape or labels.dtype.kind not in "iu":
+        raise ValueError(
+            f"Argument `segmenter` must return an integer label for each pixel, shape "
+            f"{image.shape}, but {type(segmenter).__name__} returned {labels.dtype} of shape "
+            f"{labels.shape}."
+        )
+    return labels
+
+
+def _segment_periodic(
+    image: np.ndarray, segmenter: AbstractSegmenter
+) -> Int[np.ndarray, "rows columns"]:
+    """Labels of a periodic image, with cells that cross its border whole.
+
+    Every cell lies whole somewhere in the image continued by half of itself on all sides. There it
+    has several copies; the one whose centre is in the original is taken.
+    """
+    rows, columns = image.shape
+    top, left = rows // 2, columns // 2
+    labels = _segment(np.pad(image, ((top, top), (left, left)), mode="wrap"), segmenter)
+    y, x = np.nonzero(labels > 0)
+    label = labels[y, x].astype(np.int64)
+    counts = np.maximum(np.bincount(label), 1)
+    row, column = (np.bincount(label, z) / counts - z0 for z, z0 in ((y, top), (x, left)))
+    home = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    keep = home[label]
+    periodic = np.zeros(image.shape, labels.dtype)
+    periodic[(y[keep] - top) % rows, (x[keep] - left) % columns] = label[keep]
+    return periodic
