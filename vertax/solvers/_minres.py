@@ -1,7 +1,6 @@
 """MINRES: symmetric linear systems that may be indefinite, singular or inconsistent."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,213 +11,37 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-_Map: TypeAlias = Callable[[Float[Array, " n"]], Float[Array, " n"]]
-
-# Why a Lanczos loop ended. _RUNNING at the end means that the steps ran out.
-_RUNNING, _CONVERGED, _LEAST_SQUARES, _BREAKDOWN, _NONFINITE = range(5)
-
-# Rounding errors are counted in eps times the size of what was added up: a product, two
-# orthogonalisations and a norm make a handful of them in each step.
-_ROUNDING_UNITS = 10
+from vertax.solvers._lanczos import (
+    BREAKDOWN,
+    CONVERGED,
+    LEAST_SQUARES,
+    NONFINITE,
+    ROUNDING_UNITS,
+    RUNNING,
+    dot,
+    norm,
+    over,
+    solve_in_krylov_space,
+)
 
 # |r| from the recurrence and |b - A x| recomputed agree if they differ by less than this factor.
 _SLACK = 2
-_LS = 10
-_BIG = 0.5
-
-
-class _Loop(NamedTuple):
-    """What one Lanczos step hands to the next; subscripts as in the derivation below."""
-
-    step: Int[Array, ""]
-    status: Int[Array, ""]
-    u: Float[Array, " n"]  # u_{k-1}
-    q_old: Float[Array, " n"]  # q_{k-1}
-    q: Float[Array, " n"]  # q_k
-    v: Float[Array, " n"]  # v_k = P q_k
-    beta: Float[Array, ""]  # β_k, but 0 at the first step, where q_0 = 0
-    w_old: Float[Array, " n"]  # w_{k-2}
-    w: Float[Array, " n"]  # w_{k-1}
-    c: Float[Array, ""]  # c_{k-1}
-    s: Float[Array, ""]  # s_{k-1}
-    delta_bar: Float[Array, ""]  # δ̄_k
-    epsilon: Float[Array, ""]  # ε_k
-    residual: Float[Array, ""]  # φ̄_{k-1} = |r_{k-1}|
-    operator_norm: Float[Array, ""]
-    negative_curvature: Bool[Array, ""]
 
 
 class _Solve(NamedTuple):
-    """What one of the at most three Lanczos solves hands to the next."""
+    """What one of the at most three solves in Krylov spaces hands to the next."""
 
-    index: Int[Array, ""]
+    number: Int[Array, ""]
     more: Bool[Array, ""]
-    rhs: Float[Array, " n"]
+    rhs: Float[Array, "n"]
     target: Float[Array, ""]
-    u: Float[Array, " n"]
-    r: Float[Array, " n"]  # r_0 - A P u
-    a_r: Float[Array, " n"]  # A P r
+    u: Float[Array, "n"]
+    r: Float[Array, "n"]  # r_0 - A P u
+    a_r: Float[Array, "n"]  # A P r
     step: Int[Array, ""]
     status: Int[Array, ""]
     operator_norm: Float[Array, ""]
     negative_curvature: Bool[Array, ""]
-
-
-def _dot(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
-    return jnp.dot(a, b, precision=lax.Precision.HIGHEST)
-
-
-def _norm(z: Float[Array, " n"], p_z: Float[Array, " n"]) -> Float[Array, ""]:
-    """The norm √(z·P z) in which a preconditioned residual is measured."""
-    # If z is nothing but rounding error, z·P z may come out negative.
-    return jnp.sqrt(jnp.maximum(_dot(z, p_z), 0))
-
-
-def _over(a: Array, b: Array) -> Array:
-    """`a / b`, and `a` where `b` is zero."""
-    return a / jnp.where(b == 0, 1, b)
-
-
-def _power_of_two_near(size: Float[Array, ""]) -> Float[Array, ""]:
-    """A power of two, because dividing by it costs no rounding; 1 for zero, inf and nan."""
-    usable = jnp.isfinite(size) & (size > 0)
-    _, exponent = jnp.frexp(jnp.where(usable, size, 1))
-    return jnp.where(usable, jnp.ldexp(jnp.ones_like(size), exponent - 1), 1)
-
-
-def _not_definite(z: Float[Array, " n"], p_z: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Whether z·P z is negative by more than rounding."""
-    rounding = _ROUNDING_UNITS * jnp.finfo(z.dtype).eps
-    return _dot(z, p_z) < -rounding * jnp.sqrt(_dot(z, z) * _dot(p_z, p_z))
-
-
-# Paige & Saunders (1975), with a preconditioner P ≈ A⁻¹. The unknown is u with x = P u, residuals
-# are measured in |r| = √(r·P r), and only P itself is ever applied. Without a preconditioner P = I.
-#
-# Lanczos. From β_1 q_1 = b, q_0 = 0, for k = 1, 2, ..., with v_k = P q_k,
-#     z = A v_k - β_k q_{k-1},  α_k = v_k·z,  z ← z - α_k q_k,  β_{k+1} = |z|,  q_{k+1} = z/β_{k+1}.
-# Then q_i·P q_j = δ_ij and A P Q_k = Q_{k+1} T_k, where T_k is (k+1)-by-k and tridiagonal, with α on
-# its diagonal and β on both sides of it. Measuring α_k after β_k q_{k-1} is gone is Paige's order,
-# which keeps the q orthogonal for longest.
-#
-# Least residual. For u = Q_k t the residual is Q_{k+1} (β_1 e_1 - T_k t), so t is the solution of a
-# small least-squares problem. Reflections [c_k s_k; s_k -c_k] of the rows k and k+1 make T_k upper
-# triangular, with three diagonals ε, δ and γ. Column k is (β_k, α_k, β_{k+1}), and
-#     reflection k-2 makes    ε_k = s_{k-2} β_k,                δ̄_k = -c_{k-2} β_k,
-#     reflection k-1 makes    δ_k = c_{k-1} δ̄_k + s_{k-1} α_k,  γ̄_k = s_{k-1} δ̄_k - c_{k-1} α_k,
-#     reflection k is         γ_k = √(γ̄_k² + β_{k+1}²),         c_k = γ̄_k/γ_k,  s_k = β_{k+1}/γ_k.
-# They turn β_1 e_1 into (φ_1, ..., φ_k, φ̄_k), φ_k = c_k φ̄_{k-1}, φ̄_k = s_k φ̄_{k-1}, φ̄_0 = β_1, so
-#     |r_k| = φ̄_k,    w_k = (q_k - ε_k w_{k-2} - δ_k w_{k-1})/γ_k,    u_k = u_{k-1} + φ_k w_k.
-# To start, c_0 = -1 and s_0 = 0.
-#
-# What r_{k-1} tells, once step k has made its product:
-#     |A P r_{k-1}| = φ̄_{k-1} √(γ̄_k² + δ̄_{k+1}²)     (zero for a least-squares solution), and
-#     r_{k-1}·P A P r_{k-1} = -φ̄²_{k-1} c_{k-1} γ̄_k    (Liu & Roosta 2022: not positive for some k as
-# soon as A has a direction of non-positive curvature in the Krylov space).
-def _lanczos(
-    a: _Map,
-    p: _Map | None,
-    start: _Solve,
-    null_tolerance: Float[Array, ""],
-    max_steps: int,
-) -> _Loop:
-    """Solves A P u = rhs from u = 0, until |rhs - A P u| ≤ target or |A P r| ≤ tolerance |A| |r|."""
-    eps = jnp.finfo(start.rhs.dtype).eps
-    precondition = (lambda z: z) if p is None else p
-    p_rhs = precondition(start.rhs)
-    beta_1 = _norm(start.rhs, p_rhs)
-
-    def rounding_level(operator_norm, u):
-        # No residual can be told from zero below eps (|A| |x| + |b|). With a preconditioner the
-        # size of x is known only from below, by Cauchy and Schwarz: |u·P b| ≤ |u| |b|.
-        size = jnp.sqrt(_dot(u, u)) if p is None else _over(jnp.abs(_dot(u, p_rhs)), beta_1)
-        return eps * (operator_norm * size + beta_1)
-
-    # A right-hand side whose norm vanishes although it does not, shows a P that is not definite.
-    indefinite = (_dot(start.rhs, p_rhs) <= 0) & (_dot(start.rhs, start.rhs) > 0)
-    status = jnp.where(beta_1 <= start.target, _CONVERGED, _RUNNING)
-    status = jnp.where(indefinite, _BREAKDOWN, status)
-    status = jnp.where(jnp.isfinite(beta_1), status, _NONFINITE)
-
-    zero, zeros = jnp.zeros_like(beta_1), jnp.zeros_like(start.rhs)
-    initial = _Loop(
-        step=start.step,
-        status=status,
-        u=zeros,
-        q_old=zeros,
-        q=_over(start.rhs, beta_1),
-        v=_over(p_rhs, beta_1),
-        beta=zero,
-        w_old=zeros,
-        w=zeros,
-        c=zero - 1,
-        s=zero,
-        delta_bar=zero,
-        epsilon=zero,
-        residual=beta_1,
-        operator_norm=start.operator_norm,
-        negative_curvature=start.negative_curvature,
-    )
-
-    def go_on(loop: _Loop) -> Bool[Array, ""]:
-        return (loop.status == _RUNNING) & (loop.step < max_steps)
-
-    def one_step(loop: _Loop) -> _Loop:
-        z = a(loop.v) - loop.beta * loop.q_old
-        alpha = _dot(loop.v, z)
-        z = z - alpha * loop.q
-        p_z = precondition(z)
-        beta = _norm(z, p_z)
-        # |T e_k| = |A P q_k| bounds the norm from below.
-        operator_norm = jnp.maximum(
-            loop.operator_norm, jnp.sqrt(loop.beta**2 + alpha**2 + beta**2)
-        )
-
-        delta = loop.c * loop.delta_bar + loop.s * alpha
-        gamma_bar = loop.s * loop.delta_bar - loop.c * alpha
-        epsilon, delta_bar = loop.s * beta, -loop.c * beta
-        gamma = jnp.hypot(gamma_bar, beta)
-        # β = 0 means that the Krylov space is exhausted: s = 0 and φ̄ = 0, the system is solved.
-        # γ = 0 means besides that A P r = 0: then `null` is true, and none of this is used.
-        c, s = _over(gamma_bar, gamma), _over(beta, gamma)
-        w = _over(loop.q - loop.epsilon * loop.w_old - delta * loop.w, gamma)
-        u = loop.u + c * loop.residual * w
-        residual = s * loop.residual
-
-        # The test on A P r concerns the iterate before this step, and comes before the step is
-        # taken: along a null direction γ is rounding error, and u would grow by 1/γ.
-        null = jnp.hypot(gamma_bar, delta_bar) <= null_tolerance * operator_norm
-        solved = (residual <= start.target) | (residual <= rounding_level(operator_norm, u))
-        status = jnp.where(solved, _CONVERGED, loop.status)
-        status = jnp.where(null, _LEAST_SQUARES, status)
-        status = jnp.where(_not_definite(z, p_z), _BREAKDOWN, status)
-        # A comparison with nan is false, so that nan would otherwise run to the last step.
-        status = jnp.where(jnp.isfinite(alpha) & jnp.isfinite(beta), status, _NONFINITE)
-        take = (status == _RUNNING) | (status == _CONVERGED)
-
-        # The curvature along r, over |r|². A null direction has one of the size of the rounding.
-        curvature = -loop.c * gamma_bar
-        negative = curvature < -_ROUNDING_UNITS * eps * operator_norm
-        return _Loop(
-            step=loop.step + 1,
-            status=status,
-            u=jnp.where(take, u, loop.u),
-            q_old=loop.q,
-            q=_over(z, beta),
-            v=_over(p_z, beta),
-            beta=beta,
-            w_old=loop.w,
-            w=w,
-            c=c,
-            s=s,
-            delta_bar=delta_bar,
-            epsilon=epsilon,
-            residual=jnp.where(take, residual, loop.residual),
-            operator_norm=operator_norm,
-            negative_curvature=loop.negative_curvature | negative,
-        )
-
-    return lax.while_loop(go_on, one_step, initial)
 
 
 class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
@@ -227,66 +50,69 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     $$x_k = \arg\min_{x \in \mathcal{K}_k(A, b)} \|b - A x\|, \qquad
     \mathcal{K}_k(A, b) = \mathrm{span}\{b, A b, \dots, A^{k-1} b\}$$
 
-    One product with $A$ in each step, and memory for a handful of vectors. It suits Hessians at a
-    minimum that is degenerate (zero modes) or is no minimum at all (saddles), where CG breaks down.
+    One product with $A$ in each step, and memory for a dozen vectors. It suits Hessians at a
+    minimum that is degenerate (zero modes) or is no minimum (saddles), where CG breaks down. The
+    result is the pseudo-inverse solution $A^+ b$, also if $A$ is singular, and also if the system
+    then has no solution (is inconsistent).
 
-    The result is the pseudo-inverse solution $A^+ b$, for a singular system too and whether or not
-    it is consistent. Inconsistent systems need more: rounding keeps $\|A r\| / \|A\|\|r\|$ from
-    falling below about $\sqrt{\epsilon}$, and the iterate then grows without bound. So once it falls
-    to $10\sqrt{\epsilon}$ the iteration stops, the part of the residual in the range of $A$
-    is found from the *consistent* systems $A y = A r$ and $A d = y$, and $x + d$ is freed of its
-    part along the remaining residual, which is a null vector. Inconsistent systems, and those with
-    a condition above $0.1/\sqrt{\epsilon}$, take about three times as many steps for this.
+    It ends if one of these holds, where $\|A\|$ is estimated on the way:
 
-    It stops if one of these holds, with $\|A\|$ estimated on the way:
+    - $\|r\| \le \mathtt{atol} + \mathtt{rtol}\,\|b\|$, with $r = b - A x$: solved.
+    - $\|r\| \le \epsilon\,(\|A\|\|x\| + \|b\|)$: as good as rounding allows. If the first test then
+        fails for the recomputed $r$, this is told by `stats["stagnated"]`. It still is called
+        successful if $\|r\| \le \mathtt{rtol}\,(\|A\|\|x\| + \|b\|)$, which allows for a large $x$,
+        and $\|r\| \le \epsilon^{1/8} \|b\|$, so that some of $b$ is explained.
+    - $\|A r\| \le \mathtt{rtol}\,\|A\|\|r\|$: a least-squares solution. Rounding lets the left side
+        come down to about $\sqrt{\epsilon}\,\|A\|\|r\|$ only, and then $x$ grows without bound.
+        The rest is therefore done, from the last good $x$, by two more solves, $A y = A r$ and
+        $A d = y$, which are consistent. Finally $x + d$ is freed of its part along the remaining
+        $r$, which is a null vector. Inconsistent systems take two to three times as many steps.
 
-    - $\|r\| \le \mathtt{atol} + \mathtt{rtol}\,\|b\|$: solved;
-    - $\|r\| \le \epsilon\,(\|A\|\|x\| + \|b\|)$: as good as rounding allows. It is called successful
-        if then $\|r\| \le \mathtt{rtol}\,(\|A\|\|x\| + \|b\|)$ and $\|r\| \le \sqrt\epsilon\,\|b\|$;
-        `stats["stagnated"]` tells it from the first;
-    - $\|A r\| \le \mathtt{tol}\,\|A\|\|r\|$: a least-squares solution, as described above.
+    The relative rounding error of $x$ can be as large as $\epsilon$ times the square of the
+    condition number. Above a condition of $1/\sqrt{\epsilon}$ (in float32 some thousands) be
+    prepared for `stagnation`, and for small eigenvalues to be taken for zero.
 
-    This supports the following `options` (as passed to `lineax.linear_solve(..., options=...)`):
+    This supports the following `options`, passed as `lineax.linear_solve(..., options=...)`:
 
     - `preconditioner`: a positive definite operator $P \approx A^{-1}$, tagged as such. Residuals
-        are then measured as $\sqrt{r \cdot P r}$, lengths of solutions as $\sqrt{x \cdot P^{-1} x}$.
-        For a nonsingular $A$ that changes the number of steps only. For a singular one it changes
-        which solution comes out: the weighted pseudo-inverse, not $A^+ b$, of which the derivative
-        is then not the one that Lineax computes.
-    - `y0`: the first guess. For a singular $A$ the result is the solution nearest to `y0`. Give none
-        when differentiating through a singular system: Lineax hands it to the tangent systems too.
+        are then measured as $\sqrt{r \cdot P r}$, and lengths of $x$ as $\sqrt{x \cdot P^{-1} x}$.
+        If $A$ is nonsingular, that changes the number of steps and nothing else. If it is singular,
+        the result is the pseudo-inverse solution in these lengths, which is not $A^+ b$, and for
+        which the derivative that Lineax computes does not hold.
+    - `y0`: a first guess. If $A$ is singular, the result is the solution nearest to it. Give none
+        when differentiating through a singular system: Lineax hands it to the tangent system too.
 
     **Arguments:**
 
-    - `rtol`: tolerance of the residual, relative to $\|b\|$. Defaults to $\epsilon^{2/3}$ of the
-        dtype: 3.7e-11 in float64 and 2.4e-5 in float32.
+    - `rtol`: tolerance of the residual relative to $\|b\|$. Defaults to $\epsilon^{2/3}$ of the
+        dtype, which is 3.7e-11 in float64 and 2.4e-5 in float32.
     - `atol`: absolute tolerance of the residual, added to the relative one.
-    - `max_steps`: the largest number of products in the iteration. Defaults to 30 times the size of
-        the system (rounding makes hard systems need several times their size).
+    - `max_steps`: the most steps to take, all solves together. Defaults to 50 times the size of the
+        system: without rounding one solve takes as many as there are distinct eigenvalues.
 
     **Returns:**
 
-    From `lineax.linear_solve`, a solution with these `stats`:
+    From `lineax.linear_solve`, a solution with one of the results `successful`;
+    `max_steps_reached`; `stagnation` (rounding ended it too far from a solution); `breakdown` (the
+    preconditioner is not positive definite); `nonfinite_input` ($A$, $b$ or `y0` has nan or inf;
+    the value is nan). Its `stats` are
 
-    - `num_steps`, `max_steps`: number of iterations done and allowed. The number of products is
-        larger by one (for a first estimate of $\|A\|$), two after each solve, and one for `y0`.
-    - `residual_norm`: $\|b - A x\| / \|b\|$ as recomputed at the end ($\|A x\|$ if $b = 0$).
-    - `operator_norm`: lower bound of $\|A\|$ (of $\|P^{1/2} A P^{1/2}\|$ with a preconditioner).
-    - `negative_curvature`: whether a residual $r$ with $r \cdot A r < 0$ was met. In exact arithmetic
-        it is met, if one runs to the end, exactly if $b$ has a part in eigenspaces of negative
-        eigenvalue; an early stop can miss it.
-    - `inconsistent`: whether the result is a least-squares solution with a residual that is not small.
-    - `stagnated`: whether the residual is above the tolerances, because rounding stopped the solve.
-
-    and one of these results: `successful`; `max_steps_reached`; `stagnation` (rounding ended the
-    solve too far from a solution); `breakdown` (the preconditioner is not positive definite);
-    `nonfinite_input` ($A$, $b$ or `y0` has nan or inf; the value is then nan).
+    - `num_steps` and `max_steps`: the steps taken and allowed. Each makes one product with $A$;
+        another one is made at the beginning, one for `y0`, and three after each solve.
+    - `residual_norm`: $\|b - A x\| / \|b\|$ recomputed at the end, or $\|A x\|$ if $b = 0$.
+    - `operator_norm`: a lower bound of $\|A\|$, or of $\|P^{1/2} A P^{1/2}\|$.
+    - `negative_curvature`: whether a direction $z$ with $z \cdot A z < 0$ was met. Without
+        rounding, and if solved to the end, it is so exactly if $b$ has a part in an eigenspace
+        of a negative eigenvalue. A loose tolerance can miss a small part.
+    - `inconsistent`: whether the result is a least-squares solution with a residual that is not
+        small.
+    - `stagnated`: whether rounding ended the solve with a residual above the tolerances.
 
     **Raises:**
 
-    A `ValueError` for a negative tolerance, a `max_steps` below one, an operator that is not square,
-    not tagged symmetric or complex, and a preconditioner not tagged positive definite or of another
-    shape.
+    - `ValueError` if a tolerance is negative or `max_steps` is not positive; if the operator is not
+        square, not real or not tagged symmetric; if the preconditioner is not tagged positive
+        semidefinite; if it or `y0` does not fit the system.
 
     ??? cite "References"
 
@@ -300,8 +126,8 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             doi:10.48550/arXiv.2309.17096. Removal of the part along the residual.
     """
 
-    rtol: float | None = None
-    atol: float = 0.0
+    rtol: float | None = eqx.field(default=None, static=True)
+    atol: float = eqx.field(default=0.0, static=True)
     max_steps: int | None = eqx.field(default=None, static=True)
 
     def __check_init__(self):
@@ -310,7 +136,7 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
                 raise ValueError(f"Argument `{name}` must not be negative, but {value} was given.")
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(
-                f"Argument `max_steps` must be at least one, but {self.max_steps} was given."
+                f"Argument `max_steps` must be positive, but {self.max_steps} was given."
             )
 
     def init(
@@ -318,22 +144,22 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     ) -> lx.AbstractLinearOperator:
         """Checks the operator, and linearises it so that each product costs one linear map."""
         del options
-        structure = operator.in_structure()
-        if eqx.tree_equal(structure, operator.out_structure()) is not True:
+        given, structure = type(operator).__name__, operator.in_structure()
+        if not _same_structure(structure, operator.out_structure()):
             raise ValueError(
-                "Argument `operator` must be square, but it maps "
-                f"{structure} to {operator.out_structure()}. Use `lineax.LSMR` instead."
+                f"Argument `operator` must be square, but a {given} from {structure} to "
+                f"{operator.out_structure()} was given. Use `lineax.LSMR` instead."
             )
-        if any(jnp.iscomplexobj(leaf) for leaf in jtu.tree_leaves(structure)):
+        if any(jnp.issubdtype(x.dtype, jnp.complexfloating) for x in jtu.tree_leaves(structure)):
             raise ValueError(
-                "Argument `operator` must be real, but a complex one was given. "
-                "Write the system in real and imaginary parts instead."
+                f"Argument `operator` must be real, but a complex {given} was given. Solve for "
+                "real and imaginary parts instead."
             )
         if not lx.is_symmetric(operator):
             raise ValueError(
-                f"Argument `operator` must be symmetric, but a {type(operator).__name__} without "
-                "that tag was given. Tag it with `lineax.symmetric_tag` if it is symmetric; use "
-                "`lineax.GMRES` or `lineax.LSMR` if it is not."
+                f"Argument `operator` must be symmetric, but a {given} without that tag was given. "
+                "Tag it with `lineax.symmetric_tag` if it is symmetric, and use `lineax.GMRES` or "
+                "`lineax.LSMR` if it is not."
             )
         return lx.linearise(operator)
 
@@ -343,17 +169,17 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         vector: PyTree[Array],
         options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        """Solves the system; see the class."""
+        """Solves the system for one vector; see the class."""
         b, unravel = jfu.ravel_pytree(vector)
         eps = float(jnp.finfo(b.dtype).eps)
         rtol = eps ** (2 / 3) if self.rtol is None else self.rtol
-        max_steps = 30 * max(b.size, 1) if self.max_steps is None else self.max_steps
-        # A residual with |A r| below this is taken for a least-squares one. Rounding acts on Lanczos
-        # as if each eigenvalue were a cluster (Greenbaum 1989, doi:10.1016/0024-3795(89)90285-1).
-        # Close to convergence the cluster at zero, on which an inconsistent b has a large part, is
-        # resolved like any other, and u grows by its inverse width. The √eps is where that begins.
-        least_squares = max(rtol, _LS * eps**0.5)
-        rounding = _ROUNDING_UNITS * eps
+        max_steps = 50 * max(b.size, 1) if self.max_steps is None else self.max_steps
+        rounding = ROUNDING_UNITS * eps
+        hardly_solved = eps**0.125
+        # Why √eps: see the end of the derivation. If no more than that is asked for, solve 0 stops
+        # there at once and the others have nothing to add.
+        nearly_null = max(rtol, 4 * eps**0.5)
+        coarse = rtol == nearly_null
 
         flat = lambda operator: lambda v: jfu.ravel_pytree(operator.mv(unravel(v)))[0]
         a = flat(state)
@@ -361,124 +187,134 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         p = None if preconditioner is None else flat(preconditioner)
         precondition = (lambda z: z) if p is None else p
 
-        # The cotangents of a float32 loss may be so small that their squares vanish.
+        # The cotangents of a float32 loss can be so small that their squares vanish.
         scale = _power_of_two_near(jnp.max(jnp.abs(b), initial=0))
         b = b / scale
-        p_b = precondition(b)
-        norm_b = _norm(b, p_b)
+        norm_b = norm(b, precondition(b))
         target = self.atol / scale + rtol * norm_b
-        if options.get("y0") is None:
-            x_0, r_0 = jnp.zeros_like(b), b
-        else:
-            if not _same_structure(options["y0"], vector):
-                raise ValueError(
-                    "Argument `options['y0']` must have the structure of the vector, but "
-                    f"{jax.eval_shape(lambda: options['y0'])} was given."
-                )
-            x_0 = jfu.ravel_pytree(options["y0"])[0] / scale
+        x_0, r_0 = jnp.zeros_like(b), b
+        if options.get("y0") is not None:
+            x_0 = _first_guess(vector, options) / scale
             r_0 = b - a(x_0)
 
-        # |A| is needed before Lanczos knows it: if b is a null vector, A b is rounding error, and
-        # only in comparison with |A| does it look like it. For random signs g the mean square of
-        # |A g|/|g| is that of the eigenvalues.
+        # |A| must be known before Lanczos can tell it: if b is a null vector, A b is rounding
+        # error, and this shows only in comparison with |A|. With random signs in g, the mean square
+        # of |A g|/|g| is that of the eigenvalues.
         g = jax.random.rademacher(jax.random.key(0), b.shape, b.dtype)
         p_g = precondition(g)
         a_g = a(p_g)
-        operator_norm = _over(_norm(a_g, precondition(a_g)), _norm(g, p_g))
+        operator_norm = over(norm(a_g, precondition(a_g)), norm(g, p_g))
 
-        def residual(u):
+        # Solve 0 is the system itself. If that has only a least-squares solution, two more follow:
+        #     solve 1, A P y = A P r, makes y the part of r in the range of A,
+        #     solve 2, A P d = y,     makes A⁺ r to be added to u.
+        # Both are consistent, and so do not blow up. Without rounding, A P r and y would be zero.
+        def one_solve(solve: _Solve) -> _Solve:
+            first, second = solve.number == 0, solve.number == 1
+            null = jnp.where(first & coarse, rtol, ROUNDING_UNITS * rounding).astype(b.dtype)
+            end = solve_in_krylov_space(
+                a,
+                p,
+                solve.rhs,
+                target=solve.target,
+                null=null,
+                nearly_null=nearly_null,
+                operator_norm=solve.operator_norm,
+                negative_curvature=solve.negative_curvature,
+                step=solve.step,
+                max_steps=max_steps,
+            )
+            # The level of rounding grows with u, so a u that blows up at one stroke reaches it. It
+            # shows in the recomputed residual, which is that of the suspect or larger.
+            r = solve.rhs - a(precondition(end.u))
+            norm_r, norm_rhs = norm(r, precondition(r)), norm(solve.rhs, precondition(solve.rhs))
+            no_gain = (end.residual_suspect > 0) & (norm_r > 0.5 * end.residual_suspect)
+            blown_up = (
+                (end.status == CONVERGED)
+                & (norm_r > _SLACK * solve.target)
+                & (no_gain | (norm_r > hardly_solved * norm_rhs))
+            )
+            # The test for LEAST_SQUARES, too, can be late, when u has already grown.
+            least_squares = blown_up | (end.status == LEAST_SQUARES)
+            change = jnp.where(least_squares, end.u_suspect, end.u)
+
+            u = jnp.where(second, solve.u, solve.u + change)
             r = r_0 - a(precondition(u))
             p_r = precondition(r)
-            return r, p_r, _norm(r, p_r)
-
-        # Solve 0 is the system itself. Only if it ends with a residual that is not small do solves
-        # 1 and 2 follow; both are consistent, and so have none of the trouble of solve 0:
-        #     A P y = A P r   makes y the part of r in the range,     A P d = y   adds A⁺ r to u.
-        # In exact arithmetic y would be zero after a least-squares stop, in rounding it is √eps.
-        def one_solve(solve: _Solve) -> _Solve:
-            first, second = solve.index == 0, solve.index == 1
-            tolerance = jnp.where(first, least_squares, rounding).astype(b.dtype)
-            loop = _lanczos(a, p, solve, tolerance, max_steps)
-            u = jnp.where(second, solve.u, solve.u + loop.u)
-            r, p_r, norm_r = residual(u)
-            # A blown-up u can pass for solved at the rounding level, which grows with it. No such u
-            # is worth keeping.
-            blown_up = first & (loop.status == _CONVERGED) & (norm_r > eps**_BIG * norm_b + target)
-            u = jnp.where(blown_up, 0, u)
-            r, p_r = jnp.where(blown_up, r_0, r), jnp.where(blown_up, precondition(r_0), p_r)
-            norm_r = _norm(r, p_r)
             a_r = a(p_r)
-            # How far solve 1 goes: as far as the user wants |A r| to be small, or else to rounding.
-            fine = _SLACK * rtol if rtol >= least_squares else rounding
-            ended = (loop.status == _CONVERGED) | (loop.status == _LEAST_SQUARES)
+            ended = least_squares | (end.status == CONVERGED)
+            more = jnp.where(first, least_squares & (not coarse), second & ended)
+            # Solve 1 goes as far as A P r means anything.
+            finest = rounding * end.operator_norm * norm(r, p_r)
             return _Solve(
-                index=solve.index + 1,
-                more=jnp.where(
-                    first, (loop.status == _LEAST_SQUARES) | blown_up, second & ended
-                ),
-                rhs=jnp.where(first, a_r, loop.u),
-                target=jnp.where(first, fine * loop.operator_norm * norm_r, target),
+                number=solve.number + 1,
+                more=more,
+                rhs=jnp.where(first, a_r, change),
+                target=jnp.where(first, finest, target),
                 u=u,
                 r=r,
                 a_r=a_r,
-                step=loop.step,
-                status=loop.status,
-                operator_norm=loop.operator_norm,
-                negative_curvature=loop.negative_curvature,
+                step=end.step,
+                status=jnp.where(least_squares, LEAST_SQUARES, end.status),
+                operator_norm=end.operator_norm,
+                negative_curvature=end.negative_curvature,
             )
 
-        solve = lax.while_loop(
-            lambda solve: solve.more,
-            one_solve,
-            _Solve(
-                index=jnp.array(0),
-                more=jnp.array(True),
-                rhs=r_0,
-                target=target,
-                u=jnp.zeros_like(b),
-                r=r_0,
-                a_r=jnp.zeros_like(b),
-                step=jnp.array(0),
-                status=jnp.array(_RUNNING),
-                operator_norm=operator_norm,
-                negative_curvature=jnp.array(False),
-            ),
+        start = _Solve(
+            number=jnp.array(0),
+            more=jnp.array(True),
+            rhs=r_0,
+            target=target,
+            u=jnp.zeros_like(b),
+            r=r_0,
+            a_r=jnp.zeros_like(b),
+            step=jnp.array(0),
+            status=jnp.array(RUNNING),
+            operator_norm=operator_norm,
+            negative_curvature=jnp.array(False),
         )
-        r, p_r, u, p_u = solve.r, precondition(solve.r), solve.u, precondition(solve.u)
-        norm_r, norm_a_r = _norm(r, p_r), _norm(solve.a_r, precondition(solve.a_r))
-        x = x_0 + p_u
+        solve = lax.while_loop(lambda solve: solve.more, one_solve, start)
 
-        size = jnp.sqrt(_dot(x, x)) if p is None else _over(jnp.abs(_dot(x, b)), norm_b)
-        size = jnp.maximum(size, _norm(u, p_u))
-        backward_error = _over(norm_r, solve.operator_norm * size + norm_b)
-        ended = (solve.status == _CONVERGED) | (solve.status == _LEAST_SQUARES)
+        r, p_r, p_u = solve.r, precondition(solve.r), precondition(solve.u)
+        norm_r, norm_a_r = norm(r, p_r), norm(solve.a_r, precondition(solve.a_r))
+        x = x_0 + p_u
+        # With a preconditioner this is the lower bound of |x| by Cauchy and Schwarz, for x_0 is not
+        # known in the form P u.
+        size_x = jnp.sqrt(dot(x, x)) if p is None else over(jnp.abs(dot(x, b)), norm_b)
+        size_x = jnp.maximum(size_x, norm(solve.u, p_u))
+        reach = solve.operator_norm * size_x + norm_b
+        # The recomputed r has errors of this size, and A P r those times |A|.
+        noise = ROUNDING_UNITS * rounding * reach
+
+        ended = (solve.status == CONVERGED) | (solve.status == LEAST_SQUARES)
         within = norm_r <= _SLACK * target
         inconsistent = (
             ended
             & ~within
-            & (solve.index > 1)
-            & (backward_error > _ROUNDING_UNITS * rounding)
-            & (norm_a_r <= _SLACK * least_squares * solve.operator_norm * norm_r)
+            & ((solve.number > 1) | (solve.status == LEAST_SQUARES))
+            & (norm_r > noise)
+            & (norm_a_r <= solve.operator_norm * (_SLACK * nearly_null * norm_r + noise))
         )
         stagnated = ended & ~within & ~inconsistent
-        failed = stagnated & (
-            (backward_error > max(rtol, _ROUNDING_UNITS * rounding))
-            | (norm_r > eps**_BIG * norm_b)
-        )
-        # Lifting: P r is a null vector of A, and the only one along which u - d has a part.
-        lifted = x - _over(_dot(r, p_u), norm_r**2) * p_r
+        explained = norm_r <= hardly_solved * norm_b
+        acceptable = explained & (norm_r <= jnp.maximum(rtol * reach, noise))
+        # P r is a null vector, and the only one along which P u can have a part: u is in the span
+        # of b, A P b, ..., of which only b has a part outside the range.
+        lifted = x - over(dot(r, p_u), norm_r**2) * p_r
         x = jnp.where(inconsistent, lifted, x)
 
         result = lx.RESULTS.where(ended, lx.RESULTS.successful, lx.RESULTS.max_steps_reached)
-        result = lx.RESULTS.where(failed, lx.RESULTS.stagnation, result)
-        broken, nonfinite = solve.status == _BREAKDOWN, solve.status == _NONFINITE
-        result = lx.RESULTS.where(broken, lx.RESULTS.breakdown, result)
-        result = lx.RESULTS.where(nonfinite, lx.RESULTS.nonfinite_input, result)
-        x = jnp.where(nonfinite, jnp.nan, x)
+        for where, what in (
+            (stagnated & ~acceptable, lx.RESULTS.stagnation),
+            (solve.status == BREAKDOWN, lx.RESULTS.breakdown),
+            (solve.status == NONFINITE, lx.RESULTS.nonfinite_input),
+        ):
+            result = lx.RESULTS.where(where, what, result)
+        x = jnp.where(solve.status == NONFINITE, jnp.nan, x)
         stats = {
             "num_steps": solve.step,
             "max_steps": max_steps,
-            "residual_norm": _over(jnp.sqrt(_dot(r, r)), jnp.sqrt(_dot(b, b))),
+            "residual_norm": over(jnp.sqrt(dot(r, r)), jnp.sqrt(dot(b, b))),
             "operator_norm": solve.operator_norm,
             "negative_curvature": solve.negative_curvature,
             "inconsistent": inconsistent,
@@ -489,53 +325,63 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     def transpose(
         self, state: lx.AbstractLinearOperator, options: dict[str, Any]
     ) -> tuple[lx.AbstractLinearOperator, dict[str, Any]]:
-        """The same state, for the operator is symmetric; `y0` was meant for the other system."""
-        return state, {name: option for name, option in options.items() if name != "y0"}
+        """The same state: the operator is symmetric. A first guess is for this vector only."""
+        return state, {name: value for name, value in options.items() if name != "y0"}
 
     def conj(
         self, state: lx.AbstractLinearOperator, options: dict[str, Any]
     ) -> tuple[lx.AbstractLinearOperator, dict[str, Any]]:
-        """The same state, for the operator is real."""
+        """The same state: the operator is real."""
         return state, options
 
     def assume_full_rank(self) -> bool:
-        """False: the pseudo-inverse solution is found for any rank."""
+        """False: the result is the pseudo-inverse solution whatever the rank."""
         return False
 
 
-def _same_structure(x: PyTree[Array], y: PyTree[Array]) -> bool:
-    strong = lambda tree: jtu.tree_map(
-        lambda leaf: (leaf.shape, leaf.dtype), jax.eval_shape(lambda: tree)
-    )
-    return strong(x) == strong(y)
+def _power_of_two_near(size: Float[Array, ""]) -> Float[Array, ""]:
+    """A power of two, because dividing by it costs no rounding; 1 for zero, inf and nan."""
+    usable = jnp.isfinite(size) & (size > 0)
+    _, exponent = jnp.frexp(jnp.where(usable, size, 1))
+    return jnp.where(usable, jnp.ldexp(jnp.ones_like(size), exponent - 1), 1)
+
+
+def _same_structure(x: PyTree[Any], y: PyTree[Any]) -> bool:
+    """Whether trees, shapes and dtypes are equal; weak types do not count."""
+    same = lambda a, b: a.shape == b.shape and a.dtype == b.dtype
+    equal_trees = jtu.tree_structure(x) == jtu.tree_structure(y)
+    return equal_trees and jtu.tree_all(jtu.tree_map(same, x, y))
+
+
+def _first_guess(vector: PyTree[Array], options: dict[str, Any]) -> Float[Array, "n"]:
+    y0 = jtu.tree_map(jnp.asarray, options["y0"])
+    if not _same_structure(y0, vector):
+        raise ValueError(
+            "Argument `options['y0']` must have the structure of the vector, but "
+            f"{jax.eval_shape(lambda: y0)} was given for {jax.eval_shape(lambda: vector)}."
+        )
+    return jfu.ravel_pytree(y0)[0]
 
 
 def _preconditioner(
     structure: PyTree[jax.ShapeDtypeStruct], options: dict[str, Any]
 ) -> lx.AbstractLinearOperator | None:
-    """The linearised preconditioner of `options`, checked; `None` if there is none to apply."""
+    """The preconditioner of `options`, checked and linearised; `None` if it would do nothing."""
     preconditioner = options.get("preconditioner")
     if preconditioner is None or isinstance(preconditioner, lx.IdentityLinearOperator):
         return None
-    given = type(preconditioner).__name__
+    name, given = "Argument `options['preconditioner']` must", type(preconditioner).__name__
     if not isinstance(preconditioner, lx.AbstractLinearOperator):
-        raise ValueError(
-            "Argument `options['preconditioner']` must be a `lineax.AbstractLinearOperator`, but "
-            f"a {given} was given."
-        )
+        raise ValueError(f"{name} be a `lineax.AbstractLinearOperator`, but a {given} was given.")
     if not lx.is_positive_semidefinite(preconditioner):
         raise ValueError(
-            "Argument `options['preconditioner']` must be positive definite, but a "
-            f"{given} without that tag was given. Tag it with `lineax.positive_semidefinite_tag` if "
-            "it is so."
+            f"{name} be positive definite, but a {given} without that tag was given. Tag it with "
+            "`lineax.positive_semidefinite_tag` if it is so."
         )
-    if not (
-        _same_structure(preconditioner.in_structure(), structure)
-        and _same_structure(preconditioner.out_structure(), structure)
-    ):
+    into, out = preconditioner.in_structure(), preconditioner.out_structure()
+    if not (_same_structure(into, structure) and _same_structure(out, structure)):
         raise ValueError(
-            "Argument `options['preconditioner']` must map the space of the operator to itself, "
-            f"{structure}, but it maps {preconditioner.in_structure()} to "
-            f"{preconditioner.out_structure()}."
+            f"{name} map the space of the operator, {structure}, to itself, but a {given} from "
+            f"{into} to {out} was given."
         )
     return lx.linearise(preconditioner)
