@@ -38,14 +38,16 @@ types: $(VENV)/.dev ## static types
 	$(BIN)/pyright
 
 benchmark: $(VENV)/.dev ## measure speed; nothing else should run meanwhile
-	$(BIN)/python -m benchmarks
+	@for script in benchmarks/[a-z]*.py; do \
+	    echo "== $$script"; $(BIN)/python "$$script" || exit 1; \
+	done
 
 build: $(VENV)/.dev ## wheel and source archive in dist
 	$(BIN)/python -m build
 
 clean: ## remove the environment, caches and builds, but no results
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
-	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	find . -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is newer than pyproject.toml when the environment holds what that asks for. The package itself
 # is installed in place, so changes of its code need no new set-up.
