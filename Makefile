@@ -43,6 +43,7 @@ benchmark: $(VENV)/.dev ## measure speed; nothing else should run meanwhile
 	done
 
 build: $(VENV)/.dev ## wheel and source archive in dist
+	rm -rf dist
 	$(BIN)/python -m build
 
 clean: ## remove the environment, caches and builds, but no results
@@ -52,10 +53,12 @@ clean: ## remove the environment, caches and builds, but no results
 # A stamp is newer than pyproject.toml when the environment holds what that asks for. The package itself
 # is installed in place, so changes of its code need no new set-up.
 $(VENV)/.base: pyproject.toml | $(BIN)/python
+	@echo "Setting up $(VENV); this takes a minute or two and happens once."
 	$(BIN)/python -m pip install --quiet --editable .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(BIN)/python
+	@echo "Setting up $(VENV) for development; this takes a few minutes and happens once."
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@ $(VENV)/.base
 

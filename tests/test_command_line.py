@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,8 @@ from typer.testing import CliRunner
 import vertax as vx
 from vertax.experiments import EXPERIMENTS
 from vertax.experiments.command_line import app
+
+ROOT = Path(__file__).parents[1]
 
 TINY = """
 experiment = "infer_shape_factors"
@@ -139,8 +142,8 @@ def test_help_version_list_and_describe(tiny):
     assert "infer_shape_factors" in unknown.stderr
 
 
-def test_the_program_runs_as_a_process(tiny):
+def test_the_program_runs_as_a_process():
     command = [sys.executable, "-m", "vertax.experiments.command_line", "run", "none.toml"]
-    outcome = subprocess.run(command, capture_output=True, text=True, check=False)
+    outcome = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert outcome.returncode == 2
     assert outcome.stderr == "Error: There is no configuration file none.toml.\n"
