@@ -68,7 +68,7 @@ def find_experiment(name: Any) -> Experiment:
 
 def load_config(
     path: str | os.PathLike[str], overrides: Iterable[str] = ()
-) -> tuple[Experiment, ExperimentConfig]:
+) -> tuple[Experiment, Any]:
     """Read and check a configuration file.
 
     **Arguments:**
@@ -77,7 +77,7 @@ def load_config(
     - `overrides`: texts `key=value` that set single keys, see
         [`apply_overrides`][vertax.experiments.apply_overrides].
 
-    **Returns:** the experiment and its configuration.
+    **Returns:** the experiment and its configuration, an instance of `experiment.config`.
 
     **Raises:**
 
