@@ -52,7 +52,7 @@ def test_keys_left_out_have_their_defaults(write):
     experiment, config = load_config(write(VALID))
     assert experiment is EXPERIMENTS["infer_shape_factors"]
     assert config.fit.epochs == 7
-    assert config.fit.learning_rate == experiment.config().fit.learning_rate
+    assert config.fit.learning_rate == type(config)().fit.learning_rate
 
 
 @pytest.mark.parametrize(
