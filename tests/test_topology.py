@@ -3,7 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import random_tissue, tissues
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import vertax as vx
 from vertax._topology import clockwise, counter_clockwise, flip_edges
@@ -17,7 +18,9 @@ def test_rotation_system_is_consistent(recipe):
     tissue = recipe()
     m = tissue.topology
     names = ("twin", "next", "previous", "source", "target", "cell", "offset")
-    twin, following, previous, source, target, cell, offset = (np.asarray(getattr(m, n)) for n in names)
+    twin, following, previous, source, target, cell, offset = (
+        np.asarray(getattr(m, n)) for n in names
+    )
     h = np.arange(m.n_half_edges)
     assert (twin[twin] == h).all()
     assert (following[previous] == h).all()
