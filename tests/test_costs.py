@@ -149,7 +149,7 @@ def test_weighted_sums():
     assert total(tissue, energy) == pytest.approx(float(expected))
     assert (2 * total + b)(tissue, energy) == pytest.approx(float(2 * expected + b(tissue, energy)))
     with pytest.raises(TypeError):
-        a * b
+        a * b  # pyright: ignore
     with pytest.raises(TypeError):
         a + 1.0  # pyright: ignore
 

@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import random_tissue, tissues
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from jax.test_util import check_grads
 
 import vertax as vx

@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import edge_cell_sets, random_tissue, shape_factors, tissues
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import vertax as vx
 from vertax.energies import LineTension, ShapeFactorEnergy

@@ -74,6 +74,10 @@ def plot_history(
             few = {"marker": "o", "markersize": 2.5} if len(curve) < 15 else {}
             panel.plot(epochs, values, color=colour, label=label, **few)
             panel.set_yscale("log" if logarithmic else "linear")
+            if np.issubdtype(np.asarray(history[name]).dtype, np.integer):
+                panel.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
+                top = max(1.0, panel.dataLim.y1)  # nothing but zeros would be an axis of fractions
+                panel.set_ylim(-0.03 * top, 1.05 * top)
             panel.set_xlabel("epoch")
             panel.set_ylabel(title)
         if label is not None:

@@ -2,14 +2,8 @@
 
 from vertax.solvers._first_order import (
     FIRE as FIRE,
-)
-from vertax.solvers._first_order import (
     LBFGS as LBFGS,
-)
-from vertax.solvers._first_order import (
     GradientDescent as GradientDescent,
-)
-from vertax.solvers._first_order import (
     Optax as Optax,
 )
 from vertax.solvers._minres import MINRES as MINRES

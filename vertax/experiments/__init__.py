@@ -1,0 +1,23 @@
+"""Experiments: typed configuration, run folders and the command line, one module an experiment."""
+
+from vertax.experiments._config import (
+    ConfigError as ConfigError,
+    ExperimentConfig as ExperimentConfig,
+    Section as Section,
+    allowed as allowed,
+    apply_overrides as apply_overrides,
+    fields as fields,
+    template as template,
+)
+from vertax.experiments._registry import (
+    EXPERIMENTS as EXPERIMENTS,
+    Experiment as Experiment,
+    find_experiment as find_experiment,
+    load_config as load_config,
+)
+from vertax.experiments._run import (
+    RunFolder as RunFolder,
+    RunFolderError as RunFolderError,
+    installed_version as installed_version,
+    summary as summary,
+)

@@ -1,0 +1,291 @@
+"""Typed configuration: what every experiment shares, how it is read, how mistakes are reported."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+import types
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+
+import annotated_types
+import pydantic
+from pydantic.fields import FieldInfo
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message says where and what would be right."""
+
+
+class Section(pydantic.BaseModel):
+    """A table of a configuration file.
+
+    Subclass it; each key is a field with a type, a default and a docstring below. Unknown keys and
+    values of another type are refused (an integer counts as a number, nothing else is converted).
+    """
+
+    model_config = pydantic.ConfigDict(
+        extra="forbid",
+        strict=True,
+        frozen=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
+
+
+class ExperimentConfig(Section):
+    """The keys that every experiment has.
+
+    Subclasses add a key `experiment`, a literal with the name of theirs.
+    """
+
+    seed: int = pydantic.Field(default=0, ge=0)
+    """Seed of everything random."""
+    precision: Literal["float64", "float32"] = "float64"
+    """Floating-point numbers of the whole run."""
+
+
+Model = TypeVar("Model", bound=Section)
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a TOML file.
+
+    **Arguments:**
+
+    - `path`: the file.
+
+    **Returns:** its content.
+
+    **Raises:**
+
+    - `ConfigError`, naming the file, if it cannot be read or is not valid TOML.
+    """
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except FileNotFoundError:
+        raise ConfigError(f"There is no configuration file {os.fspath(path)}.") from None
+    except OSError as error:
+        raise ConfigError(f"Cannot read {os.fspath(path)}: {error.strerror}.") from error
+    except ValueError as error:  # of TOML, or of text that is not UTF-8
+        raise ConfigError(f"{os.fspath(path)} is not valid TOML: {error}.") from error
+
+
+def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    """Set single keys of a configuration.
+
+    **Arguments:**
+
+    - `data`: the configuration; left as it is.
+    - `overrides`: texts `key=value` with a dotted key, e.g. `"fit.epochs=50"`. The value is written
+        as in TOML; what is not valid TOML is taken as a string, so plain words need no quotes. A
+        later one wins.
+
+    **Returns:** a new configuration.
+
+    **Raises:**
+
+    - `ConfigError` for a text without `=`, an empty key, or a key inside what is no table.
+    """
+    config = _copy(data)
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        parts = [part.strip() for part in key.split(".")]
+        if not equals or not all(parts):
+            raise ConfigError(
+                f"An override must have the form key=value, as in fit.epochs=50, but is "
+                f"{override!r}."
+            )
+        table = config
+        for depth, part in enumerate(parts[:-1], start=1):
+            table = table.setdefault(part, {})
+            if not isinstance(table, dict):
+                raise ConfigError(
+                    f"Cannot set `{'.'.join(parts)}`: `{'.'.join(parts[:depth])}` is a value and "
+                    "not a table."
+                )
+        table[parts[-1]] = _parse(text)
+    return config
+
+
+def validate(
+    model: type[Model], data: Mapping[str, Any], where: str = "the configuration"
+) -> Model:
+    """Check a configuration against its model.
+
+    **Arguments:**
+
+    - `model`: the class to make.
+    - `data`: the configuration.
+    - `where`: what it is called in messages, e.g. the name of the file.
+
+    **Returns:** an instance of `model`.
+
+    **Raises:**
+
+    - `ConfigError` that lists every unknown, missing or ill-typed key by its full dotted name, with
+        what is allowed there and, for an unknown one, the nearest key that exists.
+    """
+    try:
+        return model.model_validate(dict(data))
+    except pydantic.ValidationError as error:
+        known = fields(model)
+        lines = [_explain(known, mistake) for mistake in error.errors(include_url=False)]
+        listed = "\n  ".join(["", *lines]) if len(lines) > 1 else f" {lines[0]}"
+        raise ConfigError(f"In {where}:{listed}") from None
+
+
+def fields(model: type[Section], prefix: str = "") -> dict[str, FieldInfo]:
+    """All keys of a configuration by their dotted names; a table comes before the keys in it.
+
+    **Arguments:**
+
+    - `model`: the class of the configuration.
+    - `prefix`: put before each name.
+
+    **Returns:** the Pydantic field of each key.
+    """
+    found: dict[str, FieldInfo] = {}
+    for name, field in model.model_fields.items():
+        found[prefix + name] = field
+        if (section := _section(field)) is not None:
+            found |= fields(section, f"{prefix}{name}.")
+    return found
+
+
+def template(model: type[ExperimentConfig], name: str) -> str:
+    """A configuration file with every key at its default, each explained in a comment.
+
+    **Arguments:**
+
+    - `model`: the class of the configuration.
+    - `name`: of the experiment.
+
+    **Returns:** the text of a TOML file.
+    """
+    lines = [f'experiment = "{name}"', *_template_lines(model, "")]
+    return "\n".join(lines) + "\n"
+
+
+def allowed(field: FieldInfo) -> str:
+    """What may be written at a key, in words.
+
+    **Arguments:**
+
+    - `field`: the field of the key, see [`fields`][vertax.experiments.fields].
+
+    **Returns:** e.g. `"an integer, at least 1"`.
+    """
+    words = {
+        annotated_types.Ge: ("ge", "at least {}"),
+        annotated_types.Gt: ("gt", "above {}"),
+        annotated_types.Le: ("le", "at most {}"),
+        annotated_types.Lt: ("lt", "below {}"),
+    }
+    bounds = [
+        words[type(mark)][1].format(getattr(mark, words[type(mark)][0]))
+        for mark in field.metadata
+        if type(mark) in words
+    ]
+    return ", ".join([_type_in_words(field.annotation), *bounds])
+
+
+_TYPES = {int: "an integer", float: "a number", str: "a string", bool: "true or false"}
+
+
+def _type_in_words(annotation: Any) -> str:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return " or ".join(_type_in_words(a) for a in arguments if a is not types.NoneType)
+    if origin is Literal:
+        return "one of " + ", ".join(_in_toml(value) for value in arguments)
+    if origin in (list, tuple):
+        return f"a list, each entry {_type_in_words(arguments[0])}"
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return f"a table with the keys {', '.join(annotation.model_fields)}"
+    if isinstance(annotation, type) and issubclass(annotation, Path):
+        return "a string, the path of a file"
+    return _TYPES.get(annotation, str(annotation))
+
+
+def _explain(known: Mapping[str, FieldInfo], mistake: Any) -> str:
+    """One mistake, as Pydantic reports it, in a sentence."""
+    name = ".".join(str(part) for part in mistake["loc"])
+    # An entry of a list is judged by the field that the list belongs to.
+    field = known.get(".".join(part for part in mistake["loc"] if isinstance(part, str)))
+    if mistake["type"] == "extra_forbidden":
+        near = _nearest(name, known)
+        if near is not None:
+            return f"there is no key `{name}`; did you mean `{near}` ({allowed(known[near])})?"
+        parent, _, _ = name.rpartition(".")
+        siblings = [key for key in known if key.rpartition(".")[0] == parent]
+        return f"there is no key `{name}`; allowed are: {', '.join(f'`{k}`' for k in siblings)}."
+    if mistake["type"] == "missing" and field is not None:
+        return f"`{name}` is missing; it must be {allowed(field)}."
+    if mistake["type"] == "value_error" or field is None:  # of a validator of ours
+        return f"`{name}`: {mistake['msg']}." if name else f"{mistake['msg']}."
+    return f"`{name}` must be {allowed(field)}, but is {_in_toml(mistake['input'])}."
+
+
+def _nearest(name: str, known: Iterable[str]) -> str | None:
+    """The key that was probably meant, also if it was written in the wrong table."""
+    alike = lambda a, b: difflib.SequenceMatcher(None, a, b).ratio()
+    last = lambda key: key.rpartition(".")[2]
+    score = lambda key: alike(last(key), last(name)) + 0.5 * alike(key, name)
+    best = max(known, key=score, default=None)
+    return best if best is not None and alike(last(best), last(name)) > 0.65 else None
+
+
+def _template_lines(model: type[Section], prefix: str) -> Iterator[str]:
+    sections: list[tuple[str, type[Section], FieldInfo]] = []
+    for name, field in model.model_fields.items():
+        section = _section(field)
+        if section is not None:
+            sections.append((f"{prefix}{name}", section, field))
+        elif name != "experiment":
+            yield f"# {_one_line(field.description)} ({allowed(field)})"
+            if field.is_required():
+                yield f"{name} ="
+            elif (default := field.get_default(call_default_factory=True)) is None:
+                yield f"# {name} ="
+            else:
+                yield f"{name} = {_in_toml(default)}"
+    for name, section, field in sections:
+        yield ""
+        yield f"[{name}]  # {_one_line(field.description)}"
+        yield from _template_lines(section, f"{name}.")
+
+
+def _section(field: FieldInfo) -> type[Section] | None:
+    kind: Any = field.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, Section) else None
+
+
+def _one_line(text: str | None) -> str:
+    return " ".join((text or "").split())
+
+
+def _parse(text: str) -> Any:
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text.strip()
+    # A text with line breaks could smuggle in more keys.
+    return table["value"] if table.keys() == {"value"} else text.strip()
+
+
+def _copy(data: Any) -> Any:
+    return {key: _copy(value) for key, value in data.items()} if isinstance(data, Mapping) else data
+
+
+def _in_toml(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "a table"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_in_toml, value))}]"
+    return f'"{value}"' if isinstance(value, str | Path) else str(value)

@@ -1,0 +1,156 @@
+"""Pictures of an inference: what was hidden, what was found, and the way there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from vertax._bilevel import History
+from vertax._boundary import Periodic
+from vertax._tissue import Tissue
+from vertax.plotting import _style, plot_history, plot_recovery, plot_tissue
+
+Cells = Float[Array | np.ndarray, " cells"]
+
+
+def tissues(
+    panels: Mapping[str, tuple[Tissue, Cells]], *, label: str, cmap: str = "viridis"
+) -> Figure:
+    """Tissues side by side, their cells coloured on one scale.
+
+    **Arguments:**
+
+    - `panels`: tissue and values of its cells by the title of the panel.
+    - `label`: of the colour bar.
+    - `cmap`: the colour map.
+
+    **Returns:** the figure.
+    """
+    everything = np.concatenate([np.asarray(values) for _, values in panels.values()])
+    low, high = everything.min(), everything.max()
+    with _style.house_style():
+        figure, axes = new_figure(len(panels), width=2.5, height=2.5, room=0.7)
+        for ax, (title, (tissue, values)) in zip(axes, panels.items(), strict=True):
+            plot_tissue(tissue, values, ax=ax, vmin=low, vmax=high, cmap=cmap, colorbar=False)
+            ax.set_title(title)
+        figure.colorbar(axes[-1].collections[0], ax=axes, label=label, shrink=0.85, aspect=25)
+    return figure
+
+
+def convergence(history: History) -> Figure:
+    """The curves of a fit over its epochs.
+
+    **Arguments:**
+
+    - `history`: of the fit.
+
+    **Returns:** the figure.
+    """
+    curves = {f.name: getattr(history, f.name) for f in dataclasses.fields(history)}
+    if not np.isfinite(curves["relative_error"]).any():  # the truth is not known
+        del curves["relative_error"]
+    with _style.house_style():
+        n_panels = 3 + ("relative_error" in curves)
+        figure, axes = new_figure(n_panels, width=2.3, height=2.0)
+        plot_history(curves, axes=axes)
+    return figure
+
+
+def recovery(truth: Cells, inferred: Cells, initial: Cells, *, name: str) -> Figure:
+    """Inferred against true parameters.
+
+    **Arguments:**
+
+    - `truth`, `inferred`, `initial`: the parameters.
+    - `name`: what they are called.
+
+    **Returns:** the figure.
+    """
+    with _style.house_style():
+        figure, (ax,) = new_figure(1, width=3.0, height=3.0)
+        plot_recovery(truth, inferred, initial, ax=ax, name=name)
+    return figure
+
+
+def overlays(
+    image: Float[np.ndarray, "rows columns"],
+    panels: Mapping[str, Tissue | None],
+    *,
+    pixel_size: float,
+    upright: bool = False,
+) -> Figure:
+    """An image side by side with itself under meshes.
+
+    **Arguments:**
+
+    - `image`: the image; its first row and column begin at x = 0 and y = 0.
+    - `panels`: the tissue to draw over the image, or None for the image alone, by the title of the
+        panel.
+    - `pixel_size`: side of a pixel, in units of length.
+    - `upright`: draw y upwards, as pictures of tissues are, and not downwards, as images are.
+
+    **Returns:** the figure.
+    """
+    rows, columns = image.shape
+    extent = (0.0, columns * pixel_size, rows * pixel_size, 0.0)
+    dark, bright = np.percentile(image, [0.5, 99.8])
+    with _style.house_style():
+        figure, axes = new_figure(len(panels), width=2.6, height=2.6 * rows / columns + 0.2)
+        for ax, (title, tissue) in zip(axes, panels.items(), strict=True):
+            ax.imshow(image, cmap="gray", vmin=dark, vmax=bright, extent=extent)
+            ax.set_axis_off()
+            ax.set_title(title)
+            if tissue is not None:
+                draw_membranes(ax, tissue)
+            ax.set(xlim=extent[:2], ylim=extent[:1:-1] if upright else extent[2:])
+    return figure
+
+
+def draw_membranes(ax: Axes, tissue: Tissue, *, color: str = _style.HIGHLIGHT) -> None:
+    """All edges of a tissue as lines, in every periodic image that the axes show.
+
+    **Arguments:**
+
+    - `ax`: axes with limits set.
+    - `tissue`: the tissue.
+    - `color`: of the lines.
+    """
+    start, vector = (np.asarray(x, float) for x in tissue.edge_segments)
+    segments = np.stack([start, start + vector], axis=1)
+    if isinstance(tissue.boundary, Periodic):
+        # Each edge once with its middle in the home box, then the eight boxes around that.
+        lattice = np.asarray(tissue.boundary.lattice, float)
+        home = np.floor(segments.mean(axis=1) @ np.linalg.inv(lattice)) @ lattice
+        steps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) @ lattice
+        shifts = steps[:, None] - home
+        segments = (segments + shifts[:, :, None]).reshape(-1, 2, 2)
+    ax.add_collection(
+        LineCollection(list(segments), colors=color, linewidths=0.9, capstyle="round"),
+        autolim=False,
+    )
+
+
+def new_figure(
+    n: int, *, width: float, height: float, room: float = 0.0
+) -> tuple[Figure, list[Axes]]:
+    """A figure of `n` axes side by side, each `width` × `height` inches, which no window shows.
+
+    **Arguments:**
+
+    - `n`: number of axes.
+    - `width`, `height`: of each, in inches.
+    - `room`: more width on the right, for a colour bar.
+
+    **Returns:** the figure and its axes.
+    """
+    # Not pyplot: it keeps every figure open, and on a screen would open windows.
+    layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06)
+    figure = Figure(figsize=(n * width + room, height), layout=layout)
+    return figure, list(figure.subplots(1, n, squeeze=False)[0])

@@ -1,0 +1,93 @@
+"""All experiments by name."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+from vertax.experiments import infer_shape_factors
+from vertax.experiments._config import (
+    ConfigError,
+    ExperimentConfig,
+    apply_overrides,
+    read_toml,
+    validate,
+)
+from vertax.experiments._run import RunFolder
+
+
+class RunFunction(Protocol):
+    """Runs an experiment, writes its results to the folder and returns its metrics."""
+
+    def __call__(self, config: Any, folder: RunFolder, *, progress: bool) -> Mapping[str, Any]: ...
+
+
+class Experiment(NamedTuple):
+    """One experiment: what configures it and what runs it."""
+
+    name: str
+    config: type[ExperimentConfig]
+    run: RunFunction
+    summary: str
+
+
+# One module an experiment, and one entry here.
+_ALL = (
+    Experiment(
+        "infer_shape_factors",
+        infer_shape_factors.Config,
+        infer_shape_factors.run,
+        "Recover hidden target shape factors of a synthetic tissue from its vertices or an image.",
+    ),
+)
+
+EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _ALL}
+
+
+def find_experiment(name: Any) -> Experiment:
+    """The experiment of a name.
+
+    **Arguments:**
+
+    - `name`: as in the key `experiment` of a configuration.
+
+    **Returns:** the experiment.
+
+    **Raises:**
+
+    - `ConfigError` with the nearest name if there is none of this name.
+    """
+    if isinstance(name, str) and name in EXPERIMENTS:
+        return EXPERIMENTS[name]
+    near = difflib.get_close_matches(str(name), EXPERIMENTS, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(EXPERIMENTS)}."
+    raise ConfigError(f"There is no experiment {name!r}; {hint}")
+
+
+def load_config(
+    path: str | os.PathLike[str], overrides: Iterable[str] = ()
+) -> tuple[Experiment, ExperimentConfig]:
+    """Read and check a configuration file.
+
+    **Arguments:**
+
+    - `path`: a TOML file; its key `experiment` says which experiment it configures.
+    - `overrides`: texts `key=value` that set single keys, see
+        [`apply_overrides`][vertax.experiments.apply_overrides].
+
+    **Returns:** the experiment and its configuration.
+
+    **Raises:**
+
+    - `ConfigError` if the file is missing or no TOML, or for an unknown or ill-typed key.
+    """
+    data = apply_overrides(read_toml(path), overrides)
+    if "experiment" not in data:
+        raise ConfigError(
+            f"In {os.fspath(path)}: `experiment` is missing; it names the experiment to run, one "
+            f"of {', '.join(EXPERIMENTS)}."
+        )
+    experiment = find_experiment(data["experiment"])
+    return experiment, validate(experiment.config, data, os.fspath(path))

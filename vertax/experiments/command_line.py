@@ -1,0 +1,139 @@
+"""The command `vertax`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+# JAX and the experiments are imported by the commands that need them, so that help comes quickly.
+
+app = typer.Typer(
+    help="A differentiable vertex model of epithelial tissue.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+USAGE, FAILURE = 2, 1
+
+
+def main() -> None:
+    """Entry point of the program `vertax`."""
+    app()
+
+
+def _show_version(wanted: bool) -> bool:
+    if wanted:
+        from vertax.experiments import installed_version
+
+        typer.echo(f"vertax {installed_version('vertax')}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _options(
+    show_version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command("list")
+def list_experiments() -> None:
+    """List all experiments."""
+    from vertax.experiments import EXPERIMENTS
+
+    width = max(map(len, EXPERIMENTS))
+    for name, experiment in EXPERIMENTS.items():
+        typer.echo(f"{name:{width}}  {experiment.summary}")
+
+
+@app.command()
+def describe(
+    experiment: Annotated[str, typer.Argument(help="Name of an experiment, see `vertax list`.")],
+) -> None:
+    """Print a configuration file with every key of an experiment, explained and at its default."""
+    from vertax.experiments import ConfigError, find_experiment, template
+
+    try:
+        found = find_experiment(experiment)
+    except ConfigError as error:
+        _stop(error, USAGE)
+    typer.echo(template(found.config, experiment), nl=False)
+
+
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(help="Configuration file, e.g. configs/demo.toml.")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Set one key, e.g. fit.epochs=50; may be repeated."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the results; by default runs/NAME of the configuration, or NAME-2, … "
+            "if there is one already.",
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Show no progress bar and no summary.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show where in the program an error occurred.")
+    ] = False,
+) -> None:
+    """Run the experiment that a configuration file describes."""
+    import jax
+    import matplotlib
+
+    from vertax import FitError
+    from vertax.experiments import ConfigError, RunFolder, RunFolderError, load_config, summary
+
+    # Figures go to files only, also where there is a screen.
+    matplotlib.use("Agg")
+    try:
+        experiment, settings = load_config(config, overrides or ())
+        # The library leaves the precision of JAX to the user; here the configuration decides.
+        jax.config.update("jax_enable_x64", settings.precision == "float64")
+        folder = RunFolder.claim(config.stem, output, overwrite=overwrite)
+        folder.save_config(settings)
+        if not quiet:
+            typer.echo(f"{experiment.name}: {config} → {folder.path}")
+        metrics = experiment.run(settings, folder, progress=not quiet)
+        folder.save_metrics(metrics)
+    # What a user can cause and mend gets a message; anything else is our fault, with a traceback.
+    except (ConfigError, RunFolderError) as error:
+        if debug:
+            raise
+        _stop(error, USAGE)
+    except (FitError, ValueError, OSError, RuntimeError) as error:
+        if debug:
+            raise
+        _stop(error, FAILURE)
+    if not quiet:
+        typer.echo(summary(metrics))
+        typer.echo(f"Results: {folder.path}")
+        for figure in folder.figures():
+            typer.echo(f"  {figure}")
+
+
+def _stop(error: Exception, code: int) -> NoReturn:
+    typer.echo(f"Error: {error}", err=True)
+    raise typer.Exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,275 @@
+"""Recover hidden target shape factors of a synthetic tissue from its vertices or an image of it.
+
+A periodic Voronoi tissue gets a target shape factor for each cell, drawn at random, and is relaxed.
+What is seen of it (its vertices, or a microscopy image) and its topology are all that the fit is
+given; it starts from a guess of the shape factors and has to find the hidden ones (paper,
+"Benchmarking bilevel optimization approaches on vertex models").
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field
+
+from vertax._bilevel import Fit, FitError, InverseProblem, fit
+from vertax._equilibrium import equilibrate
+from vertax._tissue import Tissue
+from vertax.costs import AbstractCost, MeshImage, VertexDistance, render
+from vertax.energies import AbstractEnergy, ShapeFactorEnergy
+from vertax.experiments import _figures
+from vertax.experiments._config import ExperimentConfig, Section
+from vertax.experiments._run import RunFolder, history_columns
+from vertax.experiments._sections import Fitting, Relaxation
+from vertax.initialise import periodic_voronoi
+
+_NAME = r"$p_0$"
+
+
+class TissueSection(Section):
+    """The tissue, in a square box in which the mean area of a cell is 1."""
+
+    n_cells: int = Field(default=20, ge=4)
+    """Number of cells."""
+    lloyd_steps: int = Field(default=0, ge=0)
+    """Steps of Lloyd's algorithm, which make the first tissue more regular."""
+
+
+class ShapeFactors(Section):
+    """The normal distribution that the hidden shape factors are drawn from."""
+
+    mean: float = Field(default=3.7, gt=0)
+    """Mean."""
+    deviation: float = Field(default=0.1, ge=0)
+    """Standard deviation."""
+
+
+class ImageSection(Section):
+    """The synthetic microscopy image; intensities are relative to the brightest membrane."""
+
+    pixels: int = Field(default=128, ge=16)
+    """Side of the image in pixels."""
+    psf_width: float = Field(default=2.0, ge=1)
+    """Standard deviation of the point spread function in pixels."""
+    noise: float = Field(default=0.05, ge=0)
+    """Standard deviation of the noise of a pixel."""
+    background: float = Field(default=0.1, ge=0)
+    """Intensity where there is no membrane."""
+    uneven_gain: float = Field(default=0.0, ge=0, lt=1)
+    """Amplitude of a slow variation of brightness over the image."""
+
+
+class Config(ExperimentConfig):
+    """Configuration of this experiment."""
+
+    experiment: Literal["infer_shape_factors"] = "infer_shape_factors"
+    """Which experiment this is."""
+    data: Literal["vertices", "image", "both"] = "vertices"
+    """What the fit is given; both makes one fit from each."""
+    guess: Literal["redrawn", "mean"] = "redrawn"
+    """Where the fit starts: another draw of the distribution, or its mean in all cells."""
+    tissue: TissueSection = TissueSection()
+    """The tissue."""
+    truth: ShapeFactors = ShapeFactors()
+    """Distribution of the hidden shape factors."""
+    image: ImageSection = ImageSection()
+    """The synthetic microscopy image."""
+    fit: Fitting = Fitting()
+    """How the parameters are fitted."""
+    relaxation: Relaxation = Relaxation()
+    """How the tissue is relaxed."""
+
+
+class _Scene(eqx.Module):
+    """What is hidden, what is seen of it, and where the fit starts."""
+
+    truth: ShapeFactorEnergy
+    target: Tissue
+    guess: ShapeFactorEnergy
+    initial: Tissue
+    image: Float[np.ndarray, "rows columns"] | None
+
+
+def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
+    """Run the experiment.
+
+    **Arguments:**
+
+    - `config`: its configuration.
+    - `folder`: where the results go.
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** the metrics: `pearson`, `relative_error`, `cost_initial`, `cost_final`, `max_force`
+    and others of the fit; if there are two kinds of data, a mapping of them for each.
+
+    **Raises:**
+
+    - `FitError` if a fit cannot go on; the folder then holds what came before.
+    """
+    scene = _make_scene(config)
+    _save_scene(config, scene, folder)
+    both = config.data == "both"
+    metrics: dict[str, dict[str, Any]] = {}
+    fits: dict[str, Fit] = {}
+    for source in ("vertices", "image") if both else (config.data,):
+        try:
+            fits[source] = _fit(config, scene, source, progress)
+        except FitError as error:
+            if error.fit is not None:
+                _save_tables(scene, fits | {source: error.fit}, folder)
+            raise
+        _save_tables(scene, fits, folder)
+        _save_fit(config, scene, source, fits[source], folder)
+        metrics[source] = _metrics(scene, fits[source])
+    return metrics if both else metrics[config.data]
+
+
+def synthetic_image(
+    tissue: Tissue, options: ImageSection, key: PRNGKeyArray
+) -> Float[np.ndarray, "rows columns"]:
+    """What a microscope might see of a tissue: blurred membranes on a background, uneven and noisy.
+
+    **Arguments:**
+
+    - `tissue`: a tissue in a square periodic box.
+    - `options`: the microscope.
+    - `key`: of the noise.
+
+    **Returns:** the image of one period, rows along y.
+    """
+    shape = (options.pixels, options.pixels)
+    width = options.psf_width * _pixel_size(tissue, options)
+    membranes = np.asarray(eqx.filter_jit(render)(tissue, shape, width), float)
+    # Brightest off the centre, and periodic as the tissue is.
+    phase = 2 * np.pi * (np.arange(options.pixels) + 0.5) / options.pixels
+    gain = 1 + 0.5 * options.uneven_gain * (np.sin(phase)[:, None] + np.cos(phase)[None, :])
+    noise = np.asarray(jax.random.normal(key, shape), float)
+    return gain * (membranes / membranes.max() + options.background) + options.noise * noise
+
+
+def _make_scene(config: Config) -> _Scene:
+    keys = jax.random.split(jax.random.key(config.seed), 4)
+    n_cells, prior = config.tissue.n_cells, config.truth
+    draw = lambda key: prior.mean + prior.deviation * jax.random.normal(key, (n_cells,))
+    truth = ShapeFactorEnergy(draw(keys[0]))
+    guess = ShapeFactorEnergy(
+        draw(keys[1]) if config.guess == "redrawn" else jnp.full(n_cells, prior.mean)
+    )
+    first = periodic_voronoi(n_cells, key=keys[2], lloyd_steps=config.tissue.lloyd_steps)
+    # The hidden tissue is a true equilibrium, however coarsely the fit is told to relax.
+    relaxed = equilibrate(first, truth, **Relaxation().options(), throw=False)
+    if not relaxed.converged:
+        raise ValueError(
+            f"The hidden tissue did not reach equilibrium (largest force {relaxed.max_force:.1e}): "
+            "choose another seed, or a smaller truth.mean or truth.deviation."
+        )
+    target = relaxed.tissue
+    # The guess relaxes from the target's topology, because vertices are compared by number. A
+    # coarse relaxation need not reach the tolerance here; the fit reports how often it did.
+    initial = equilibrate(target, guess, **config.relaxation.options(), throw=False).tissue
+    needs_image = config.data != "vertices"
+    image = synthetic_image(target, config.image, keys[3]) if needs_image else None
+    return _Scene(truth, target, guess, initial, image)
+
+
+def _fit(config: Config, scene: _Scene, source: str, progress: bool) -> Fit:
+    cost: AbstractCost
+    if source == "image":
+        assert scene.image is not None
+        width = config.image.psf_width * _pixel_size(scene.target, config.image)
+        cost = MeshImage(scene.image, width)
+    else:
+        cost = VertexDistance(scene.target)
+    problem = InverseProblem(
+        scene.initial,
+        scene.guess,
+        cost,
+        # Vertices keep their centroid while they relax; an image does not say where it was.
+        fit_position=source == "image",
+        **config.relaxation.options(),
+    )
+    optimiser = config.fit.build()
+    return fit(problem, optimiser, config.fit.epochs, truth=scene.truth, progress=progress)
+
+
+def _metrics(scene: _Scene, outcome: Fit) -> dict[str, Any]:
+    true, inferred = _parameters(scene.truth), _parameters(outcome.energy)
+    history = outcome.history
+    varied = np.ptp(true) > 0 and np.ptp(inferred) > 0
+    return {
+        "pearson": np.corrcoef(true, inferred)[0, 1] if varied else np.nan,
+        "relative_error": np.mean(np.abs(inferred - true) / np.abs(true)),
+        "relative_error_initial": history.relative_error[0],
+        "cost_initial": history.cost[0],
+        "cost_final": outcome.cost,
+        "max_force": outcome.max_force,
+        "epochs": len(history.cost),
+        "best_epoch": outcome.best_epoch,
+        # The first epoch is the one that is compiled.
+        "seconds_per_epoch": np.median(history.seconds[1:]) if len(history.cost) > 1 else np.nan,
+        "num_t1": history.num_t1.sum(),
+        "converged_fraction": history.converged.mean(),
+        "same_neighbours": _neighbours(outcome.tissue) == _neighbours(scene.target),
+    }
+
+
+def _save_scene(config: Config, scene: _Scene, folder: RunFolder) -> None:
+    folder.save_tissue("target", scene.target)
+    folder.save_tissue("initial", scene.initial)
+    panels = {"target": (scene.target, _parameters(scene.truth))}
+    folder.save_figure("target", _figures.tissues(panels, label=f"true {_NAME}"))
+    if scene.image is not None:
+        folder.save_array("image", scene.image)
+
+
+def _save_tables(scene: _Scene, fits: dict[str, Fit], folder: RunFolder) -> None:
+    inferred = {
+        "inferred" if len(fits) == 1 else f"inferred_{source}": _parameters(outcome.energy)
+        for source, outcome in fits.items()
+    }
+    true, initial = _parameters(scene.truth), _parameters(scene.guess)
+    cells = {"cell": np.arange(len(true)), "true": true, "initial": initial} | inferred
+    folder.save_table("shape_factors", cells)
+    epochs = [history_columns(outcome.history, data=source) for source, outcome in fits.items()]
+    folder.save_table(
+        "history", {name: np.concatenate([e[name] for e in epochs]) for name in epochs[0]}
+    )
+
+
+def _save_fit(config: Config, scene: _Scene, source: str, outcome: Fit, folder: RunFolder) -> None:
+    ending = f"_{source}" if config.data == "both" else ""
+    folder.save_tissue(f"fitted{ending}", outcome.tissue)
+    true, inferred, initial = map(_parameters, (scene.truth, outcome.energy, scene.guess))
+    panels = {
+        "initial guess": (scene.initial, initial),
+        "fitted": (outcome.tissue, inferred),
+        "target": (scene.target, true),
+    }
+    label = f"target shape factor {_NAME}"
+    folder.save_figure(f"before_after{ending}", _figures.tissues(panels, label=label))
+    folder.save_figure(f"convergence{ending}", _figures.convergence(outcome.history))
+    folder.save_figure(f"recovery{ending}", _figures.recovery(true, inferred, initial, name=_NAME))
+    if source == "image" and scene.image is not None:
+        overlays = {"image": None, "initial guess": scene.initial, "fitted": outcome.tissue}
+        pixel = _pixel_size(scene.target, config.image)
+        figure = _figures.overlays(scene.image, overlays, pixel_size=pixel, upright=True)
+        folder.save_figure(f"overlay{ending}", figure)
+
+
+def _parameters(energy: AbstractEnergy) -> Float[np.ndarray, " cells"]:
+    assert isinstance(energy, ShapeFactorEnergy)
+    return np.asarray(energy.target_shape_factor, float)
+
+
+def _neighbours(tissue: Tissue) -> list[list[int]]:
+    """The two cells of each edge, in an order that does not depend on how edges are numbered."""
+    return sorted(np.sort(np.asarray(tissue.topology.edge_cells), axis=1).tolist())
+
+
+def _pixel_size(tissue: Tissue, options: ImageSection) -> float:
+    return float(np.sqrt(tissue.n_cells)) / options.pixels
