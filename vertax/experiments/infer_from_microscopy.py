@@ -9,11 +9,9 @@ are reported.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -44,7 +42,7 @@ class ImageSection(Section):
     """Which plane, if it is a stack."""
     pixels: int = Field(default=256, ge=32)
     """Longer side, in pixels, of the image that the model is compared with."""
-    background_width: float = Field(default=1.0, gt=0)
+    background_width: float = Field(default=0.5, gt=0)
     """Width of the filter that evens out the illumination, in mean cell diameters."""
     psf_width: float | None = Field(default=None, gt=0)
     """Standard deviation of the blur, in pixels of the file; left out, the one that fits best."""
@@ -295,6 +293,3 @@ def _draw(
         label="target shape factor $p_0$",
     )
     folder.save_figure("shape_factors", figure)
-    panels = {"relaxed first guess": initial, "fitted": outcome.tissue}
-    observed = {name: (t, np.asarray(t.shape_factors)) for name, t in panels.items()}
-    folder.save_figure("before_after", _figures.tissues(observed, label=r"shape factor $P/\sqrt{A}$"))
