@@ -10,7 +10,9 @@ import equinox as eqx
 import jax
 
 
-def first_and_best(function: Callable[..., Any], *args: Any, repeats: int = 7) -> tuple[float, float]:
+def first_and_best(
+    function: Callable[..., Any], *args: Any, repeats: int = 7
+) -> tuple[float, float]:
     """Seconds of the first call (which compiles) and of the fastest of some later ones."""
 
     def once() -> float:

@@ -16,7 +16,9 @@ jax.config.update("jax_enable_x64", True)
 
 def main(sizes: tuple[int, ...] = (20, 100, 1000), epochs: int = 60) -> None:
     """Print one row a size."""
-    print(f"{'cells':>6} {'first epoch s':>14} {'ms/epoch':>9} {'Newton steps':>13} {'relative error':>24}")
+    print(
+        f"{'cells':>6} {'first epoch s':>14} {'ms/epoch':>9} {'Newton steps':>13} {'relative error':>24}"
+    )
     for n in sizes:
         tissue = vx.initialise.periodic_voronoi(n, key=jax.random.key(0))
         p0 = 3.7 + 0.1 * jax.random.normal(jax.random.key(1), (n,))

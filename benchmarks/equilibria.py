@@ -24,7 +24,9 @@ def main(n_tissues: int = 100, n_cells: int = 64) -> None:
     """Print one row a mean target shape factor."""
     print(f"{n_tissues} random Voronoi tissues of {n_cells} cells, s.d. of p0 0.1, force < 1e-8")
     print(f"{'mean p0':>8} {'share':>6} {'steps':>12} {'T1s':>6} {'ms':>15} {'largest force':>14}")
-    tissues = [vx.initialise.periodic_voronoi(n_cells, key=jax.random.key(s)) for s in range(n_tissues)]
+    tissues = [
+        vx.initialise.periodic_voronoi(n_cells, key=jax.random.key(s)) for s in range(n_tissues)
+    ]
     for mean in (3.5, 3.7, 3.8, 3.9):
         rows = []
         for seed, tissue in enumerate(tissues):
@@ -37,7 +39,8 @@ def main(n_tissues: int = 100, n_cells: int = 64) -> None:
         converged, steps, t1s, seconds, force = np.array(rows, float).T
         print(
             f"{mean:8.2f} {converged.mean():6.2f} {np.median(steps):5.0f} ≤{steps.max():5.0f} "
-            f"{t1s.mean():6.1f} {1e3 * np.median(seconds):6.1f} ≤{1e3 * seconds.max():7.1f} {force.max():14.1e}"
+            f"{t1s.mean():6.1f} {1e3 * np.median(seconds):6.1f} ≤{1e3 * seconds.max():7.1f} "
+            f"{force.max():14.1e}"
         )
 
 

@@ -47,7 +47,8 @@ def random_like(x, seed=0):
     leaves, structure = jax.tree.flatten(x)
     keys = jax.random.split(jax.random.key(seed), len(leaves))
     return jax.tree.unflatten(
-        structure, [jax.random.normal(k, a.shape, a.dtype) for k, a in zip(keys, leaves, strict=True)]
+        structure,
+        [jax.random.normal(k, a.shape, a.dtype) for k, a in zip(keys, leaves, strict=True)],
     )
 
 
@@ -66,6 +67,18 @@ def tissues(draw, min_cells: int = 1, max_cells: int = 30):
     n = draw(st.sampled_from([n for n in (1, 2, 3, 5, 12, 30) if min_cells <= n <= max_cells]))
     seed, lattice = draw(st.integers(0, 2**16)), draw(lattices(n))
     return functools.partial(random_tissue, n, seed, lattice=lattice)
+
+
+def box(tissue: vx.Tissue) -> vx.Periodic:
+    """The boundary of a periodic tissue."""
+    assert isinstance(tissue.boundary, vx.Periodic)
+    return tissue.boundary
+
+
+def p0_of(energy: vx.AbstractEnergy) -> jax.Array:
+    """The target shape factors of an energy E1."""
+    assert isinstance(energy, vx.energies.ShapeFactorEnergy)
+    return jnp.asarray(energy.target_shape_factor)
 
 
 def dense_hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> np.ndarray:

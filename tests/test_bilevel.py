@@ -112,7 +112,9 @@ def test_the_optimiser_keeps_its_momentum_over_epochs(hidden):
     energy, state, tissue = guess, optimiser.init(eqx.filter(guess, eqx.is_inexact_array)), start
     for _ in range(3):
         problem = vx.InverseProblem(tissue, energy, cost)
-        (_, found), gradient = eqx.filter_value_and_grad(lambda e, p=problem: p(e), has_aux=True)(energy)
+        (_, found), gradient = eqx.filter_value_and_grad(lambda e, p=problem: p(e), has_aux=True)(
+            energy
+        )
         updates, state = optimiser.update(gradient, state)
         energy, tissue = eqx.apply_updates(energy, updates), found.tissue
     fit = vx.fit(vx.InverseProblem(start, guess, cost), optimiser, 4, progress=False)
@@ -177,7 +179,7 @@ def test_an_interrupt_keeps_what_there_is(hidden):
 def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):
     target, _, guess, start = hidden
     problem = vx.InverseProblem(start, guess, VertexDistance(target), max_steps=300)
-    with pytest.raises(vx.FitError, match="not finite|broke down") as error:
+    with pytest.raises(vx.FitError, match=r"not finite|broke down") as error:
         vx.fit(problem, optax.sgd(1e300), 20, progress=False)
     assert error.value.fit is not None
     assert error.value.fit.best_epoch == 0
@@ -207,5 +209,3 @@ def test_shape_factors_in_float32(hidden):
     fit = vx.fit(problem, optax.adam(1e-2), 80, truth=truth, progress=False)
     assert fit.energy.target_shape_factor.dtype == jnp.float32
     assert fit.history.relative_error[-1] < 0.1 * fit.history.relative_error[0]
-
-

@@ -75,7 +75,9 @@ def test_cost_of_the_own_image_is_zero_whatever_its_brightness():
     for scale, background in ((1.0, 0.0), (250.0, 31.0), (1e-3, -5.0)):
         cost = MeshImage(scale * image + background, 0.12)
         assert cost(tissue, energy) == pytest.approx(0, abs=1e-12)
-    assert MeshImage(image, 0.12, fit_intensity=False)(tissue, energy) == pytest.approx(0, abs=1e-12)
+    assert MeshImage(image, 0.12, fit_intensity=False)(tissue, energy) == pytest.approx(
+        0, abs=1e-12
+    )
     assert MeshImage(2 * image, 0.12, fit_intensity=False)(tissue, energy) > 0.01
     assert MeshImage(-image, 0.12)(tissue, energy) == pytest.approx(0.5)
 
@@ -84,7 +86,10 @@ def test_image_cost_is_least_at_the_true_tissue():
     tissue, _ = relaxed(9, 1)
     cost = MeshImage(render(tissue, (64, 64), 0.1), 0.1)
     noise = random_like(tissue.vertices)
-    values = [float(cost(tissue.with_configuration(tissue.vertices + s * noise), energy)) for s in (0, 0.01, 0.05)]
+    values = [
+        float(cost(tissue.with_configuration(tissue.vertices + s * noise), energy))
+        for s in (0, 0.01, 0.05)
+    ]
     assert values[0] < values[1] < values[2]
 
 
@@ -111,9 +116,7 @@ def test_derivatives_of_the_image_cost(fit_intensity):
 
     inputs = (tissue.vertices, jnp.array(0.15), tissue.boundary.lattice)
     direction = random_like(inputs)
-    slope = sum(
-        jnp.sum(g * d) for g, d in zip(jax.grad(f)(inputs), direction, strict=True)
-    )
+    slope = sum(jnp.sum(g * d) for g, d in zip(jax.grad(f)(inputs), direction, strict=True))
     assert slope == pytest.approx(float(central_difference(f, inputs, direction, 1e-6)), rel=1e-6)
 
 
@@ -130,7 +133,9 @@ def test_vertex_distance_follows_its_formula_and_gradient():
     noise = 0.05 * random_like(tissue.vertices)
     moved = tissue.with_configuration(tissue.vertices + noise)
     cost = VertexDistance(tissue)
-    assert cost(moved, energy) == pytest.approx(float(0.5 * jnp.mean(jnp.sum(noise**2, 1))), rel=1e-9)
+    assert cost(moved, energy) == pytest.approx(
+        float(0.5 * jnp.mean(jnp.sum(noise**2, 1))), rel=1e-9
+    )
     gradient = jax.grad(lambda x: cost(moved.with_configuration(x), energy))(moved.vertices)
     np.testing.assert_allclose(gradient, noise / 18, rtol=1e-9)
 
@@ -144,9 +149,9 @@ def test_weighted_sums():
     assert total(tissue, energy) == pytest.approx(float(expected))
     assert (2 * total + b)(tissue, energy) == pytest.approx(float(2 * expected + b(tissue, energy)))
     with pytest.raises(TypeError):
-        a * b  # noqa: B018
+        a * b  # pyright: ignore
     with pytest.raises(TypeError):
-        a + 1.0  # noqa: B018  # pyright: ignore
+        a + 1.0  # pyright: ignore
 
 
 def test_a_cost_of_the_parameters():

@@ -155,7 +155,7 @@ def test_bad_settings_are_refused(options):
 
 
 def test_no_retracing_between_calls():
-    traces = []
+    traces, first = [], 0
 
     class Counting(vx.AbstractEnergy):
         p0: jax.Array

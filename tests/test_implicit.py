@@ -35,7 +35,9 @@ def test_hypergradient_against_a_dense_pseudo_inverse_and_finite_differences(n_c
     at = vx.equilibrate(tissue, energy, tolerance=1e-12, transitions=None).tissue
     pull = jax.grad(lambda x: cost(at.with_configuration(x), energy))(at.vertices).ravel()
     mixed = jax.jacobian(
-        lambda p: jax.grad(lambda x: ShapeFactorEnergy(p)(at.with_configuration(x)))(at.vertices).ravel()
+        lambda p: jax.grad(lambda x: ShapeFactorEnergy(p)(at.with_configuration(x)))(
+            at.vertices
+        ).ravel()
     )(p0)
     dense = -mixed.T @ np.linalg.pinv(dense_hessian(at, energy), rcond=1e-10) @ pull
     assert np.linalg.norm(gradient - dense) < 1e-7 * np.linalg.norm(dense)
@@ -65,7 +67,9 @@ def test_gradient_with_respect_to_line_tensions():
 
     direction = random_like(tension)
     slope = jnp.sum(jax.grad(loss)(tension) * direction)
-    assert slope == pytest.approx(float(central_difference(jax.jit(loss), tension, direction)), rel=1e-5)
+    assert slope == pytest.approx(
+        float(central_difference(jax.jit(loss), tension, direction)), rel=1e-5
+    )
 
 
 def test_gradient_with_respect_to_the_shape_of_the_box():
@@ -79,7 +83,9 @@ def test_gradient_with_respect_to_the_shape_of_the_box():
     lattice = tissue.boundary.lattice
     direction = 0.1 * random_like(lattice)
     slope = jnp.sum(jax.grad(loss)(lattice) * direction)
-    assert slope == pytest.approx(float(central_difference(jax.jit(loss), lattice, direction)), rel=1e-6)
+    assert slope == pytest.approx(
+        float(central_difference(jax.jit(loss), lattice, direction)), rel=1e-6
+    )
 
 
 def test_gradient_through_a_relaxation_with_t1_transitions():

@@ -7,8 +7,7 @@ import lineax as lx
 import numpy as np
 import pytest
 import scipy.sparse.linalg as spla
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from vertax.solvers import MINRES
 

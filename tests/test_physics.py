@@ -68,7 +68,9 @@ def test_area_stiffness_of_the_hexagonal_lattice(lattice):
     assert jax.hessian(of_area)(1.0) == pytest.approx(k_a + k_p * C * p0 / 4, rel=1e-9)
 
 
-@pytest.mark.parametrize(("contractility", "expected"), [(0.0, 0.29246), (0.04, 0.17975), (0.08, 0.08704)])
+@pytest.mark.parametrize(
+    ("contractility", "expected"), [(0.0, 0.29246), (0.04, 0.17975), (0.08, 0.08704)]
+)
 def test_collapse_of_the_hexagonal_ground_state(lattice, contractility, expected):
     # Farhadifar et al. 2007: above this line tension the collapsed network has the lower energy.
     scales = jnp.linspace(0.02, 1.3, 4000)
@@ -140,8 +142,8 @@ def test_stress_from_tensions_and_pressures_is_the_derivative_by_the_strain_of_t
     pressure = jnp.sum(k_a * (tissue.areas - 1.1) * tissue.areas) * jnp.eye(2)
     cells = tissue.topology.edge_cells
     tension = gamma + k_p * jnp.sum(tissue.perimeters[cells] - p0, axis=1)
-    l = tissue.edge_vectors
-    outer = l[:, :, None] * l[:, None, :] / tissue.edge_lengths[:, None, None]
+    edge = tissue.edge_vectors
+    outer = edge[:, :, None] * edge[:, None, :] / tissue.edge_lengths[:, None, None]
     formula = (pressure + jnp.sum(tension[:, None, None] * outer, axis=0)) / tissue.boundary.area
 
     def relaxed_energy(strain):

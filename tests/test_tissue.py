@@ -31,7 +31,9 @@ def test_translation_changes_no_shape(recipe, x, y):
     moved = tissue.with_configuration(tissue.vertices + jnp.array([x, y]))
     np.testing.assert_allclose(moved.areas, tissue.areas, rtol=1e-10)
     np.testing.assert_allclose(moved.perimeters, tissue.perimeters, rtol=1e-12)
-    np.testing.assert_allclose(moved.centroids - tissue.centroids, [[x, y]] * tissue.n_cells, atol=1e-9)
+    np.testing.assert_allclose(
+        moved.centroids - tissue.centroids, [[x, y]] * tissue.n_cells, atol=1e-9
+    )
 
 
 @many
@@ -39,7 +41,9 @@ def test_translation_changes_no_shape(recipe, x, y):
 def test_rotation_changes_no_shape(recipe, angle):
     tissue = recipe()
     turn = jnp.array([[jnp.cos(angle), jnp.sin(angle)], [-jnp.sin(angle), jnp.cos(angle)]])
-    turned = with_lattice(tissue.with_configuration(tissue.vertices @ turn), tissue.boundary.lattice @ turn)
+    turned = with_lattice(
+        tissue.with_configuration(tissue.vertices @ turn), tissue.boundary.lattice @ turn
+    )
     np.testing.assert_allclose(turned.areas, tissue.areas, rtol=1e-10)
     np.testing.assert_allclose(turned.perimeters, tissue.perimeters, rtol=1e-11)
 
@@ -54,7 +58,9 @@ def test_relabelling_the_seeds_relabels_the_cells(recipe, random):
     order = list(range(tissue.n_cells))
     random.shuffle(order)
     make = lambda s: vx.initialise.periodic_voronoi(seeds=s, lattice=tissue.boundary.lattice)
-    np.testing.assert_allclose(make(seeds[order]).areas, make(seeds).areas[np.array(order)], rtol=1e-9)
+    np.testing.assert_allclose(
+        make(seeds[order]).areas, make(seeds).areas[np.array(order)], rtol=1e-9
+    )
 
 
 @many
@@ -72,7 +78,9 @@ def test_geometry_of_each_cell_agrees_with_its_polygon(recipe):
         q = np.roll(p, -1, axis=0)
         area = 0.5 * np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
         assert tissue.areas[c] == pytest.approx(area, rel=1e-10)
-        assert tissue.perimeters[c] == pytest.approx(np.sqrt(((q - p) ** 2).sum(1) + 1e-6).sum(), rel=1e-10)
+        assert tissue.perimeters[c] == pytest.approx(
+            np.sqrt(((q - p) ** 2).sum(1) + 1e-6).sum(), rel=1e-10
+        )
         assert tissue.neighbour_counts[c] == len(loop)
         fan = np.stack([np.roll(p, -1, 0)[:-2], np.roll(p, -2, 0)[:-2]])[:, :, :] - p[0]
         weights = 0.5 * (fan[0, :, 0] * fan[1, :, 1] - fan[0, :, 1] * fan[1, :, 0])
@@ -111,7 +119,9 @@ def test_hexagonal_lattice():
     np.testing.assert_allclose(tissue.shape_factors, 3.7224194364083982, rtol=1e-12)
     assert (tissue.neighbour_counts == 6).all()
     spacing = np.sqrt(5 / np.sqrt(3))
-    seeds = spacing * np.array([[c + 0.5 * (r % 2), r * np.sqrt(3) / 2] for r in range(6) for c in range(4)])
+    seeds = spacing * np.array(
+        [[c + 0.5 * (r % 2), r * np.sqrt(3) / 2] for r in range(6) for c in range(4)]
+    )
     apart = tissue.boundary.shortest(tissue.centroids - seeds)
     np.testing.assert_allclose(apart, 0, atol=1e-12)
 
@@ -138,11 +148,15 @@ def test_vertices_may_leave_the_box_one_by_one():
     np.testing.assert_allclose(moved.edge_vectors, tissue.edge_vectors, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["areas", "perimeters", "shape_factors", "centroids", "edge_lengths"])
+@pytest.mark.parametrize(
+    "name", ["areas", "perimeters", "shape_factors", "centroids", "edge_lengths"]
+)
 def test_derivatives_of_geometry(name):
     tissue = random_tissue(6, 2)
     check_grads(
-        lambda x, lattice: getattr(with_lattice(tissue.with_configuration(jnp.asarray(x)), lattice), name),
+        lambda x, lattice: getattr(
+            with_lattice(tissue.with_configuration(jnp.asarray(x)), lattice), name
+        ),
         (tissue.vertices, tissue.boundary.lattice),
         order=2,
         atol=1e-4,
@@ -154,7 +168,7 @@ def test_derivatives_of_geometry(name):
 @pytest.mark.parametrize("softening", [0.0, 1e-3])
 def test_derivatives_are_finite_at_a_four_fold_vertex(softening):
     tissue = random_tissue(12, 4, softening=softening)
-    v, w = tissue.topology.edge_vertices[3]
+    _, w = tissue.topology.edge_vertices[3]
     step = tissue.edge_vectors[3]
     merged = tissue.with_configuration(tissue.vertices.at[w].add(-step))
     assert merged.edge_lengths[3] == pytest.approx(softening, abs=1e-12)
@@ -171,7 +185,9 @@ def test_softening_changes_lengths_by_parts_in_a_million():
     exact = jnp.linalg.norm(sharp.edge_vectors, axis=1)
     np.testing.assert_allclose(sharp.edge_lengths, exact, rtol=1e-14)
     np.testing.assert_allclose(soft.edge_lengths, jnp.sqrt(exact**2 + 1e-6), rtol=1e-12)
-    assert vx.Tissue(soft.vertices, soft.topology, soft.boundary).softening == pytest.approx(1e-3, rel=0.3)
+    assert vx.Tissue(soft.vertices, soft.topology, soft.boundary).softening == pytest.approx(
+        1e-3, rel=0.3
+    )
 
 
 def test_float32_tissues_stay_float32():
@@ -180,7 +196,9 @@ def test_float32_tissues_stay_float32():
     small = jax.tree.map(to32, tissue)
     for name in ("areas", "perimeters", "edge_lengths", "centroids"):
         assert getattr(small, name).dtype == jnp.float32
-        np.testing.assert_allclose(getattr(small, name), getattr(tissue, name), rtol=2e-5, atol=2e-5)
+        np.testing.assert_allclose(
+            getattr(small, name), getattr(tissue, name), rtol=2e-5, atol=2e-5
+        )
 
 
 def test_bad_tissues_are_refused():
@@ -191,7 +209,11 @@ def test_bad_tissues_are_refused():
         vx.Tissue(tissue.vertices.at[0, 0].set(jnp.nan), tissue.topology, tissue.boundary)
     with pytest.raises(ValueError, match="`softening`"):
         vx.Tissue(tissue.vertices, tissue.topology, tissue.boundary, -1.0)
-    for lattice in ([[1.0, 0.0], [0.0, -1.0]], [[1.0, 0.0], [2.0, 0.0]], [[np.nan, 0.0], [0.0, 1.0]]):
+    for lattice in (
+        [[1.0, 0.0], [0.0, -1.0]],
+        [[1.0, 0.0], [2.0, 0.0]],
+        [[np.nan, 0.0], [0.0, 1.0]],
+    ):
         with pytest.raises(ValueError, match="`lattice`"):
             vx.Periodic(jnp.array(lattice))
     with pytest.raises(ValueError, match="`lattice` must hold two"):
@@ -204,7 +226,9 @@ def test_shortest_displacement_is_the_shortest_image(recipe, i, j, seed):
     tissue = recipe()
     boundary = tissue.boundary
     d = np.random.default_rng(seed).uniform(-1, 1, (5, 2)) @ np.asarray(boundary.lattice)
-    grid = np.array([(a, b) for a in range(-6, 7) for b in range(-6, 7)]) @ np.asarray(boundary.lattice)
+    grid = np.array([(a, b) for a in range(-6, 7) for b in range(-6, 7)]) @ np.asarray(
+        boundary.lattice
+    )
     brute = np.linalg.norm(d[:, None] + grid, axis=-1).min(axis=1)
     short = boundary.shortest(jnp.asarray(d) + boundary.translation(jnp.array([i, j])))
     np.testing.assert_allclose(np.linalg.norm(short, axis=-1), brute, atol=1e-10)

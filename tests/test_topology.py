@@ -17,7 +17,9 @@ def test_rotation_system_is_consistent(recipe):
     tissue = recipe()
     m = tissue.topology
     names = ("twin", "next", "previous", "source", "target", "cell", "offset")
-    twin, following, previous, source, target, cell, offset = (np.asarray(getattr(m, n)) for n in names)
+    twin, following, previous, source, target, cell, offset = (
+        np.asarray(getattr(m, n)) for n in names
+    )
     h = np.arange(m.n_half_edges)
     assert (twin[twin] == h).all()
     assert (following[previous] == h).all()

@@ -50,7 +50,9 @@ def test_the_configuration_of_lower_energy_wins():
     assert flipped.edge_lengths[edge] == pytest.approx(0.01, rel=0.02)
     assert not set(edge_cell_sets(flipped)[edge]) & set(sides.tolist())
     # The flipped edge stands across the old one.
-    assert jnp.dot(flipped.edge_vectors[edge], tissue.edge_vectors[edge]) == pytest.approx(0, abs=1e-9)
+    assert jnp.dot(flipped.edge_vectors[edge], tissue.edge_vectors[edge]) == pytest.approx(
+        0, abs=1e-9
+    )
     assert flipped.areas.sum() == pytest.approx(16)
     np.testing.assert_allclose(flipped.vertices.mean(0), tissue.vertices.mean(0), atol=1e-12)
 

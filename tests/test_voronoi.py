@@ -18,7 +18,9 @@ def test_vertices_are_equally_far_from_three_seeds_and_no_other_is_closer(n, see
     tissue = voronoi(seeds=seeds, lattice=lattice)
     grid = np.array([(i, j) for i in range(-4, 5) for j in range(-4, 5)]) @ lattice
     images = (seeds[None] + grid[:, None]).reshape(-1, 2)
-    distance = np.sort(np.linalg.norm(np.asarray(tissue.vertices)[:, None] - images, axis=-1), axis=1)
+    distance = np.sort(
+        np.linalg.norm(np.asarray(tissue.vertices)[:, None] - images, axis=-1), axis=1
+    )
     np.testing.assert_allclose(distance[:, 2], distance[:, 0], atol=1e-9)
     # and the cell at each corner is the one of the seed that close, in the frame of the cell
     cell = np.asarray(tissue.topology.cell)
@@ -88,7 +90,9 @@ def test_bad_arguments_are_named(options, message):
         voronoi(**options)
 
 
-@pytest.mark.parametrize(("nx", "ny", "area"), [(0, 3, 1.0), (2, -1, 1.0), (2, 2, 0.0), (2, 2, np.nan)])
+@pytest.mark.parametrize(
+    ("nx", "ny", "area"), [(0, 3, 1.0), (2, -1, 1.0), (2, 2, 0.0), (2, 2, np.nan)]
+)
 def test_bad_hexagonal_lattices_are_refused(nx, ny, area):
     with pytest.raises(ValueError, match="must be"):
         vx.initialise.hexagonal(nx, ny, area=area)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -21,8 +21,10 @@ from vertax._transitions import T1, AbstractTransitions
 from vertax.costs import AbstractCost
 from vertax.energies import AbstractEnergy
 
+Energy = TypeVar("Energy", bound=AbstractEnergy)
 
-class InverseProblem(eqx.Module):
+
+class InverseProblem(eqx.Module, Generic[Energy]):
     r"""Find the parameters whose equilibrium minimises a cost (paper, "Bilevel optimization").
 
     $$\min_\theta C(X^*_\theta, \theta) \quad \text{subject to} \quad
@@ -43,7 +45,7 @@ class InverseProblem(eqx.Module):
     """
 
     tissue: Tissue
-    energy: AbstractEnergy
+    energy: Energy
     cost: AbstractCost
     trainable: PyTree[bool] | Callable[[Any], bool] = eqx.is_inexact_array
     fit_position: bool = False
@@ -58,7 +60,7 @@ class InverseProblem(eqx.Module):
         self,
         energy: AbstractEnergy | None = None,
         tissue: Tissue | None = None,
-        shift: Float[Array, "2"] | None = None,
+        shift: Float[Array, 2] | None = None,
     ) -> tuple[Float[Array, ""], Equilibrium]:
         """Cost and equilibrium for some parameters.
 
@@ -109,10 +111,10 @@ class History(eqx.Module):
     """Wall-clock time of each epoch; the first one includes compilation."""
 
 
-class Fit(eqx.Module):
+class Fit(eqx.Module, Generic[Energy]):
     """The outcome of a fit: the best parameters, their equilibrium, and the way there."""
 
-    energy: AbstractEnergy
+    energy: Energy
     """The energy with the parameters of lowest cost."""
     tissue: Tissue
     """The equilibrium of these parameters."""
@@ -153,14 +155,14 @@ class _Record(eqx.Module):
 
 
 def fit(
-    problem: InverseProblem,
+    problem: InverseProblem[Energy],
     optimiser: optax.GradientTransformation,
     epochs: int,
     *,
     truth: AbstractEnergy | None = None,
     progress: bool = True,
     callback: Callable[[int, _Record], None] | None = None,
-) -> Fit:
+) -> Fit[Energy]:
     """Solve an inverse problem with an Optax optimiser.
 
     Each epoch relaxes the tissue from the last equilibrium, takes the gradient of the cost through it
@@ -198,7 +200,9 @@ def fit(
     true = None if truth is None else eqx.filter(truth, problem.trainable)
     # The position is counted from the last equilibrium: an update displaces, and is forgotten.
     shift = jnp.zeros(2, problem.tissue.vertices.dtype) if problem.fit_position else None
-    state = _State(parameters, optimiser.init((parameters, shift)), problem.tissue)
+    state = _State(
+        parameters, optimiser.init(cast(optax.Params, (parameters, shift))), problem.tissue
+    )
     best: tuple[int, _Record] | None = None
     rows: list[tuple] = []
     stopped = None
@@ -279,7 +283,7 @@ def _epoch(
     fitted = (state.parameters, here)
     (value, equilibrium), gradient = jax.value_and_grad(cost, has_aux=True)(fitted)
     updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
-        gradient, state.optimiser, fitted, value=value, grad=gradient
+        gradient, state.optimiser, cast(optax.Params, fitted), value=value, grad=gradient
     )
     parameters, shift = eqx.apply_updates(fitted, updates)
     following = equilibrium.tissue

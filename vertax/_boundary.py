@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
+from vertax._misc import is_concrete
+
 
 class AbstractBoundary(eqx.Module):
     """The space a tissue lives in: how lattice images are placed and which motions cost nothing."""
@@ -56,7 +58,7 @@ class Periodic(AbstractBoundary):
                 "Argument `lattice` must hold two lattice vectors as rows, shape (2, 2), but its shape "
                 f"is {lattice.shape}. For a rectangle pass jnp.diag(jnp.array([width, height]))."
             )
-        if not isinstance(lattice, jax.core.Tracer):
+        if is_concrete(lattice):
             rows = np.asarray(lattice, float)
             if not np.isfinite(rows).all() or np.linalg.det(rows) <= 0:
                 raise ValueError(
@@ -70,7 +72,7 @@ class Periodic(AbstractBoundary):
         """Area of the box."""
         return jnp.linalg.det(self.lattice)
 
-    def translation(self, image: Num[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:  # noqa: D102
+    def translation(self, image: Num[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
         # Written out: a matrix product would run in reduced precision on some accelerators.
         image = jnp.asarray(image, self.lattice.dtype)
         return image[..., :1] * self.lattice[0] + image[..., 1:] * self.lattice[1]
@@ -91,7 +93,7 @@ class Periodic(AbstractBoundary):
         best = jnp.argmin(jnp.sum(choices**2, axis=-1), axis=-1)
         return jnp.take_along_axis(choices, best[..., None, None], axis=-2)[..., 0, :]
 
-    def drift(  # noqa: D102
+    def drift(
         self, vertices: Float[Array, "vertices 2"], reference: Float[Array, "vertices 2"]
     ) -> Float[Array, " modes"]:
         return jnp.mean(vertices - reference, axis=0) * jnp.sqrt(1.0 * vertices.shape[0])

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._misc import is_concrete
 from vertax._tissue import Tissue
 from vertax._transitions import T1, AbstractTransitions
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
@@ -89,7 +90,7 @@ def equilibrate(
         adjoint = ImplicitDifferentiation()
     if tolerance is None:
         tolerance = 1e-9 if tissue.vertices.dtype == jnp.float64 else 1e-4
-    if not isinstance(tolerance, jax.core.Tracer) and not tolerance > 0:
+    if is_concrete(tolerance) and not tolerance > 0:
         raise ValueError(f"Argument `tolerance` must be positive, but is {tolerance}.")
     if patience < 1 or max_steps < 1:
         raise ValueError(
@@ -112,7 +113,8 @@ def _equilibrate(
     max_steps: int,
     throw: bool,
 ) -> Equilibrium:
-    relaxation = _Relaxation(solver, jnp.asarray(tolerance, tissue.vertices.dtype), patience)
+    threshold = jnp.asarray(tolerance, tissue.vertices.dtype)
+    relaxation = _Relaxation(solver=solver, tolerance=threshold, patience=patience)
     # The box is as good a unit of length as the cells: both are the scale of the shapes.
     scale = jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
     options = {"length_scale": jax.lax.stop_gradient(scale), "budget": jnp.array(max_steps)}
@@ -149,9 +151,7 @@ def _equilibrate(
         result=found.result,
     )
     if throw:
-        equilibrium = found.result.error_if(
-            equilibrium, found.result != optx.RESULTS.successful
-        )
+        equilibrium = found.result.error_if(equilibrium, found.result != optx.RESULTS.successful)
     return equilibrium
 
 
@@ -200,9 +200,7 @@ class _Relaxation(optx.AbstractMinimiser):
     ) -> _RelaxationState:
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
         force = self.norm(self.solver.gradient(inner))
-        return _RelaxationState(
-            inner, force, jnp.where(force < self.tolerance, 1, 0), jnp.array(0)
-        )
+        return _RelaxationState(inner, force, jnp.where(force < self.tolerance, 1, 0), jnp.array(0))
 
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _RelaxationState, tags: Any
@@ -250,7 +248,15 @@ class _AtRest(optx.AbstractMinimiser):
         return jnp.array(True), optx.RESULTS.successful
 
     def postprocess(
-        self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: None, tags: Any, result: Any
+        self,
+        fn: Any,
+        y: Any,
+        aux: Any,
+        args: Any,
+        options: Any,
+        state: None,
+        tags: Any,
+        result: Any,
     ) -> tuple[Any, Any, dict[str, Any]]:
         return y, aux, {}
 
@@ -325,7 +331,7 @@ def _search(
         )
 
     start = (tissue, dynamic, counts, jnp.array(0), jnp.array(False))
-    tissue, dynamic, counts, num_steps, finished = jax.lax.while_loop(unfinished, iterate, start)
+    tissue, dynamic, counts, num_steps, _ = jax.lax.while_loop(unfinished, iterate, start)
     state = eqx.combine(dynamic, static)
     result = optx.RESULTS.where(
         relaxation.at_rest(state), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax.core
 
 if TYPE_CHECKING:
     compiled_property = property  # so that type checkers see the type of each property
 else:
 
-    class compiled_property(property):  # noqa: N801
+    class compiled_property(property):
         """A property of an Equinox module that is compiled as one function.
 
         Outside `jax.jit` a property of thirty array operations would otherwise compile thirty functions
@@ -20,3 +21,8 @@ else:
 
         def __init__(self, method: Callable[[Any], Any]):
             super().__init__(eqx.filter_jit(method, inline=True), doc=method.__doc__)
+
+
+def is_concrete(value: Any) -> bool:
+    """Whether the numbers of an array can be looked at (outside of `jax.jit` and `jax.grad`)."""
+    return not isinstance(value, jax.core.Tracer)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from vertax._misc import compiled_property
 from vertax._boundary import AbstractBoundary
+from vertax._misc import compiled_property, is_concrete
 from vertax._topology import Topology, clockwise, edge_neighbourhood, source, take
 
 
@@ -51,7 +51,7 @@ class Tissue(eqx.Module):
                 f"Argument `vertices` must have shape ({topology.n_vertices}, 2) to match the topology, "
                 f"but has {vertices.shape}."
             )
-        if not isinstance(vertices, jax.core.Tracer) and not np.isfinite(np.asarray(vertices)).all():
+        if is_concrete(vertices) and not np.isfinite(np.asarray(vertices)).all():
             raise ValueError("Argument `vertices` must be finite, but holds NaN or infinity.")
         self.vertices = vertices
         self.topology = topology
@@ -60,7 +60,7 @@ class Tissue(eqx.Module):
             self.softening = jnp.zeros((), vertices.dtype)
             softening = 1e-3 * jnp.sqrt(jax.lax.stop_gradient(_mean_area(self)))
         softening = jnp.asarray(softening, vertices.dtype)
-        if not isinstance(softening, jax.core.Tracer) and not softening >= 0:
+        if is_concrete(softening) and not softening >= 0:
             raise ValueError(f"Argument `softening` must be at least 0, but is {softening}.")
         self.softening = softening
 

@@ -42,8 +42,8 @@ class Topology(eqx.Module):
     - `cell`, shape `(halfedges,)`: the cell on the left of each half-edge, `0 … n_cells - 1`.
     - `frame`, shape `(halfedges, 2)`: integer lattice image of each half-edge's source, in the frame of
         the cell on its left. Zero where there is no periodicity.
-    - `edge`, shape `(halfedges,)`: an edge number for each half-edge, shared with its twin. Numbered in the order of the
-        half-edges when left out.
+    - `edge`, shape `(halfedges,)`: an edge number for each half-edge, shared with its twin. Numbered in
+        the order of the half-edges when left out.
 
     **Raises:**
 
@@ -87,7 +87,9 @@ class Topology(eqx.Module):
         edge = np.asarray(edge)
         half_edge = np.full(twin.size // 2, -1)
         if edge.shape != twin.shape or edge.min() < 0 or edge.max() >= half_edge.size:
-            raise ValueError("Argument `edge` must give each half-edge a number in 0 … n_edges - 1.")
+            raise ValueError(
+                "Argument `edge` must give each half-edge a number in 0 … n_edges - 1."
+            )
         half_edge[edge[::-1]] = h[::-1]  # reversed: the first half-edge of each edge wins
         to_int32 = lambda x: jnp.asarray(x, jnp.int32)
         self.twin = to_int32(twin)
@@ -180,9 +182,17 @@ class Topology(eqx.Module):
         require(frame.shape == (n_half, 2), "`frame` must have two entries a half-edge")
         require(twin[twin] == h, "`twin` must be an involution, twin[twin[h]] == h, at half-edges")
         require(twin != h, "no half-edge may be its own twin, at half-edges")
-        require(edge[twin] == edge, "a half-edge and its twin must carry one edge number, at half-edges")
-        require(np.bincount(edge, minlength=n_half // 2) == 2, "each edge must have two half-edges, at edges")
-        require(edge[half_edge] == np.arange(n_half // 2), "`half_edge` must point into its edge, at edges")
+        require(
+            edge[twin] == edge, "a half-edge and its twin must carry one edge number, at half-edges"
+        )
+        require(
+            np.bincount(edge, minlength=n_half // 2) == 2,
+            "each edge must have two half-edges, at edges",
+        )
+        require(
+            edge[half_edge] == np.arange(n_half // 2),
+            "`half_edge` must point into its edge, at edges",
+        )
         require((cell >= 0) & (cell < n_cells), "`cell` must lie in 0 … n_cells - 1, at half-edges")
         sides = np.bincount(cell, minlength=n_cells)
         require(sides > 0, "every cell must have half-edges, at cells")
@@ -190,7 +200,8 @@ class Topology(eqx.Module):
         following = np.where(twin % 3 == 0, twin + 2, twin - 1)
         require(cell[following] == cell, "`cell` must be the same all around a face, at half-edges")
         n_faces, face = connected_components(
-            coo_array((np.ones(n_half, bool), (h, following)), shape=(n_half, n_half)), directed=False
+            coo_array((np.ones(n_half, bool), (h, following)), shape=(n_half, n_half)),
+            directed=False,
         )
         faces_of_cell = np.bincount(cell[np.unique(face, return_index=True)[1]], minlength=n_cells)
         require(faces_of_cell == 1, "every cell must be one face, at cells")

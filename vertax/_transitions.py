@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._misc import is_concrete
 from vertax._tissue import Tissue
 from vertax._topology import edge_neighbourhood, flip_edges, source, take
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
@@ -56,7 +57,7 @@ class T1(AbstractTransitions):
     max_flips: int = eqx.field(static=True, default=20)
 
     def __check_init__(self):
-        if not isinstance(self.threshold, jax.core.Tracer) and not self.threshold > 0:
+        if is_concrete(self.threshold) and not self.threshold > 0:
             raise ValueError(
                 f"Argument `threshold` must be positive, but is {self.threshold}. To switch T1 "
                 "transitions off pass `transitions=None`."
@@ -85,8 +86,10 @@ class T1(AbstractTransitions):
                 corner.place(tissue, which, corner.across, length),
                 flip_edges(tissue.topology, which),
             )
-            judge_all = _judge_local if isinstance(energy, AbstractLocalEnergy) else _judge_total
-            accepted = judge_all(energy, chosen, corner, stretch, flip)
+            if isinstance(energy, AbstractLocalEnergy):
+                accepted = _judge_local(energy, chosen, corner, stretch, flip)
+            else:
+                accepted = _judge_total(energy, chosen, corner, stretch, flip)
             return flip(accepted), accepted
 
         new, accepted = jax.lax.cond(
@@ -166,7 +169,9 @@ def _independent(
     """The candidates that are the shortest of all candidates at each of their four cells."""
     # Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute.
     n = candidates.shape[0]
-    rank = jnp.zeros(n, jnp.int32).at[jnp.argsort(corner.length)].set(jnp.arange(n, dtype=jnp.int32))
+    rank = (
+        jnp.zeros(n, jnp.int32).at[jnp.argsort(corner.length)].set(jnp.arange(n, dtype=jnp.int32))
+    )
     rank = jnp.where(candidates, rank, n)
     best = jnp.full(n_cells, n, jnp.int32).at[corner.cells].min(rank[:, None])
     return candidates & jnp.all(take(best, corner.cells) == rank[:, None], axis=-1)
@@ -212,4 +217,3 @@ def _judge_total(
         return accepted | (this & (energy(flip(this)) < energy(stretch(this))))
 
     return jax.lax.fori_loop(0, jnp.sum(chosen), body, jnp.zeros_like(chosen))
-

@@ -34,7 +34,7 @@ class ImplicitDifferentiation(AbstractAdjoint):
 
     linear_solver: lx.AbstractLinearSolver = eqx.field(default_factory=MINRES)
 
-    def apply(  # noqa: D102
+    def apply(
         self,
         primal_fn: Callable,
         rewrite_fn: Callable,

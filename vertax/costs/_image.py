@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from vertax._boundary import Periodic
+from vertax._misc import is_concrete
 from vertax._tissue import Tissue
 from vertax.costs._cost import AbstractCost
 from vertax.energies import AbstractEnergy
@@ -157,11 +158,15 @@ class MeshImage(AbstractCost):
                 f"{weights.shape}."
             )
         if not (weights >= 0).all() or not weights.sum() > 0:
-            raise ValueError("Argument `weight` must be at least 0 everywhere and positive somewhere.")
-        if not isinstance(psf_width, jax.core.Tracer) and not psf_width > 0:
+            raise ValueError(
+                "Argument `weight` must be at least 0 everywhere and positive somewhere."
+            )
+        if is_concrete(psf_width) and not psf_width > 0:
             raise ValueError(f"Argument `psf_width` must be positive, but is {psf_width}.")
         if points_per_edge < 1:
-            raise ValueError(f"Argument `points_per_edge` must be at least 1, but is {points_per_edge}.")
+            raise ValueError(
+                f"Argument `points_per_edge` must be at least 1, but is {points_per_edge}."
+            )
         weights = weights / weights.sum()
         if fit_intensity:
             mean = (weights * pixels).sum()

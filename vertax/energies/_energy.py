@@ -26,9 +26,9 @@ class AbstractEnergy(eqx.Module):
     ```
 
     Fields that are arrays are parameters, which a fit adjusts by default; plain Python numbers are
-    constants. Energies add: `AreaElasticity(...) + LineTension(...)`. An energy that is a sum over cells and edges
-    is better a subclass of [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]: T1 transitions are then
-    judged many at a time.
+    constants. Energies add: `AreaElasticity(...) + LineTension(...)`. An energy that is a sum over cells
+    and edges is better a subclass of [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]: T1 transitions
+    are then judged many at a time.
 
     `jax.custom_vjp` must not be used inside: implicit differentiation needs forward mode through the
     gradient (`jax.custom_jvp` is fine).
@@ -43,9 +43,8 @@ class AbstractEnergy(eqx.Module):
         if not isinstance(other, AbstractEnergy):
             return NotImplemented
         terms = (*_terms(self), *_terms(other))
-        if all(isinstance(term, AbstractLocalEnergy) for term in terms):
-            return LocalSum(terms)
-        return Sum(terms)
+        local = tuple(term for term in terms if isinstance(term, AbstractLocalEnergy))
+        return LocalSum(local) if len(local) == len(terms) else Sum(terms)
 
 
 class AbstractLocalEnergy(AbstractEnergy):

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -110,6 +110,36 @@ def overlays(
             if tissue is not None:
                 draw_membranes(ax, tissue)
             ax.set(xlim=extent[:2], ylim=extent[:1:-1] if upright else extent[2:])
+    return figure
+
+
+def cells_on_image(
+    image: Float[np.ndarray, "rows columns"],
+    tissue: Tissue,
+    values: Cells,
+    mask: Bool[np.ndarray, " cells"],
+    *,
+    pixel_size: float,
+    label: str,
+) -> Figure:
+    """Some cells of a tissue, coloured, over the image that they come from.
+
+    **Arguments:**
+
+    - `image`: the image; its first row and column begin at x = 0 and y = 0.
+    - `tissue`: the tissue.
+    - `values`: of the cells.
+    - `mask`: which cells to draw.
+    - `pixel_size`: side of a pixel, in units of length.
+    - `label`: of the colour bar.
+
+    **Returns:** the figure.
+    """
+    with _style.house_style():
+        figure, (ax,) = new_figure(1, width=4.6, height=3.9)
+        plot_tissue(
+            tissue, values, ax=ax, mask=mask, image=image, pixel_size=pixel_size, label=label
+        )
     return figure
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
-from vertax.experiments import infer_shape_factors
+from vertax.experiments import infer_from_microscopy, infer_shape_factors
 from vertax.experiments._config import (
     ConfigError,
     ExperimentConfig,
@@ -40,6 +40,12 @@ _ALL = (
         infer_shape_factors.Config,
         infer_shape_factors.run,
         "Recover hidden target shape factors of a synthetic tissue from its vertices or an image.",
+    ),
+    Experiment(
+        "infer_from_microscopy",
+        infer_from_microscopy.Config,
+        infer_from_microscopy.run,
+        "Infer the target shape factors of the cells in a microscopy image.",
     ),
 )
 

@@ -1,10 +1,10 @@
 """Ways to make a first tissue."""
 
-from vertax.initialise._labels import Segmentation as Segmentation
-from vertax.initialise._labels import from_labels as from_labels
+from vertax.initialise._labels import Segmentation as Segmentation, from_labels as from_labels
 from vertax.initialise._microscopy import from_microscopy as from_microscopy
-from vertax.initialise._segmenters import AbstractSegmenter as AbstractSegmenter
-from vertax.initialise._segmenters import Cellpose as Cellpose
-from vertax.initialise._segmenters import Watershed as Watershed
-from vertax.initialise._voronoi import hexagonal as hexagonal
-from vertax.initialise._voronoi import periodic_voronoi as periodic_voronoi
+from vertax.initialise._segmenters import (
+    AbstractSegmenter as AbstractSegmenter,
+    Cellpose as Cellpose,
+    Watershed as Watershed,
+)
+from vertax.initialise._voronoi import hexagonal as hexagonal, periodic_voronoi as periodic_voronoi

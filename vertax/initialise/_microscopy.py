@@ -46,10 +46,8 @@ def from_microscopy(
     check_options(boundary, pixel_size)
     pixels = check_image(image)
     segmenter = Watershed() if segmenter is None else segmenter
-    if boundary == "periodic":
-        labels = _segment_periodic(pixels, segmenter)
-    else:
-        labels = _segment(pixels, segmenter)
+    segment = _segment_periodic if boundary == "periodic" else _segment
+    labels = segment(pixels, segmenter)
     n_cells = len(np.unique(labels[labels > 0]))
     if n_cells < 2:
         raise ValueError(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay, KDTree
 
 from vertax._boundary import Periodic
 from vertax._tissue import Tissue
@@ -32,8 +32,8 @@ def periodic_voronoi(
     - `n_cells`: number of random seeds, uniform in the box; needs `key`. Or
     - `seeds`, shape `(cells, 2)`: the seeds themselves; they may lie outside the box.
     - `key`: a key from `jax.random.key`, for random seeds.
-    - `lattice`, shape `(2, 2)`: the two lattice vectors of the box as rows; by default a square of side $\sqrt N$,
-        so that the mean cell area is 1. Sheared boxes are fine.
+    - `lattice`, shape `(2, 2)`: the two lattice vectors of the box as rows; by default a square of side
+        $\sqrt N$, so that the mean cell area is 1. Sheared boxes are fine.
     - `lloyd_steps`: number of Lloyd iterations (each seed moves to the mean of its cell's corners),
         which make the tissue more regular.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
@@ -50,10 +50,13 @@ def periodic_voronoi(
     if lloyd_steps < 0:
         raise ValueError(f"Argument `lloyd_steps` must be at least 0, but is {lloyd_steps}.")
     dtype = jnp.result_type(float)
+    points = np.zeros((0, 2))
     if seeds is not None:
         points = np.asarray(seeds, float)
         if points.ndim != 2 or points.shape[1] != 2:
-            raise ValueError(f"Argument `seeds` must have shape (cells, 2), but has {points.shape}.")
+            raise ValueError(
+                f"Argument `seeds` must have shape (cells, 2), but has {points.shape}."
+            )
         if not np.isfinite(points).all():
             raise ValueError("Argument `seeds` must be finite, but holds NaN or infinity.")
         n_cells = len(points)
@@ -63,7 +66,9 @@ def periodic_voronoi(
     boundary = Periodic(jnp.asarray(box, dtype))
     if seeds is None:
         if key is None:
-            raise ValueError("Argument `key` is needed for random seeds: pass jax.random.key(seed).")
+            raise ValueError(
+                "Argument `key` is needed for random seeds: pass jax.random.key(seed)."
+            )
         fractions = np.asarray(jax.random.uniform(key, (n_cells, 2), dtype), float)
         points = fractions[spatial_order(fractions)] @ box
 
@@ -141,7 +146,7 @@ def _periodic_delaunay(
     home = np.floor(fractions).astype(int)
     fractions = fractions - home
     spacing = 1 / np.sqrt(n)
-    tree = cKDTree(fractions, boxsize=1.0)
+    tree = KDTree(fractions, boxsize=1.0)
     distance = tree.query(fractions, k=2)[0][:, 1] if n > 1 else np.ones(1)
     if distance.min() < 1e-12 * spacing:
         first, second = tree.query_pairs(1e-12 * spacing, output_type="ndarray")[0]

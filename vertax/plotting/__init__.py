@@ -1,6 +1,5 @@
 """Pictures of tissues and of fits."""
 
-from vertax.plotting._curves import plot_history as plot_history
-from vertax.plotting._curves import plot_recovery as plot_recovery
+from vertax.plotting._curves import plot_history as plot_history, plot_recovery as plot_recovery
 from vertax.plotting._polygons import cell_polygons as cell_polygons
 from vertax.plotting._tissue import plot_tissue as plot_tissue

@@ -33,20 +33,20 @@ class GradientDescent(AbstractSolver):
 
     learning_rate: float | Float[Array, ""] = 1e-2
 
-    def init(  # noqa: D102
+    def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _State:
         value, gradient, aux = value_and_gradient(fn, y, args)
         return _State(value, gradient, None, aux)
 
-    def step(  # noqa: D102
+    def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
     ) -> tuple[Any, _State, Any]:
         y = optax.tree.add_scale(y, -self.learning_rate, state.gradient)
         value, gradient, aux = value_and_gradient(fn, y, args)
         return y, _State(value, gradient, None, aux), aux
 
-    def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+    def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
 
@@ -61,13 +61,13 @@ class Optax(AbstractSolver):
 
     optimiser: optax.GradientTransformation = eqx.field(static=True)
 
-    def init(  # noqa: D102
+    def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _State:
         value, gradient, aux = value_and_gradient(fn, y, args)
         return _State(value, gradient, self.optimiser.init(y), aux)
 
-    def step(  # noqa: D102
+    def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
     ) -> tuple[Any, _State, Any]:
         update = optax.with_extra_args_support(self.optimiser).update
@@ -83,7 +83,7 @@ class Optax(AbstractSolver):
         value, gradient, aux = value_and_gradient(fn, y, args)
         return y, _State(value, gradient, optimiser, aux), aux
 
-    def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+    def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
 
@@ -127,7 +127,7 @@ class FIRE(AbstractSolver):
     max_time_step: float = 0.2
     max_displacement: float = 0.1
 
-    def init(  # noqa: D102
+    def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _FIREState:
         value, gradient, aux = value_and_gradient(fn, y, args)
@@ -137,11 +137,11 @@ class FIRE(AbstractSolver):
             value, gradient, rest, scalar(self.time_step), scalar(_MIXING), scalar(0), aux
         )
 
-    def step(  # noqa: D102
+    def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _FIREState, tags: Any
     ) -> tuple[Any, _FIREState, Any]:
         force = optax.tree.scale(-1, state.gradient)
-        power = optax.tree.vdot(force, state.velocity)
+        power = jnp.asarray(optax.tree.vdot(force, state.velocity))
         downhill = power > 0
         n_downhill = jnp.where(downhill, state.downhill + 1, 0)
         fast = n_downhill > _DELAY
@@ -163,7 +163,7 @@ class FIRE(AbstractSolver):
         value, gradient, aux = value_and_gradient(fn, y, args)
         return y, _FIREState(value, gradient, velocity, dt, mixing, n_downhill, aux), aux
 
-    def gradient(self, state: _FIREState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+    def gradient(self, state: _FIREState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
 

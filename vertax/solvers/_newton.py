@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
-
 from optax import tree
 
 from vertax.solvers._solver import AbstractSolver, value_and_gradient
@@ -41,7 +40,7 @@ class NewtonCG(AbstractSolver):
     max_displacement: float = 0.2
     max_products: int = eqx.field(static=True, default=200)
 
-    def init(  # noqa: D102
+    def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _NewtonState:
         value, gradient, aux = value_and_gradient(fn, y, args)
@@ -50,7 +49,7 @@ class NewtonCG(AbstractSolver):
         radius = reach * jnp.sqrt(jnp.asarray(tree.size(y), value.dtype))
         return _NewtonState(value, gradient, radius, jnp.array(0), aux)
 
-    def step(  # noqa: D102
+    def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
     ) -> tuple[Any, _NewtonState, Any]:
         reach = self.max_displacement * options.get("length_scale", 1.0)
@@ -61,7 +60,7 @@ class NewtonCG(AbstractSolver):
         largest = tree.norm(p, ord=jnp.inf)
         shrink = jnp.minimum(1.0, reach / jnp.where(largest > 0, largest, 1))
         p = tree.scale(shrink, p)
-        predicted = -(tree.vdot(g, p) + 0.5 * shrink * tree.vdot(p, hp))
+        predicted = -(_dot(g, p) + 0.5 * shrink * _dot(p, hp))
 
         trial = tree.add(y, p)
         value, gradient, aux = value_and_gradient(fn, trial, args)
@@ -70,12 +69,12 @@ class NewtonCG(AbstractSolver):
         # force.
         noise = 20 * jnp.finfo(value.dtype).eps * jnp.abs(value)
         lost = predicted <= noise
-        lower_force = tree.vdot(gradient, gradient) < tree.vdot(g, g)
+        lower_force = _dot(gradient, gradient) < _dot(g, g)
         ratio = actual / jnp.where(predicted > 0, predicted, 1)
-        finite = jnp.isfinite(value) & jnp.isfinite(tree.vdot(gradient, gradient))
+        finite = jnp.isfinite(value) & jnp.isfinite(_dot(gradient, gradient))
         accept = finite & jnp.where(lost, lower_force, ratio > 1e-4)
 
-        length = jnp.sqrt(tree.vdot(p, p))
+        length = jnp.sqrt(_dot(p, p))
         at_edge = length > 0.9 * state.radius
         radius = jnp.where(
             accept & (lost | (ratio > 0.25)),
@@ -86,7 +85,7 @@ class NewtonCG(AbstractSolver):
         y, value, g, aux = tree.where(accept, (trial, value, gradient, aux), kept)
         return y, _NewtonState(value, g, radius, state.num_products + products, aux), aux
 
-    def gradient(self, state: _NewtonState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+    def gradient(self, state: _NewtonState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
     def _truncated_cg(
@@ -95,7 +94,7 @@ class NewtonCG(AbstractSolver):
         """A step `p` inside the trust region, and `H p`."""
         # Conjugate gradients on H p = -g from p = 0; |p| grows from iterate to iterate, so the first
         # one to leave the region, or to meet negative curvature, ends on its edge.
-        squared = tree.vdot(g, g)
+        squared = _dot(g, g)
         size = jnp.sqrt(squared)
         forcing = jnp.minimum(0.1, jnp.sqrt(size))
         zero = tree.zeros_like(g)
@@ -108,19 +107,27 @@ class NewtonCG(AbstractSolver):
         def iterate(carry: tuple) -> tuple:
             p, hp, r, d, rr, _, k = carry
             hd = hessian(d)
-            curvature = tree.vdot(d, hd)
+            curvature = _dot(d, hd)
             convex = curvature > 0
             alpha = rr / jnp.where(convex, curvature, 1)
-            pp, pd, dd = tree.vdot(p, p), tree.vdot(p, d), tree.vdot(d, d)
+            pp, pd, dd = _dot(p, p), _dot(p, d), _dot(d, d)
             leaves = pp + 2 * alpha * pd + alpha**2 * dd >= radius**2
             done = leaves | ~convex
             to_edge = (-pd + jnp.sqrt(jnp.maximum(pd**2 + dd * (radius**2 - pp), 0))) / dd
             alpha = jnp.where(done, to_edge, alpha)
-            p, hp, r = tree.add_scale(p, alpha, d), tree.add_scale(hp, alpha, hd), tree.add_scale(r, alpha, hd)
-            new = tree.vdot(r, r)
+            p, hp, r = (
+                tree.add_scale(p, alpha, d),
+                tree.add_scale(hp, alpha, hd),
+                tree.add_scale(r, alpha, hd),
+            )
+            new = _dot(r, r)
             d = tree.sub(tree.scale(new / rr, d), r)
             return p, hp, r, d, new, done, k + 1
 
         start = (zero, zero, g, first, squared, squared == 0, jnp.array(0))
         p, hp, *_, products = jax.lax.while_loop(unfinished, iterate, start)
         return p, hp, products
+
+
+def _dot(a: PyTree, b: PyTree) -> Float[Array, ""]:
+    return jnp.asarray(tree.vdot(a, b))

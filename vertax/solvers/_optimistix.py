@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import optimistix as optx
-from jaxtyping import Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from vertax.solvers._solver import AbstractSolver, value_and_gradient
 
@@ -30,13 +30,13 @@ class Wrapped(AbstractSolver):
 
     solver: optx.AbstractMinimiser
 
-    def init(  # noqa: D102
+    def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _WrappedState:
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
         return _WrappedState(inner, value_and_gradient(fn, y, args)[1])
 
-    def step(  # noqa: D102
+    def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _WrappedState, tags: Any
     ) -> tuple[Any, _WrappedState, Any]:
         y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
@@ -46,6 +46,5 @@ class Wrapped(AbstractSolver):
             gradient = value_and_gradient(fn, y, args)[1]
         return y, _WrappedState(inner, gradient), aux
 
-    def gradient(self, state: _WrappedState) -> PyTree[Float[Array, "..."]]:  # noqa: D102
+    def gradient(self, state: _WrappedState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
-

@@ -30,12 +30,12 @@ class AbstractSolver(optx.AbstractMinimiser):
     def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
 
-    def terminate(  # noqa: D102
+    def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         return self.norm(self.gradient(state)) < self.atol, optx.RESULTS.successful
 
-    def postprocess(  # noqa: D102
+    def postprocess(
         self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
     ) -> tuple[Any, Any, dict[str, Any]]:
         return y, aux, {}
@@ -45,4 +45,3 @@ def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, Py
     """Value, gradient and auxiliary output of an Optimistix objective `fn(y, args) -> (value, aux)`."""
     (value, aux), gradient = jax.value_and_grad(fn, has_aux=True)(y, args)
     return value, gradient, aux
-

@@ -1,0 +1,295 @@
+"""Target shape factors of the cells in a microscopy image of an epithelium.
+
+The image is segmented into cells, the cells become a mesh, the mesh a model tissue in mechanical
+equilibrium; then target shape factor and rest area of every cell are adjusted until the edges of the
+relaxed tissue, blurred as by a microscope, match the image (paper, "Inference of mechanical parameters
+from microscopy image"). The image is mirrored to make it periodic, and only whole cells of the original
+are reported.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from pydantic import Field
+from scipy.ndimage import gaussian_filter, zoom
+
+from vertax._bilevel import Fit, FitError, InverseProblem, fit
+from vertax._equilibrium import Equilibrium, equilibrate
+from vertax._tissue import Tissue
+from vertax.costs import MeshImage, mirror
+from vertax.energies import ShapeFactorEnergy
+from vertax.experiments import _figures
+from vertax.experiments._config import ConfigError, ExperimentConfig, Section
+from vertax.experiments._run import RunFolder, history_columns
+from vertax.experiments._sections import Fitting, Relaxation
+from vertax.initialise import Cellpose, Segmentation, Watershed, from_microscopy
+from vertax.io import read_image
+
+
+class ImageSection(Section):
+    """The image, and how it is prepared for the comparison with the model."""
+
+    path: str = ""
+    """File of a membrane image, bright membranes on dark cells."""
+    channel: int | None = None
+    """Which channel, if there are several."""
+    plane: int | None = None
+    """Which plane, if it is a stack."""
+    pixels: int = Field(default=256, ge=32)
+    """Longer side, in pixels, of the image that the model is compared with."""
+    background_width: float = Field(default=0.5, gt=0)
+    """Width of the filter that evens out the illumination, in mean cell diameters."""
+    psf_width: float | None = Field(default=None, gt=0)
+    """Standard deviation of the blur, in pixels of the file; left out, the one that fits best."""
+
+
+class SegmentationSection(Section):
+    """How the cells are found."""
+
+    method: Literal["watershed", "cellpose"] = "watershed"
+    """Cellpose needs its own extra and downloads a model."""
+    cell_size: float | None = Field(default=None, gt=0)
+    """Typical diameter of a cell in pixels of the file; left out, estimated from the image."""
+
+    def build(self) -> Watershed | Cellpose:
+        """The segmenter.
+
+        **Returns:** a [`Watershed`][vertax.initialise.Watershed] or
+        [`Cellpose`][vertax.initialise.Cellpose].
+        """
+        if self.method == "cellpose":
+            return Cellpose(diameter=self.cell_size)
+        return Watershed(cell_size=self.cell_size)
+
+
+class Model(Section):
+    """The energy, E1 with a rest area for each cell, and the first guess."""
+
+    target_shape_factor: float = Field(default=3.7, gt=0)
+    """First guess of the target shape factor of every cell."""
+    fit_areas: bool = True
+    """Fit the rest areas too; the first guess are the areas of the segmented cells."""
+
+
+class Config(ExperimentConfig):
+    """Configuration of this experiment."""
+
+    experiment: Literal["infer_from_microscopy"] = "infer_from_microscopy"
+    """Which experiment this is."""
+    image: ImageSection = ImageSection()
+    """The image."""
+    segmentation: SegmentationSection = SegmentationSection()
+    """How the cells are found."""
+    model: Model = Model()
+    """The energy and the first guess."""
+    fit: Fitting = Fitting(learning_rate=2e-2, epochs=150)
+    """How the parameters are fitted."""
+    relaxation: Relaxation = Relaxation(tolerance=1e-7)
+    """How the tissue is relaxed."""
+
+
+def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
+    """Run the experiment.
+
+    **Arguments:**
+
+    - `config`: its configuration.
+    - `folder`: where the results go.
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** the metrics. `correlation_*` compare the blurred mesh with the image, for the
+    segmented mesh (straight edges between its corners), the relaxed tissue of the first guess and the
+    fitted one; `membrane_contrast_*` is how much brighter the image is along the edges than
+    elsewhere, in standard deviations of the image, in the original image alone.
+
+    **Raises:**
+
+    - `ConfigError` if no image is named; `FileNotFoundError` and `ValueError` for one that cannot be
+        used; `FitError` if the fit cannot go on.
+    """
+    if not config.image.path:
+        raise ConfigError(
+            "`image.path` is missing: name a membrane image, as in --set image.path=IMAGE.tif."
+        )
+    pixels = read_image(config.image.path, channel=config.image.channel, plane=config.image.plane)
+    found = from_microscopy(pixels, segmenter=config.segmentation.build())
+    seen = _prepare(np.asarray(pixels, float), found, config.image)
+    width = _psf_width(found, seen, config.image)
+    cost = MeshImage(mirror(seen), width, points_per_edge=_POINTS)
+
+    segmented = found.tissue
+    guess = ShapeFactorEnergy(
+        jnp.full(segmented.n_cells, config.model.target_shape_factor), segmented.areas
+    )
+    options = config.relaxation.options()
+    first: Equilibrium = equilibrate(segmented, guess, **options, throw=False)
+    folder.save_tissue("target", segmented)
+    folder.save_tissue("initial", first.tissue)
+    folder.save_array("image", seen)
+
+    fitted = eqx.tree_at(
+        lambda e: (e.target_shape_factor, e.mean_area), guess, (True, config.model.fit_areas)
+    )
+    # The mirror planes hold the tissue in its place: there is no position to fit.
+    problem = InverseProblem(first.tissue, guess, cost, fitted, **options)
+    try:
+        outcome = fit(problem, config.fit.build(), config.fit.epochs, progress=progress)
+    except FitError as error:
+        if error.fit is not None:
+            folder.save_table("history", history_columns(error.fit.history))
+            folder.save_tissue("fitted", error.fit.tissue)
+        raise
+    folder.save_tissue("fitted", outcome.tissue)
+    folder.save_table("history", history_columns(outcome.history))
+    folder.save_table("cells", _cell_table(found, outcome))
+    _draw(found, np.asarray(pixels, float), first.tissue, outcome, folder)
+    return _metrics(found, seen, cost, first, outcome, width)
+
+
+_POINTS = 48
+
+
+def _prepare(
+    pixels: Float[np.ndarray, "rows columns"], found: Segmentation, options: ImageSection
+) -> Float[np.ndarray, "rows columns"]:
+    """The image in even light, and no finer than it need be."""
+    # The logarithm brings bright junctions and faint membranes together, as the segmentation does.
+    bright = pixels - pixels.min()
+    bright = np.log1p(bright / bright.mean())
+    diameter = 1 / found.pixel_size  # the mean cell area is 1
+    even = bright - gaussian_filter(bright, options.background_width * diameter, mode="reflect")
+    factor = options.pixels / max(pixels.shape)
+    if factor >= 1:
+        return even
+    shape = [max(16, round(side * factor)) for side in pixels.shape]
+    smooth = gaussian_filter(even, 0.35 / factor, mode="reflect")
+    steps = [new / old for new, old in zip(shape, pixels.shape, strict=True)]
+    # Pixels as areas: the coarse image covers the same extent as the fine one.
+    return zoom(smooth, steps, order=1, mode="reflect", grid_mode=True)
+
+
+def _psf_width(
+    found: Segmentation, seen: Float[np.ndarray, "rows columns"], options: ImageSection
+) -> float:
+    """Width of the blur in units of length: as configured, or as fits the segmented mesh best."""
+    if options.psf_width is not None:
+        return options.psf_width * found.pixel_size
+    image = mirror(seen)
+    pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
+
+    @eqx.filter_jit
+    def misfit(width: Float[Array, ""]) -> Float[Array, ""]:
+        return MeshImage(image, width, points_per_edge=_POINTS)(found.tissue, _NO_ENERGY)
+
+    widths = pixel * np.geomspace(1.0, 12.0, 30)
+    return float(widths[np.argmin([float(misfit(jnp.asarray(w))) for w in widths])])
+
+
+_NO_ENERGY = ShapeFactorEnergy(0.0)  # the image cost does not look at the energy
+
+
+def _correlation(cost: MeshImage, tissue: Tissue) -> float:
+    """Correlation of the blurred mesh with the image: the cost is half of 1 - ρ²."""
+    value = eqx.filter_jit(lambda t: cost(t, _NO_ENERGY))(tissue)
+    return float(np.sqrt(max(0.0, 1 - 2 * float(value))))
+
+
+def _membrane_contrast(
+    tissue: Tissue, found: Segmentation, seen: Float[np.ndarray, "rows columns"]
+) -> float:
+    """Mean of the standardised image along the edges, weighted by length."""
+    start, vector = (np.asarray(x, float) for x in tissue.edge_segments)
+    steps = (np.arange(32) + 0.5) / 32
+    points = (start[:, None] + steps[:, None] * vector[:, None]).reshape(-1, 2)
+    length = np.repeat(np.linalg.norm(vector, axis=1), 32)
+    pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
+    column, row = np.floor(points / pixel).astype(int).T
+    inside = (row >= 0) & (row < seen.shape[0]) & (column >= 0) & (column < seen.shape[1])
+    values = (seen - seen.mean()) / seen.std()
+    return float(np.average(values[row[inside], column[inside]], weights=length[inside]))
+
+
+def _metrics(
+    found: Segmentation,
+    seen: Float[np.ndarray, "rows columns"],
+    cost: MeshImage,
+    first: Equilibrium,
+    outcome: Fit,
+    width: float,
+) -> dict[str, Any]:
+    history, whole = outcome.history, np.asarray(found.whole)
+    meshes = {"segmented": found.tissue, "initial": first.tissue, "fitted": outcome.tissue}
+    factors = _shape_factors(outcome)[whole]
+    metrics: dict[str, Any] = {}
+    for name, tissue in meshes.items():
+        metrics[f"correlation_{name}"] = _correlation(cost, tissue)
+        metrics[f"membrane_contrast_{name}"] = _membrane_contrast(tissue, found, seen)
+    corners = outcome.tissue.boundary.shortest(outcome.tissue.vertices - found.tissue.vertices)
+    return metrics | {
+        "n_cells": found.tissue.n_cells,
+        "n_whole_cells": int(whole.sum()),
+        "shape_factor_mean": factors.mean(),
+        "shape_factor_std": factors.std(),
+        "shape_factor_median": np.median(factors),
+        "observed_shape_factor_mean": np.asarray(outcome.tissue.shape_factors)[whole].mean(),
+        "vertex_displacement_from_segmentation": float(jnp.mean(jnp.linalg.norm(corners, axis=-1))),
+        "psf_width_pixels": width / found.pixel_size,
+        "pixel_size": found.pixel_size,
+        "cost_initial": history.cost[0],
+        "cost_final": outcome.cost,
+        "max_force": outcome.max_force,
+        "epochs": len(history.cost),
+        "best_epoch": outcome.best_epoch,
+        "seconds_per_epoch": np.median(history.seconds[1:]) if len(history.cost) > 1 else np.nan,
+        "num_t1": first.num_t1 + history.num_t1.sum(),
+        "converged_fraction": history.converged.mean(),
+    }
+
+
+def _shape_factors(outcome: Fit) -> Float[np.ndarray, " cells"]:
+    assert isinstance(outcome.energy, ShapeFactorEnergy)
+    return np.asarray(outcome.energy.target_shape_factor, float)
+
+
+def _cell_table(found: Segmentation, outcome: Fit) -> dict[str, np.ndarray]:
+    """One row a whole cell of the original image."""
+    assert isinstance(outcome.energy, ShapeFactorEnergy)
+    whole: Bool[np.ndarray, " cells"] = np.asarray(found.whole)
+    tissue, energy = outcome.tissue, outcome.energy
+    columns = {
+        "label": found.labels,
+        "target_shape_factor": energy.target_shape_factor,
+        "rest_area": energy.mean_area,
+        "shape_factor": tissue.shape_factors,
+        "area": tissue.areas,
+        "perimeter": tissue.perimeters,
+        "x_pixels": tissue.centroids[:, 0] / found.pixel_size,
+        "y_pixels": tissue.centroids[:, 1] / found.pixel_size,
+    }
+    return {name: np.asarray(column)[whole] for name, column in columns.items()}
+
+
+def _draw(
+    found: Segmentation,
+    pixels: Float[np.ndarray, "rows columns"],
+    initial: Tissue,
+    outcome: Fit,
+    folder: RunFolder,
+) -> None:
+    overlays = {"segmented": found.tissue, "relaxed first guess": initial, "fitted": outcome.tissue}
+    folder.save_figure("overlay", _figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
+    folder.save_figure("convergence", _figures.convergence(outcome.history))
+    figure = _figures.cells_on_image(
+        pixels,
+        outcome.tissue,
+        _shape_factors(outcome),
+        np.asarray(found.whole),
+        pixel_size=found.pixel_size,
+        label="target shape factor $p_0$",
+    )
+    folder.save_figure("shape_factors", figure)
