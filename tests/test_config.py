@@ -190,6 +190,55 @@ class _Config(ExperimentConfig):
     """A camera."""
 
 
+class _Deep(ExperimentConfig):
+    """A configuration with its own defaults for shared tables."""
+
+    experiment: Literal["x"] = "x"
+    """Which."""
+    outer: "_Outer" = Field(default_factory=lambda: _Outer())
+    """A table."""
+    camera: _Camera = _Camera(path=Path("here.tif"), crop=[1, 2])
+    """A camera."""
+
+
+class _Inner(Section):
+    """A table in a table."""
+
+    a: int = 1
+    """A."""
+    b: int = 2
+    """B."""
+
+
+class _Outer(Section):
+    """A table."""
+
+    inner: _Inner = _Inner(a=10)
+    """The inner one."""
+
+
+_Deep.model_rebuild()
+
+
+def test_a_table_of_which_one_key_is_given_keeps_the_defaults_of_the_others():
+    assert validate(_Deep, {"camera": {"crop": [3, 4]}}).camera.path == Path("here.tif")
+    inner = validate(_Deep, {"outer": {"inner": {"b": 5}}}).outer.inner
+    assert (inner.a, inner.b) == (10, 5)
+    assert "a = 10" in template(_Deep, "x")
+    with pytest.raises(ConfigError, match=r"`camera` must be a table"):
+        validate(_Deep, {"camera": 3})
+    with pytest.raises(ConfigError, match=r"no key `outer.inner.aa`"):
+        validate(_Deep, {"outer": {"inner": {"aa": 5}}})
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
+def test_setting_a_default_changes_nothing(experiment):
+    default = experiment.config().model_dump(exclude_none=True)
+    for table, keys in default.items():
+        for key, value in keys.items() if isinstance(keys, dict) else ():
+            assert validate(experiment.config, {table: {key: value}}) == experiment.config()
+
+
 def test_missing_keys_paths_and_lists_are_explained():
     with pytest.raises(
         ConfigError, match=r"`camera` is missing; it must be a table with the keys path"

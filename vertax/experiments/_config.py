@@ -34,6 +34,21 @@ class Section(pydantic.BaseModel):
         use_attribute_docstrings=True,
     )
 
+    # An experiment may give a shared table defaults of its own, `fit: Fitting = Fitting(epochs=150)`.
+    # They hold for each key of the table by itself, not only where the whole table is left out.
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _complete(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        defaults = {name: field.default for name, field in cls.model_fields.items()}
+        return {
+            name: _merge(default.model_dump(), value)
+            if isinstance(default := defaults.get(name), Section)
+            else value
+            for name, value in data.items()
+        }
+
 
 class ExperimentConfig(Section):
     """The keys that every experiment has.
@@ -166,7 +181,7 @@ def template(model: type[ExperimentConfig], name: str) -> str:
 
     **Returns:** the text of a TOML file.
     """
-    lines = [f'experiment = "{name}"', *_template_lines(model, "")]
+    lines = [f'experiment = "{name}"', *_template_lines(model, "", {})]
     return "\n".join(lines) + "\n"
 
 
@@ -239,7 +254,9 @@ def _nearest(name: str, known: Iterable[str]) -> str | None:
     return best if best is not None and alike(last(best), last(name)) > 0.65 else None
 
 
-def _template_lines(model: type[Section], prefix: str) -> Iterator[str]:
+def _template_lines(
+    model: type[Section], prefix: str, defaults: Mapping[str, Any]
+) -> Iterator[str]:
     sections: list[tuple[str, type[Section], FieldInfo]] = []
     for name, field in model.model_fields.items():
         section = _section(field)
@@ -247,16 +264,19 @@ def _template_lines(model: type[Section], prefix: str) -> Iterator[str]:
             sections.append((f"{prefix}{name}", section, field))
         elif name != "experiment":
             yield f"# {_one_line(field.description)} ({allowed(field)})"
-            if field.is_required():
+            default = defaults.get(name, field.get_default(call_default_factory=True))
+            if field.is_required() and name not in defaults:
                 yield f"{name} ="
-            elif (default := field.get_default(call_default_factory=True)) is None:
+            elif default is None:
                 yield f"# {name} ="
             else:
                 yield f"{name} = {_in_toml(default)}"
     for name, section, field in sections:
         yield ""
         yield f"[{name}]  # {_one_line(field.description)}"
-        yield from _template_lines(section, f"{name}.")
+        below = field.default.model_dump() if isinstance(field.default, Section) else {}
+        inherited = defaults.get(name.rpartition(".")[2])
+        yield from _template_lines(section, f"{name}.", inherited or below)
 
 
 def _section(field: FieldInfo) -> type[Section] | None:
@@ -275,6 +295,16 @@ def _parse(text: str) -> Any:
         return text.strip()
     # A text with line breaks could smuggle in more keys.
     return table["value"] if table.keys() == {"value"} else text.strip()
+
+
+def _merge(below: Mapping[str, Any], above: Any) -> Any:
+    """Two nested tables as one; what stands above wins."""
+    if not isinstance(above, Mapping):
+        return above
+    merge = lambda name: (
+        _merge(below[name], above[name]) if isinstance(below.get(name), Mapping) else above[name]
+    )
+    return {**below, **{name: merge(name) for name in above}}
 
 
 def _copy(data: Any) -> Any:
