@@ -6,6 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
@@ -264,3 +265,36 @@ def moved_by_boxes(tissue, boxes):
     topology = vx.Topology(m.twin, m.cell, frame, m.edge)
     vertices = tissue.vertices + tissue.boundary.translation(jnp.asarray(boxes))
     return vx.Tissue(vertices, topology, tissue.boundary, tissue.softening)
+
+
+@needs_data
+class TestAgainstTheAuthorsResults:
+    def test_hypergradient_at_an_unfinished_relaxation(self, load):
+        # The implicit formula with a dense pseudo-inverse, at a state with forces left: the Hessian is
+        # singular (translations), and nothing of our relaxation takes part.
+        tables, _, data = load("e1_N20_k0_f64", "rerelaxed")
+        tissue = from_tables(tables, softening=0.0)
+
+        def force(x, p0):
+            energy = vx.energies.ShapeFactorEnergy(p0)
+            return jax.grad(lambda y: energy(tissue.with_configuration(y)))(x)
+
+        p0 = jnp.asarray(data["p0_start"])
+        hessian = lx.JacobianLinearOperator(
+            lambda x, _: force(x, p0), tissue.vertices, tags=lx.symmetric_tag
+        )
+        pull = jnp.asarray(data["cost_grad_vertices"])
+        adjoint = lx.linear_solve(hessian, pull, vx.MINRES()).value
+        gradient = -jax.grad(lambda p: jnp.sum(force(tissue.vertices, p) * adjoint))(p0)
+        np.testing.assert_allclose(gradient, data["dense_implicit_grad"], rtol=1e-8, atol=1e-13)
+
+    def test_one_pass_of_t1_transitions_changes_the_same_neighbours(self, load):
+        before, _, data = load("t1_N20_k2_d01_f64", "before")
+        after, _, _ = load("t1_N20_k2_d01_f64", "after_one_pass")
+        start, theirs = (from_tables(t, softening=0.0) for t in (before, after))
+        energy = vx.energies.ShapeFactorEnergy(jnp.asarray(data["p0"]))
+        rule = vx.T1(threshold=float(data["min_dist_T1"]))
+        ours, counts = rule.sweep(start, energy, rule.init(start))
+        pairs = lambda t: sorted(np.sort(np.asarray(t.topology.edge_cells), axis=1).tolist())
+        assert counts.sum() == 3
+        assert pairs(ours) == pairs(theirs) != pairs(start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar, cast
@@ -109,6 +110,11 @@ class History(eqx.Module):
     """Mean of |inferred - true| / |true| over all parameters; NaN if the truth is not known."""
     seconds: Float[np.ndarray, " epochs"]
     """Wall-clock time of each epoch; the first one includes compilation."""
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """All curves by name, without those that nothing is known of."""
+        curves = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: curve for name, curve in curves.items() if not np.isnan(curve).all()}
 
 
 class Fit(eqx.Module, Generic[Energy]):

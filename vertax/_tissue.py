@@ -107,13 +107,13 @@ class Tissue(eqx.Module):
     @compiled_property
     def areas(self) -> Float[Array, " cells"]:
         """Signed area of each cell, positive for an upright (counter-clockwise) polygon."""
-        return self._cell_sums(self._area_shares())[:, 0]
+        return self._cell_sums(self._area_shares())
 
     @compiled_property
     def perimeters(self) -> Float[Array, " cells"]:
         """Perimeter of each cell (softened, see the class)."""
-        lengths = self.edge_lengths[:, None]
-        return self._cell_sums((lengths, lengths))[:, 0]
+        lengths = self.edge_lengths
+        return self._cell_sums((lengths, lengths))
 
     @compiled_property
     def shape_factors(self) -> Float[Array, " cells"]:
@@ -161,18 +161,18 @@ class Tissue(eqx.Module):
         at_zero = squared == 0
         return jnp.where(at_zero, 0, jnp.sqrt(jnp.where(at_zero, 1, squared)))
 
-    def _area_shares(self) -> tuple[Float[Array, "edges 1"], Float[Array, "edges 1"]]:
+    def _area_shares(self) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
         """What each edge contributes to the areas of its left and right cell (shoelace formula)."""
         m = self.topology
         first, vector = self.edge_segments
         left = first + self.boundary.translation(take(m.frame, m.half_edge))
         # The right cell's corner at the first vertex is one slot clockwise.
         right = first + self.boundary.translation(take(m.frame, clockwise(m.half_edge)))
-        return 0.5 * _cross(left, vector)[:, None], -0.5 * _cross(right, vector)[:, None]
+        return 0.5 * _cross(left, vector), -0.5 * _cross(right, vector)
 
     def _cell_sums(
-        self, shares: tuple[Float[Array, "edges columns"], Float[Array, "edges columns"]]
-    ) -> Float[Array, "cells columns"]:
+        self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]
+    ) -> Float[Array, " cells"]:
         cells = self.topology.edge_cells
         ids = jnp.concatenate([cells[:, 0], cells[:, 1]])
         return jax.ops.segment_sum(jnp.concatenate(shares), ids, self.n_cells)

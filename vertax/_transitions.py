@@ -36,7 +36,7 @@ class T1(AbstractTransitions):
     An edge shorter than the threshold is compared in two configurations of the same length: stretched
     along itself, and flipped (the two cells at its ends become neighbours). If the flipped one has the
     lower energy it is taken; otherwise the vertices stay where they are. Edges that a large step has
-    turned inside out are candidates too. All candidates of a sweep that share no cell are tried
+    turned inside out are candidates too. A sweep tries every candidate once, all that share no cell
     together, shortest first.
 
     A flip that would leave a cell with two sides, or an edge with one cell on both sides, is refused.
@@ -72,30 +72,43 @@ class T1(AbstractTransitions):
     def sweep(
         self, tissue: Tissue, energy: AbstractEnergy, counts: Int[Array, " edges"]
     ) -> tuple[Tissue, Int[Array, " edges"]]:
-        """Try every independent candidate once; returns the new tissue and the updated counts."""
-        corner = _EdgeFrames(tissue)
-        candidates = (corner.length < self.threshold) | corner.inside_out
-        candidates &= corner.can_flip & (counts < self.max_flips)
-        chosen = _independent(candidates, corner, tissue.n_cells)
+        """Try every candidate once; returns the new tissue and the updated counts."""
 
-        def judge() -> tuple[Tissue, Bool[Array, " edges"]]:
-            length = jnp.maximum(corner.length, self.threshold)
-            stretch = lambda which: corner.place(tissue, which, corner.along, length)
-            flip = lambda which: eqx.tree_at(
-                lambda t: t.topology,
-                corner.place(tissue, which, corner.across, length),
-                flip_edges(tissue.topology, which),
+        # Rounds of candidates that share no cell, until all were tried: one that is refused must not
+        # keep its neighbours from being tried. `todo` loses at least one edge a round.
+        def unfinished(carry: tuple) -> Bool[Array, ""]:
+            *_, todo = carry
+            return jnp.any(todo)
+
+        def one_round(carry: tuple) -> tuple:
+            tissue, counts, todo = carry
+            corner = _EdgeFrames(tissue)
+            todo &= (corner.length < self.threshold) | corner.inside_out
+            todo &= corner.can_flip & (counts < self.max_flips)
+            chosen = _independent(todo, corner, tissue.n_cells)
+
+            def judge() -> tuple[Tissue, Bool[Array, " edges"]]:
+                length = jnp.maximum(corner.length, self.threshold)
+                stretch = lambda which: corner.place(tissue, which, corner.along, length)
+                flip = lambda which: eqx.tree_at(
+                    lambda t: t.topology,
+                    corner.place(tissue, which, corner.across, length),
+                    flip_edges(tissue.topology, which),
+                )
+                if isinstance(energy, AbstractLocalEnergy):
+                    accepted = _judge_local(energy, chosen, corner, stretch, flip)
+                else:
+                    accepted = _judge_total(energy, chosen, corner, stretch, flip)
+                return flip(accepted), accepted
+
+            new, accepted = jax.lax.cond(
+                jnp.any(chosen), judge, lambda: (tissue, jnp.zeros_like(chosen))
             )
-            if isinstance(energy, AbstractLocalEnergy):
-                accepted = _judge_local(energy, chosen, corner, stretch, flip)
-            else:
-                accepted = _judge_total(energy, chosen, corner, stretch, flip)
-            return flip(accepted), accepted
+            return new, counts + accepted, todo & ~chosen
 
-        new, accepted = jax.lax.cond(
-            jnp.any(chosen), judge, lambda: (tissue, jnp.zeros_like(chosen))
-        )
-        return new, counts + accepted
+        start = (tissue, counts, jnp.ones(tissue.n_edges, bool))
+        tissue, counts, _ = jax.lax.while_loop(unfinished, one_round, start)
+        return tissue, counts
 
 
 class _EdgeFrames(eqx.Module):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -53,13 +52,10 @@ def convergence(history: History) -> Figure:
 
     **Returns:** the figure.
     """
-    curves = {f.name: getattr(history, f.name) for f in dataclasses.fields(history)}
-    if not np.isfinite(curves["relative_error"]).any():  # the truth is not known
-        del curves["relative_error"]
+    curves = history.columns()
     with _style.house_style():
-        n_panels = 3 + ("relative_error" in curves)
-        figure, axes = new_figure(n_panels, width=2.3, height=2.0)
-        plot_history(curves, axes=axes)
+        figure, axes = new_figure(3 + ("relative_error" in curves), width=2.3, height=2.0)
+        plot_history(history, axes=axes)
     return figure
 
 

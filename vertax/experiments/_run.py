@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import importlib.metadata
 import json
 import math
@@ -18,6 +17,7 @@ import tomli_w
 from jaxtyping import Shaped
 from matplotlib.figure import Figure
 
+from vertax._bilevel import History
 from vertax._tissue import Tissue
 from vertax.experiments._config import ExperimentConfig
 from vertax.io import atomic_write, save_tissue
@@ -176,7 +176,7 @@ class RunFolder:
         return sorted(self.path.glob("figures/*.png"))
 
 
-def history_columns(history: Any, **labels: str) -> dict[str, Any]:
+def history_columns(history: History, **labels: str) -> dict[str, Any]:
     """The columns of a table of the epochs of a fit.
 
     **Arguments:**
@@ -184,11 +184,13 @@ def history_columns(history: Any, **labels: str) -> dict[str, Any]:
     - `history`: a [`History`][vertax.History].
     - `labels`: columns of one repeated text each, to tell fits apart in one table.
 
-    **Returns:** the labels, the number of the epoch and every curve of the history.
+    **Returns:** the labels, the number of the epoch and every known curve of the history.
     """
-    curves = {f.name: np.asarray(getattr(history, f.name)) for f in dataclasses.fields(history)}
-    n = len(curves["cost"])
-    return {name: [text] * n for name, text in labels.items()} | {"epoch": np.arange(n)} | curves
+    n = len(history.cost)
+    return {name: [text] * n for name, text in labels.items()} | {
+        "epoch": np.arange(n),
+        **history.columns(),
+    }
 
 
 def installed_version(name: str) -> str:

@@ -156,7 +156,7 @@ _POINTS = 48
 
 def _prepare(
     pixels: Float[np.ndarray, "rows columns"], found: Segmentation, options: ImageSection
-) -> Float[np.ndarray, "rows columns"]:
+) -> Float[np.ndarray, "coarse_rows coarse_columns"]:
     """The image in even light, and no finer than it need be."""
     # The logarithm brings bright junctions and faint membranes together, as the segmentation does.
     bright = pixels - pixels.min()
@@ -170,7 +170,7 @@ def _prepare(
     smooth = gaussian_filter(even, 0.35 / factor, mode="reflect")
     steps = [new / old for new, old in zip(shape, pixels.shape, strict=True)]
     # Pixels as areas: the coarse image covers the same extent as the fine one.
-    return zoom(smooth, steps, order=1, mode="reflect", grid_mode=True)
+    return np.asarray(zoom(smooth, steps, order=1, mode="reflect", grid_mode=True))
 
 
 def _psf_width(

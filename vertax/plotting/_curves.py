@@ -9,6 +9,7 @@ from jaxtyping import Array, Real
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from vertax._bilevel import History
 from vertax.plotting import _style
 
 # What a history may hold, in the order of the panels: its name there, and the scale of its axis.
@@ -21,7 +22,7 @@ _CURVES = {
 
 
 def plot_history(
-    history: Mapping[str, Real[Array | np.ndarray, " ..."]],
+    history: History | Mapping[str, Real[Array | np.ndarray, " ..."]],
     *,
     axes: Sequence[Axes] | np.ndarray | None = None,
     label: str | None = None,
@@ -33,8 +34,8 @@ def plot_history(
 
     **Arguments:**
 
-    - `history`: values per epoch under the names `cost`, and if there `relative_error`,
-        `max_force` and `num_t1`; other entries are left out.
+    - `history`: of a [`Fit`][vertax.Fit], or values per epoch under the names `cost`, and if there
+        `relative_error`, `max_force` and `num_t1`; other entries are left out.
     - `axes`: where to draw, one for each panel, to compare several fits; by default a new figure.
     - `label`: name of this fit in the legend.
 
@@ -45,6 +46,8 @@ def plot_history(
     - `ValueError` if the history has no `cost`, if its curves differ in length, or if the number of
         `axes` is not that of the panels.
     """
+    if isinstance(history, History):
+        history = history.columns()
     if "cost" not in history:
         raise ValueError(
             "Argument `history` must hold `cost`, but holds "

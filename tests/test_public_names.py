@@ -1,0 +1,47 @@
+import vertax as vx
+
+# The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
+NAMES = """
+AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions Equilibrium Fit
+FitError History ImplicitDifferentiation InverseProblem MINRES Periodic T1 Tissue Topology adjoints costs
+energies equilibrate fit initialise io load_tissue plot_history plot_recovery plot_tissue plotting
+save_tissue solvers
+"""
+
+FAMILIES = {
+    "adjoints": "AbstractAdjoint ImplicitDifferentiation",
+    "costs": "AbstractCost MeshImage VertexDistance WeightedSum mirror render",
+    "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity LineTension LocalSum "
+    "PerimeterElasticity ShapeFactorEnergy Sum",
+    "initialise": "AbstractSegmenter Cellpose Segmentation Watershed from_labels from_microscopy "
+    "hexagonal periodic_voronoi",
+    "io": "Tables atomic_write from_tables load_tissue read_image save_tissue to_tables",
+    "plotting": "cell_polygons plot_history plot_recovery plot_tissue",
+    "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
+}
+
+
+def public(module):
+    # The hook that checks types in tests leaves its own name behind.
+    return sorted(n for n in vars(module) if not n.startswith("_") and n != "jaxtyping")
+
+
+def test_top_level_names():
+    # Importing the command line makes `experiments` an attribute too.
+    assert [name for name in public(vx) if name != "experiments"] == NAMES.split()
+
+
+def test_names_of_the_families():
+    for family, names in FAMILIES.items():
+        assert public(getattr(vx, family)) == names.split(), family
+
+
+def test_importing_changes_no_setting_of_jax():
+    import subprocess
+    import sys
+
+    code = (
+        "import jax; before = dict(jax.config.values); import vertax; import vertax.experiments; "
+        "assert dict(jax.config.values) == before"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
