@@ -17,7 +17,8 @@ jax.config.update("jax_enable_x64", True)
 def main(sizes: tuple[int, ...] = (20, 100, 1000), epochs: int = 60) -> None:
     """Print one row a size."""
     print(
-        f"{'cells':>6} {'first epoch s':>14} {'ms/epoch':>9} {'Newton steps':>13} {'relative error':>24}"
+        f"{'cells':>6} {'first epoch s':>14} {'ms/epoch':>9} {'Newton steps':>13} {'T1s':>4} "
+        f"{'relative error':>24}"
     )
     for n in sizes:
         tissue = vx.initialise.periodic_voronoi(n, key=jax.random.key(0))
@@ -34,7 +35,8 @@ def main(sizes: tuple[int, ...] = (20, 100, 1000), epochs: int = 60) -> None:
         h = fit.history
         print(
             f"{n:6d} {h.seconds[0]:14.1f} {1e3 * np.median(h.seconds[1:]):9.2f} "
-            f"{h.num_steps[1:].mean():13.1f} {h.relative_error[0]:11.2e} -> {h.relative_error[-1]:8.2e}"
+            f"{h.num_steps[1:].mean():13.1f} {h.num_t1.sum():4d} "
+            f"{h.relative_error[0]:11.2e} -> {h.relative_error[-1]:8.2e}"
         )
 
 

@@ -154,6 +154,12 @@ def test_bad_settings_are_refused(options):
         vx.equilibrate(random_tissue(5), ShapeFactorEnergy(3.7), **options)
 
 
+def test_an_adjoint_that_would_unroll_is_refused():
+    adjoint = optx.RecursiveCheckpointAdjoint()
+    with pytest.raises(Exception, match="adjoint"):
+        vx.equilibrate(random_tissue(5), ShapeFactorEnergy(3.7), adjoint=adjoint)  # pyright: ignore
+
+
 def test_no_retracing_between_calls():
     traces, first = [], 0
 

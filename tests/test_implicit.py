@@ -138,3 +138,29 @@ def test_adjoint_ignores_translations():
 
     gradient = jax.grad(loss)(energy.target_shape_factor)
     assert jnp.abs(gradient).max() < 1e-8
+
+
+def test_gradient_with_respect_to_a_neural_network_inside_an_energy():
+    class Learned(vx.AbstractEnergy):
+        network: eqx.nn.MLP
+
+        def __call__(self, tissue):
+            shape = jnp.stack([tissue.areas, tissue.perimeters / 4], axis=-1)
+            return ShapeFactorEnergy(3.6)(tissue) + 0.1 * jnp.sum(jax.vmap(self.network)(shape))
+
+    tissue, _ = relaxed(10, 3)
+    energy = Learned(eqx.nn.MLP(2, "scalar", 8, 1, jnp.tanh, key=jax.random.key(0)))
+
+    def loss(e):
+        found = vx.equilibrate(tissue, e, transitions=None, tolerance=1e-11)
+        return jnp.sum(found.tissue.areas**3)
+
+    gradient = eqx.filter_grad(loss)(energy)
+    parameters, constants = eqx.partition(energy, eqx.is_inexact_array)
+    direction = random_like(parameters)
+    slope = sum(
+        jnp.sum(a * b)
+        for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True)
+    )
+    run = eqx.filter_jit(lambda p: loss(eqx.combine(p, constants)))
+    assert slope == pytest.approx(float(central_difference(run, parameters, direction)), rel=1e-5)

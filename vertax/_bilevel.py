@@ -19,6 +19,7 @@ from tqdm.auto import tqdm
 from vertax._equilibrium import Equilibrium, equilibrate
 from vertax._tissue import Tissue
 from vertax._transitions import T1, AbstractTransitions
+from vertax.adjoints import AbstractAdjoint
 from vertax.costs import AbstractCost
 from vertax.energies import AbstractEnergy
 
@@ -50,7 +51,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     cost: AbstractCost
     trainable: PyTree[bool] | Callable[[Any], bool] = eqx.is_inexact_array
     fit_position: bool = False
-    adjoint: optx.AbstractAdjoint | None = None
+    adjoint: AbstractAdjoint | None = None
     solver: optx.AbstractMinimiser | None = None
     transitions: AbstractTransitions | None = T1()
     tolerance: float | Float[Array, ""] | None = None

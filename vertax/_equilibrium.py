@@ -46,7 +46,7 @@ def equilibrate(
     energy: AbstractEnergy,
     *,
     solver: optx.AbstractMinimiser | None = None,
-    adjoint: optx.AbstractAdjoint | None = None,
+    adjoint: AbstractAdjoint | None = None,
     transitions: AbstractTransitions | None = T1(),
     tolerance: float | Float[Array, ""] | None = None,
     patience: int = 1,
@@ -80,6 +80,7 @@ def equilibrate(
     **Raises:**
 
     - `ValueError` for a tolerance, patience or number of steps that is not positive.
+    - `TypeError` for an adjoint that is none of `vertax.adjoints`.
     - `RuntimeError` (of Equinox, also inside `jax.jit`) if `throw` and the relaxation did not converge.
     """
     if solver is None:
@@ -88,6 +89,11 @@ def equilibrate(
         solver = Wrapped(solver)
     if adjoint is None:
         adjoint = ImplicitDifferentiation()
+    if not isinstance(adjoint, AbstractAdjoint):
+        raise TypeError(
+            "Argument `adjoint` must be one of vertax.adjoints, e.g. ImplicitDifferentiation(), but is "
+            f"{type(adjoint).__name__}."
+        )
     if tolerance is None:
         tolerance = 1e-9 if tissue.vertices.dtype == jnp.float64 else 1e-4
     if is_concrete(tolerance) and not tolerance > 0:
@@ -106,7 +112,7 @@ def _equilibrate(
     tissue: Tissue,
     energy: AbstractEnergy,
     solver: AbstractSolver,
-    adjoint: optx.AbstractAdjoint,
+    adjoint: AbstractAdjoint,
     transitions: AbstractTransitions | None,
     tolerance: float | Float[Array, ""],
     patience: int,
@@ -114,30 +120,25 @@ def _equilibrate(
     throw: bool,
 ) -> Equilibrium:
     threshold = jnp.asarray(tolerance, tissue.vertices.dtype)
-    relaxation = _Relaxation(solver=solver, tolerance=threshold, patience=patience)
     # The box is as good a unit of length as the cells: both are the scale of the shapes.
     scale = jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
-    options = {"length_scale": jax.lax.stop_gradient(scale), "budget": jnp.array(max_steps)}
+    options = {"length_scale": jax.lax.stop_gradient(scale)}
+    relaxation = _Relaxation(solver, threshold, patience, options)
 
     found = _search(
         relaxation,
         transitions,
-        *jax.lax.stop_gradient((tissue, energy)),
-        options=options,
+        *_frozen((tissue, energy)),
         max_steps=max_steps,
     )
-    # The second solve starts at rest and takes no step of its own: it is there to be differentiated.
-    # Most adjoints need no more than the equilibrium; then the solver is not even compiled.
-    at_equilibrium = isinstance(adjoint, AbstractAdjoint) and not adjoint.runs_solver
+    # The second solve starts at rest and takes no step: it is there to be differentiated.
     moved = eqx.tree_at(lambda t: t.boundary, found.tissue, tissue.boundary)
-    gauge = _gauge_stiffness(found.tissue, jax.lax.stop_gradient(energy))
+    gauge = _gauge_stiffness(found.tissue, _frozen(energy))
     solution = optx.minimise(
         _potential,
-        _AtRest() if at_equilibrium else relaxation,
+        _AtRest(),
         found.tissue.configuration,
         (moved, energy, gauge),
-        options=options | {"budget": jnp.array(0)},
-        max_steps=max_steps,
         adjoint=adjoint,
         throw=False,
     )
@@ -153,6 +154,11 @@ def _equilibrate(
     if throw:
         equilibrium = found.result.error_if(equilibrium, found.result != optx.RESULTS.successful)
     return equilibrium
+
+
+def _frozen(tree: PyTree) -> PyTree:
+    """The same values, taken for constants by differentiation."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def _potential(configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Array]) -> Array:
@@ -179,50 +185,36 @@ class _RelaxationState(eqx.Module):
     inner: PyTree
     force: Float[Array, ""]
     n_below: Int[Array, ""]
-    n_steps: Int[Array, ""]
 
 
-class _Relaxation(optx.AbstractMinimiser):
-    """A solver that stops when the largest force stays below a tolerance for some steps.
-
-    `options["budget"]` bounds its steps.
-    """
+class _Relaxation(eqx.Module):
+    """A solver that is at rest when the largest force has stayed below a tolerance for some steps."""
 
     solver: AbstractSolver
     tolerance: Float[Array, ""]
     patience: int = eqx.field(static=True)
-    rtol: float = 0.0
-    atol: float = 0.0
-    norm: Callable = eqx.field(static=True, default=optx.max_norm)
+    options: dict[str, Array]
 
-    def init(
-        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
-    ) -> _RelaxationState:
-        inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
-        force = self.norm(self.solver.gradient(inner))
-        return _RelaxationState(inner, force, jnp.where(force < self.tolerance, 1, 0), jnp.array(0))
+    def init(self, y: Any, args: Any) -> _RelaxationState:
+        f_struct = jax.ShapeDtypeStruct((), self.tolerance.dtype)
+        tags = frozenset()
+        inner = self.solver.init(_objective, y, args, self.options, f_struct, None, tags)
+        return self._judge(inner, jnp.array(0))
 
-    def step(
-        self, fn: Any, y: Any, args: Any, options: Any, state: _RelaxationState, tags: Any
-    ) -> tuple[Any, _RelaxationState, Any]:
-        y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
-        force = self.norm(self.solver.gradient(inner))
-        n_below = jnp.where(force < self.tolerance, state.n_below + 1, 0)
-        return y, _RelaxationState(inner, force, n_below, state.n_steps + 1), aux
+    def step(self, y: Any, args: Any, state: _RelaxationState) -> tuple[Any, _RelaxationState]:
+        y, inner, _ = self.solver.step(_objective, y, args, self.options, state.inner, frozenset())
+        return y, self._judge(inner, state.n_below)
 
     def at_rest(self, state: _RelaxationState) -> Bool[Array, ""]:
         return state.n_below >= self.patience
 
-    def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: _RelaxationState, tags: Any
-    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        out_of_budget = state.n_steps >= options["budget"]
-        return self.at_rest(state) | out_of_budget, optx.RESULTS.successful
+    def _judge(self, inner: Any, n_below: Int[Array, ""]) -> _RelaxationState:
+        force = optx.max_norm(self.solver.gradient(inner))
+        return _RelaxationState(inner, force, jnp.where(force < self.tolerance, n_below + 1, 0))
 
-    def postprocess(
-        self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        return y, aux, {}
+
+def _objective(y: PyTree[Array], args: Any) -> tuple[Array, None]:
+    return _potential(y, args), None
 
 
 class _AtRest(optx.AbstractMinimiser):
@@ -275,21 +267,13 @@ def _search(
     tissue: Tissue,
     energy: AbstractEnergy,
     *,
-    options: dict[str, Array],
     max_steps: int,
 ) -> _Found:
     """Relax with topology changes; not differentiable."""
     no_gauge = jnp.zeros((), tissue.vertices.dtype)
-    f_struct = jax.ShapeDtypeStruct((), tissue.vertices.dtype)
-
-    def objective(y: Array, args: tuple) -> tuple[Array, None]:
-        return _potential(y, args), None
 
     def begin(at: Tissue) -> _RelaxationState:
-        args = (at, energy, no_gauge)
-        return relaxation.init(
-            objective, at.configuration, args, options, f_struct, None, frozenset()
-        )
+        return relaxation.init(at.configuration, (at, energy, no_gauge))
 
     state = begin(tissue)
     dynamic, static = eqx.partition(state, eqx.is_array)
@@ -316,9 +300,7 @@ def _search(
 
         def step() -> tuple[Array, PyTree]:
             args = (tissue, energy, no_gauge)
-            y, new_state, _ = relaxation.step(
-                objective, tissue.configuration, args, options, state, frozenset()
-            )
+            y, new_state = relaxation.step(tissue.configuration, args, state)
             return y, eqx.filter(new_state, eqx.is_array)
 
         y, dynamic = jax.lax.cond(finished, lambda: (tissue.configuration, dynamic), step)

@@ -1,17 +1,14 @@
-"""What every adjoint here says of itself."""
+"""What every adjoint here has in common."""
 
 from __future__ import annotations
-
-from typing import ClassVar
 
 import optimistix as optx
 
 
 class AbstractAdjoint(optx.AbstractAdjoint):
-    """A way to differentiate through an equilibrium: an Optimistix adjoint that says what it needs.
+    """A way to differentiate through an equilibrium, given the equilibrium itself.
 
-    [`equilibrate`][vertax.equilibrate] first finds the equilibrium and its topology, without gradients.
+    [`equilibrate`][vertax.equilibrate] first finds the equilibrium and its topology without gradients;
+    the adjoint then sees a minimisation that starts, and ends, there. (An adjoint that unrolls the steps
+    of a minimiser would find none, and a gradient of zero: so Optimistix's own are not accepted.)
     """
-
-    runs_solver: ClassVar[bool]
-    """Whether the adjoint runs the minimiser itself, or needs the equilibrium alone."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import lineax as lx
@@ -29,8 +29,6 @@ class ImplicitDifferentiation(AbstractAdjoint):
 
     - `linear_solver`: solves the systems with the Hessian, which is symmetric and may be indefinite.
     """
-
-    runs_solver: ClassVar[bool] = False
 
     linear_solver: lx.AbstractLinearSolver = eqx.field(default_factory=MINRES)
 

@@ -17,7 +17,7 @@ import tomli_w
 from jaxtyping import Shaped
 from matplotlib.figure import Figure
 
-from vertax._bilevel import History
+from vertax._bilevel import Fit, History
 from vertax._tissue import Tissue
 from vertax.experiments._config import ExperimentConfig
 from vertax.io import atomic_write, save_tissue
@@ -190,6 +190,29 @@ def history_columns(history: History, **labels: str) -> dict[str, Any]:
     return {name: [text] * n for name, text in labels.items()} | {
         "epoch": np.arange(n),
         **history.columns(),
+    }
+
+
+def fit_metrics(outcome: Fit) -> dict[str, Any]:
+    """What every fit has to tell.
+
+    **Arguments:**
+
+    - `outcome`: the fit.
+
+    **Returns:** costs, largest force, epochs, seconds and T1 transitions.
+    """
+    history = outcome.history
+    return {
+        "cost_initial": history.cost[0],
+        "cost_final": outcome.cost,
+        "max_force": outcome.max_force,
+        "epochs": len(history.cost),
+        "best_epoch": outcome.best_epoch,
+        # The first epoch is the one that is compiled.
+        "seconds_per_epoch": np.median(history.seconds[1:]) if len(history.cost) > 1 else np.nan,
+        "num_t1": history.num_t1.sum(),
+        "converged_fraction": history.converged.mean(),
     }
 
 

@@ -25,7 +25,7 @@ from vertax.costs import MeshImage, mirror
 from vertax.energies import ShapeFactorEnergy
 from vertax.experiments import _figures
 from vertax.experiments._config import ConfigError, ExperimentConfig, Section
-from vertax.experiments._run import RunFolder, history_columns
+from vertax.experiments._run import RunFolder, fit_metrics, history_columns
 from vertax.experiments._sections import Fitting, Relaxation
 from vertax.initialise import Cellpose, Segmentation, Watershed, from_microscopy
 from vertax.io import read_image
@@ -222,7 +222,7 @@ def _metrics(
     outcome: Fit,
     width: float,
 ) -> dict[str, Any]:
-    history, whole = outcome.history, np.asarray(found.whole)
+    whole = np.asarray(found.whole)
     meshes = {"segmented": found.tissue, "initial": first.tissue, "fitted": outcome.tissue}
     factors = _shape_factors(outcome)[whole]
     metrics: dict[str, Any] = {}
@@ -240,14 +240,8 @@ def _metrics(
         "vertex_displacement_from_segmentation": float(jnp.mean(jnp.linalg.norm(corners, axis=-1))),
         "psf_width_pixels": width / found.pixel_size,
         "pixel_size": found.pixel_size,
-        "cost_initial": history.cost[0],
-        "cost_final": outcome.cost,
-        "max_force": outcome.max_force,
-        "epochs": len(history.cost),
-        "best_epoch": outcome.best_epoch,
-        "seconds_per_epoch": np.median(history.seconds[1:]) if len(history.cost) > 1 else np.nan,
-        "num_t1": first.num_t1 + history.num_t1.sum(),
-        "converged_fraction": history.converged.mean(),
+        **fit_metrics(outcome),
+        "num_t1_first_guess": first.num_t1,
     }
 
 

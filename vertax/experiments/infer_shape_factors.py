@@ -24,7 +24,7 @@ from vertax.costs import AbstractCost, MeshImage, VertexDistance, render
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.experiments import _figures
 from vertax.experiments._config import ExperimentConfig, Section
-from vertax.experiments._run import RunFolder, history_columns
+from vertax.experiments._run import RunFolder, fit_metrics, history_columns
 from vertax.experiments._sections import Fitting, Relaxation
 from vertax.initialise import periodic_voronoi
 
@@ -205,15 +205,7 @@ def _metrics(scene: _Scene, outcome: Fit) -> dict[str, Any]:
         "pearson": np.corrcoef(true, inferred)[0, 1] if varied else np.nan,
         "relative_error": np.mean(np.abs(inferred - true) / np.abs(true)),
         "relative_error_initial": history.relative_error[0],
-        "cost_initial": history.cost[0],
-        "cost_final": outcome.cost,
-        "max_force": outcome.max_force,
-        "epochs": len(history.cost),
-        "best_epoch": outcome.best_epoch,
-        # The first epoch is the one that is compiled.
-        "seconds_per_epoch": np.median(history.seconds[1:]) if len(history.cost) > 1 else np.nan,
-        "num_t1": history.num_t1.sum(),
-        "converged_fraction": history.converged.mean(),
+        **fit_metrics(outcome),
         "same_neighbours": _neighbours(outcome.tissue) == _neighbours(scene.target),
     }
 
