@@ -123,6 +123,7 @@ def test_history_has_a_row_for_each_epoch_of_each_fit(tiny):
     assert history["data"] == 4 * ["vertices"] + 4 * ["image"]
     assert history["epoch"] == 2 * ["0", "1", "2", "3"]
     assert float(history["cost"][0]) == metrics["vertices"]["cost_initial"]
+    assert metrics["pearson"] == metrics["vertices"]["pearson"]
     assert float(history["relative_error"][4]) == metrics["image"]["relative_error_initial"]
 
 

@@ -236,14 +236,16 @@ def summary(metrics: Mapping[str, Any]) -> str:
 
     **Arguments:**
 
-    - `metrics`: numbers by name, or mappings of numbers by the name of the group; other entries
-        are left out.
+    - `metrics`: numbers by name, or mappings of numbers by the name of the group; if there are
+        groups, other entries are left out.
 
     **Returns:** the table.
     """
     plain: dict[str, Any] = _plain(metrics)
     groups = {"": plain} | {k: group for k, group in plain.items() if isinstance(group, dict)}
     groups = {k: group for k, group in groups.items() if any(map(_is_number, group.values()))}
+    if len(groups) > 1:
+        groups.pop("", None)
     names = {n: None for group in groups.values() for n in group if _is_number(group[n])}
     rows = [["", *groups]] if any(groups) else []
     rows += [[n, *(_short(group.get(n)) for group in groups.values())] for n in names]

@@ -105,7 +105,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     - `progress`: show a progress bar (only on a terminal).
 
     **Returns:** the metrics: `pearson`, `relative_error`, `cost_initial`, `cost_final`, `max_force`
-    and others of the fit; if there are two kinds of data, a mapping of them for each.
+    and others of the fit; if there are two kinds of data, those of the vertices and a mapping for
+    each.
 
     **Raises:**
 
@@ -126,7 +127,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         _save_tables(scene, fits, folder)
         _save_fit(config, scene, source, fits[source], folder)
         metrics[source] = _metrics(scene, fits[source])
-    return metrics if both else metrics[config.data]
+    # The same keys are at the top whatever the data; the exact data, vertices, come first.
+    return metrics["vertices"] | metrics if both else metrics[config.data]
 
 
 def synthetic_image(
