@@ -205,13 +205,10 @@ def fit(
     # of type would compile the epoch anew.
     parameters = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
     true = None if truth is None else eqx.filter(truth, problem.trainable)
-    # The position is counted from the last equilibrium: an update displaces, and is forgotten.
-    shift = jnp.zeros(2, problem.tissue.vertices.dtype) if problem.fit_position else None
-    state = _State(
-        parameters, optimiser.init(cast(optax.Params, (parameters, shift))), problem.tissue
-    )
+    fitted = cast(optax.Params, (parameters, _no_shift(problem)))
+    state = _State(parameters, optimiser.init(fitted), problem.tissue)
     best: tuple[int, _Record] | None = None
-    rows: list[tuple] = []
+    rows: list[dict[str, float]] = []
     stopped = None
     bar = tqdm(range(epochs), unit="epoch", disable=None if progress else True)
     try:
@@ -219,24 +216,23 @@ def fit(
             began = time.perf_counter()
             state, record = _epoch(problem, optimiser, constants, true, state)
             cost, slope = float(record.cost), float(record.gradient_norm)
-            rows.append(
-                (
-                    cost,
-                    float(record.max_force),
-                    bool(record.converged),
-                    int(record.num_steps),
-                    int(record.num_t1),
-                    slope,
-                    float(record.relative_error),
-                    time.perf_counter() - began,
-                )
-            )
+            row = {
+                "cost": cost,
+                "max_force": float(record.max_force),
+                "converged": bool(record.converged),
+                "num_steps": int(record.num_steps),
+                "num_t1": int(record.num_t1),
+                "gradient_norm": slope,
+                "relative_error": float(record.relative_error),
+                "seconds": time.perf_counter() - began,
+            }
+            rows.append(row)
             if not (np.isfinite(cost) and np.isfinite(slope)):
                 stopped = f"cost ({cost}) or gradient ({slope}) is not finite in epoch {epoch}"
                 break
             if record.converged and (best is None or cost < float(best[1].cost)):
                 best = epoch, record
-            bar.set_postfix(cost=f"{cost:.3e}", force=f"{rows[-1][1]:.1e}", t1=rows[-1][4])
+            bar.set_postfix(cost=f"{cost:.3e}", force=f"{row['max_force']:.1e}", t1=row["num_t1"])
             if callback is not None:
                 callback(epoch, record)
     except KeyboardInterrupt:
@@ -246,7 +242,7 @@ def fit(
         stopped = f"epoch {len(rows)} broke down ({_first_line(error)})"
     if not rows:
         raise FitError(f"The fit stopped: {stopped}.", None)
-    history = History(*(np.asarray(column) for column in zip(*rows, strict=True)))
+    history = History(**{name: np.asarray([row[name] for row in rows]) for name in rows[0]})
     if best is None:
         raise FitError(
             "No epoch of the fit reached equilibrium: raise `max_steps`, loosen `tolerance`, or use the "
@@ -268,6 +264,12 @@ def fit(
     return outcome
 
 
+def _no_shift(problem: InverseProblem) -> Float[Array, "2"] | None:
+    """Where a fitted position starts in each epoch; None if it is not fitted."""
+    # It is counted from the last equilibrium: an update displaces the tissue, and is forgotten.
+    return jnp.zeros(2, problem.tissue.vertices.dtype) if problem.fit_position else None
+
+
 def _first_line(error: Exception) -> str:
     return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
@@ -286,8 +288,7 @@ def _epoch(
         parameters, shift = fitted
         return problem(eqx.combine(parameters, constants), state.tissue, shift)
 
-    here = jnp.zeros(2, state.tissue.vertices.dtype) if problem.fit_position else None
-    fitted = (state.parameters, here)
+    fitted = (state.parameters, _no_shift(problem))
     (value, equilibrium), gradient = jax.value_and_grad(cost, has_aux=True)(fitted)
     updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
         gradient, state.optimiser, cast(optax.Params, fitted), value=value, grad=gradient

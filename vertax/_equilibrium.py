@@ -120,7 +120,7 @@ def _equilibrate(
     throw: bool,
 ) -> Equilibrium:
     threshold = jnp.asarray(tolerance, tissue.vertices.dtype)
-    # The box is as good a unit of length as the cells: both are the scale of the shapes.
+    # Solvers bound their steps in units of the cells, whatever unit of length the user chose.
     scale = jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
     options = {"length_scale": jax.lax.stop_gradient(scale)}
     relaxation = _Relaxation(solver, threshold, patience, options)
