@@ -21,7 +21,12 @@ from vertax._equilibrium import Equilibrium as Equilibrium, equilibrate as equil
 from vertax._tissue import Tissue as Tissue
 from vertax._topology import Topology as Topology
 from vertax._transitions import T1 as T1, AbstractTransitions as AbstractTransitions
-from vertax.adjoints import ImplicitDifferentiation as ImplicitDifferentiation
+from vertax.adjoints import (
+    AutomaticDifferentiation as AutomaticDifferentiation,
+    EquilibriumPropagation as EquilibriumPropagation,
+    GradientOutcome as GradientOutcome,
+    ImplicitDifferentiation as ImplicitDifferentiation,
+)
 from vertax.costs import AbstractCost as AbstractCost
 from vertax.energies import (
     AbstractEnergy as AbstractEnergy,

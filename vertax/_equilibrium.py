@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -14,9 +13,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from vertax._misc import is_concrete
 from vertax._tissue import Tissue
 from vertax._transitions import T1, AbstractTransitions
-from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
+from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
+from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
+from vertax.solvers._relaxation import Relaxation, RelaxationState
 
 
 class Equilibrium(eqx.Module):
@@ -87,13 +88,8 @@ def equilibrate(
         solver = NewtonCG()
     if not isinstance(solver, AbstractSolver):
         solver = Wrapped(solver)
-    if adjoint is None:
-        adjoint = ImplicitDifferentiation()
-    if not isinstance(adjoint, AbstractAdjoint):
-        raise TypeError(
-            "Argument `adjoint` must be one of vertax.adjoints, e.g. ImplicitDifferentiation(), but is "
-            f"{type(adjoint).__name__}."
-        )
+    adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
+    _check_adjoint(adjoint, solver)
     if tolerance is None:
         tolerance = 1e-9 if tissue.vertices.dtype == jnp.float64 else 1e-4
     if is_concrete(tolerance) and not tolerance > 0:
@@ -122,23 +118,28 @@ def _equilibrate(
     threshold = jnp.asarray(tolerance, tissue.vertices.dtype)
     # Solvers bound their steps in units of the cells, whatever unit of length the user chose.
     scale = jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
-    options = {"length_scale": jax.lax.stop_gradient(scale)}
-    relaxation = _Relaxation(solver, threshold, patience, options)
+    options = frozen({"length_scale": scale})
+    relaxation = Relaxation(solver, threshold, patience)
 
     found = _search(
-        relaxation,
-        transitions,
-        *_frozen((tissue, energy)),
-        max_steps=max_steps,
+        relaxation, options, transitions, *frozen((tissue, energy)), max_steps=max_steps
     )
-    # The second solve starts at rest and takes no step: it is there to be differentiated.
+    # The second solve is there to be differentiated. It starts at rest and takes no step, unless the
+    # adjoint differentiates the steps themselves.
     moved = eqx.tree_at(lambda t: t.boundary, found.tissue, tissue.boundary)
-    gauge = _gauge_stiffness(found.tissue, _frozen(energy))
+    stiffness = _stiffness(found.tissue, frozen(energy))
+    if adjoint.unrolls:
+        start, gauge = found.start, jnp.zeros_like(stiffness)
+    else:
+        start, gauge = found.tissue.configuration, stiffness
+        options = options | {"num_steps": jnp.array(0), "stiffness": stiffness}
     solution = optx.minimise(
         _potential,
-        _AtRest(),
-        found.tissue.configuration,
+        relaxation,
+        start,
         (moved, energy, gauge),
+        options,
+        max_steps=max_steps,
         adjoint=adjoint,
         throw=False,
     )
@@ -156,9 +157,25 @@ def _equilibrate(
     return equilibrium
 
 
-def _frozen(tree: PyTree) -> PyTree:
-    """The same values, taken for constants by differentiation."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
+    if not isinstance(adjoint, AbstractAdjoint):
+        raise TypeError(
+            "Argument `adjoint` must be one of vertax.adjoints, e.g. ImplicitDifferentiation(), but is "
+            f"{type(adjoint).__name__}."
+        )
+    if adjoint.unrolls and not solver.unrollable:
+        inner = solver.solver if isinstance(solver, Wrapped) else solver
+        raise ValueError(
+            f"{type(adjoint).__name__} differentiates the steps of the solver, which line searches and "
+            f"inner loops do not allow, so it does not go with {type(inner).__name__}. Pass e.g. "
+            "solver=vertax.solvers.GradientDescent() or Optax(optax.sgd(1e-2, momentum=0.9)), or "
+            "keep the solver and use ImplicitDifferentiation or EquilibriumPropagation."
+        )
+    if isinstance(adjoint, EquilibriumPropagation) and adjoint.nudge == "cost":
+        raise ValueError(
+            "EquilibriumPropagation(nudge='cost') needs to know the cost: use it in an InverseProblem, "
+            "or nudge='linear' here."
+        )
 
 
 def _potential(configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Array]) -> Array:
@@ -170,8 +187,8 @@ def _potential(configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy,
     return energy(tissue.with_configuration(configuration)) + 0.5 * gauge * jnp.sum(drift**2)
 
 
-def _gauge_stiffness(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
-    """A stiffness for the zero modes that sits amid those of the other modes, in any units."""
+def _stiffness(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
+    """A typical stiffness, amid those of all modes, in any units."""
     # The Rayleigh quotient of a random vector is the mean eigenvalue, near enough.
     y = tissue.configuration
     force = jax.grad(lambda x: energy(tissue.with_configuration(x)))
@@ -181,80 +198,9 @@ def _gauge_stiffness(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]
     return jnp.where(quotient > 0, quotient, 1)
 
 
-class _RelaxationState(eqx.Module):
-    inner: PyTree
-    force: Float[Array, ""]
-    n_below: Int[Array, ""]
-
-
-class _Relaxation(eqx.Module):
-    """A solver that is at rest when the largest force has stayed below a tolerance for some steps."""
-
-    solver: AbstractSolver
-    tolerance: Float[Array, ""]
-    patience: int = eqx.field(static=True)
-    options: dict[str, Array]
-
-    def init(self, y: Any, args: Any) -> _RelaxationState:
-        f_struct = jax.ShapeDtypeStruct((), self.tolerance.dtype)
-        tags = frozenset()
-        inner = self.solver.init(_objective, y, args, self.options, f_struct, None, tags)
-        return self._judge(inner, jnp.array(0))
-
-    def step(self, y: Any, args: Any, state: _RelaxationState) -> tuple[Any, _RelaxationState]:
-        y, inner, _ = self.solver.step(_objective, y, args, self.options, state.inner, frozenset())
-        return y, self._judge(inner, state.n_below)
-
-    def at_rest(self, state: _RelaxationState) -> Bool[Array, ""]:
-        return state.n_below >= self.patience
-
-    def _judge(self, inner: Any, n_below: Int[Array, ""]) -> _RelaxationState:
-        force = optx.max_norm(self.solver.gradient(inner))
-        return _RelaxationState(inner, force, jnp.where(force < self.tolerance, n_below + 1, 0))
-
-
-def _objective(y: PyTree[Array], args: Any) -> tuple[Array, None]:
-    return _potential(y, args), None
-
-
-class _AtRest(optx.AbstractMinimiser):
-    """Returns the point it is given, which is known to be a minimum."""
-
-    rtol: float = 0.0
-    atol: float = 0.0
-    norm: Callable = eqx.field(static=True, default=optx.max_norm)
-
-    def init(
-        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
-    ) -> None:
-        return None
-
-    def step(
-        self, fn: Any, y: Any, args: Any, options: Any, state: None, tags: Any
-    ) -> tuple[Any, None, Any]:
-        return y, None, None
-
-    def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: None, tags: Any
-    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        return jnp.array(True), optx.RESULTS.successful
-
-    def postprocess(
-        self,
-        fn: Any,
-        y: Any,
-        aux: Any,
-        args: Any,
-        options: Any,
-        state: None,
-        tags: Any,
-        result: Any,
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        return y, aux, {}
-
-
 class _Found(eqx.Module):
     tissue: Tissue
+    start: PyTree[Array]  # the configuration right after the last T1 transition, or the first one
     max_force: Float[Array, ""]
     num_steps: Int[Array, ""]
     num_t1: Int[Array, ""]
@@ -262,7 +208,8 @@ class _Found(eqx.Module):
 
 
 def _search(
-    relaxation: _Relaxation,
+    relaxation: Relaxation,
+    options: dict[str, Array],
     transitions: AbstractTransitions | None,
     tissue: Tissue,
     energy: AbstractEnergy,
@@ -271,9 +218,12 @@ def _search(
 ) -> _Found:
     """Relax with topology changes; not differentiable."""
     no_gauge = jnp.zeros((), tissue.vertices.dtype)
+    objective = lambda y, args: (_potential(y, args), None)
+    f_struct, tags = jax.ShapeDtypeStruct((), no_gauge.dtype), frozenset()
 
-    def begin(at: Tissue) -> _RelaxationState:
-        return relaxation.init(at.configuration, (at, energy, no_gauge))
+    def begin(at: Tissue) -> RelaxationState:
+        args = (at, energy, no_gauge)
+        return relaxation.init(objective, at.configuration, args, options, f_struct, None, tags)
 
     state = begin(tissue)
     dynamic, static = eqx.partition(state, eqx.is_array)
@@ -284,7 +234,7 @@ def _search(
         return ~finished & (num_steps < max_steps)
 
     def iterate(carry: tuple) -> tuple:
-        tissue, dynamic, counts, num_steps, _ = carry
+        tissue, origin, dynamic, counts, num_steps, _ = carry
         if transitions is None:
             flipped = jnp.array(False)
         else:
@@ -295,29 +245,35 @@ def _search(
             dynamic = jax.lax.cond(
                 flipped, lambda: eqx.filter(begin(tissue), eqx.is_array), lambda: dynamic
             )
+            origin = jax.tree.map(
+                lambda new, old: jnp.where(flipped, new, old), tissue.configuration, origin
+            )
         state = eqx.combine(dynamic, static)
         finished = (relaxation.at_rest(state) & ~flipped) | jnp.isnan(state.force)
 
         def step() -> tuple[Array, PyTree]:
             args = (tissue, energy, no_gauge)
-            y, new_state = relaxation.step(tissue.configuration, args, state)
+            y, new_state, _ = relaxation.step(
+                objective, tissue.configuration, args, options, state, tags
+            )
             return y, eqx.filter(new_state, eqx.is_array)
 
         y, dynamic = jax.lax.cond(finished, lambda: (tissue.configuration, dynamic), step)
         return (
             tissue.with_configuration(y),
+            origin,
             dynamic,
             counts,
             num_steps + jnp.where(finished, 0, 1),
             finished,
         )
 
-    start = (tissue, dynamic, counts, jnp.array(0), jnp.array(False))
-    tissue, dynamic, counts, num_steps, _ = jax.lax.while_loop(unfinished, iterate, start)
+    start = (tissue, tissue.configuration, dynamic, counts, jnp.array(0), jnp.array(False))
+    tissue, origin, dynamic, counts, num_steps, _ = jax.lax.while_loop(unfinished, iterate, start)
     state = eqx.combine(dynamic, static)
     result = optx.RESULTS.where(
         relaxation.at_rest(state), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
     )
     finite = jnp.isfinite(state.force) & jnp.all(jnp.isfinite(tissue.vertices))
     result = optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
-    return _Found(tissue, state.force, num_steps, jnp.sum(counts), result)
+    return _Found(tissue, origin, state.force, num_steps, jnp.sum(counts), result)

@@ -2,13 +2,100 @@
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import optimistix as optx
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+
+def _floating(x: ArrayLike) -> Array:
+    # An outcome is handed over as a gradient, and gradients are floating-point arrays.
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
+
+
+class GradientOutcome(eqx.Module):
+    r"""How a gradient through an equilibrium came about.
+
+    All methods solve $H\,\lambda = \partial C / \partial X$ in their own way, so their outcomes compare.
+
+    Plain JAX hands it over as the "gradient" with respect to an empty outcome that was given to the
+    adjoint; [`InverseProblem.value_and_gradient`][vertax.InverseProblem.value_and_gradient] and
+    [`fit`][vertax.fit] do that by themselves:
+
+    ```python
+    def loss(energy, outcome):
+        adjoint = vx.ImplicitDifferentiation(outcome=outcome)
+        return cost(vx.equilibrate(tissue, energy, adjoint=adjoint).tissue, energy)
+
+    gradient, outcome = eqx.filter_grad(lambda x: loss(*x))((energy, vx.GradientOutcome()))
+    ```
+    """
+
+    residual: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
+    """What is left of the linear system, relative to its right-hand side."""
+    num_steps: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
+    """Steps of the linear solver, of the nudged relaxations, or of the unrolled relaxation."""
+    negative_curvature: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
+    """1 if the Hessian was seen to have a negative eigenvalue, so that the equilibrium is a saddle; NaN
+    if the method cannot tell."""
+    trusted: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
+    """1 if the gradient can be trusted, 0 if not."""
 
 
 class AbstractAdjoint(optx.AbstractAdjoint):
-    """A way to differentiate through an equilibrium, given the equilibrium itself.
+    """A way to differentiate through an equilibrium.
 
-    [`equilibrate`][vertax.equilibrate] first finds the equilibrium and its topology without gradients;
-    the adjoint then sees a minimisation that starts, and ends, there. (An adjoint that unrolls the steps
-    of a minimiser would find none, and a gradient of zero: so Optimistix's own are not accepted.)
+    [`equilibrate`][vertax.equilibrate] first finds the equilibrium and its topology without gradients.
+    The adjoint then sees a minimisation in this topology: one that starts at the equilibrium and takes
+    no step or, if the adjoint `unrolls`, one that repeats what came after the last T1 transition.
+
+    **Arguments:**
+
+    - `throw`: raise an error rather than return a gradient that cannot be trusted.
+    - `outcome`: an empty [`GradientOutcome`][vertax.GradientOutcome], whose own "gradient" becomes the
+        outcome; reverse mode only.
     """
+
+    unrolls: ClassVar[bool] = False
+
+    throw: eqx.AbstractVar[bool]
+    outcome: eqx.AbstractVar[GradientOutcome | None]
+
+    def without_outcome(self) -> AbstractAdjoint:
+        """The same adjoint, which tells nobody how it went."""
+        return eqx.tree_at(lambda a: a.outcome, self, None, is_leaf=lambda x: x is None)
+
+    def with_outcome(self, outcome: GradientOutcome) -> AbstractAdjoint:
+        """The same adjoint with somewhere to put its outcome."""
+        return eqx.tree_at(lambda a: a.outcome, self, outcome, is_leaf=lambda x: x is None)
+
+
+def frozen(tree: PyTree) -> PyTree:
+    """The same values, taken for constants by differentiation."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def settle(
+    gradient: PyTree, outcome: GradientOutcome, throw: bool, like: GradientOutcome | None, reason: str
+) -> tuple[PyTree, GradientOutcome | None]:
+    """Refuse a gradient that cannot be trusted, and shape the outcome as the slot it goes to."""
+    if throw:
+        gradient = eqx.error_if(gradient, outcome.trusted == 0, reason)
+    if like is None:
+        return gradient, None
+    return gradient, jax.tree.map(lambda x, slot: jnp.asarray(x, slot.dtype), outcome, like)
+
+
+def materialise(cotangent: PyTree[Array | None], like: PyTree[Array]) -> PyTree[Array]:
+    """A cotangent with its symbolic zeros written out."""
+    zero = lambda g, x: jnp.zeros_like(x) if g is None else g
+    return jax.tree.map(zero, cotangent, like, is_leaf=lambda g: g is None)
+
+
+def differentiable(tree: Any) -> tuple[Any, Any]:
+    """The floating-point arrays of a pytree, and the rest."""
+    return eqx.partition(tree, eqx.is_inexact_array)

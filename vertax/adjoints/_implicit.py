@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
 import lineax as lx
-import optimistix as optx
-from jaxtyping import PyTree
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
 
-from vertax.adjoints._adjoint import AbstractAdjoint
+from vertax.adjoints._adjoint import (
+    AbstractAdjoint,
+    GradientOutcome,
+    frozen,
+    materialise,
+    settle,
+)
 from vertax.solvers import MINRES
 
 
@@ -21,16 +31,35 @@ class ImplicitDifferentiation(AbstractAdjoint):
 
     $$\frac{dX^*}{d\theta} = -H^{-1}\, \nabla^2_{X\theta} E, \qquad H = \nabla^2_X E.$$
 
-    Reverse mode solves one linear system with $H$, whatever the number of parameters (the adjoint-state
-    form); memory does not grow with the number of relaxation steps. The equilibrium must be a true one:
-    an error $g$ in the force leaves an error of order $H^{-1} g$ in the gradient.
+    Memory does not grow with the number of relaxation steps. The equilibrium must be a true one: an
+    error $g$ in the force leaves an error of order $H^{-1} g$ in the gradient. Forward and reverse mode
+    work, and higher derivatives.
 
     **Arguments:**
 
+    - `mode`: `"adjoint"` (Adj-ID) solves one system for each derivative asked for: in reverse mode one
+        for a cost, whatever the number of parameters. `"sensitivity"` (Sen-ID) solves the systems of
+        all parameters as one batch and multiplies by the result: for a forward-mode Jacobian, or for
+        comparison with the paper; time and memory grow with the number of parameters.
     - `linear_solver`: solves the systems with the Hessian, which is symmetric and may be indefinite.
+    - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is not
+        trusted if the linear solver reports failure.
+
+    **Raises:**
+
+    - `ValueError` for another mode.
     """
 
+    mode: Literal["adjoint", "sensitivity"] = eqx.field(static=True, default="adjoint")
     linear_solver: lx.AbstractLinearSolver = eqx.field(default_factory=MINRES)
+    throw: bool = True
+    outcome: GradientOutcome | None = None
+
+    def __check_init__(self):
+        if self.mode not in ("adjoint", "sensitivity"):
+            raise ValueError(
+                f"Argument `mode` must be 'adjoint' or 'sensitivity', but is {self.mode!r}."
+            )
 
     def apply(
         self,
@@ -39,5 +68,134 @@ class ImplicitDifferentiation(AbstractAdjoint):
         inputs: PyTree,
         tags: frozenset[object],
     ) -> PyTree[Any]:
-        implicit = optx.ImplicitAdjoint(linear_solver=self.linear_solver)
-        return implicit.apply(primal_fn, rewrite_fn, inputs, tags | {lx.symmetric_tag})
+        loop = partial(eqxi.while_loop, kind="lax")
+        root, residual = primal_fn((*frozen(inputs), loop))
+        root, residual = frozen(root), jax.tree.map(eqxi.nondifferentiable_backward, residual)
+        system = _System(self.without_outcome(), rewrite_fn, residual, tags | {lx.symmetric_tag})
+        if self.outcome is None:
+            return _follow(inputs, root, system), residual
+        return _follow_and_report((inputs, self.outcome), root, system), residual
+
+
+class _System(eqx.Module):
+    r"""The linear systems behind the derivatives of a root of $g(X, \theta) = \nabla_X E$."""
+
+    adjoint: ImplicitDifferentiation
+    rewrite_fn: Callable = eqx.field(static=True)
+    residual: PyTree
+    tags: frozenset[object] = eqx.field(static=True)
+
+    def force(self, root: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
+        return self.rewrite_fn(root, self.residual, inputs)
+
+    def solve(
+        self, root: PyTree[Array], inputs: PyTree, rhs: PyTree[Array], *, throw: bool = False
+    ) -> tuple[PyTree[Array], GradientOutcome]:
+        operator = lx.JacobianLinearOperator(self.force, root, inputs, tags=self.tags)
+        solution = lx.linear_solve(operator, rhs, self.adjoint.linear_solver, throw=throw)
+        known = lambda name: jnp.asarray(solution.stats.get(name, jnp.nan), float)
+        outcome = GradientOutcome(
+            known("residual_norm"),
+            known("num_steps"),
+            known("negative_curvature"),
+            jnp.asarray(solution.result == lx.RESULTS.successful, float),
+        )
+        return solution.value, outcome
+
+    def tangent(
+        self, root: PyTree[Array], inputs: PyTree, t_inputs: PyTree, *, throw: bool = False
+    ) -> tuple[PyTree[Array], GradientOutcome]:
+        """How the root moves with the inputs; `t_inputs` is None where they are fixed."""
+        moving, fixed = _split(inputs, t_inputs)
+        force = lambda m: self.force(root, eqx.combine(m, fixed))
+        _, rhs = jax.jvp(force, (moving,), (t_inputs,))
+        response, outcome = self.solve(root, inputs, rhs, throw=throw)
+        return jax.tree.map(jnp.negative, response), outcome
+
+    def sensitivities(
+        self, root: PyTree[Array], inputs: PyTree, t_inputs: PyTree, *, throw: bool = False
+    ) -> tuple[PyTree[Array], GradientOutcome]:
+        """How the root moves with each number in those inputs that have a tangent, along a new first
+        axis."""
+        moving, _ = _split(inputs, t_inputs)
+        flat, unravel = ravel_pytree(moving)
+
+        def one(direction: Array) -> tuple[PyTree[Array], GradientOutcome]:
+            t = _like(unravel(direction), t_inputs)
+            return self.tangent(root, inputs, t, throw=throw)
+
+        return jax.vmap(one)(jnp.eye(flat.size, dtype=flat.dtype))
+
+
+def _split(inputs: PyTree, t_inputs: PyTree) -> tuple[PyTree, PyTree]:
+    absent = jax.tree.map(lambda t: t is None, t_inputs, is_leaf=lambda t: t is None)
+    fixed, moving = eqx.partition(inputs, absent, is_leaf=lambda t: t is None)
+    return moving, fixed
+
+
+def _like(tangent: PyTree, structure: PyTree) -> PyTree:
+    return jax.tree.unflatten(jax.tree.structure(structure), jax.tree.leaves(tangent))
+
+
+@eqx.filter_custom_jvp
+def _follow(inputs: PyTree, root: PyTree[Array], system: _System) -> PyTree[Array]:
+    return root
+
+
+@_follow.def_jvp
+def _(primals: tuple, tangents: tuple) -> tuple[PyTree[Array], PyTree[Array]]:
+    inputs, _, system = primals
+    t_inputs, *_ = tangents
+    # The root itself depends on the inputs, which matters for second derivatives.
+    root = _follow(*primals)
+    throw = system.adjoint.throw
+    if system.adjoint.mode == "adjoint":
+        t_root, _ = system.tangent(root, inputs, t_inputs, throw=throw)
+    else:
+        columns, _ = system.sensitivities(root, inputs, t_inputs, throw=throw)
+        weights = ravel_pytree(t_inputs)[0]
+        t_root = jax.tree.map(lambda c: jnp.tensordot(weights, c, 1), columns)
+    return root, t_root
+
+
+@eqx.filter_custom_vjp
+def _follow_and_report(
+    vjp_arg: tuple[PyTree, GradientOutcome], root: PyTree[Array], system: _System
+) -> PyTree[Array]:
+    return root
+
+
+@_follow_and_report.def_fwd
+def _(perturbed: Any, vjp_arg: Any, root: PyTree[Array], system: _System) -> tuple:
+    inputs, _ = vjp_arg
+    return _follow(inputs, root, system), None
+
+
+@_follow_and_report.def_bwd
+def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, root: Any, system: Any) -> Any:
+    inputs, slot = vjp_arg
+    wanted, _ = perturbed
+    moving, fixed = eqx.partition(inputs, wanted)
+    root = _follow(inputs, root, system)
+    cotangent = materialise(cotangent, root)
+    if system.adjoint.mode == "adjoint":
+        multiplier, outcome = system.solve(root, inputs, cotangent)
+        _, pull = jax.vjp(lambda m: system.force(root, eqx.combine(m, fixed)), moving)
+        gradient = jax.tree.map(jnp.negative, pull(multiplier)[0])
+    else:
+        columns, outcomes = system.sensitivities(root, inputs, moving)
+        parts = jax.tree.map(lambda c, g: jnp.tensordot(c, g, g.ndim), columns, cotangent)
+        gradient = ravel_pytree(moving)[1](sum(jax.tree.leaves(parts)))
+        outcome = GradientOutcome(
+            jnp.max(outcomes.residual),
+            jnp.max(outcomes.num_steps),
+            jnp.max(outcomes.negative_curvature),
+            jnp.min(outcomes.trusted),
+        )
+    return settle(gradient, outcome, system.adjoint.throw, slot, _REASON)
+
+
+_REASON = (
+    "The gradient through the equilibrium cannot be trusted: the linear solve with the Hessian failed. "
+    "Relax to a smaller tolerance, or allow it with ImplicitDifferentiation(throw=False)."
+)

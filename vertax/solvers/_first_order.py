@@ -33,6 +33,10 @@ class GradientDescent(AbstractSolver):
 
     learning_rate: float | Float[Array, ""] = 1e-2
 
+    @property
+    def unrollable(self) -> bool:
+        return True
+
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _State:
@@ -61,6 +65,11 @@ class Optax(AbstractSolver):
 
     optimiser: optax.GradientTransformation = eqx.field(static=True)
 
+    @property
+    def unrollable(self) -> bool:
+        """Whether the optimiser has no line search: whether it never evaluates the energy itself."""
+        return not has_line_search(self.optimiser)
+
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _State:
@@ -85,6 +94,23 @@ class Optax(AbstractSolver):
 
     def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
+
+
+def has_line_search(optimiser: optax.GradientTransformation) -> bool:
+    """Whether an Optax optimiser evaluates the objective in its updates."""
+    evaluated = []
+
+    def objective(x: Array) -> Array:
+        evaluated.append(True)
+        return jnp.sum(x**2)
+
+    def update(x: Array) -> Any:
+        update = optax.with_extra_args_support(optimiser).update
+        state = optimiser.init(x)
+        return update(x, state, x, value=objective(x), grad=x, value_fn=objective)
+
+    jax.eval_shape(update, jax.ShapeDtypeStruct((2,), jnp.float32))
+    return len(evaluated) > 1
 
 
 def LBFGS(history: int = 10) -> Optax:

@@ -8,6 +8,7 @@ import equinox as eqx
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
+from vertax.solvers._first_order import has_line_search
 from vertax.solvers._solver import AbstractSolver, value_and_gradient
 
 
@@ -29,6 +30,12 @@ class Wrapped(AbstractSolver):
     """
 
     solver: optx.AbstractMinimiser
+
+    @property
+    def unrollable(self) -> bool:
+        if isinstance(self.solver, optx.OptaxMinimiser):
+            return not has_line_search(self.solver.optim)
+        return isinstance(self.solver, optx.GradientDescent)
 
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any

@@ -26,6 +26,15 @@ class AbstractSolver(optx.AbstractMinimiser):
         default=optx.max_norm, kw_only=True, static=True
     )
 
+    @property
+    def unrollable(self) -> bool:
+        """Whether its steps can be differentiated one by one, as automatic differentiation does.
+
+        Not so for line searches and inner loops, which decide by comparisons: the derivative of what
+        they return is not the derivative of where they lead.
+        """
+        return False
+
     @abc.abstractmethod
     def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""

@@ -1,0 +1,208 @@
+"""Equilibrium propagation: gradients from relaxations of a nudged tissue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import optax
+import optimistix as optx
+from jaxtyping import Array, Float, PyTree
+
+from vertax.adjoints._adjoint import (
+    AbstractAdjoint,
+    GradientOutcome,
+    differentiable,
+    frozen,
+    materialise,
+    settle,
+)
+
+
+class EquilibriumPropagation(AbstractAdjoint):
+    r"""Gradients from the response of the equilibrium to a nudge (paper, Methods, "EP").
+
+    A weak force along the gradient of the cost moves the equilibrium from $X^*$ to $X_{\pm\beta}$, and
+
+    $$\frac{dC}{d\theta} = \lim_{\beta\to 0} \frac1\beta \left(\frac{\partial E}{\partial\theta}
+      (X_{+\beta}, \theta) - \frac{\partial E}{\partial\theta}(X_{-\beta}, \theta)\right).$$
+
+    It needs nothing but relaxations and $\partial E / \partial \theta$: no second derivative (other
+    than those of the solver) and no linear system. Reverse mode only. (Scellier & Bengio 2017,
+    doi:10.3389/fncom.2017.00024; centred: Laborieux et al. 2021, doi:10.3389/fnins.2021.633674.)
+
+    **Arguments:**
+
+    - `beta`: strength of the nudge. With a linear nudge it is the largest nudging force in units of
+        the mean stiffness times the size of a cell, so that one value suits every cost; by default
+        1e-5 in float64 and 1e-3 in float32, where a weaker nudge drowns in rounding. With the nudge by
+        the cost it is the $\beta$ of the paper, energy per cost; by default it is chosen so that the
+        nudging force is as above.
+    - `nudge`: `"linear"` adds $\pm\tfrac\beta2\,\partial C/\partial X \cdot X$, a constant force on
+        each vertex. `"cost"` adds $\pm\tfrac\beta2\,C$ itself, and the nudged tissue may undergo T1
+        transitions, so that a cost of the topology steers them; the cost must be known, so this works
+        in an [`InverseProblem`][vertax.InverseProblem] only.
+    - `centred`: relax with both signs, error $O(\beta^2)$; otherwise with one, error $O(\beta)$.
+    - `rtol`: tolerance of the nudged relaxations relative to the nudging force; they are never
+        coarser than the first relaxation. By default 1e-6 in float64 and 1e-3 in float32.
+    - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is not
+        trusted if a nudged relaxation ended with a force above 1 % of the nudging one.
+
+    **Raises:**
+
+    - `ValueError` for another nudge, or a `beta` or `rtol` that is not positive.
+    """
+
+    beta: float | Float[Array, ""] | None = None
+    nudge: Literal["linear", "cost"] = eqx.field(static=True, default="linear")
+    centred: bool = eqx.field(static=True, default=True)
+    rtol: float | None = None
+    throw: bool = True
+    outcome: GradientOutcome | None = None
+
+    def __check_init__(self):
+        if self.nudge not in ("linear", "cost"):
+            raise ValueError(f"Argument `nudge` must be 'linear' or 'cost', but is {self.nudge!r}.")
+        for name, value in (("beta", self.beta), ("rtol", self.rtol)):
+            if isinstance(value, float | int) and not value > 0:
+                raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+
+    def apply(
+        self,
+        primal_fn: Callable,
+        rewrite_fn: Callable,
+        inputs: PyTree,
+        tags: frozenset[object],
+    ) -> PyTree[Any]:
+        fn, solver, y0, args, options, *rest = inputs
+        loop = partial(eqxi.while_loop, kind="lax")
+        others = frozen((solver, y0, options, rest))
+        minimise = partial(_minimise, primal_fn, loop)
+        root, residual = minimise(frozen(fn), frozen(args), *others)
+        root, residual = frozen((root, residual))
+        vjp_arg = (fn, args, self.outcome)
+        return _propagate(vjp_arg, root, others, self.without_outcome(), minimise), residual
+
+    def strength(
+        self, beta: float | Float[Array, ""] | None, options: dict[str, Any], dtype: Any
+    ) -> Float[Array, ""]:
+        """The largest nudging force, in units of force."""
+        if beta is None:
+            beta = 1e-5 if dtype == jnp.float64 else 1e-3
+        unit = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
+        return jnp.asarray(beta * unit, dtype)
+
+    def tolerance(self, strength: Float[Array, ""]) -> Float[Array, ""]:
+        """Largest force at which a nudged tissue counts as relaxed."""
+        rtol = self.rtol
+        if rtol is None:
+            rtol = 1e-6 if strength.dtype == jnp.float64 else 1e-3
+        return rtol * strength
+
+    @property
+    def signs(self) -> tuple[float, ...]:
+        """Signs of the nudges."""
+        return (1.0, -1.0) if self.centred else (1.0, 0.0)
+
+
+def _minimise(
+    primal_fn: Callable, loop: Callable, fn: Any, args: Any, solver: Any, y0: Any, options: Any, rest: Any
+) -> tuple[PyTree[Array], PyTree]:
+    return primal_fn((fn, solver, y0, args, options, *rest, loop))
+
+
+class _Nudged(eqx.Module):
+    """An objective with a constant force on every degree of freedom."""
+
+    fn: Callable
+    force: PyTree[Array]
+    strength: Float[Array, ""]
+
+    def __call__(self, y: PyTree[Array], args: Any) -> tuple[Array, Any]:
+        value, aux = self.fn(y, args)
+        return value + self.strength * jnp.asarray(optax.tree.vdot(self.force, y)), aux
+
+
+@eqx.filter_custom_vjp
+def _propagate(
+    vjp_arg: tuple[Any, Any, GradientOutcome | None],
+    root: PyTree[Array],
+    others: tuple,
+    adjoint: EquilibriumPropagation,
+    minimise: Callable,
+) -> PyTree[Array]:
+    return root
+
+
+@_propagate.def_fwd
+def _(perturbed: Any, vjp_arg: Any, root: PyTree[Array], *args: Any) -> tuple:
+    return root, None
+
+
+@_propagate.def_bwd
+def _(
+    residuals: None,
+    cotangent: PyTree,
+    perturbed: Any,
+    vjp_arg: Any,
+    root: PyTree[Array],
+    others: tuple,
+    adjoint: EquilibriumPropagation,
+    minimise: Callable,
+) -> Any:
+    fn, args, slot = vjp_arg
+    solver, _, options, rest = others
+    cotangent = materialise(cotangent, root)
+    size = optx.max_norm(cotangent)
+    force = optax.tree.scale(1 / jnp.where(size > 0, size, 1), cotangent)
+    strength = adjoint.strength(adjoint.beta, options, size.dtype)
+    options = {k: v for k, v in options.items() if k != "num_steps"}
+    tolerance = jnp.minimum(solver.tolerance, adjoint.tolerance(strength))
+    options["tolerance"] = tolerance
+
+    moving, fixed = differentiable((fn, args))
+
+    def slope(y: PyTree[Array]) -> PyTree[Array]:
+        def energy(m: PyTree[Array]) -> Array:
+            fn, args = eqx.combine(m, fixed)
+            return fn(y, args)[0]
+
+        return jax.grad(energy)(moving)
+
+    def phase(sign: Array) -> tuple[PyTree[Array], Array, Array]:
+        nudged = _Nudged(fn, force, sign * strength)
+        y, (num_steps, *_) = minimise(nudged, args, solver, root, options, rest)
+        left = optx.max_norm(jax.grad(lambda y: nudged(y, args)[0])(y))
+        return slope(y), left, num_steps
+
+    # One phase is a batch of the two signs. A one-sided difference needs no second relaxation.
+    signs = jnp.asarray([s for s in adjoint.signs if s != 0], size.dtype)
+    slopes, left, num_steps = jax.vmap(phase)(signs)
+    if adjoint.centred:
+        difference = jax.tree.map(lambda s: (s[0] - s[1]) / 2, slopes)
+    else:
+        difference = jax.tree.map(lambda s, at_rest: s[0] - at_rest, slopes, slope(root))
+    gradient = jax.tree.map(lambda d: size / strength * d, difference)
+    residual = jnp.max(left) / strength
+    outcome = GradientOutcome(
+        residual,
+        jnp.asarray(jnp.sum(num_steps), size.dtype),
+        jnp.nan,
+        # A cost that pulls on nothing has the gradient 0, however well the phases relaxed.
+        jnp.asarray((residual < UNTRUSTED) | (size == 0), size.dtype),
+    )
+    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, REASON)
+    return d_fn, d_args, outcome
+
+
+UNTRUSTED = 0.01
+REASON = (
+    "The gradient by equilibrium propagation cannot be trusted: a nudged relaxation did not come to "
+    "rest. Raise `max_steps`, use the default solver or a larger `beta`, or allow it with "
+    "EquilibriumPropagation(throw=False)."
+)

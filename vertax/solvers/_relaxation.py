@@ -1,0 +1,84 @@
+"""The minimiser that `equilibrate` runs: a solver, and when it is at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from vertax.solvers._solver import AbstractSolver
+
+
+class RelaxationState(eqx.Module):
+    """State of a [`Relaxation`][vertax.solvers.Relaxation]."""
+
+    inner: PyTree
+    force: Float[Array, ""]
+    n_below: Int[Array, ""]
+    num_steps: Int[Array, ""]
+
+
+class Relaxation(optx.AbstractMinimiser):
+    """A solver that is at rest when the largest force has stayed below a tolerance for some steps.
+
+    Besides those of the solver it knows two options: `num_steps`, after which it stops, at rest or not
+    and neither sooner nor later; and `tolerance`, which replaces its own.
+
+    **Arguments:**
+
+    - `solver`: takes the steps.
+    - `tolerance`: largest force at rest.
+    - `patience`: number of consecutive steps for which the force must stay below the tolerance.
+    """
+
+    solver: AbstractSolver
+    tolerance: Float[Array, ""]
+    patience: int = eqx.field(static=True, default=1)
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(default=optx.max_norm, static=True)
+
+    def init(
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> RelaxationState:
+        inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
+        return self._judge(inner, options, jnp.array(0), jnp.array(0))
+
+    def step(
+        self, fn: Any, y: Any, args: Any, options: Any, state: RelaxationState, tags: Any
+    ) -> tuple[Any, RelaxationState, Any]:
+        y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
+        return y, self._judge(inner, options, state.n_below, state.num_steps + 1), aux
+
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: RelaxationState, tags: Any
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        if "num_steps" in options:
+            done = state.num_steps >= options["num_steps"]
+        else:
+            done = self.at_rest(state) | jnp.isnan(state.force)
+        return done, optx.RESULTS.successful
+
+    def postprocess(
+        self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        return y, aux, {}
+
+    def at_rest(self, state: RelaxationState) -> Bool[Array, ""]:
+        """Whether the force has been below the tolerance for long enough."""
+        return state.n_below >= self.patience
+
+    def gradient(self, state: RelaxationState) -> PyTree[Float[Array, "..."]]:
+        """Gradient at the point that the last step (or `init`) returned."""
+        return self.solver.gradient(state.inner)
+
+    def _judge(
+        self, inner: Any, options: Any, n_below: Int[Array, ""], num_steps: Int[Array, ""]
+    ) -> RelaxationState:
+        force = self.norm(self.solver.gradient(inner))
+        below = force < options.get("tolerance", self.tolerance)
+        return RelaxationState(inner, force, jnp.where(below, n_below + 1, 0), num_steps)
