@@ -9,15 +9,15 @@ from vertax import (
     plotting as plotting,
     solvers as solvers,
 )
-from vertax._bilevel import (
+from vertax._boundary import AbstractBoundary as AbstractBoundary, Periodic as Periodic
+from vertax._equilibrium import Equilibrium as Equilibrium, equilibrate as equilibrate
+from vertax._fit import (
     Fit as Fit,
     FitError as FitError,
     History as History,
-    InverseProblem as InverseProblem,
     fit as fit,
 )
-from vertax._boundary import AbstractBoundary as AbstractBoundary, Periodic as Periodic
-from vertax._equilibrium import Equilibrium as Equilibrium, equilibrate as equilibrate
+from vertax._inverse import InverseProblem as InverseProblem
 from vertax._tissue import Tissue as Tissue
 from vertax._topology import Topology as Topology
 from vertax._transitions import T1 as T1, AbstractTransitions as AbstractTransitions

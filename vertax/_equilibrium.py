@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -127,7 +128,8 @@ def _equilibrate(
     # The second solve is there to be differentiated. It starts at rest and takes no step, unless the
     # adjoint differentiates the steps themselves.
     moved = eqx.tree_at(lambda t: t.boundary, found.tissue, tissue.boundary)
-    stiffness = _stiffness(found.tissue, frozen(energy))
+    stiffness = mean_stiffness(found.tissue, frozen(energy))
+    stiffness = jnp.where(stiffness > 0, stiffness, 1)
     if adjoint.unrolls:
         start, gauge = found.start, jnp.zeros_like(stiffness)
     else:
@@ -187,15 +189,14 @@ def _potential(configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy,
     return energy(tissue.with_configuration(configuration)) + 0.5 * gauge * jnp.sum(drift**2)
 
 
-def _stiffness(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
-    """A typical stiffness, amid those of all modes, in any units."""
+def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:
+    """The size of a typical second derivative of an energy, or of any number that a tissue has."""
     # The Rayleigh quotient of a random vector is the mean eigenvalue, near enough.
     y = tissue.configuration
-    force = jax.grad(lambda x: energy(tissue.with_configuration(x)))
+    slope = jax.grad(lambda x: energy(tissue.with_configuration(x)))
     probe = jax.random.normal(jax.random.key(0), y.shape, y.dtype)
-    _, response = jax.jvp(force, (y,), (probe,))
-    quotient = jnp.abs(jnp.sum(probe * response)) / jnp.sum(probe**2)
-    return jnp.where(quotient > 0, quotient, 1)
+    _, response = jax.jvp(slope, (y,), (probe,))
+    return jnp.abs(jnp.sum(probe * response)) / jnp.sum(probe**2)
 
 
 class _Found(eqx.Module):

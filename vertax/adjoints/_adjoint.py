@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 
 def _floating(x: ArrayLike) -> Array:
@@ -42,8 +42,13 @@ class GradientOutcome(eqx.Module):
     negative_curvature: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
     """1 if the Hessian was seen to have a negative eigenvalue, so that the equilibrium is a saddle; NaN
     if the method cannot tell."""
-    trusted: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """1 if the gradient can be trusted, 0 if not."""
+    failed: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
+    """1 if the gradient cannot be trusted, otherwise 0."""
+
+    @property
+    def trusted(self) -> Bool[Array, "*batch"]:
+        """Whether the gradient can be trusted."""
+        return self.failed == 0
 
 
 class AbstractAdjoint(optx.AbstractAdjoint):
@@ -84,7 +89,7 @@ def settle(
 ) -> tuple[PyTree, GradientOutcome | None]:
     """Refuse a gradient that cannot be trusted, and shape the outcome as the slot it goes to."""
     if throw:
-        gradient = eqx.error_if(gradient, outcome.trusted == 0, reason)
+        gradient = eqx.error_if(gradient, ~outcome.trusted, reason)
     if like is None:
         return gradient, None
     return gradient, jax.tree.map(lambda x, slot: jnp.asarray(x, slot.dtype), outcome, like)

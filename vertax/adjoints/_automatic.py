@@ -142,7 +142,7 @@ class AutomaticDifferentiation(AbstractAdjoint):
             left / jnp.where(initial > 0, initial, 1),
             jnp.asarray(state.num_steps, left.dtype),
             jnp.nan,
-            jnp.asarray(left <= rtol * initial, left.dtype),
+            jnp.asarray(~(left <= rtol * initial), left.dtype),
         )
 
 

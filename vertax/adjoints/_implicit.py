@@ -98,7 +98,7 @@ class _System(eqx.Module):
             known("residual_norm"),
             known("num_steps"),
             known("negative_curvature"),
-            jnp.asarray(solution.result == lx.RESULTS.successful, float),
+            jnp.asarray(solution.result != lx.RESULTS.successful, float),
         )
         return solution.value, outcome
 
@@ -190,7 +190,7 @@ def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, root: Any, 
             jnp.max(outcomes.residual),
             jnp.max(outcomes.num_steps),
             jnp.max(outcomes.negative_curvature),
-            jnp.min(outcomes.trusted),
+            jnp.max(outcomes.failed),
         )
     return settle(gradient, outcome, system.adjoint.throw, slot, _REASON)
 

@@ -193,8 +193,7 @@ def _(
         residual,
         jnp.asarray(jnp.sum(num_steps), size.dtype),
         jnp.nan,
-        # A cost that pulls on nothing has the gradient 0, however well the phases relaxed.
-        jnp.asarray((residual < UNTRUSTED) | (size == 0), size.dtype),
+        jnp.asarray(~(residual < UNTRUSTED), size.dtype),
     )
     (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, REASON)
     return d_fn, d_args, outcome

@@ -23,6 +23,19 @@ class AbstractCost(eqx.Module):
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Cost of a relaxed tissue and the energy that it minimises."""
 
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """The numbers of which the cost is half the sum of squares.
+
+        **Raises:**
+
+        - `TypeError` if the cost is no sum of squares (see
+            [`AbstractLeastSquaresCost`][vertax.costs.AbstractLeastSquaresCost]).
+        """
+        raise TypeError(
+            f"{type(self).__name__} is no sum of squares, which a least-squares solver needs: subclass "
+            "vertax.costs.AbstractLeastSquaresCost, or fit with an Optax optimiser."
+        )
+
     def __add__(self, other: AbstractCost) -> AbstractCost:
         """The sum of two costs."""
         if not isinstance(other, AbstractCost):
@@ -40,6 +53,22 @@ class AbstractCost(eqx.Module):
     __rmul__ = __mul__
 
 
+class AbstractLeastSquaresCost(AbstractCost):
+    """A cost that is half a sum of squares.
+
+    Subclass it and write `residuals` instead of `__call__`; such a cost also serves second-order
+    solvers like `optimistix.LevenbergMarquardt` in [`fit`][vertax.fit].
+    """
+
+    @abc.abstractmethod
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """The numbers of which the cost is half the sum of squares."""
+
+    def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
+        """Half the sum of the squared residuals."""
+        return 0.5 * jnp.sum(self.residuals(tissue, energy) ** 2)
+
+
 class WeightedSum(AbstractCost):
     """A weighted sum of costs; made by `*` and `+`."""
 
@@ -49,6 +78,12 @@ class WeightedSum(AbstractCost):
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Weighted sum of the costs."""
         return jnp.sum(self.weights * jnp.stack([cost(tissue, energy) for cost in self.costs]))
+
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """The residuals of all terms, times the roots of the weights, which must not be negative."""
+        roots = jnp.sqrt(self.weights)
+        parts = [cost.residuals(tissue, energy) for cost in self.costs]
+        return jnp.concatenate([root * part for root, part in zip(roots, parts, strict=True)])
 
 
 def _parts(cost: AbstractCost) -> tuple[Float[Array, " costs"], tuple[AbstractCost, ...]]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from vertax._boundary import Periodic
 from vertax._misc import is_concrete
 from vertax._tissue import Tissue
-from vertax.costs._cost import AbstractCost
+from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 
 
@@ -102,7 +102,7 @@ def _spread(
     return jnp.mod(pixels, size), jnp.stack(w, axis=-1)
 
 
-class MeshImage(AbstractCost):
+class MeshImage(AbstractLeastSquaresCost):
     r"""Squared difference between the image of a tissue and a measured image (paper, Methods).
 
     $$C = \frac{1}{2M} \sum_{k=1}^{M} \bigl(a\,I(X)(r_k) + b - I_{\mathrm{exp}}(r_k)\bigr)^2$$
@@ -180,16 +180,16 @@ class MeshImage(AbstractCost):
         self.points_per_edge = points_per_edge
         self.fit_intensity = fit_intensity
 
-    def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
-        """Half the weighted mean squared difference of the two images."""
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """Difference of the two images at each pixel, times the root of its share of the weights."""
         shape = (self.image.shape[0], self.image.shape[1])
         model = render(tissue, shape, self.psf_width, points_per_edge=self.points_per_edge)
-        mean = lambda x: jnp.sum(self.weight * x)
-        if not self.fit_intensity:
-            return 0.5 * mean((model - self.image) ** 2)
-        model = model - mean(model)
-        covariance = jnp.maximum(mean(model * self.image), 0)
-        return 0.5 * (1 - covariance**2 / mean(model**2))
+        if self.fit_intensity:
+            mean = lambda x: jnp.sum(self.weight * x)
+            model = model - mean(model)
+            scale = jnp.maximum(mean(model * self.image), 0) / mean(model**2)
+            model = scale * model
+        return (jnp.sqrt(self.weight) * (model - self.image)).ravel()
 
 
 def mirror(image: np.ndarray) -> np.ndarray:

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vertax._tissue import Tissue
-from vertax.costs._cost import AbstractCost
+from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 
 
-class VertexDistance(AbstractCost):
+class VertexDistance(AbstractLeastSquaresCost):
     r"""Mean squared distance of vertices to those of a target tissue (paper, "v2v" cost).
 
     $$C = \frac{1}{2N}\sum_{i=1}^{N} \|x_i - x_{\mathrm{target},i}\|^2$$
@@ -30,12 +30,12 @@ class VertexDistance(AbstractCost):
 
     target: Tissue
 
-    def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
-        """Half the mean squared distance of corresponding vertices."""
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """Displacements from the target over the root of the number of vertices."""
         if tissue.n_vertices != self.target.n_vertices:
             raise ValueError(
                 f"The target of VertexDistance must have {tissue.n_vertices} vertices, as the tissue "
                 f"has, but has {self.target.n_vertices}."
             )
         displacement = tissue.boundary.shortest(tissue.vertices - self.target.vertices)
-        return 0.5 * jnp.mean(jnp.sum(displacement**2, axis=-1))
+        return displacement.ravel() / jnp.sqrt(1.0 * tissue.n_vertices)

@@ -17,7 +17,7 @@ import tomli_w
 from jaxtyping import Shaped
 from matplotlib.figure import Figure
 
-from vertax._bilevel import Fit, History
+from vertax._fit import Fit, History
 from vertax._tissue import Tissue
 from vertax.experiments._config import ExperimentConfig
 from vertax.io import atomic_write, save_tissue

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
-from vertax._bilevel import Fit, FitError, InverseProblem, fit
+from vertax._fit import Fit, FitError, fit
+from vertax._inverse import InverseProblem
 from vertax._equilibrium import equilibrate
 from vertax._tissue import Tissue
 from vertax.costs import AbstractCost, MeshImage, VertexDistance, render

@@ -1,0 +1,262 @@
+"""The inverse problem: parameters whose equilibrium minimises a cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float, PyTree
+
+from vertax._equilibrium import Equilibrium, equilibrate, mean_stiffness
+from vertax._tissue import Tissue
+from vertax._transitions import T1, AbstractTransitions
+from vertax.adjoints import (
+    AbstractAdjoint,
+    EquilibriumPropagation,
+    GradientOutcome,
+    ImplicitDifferentiation,
+)
+from vertax.adjoints._adjoint import differentiable, frozen, settle
+from vertax.adjoints._propagation import REASON, UNTRUSTED
+from vertax.costs import AbstractCost
+from vertax.energies import AbstractEnergy
+
+Energy = TypeVar("Energy", bound=AbstractEnergy)
+
+
+class InverseProblem(eqx.Module, Generic[Energy]):
+    r"""Find the parameters whose equilibrium minimises a cost (paper, "Bilevel optimization").
+
+    $$\min_\theta C(X^*_\theta, \theta) \quad \text{subject to} \quad
+      X^*_\theta \in \arg\min_X E(X, \theta)$$
+
+    **Arguments:**
+
+    - `tissue`: where the first relaxation starts.
+    - `energy`: the energy, with the first guess of its parameters.
+    - `cost`: what to minimise.
+    - `trainable`: which leaves of the energy are fitted: a predicate of a leaf, or a pytree of booleans
+        shaped like the energy (as in `equinox.partition`). By default every floating-point array;
+        Python floats are constants.
+    - `fit_position`: fit also where the whole tissue lies. No parameter of an energy moves the centroid
+        of a tissue, so a cost that sees positions (an image) needs this unless they are known.
+    - `adjoint`, `solver`, `transitions`, `tolerance`, `patience`, `max_steps`: passed on to
+        [`equilibrate`][vertax.equilibrate].
+    """
+
+    tissue: Tissue
+    energy: Energy
+    cost: AbstractCost
+    trainable: PyTree[bool] | Callable[[Any], bool] = eqx.is_inexact_array
+    fit_position: bool = False
+    adjoint: AbstractAdjoint = eqx.field(default_factory=ImplicitDifferentiation)
+    solver: optx.AbstractMinimiser | None = None
+    transitions: AbstractTransitions | None = T1()
+    tolerance: float | Float[Array, ""] | None = None
+    patience: int = 1
+    max_steps: int = 2000
+
+    def __call__(
+        self,
+        energy: AbstractEnergy | None = None,
+        tissue: Tissue | None = None,
+        shift: Float[Array, 2] | None = None,
+    ) -> tuple[Float[Array, ""], Equilibrium]:
+        """Cost and equilibrium for some parameters.
+
+        **Arguments:**
+
+        - `energy`: the energy, by default the problem's.
+        - `tissue`: where the relaxation starts, by default the problem's tissue.
+        - `shift`: a displacement of the relaxed tissue as a whole, by default none.
+
+        **Returns:** the cost, differentiable in `energy` and `shift`, and the equilibrium.
+        """
+        energy = self.energy if energy is None else energy
+        tissue = self.tissue if tissue is None else tissue
+        if isinstance(self.adjoint, EquilibriumPropagation) and self.adjoint.nudge == "cost":
+            settled = frozen(self._relax(*frozen((tissue, energy)), adjoint=None))
+            problem = eqx.tree_at(
+                lambda p: (p.adjoint, p.energy), self, (self.adjoint.without_outcome(), None)
+            )
+            vjp_arg = (energy, shift, self.adjoint.outcome)
+            cost = _cost_by_nudging(vjp_arg, frozen(problem), settled.tissue)
+            return cost, _placed(settled, shift)
+        equilibrium = _placed(self._relax(tissue, energy, adjoint=self.adjoint), shift)
+        return self.cost(equilibrium.tissue, energy), equilibrium
+
+    def residuals(
+        self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
+    ) -> tuple[Float[Array, " residuals"], Equilibrium, Tissue]:
+        """Residuals of a least-squares cost, the equilibrium, and its tissue displaced by `shift`."""
+        equilibrium = self._relax(tissue, energy, adjoint=self.adjoint)
+        placed = _moved(equilibrium.tissue, shift)
+        return self.cost.residuals(placed, energy), equilibrium, placed
+
+    def value_and_gradient(
+        self,
+        energy: AbstractEnergy | None = None,
+        tissue: Tissue | None = None,
+        shift: Float[Array, 2] | None = None,
+    ) -> tuple[
+        Float[Array, ""], Equilibrium, tuple[PyTree[Array], Float[Array, 2] | None], GradientOutcome
+    ]:
+        """Cost, equilibrium, gradient, and how the gradient came about.
+
+        **Arguments:** as in a call of the problem.
+
+        **Returns:**
+
+        - the cost;
+        - the equilibrium;
+        - the gradient with respect to the trainable leaves of the energy (the others are None) and with
+            respect to `shift` (None if there is none);
+        - the [`GradientOutcome`][vertax.GradientOutcome] of the adjoint.
+
+        **Raises:**
+
+        - `RuntimeError` (of Equinox) for a gradient that cannot be trusted, unless the adjoint is told
+            not to with `throw=False`.
+        """
+        energy = self.energy if energy is None else energy
+        parameters, constants = eqx.partition(energy, self.trainable)
+
+        def cost(arguments: tuple) -> tuple[Array, Equilibrium]:
+            parameters, shift, outcome = arguments
+            adjoint = self.adjoint.with_outcome(outcome)
+            problem = eqx.tree_at(lambda p: p.adjoint, self, adjoint)
+            return problem(eqx.combine(parameters, constants), tissue, shift)
+
+        arguments = (parameters, shift, GradientOutcome())
+        (value, equilibrium), (*gradient, outcome) = jax.value_and_grad(cost, has_aux=True)(
+            arguments
+        )
+        return value, equilibrium, tuple(gradient), outcome
+
+    def _relax(
+        self, tissue: Tissue, energy: AbstractEnergy, *, adjoint: AbstractAdjoint | None, **options: Any
+    ) -> Equilibrium:
+        settings: dict[str, Any] = {
+            "solver": self.solver,
+            "transitions": self.transitions,
+            "tolerance": self.tolerance,
+            "patience": self.patience,
+            "max_steps": self.max_steps,
+        }
+        return equilibrate(tissue, energy, adjoint=adjoint, throw=False, **settings | options)
+
+
+def _moved(tissue: Tissue, shift: Float[Array, 2] | None) -> Tissue:
+    if shift is None:
+        return tissue
+    return eqx.tree_at(lambda t: t.vertices, tissue, tissue.vertices + shift)
+
+
+def _placed(equilibrium: Equilibrium, shift: Float[Array, 2] | None) -> Equilibrium:
+    return eqx.tree_at(lambda e: e.tissue, equilibrium, _moved(equilibrium.tissue, shift))
+
+
+class _Nudged(AbstractEnergy):
+    """An energy and a share of the cost."""
+
+    energy: AbstractEnergy
+    cost: AbstractCost
+    shift: Float[Array, 2] | None
+    strength: Float[Array, ""]
+
+    def __call__(self, tissue: Tissue) -> Float[Array, ""]:
+        cost = self.cost(_moved(tissue, self.shift), self.energy)
+        return self.energy(tissue) + self.strength * cost
+
+
+# Equilibrium propagation in the form of the paper: X± minimise E ± (β/2) C, with the whole cost and with
+# T1 transitions, and the gradient is the difference of the partial derivatives of these two energies
+# with respect to the parameters, over β.
+@eqx.filter_custom_vjp
+def _cost_by_nudging(
+    vjp_arg: tuple[AbstractEnergy, Float[Array, 2] | None, GradientOutcome | None],
+    problem: InverseProblem,
+    settled: Tissue,
+) -> Float[Array, ""]:
+    energy, shift, _ = vjp_arg
+    return problem.cost(_moved(settled, shift), energy)
+
+
+@_cost_by_nudging.def_fwd
+def _(perturbed: Any, vjp_arg: Any, problem: InverseProblem, settled: Tissue) -> tuple:
+    energy, shift, _ = vjp_arg
+    return problem.cost(_moved(settled, shift), energy), None
+
+
+@_cost_by_nudging.def_bwd
+def _(
+    residuals: None,
+    cotangent: Float[Array, ""],
+    perturbed: Any,
+    vjp_arg: Any,
+    problem: InverseProblem,
+    settled: Tissue,
+) -> Any:
+    energy, shift, slot = vjp_arg
+    adjoint = problem.adjoint
+    assert isinstance(adjoint, EquilibriumPropagation)
+    half_beta, force = _nudge(problem, adjoint, settled, energy, shift)
+    moving, fixed = differentiable((energy, shift))
+
+    def phase(sign: Array) -> tuple[PyTree[Array], Equilibrium]:
+        def nudged(m: PyTree[Array]) -> _Nudged:
+            energy, shift = eqx.combine(m, fixed)
+            return _Nudged(energy, problem.cost, shift, sign * half_beta)
+
+        found = problem._relax(
+            settled, nudged(moving), adjoint=None, tolerance=_tolerance(problem, adjoint, force)
+        )
+        found = frozen(found)
+        return jax.grad(lambda m: nudged(m)(found.tissue))(moving), found
+
+    signs = jnp.asarray(adjoint.signs, half_beta.dtype)
+    slopes, found = jax.vmap(phase)(signs)
+    beta = half_beta * (signs[0] - signs[1])
+    gradient = jax.tree.map(lambda s: cotangent * (s[0] - s[1]) / beta, slopes)
+    residual = jnp.max(found.max_force) / force
+    outcome = GradientOutcome(
+        residual, jnp.sum(found.num_steps), jnp.nan, ~(residual < UNTRUSTED)
+    )
+    (d_energy, d_shift), outcome = settle(gradient, outcome, adjoint.throw, slot, REASON)
+    return d_energy, d_shift, outcome
+
+
+def _nudge(
+    problem: InverseProblem,
+    adjoint: EquilibriumPropagation,
+    settled: Tissue,
+    energy: AbstractEnergy,
+    shift: Float[Array, 2] | None,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Half of β, and a force that it exerts if not at the optimum."""
+    cost = lambda tissue: problem.cost(_moved(tissue, shift), energy)
+    at = lambda y: cost(settled.with_configuration(y))
+    value, slope = jax.value_and_grad(at)(settled.configuration)
+    length = jnp.sqrt(jnp.mean(jnp.abs(settled.areas)))
+    # At the optimum of the cost its slope vanishes, and β has to stay so small that E - (β/2) C keeps
+    # its minimum. A cost that counts neighbours has neither slope nor curvature: only a size.
+    pull = jnp.maximum(optx.max_norm(slope), mean_stiffness(settled, cost) * length)
+    pull = jnp.maximum(pull, 1e-8 * jnp.abs(value) / length)
+    pull = jnp.where(pull > 0, pull, 1)
+    if adjoint.beta is not None:
+        half_beta = jnp.asarray(adjoint.beta, value.dtype) / 2
+    else:
+        units = {"stiffness": mean_stiffness(settled, energy), "length_scale": length}
+        half_beta = adjoint.strength(None, units, value.dtype) / pull
+    return half_beta, half_beta * pull
+
+
+def _tolerance(
+    problem: InverseProblem, adjoint: EquilibriumPropagation, force: Float[Array, ""]
+) -> Float[Array, ""]:
+    tolerance = adjoint.tolerance(force)
+    return tolerance if problem.tolerance is None else jnp.minimum(tolerance, problem.tolerance)
