@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import optimistix as optx
 from hypothesis import strategies as st
+from jax import Array
 
 import vertax as vx
 
@@ -84,6 +85,18 @@ def p0_of(energy: vx.AbstractEnergy) -> jax.Array:
 def dense_hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> np.ndarray:
     f = lambda y: energy(tissue.with_configuration(y.reshape(tissue.vertices.shape)))
     return np.asarray(eqx.filter_jit(jax.hessian(f))(tissue.vertices.ravel()))
+
+
+def dense_hypergradient(tissue: vx.Tissue, energy: vx.AbstractEnergy, cost: vx.AbstractCost) -> Array:
+    """Gradient with respect to the target shape factors of E1 at an equilibrium, by a pseudo-inverse."""
+    pull = jax.grad(lambda x: cost(tissue.with_configuration(x), energy))(tissue.vertices).ravel()
+
+    def force(p: Array) -> Array:
+        e = vx.energies.ShapeFactorEnergy(p)
+        return jax.grad(lambda x: e(tissue.with_configuration(x)))(tissue.vertices).ravel()
+
+    inverse = np.linalg.pinv(dense_hessian(tissue, energy), rcond=1e-10)
+    return -jax.jacobian(force)(p0_of(energy)).T @ inverse @ pull
 
 
 def edge_cell_sets(tissue: vx.Tissue) -> list[tuple[int, int]]:

@@ -18,7 +18,7 @@ from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDif
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
-from vertax.solvers._relaxation import Relaxation, RelaxationState
+from vertax.solvers._relaxation import AtRest, Relaxation, RelaxationState
 
 
 class Equilibrium(eqx.Module):
@@ -116,11 +116,11 @@ def _equilibrate(
     max_steps: int,
     throw: bool,
 ) -> Equilibrium:
-    threshold = jnp.asarray(tolerance, tissue.vertices.dtype)
     # Solvers bound their steps in units of the cells, whatever unit of length the user chose.
     scale = jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
-    options = frozen({"length_scale": scale})
-    relaxation = Relaxation(solver, threshold, patience)
+    tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
+    options = frozen({"length_scale": scale, "tolerance": tolerance})
+    relaxation = Relaxation(solver, patience)
 
     found = _search(
         relaxation, options, transitions, *frozen((tissue, energy)), max_steps=max_steps
@@ -131,13 +131,13 @@ def _equilibrate(
     stiffness = mean_stiffness(found.tissue, frozen(energy))
     stiffness = jnp.where(stiffness > 0, stiffness, 1)
     if adjoint.unrolls:
-        start, gauge = found.start, jnp.zeros_like(stiffness)
+        minimiser, start, gauge = relaxation, found.start, jnp.zeros_like(stiffness)
     else:
-        start, gauge = found.tissue.configuration, stiffness
-        options = options | {"num_steps": jnp.array(0), "stiffness": stiffness}
+        minimiser, start, gauge = AtRest(), found.tissue.configuration, stiffness
+        options = options | {"stiffness": stiffness, "relaxation": relaxation}
     solution = optx.minimise(
         _potential,
-        relaxation,
+        minimiser,
         start,
         (moved, energy, gauge),
         options,

@@ -56,8 +56,8 @@ class AutomaticDifferentiation(AbstractAdjoint):
 
     checkpoints: int | None = eqx.field(static=True, default=None)
     rtol: float | None = None
-    throw: bool = True
-    outcome: GradientOutcome | None = None
+    throw: bool = eqx.field(default=True, kw_only=True)
+    outcome: GradientOutcome | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         if self.checkpoints is not None and self.checkpoints < 1:

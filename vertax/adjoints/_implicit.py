@@ -52,8 +52,8 @@ class ImplicitDifferentiation(AbstractAdjoint):
 
     mode: Literal["adjoint", "sensitivity"] = eqx.field(static=True, default="adjoint")
     linear_solver: lx.AbstractLinearSolver = eqx.field(default_factory=MINRES)
-    throw: bool = True
-    outcome: GradientOutcome | None = None
+    throw: bool = eqx.field(default=True, kw_only=True)
+    outcome: GradientOutcome | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         if self.mode not in ("adjoint", "sensitivity"):

@@ -62,8 +62,8 @@ class EquilibriumPropagation(AbstractAdjoint):
     nudge: Literal["linear", "cost"] = eqx.field(static=True, default="linear")
     centred: bool = eqx.field(static=True, default=True)
     rtol: float | None = None
-    throw: bool = True
-    outcome: GradientOutcome | None = None
+    throw: bool = eqx.field(default=True, kw_only=True)
+    outcome: GradientOutcome | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         if self.nudge not in ("linear", "cost"):
@@ -161,9 +161,11 @@ def _(
     size = optx.max_norm(cotangent)
     force = optax.tree.scale(1 / jnp.where(size > 0, size, 1), cotangent)
     strength = adjoint.strength(adjoint.beta, options, size.dtype)
-    options = {k: v for k, v in options.items() if k != "num_steps"}
-    tolerance = jnp.minimum(solver.tolerance, adjoint.tolerance(strength))
-    options["tolerance"] = tolerance
+    # The solver of an equilibrium that is known takes no step; the relaxation that found it does.
+    solver = options.get("relaxation", solver)
+    coarsest = options.get("tolerance", jnp.inf)
+    tolerance = jnp.minimum(coarsest, adjoint.tolerance(strength))
+    options = options | {"tolerance": tolerance}
 
     moving, fixed = differentiable((fn, args))
 

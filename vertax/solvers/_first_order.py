@@ -79,6 +79,10 @@ class Optax(AbstractSolver):
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
     ) -> tuple[Any, _State, Any]:
+        def value_fn(x: Any) -> Array:
+            # Line searches of Optax work in the default precision, whatever that of the tissue is.
+            return fn(jax.tree.map(lambda a, b: a.astype(b.dtype), x, y), args)[0]
+
         update = optax.with_extra_args_support(self.optimiser).update
         updates, optimiser = update(
             state.gradient,
@@ -86,7 +90,7 @@ class Optax(AbstractSolver):
             y,
             value=state.value,
             grad=state.gradient,
-            value_fn=lambda x: fn(x, args)[0],
+            value_fn=value_fn,
         )
         y = optax.apply_updates(y, updates)
         value, gradient, aux = value_and_gradient(fn, y, args)

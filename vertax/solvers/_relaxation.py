@@ -1,4 +1,4 @@
-"""The minimiser that `equilibrate` runs: a solver, and when it is at rest."""
+"""The minimisers that `equilibrate` runs: to come to rest, and to stay there."""
 
 from __future__ import annotations
 
@@ -25,18 +25,16 @@ class RelaxationState(eqx.Module):
 class Relaxation(optx.AbstractMinimiser):
     """A solver that is at rest when the largest force has stayed below a tolerance for some steps.
 
-    Besides those of the solver it knows two options: `num_steps`, after which it stops, at rest or not
-    and neither sooner nor later; and `tolerance`, which replaces its own.
+    Besides those of the solver it knows two options: `tolerance`, the largest force at rest; and
+    `num_steps`, after which it stops, at rest or not and neither sooner nor later.
 
     **Arguments:**
 
     - `solver`: takes the steps.
-    - `tolerance`: largest force at rest.
     - `patience`: number of consecutive steps for which the force must stay below the tolerance.
     """
 
     solver: AbstractSolver
-    tolerance: Float[Array, ""]
     patience: int = eqx.field(static=True, default=1)
     rtol: float = 0.0
     atol: float = 0.0
@@ -80,5 +78,41 @@ class Relaxation(optx.AbstractMinimiser):
         self, inner: Any, options: Any, n_below: Int[Array, ""], num_steps: Int[Array, ""]
     ) -> RelaxationState:
         force = self.norm(self.solver.gradient(inner))
-        below = force < options.get("tolerance", self.tolerance)
+        below = force < options["tolerance"]
         return RelaxationState(inner, force, jnp.where(below, n_below + 1, 0), num_steps)
+
+
+class AtRest(optx.AbstractMinimiser):
+    """Returns the point it is given, which is known to be a minimum."""
+
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(default=optx.max_norm, static=True)
+
+    def init(
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> None:
+        return None
+
+    def step(
+        self, fn: Any, y: Any, args: Any, options: Any, state: None, tags: Any
+    ) -> tuple[Any, None, Any]:
+        return y, None, None
+
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: None, tags: Any
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        return jnp.array(True), optx.RESULTS.successful
+
+    def postprocess(
+        self,
+        fn: Any,
+        y: Any,
+        aux: Any,
+        args: Any,
+        options: Any,
+        state: None,
+        tags: Any,
+        result: Any,
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        return y, aux, {}
