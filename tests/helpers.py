@@ -87,7 +87,9 @@ def dense_hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> np.ndarray:
     return np.asarray(eqx.filter_jit(jax.hessian(f))(tissue.vertices.ravel()))
 
 
-def dense_hypergradient(tissue: vx.Tissue, energy: vx.AbstractEnergy, cost: vx.AbstractCost) -> Array:
+def dense_hypergradient(
+    tissue: vx.Tissue, energy: vx.AbstractEnergy, cost: vx.AbstractCost
+) -> Array:
     """Gradient with respect to the target shape factors of E1 at an equilibrium, by a pseudo-inverse."""
     pull = jax.grad(lambda x: cost(tissue.with_configuration(x), energy))(tissue.vertices).ravel()
 

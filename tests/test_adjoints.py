@@ -1,5 +1,7 @@
 """What all adjoints have in common: one line to differentiate, and one gradient."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -42,6 +44,7 @@ def distance(a, b) -> float:
     return float(jnp.linalg.norm(a - b) / jnp.linalg.norm(b))
 
 
+@functools.cache
 def start_and_cost(n_cells, seed=0):
     """A relaxed tissue, and a cost that pulls on all its vertices."""
     tissue, energy = relaxed(n_cells, seed)
@@ -52,7 +55,7 @@ def start_and_cost(n_cells, seed=0):
 @all_adjoints
 @pytest.mark.parametrize("n_cells", [20, 64])
 def test_hypergradient_against_a_dense_reference(adjoint, options, rtol, n_cells):
-    tissue, energy, cost = start_and_cost(n_cells)
+    tissue, _energy, cost = start_and_cost(n_cells)
     guess = ShapeFactorEnergy(shape_factors(n_cells, 3.7, 0.1, 5))
 
     def loss(e):
@@ -97,7 +100,9 @@ def energies(tissue):
 
 
 @all_adjoints
-@pytest.mark.parametrize("which", ["edges", "vertices", "network"])
+@pytest.mark.parametrize(
+    "which", ["edges", pytest.param("vertices", marks=pytest.mark.slow), "network"]
+)
 def test_parameters_of_every_kind(adjoint, options, rtol, which):
     tissue, _ = relaxed(8, 3)
     energy = energies(tissue)[which]
@@ -162,7 +167,7 @@ def test_vmap(adjoint, options, rtol):
 
 @all_adjoints
 def test_float32(adjoint, options, rtol):
-    tissue, energy, cost = start_and_cost(12, 1)
+    tissue, _energy, cost = start_and_cost(12, 1)
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     small, small_cost = jax.tree.map(to32, (tissue, cost))
     p0 = shape_factors(12, 3.7, 0.1, 4)
@@ -182,9 +187,20 @@ def test_float32(adjoint, options, rtol):
     assert distance(gradient.astype(jnp.float64), reference) < 0.03
 
 
-@pytest.mark.parametrize(("name", "solver", "reach"), SOLVERS, ids=[s[0] for s in SOLVERS])
-@all_adjoints
-def test_every_solver_that_an_adjoint_takes(adjoint, options, rtol, name, solver, reach):
+def solver_pairs():
+    """Every adjoint with every solver; only some of the pairs are tried on every change."""
+    quick = {("propagation", "lbfgs"), ("implicit", "fire"), ("automatic", "gradient_descent")}
+    for adjoint_name, adjoint, _, rtol in ADJOINTS:
+        for name, solver, reach in SOLVERS:
+            if adjoint.unrolls and name not in ("gradient_descent", "optax_adam"):
+                continue
+            mark = () if (adjoint_name, name) in quick else (pytest.mark.slow,)
+            label = f"{adjoint_name}-{name}"
+            yield pytest.param(adjoint, rtol, name, solver, reach, id=label, marks=mark)
+
+
+@pytest.mark.parametrize(("adjoint", "rtol", "name", "solver", "reach"), solver_pairs())
+def test_every_solver_that_an_adjoint_takes(adjoint, rtol, name, solver, reach):
     tissue, _, cost = start_and_cost(6, 1)
     energy = ShapeFactorEnergy(shape_factors(6, 3.6, 0.1, 3))
 
@@ -201,19 +217,14 @@ def test_every_solver_that_an_adjoint_takes(adjoint, options, rtol, name, solver
         return cost(found.tissue, e)
 
     gradient = eqx.filter_jit(jax.grad(loss))
-    unrollable = name in ("gradient_descent", "optax_adam")
-    if adjoint.unrolls and not unrollable:
-        with pytest.raises(ValueError, match=r"does not go with .*GradientDescent\(\)"):
-            gradient(energy, solver, adjoint)
-        return
-    if name == "optax_adam":
+    nudged = isinstance(adjoint, vx.EquilibriumPropagation)
+    if name == "optax_adam" and (adjoint.unrolls or nudged):
         # Its steps do not shrink with the force: neither a nudged tissue nor a derivative comes to
         # rest, and that must not pass silently.
-        if adjoint.unrolls or isinstance(adjoint, vx.EquilibriumPropagation):
-            with pytest.raises(RuntimeError, match="cannot be trusted"):
-                jax.block_until_ready(gradient(energy, solver, adjoint))
-            return
-    if isinstance(adjoint, vx.EquilibriumPropagation):
+        with pytest.raises(RuntimeError, match="cannot be trusted"):
+            jax.block_until_ready(gradient(energy, solver, adjoint))
+        return
+    if nudged:
         # The nudge has to stand out from the force at which the solver stalls.
         adjoint = vx.EquilibriumPropagation(beta=max(1e-5, reach), throw=False)
     found = gradient(energy, solver, adjoint)
@@ -221,17 +232,17 @@ def test_every_solver_that_an_adjoint_takes(adjoint, options, rtol, name, solver
     assert distance(found, reference) < max(rtol, 0.02 if reach > 1e-9 else 0)
 
 
-def test_line_searches_are_not_unrolled():
+def test_steps_with_decisions_are_not_unrolled():
     tissue, energy = relaxed(4, 1)
-    for solver in (optx.OptaxMinimiser(optax.lbfgs(), 0.0, 0.0), optx.BFGS(0.0, 0.0)):
-        with pytest.raises(ValueError, match="does not go with"):
-            vx.equilibrate(
-                tissue, energy, solver=solver, adjoint=vx.AutomaticDifferentiation()
-            )
+    refused = [
+        solver for name, solver, _ in SOLVERS if "adam" not in name and "descent" not in name
+    ]
+    for solver in (*refused, optx.OptaxMinimiser(optax.lbfgs(), 0.0, 0.0)):
+        with pytest.raises(ValueError, match=r"does not go with .*GradientDescent\(\)"):
+            vx.equilibrate(tissue, energy, solver=solver, adjoint=vx.AutomaticDifferentiation())
     plain = optx.OptaxMinimiser(optax.sgd(1e-3), 0.0, 0.0)
     assert vx.solvers.Wrapped(plain).unrollable
     assert vx.solvers.Optax(optax.polyak_sgd()).unrollable
-    assert not vx.solvers.LBFGS().unrollable
 
 
 def test_an_unrolled_relaxation_that_starts_at_rest_still_has_a_gradient():
@@ -241,7 +252,9 @@ def test_an_unrolled_relaxation_that_starts_at_rest_still_has_a_gradient():
         found = vx.equilibrate(tissue, e, adjoint=adjoint, transitions=None, **options)
         return cost(found.tissue, e), found
 
-    gradient, found = jax.grad(loss, has_aux=True)(energy, vx.AutomaticDifferentiation(), **UNROLLED)
+    gradient, found = jax.grad(loss, has_aux=True)(
+        energy, vx.AutomaticDifferentiation(), **UNROLLED
+    )
     assert found.num_steps == 0
     assert distance(gradient, jax.grad(loss, has_aux=True)(energy, None)[0]) < 1e-4
 
@@ -267,6 +280,36 @@ def test_forward_mode_and_second_derivatives(mode):
     np.testing.assert_allclose(hessian, hessian.T, rtol=1e-5, atol=1e-7)
     difference = central_difference(jax.jit(jax.grad(loss)), p0, direction)
     assert distance(hessian @ direction, difference) < 1e-5
+
+
+@all_adjoints
+def test_gradient_with_respect_to_the_shape_of_the_box(adjoint, options, rtol):
+    tissue, energy = relaxed(12, 4)
+    strained = lambda lattice: eqx.tree_at(lambda t: t.boundary.lattice, tissue, lattice)
+
+    def loss(lattice, adjoint=None, **options):
+        found = vx.equilibrate(
+            strained(lattice), energy, tolerance=1e-10, transitions=None, adjoint=adjoint, **options
+        )
+        return jnp.sum(found.tissue.perimeters**3)
+
+    lattice = tissue.boundary.lattice
+    direction = 0.1 * random_like(lattice)
+    slope = jnp.sum(eqx.filter_jit(jax.grad(loss))(lattice, adjoint, **options) * direction)
+    difference = central_difference(eqx.filter_jit(loss), lattice, direction)
+    assert slope == pytest.approx(float(difference), rel=10 * rtol)
+
+
+def test_adjoint_ignores_translations():
+    # A cost that pulls on the centroid alone has no gradient: no parameter moves the centroid.
+    tissue, energy = relaxed(12, 1)
+
+    def loss(p):
+        found = vx.equilibrate(tissue, ShapeFactorEnergy(p), transitions=None, tolerance=1e-12)
+        return jnp.sum(found.tissue.vertices)
+
+    gradient = jax.grad(loss)(energy.target_shape_factor)
+    assert jnp.abs(gradient).max() < 1e-8
 
 
 def test_order_of_the_estimators_of_equilibrium_propagation():
@@ -407,9 +450,7 @@ class TestNudgeByTheCost:
         assert value == cost(found.tissue, energy)
         assert outcome.trusted
         assert distance(gradient, reference) < 1e-4
-        scaled = jax.grad(
-            lambda e: 3 * make(vx.EquilibriumPropagation(nudge="cost"))(e)[0]
-        )(energy)
+        scaled = jax.grad(lambda e: 3 * make(vx.EquilibriumPropagation(nudge="cost"))(e)[0])(energy)
         assert distance(scaled, 3 * reference.target_shape_factor) < 1e-4
 
     def test_a_fitted_position_has_its_gradient_too(self):
@@ -447,7 +488,8 @@ class TestNudgeByTheCost:
         assert not gradient().any()
         assert not gradient(nudge="cost", beta=1e-6).any()  # too weak to flip
         steering = gradient(nudge="cost", beta=0.5)
-        assert jnp.isfinite(steering).all() and steering.any()
+        assert jnp.isfinite(steering).all()
+        assert steering.any()
 
 
 def test_bad_arguments():

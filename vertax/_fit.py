@@ -296,7 +296,13 @@ def _unbeaten(problem: InverseProblem, parameters: PyTree[Array]) -> _Best:
 
 
 def _better(
-    best: _Best, parameters: PyTree, tissue: Tissue, cost: Array, force: Array, epoch: Array, ok: Array
+    best: _Best,
+    parameters: PyTree,
+    tissue: Tissue,
+    cost: Array,
+    force: Array,
+    epoch: Array,
+    ok: Array,
 ) -> _Best:
     new = _Best(parameters, tissue, cost, force, epoch)
     return _choose(ok & (cost < best.cost), new, best)
@@ -317,9 +323,7 @@ def _start(
     def start(problem: InverseProblem, parameters: PyTree[Array]) -> _State:
         fitted = cast(optax.Params, (parameters, _no_shift(problem)))
         best = _unbeaten(problem, parameters)
-        return _State(
-            parameters, optimiser.init(fitted), problem.tissue, best, jnp.array(True)
-        )
+        return _State(parameters, optimiser.init(fitted), problem.tissue, best, jnp.array(True))
 
     return (eqx.filter_vmap(start) if batched else start)(problem, parameters)
 

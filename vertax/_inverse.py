@@ -138,7 +138,12 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         return value, equilibrium, tuple(gradient), outcome
 
     def _relax(
-        self, tissue: Tissue, energy: AbstractEnergy, *, adjoint: AbstractAdjoint | None, **options: Any
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        *,
+        adjoint: AbstractAdjoint | None,
+        **options: Any,
     ) -> Equilibrium:
         settings: dict[str, Any] = {
             "solver": self.solver,
@@ -223,9 +228,7 @@ def _(
     beta = half_beta * (signs[0] - signs[1])
     gradient = jax.tree.map(lambda s: cotangent * (s[0] - s[1]) / beta, slopes)
     residual = jnp.max(found.max_force) / force
-    outcome = GradientOutcome(
-        residual, jnp.sum(found.num_steps), jnp.nan, ~(residual < UNTRUSTED)
-    )
+    outcome = GradientOutcome(residual, jnp.sum(found.num_steps), jnp.nan, ~(residual < UNTRUSTED))
     (d_energy, d_shift), outcome = settle(gradient, outcome, adjoint.throw, slot, REASON)
     return d_energy, d_shift, outcome
 

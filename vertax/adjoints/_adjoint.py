@@ -85,7 +85,11 @@ def frozen(tree: PyTree) -> PyTree:
 
 
 def settle(
-    gradient: PyTree, outcome: GradientOutcome, throw: bool, like: GradientOutcome | None, reason: str
+    gradient: PyTree,
+    outcome: GradientOutcome,
+    throw: bool,
+    like: GradientOutcome | None,
+    reason: str,
 ) -> tuple[PyTree, GradientOutcome | None]:
     """Refuse a gradient that cannot be trusted, and shape the outcome as the slot it goes to."""
     if throw:

@@ -76,7 +76,9 @@ class AutomaticDifferentiation(AbstractAdjoint):
     ) -> PyTree[Any]:
         fn, solver, y0, args, options, max_steps, *structs = inputs
         if not isinstance(solver, Relaxation):
-            raise TypeError("AutomaticDifferentiation differentiates the relaxations of `equilibrate`.")
+            raise TypeError(
+                "AutomaticDifferentiation differentiates the relaxations of `equilibrate`."
+            )
         outcome = self._rehearse(*frozen((fn, solver, y0, args, options, max_steps)))
         options = options | {"num_steps": outcome.num_steps}
         inputs = (fn, solver, y0, args, options, max_steps, *structs)
@@ -116,9 +118,7 @@ class AutomaticDifferentiation(AbstractAdjoint):
         floats, tangents, others = jax.jvp(begin, (parameters,), (direction,), has_aux=True)
         arrays, static = eqx.partition(others, eqx.is_array)
         initial = residual(tangents)
-        rtol = (
-            (1e-8 if initial.dtype == jnp.float64 else 1e-3) if self.rtol is None else self.rtol
-        )
+        rtol = (1e-8 if initial.dtype == jnp.float64 else 1e-3) if self.rtol is None else self.rtol
 
         def unfinished(carry: tuple) -> Bool[Array, ""]:
             floats, tangents, arrays = carry
@@ -150,9 +150,11 @@ def _random_direction(parameters: PyTree[Array]) -> PyTree[Array]:
     """A change of all parameters that is of the order of each."""
     leaves, structure = jax.tree.flatten(parameters)
     keys = jax.random.split(jax.random.key(0), max(len(leaves), 1))
-    size = lambda x: jnp.where(x == 0, 1, jnp.abs(x))
-    draw = [size(x) * jax.random.normal(k, x.shape, x.dtype) for k, x in zip(keys, leaves)]
-    return jax.tree.unflatten(structure, draw)
+
+    def draw(key: Array, x: Array) -> Array:
+        return jnp.where(x == 0, 1, jnp.abs(x)) * jax.random.normal(key, x.shape, x.dtype)
+
+    return jax.tree.unflatten(structure, [draw(*pair) for pair in zip(keys, leaves, strict=False)])
 
 
 @eqx.filter_custom_vjp
@@ -170,7 +172,9 @@ def _(perturbed: Any, vjp_arg: Any, outcome: GradientOutcome, throw: bool) -> tu
 
 
 @_report.def_bwd
-def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, outcome: Any, throw: Any) -> Any:
+def _(
+    residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, outcome: Any, throw: Any
+) -> Any:
     _, slot = vjp_arg
     return settle(cotangent, outcome, throw, slot, _REASON)
 

@@ -111,7 +111,14 @@ class EquilibriumPropagation(AbstractAdjoint):
 
 
 def _minimise(
-    primal_fn: Callable, loop: Callable, fn: Any, args: Any, solver: Any, y0: Any, options: Any, rest: Any
+    primal_fn: Callable,
+    loop: Callable,
+    fn: Any,
+    args: Any,
+    solver: Any,
+    y0: Any,
+    options: Any,
+    rest: Any,
 ) -> tuple[PyTree[Array], PyTree]:
     return primal_fn((fn, solver, y0, args, options, *rest, loop))
 

@@ -11,8 +11,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from vertax._fit import History
 from vertax._boundary import Periodic
+from vertax._fit import History
 from vertax._tissue import Tissue
 from vertax.plotting import _style, plot_history, plot_recovery, plot_tissue
 

@@ -17,10 +17,12 @@ from vertax.experiments._config import Section
 class Relaxation(Section):
     """How the tissue is relaxed to mechanical equilibrium."""
 
-    solver: Literal["newton_cg", "lbfgs", "fire", "gradient_descent"] = "newton_cg"
-    """The minimiser; gradient_descent is the paper's."""
+    solver: Literal["newton_cg", "lbfgs", "fire", "gradient_descent", "momentum"] = "newton_cg"
+    """The minimiser; gradient_descent is the paper's, momentum the same with Nesterov momentum."""
     learning_rate: float = Field(default=1e-2, gt=0)
-    """Step of gradient_descent; the others choose their own."""
+    """Step of gradient_descent and momentum; the others choose their own."""
+    momentum: float = Field(default=0.95, ge=0, lt=1)
+    """How much of its last step momentum keeps."""
     tolerance: float | None = Field(default=None, gt=0)
     """Largest force that counts as equilibrium; left out, 1e-9 in float64 and 1e-4 in float32."""
     patience: int = Field(default=1, ge=1)
@@ -48,6 +50,8 @@ class Relaxation(Section):
     def _minimiser(self) -> optx.AbstractMinimiser:
         if self.solver == "gradient_descent":
             return solvers.GradientDescent(learning_rate=self.learning_rate)
+        if self.solver == "momentum":
+            return solvers.Optax(_momentum(self.learning_rate, self.momentum))
         named = {"newton_cg": solvers.NewtonCG, "lbfgs": solvers.LBFGS, "fire": solvers.FIRE}
         return named[self.solver]()
 
@@ -72,6 +76,11 @@ class Fitting(Section):
 
 # JAX knows an Optax optimiser by identity: a second fit in a process is not compiled again if it gets
 # the very same one.
+@functools.cache
+def _momentum(learning_rate: float, momentum: float) -> optax.GradientTransformation:
+    return optax.sgd(learning_rate, momentum, nesterov=True)
+
+
 @functools.cache
 def _optimiser(name: str, learning_rate: float) -> optax.GradientTransformation:
     return {"adam": optax.adam, "nadam": optax.nadam}[name](learning_rate)

@@ -18,9 +18,9 @@ from jaxtyping import Array, Bool, Float
 from pydantic import Field
 from scipy.ndimage import gaussian_filter, zoom
 
+from vertax._equilibrium import Equilibrium, equilibrate
 from vertax._fit import Fit, FitError, fit
 from vertax._inverse import InverseProblem
-from vertax._equilibrium import Equilibrium, equilibrate
 from vertax._tissue import Tissue
 from vertax.costs import MeshImage, mirror
 from vertax.energies import ShapeFactorEnergy

@@ -12,42 +12,23 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
 from vertax._fit import Fit, FitError, fit
 from vertax._inverse import InverseProblem
-from vertax._equilibrium import equilibrate
 from vertax._tissue import Tissue
 from vertax.costs import AbstractCost, MeshImage, VertexDistance, render
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.experiments import _figures
 from vertax.experiments._config import ExperimentConfig, Section
 from vertax.experiments._run import RunFolder, fit_metrics, history_columns
+from vertax.experiments._scenes import Scene, ShapeFactors, TissueSection, make_scene
 from vertax.experiments._sections import Fitting, Relaxation
-from vertax.initialise import periodic_voronoi
 
 _NAME = r"$p_0$"
-
-
-class TissueSection(Section):
-    """The tissue, in a square box in which the mean area of a cell is 1."""
-
-    n_cells: int = Field(default=20, ge=4)
-    """Number of cells."""
-    lloyd_steps: int = Field(default=0, ge=0)
-    """Steps of Lloyd's algorithm, which make the first tissue more regular."""
-
-
-class ShapeFactors(Section):
-    """The normal distribution that the hidden shape factors are drawn from."""
-
-    mean: float = Field(default=3.7, gt=0)
-    """Mean."""
-    deviation: float = Field(default=0.1, ge=0)
-    """Standard deviation."""
+_Image = Float[np.ndarray, "rows columns"] | None
 
 
 class ImageSection(Section):
@@ -86,16 +67,6 @@ class Config(ExperimentConfig):
     """How the tissue is relaxed."""
 
 
-class _Scene(eqx.Module):
-    """What is hidden, what is seen of it, and where the fit starts."""
-
-    truth: ShapeFactorEnergy
-    target: Tissue
-    guess: ShapeFactorEnergy
-    initial: Tissue
-    image: Float[np.ndarray, "rows columns"] | None
-
-
 def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """Run the experiment.
 
@@ -113,20 +84,20 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
 
     - `FitError` if a fit cannot go on; the folder then holds what came before.
     """
-    scene = _make_scene(config)
-    _save_scene(config, scene, folder)
+    scene, image = _make_scene(config)
+    _save_scene(scene, image, folder)
     both = config.data == "both"
     metrics: dict[str, dict[str, Any]] = {}
     fits: dict[str, Fit] = {}
     for source in ("vertices", "image") if both else (config.data,):
         try:
-            fits[source] = _fit(config, scene, source, progress)
+            fits[source] = _fit(config, scene, image, source, progress)
         except FitError as error:
             if error.fit is not None:
                 _save_tables(scene, fits | {source: error.fit}, folder)
             raise
         _save_tables(scene, fits, folder)
-        _save_fit(config, scene, source, fits[source], folder)
+        _save_fit(config, scene, image, source, fits[source], folder)
         metrics[source] = _metrics(scene, fits[source])
     # The same keys are at the top whatever the data; the exact data, vertices, come first.
     return metrics["vertices"] | metrics if both else metrics[config.data]
@@ -155,37 +126,20 @@ def synthetic_image(
     return gain * (membranes / membranes.max() + options.background) + options.noise * noise
 
 
-def _make_scene(config: Config) -> _Scene:
-    keys = jax.random.split(jax.random.key(config.seed), 4)
-    n_cells, prior = config.tissue.n_cells, config.truth
-    draw = lambda key: prior.mean + prior.deviation * jax.random.normal(key, (n_cells,))
-    truth = ShapeFactorEnergy(draw(keys[0]))
-    guess = ShapeFactorEnergy(
-        draw(keys[1]) if config.guess == "redrawn" else jnp.full(n_cells, prior.mean)
-    )
-    first = periodic_voronoi(n_cells, key=keys[2], lloyd_steps=config.tissue.lloyd_steps)
-    # The hidden tissue is a true equilibrium, however coarsely the fit is told to relax.
-    relaxed = equilibrate(first, truth, **Relaxation().options(), throw=False)
-    if not relaxed.converged:
-        raise ValueError(
-            f"The hidden tissue did not reach equilibrium (largest force {relaxed.max_force:.1e}): "
-            "choose another seed, or a smaller truth.mean or truth.deviation."
-        )
-    target = relaxed.tissue
-    # The guess relaxes from the target's topology, because vertices are compared by number. A
-    # coarse relaxation need not reach the tolerance here; the fit reports how often it did.
-    initial = equilibrate(target, guess, **config.relaxation.options(), throw=False).tissue
+def _make_scene(config: Config) -> tuple[Scene, _Image]:
+    keys = jax.random.split(jax.random.key(config.seed))
+    redrawn = config.guess == "redrawn"
+    scene = make_scene(keys[0], config.tissue, config.truth, config.relaxation, redrawn=redrawn)
     needs_image = config.data != "vertices"
-    image = synthetic_image(target, config.image, keys[3]) if needs_image else None
-    return _Scene(truth, target, guess, initial, image)
+    return scene, synthetic_image(scene.target, config.image, keys[1]) if needs_image else None
 
 
-def _fit(config: Config, scene: _Scene, source: str, progress: bool) -> Fit:
+def _fit(config: Config, scene: Scene, image: _Image, source: str, progress: bool) -> Fit:
     cost: AbstractCost
     if source == "image":
-        assert scene.image is not None
+        assert image is not None
         width = config.image.psf_width * _pixel_size(scene.target, config.image)
-        cost = MeshImage(scene.image, width)
+        cost = MeshImage(image, width)
     else:
         cost = VertexDistance(scene.target)
     problem = InverseProblem(
@@ -200,7 +154,7 @@ def _fit(config: Config, scene: _Scene, source: str, progress: bool) -> Fit:
     return fit(problem, optimiser, config.fit.epochs, truth=scene.truth, progress=progress)
 
 
-def _metrics(scene: _Scene, outcome: Fit) -> dict[str, Any]:
+def _metrics(scene: Scene, outcome: Fit) -> dict[str, Any]:
     true, inferred = _parameters(scene.truth), _parameters(outcome.energy)
     history = outcome.history
     varied = np.ptp(true) > 0 and np.ptp(inferred) > 0
@@ -213,16 +167,16 @@ def _metrics(scene: _Scene, outcome: Fit) -> dict[str, Any]:
     }
 
 
-def _save_scene(config: Config, scene: _Scene, folder: RunFolder) -> None:
+def _save_scene(scene: Scene, image: _Image, folder: RunFolder) -> None:
     folder.save_tissue("target", scene.target)
     folder.save_tissue("initial", scene.initial)
     panels = {"target": (scene.target, _parameters(scene.truth))}
     folder.save_figure("target", _figures.tissues(panels, label=f"true {_NAME}"))
-    if scene.image is not None:
-        folder.save_array("image", scene.image)
+    if image is not None:
+        folder.save_array("image", image)
 
 
-def _save_tables(scene: _Scene, fits: dict[str, Fit], folder: RunFolder) -> None:
+def _save_tables(scene: Scene, fits: dict[str, Fit], folder: RunFolder) -> None:
     inferred = {
         "inferred" if len(fits) == 1 else f"inferred_{source}": _parameters(outcome.energy)
         for source, outcome in fits.items()
@@ -236,7 +190,9 @@ def _save_tables(scene: _Scene, fits: dict[str, Fit], folder: RunFolder) -> None
     )
 
 
-def _save_fit(config: Config, scene: _Scene, source: str, outcome: Fit, folder: RunFolder) -> None:
+def _save_fit(
+    config: Config, scene: Scene, image: _Image, source: str, outcome: Fit, folder: RunFolder
+) -> None:
     ending = f"_{source}" if config.data == "both" else ""
     folder.save_tissue(f"fitted{ending}", outcome.tissue)
     true, inferred, initial = map(_parameters, (scene.truth, outcome.energy, scene.guess))
@@ -249,10 +205,10 @@ def _save_fit(config: Config, scene: _Scene, source: str, outcome: Fit, folder: 
     folder.save_figure(f"before_after{ending}", _figures.tissues(panels, label=label))
     folder.save_figure(f"convergence{ending}", _figures.convergence(outcome.history))
     folder.save_figure(f"recovery{ending}", _figures.recovery(true, inferred, initial, name=_NAME))
-    if source == "image" and scene.image is not None:
+    if source == "image" and image is not None:
         overlays = {"image": None, "initial guess": scene.initial, "fitted": outcome.tissue}
         pixel = _pixel_size(scene.target, config.image)
-        figure = _figures.overlays(scene.image, overlays, pixel_size=pixel, upright=True)
+        figure = _figures.overlays(image, overlays, pixel_size=pixel, upright=True)
         folder.save_figure(f"overlay{ending}", figure)
 
 
