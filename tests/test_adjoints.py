@@ -199,7 +199,7 @@ def solver_pairs():
             yield pytest.param(adjoint, rtol, name, solver, reach, id=label, marks=mark)
 
 
-@pytest.mark.parametrize(("adjoint", "rtol", "name", "solver", "reach"), solver_pairs())
+@pytest.mark.parametrize(("adjoint", "rtol", "name", "solver", "reach"), list(solver_pairs()))
 def test_every_solver_that_an_adjoint_takes(adjoint, rtol, name, solver, reach):
     tissue, _, cost = start_and_cost(6, 1)
     energy = ShapeFactorEnergy(shape_factors(6, 3.6, 0.1, 3))

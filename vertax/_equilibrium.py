@@ -125,22 +125,17 @@ def _equilibrate(
     found = _search(
         relaxation, options, transitions, *frozen((tissue, energy)), max_steps=max_steps
     )
-    # The second solve is there to be differentiated. It starts at rest and takes no step, unless the
-    # adjoint differentiates the steps themselves.
+    # The second solve starts at rest and takes no step: it is there to be differentiated.
     moved = eqx.tree_at(lambda t: t.boundary, found.tissue, tissue.boundary)
     stiffness = mean_stiffness(found.tissue, frozen(energy))
     stiffness = jnp.where(stiffness > 0, stiffness, 1)
-    if adjoint.unrolls:
-        minimiser, start, gauge = relaxation, found.start, jnp.zeros_like(stiffness)
-    else:
-        minimiser, start, gauge = AtRest(), found.tissue.configuration, stiffness
-        options = options | {"stiffness": stiffness, "relaxation": relaxation}
+    memory = {"stiffness": stiffness, "relaxation": relaxation, "start": found.start}
     solution = optx.minimise(
         _potential,
-        minimiser,
-        start,
-        (moved, energy, gauge),
-        options,
+        AtRest(),
+        found.tissue.configuration,
+        (moved, energy, stiffness),
+        options | memory,
         max_steps=max_steps,
         adjoint=adjoint,
         throw=False,

@@ -55,8 +55,10 @@ class AbstractAdjoint(optx.AbstractAdjoint):
     """A way to differentiate through an equilibrium.
 
     [`equilibrate`][vertax.equilibrate] first finds the equilibrium and its topology without gradients.
-    The adjoint then sees a minimisation in this topology: one that starts at the equilibrium and takes
-    no step or, if the adjoint `unrolls`, one that repeats what came after the last T1 transition.
+    The adjoint then sees a minimisation in this topology that starts, and ends, there. The options of
+    the minimisation hold what found it: the `relaxation`, a minimiser; the configuration that it set
+    out from after the last T1 transition, `start`; and typical sizes, `stiffness` and `length_scale`.
+    An adjoint that `unrolls` the steps of the relaxation needs a solver that is `unrollable`.
 
     **Arguments:**
 

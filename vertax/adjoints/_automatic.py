@@ -18,9 +18,9 @@ from vertax.adjoints._adjoint import (
     GradientOutcome,
     differentiable,
     frozen,
+    materialise,
     settle,
 )
-from vertax.solvers._relaxation import Relaxation
 
 
 class AutomaticDifferentiation(AbstractAdjoint):
@@ -74,23 +74,22 @@ class AutomaticDifferentiation(AbstractAdjoint):
         inputs: PyTree,
         tags: frozenset[object],
     ) -> PyTree[Any]:
-        fn, solver, y0, args, options, max_steps, *structs = inputs
-        if not isinstance(solver, Relaxation):
+        fn, _, _, args, options, *rest = inputs
+        if not {"relaxation", "start"} <= options.keys():
             raise TypeError(
-                "AutomaticDifferentiation differentiates the relaxations of `equilibrate`."
+                "AutomaticDifferentiation differentiates the relaxations of vertax.equilibrate."
             )
-        outcome = self._rehearse(*frozen((fn, solver, y0, args, options, max_steps)))
-        options = options | {"num_steps": outcome.num_steps}
-        inputs = (fn, solver, y0, args, options, max_steps, *structs)
+        loop = partial(eqxi.while_loop, kind="lax")
+        root, residual = frozen(primal_fn((*frozen(inputs), loop)))
         loop = partial(eqxi.while_loop, kind="checkpointed", checkpoints=self.checkpoints)
-        root, residual = primal_fn((*inputs, loop))
-        return _report((root, self.outcome), outcome, self.throw), residual
+        minimise = partial(_minimise, primal_fn, loop)
+        vjp_arg = (fn, args, self.outcome)
+        others = frozen((options, rest))
+        return _unroll(vjp_arg, root, others, self.without_outcome(), minimise), residual
 
     def _rehearse(
         self,
         fn: Callable,
-        relaxation: Relaxation,
-        y0: PyTree[Array],
         args: PyTree,
         options: dict[str, Any],
         max_steps: int,
@@ -98,6 +97,7 @@ class AutomaticDifferentiation(AbstractAdjoint):
         """How many steps it takes until the position and its derivative are at rest."""
         # The gradient that a solver keeps in its state is g(X_n, θ). Its derivative along a direction of
         # θ, H dX_n/dθ + ∂g/∂θ, is what is left of the linear system that the derivative solves.
+        relaxation, y0 = options["relaxation"], options["start"]
         parameters, constants = differentiable(args)
         direction = _random_direction(parameters)
 
@@ -157,26 +157,64 @@ def _random_direction(parameters: PyTree[Array]) -> PyTree[Array]:
     return jax.tree.unflatten(structure, [draw(*pair) for pair in zip(keys, leaves, strict=False)])
 
 
-@eqx.filter_custom_vjp
-def _report(
-    vjp_arg: tuple[PyTree[Array], GradientOutcome | None], outcome: GradientOutcome, throw: bool
+def _minimise(
+    primal_fn: Callable,
+    loop: Callable,
+    fn: Any,
+    args: Any,
+    options: dict[str, Any],
+    rest: list[Any],
 ) -> PyTree[Array]:
-    root, _ = vjp_arg
+    inputs = (fn, options["relaxation"], options["start"], args, options, *rest, loop)
+    return primal_fn(inputs)[0]
+
+
+@eqx.filter_custom_vjp
+def _unroll(
+    vjp_arg: tuple[Any, Any, GradientOutcome | None],
+    root: PyTree[Array],
+    others: tuple,
+    adjoint: AutomaticDifferentiation,
+    minimise: Callable,
+) -> PyTree[Array]:
+    # Who does not differentiate needs no second run.
     return root
 
 
-@_report.def_fwd
-def _(perturbed: Any, vjp_arg: Any, outcome: GradientOutcome, throw: bool) -> tuple:
-    root, _ = vjp_arg
-    return root, None
-
-
-@_report.def_bwd
+@_unroll.def_fwd
 def _(
-    residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, outcome: Any, throw: Any
+    perturbed: Any,
+    vjp_arg: Any,
+    root: PyTree[Array],
+    others: tuple,
+    adjoint: AutomaticDifferentiation,
+    minimise: Callable,
+) -> tuple:
+    fn, args, _ = vjp_arg
+    options, rest = others
+    outcome = adjoint._rehearse(fn, args, options, rest[0])
+    options = options | {"num_steps": outcome.num_steps}
+    moving, fixed = differentiable((fn, args))
+    root, pull = jax.vjp(lambda m: minimise(*eqx.combine(m, fixed), options, rest), moving)
+    return root, (pull, outcome)
+
+
+@_unroll.def_bwd
+def _(
+    residuals: tuple,
+    cotangent: PyTree,
+    perturbed: Any,
+    vjp_arg: Any,
+    root: PyTree[Array],
+    others: tuple,
+    adjoint: AutomaticDifferentiation,
+    minimise: Callable,
 ) -> Any:
-    _, slot = vjp_arg
-    return settle(cotangent, outcome, throw, slot, _REASON)
+    *_, slot = vjp_arg
+    pull, outcome = residuals
+    (gradient,) = pull(materialise(cotangent, root))
+    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
+    return d_fn, d_args, outcome
 
 
 _REASON = (

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
-from vertax.experiments import infer_from_microscopy, infer_shape_factors
+from vertax.experiments import benchmark_adjoints, infer_from_microscopy, infer_shape_factors
 from vertax.experiments._config import (
     ConfigError,
     ExperimentConfig,
@@ -46,6 +46,12 @@ _ALL = (
         infer_from_microscopy.Config,
         infer_from_microscopy.run,
         "Infer the target shape factors of the cells in a microscopy image.",
+    ),
+    Experiment(
+        "benchmark_adjoints",
+        benchmark_adjoints.Config,
+        benchmark_adjoints.run,
+        "Compare automatic and implicit differentiation and equilibrium propagation.",
     ),
 )
 
