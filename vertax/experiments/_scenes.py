@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import PRNGKeyArray
 from pydantic import Field
 
@@ -86,6 +87,15 @@ def make_scene(
     # coarse relaxation need not reach the tolerance here; the fit reports how often it did.
     initial = equilibrate(target, guess, **relaxation.options(), throw=False).tissue
     return Scene(hidden, target, guess, initial)
+
+
+def same_neighbours(tissue: Tissue, other: Tissue) -> bool:
+    """Whether the same cells touch in two tissues, however their edges are numbered."""
+
+    def pairs(t: Tissue) -> list[list[int]]:
+        return sorted(np.sort(np.asarray(t.topology.edge_cells), axis=1).tolist())
+
+    return pairs(tissue) == pairs(other)
 
 
 Tree = TypeVar("Tree", bound=Any)

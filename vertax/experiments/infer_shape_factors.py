@@ -24,7 +24,13 @@ from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.experiments import _figures
 from vertax.experiments._config import ExperimentConfig, Section
 from vertax.experiments._run import RunFolder, fit_metrics, history_columns
-from vertax.experiments._scenes import Scene, ShapeFactors, TissueSection, make_scene
+from vertax.experiments._scenes import (
+    Scene,
+    ShapeFactors,
+    TissueSection,
+    make_scene,
+    same_neighbours,
+)
 from vertax.experiments._sections import Fitting, Relaxation
 
 _NAME = r"$p_0$"
@@ -163,7 +169,7 @@ def _metrics(scene: Scene, outcome: Fit) -> dict[str, Any]:
         "relative_error": np.mean(np.abs(inferred - true) / np.abs(true)),
         "relative_error_initial": history.relative_error[0],
         **fit_metrics(outcome),
-        "same_neighbours": _neighbours(outcome.tissue) == _neighbours(scene.target),
+        "same_neighbours": same_neighbours(outcome.tissue, scene.target),
     }
 
 
@@ -215,11 +221,6 @@ def _save_fit(
 def _parameters(energy: AbstractEnergy) -> Float[np.ndarray, " cells"]:
     assert isinstance(energy, ShapeFactorEnergy)
     return np.asarray(energy.target_shape_factor, float)
-
-
-def _neighbours(tissue: Tissue) -> list[list[int]]:
-    """The two cells of each edge, in an order that does not depend on how edges are numbered."""
-    return sorted(np.sort(np.asarray(tissue.topology.edge_cells), axis=1).tolist())
 
 
 def _pixel_size(tissue: Tissue, options: ImageSection) -> float:
