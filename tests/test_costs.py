@@ -200,3 +200,13 @@ def test_bad_options_are_refused():
         VertexDistance(random_tissue(6))(random_tissue(5), energy)
     with pytest.raises(ValueError, match="6 × 6"):
         render(random_tissue(5), (5, 64), 0.1)
+
+
+def test_least_squares_costs_are_half_their_squared_residuals():
+    tissue, energy = relaxed(6, 1)
+    target = tissue.with_configuration(tissue.vertices + 0.05 * random_like(tissue.vertices))
+    image = MeshImage(render(target, (32, 32), 0.2), 0.2)
+    plain = MeshImage(np.asarray(render(target, (32, 32), 0.2)), 0.2, fit_intensity=False)
+    for cost in (VertexDistance(target), image, plain, 0.9 * VertexDistance(target) + 0.1 * image):
+        value = 0.5 * jnp.sum(cost.residuals(tissue, energy) ** 2)
+        assert value == pytest.approx(float(cost(tissue, energy)), rel=1e-12)

@@ -2,15 +2,17 @@ import vertax as vx
 
 # The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
 NAMES = """
-AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions Equilibrium Fit
-FitError History ImplicitDifferentiation InverseProblem MINRES Periodic T1 Tissue Topology adjoints costs
-energies equilibrate fit initialise io load_tissue plot_history plot_recovery plot_tissue plotting
-save_tissue solvers
+AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions
+AutomaticDifferentiation Equilibrium EquilibriumPropagation Fit FitError GradientOutcome History
+ImplicitDifferentiation InverseProblem MINRES Periodic T1 Tissue Topology adjoints costs energies
+equilibrate fit initialise io load_tissue plot_history plot_recovery plot_tissue plotting save_tissue
+solvers
 """
 
 FAMILIES = {
-    "adjoints": "AbstractAdjoint ImplicitDifferentiation",
-    "costs": "AbstractCost MeshImage VertexDistance WeightedSum mirror render",
+    "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
+    "ImplicitDifferentiation",
+    "costs": "AbstractCost AbstractLeastSquaresCost MeshImage VertexDistance WeightedSum mirror render",
     "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity LineTension LocalSum "
     "PerimeterElasticity ShapeFactorEnergy Sum",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed from_labels from_microscopy "

@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import optimistix as optx
 import pytest
 from helpers import central_difference, random_like, random_tissue, relaxed
 from jaxtyping import Array, Float
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float
 import vertax as vx
 from vertax.costs import MeshImage, VertexDistance, render
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
+from vertax.experiments._scenes import stack
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +148,131 @@ def test_one_compilation_serves_all_epochs(hidden):
     )
     assert counts[0] > 0
     assert len(set(counts)) == 1
+
+
+LEAST_SQUARES = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+
+
+def test_levenberg_marquardt_recovers_many_digits_in_a_dozen_steps(hidden):
+    target, truth, guess, start = hidden
+    problem = vx.InverseProblem(start, guess, VertexDistance(target))
+    fit = vx.fit(problem, LEAST_SQUARES, 12, truth=truth)
+    np.testing.assert_allclose(fit.energy.target_shape_factor, truth.target_shape_factor, rtol=1e-8)
+    assert fit.history.converged.all()
+    assert len(fit.history.cost) <= 12
+    assert fit.history.cost[0] == pytest.approx(float(problem()[0]), rel=1e-6)
+    assert fit.cost == fit.history.cost.min()
+    again, _ = problem(fit.energy, fit.tissue)
+    assert again == pytest.approx(float(fit.cost), abs=1e-15)
+
+
+def test_levenberg_marquardt_fits_an_image_and_where_the_tissue_lies(hidden):
+    target, truth, guess, start = hidden
+    displaced = start.with_configuration(start.vertices + jnp.array([0.02, -0.03]))
+    cost = MeshImage(render(target, (64, 64), 0.1), 0.1)
+    problem = vx.InverseProblem(displaced, guess, cost, fit_position=True)
+    fit = vx.fit(problem, LEAST_SQUARES, 15, truth=truth)
+    np.testing.assert_allclose(fit.energy.target_shape_factor, truth.target_shape_factor, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_levenberg_marquardt_takes_jacobians_of_other_adjoints(hidden):
+    target, truth, guess, start = hidden
+    adjoint = vx.EquilibriumPropagation()
+    problem = vx.InverseProblem(start, guess, VertexDistance(target), adjoint=adjoint)
+    fit = vx.fit(problem, LEAST_SQUARES, 12, truth=truth)
+    assert fit.history.relative_error[-1] < 1e-6
+
+
+def test_a_least_squares_solver_needs_a_sum_of_squares(hidden):
+    class Area(vx.AbstractCost):
+        def __call__(self, tissue, energy):
+            return tissue.areas[0]
+
+    _, _, guess, start = hidden
+    with pytest.raises(TypeError, match="Area is no sum of squares"):
+        vx.fit(vx.InverseProblem(start, guess, Area()), LEAST_SQUARES, 3)
+
+
+@pytest.fixture(scope="module")
+def batch(hidden):
+    """Three problems with guesses of their own, alone and stacked."""
+    target, truth, guess, _ = hidden
+    problems = []
+    for k in range(3):
+        noise = 0.05 * random_like(guess.target_shape_factor, k)
+        energy = ShapeFactorEnergy(guess.target_shape_factor + noise)
+        start = vx.equilibrate(target, energy).tissue
+        problems.append(vx.InverseProblem(start, energy, VertexDistance(target)))
+    stacked = stack(problems)
+    return problems, stacked, truth, stack([truth] * 3)
+
+
+@pytest.mark.parametrize("optimiser", [optax.adam(1e-2), LEAST_SQUARES], ids=["adam", "lm"])
+def test_a_batch_is_fitted_as_its_members_are(batch, optimiser):
+    problems, stacked, truth, truths = batch
+    together = vx.fit(stacked, optimiser, 8, truth=truths, batched=True, progress=False)
+    assert together.history.cost.shape[1:] == together.cost.shape == (3,)
+    for k, problem in enumerate(problems):
+        alone = vx.fit(problem, optimiser, 8, truth=truth, progress=False)
+        n = len(alone.history.cost)
+        np.testing.assert_allclose(
+            together.history.relative_error[:n, k],
+            alone.history.relative_error,
+            rtol=1e-5,
+            atol=1e-9,
+        )
+        np.testing.assert_allclose(
+            together.energy.target_shape_factor[k], alone.energy.target_shape_factor, rtol=1e-6
+        )
+
+
+def test_a_member_that_breaks_down_leaves_the_others_alone(batch):
+    _, stacked, _, truths = batch
+    broken = eqx.tree_at(
+        lambda p: p.cost.target.vertices,
+        stacked,
+        stacked.cost.target.vertices.at[1].set(jnp.nan),
+    )
+    fit = vx.fit(broken, optax.adam(1e-2), 30, truth=truths, batched=True, progress=False)
+    error = fit.history.relative_error
+    assert (error[-1, [0, 2]] < 0.5 * error[0, [0, 2]]).all()
+    assert (error[:, 1] == error[0, 1]).all()
+    assert list(fit.best_epoch == -1) == [False, True, False]
+    assert list(jnp.isfinite(fit.cost)) == [True, False, True]
+
+
+def test_a_batch_has_one_leading_axis(hidden):
+    target, _, guess, start = hidden
+    with pytest.raises(ValueError, match="one leading axis"):
+        vx.fit(
+            vx.InverseProblem(start, guess, VertexDistance(target)),
+            optax.adam(1e-2),
+            3,
+            batched=True,
+        )
+
+
+def test_the_history_knows_how_gradients_came_about(hidden):
+    target, _, guess, start = hidden
+    problem = vx.InverseProblem(start, guess, VertexDistance(target))
+    history = vx.fit(problem, optax.adam(1e-2), 3, progress=False).history
+    assert (history.gradient_residual < 1e-9).all()
+    assert (history.gradient_steps > 5).all()
+
+
+def test_a_gradient_that_cannot_be_trusted_ends_a_fit(hidden):
+    target, _, guess, start = hidden
+
+    def run(throw):
+        solver = vx.MINRES(max_steps=2)
+        adjoint = vx.ImplicitDifferentiation(linear_solver=solver, throw=throw)
+        problem = vx.InverseProblem(start, guess, VertexDistance(target), adjoint=adjoint)
+        return vx.fit(problem, optax.adam(1e-3), 3, progress=False)
+
+    with pytest.raises(vx.FitError, match="epoch 0 cannot be trusted"):
+        run(True)
+    assert (run(False).history.gradient_residual > 1e-3).all()
 
 
 def test_the_protocol_of_the_paper(hidden):
