@@ -1,12 +1,26 @@
 """Settings for all tests."""
 
 import os
+from pathlib import Path
 
 # Tests compile more than they compute: half the optimisation is half the time. Read when JAX starts.
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
 
+import equinox as eqx
 import jax
 import matplotlib
+import pytest
 
 jax.config.update("jax_enable_x64", True)
 matplotlib.use("Agg")
+
+MAPS = Path("/proc/self/maps")
+
+
+@pytest.fixture(autouse=True)
+def _few_compiled_functions():
+    """Forget compiled functions before there are too many."""
+    # Each holds some memory maps, of which Linux allows a process 65530; beyond, the compiler aborts.
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 25_000:
+        eqx.clear_caches()
