@@ -476,6 +476,7 @@ class TestNudgeByTheCost:
         )
         _, _, (_, gradient), _ = problem.value_and_gradient(shift=shift)
         slope = jax.grad(lambda s: vx.InverseProblem(tissue, energy, cost)(shift=s)[0])(shift)
+        assert gradient is not None
         np.testing.assert_allclose(gradient, slope, rtol=1e-4)
 
     def test_it_needs_to_know_the_cost(self):
@@ -509,11 +510,11 @@ class TestNudgeByTheCost:
 
 def test_bad_arguments():
     with pytest.raises(ValueError, match=r"`mode` must be 'adjoint' or 'sensitivity'"):
-        vx.ImplicitDifferentiation("forward")
+        vx.ImplicitDifferentiation("forward")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="`beta` must be positive"):
         vx.EquilibriumPropagation(beta=0.0)
     with pytest.raises(ValueError, match="`nudge` must be"):
-        vx.EquilibriumPropagation(nudge="both")
+        vx.EquilibriumPropagation(nudge="both")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="`checkpoints` must be at least 1"):
         vx.AutomaticDifferentiation(checkpoints=0)
     with pytest.raises(ValueError, match="`rtol` must be positive"):

@@ -120,7 +120,7 @@ def _equilibrate(
     scale = jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
     tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
     options = frozen({"length_scale": scale, "tolerance": tolerance})
-    relaxation = Relaxation(solver, patience)
+    relaxation = Relaxation(solver=solver, patience=patience)
 
     found = _search(
         relaxation, options, transitions, *frozen((tissue, energy)), max_steps=max_steps

@@ -172,11 +172,11 @@ def fit(
     # of type would compile the epoch anew.
     parameters = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
     true = None if truth is None else eqx.filter(truth, problem.trainable)
+    task = (problem, parameters, constants, true, epochs, batched)
     if isinstance(optimiser, optx.AbstractLeastSquaresSolver):
-        loop = _least_squares
+        best, rows, stopped = _solve(optimiser, *task)
     else:
-        loop = _Descent(progress, callback)
-    best, rows, stopped = loop(problem, optimiser, parameters, constants, true, epochs, batched)
+        best, rows, stopped = _descend(optimiser, *task, progress, callback)
     if not rows:
         raise FitError(f"The fit stopped: {stopped}.", None)
     history = History(**{name: np.asarray([row[name] for row in rows]) for name in rows[0]})
@@ -212,53 +212,48 @@ def _check_batch(tree: PyTree) -> None:
         )
 
 
-class _Descent:
-    """Epochs of an Optax optimiser."""
-
-    def __init__(self, progress: bool, callback: Callable[[int, Record], None] | None):
-        self.progress = progress
-        self.callback = callback
-
-    def __call__(
-        self,
-        problem: InverseProblem,
-        optimiser: optax.GradientTransformation,
-        parameters: PyTree[Array],
-        constants: PyTree,
-        true: PyTree[Array] | None,
-        epochs: int,
-        batched: bool,
-    ) -> tuple[_Best, list[dict[str, Any]], str | None]:
-        # A step that cannot be trusted is refused here, one member of a batch at a time.
-        throw = problem.adjoint.throw
-        problem = eqx.tree_at(lambda p: p.adjoint.throw, problem, False)
-        state = _start(problem, optimiser, parameters, batched)
-        rows: list[dict[str, Any]] = []
-        bar = tqdm(range(epochs), unit="epoch", disable=None if self.progress else True)
-        try:
-            for epoch in bar:
-                began = time.perf_counter()
-                state, record = _epoch(
-                    problem, optimiser, constants, true, state, jnp.array(epoch), throw, batched
-                )
-                sound = np.asarray(record.sound)  # waits for the epoch to be done
-                rows.append(_row(record, time.perf_counter() - began))
-                if not sound.any():
-                    return state.best, rows, _trouble(record, epoch)
-                row = rows[-1]
-                bar.set_postfix(
-                    cost=f"{np.nanmean(row['cost']):.3e}",
-                    force=f"{np.max(row['max_force']):.1e}",
-                    t1=int(np.sum(row["num_t1"])),
-                )
-                if self.callback is not None:
-                    self.callback(epoch, record)
-        except KeyboardInterrupt:
-            if not np.isfinite(state.best.cost).any():
-                raise
-        except eqx.EquinoxRuntimeError as error:
-            return state.best, rows, f"epoch {len(rows)} broke down ({_first_line(error)})"
-        return state.best, rows, None
+def _descend(
+    optimiser: optax.GradientTransformation,
+    problem: InverseProblem,
+    parameters: PyTree[Array],
+    constants: PyTree,
+    true: PyTree[Array] | None,
+    epochs: int,
+    batched: bool,
+    progress: bool,
+    callback: Callable[[int, Record], None] | None,
+) -> tuple[_Best, list[dict[str, Any]], str | None]:
+    """Epochs of an Optax optimiser: the best point, what happened, and why it stopped early."""
+    # A step that cannot be trusted is refused here, one member of a batch at a time.
+    throw = problem.adjoint.throw
+    problem = eqx.tree_at(lambda p: p.adjoint.throw, problem, False)
+    state = _start(problem, optimiser, parameters, batched)
+    rows: list[dict[str, Any]] = []
+    bar = tqdm(range(epochs), unit="epoch", disable=None if progress else True)
+    try:
+        for epoch in bar:
+            began = time.perf_counter()
+            state, record = _epoch(
+                problem, optimiser, constants, true, state, jnp.array(epoch), throw, batched
+            )
+            sound = np.asarray(record.sound)  # waits for the epoch to be done
+            rows.append(_row(record, time.perf_counter() - began))
+            if not sound.any():
+                return state.best, rows, _trouble(record, epoch)
+            row = rows[-1]
+            bar.set_postfix(
+                cost=f"{np.nanmean(row['cost']):.3e}",
+                force=f"{np.max(row['max_force']):.1e}",
+                t1=int(np.sum(row["num_t1"])),
+            )
+            if callback is not None:
+                callback(epoch, record)
+    except KeyboardInterrupt:
+        if not np.isfinite(state.best.cost).any():
+            raise
+    except eqx.EquinoxRuntimeError as error:
+        return state.best, rows, f"epoch {len(rows)} broke down ({_first_line(error)})"
+    return state.best, rows, None
 
 
 def _row(record: Record, seconds: float) -> dict[str, Any]:
@@ -352,7 +347,11 @@ def _epoch(
         going = state.going & record.sound
         fitted = (state.parameters, shift)
         updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
-            gradient, state.optimiser, cast(optax.Params, fitted), value=value, grad=gradient
+            cast(optax.Updates, gradient),
+            state.optimiser,
+            cast(optax.Params, fitted),
+            value=value,
+            grad=gradient,
         )
         parameters, shift = eqx.apply_updates(fitted, updates)
         following = equilibrium.tissue
@@ -408,9 +407,9 @@ def _relative_error(parameters: PyTree[Array], true: PyTree[Array] | None) -> Fl
     return jnp.mean(jnp.concatenate(jax.tree.leaves(errors)))
 
 
-def _least_squares(
-    problem: InverseProblem,
+def _solve(
     solver: optx.AbstractLeastSquaresSolver,
+    problem: InverseProblem,
     parameters: PyTree[Array],
     constants: PyTree,
     true: PyTree[Array] | None,
@@ -420,7 +419,7 @@ def _least_squares(
     """Epochs of a least-squares solver."""
     began = time.perf_counter()
     best, n_done, record = jax.block_until_ready(
-        _least_squares_loop(problem, solver, parameters, constants, true, epochs, batched)
+        _least_squares(solver, problem, parameters, constants, true, epochs, batched)
     )
     last = np.asarray(n_done) - 1
     seconds = (time.perf_counter() - began) / (np.max(last) + 1)
@@ -444,9 +443,9 @@ _PATIENCE = 8
 
 
 @eqx.filter_jit
-def _least_squares_loop(
-    problem: InverseProblem,
+def _least_squares(
     solver: optx.AbstractLeastSquaresSolver,
+    problem: InverseProblem,
     parameters: PyTree[Array],
     constants: PyTree,
     true: PyTree[Array] | None,

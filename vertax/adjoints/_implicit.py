@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -71,7 +71,8 @@ class ImplicitDifferentiation(AbstractAdjoint):
         loop = partial(eqxi.while_loop, kind="lax")
         root, residual = primal_fn((*frozen(inputs), loop))
         root, residual = frozen(root), jax.tree.map(eqxi.nondifferentiable_backward, residual)
-        system = _System(self.without_outcome(), rewrite_fn, residual, tags | {lx.symmetric_tag})
+        adjoint = cast(ImplicitDifferentiation, self.without_outcome())
+        system = _System(adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag})
         if self.outcome is None:
             return _follow(inputs, root, system), residual
         return _follow_and_report((inputs, self.outcome), root, system), residual
@@ -185,7 +186,7 @@ def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, root: Any, 
     else:
         columns, outcomes = system.sensitivities(root, inputs, moving)
         parts = jax.tree.map(lambda c, g: jnp.tensordot(c, g, g.ndim), columns, cotangent)
-        gradient = ravel_pytree(moving)[1](sum(jax.tree.leaves(parts)))
+        gradient = ravel_pytree(moving)[1](jax.tree.reduce(jnp.add, parts))
         outcome = GradientOutcome(
             jnp.max(outcomes.residual),
             jnp.max(outcomes.num_steps),

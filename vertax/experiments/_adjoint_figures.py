@@ -89,7 +89,7 @@ def accuracy(tolerances: np.ndarray, errors: Mapping[str, np.ndarray]) -> Figure
         figure, (ax,) = new_figure(1, width=4.2, height=3.0)
         for name, values in errors.items():
             method, _, variant = name.partition(",")
-            style = {"ls": "--", "mfc": "white"} if variant else {}
+            style: Any = {"ls": "--", "mfc": "white"} if variant else {}
             # The two forms of ID agree to rounding: a larger marker lets both be seen.
             size = 6 if method == "Sen-ID" else 3.5
             ax.plot(

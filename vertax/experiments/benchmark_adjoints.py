@@ -312,7 +312,7 @@ def _dense(scene: Scene, settled: Any) -> jax.Array:
     return -mixed.T @ jnp.linalg.pinv(hessian, rtol=1e-10, hermitian=True) @ pull
 
 
-def _gradient_error(case: _Case, adjoint: AbstractAdjoint, **options: Any) -> Callable[..., float]:
+def _gradient_error(**options: Any) -> Callable[..., jax.Array]:
     """How far a gradient is from the reference, as a function of tolerance and adjoint."""
 
     @eqx.filter_jit
@@ -353,7 +353,7 @@ def _accuracy(config: Config, folder: RunFolder) -> dict[str, Any]:
     cases = _cases(config)
     errors = {}
     for name, adjoint in adjoints.items():
-        error = _gradient_error(cases[0], adjoint, solver=solver, max_steps=max_steps)
+        error = _gradient_error(solver=solver, max_steps=max_steps)
         errors[name] = np.array(
             [
                 [float(error(c, adjoint, c.scene.target, jnp.asarray(t))) for c in cases]
@@ -385,7 +385,7 @@ def _beta_scan(config: Config, folder: RunFolder, progress: bool) -> dict[str, A
         # The β of the paper is an energy per cost. Times a typical one it spans the same range.
         scale = 1e5 if kind["nudge"] == "cost" else 1.0
         make = lambda b, kind=kind: EquilibriumPropagation(jnp.asarray(b), throw=False, **kind)
-        error = _gradient_error(cases[0], make(betas[0]))
+        error = _gradient_error()
         errors[name] = np.array(
             [
                 [float(error(c, make(scale * b), c.settled, jnp.asarray(1e-12))) for c in cases]
@@ -458,7 +458,7 @@ def _measure(problem: InverseProblem[ShapeFactorEnergy], epochs: int) -> dict[st
         .compile()
     )
     seconds: dict[str, list[float]] = {"forward": [], "epoch": []}
-    tissue, p = problem.tissue, problem.energy.target_shape_factor
+    tissue, p = problem.tissue, jnp.asarray(problem.energy.target_shape_factor)
     for key in jax.random.split(jax.random.key(1), epochs + 1):
         # A change as large as that of an update by ADAM.
         p = p + 1e-3 * jax.random.normal(key, p.shape, p.dtype)
