@@ -57,7 +57,7 @@ def inference(
         _scatter(grid["end"], true, last, f"epoch {epochs}")
         for key, name, label in (
             ("cost", "cost", "cost (v2v)"),
-            ("error", "relative_error", "mean relative error"),
+            ("error", "relative_error", "relative error"),
         ):
             for method, fit in fits.items():
                 _band(grid[key], getattr(fit.history, name), method)
@@ -69,9 +69,9 @@ def inference(
         }
         error = {m: np.mean(np.abs(p - true) / np.abs(true), axis=1) for m, p in inferred.items()}
         _boxes(grid["pearson"], {m: 1 - np.asarray(r) for m, r in pearson.items()})
-        grid["pearson"].set_ylabel("1 − Pearson correlation, at the end")
+        grid["pearson"].set_ylabel("1 − Pearson $r$ at the end")
         _boxes(grid["final"], error)
-        grid["final"].set_ylabel("mean relative error, at the end")
+        grid["final"].set_ylabel("relative error at the end")
     return figure
 
 
@@ -213,6 +213,7 @@ def _scatter(ax: Axes, true: np.ndarray, found: Mapping[str, np.ndarray], title:
             color=_COLOURS[method],
         )
     ax.set(xlim=ends, ylim=ends, xlabel=r"true $p_0$", ylabel=r"inferred $p_0$", title=title)
+    ax.set_aspect("equal")
 
 
 def _band(ax: Axes, curves: np.ndarray, method: str) -> None:
