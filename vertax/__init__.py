@@ -16,7 +16,11 @@ from vertax._bilevel import (
     InverseProblem as InverseProblem,
     fit as fit,
 )
-from vertax._boundary import AbstractBoundary as AbstractBoundary, Periodic as Periodic
+from vertax._boundary import (
+    AbstractBoundary as AbstractBoundary,
+    Free as Free,
+    Periodic as Periodic,
+)
 from vertax._equilibrium import Equilibrium as Equilibrium, equilibrate as equilibrate
 from vertax._tissue import Tissue as Tissue
 from vertax._topology import Topology as Topology

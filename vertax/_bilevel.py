@@ -87,7 +87,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
             throw=False,
         )
         if shift is not None:
-            placed = equilibrium.tissue.with_configuration(equilibrium.tissue.vertices + shift)
+            placed = equilibrium.tissue.with_vertices(equilibrium.tissue.vertices + shift)
             equilibrium = eqx.tree_at(lambda e: e.tissue, equilibrium, placed)
         return self.cost(equilibrium.tissue, energy), equilibrium
 
@@ -296,7 +296,7 @@ def _epoch(
     parameters, shift = eqx.apply_updates(fitted, updates)
     following = equilibrium.tissue
     if shift is not None:
-        following = following.with_configuration(following.vertices + shift)
+        following = following.with_vertices(following.vertices + shift)
     record = _Record(
         parameters=state.parameters,
         tissue=equilibrium.tissue,

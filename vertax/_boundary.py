@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Num
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from vertax._misc import is_concrete
 
@@ -17,7 +17,7 @@ class AbstractBoundary(eqx.Module):
     """The space a tissue lives in: how lattice images are placed and which motions cost nothing."""
 
     @abc.abstractmethod
-    def translation(self, image: Num[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+    def translation(self, image: Num[Array, "*shape 2"]) -> Num[Array, "*shape 2"]:
         """Displacement of an integer lattice image from the home box."""
 
     @abc.abstractmethod
@@ -26,12 +26,16 @@ class AbstractBoundary(eqx.Module):
 
     @abc.abstractmethod
     def drift(
-        self, vertices: Float[Array, "vertices 2"], reference: Float[Array, "vertices 2"]
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
     ) -> Float[Array, " modes"]:
         """How far a configuration moved along the motions that change no shape.
 
         One number for each zero mode, in units of length times the square root of the number of
-        vertices: the norm of the part of the displacement that lies along that mode.
+        vertices: the norm of the part of the displacement that lies along that mode. Motions that
+        `pinned` vertices rule out are no zero modes, and count as 0.
         """
 
 
@@ -94,6 +98,51 @@ class Periodic(AbstractBoundary):
         return jnp.take_along_axis(choices, best[..., None, None], axis=-2)[..., 0, :]
 
     def drift(
-        self, vertices: Float[Array, "vertices 2"], reference: Float[Array, "vertices 2"]
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
     ) -> Float[Array, " modes"]:
-        return jnp.mean(vertices - reference, axis=0) * jnp.sqrt(1.0 * vertices.shape[0])
+        return _translation_drift(vertices - reference, pinned)
+
+
+class Free(AbstractBoundary):
+    """The plane: a cluster of cells with an exterior around it.
+
+    Its three zero modes are the translations and the rotation. Give the tissue `angles`, and edges with
+    the exterior on one side are circular arcs.
+    """
+
+    def translation(self, image: Num[Array, "*shape 2"]) -> Num[Array, "*shape 2"]:
+        return jnp.zeros_like(image)
+
+    def shortest(self, displacement: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+        return displacement
+
+    def drift(
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
+    ) -> Float[Array, " modes"]:
+        displacement = vertices - reference
+        # The rotation is about the centroid, or about the one vertex that is pinned.
+        if pinned is None:
+            centre, rotates = jnp.mean(reference, axis=0), True
+        else:
+            n_pinned = jnp.sum(pinned)
+            weight = jnp.where(n_pinned > 0, pinned, True)[:, None]
+            centre = jnp.sum(jnp.where(weight, reference, 0), axis=0) / jnp.sum(weight)
+            rotates = n_pinned <= 1
+        arm = reference - centre
+        size = jnp.sqrt(jnp.sum(arm**2))
+        turn = jnp.sum(arm[:, 0] * displacement[:, 1] - arm[:, 1] * displacement[:, 0])
+        turn = jnp.where(rotates, turn / size, 0)
+        return jnp.append(_translation_drift(displacement, pinned), turn)
+
+
+def _translation_drift(
+    displacement: Float[Array, "vertices 2"], pinned: Bool[Array, " vertices"] | None
+) -> Float[Array, "2"]:
+    drift = jnp.mean(displacement, axis=0) * jnp.sqrt(1.0 * displacement.shape[0])
+    return drift if pinned is None else jnp.where(jnp.any(pinned), 0, drift)

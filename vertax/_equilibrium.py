@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._misc import is_concrete
@@ -132,7 +133,7 @@ def _equilibrate(
         max_steps=max_steps,
     )
     # The second solve starts at rest and takes no step: it is there to be differentiated.
-    moved = eqx.tree_at(lambda t: t.boundary, found.tissue, tissue.boundary)
+    moved = found.tissue.held_as(tissue)
     gauge = _gauge_stiffness(found.tissue, _frozen(energy))
     solution = optx.minimise(
         _potential,
@@ -163,18 +164,18 @@ def _frozen(tree: PyTree) -> PyTree:
 
 def _potential(configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Array]) -> Array:
     """The energy, and a term that pins the motions which cost nothing."""
-    # Translations are zero modes. They make the Hessian singular, and a nudged relaxation would drift
-    # along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
+    # Motions of the whole are zero modes. They make the Hessian singular, and a nudged relaxation would
+    # drift along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
     tissue, energy, gauge = args
-    drift = tissue.boundary.drift(configuration, jax.lax.stop_gradient(tissue.vertices))
+    drift = tissue.drift(configuration)
     return energy(tissue.with_configuration(configuration)) + 0.5 * gauge * jnp.sum(drift**2)
 
 
 def _gauge_stiffness(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
     """A stiffness for the zero modes that sits amid those of the other modes, in any units."""
     # The Rayleigh quotient of a random vector is the mean eigenvalue, near enough.
-    y = tissue.configuration
-    force = jax.grad(lambda x: energy(tissue.with_configuration(x)))
+    y, unravel = ravel_pytree(tissue.configuration)
+    force = jax.grad(lambda x: energy(tissue.with_configuration(unravel(x))))
     probe = jax.random.normal(jax.random.key(0), y.shape, y.dtype)
     _, response = jax.jvp(force, (y,), (probe,))
     quotient = jnp.abs(jnp.sum(probe * response)) / jnp.sum(probe**2)
