@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from vertax._arcs import area_factor, length_factor, moment_factor
+from vertax._arcs import arc_points, area_factor, length_factor, moment_factor
 from vertax._boundary import AbstractBoundary, Free
 from vertax._misc import compiled_property, is_concrete
 from vertax._topology import Topology, clockwise, edge_neighbourhood, source, take
@@ -155,6 +155,16 @@ class Tissue(eqx.Module):
     def edge_vectors(self) -> Float[Array, "edges 2"]:
         """Each edge as a vector, from its first to its second vertex across periodic boundaries."""
         return self.edge_segments[1]
+
+    def edge_points(self, fractions: Float[Array, " points"]) -> Float[Array, "edges points 2"]:
+        """Points on each edge at some fractions (0 to 1) of its length.
+
+        Edges across a periodic boundary go on beyond the box.
+        """
+        first, vector = self.edge_segments
+        if self.angles is None:
+            return first[:, None] + fractions[:, None] * vector[:, None]
+        return arc_points(first, vector, self.edge_angles, fractions)
 
     @property
     def is_arc(self) -> Bool[Array, " edges"]:
