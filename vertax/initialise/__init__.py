@@ -8,4 +8,5 @@ from vertax.initialise._segmenters import (
     Cellpose as Cellpose,
     Watershed as Watershed,
 )
+from vertax.initialise._skeleton import labels_from_skeleton as labels_from_skeleton
 from vertax.initialise._voronoi import hexagonal as hexagonal, periodic_voronoi as periodic_voronoi

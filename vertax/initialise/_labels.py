@@ -6,11 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, label as connected_regions
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vertax._boundary import Periodic
+from vertax._arcs import angle_of_area
+from vertax._boundary import Free, Periodic
 from vertax._tissue import Tissue
 from vertax._topology import Topology
 from vertax.initialise._cracks import (
@@ -22,7 +23,7 @@ from vertax.initialise._cracks import (
     enclosed_cells,
 )
 
-_BOUNDARIES = ("mirrored", "periodic")
+_BOUNDARIES = ("mirrored", "periodic", "free")
 
 
 class Segmentation(eqx.Module):
@@ -33,7 +34,7 @@ class Segmentation(eqx.Module):
     """
 
     tissue: Tissue
-    """The tissue. The original image lies at the origin of its box."""
+    """The tissue. The original image has its corner at the origin."""
     labels: Int[np.ndarray, " cells"]
     """Label in the given mask of each cell; a mirrored cell carries the label of its original."""
     whole: Bool[np.ndarray, " cells"]
@@ -56,6 +57,7 @@ def from_labels(
     *,
     boundary: str = "mirrored",
     pixel_size: float | None = None,
+    gap_width: float = 3.0,
     softening: float | None = None,
 ) -> Segmentation:
     """Tissue with the cells and neighbours of a label image (paper, "Mesh initialization").
@@ -78,6 +80,11 @@ def from_labels(
     The last two steps are repeated until nothing is left to do. `absorbed` tells which labels are
     gone.
 
+    In a free tissue the pixels without a label are the exterior, but for lines between cells, narrow
+    bays and holes. The largest cluster of cells stays. Each piece of its outline between two
+    junctions becomes an arc, which keeps the area of its cell; a cell on the outline may have two
+    sides.
+
     A cell so concave that the polygon of its vertices has less than a hundredth of its area in the
     image, or is inside out, is inflated a little by moving its vertices; `inflated` tells which.
 
@@ -86,8 +93,11 @@ def from_labels(
     - `mask`: a label for each pixel, integers of shape (rows, columns).
     - `boundary`: how the mask becomes periodic. `"mirrored"` mirrors it about its right and bottom
         border into a box of twice the width and height, as in the paper; cells at the border merge
-        with their mirror image. `"periodic"` takes a mask that wraps around already.
+        with their mirror image. `"periodic"` takes a mask that wraps around already. `"free"` makes
+        a free cluster in an exterior, with arcs; what lies beyond the image is exterior too.
     - `pixel_size`: length of a pixel side; by default such that the mean cell area is 1.
+    - `gap_width`: how wide lines between cells may be, in pixels, not to be taken for a part of the
+        exterior of a free tissue.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
 
     **Returns:** a [`Segmentation`][vertax.initialise.Segmentation]. Cells of the original image
@@ -97,10 +107,14 @@ def from_labels(
 
     - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
         labels, or has a cell that reaches around the (mirrored) image or around all other cells;
-        for an unknown `boundary` or a `pixel_size` that is not positive.
+        for an unknown `boundary`, a `pixel_size` that is not positive or a negative `gap_width`.
     """
     check_options(boundary, pixel_size)
+    if not (np.isfinite(gap_width) and gap_width >= 0):
+        raise ValueError(f"Argument `gap_width` must be at least 0, but is {gap_width}.")
     values, image = _checked(np.asarray(mask))
+    if boundary == "free":
+        return _free_from_labels(values, image, pixel_size, gap_width, softening)
     periodic = boundary == "periodic"
     image = _fill_gaps(image, periodic)
     image = _join_pieces(image, periodic)
@@ -116,13 +130,9 @@ def from_labels(
     label = mesh.cells % n
     size = np.array(cells.shape[::-1], float)
     pixels = np.bincount(cells.ravel(), minlength=4 * n)[mesh.cells]
-    vertices, moved = _untangle(mesh, size, pixels)
+    vertices, moved = _untangle(mesh, size, pixels, 0 * pixels)
     if vertices is None:
-        raise ValueError(
-            "Argument `mask` must hold cells that polygons can stand for, but no polygons of "
-            f"positive area were found around the labels {_listed(values[label[moved]])}. Smooth "
-            "their outlines or merge them with a neighbour."
-        )
+        raise _no_polygons(values[label[moved]])
     if pixel_size is None:
         pixel_size = float(np.sqrt(len(label) / size.prod()))
     dtype = jnp.result_type(float)
@@ -143,6 +153,104 @@ def from_labels(
         inflated=np.unique(values[label[moved]]),
         pixel_size=float(pixel_size),
         image_shape=(int(image.shape[0]), int(image.shape[1])),
+    )
+
+
+def _free_from_labels(
+    values: Int[np.ndarray, " labels"],
+    image: Int[np.ndarray, "rows columns"],
+    pixel_size: float | None,
+    gap_width: float,
+    softening: float | None,
+) -> Segmentation:
+    """The part of `from_labels` for a free cluster."""
+    exterior = len(values)
+    rows, columns = image.shape
+    image, margin = _with_exterior(image, exterior, gap_width)
+    image = _join_pieces(image, periodic=False)
+    while True:
+        image = _largest_cluster(image, exterior)
+        mesh = _mesh_or_repairs(crack_graph(image), np.append(values, 0), exterior)
+        if isinstance(mesh, Mesh):
+            break
+        image = mesh[image]
+
+    label = mesh.cells[:-1]
+    n_cells = len(label)
+    left, right = mesh.cell, mesh.cell[mesh.twin]
+    outline = (left < n_cells) & (right == n_cells)
+    pixels = np.bincount(image.ravel(), minlength=exterior + 1)[mesh.cells]
+    bulge = np.bincount(left, np.where(outline, mesh.bulge, 0.0), n_cells + 1)
+    pixels[-1] = 0  # the exterior is no cell, and has no area
+    bulge[-1] = np.inf
+    size = np.array(image.shape[::-1], float)
+    vertices, moved = _untangle(mesh, size, pixels, bulge)
+    moved = moved[:-1]
+    if vertices is None:
+        raise _no_polygons(values[label[moved]])
+    topology = Topology(mesh.twin, mesh.cell, mesh.frame, exterior=True)
+    chord = vertices[mesh.twin[outline] // 3] - np.repeat(vertices, 3, axis=0)[outline]
+    angles = np.zeros(topology.n_edges)
+    angles[np.asarray(topology.edge)[outline]] = angle_of_area(
+        mesh.bulge[outline], np.linalg.norm(chord, axis=1)
+    )
+    if pixel_size is None:
+        pixel_size = float(np.sqrt(n_cells / pixels.sum()))
+    dtype = jnp.result_type(float)
+    home = image[margin : margin + rows, margin : margin + columns]
+    top_bottom, left_right = _touching(home, exterior + 1)
+    return Segmentation(
+        tissue=Tissue(
+            jnp.asarray((vertices - margin) * pixel_size, dtype),
+            topology,
+            Free(),
+            softening,
+            angles=jnp.asarray(angles, dtype),
+        ),
+        labels=values[label],
+        whole=~(top_bottom | left_right)[label],
+        absorbed=np.setdiff1d(values, values[label]),
+        inflated=np.unique(values[label[moved]]),
+        pixel_size=float(pixel_size),
+        image_shape=(rows, columns),
+    )
+
+
+def _with_exterior(
+    image: Int[np.ndarray, "rows columns"], exterior: int, gap_width: float
+) -> tuple[Int[np.ndarray, "rows columns"], int]:
+    """The image in a margin, its gaps given to the exterior or to the nearest label; and the margin."""
+    # The distance to the nearest label tells wide gaps from narrow ones: in the middle of a line of n
+    # pixels it is (n + 1) / 2. Wide gaps connected with the margin are exterior, and take back the rim
+    # that this leaves around the labels.
+    reach = (gap_width + 1) / 2
+    margin = int(np.ceil(2 * reach)) + 2
+    image = np.pad(image, margin, constant_values=-1)
+    gap = image < 0
+    wide = np.asarray(distance_transform_edt(gap)) > reach
+    pieces = np.asarray(connected_regions(wide)[0])
+    core = pieces == pieces[0, 0]
+    near = np.asarray(distance_transform_edt(~core)) <= reach
+    return _fill_gaps(np.where(gap & near, exterior, image), periodic=False), margin
+
+
+def _largest_cluster(
+    image: Int[np.ndarray, "rows columns"], exterior: int
+) -> Int[np.ndarray, "rows columns"]:
+    """All clusters but the one of most pixels become exterior."""
+    cluster, n_clusters = connected_regions(image != exterior)
+    if n_clusters < 2:
+        return image
+    sizes = np.bincount(cluster.ravel())
+    sizes[0] = 0
+    return np.where(cluster == np.argmax(sizes), image, exterior)
+
+
+def _no_polygons(labels: Int[np.ndarray, " labels"]) -> ValueError:
+    return ValueError(
+        "Argument `mask` must hold cells that polygons can stand for, but no polygons of positive "
+        f"area were found around the labels {_listed(labels)}. Smooth their outlines or merge them "
+        "with a neighbour."
     )
 
 
@@ -284,7 +392,7 @@ def _mirror(image: Int[np.ndarray, "rows columns"], n: int) -> np.ndarray:
 
 
 def _mesh_or_repairs(
-    graph: CrackGraph, values: Int[np.ndarray, " labels"]
+    graph: CrackGraph, values: Int[np.ndarray, " labels"], exterior: int | None = None
 ) -> Mesh | Int[np.ndarray, " labels"]:
     """The mesh, or which label each label must become first."""
     n = len(values)
@@ -295,10 +403,10 @@ def _mesh_or_repairs(
         f"of its {n} labels too few remain after those inside others or with two sides are "
         "absorbed. Give a larger image, or a finer segmentation."
     )
-    if len(left) == 0:
+    if len(np.unique(left)) < (2 if exterior is None else 3):
         raise ValueError(too_few)
     try:
-        inside = enclosed_cells(graph)
+        inside = enclosed_cells(graph, exterior)
     except NotADiskError as error:
         raise ValueError(
             "Argument `mask` must hold cells that do not surround the others or reach from one "
@@ -311,11 +419,15 @@ def _mesh_or_repairs(
         into[np.array(list(inside)) % n] = np.array(list(inside.values())) % n
         return into
     mesh = build_mesh(graph, graph.left % n)
-    sides = np.bincount(mesh.cell)
-    if sides.min() >= 3:
+    too_small = np.bincount(mesh.cell) < 3
+    if exterior is not None:
+        # Two sides are enough if one is an arc.
+        too_small[mesh.cell[mesh.cells[mesh.cell[mesh.twin]] == exterior]] = False
+        too_small[-1] = False
+    if not too_small.any():
         return mesh
     small = np.zeros(n, bool)
-    small[mesh.cells[sides < 3] % n] = True
+    small[mesh.cells[too_small] % n] = True
     found, host = _longest_interface(left[small[left]], right[small[left]])
     # Two small cells must not go to each other: between them, the one with the shorter outline goes
     # first. Then every chain of cells that are absorbed one into the other has an end.
@@ -330,11 +442,14 @@ def _mesh_or_repairs(
 
 
 def _untangle(
-    mesh: Mesh, size: Float[np.ndarray, " xy"], pixels: Int[np.ndarray, " cells"]
+    mesh: Mesh,
+    size: Float[np.ndarray, " xy"],
+    pixels: Int[np.ndarray, " cells"],
+    bulge: Shaped[np.ndarray, " cells"],
 ) -> tuple[Float[np.ndarray, "vertices 2"] | None, Bool[np.ndarray, " cells"]]:
     """Vertices such that every cell has a positive area, and the cells that had next to none.
 
-    Without vertices, the cells that are left over.
+    `bulge` is what arcs add to the areas. Without vertices, the cells that are left over.
     """
     vertices = mesh.vertices.astype(float)
     before = np.empty_like(mesh.following)
@@ -349,6 +464,7 @@ def _untangle(
         corners = np.repeat(vertices, 3, axis=0) + mesh.frame * size
         ends, starts = corners[mesh.following], corners[before]
         areas = 0.5 * np.bincount(mesh.cell, np.linalg.det(np.stack([corners, ends], axis=1)))
+        areas += bulge
         bad = areas < least
         if not bad.any():
             return vertices, ever
