@@ -38,6 +38,15 @@ class AbstractBoundary(eqx.Module):
         `pinned` vertices rule out are no zero modes, and count as 0.
         """
 
+    @abc.abstractmethod
+    def settle(
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
+    ) -> Float[Array, "vertices 2"]:
+        """The vertices, moved as a whole such that nothing is left of their drift."""
+
 
 class Periodic(AbstractBoundary):
     """A periodic box spanned by two lattice vectors; differentiable, sheared boxes included.
@@ -105,6 +114,15 @@ class Periodic(AbstractBoundary):
     ) -> Float[Array, " modes"]:
         return _translation_drift(vertices - reference, pinned)
 
+    def settle(
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
+    ) -> Float[Array, "vertices 2"]:
+        back = jnp.mean(reference - vertices, axis=0)
+        return vertices + (back if pinned is None else jnp.where(jnp.any(pinned), 0, back))
+
 
 class Free(AbstractBoundary):
     """The plane: a cluster of cells with an exterior around it.
@@ -126,19 +144,40 @@ class Free(AbstractBoundary):
         pinned: Bool[Array, " vertices"] | None = None,
     ) -> Float[Array, " modes"]:
         displacement = vertices - reference
-        # The rotation is about the centroid, or about the one vertex that is pinned.
-        if pinned is None:
-            centre, rotates = jnp.mean(reference, axis=0), True
-        else:
-            n_pinned = jnp.sum(pinned)
-            weight = jnp.where(n_pinned > 0, pinned, True)[:, None]
-            centre = jnp.sum(jnp.where(weight, reference, 0), axis=0) / jnp.sum(weight)
-            rotates = n_pinned <= 1
+        centre, rotates = _pivot(reference, pinned)
         arm = reference - centre
-        size = jnp.sqrt(jnp.sum(arm**2))
-        turn = jnp.sum(arm[:, 0] * displacement[:, 1] - arm[:, 1] * displacement[:, 0])
-        turn = jnp.where(rotates, turn / size, 0)
+        turn = jnp.sum(_cross(arm, displacement)) / jnp.sqrt(jnp.sum(arm**2))
+        turn = jnp.where(rotates, turn, 0)
         return jnp.append(_translation_drift(displacement, pinned), turn)
+
+    def settle(
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
+    ) -> Float[Array, "vertices 2"]:
+        (centre, rotates), (pivot, _) = _pivot(reference, pinned), _pivot(vertices, pinned)
+        arm, moved = reference - centre, vertices - pivot
+        turn = jnp.arctan2(jnp.sum(_cross(moved, arm)), jnp.sum(moved * arm))
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        aside = jnp.stack([-moved[:, 1], moved[:, 0]], axis=-1)
+        return jnp.where(rotates, centre + cos * moved + sin * aside, vertices)
+
+
+def _pivot(
+    vertices: Float[Array, "vertices 2"], pinned: Bool[Array, " vertices"] | None
+) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+    """What a free tissue can turn about, if it can: its centroid, or the one vertex that is pinned."""
+    if pinned is None:
+        return jnp.mean(vertices, axis=0), jnp.array(True)
+    n_pinned = jnp.sum(pinned)
+    counts = jnp.where(n_pinned > 0, pinned, True)[:, None]
+    centre = jnp.sum(jnp.where(counts, vertices, 0), axis=0) / jnp.sum(counts)
+    return centre, n_pinned <= 1
+
+
+def _cross(p: Float[Array, "n 2"], q: Float[Array, "n 2"]) -> Float[Array, " n"]:
+    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
 
 
 def _translation_drift(

@@ -133,12 +133,14 @@ def _equilibrate(
         max_steps=max_steps,
     )
     # The second solve starts at rest and takes no step: it is there to be differentiated.
-    moved = found.tissue.held_as(tissue)
-    gauge = _gauge_stiffness(found.tissue, _frozen(energy))
+    # What the solver did to the whole (turned it a little, say) depends on its way there: undo that.
+    settled = found.tissue.settled(_frozen(tissue))
+    moved = settled.held_as(tissue)
+    gauge = _gauge_stiffness(settled, _frozen(energy))
     solution = optx.minimise(
         _potential,
         _AtRest(),
-        found.tissue.configuration,
+        settled.configuration,
         (moved, energy, gauge),
         adjoint=adjoint,
         throw=False,

@@ -288,22 +288,31 @@ class Tissue(eqx.Module):
         These are the motions of the whole, see [`AbstractBoundary`][vertax.AbstractBoundary], and the
         degrees of freedom that `with_configuration` ignores. All are lengths.
         """
-        here = jax.lax.stop_gradient(self)
         vertices, scaled = self._split(configuration)
-        drift = [self.boundary.drift(vertices, here.vertices, self.pinned)]
+        drift = [self.boundary.drift(vertices, self.vertices, self.pinned)]
         if self.pinned is not None:
-            held = jnp.where(self.pinned[:, None], vertices - here.vertices, 0)
+            held = jnp.where(self.pinned[:, None], vertices - self.vertices, 0)
             drift.append(held.ravel())
         if scaled is not None:
-            drift.append(jnp.where(self.is_arc, 0, scaled - here._scaled_angles()))
+            drift.append(jnp.where(self.is_arc, 0, scaled - self._scaled_angles()))
         return jnp.concatenate(drift)
 
-    def held_as(self, other: Tissue) -> Tissue:
-        """This tissue in the boundary of another one, and its pinned vertices where they are there."""
-        held = eqx.tree_at(lambda t: t.boundary, self, other.boundary)
-        if self.pinned is None:
-            return held
-        return held.with_vertices(jnp.where(self.pinned[:, None], other.vertices, self.vertices))
+    def settled(self, start: Tissue) -> Tissue:
+        """The same shape, moved as a whole to where it has no drift from the vertices of `start`."""
+        settle = self.boundary.settle
+        return self.with_vertices(settle(self.vertices, start.vertices, self.pinned))
+
+    def held_as(self, start: Tissue) -> Tissue:
+        """This tissue in the boundary of `start` and with its vertices.
+
+        What it lends to a configuration (pinned vertices, what `drift` counts from) is then that of
+        `start`; differentiable are the boundary and the pinned vertices.
+        """
+        vertices = jax.lax.stop_gradient(start.vertices)
+        if start.pinned is not None:
+            vertices = jnp.where(start.pinned[:, None], start.vertices, vertices)
+        lent = (start.boundary, vertices)
+        return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, lent)
 
     def with_topology(self, topology: Topology) -> Tissue:
         """The same vertices, connected in another way."""
