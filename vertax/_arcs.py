@@ -35,7 +35,8 @@ LARGEST_ANGLE = 0.98 * np.pi
 
 
 class _Function(NamedTuple):
-    series: np.ndarray  # in α²; of an odd function over α
+    # All numbers are Python's, which leave float32 as it is.
+    series: tuple[float, ...]  # in α²; of an odd function over α
     closed: Callable[[Array], Array]
     odd: bool
     beyond: tuple[float, float, float]
@@ -49,8 +50,9 @@ class _Function(NamedTuple):
         size = jnp.abs(angle)
         near, far = size < _SERIES_BELOW, size > LARGEST_ANGLE
         squared = jnp.where(near, angle, 0) ** 2
-        sum_ = jnp.full_like(angle, self.series[-1])
-        for coefficient in self.series[-2::-1]:
+        *lower, highest = self.series
+        sum_ = jnp.full_like(angle, highest)
+        for coefficient in reversed(lower):
             sum_ = sum_ * squared + coefficient
         middle = self.closed(jnp.where(near | far, 1, size))
         over = jnp.where(far, size - LARGEST_ANGLE, 0)
@@ -61,7 +63,7 @@ class _Function(NamedTuple):
         return jnp.where(near, sum_, outer)
 
 
-_SIN, _COS = np.sin(LARGEST_ANGLE), np.cos(LARGEST_ANGLE)
+_SIN, _COS = float(np.sin(LARGEST_ANGLE)), float(np.cos(LARGEST_ANGLE))
 _BULGE = _SIN - LARGEST_ANGLE * _COS  # f' sin² = 2 g' sin³
 _f = LARGEST_ANGLE / _SIN
 _g = (LARGEST_ANGLE - _SIN * _COS) / (4 * _SIN**2)
@@ -70,7 +72,7 @@ _g2 = (LARGEST_ANGLE * _SIN**2 - 3 * _COS * _BULGE) / (2 * _SIN**4)
 _cot, _cot1, _cot2 = _COS / _SIN, -1 / _SIN**2, 2 * _COS / _SIN**3
 
 length_factor = _Function(
-    _LENGTH,
+    tuple(_LENGTH.tolist()),
     lambda a: a / jnp.sin(a),
     False,
     (_f, _BULGE / _SIN**2, (LARGEST_ANGLE * _SIN**2 - 2 * _COS * _BULGE) / _SIN**3),
@@ -78,7 +80,7 @@ length_factor = _Function(
 """Length of an arc over that of its chord."""
 
 area_factor = _Function(
-    _AREA,
+    tuple(_AREA.tolist()),
     lambda a: (a - jnp.sin(a) * jnp.cos(a)) / (4 * jnp.sin(a) ** 2),
     True,
     (_g, _g1, _g2),
@@ -86,7 +88,7 @@ area_factor = _Function(
 """Area between an arc and its chord over the square of the chord, positive on its right."""
 
 moment_factor = _Function(
-    _MOMENT,
+    tuple(_MOMENT.tolist()),
     lambda a: 1 / 12 - (a - jnp.sin(a) * jnp.cos(a)) * jnp.cos(a) / (8 * jnp.sin(a) ** 3),
     False,
     (

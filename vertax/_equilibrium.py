@@ -301,7 +301,7 @@ def _search(
         state = eqx.combine(dynamic, static)
         finished = (relaxation.at_rest(state) & ~flipped) | jnp.isnan(state.force)
 
-        def step() -> tuple[Array, PyTree]:
+        def step() -> tuple[PyTree, PyTree]:
             args = (tissue, energy, no_gauge)
             y, new_state = relaxation.step(tissue.configuration, args, state)
             return y, eqx.filter(new_state, eqx.is_array)

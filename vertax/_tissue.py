@@ -44,8 +44,8 @@ class Tissue(eqx.Module):
     - `pinned`, shape `(vertices,)`: which vertices do not move when the tissue relaxes. T1 transitions
         leave edges alone that end at one.
     - `angle_length`: the length that makes an angle a degree of freedom like a position, so that
-        solvers may measure steps and forces without knowing which is which; by default a quarter of the
-        root mean cell area, about what moves the middle of an arc as far as a vertex.
+        solvers may measure steps and forces without knowing which is which; by default half the root
+        mean cell area, about what moves the middle of an arc as far as a vertex.
 
     **Raises:**
 
@@ -109,7 +109,7 @@ class Tissue(eqx.Module):
         if softening is None or (angles is not None and angle_length is None):
             size = jnp.sqrt(jax.lax.stop_gradient(_mean_area(self)))
             softening = 1e-3 * size if softening is None else softening
-            angle_length = 0.25 * size if angle_length is None else angle_length
+            angle_length = 0.5 * size if angle_length is None else angle_length
         softening = jnp.asarray(softening, vertices.dtype)
         if is_concrete(softening) and not softening >= 0:
             raise ValueError(f"Argument `softening` must be at least 0, but is {softening}.")
