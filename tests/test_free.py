@@ -40,7 +40,9 @@ def test_rigid_motions_change_no_shape(recipe, angle, x):
     moved = rotated(tissue, angle, (x, -0.3 * x))
     for name, values in shape(tissue).items():
         np.testing.assert_allclose(shape(moved)[name], values, rtol=1e-9, atol=1e-9)
-    turned = rotated(tissue.with_vertices(jnp.tile(tissue.centroids[:1], (tissue.n_vertices, 1))), angle)
+    turned = rotated(
+        tissue.with_vertices(jnp.tile(tissue.centroids[:1], (tissue.n_vertices, 1))), angle
+    )
     expected = turned.vertices[0] + jnp.array([x, -0.3 * x])
     np.testing.assert_allclose(moved.centroids[0], expected, atol=1e-8)
 
@@ -53,7 +55,9 @@ def test_relabelling_changes_no_shape(recipe, seed):
     for name in ("areas", "perimeters", "shape_factors", "centroids"):
         # Not to rounding: sums are in another order, and small cells are differences of large numbers.
         expected = np.asarray(getattr(tissue, name))
-        np.testing.assert_allclose(np.asarray(getattr(new, name))[cell], expected, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(
+            np.asarray(getattr(new, name))[cell], expected, rtol=1e-8, atol=1e-9
+        )
     np.testing.assert_allclose(np.asarray(new.edge_lengths)[edge], tissue.edge_lengths, rtol=1e-12)
 
 
@@ -116,7 +120,9 @@ def test_a_disc_of_two_cells():
     tissue = with_angles(doublet(), jnp.full(3, np.pi / 2))  # the interface's angle does not count
     np.testing.assert_allclose(tissue.areas, np.pi / 8, rtol=1e-14)
     np.testing.assert_allclose(tissue.perimeters, np.pi / 2 + 1, rtol=1e-14)
-    np.testing.assert_allclose(tissue.centroids, [[-2 / 3 / np.pi, 0], [2 / 3 / np.pi, 0]], atol=1e-15)
+    np.testing.assert_allclose(
+        tissue.centroids, [[-2 / 3 / np.pi, 0], [2 / 3 / np.pi, 0]], atol=1e-15
+    )
     np.testing.assert_allclose(tissue.edge_curvatures, [2, 0, 2], rtol=1e-14)
 
 
@@ -139,7 +145,9 @@ def test_forces_and_second_derivatives_against_finite_differences(inner_arcs, an
     if angle is not None:  # exactly straight, concave, beyond a semicircle
         tissue = with_angles(tissue, jnp.full(tissue.n_edges, angle))
     energy = (
-        AreaElasticity(2.0, 0.9) + PerimeterElasticity(0.3, 3.5) + LineTension(jnp.linspace(1, 2, 12))
+        AreaElasticity(2.0, 0.9)
+        + PerimeterElasticity(0.3, 3.5)
+        + LineTension(jnp.linspace(1, 2, 12))
     )
     y = tissue.configuration
     f = jax.jit(lambda y: energy(tissue.with_configuration(y)))
@@ -169,7 +177,11 @@ def test_forces_and_torque_sum_to_zero(curved):
 def test_periodic_tissues_may_have_arcs():
     straight = random_tissue(9, 1)
     tissue = vx.Tissue(
-        straight.vertices, straight.topology, straight.boundary, angles=jnp.zeros(27), inner_arcs=True
+        straight.vertices,
+        straight.topology,
+        straight.boundary,
+        angles=jnp.zeros(27),
+        inner_arcs=True,
     )
     np.testing.assert_allclose(tissue.areas, straight.areas)
     bent = with_angles(tissue, 0.3 * jax.random.normal(jax.random.key(0), (27,)))
@@ -197,7 +209,7 @@ def test_broken_topologies_with_an_exterior_are_refused():
     # Two clusters with one exterior: two pieces.
     n = len(twin)
     both = np.where(cell < 6, cell + 6, 12)
-    with pytest.raises(ValueError, match="one face|one piece"):
+    with pytest.raises(ValueError, match=r"one face|one piece"):
         vx.Topology(
             np.concatenate([twin, twin + n]),
             np.concatenate([np.where(cell < 6, cell, 12), both]),

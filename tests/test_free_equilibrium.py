@@ -111,7 +111,9 @@ def test_young_laplace_and_force_balance_in_random_clusters(inner_arcs):
     n, target = 20, jnp.linspace(0.7, 1.3, 20)
     batch = [cluster(n, s, inner_arcs=inner_arcs, softening=1e-6) for s in range(3)]
     tissues = jax.tree.map(lambda *x: jnp.stack(x), *batch)
-    tension = 0.6 + 0.3 * jax.random.uniform(jax.random.key(1), (3, tissues.vertices.shape[1] * 3 // 2))
+    tension = 0.6 + 0.3 * jax.random.uniform(
+        jax.random.key(1), (3, tissues.vertices.shape[1] * 3 // 2)
+    )
     run = lambda t, g: vx.equilibrate(t, drops(g, target), tolerance=1e-10, throw=False)
     found = eqx.filter_jit(eqx.filter_vmap(run))(tissues, tension)
     assert found.converged.all()
@@ -127,12 +129,13 @@ def test_young_laplace_and_force_balance_in_random_clusters(inner_arcs):
 @pytest.mark.parametrize(("name", "solver", "reached"), SOLVERS, ids=[row[0] for row in SOLVERS])
 def test_all_solvers_reach_the_same_drop(name, solver, reached):
     tension, target = jnp.array([0.9, 0.7, 1.2]), jnp.array([0.7, 1.4])
+    energy = AreaElasticity(0.2 * K, target) + LineTension(0.2 * tension)
     start = relax(doublet(inner_arcs=True), drops(tension, 0.9 * target), transitions=None)
-    options = {"solver": solver, "tolerance": reached, "max_steps": 3000, "transitions": None}
-    found = vx.equilibrate(start, drops(tension, target), throw=False, **options)
+    options = {"solver": solver, "tolerance": 10 * reached, "max_steps": 3000, "transitions": None}
+    found = vx.equilibrate(start, energy, throw=False, **options)
     assert found.converged, (found.max_force, found.num_steps)
-    exact = relax(start, drops(tension, target), transitions=None)
-    np.testing.assert_allclose(found.tissue.areas, exact.areas, atol=10 * reached)
+    exact = relax(start, energy, transitions=None)
+    np.testing.assert_allclose(found.tissue.areas, exact.areas, atol=100 * reached)
 
 
 def test_units_of_length_do_not_matter_to_the_solver():
@@ -143,17 +146,15 @@ def test_units_of_length_do_not_matter_to_the_solver():
     energy = drops(0.8)
     scaled = AreaElasticity(K / unit**4, unit**2) + LineTension(0.8 / unit)
     small_one = vx.equilibrate(start, energy)
-    large_one = vx.equilibrate(
-        large, scaled, transitions=vx.T1(0.02 * unit), tolerance=1e-9 / unit
-    )
+    large_one = vx.equilibrate(large, scaled, transitions=vx.T1(0.02 * unit), tolerance=1e-9 / unit)
     assert large_one.num_steps <= 2 * small_one.num_steps
     np.testing.assert_allclose(large_one.tissue.angles, small_one.tissue.angles, atol=1e-7)
 
 
-def test_overstretched_arcs_find_back():
-    start = with_angles(doublet(), jnp.array([3.6, 0.0, -3.3]))
+@pytest.mark.parametrize("angles", [(3.6, 0.0, 3.6), (5.0, 0.0, 1.0)])
+def test_overstretched_arcs_find_back(angles):
+    start = with_angles(doublet(), jnp.array(angles))
     tissue = relax(start, drops([1.0, 1.0, 1.0]))
-    assert 0 < tissue.edge_angles[0] < np.pi
     np.testing.assert_allclose(tissue.edge_angles[jnp.array([0, 2])], 2 * np.pi / 3, atol=1e-8)
 
 
@@ -243,7 +244,8 @@ def test_the_gauge_makes_the_hessian_regular():
     assert held[0] > 1e-3
     # One zero mode of the energy becomes an eigenvalue 1; the others are what they were.
     np.testing.assert_allclose(
-        jnp.sort(jnp.concatenate([spectrum[3 + n_straight :], jnp.ones(3 + n_straight)])), held,
+        jnp.sort(jnp.concatenate([spectrum[3 + n_straight :], jnp.ones(3 + n_straight)])),
+        held,
         atol=1e-7,
     )
 
@@ -282,7 +284,9 @@ def test_images_of_free_tissues():
     points = np.asarray(tissue.edge_points(jnp.linspace(0, 1, 201)))
     middle, mass = (points[:, 1:] + points[:, :-1]) / 2, np.asarray(tissue.edge_lengths) / 200
     x, y = 0.1 * (np.arange(50) + 0.5), 0.1 * (np.arange(40) + 0.5)
-    gauss = lambda r, p: np.exp(-((r - p[..., None]) ** 2) / (2 * 0.2**2)) / np.sqrt(2 * np.pi) / 0.2
+    gauss = lambda r, p: (
+        np.exp(-((r - p[..., None]) ** 2) / (2 * 0.2**2)) / np.sqrt(2 * np.pi) / 0.2
+    )
     expected = np.einsum("e,epi,epj->ij", mass, gauss(y, middle[..., 1]), gauss(x, middle[..., 0]))
     np.testing.assert_allclose(image, expected, atol=2e-4 * expected.max())
     cost = MeshImage(np.asarray(image), 0.2, pixel_size=0.1)

@@ -226,7 +226,9 @@ def test_too_few_cells_are_refused():
 
 
 def test_unknown_boundary_lists_the_valid_ones():
-    with pytest.raises(ValueError, match=re.escape("'mirrored', 'periodic', 'free', but is 'open'")):
+    with pytest.raises(
+        ValueError, match=re.escape("'mirrored', 'periodic', 'free', but is 'open'")
+    ):
         from_labels(honeycomb(), boundary="open")
 
 

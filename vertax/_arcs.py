@@ -30,74 +30,58 @@ _MOMENT = -0.5 * np.convolve(_AREA, np.concatenate([[1.0], -2 * _ZETA]))[: len(_
 _MOMENT[0] = 0.0  # 1/12 cancels exactly
 _SERIES_BELOW = 0.5
 
-LARGEST_ANGLE = 0.98 * np.pi
-"""Up to here the three functions are exact. At π an arc is a whole circle over a chord of length 0."""
-
 
 class _Function(NamedTuple):
-    # All numbers are Python's, which leave float32 as it is.
-    series: tuple[float, ...]  # in α²; of an odd function over α
+    series: tuple[
+        float, ...
+    ]  # in α²; of an odd function over α. Python's numbers leave float32 alone.
     closed: Callable[[Array], Array]
     odd: bool
-    beyond: tuple[float, float, float]
-    """Value and two derivatives at the largest angle."""
 
     def __call__(self, angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        # An overlong step of a minimiser may carry an angle past π, where the formulas describe
-        # something else, of negative length. From the largest angle on a parabola goes on as steeply
-        # and with the same curvature, so that the way back leads downhill. Each `where` is doubled: the
-        # branch that is not taken gets an argument at which it has derivatives.
-        size = jnp.abs(angle)
-        near, far = size < _SERIES_BELOW, size > LARGEST_ANGLE
+        # The `where` is doubled: the branch that is not taken gets an argument at which it has
+        # derivatives.
+        near = jnp.abs(angle) < _SERIES_BELOW
         squared = jnp.where(near, angle, 0) ** 2
         *lower, highest = self.series
         sum_ = jnp.full_like(angle, highest)
         for coefficient in reversed(lower):
             sum_ = sum_ * squared + coefficient
-        middle = self.closed(jnp.where(near | far, 1, size))
-        over = jnp.where(far, size - LARGEST_ANGLE, 0)
-        value, slope, curvature = self.beyond
-        outer = jnp.where(far, value + over * (slope + 0.5 * curvature * over), middle)
-        if self.odd:
-            return jnp.where(near, angle * sum_, jnp.sign(angle) * outer)
-        return jnp.where(near, sum_, outer)
+        closed = self.closed(jnp.where(near, 1, angle))
+        return jnp.where(near, angle * sum_ if self.odd else sum_, closed)
 
 
-_SIN, _COS = float(np.sin(LARGEST_ANGLE)), float(np.cos(LARGEST_ANGLE))
-_BULGE = _SIN - LARGEST_ANGLE * _COS  # f' sin² = 2 g' sin³
-_f = LARGEST_ANGLE / _SIN
-_g = (LARGEST_ANGLE - _SIN * _COS) / (4 * _SIN**2)
-_g1 = _BULGE / (2 * _SIN**3)
-_g2 = (LARGEST_ANGLE * _SIN**2 - 3 * _COS * _BULGE) / (2 * _SIN**4)
-_cot, _cot1, _cot2 = _COS / _SIN, -1 / _SIN**2, 2 * _COS / _SIN**3
-
-length_factor = _Function(
-    tuple(_LENGTH.tolist()),
-    lambda a: a / jnp.sin(a),
-    False,
-    (_f, _BULGE / _SIN**2, (LARGEST_ANGLE * _SIN**2 - 2 * _COS * _BULGE) / _SIN**3),
-)
+length_factor = _Function(tuple(_LENGTH.tolist()), lambda a: a / jnp.sin(a), odd=False)
 """Length of an arc over that of its chord."""
 
 area_factor = _Function(
     tuple(_AREA.tolist()),
     lambda a: (a - jnp.sin(a) * jnp.cos(a)) / (4 * jnp.sin(a) ** 2),
-    True,
-    (_g, _g1, _g2),
+    odd=True,
 )
 """Area between an arc and its chord over the square of the chord, positive on its right."""
 
 moment_factor = _Function(
     tuple(_MOMENT.tolist()),
     lambda a: 1 / 12 - (a - jnp.sin(a) * jnp.cos(a)) * jnp.cos(a) / (8 * jnp.sin(a) ** 3),
-    False,
-    (
-        1 / 12 - _g * _cot / 2,
-        -(_g1 * _cot + _g * _cot1) / 2,
-        -(_g2 * _cot + 2 * _g1 * _cot1 + _g * _cot2) / 2,
-    ),
+    odd=False,
 )
 """First moment of that area about the chord over the cube of the chord; towards the right."""
+
+# At π an arc is a whole circle over a chord of length 0, and beyond the formulas describe something
+# else, of negative length, to which an overlong step of a minimiser must not lead. So angles are
+# bounded: from the largest free angle on, d beyond it becomes w d / √(w² + d²), where w is what is left
+# up to π. That has the slope 1 and no curvature at d = 0, and every angle is that of an arc. (Lengths and
+# areas grow like d² and d⁴: the way back stays steep.)
+LARGEST_FREE_ANGLE = 0.98 * np.pi
+
+
+def bounded(angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The angle itself up to 0.98 π, and always less than π."""
+    beyond = jnp.maximum(jnp.abs(angle) - LARGEST_FREE_ANGLE, 0)
+    width = np.pi - LARGEST_FREE_ANGLE
+    limited = LARGEST_FREE_ANGLE + width * beyond / jnp.sqrt(width**2 + beyond**2)
+    return jnp.where(beyond > 0, jnp.sign(angle) * limited, angle)
 
 
 def arc_points(

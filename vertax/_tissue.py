@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from vertax._arcs import arc_points, area_factor, length_factor, moment_factor
+from vertax._arcs import arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax._boundary import AbstractBoundary, Free
 from vertax._misc import compiled_property, is_concrete
 from vertax._topology import Topology, clockwise, edge_neighbourhood, source, take
@@ -24,8 +24,7 @@ class Tissue(eqx.Module):
     $\alpha$ between its chord $c$ and its tangents has the radius $R = c / (2 \sin\alpha)$ and the length
     $c\,\alpha / \sin\alpha$, and adds the area $c^2 (\alpha - \sin\alpha\cos\alpha) / (4 \sin^2\alpha)$
     to the cell on the left of its edge, which it bulges out of if $\alpha > 0$. On the outline of a
-    free tissue the cell is always on the left. Angles beyond 0.98 π (almost a full circle) are
-    overstretched: there lengths and areas are continued smoothly, and belong to no arc.
+    free tissue the cell is always on the left.
 
     **Arguments:**
 
@@ -37,8 +36,9 @@ class Tissue(eqx.Module):
         point of every energy. 0 switches it off; by default $10^{-3}$ of the root mean cell area,
         which changes the length of a typical edge by parts in a million. (Of an arc, it is the chord.)
     - `angles`, shape `(edges,)`: the angle $\alpha$ of each edge, in radians. Every edge owns one,
-        since a T1 transition may put it on the outline, but only those of arcs count. Left out: all
-        edges are straight.
+        since a T1 transition may put it on the outline, but only those of arcs count. Beyond 0.98 π
+        (nearly a circle) they are bounded smoothly, see `edge_angles`. Left out: all edges are
+        straight.
     - `inner_arcs`: whether edges between two cells are arcs too, as in a foam; otherwise the edges on
         the outline are.
     - `pinned`, shape `(vertices,)`: which vertices do not move when the tissue relaxes. T1 transitions
@@ -177,11 +177,12 @@ class Tissue(eqx.Module):
     def edge_angles(self) -> Float[Array, " edges"]:
         """Angle between the chord and the tangents of each edge, positive if it bulges to its right.
 
-        That is out of the cell on its left; 0 for straight edges.
+        That is out of the cell on its left; 0 for straight edges. Always between -π and π, where an
+        edge is an arc: a minimiser may overstep that in `angles`, but not here.
         """
         if self.angles is None:
             return jnp.zeros(self.n_edges, self.vertices.dtype)
-        return jnp.where(self.is_arc, self.angles, 0)
+        return jnp.where(self.is_arc, bounded(self.angles), 0)
 
     @compiled_property
     def edge_curvatures(self) -> Float[Array, " edges"]:

@@ -208,9 +208,7 @@ class MeshImage(AbstractCost):
         self.fit_intensity = fit_intensity
         if pixel_size is not None and is_concrete(pixel_size) and not pixel_size > 0:
             raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
-        self.pixel_size = (
-            None if pixel_size is None else jnp.asarray(pixel_size, self.image.dtype)
-        )
+        self.pixel_size = None if pixel_size is None else jnp.asarray(pixel_size, self.image.dtype)
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Half the weighted mean squared difference of the two images."""

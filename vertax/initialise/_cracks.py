@@ -236,9 +236,7 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
 
 def _follow(
     pointer: Int[np.ndarray, " nodes"], value: Int[np.ndarray, "nodes 2"]
-) -> tuple[
-    Int[np.ndarray, " nodes"], Int[np.ndarray, "nodes 2"], Int[np.ndarray, " nodes"]
-]:
+) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, "nodes 2"], Int[np.ndarray, " nodes"]]:
     """End of every chain of pointers (a node that points to itself), and the sum up to there.
 
     Also twice the area that the chain of vectors encloses with their sum, on the right of the sum.

@@ -76,7 +76,9 @@ def free_voronoi(
 
 
 def _cut_out(
-    corners: Float[np.ndarray, "halfedges 2"], topology: Topology, chosen: Bool[np.ndarray, " cells"]
+    corners: Float[np.ndarray, "halfedges 2"],
+    topology: Topology,
+    chosen: Bool[np.ndarray, " cells"],
 ) -> tuple[Float[np.ndarray, "vertices 2"], Topology, Float[np.ndarray, " edges"]]:
     """The cluster of the chosen cells: vertices, topology and the angles of its arcs."""
     cell, twin = np.asarray(topology.cell), np.asarray(topology.twin)

@@ -218,7 +218,7 @@ def _free_from_labels(
 
 def _with_exterior(
     image: Int[np.ndarray, "rows columns"], exterior: int, gap_width: float
-) -> tuple[Int[np.ndarray, "rows columns"], int]:
+) -> tuple[Int[np.ndarray, "padded_rows padded_columns"], int]:
     """The image in a margin, its gaps given to the exterior or to the nearest label; and the margin."""
     # The distance to the nearest label tells wide gaps from narrow ones: in the middle of a line of n
     # pixels it is (n + 1) / 2. Wide gaps connected with the margin are exterior, and take back the rim

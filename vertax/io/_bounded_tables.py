@@ -86,9 +86,7 @@ def without_exterior(
     columns[outside, 2] = twin[outside]
     first = np.unique(np.where(outside, n_cells, face), return_index=True)[1][:n_cells]
     face_table = np.stack([first, np.zeros_like(first)], axis=1)
-    return BoundedTables(
-        vertices, angles, columns.astype(np.int32), face_table.astype(np.int32)
-    )
+    return BoundedTables(vertices, angles, columns.astype(np.int32), face_table.astype(np.int32))
 
 
 def checked(tables: BoundedTables) -> BoundedTables:

@@ -187,7 +187,9 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
             f"{tissue.vertices.shape}."
         )
     if tissue.inner_arcs:
-        raise ValueError("Tables hold arcs on the outline only. Use `save_tissue`, which keeps all.")
+        raise ValueError(
+            "Tables hold arcs on the outline only. Use `save_tissue`, which keeps all."
+        )
     boundary = tissue.boundary
     if isinstance(boundary, Free):
         angles = np.asarray(tissue.edge_angles if tissue.angles is None else tissue.angles)

@@ -11,7 +11,6 @@ from vertax._boundary import Periodic
 from vertax._tissue import Tissue
 from vertax._topology import take
 
-
 _POINTS_PER_ARC = 24
 
 
