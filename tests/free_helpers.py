@@ -32,6 +32,11 @@ def doublet(*, inner_arcs: bool = False, softening: float = 0.0) -> vx.Tissue:
     )
 
 
+def angles_of(tissue: vx.Tissue) -> jax.Array:
+    assert tissue.angles is not None
+    return tissue.angles
+
+
 def with_angles(tissue: vx.Tissue, angles: jax.Array) -> vx.Tissue:
     return eqx.tree_at(lambda t: t.angles, tissue, angles)
 

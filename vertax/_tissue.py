@@ -274,7 +274,7 @@ class Tissue(eqx.Module):
         if self.pinned is not None:
             vertices = jnp.where(self.pinned[:, None], self.vertices, vertices)
         moved = self.with_vertices(vertices)
-        if scaled is None:
+        if scaled is None or self.angles is None or self.angle_length is None:
             return moved
         angles = jnp.where(self.is_arc, scaled / self.angle_length, self.angles)
         return eqx.tree_at(lambda t: t.angles, moved, angles)
@@ -294,8 +294,9 @@ class Tissue(eqx.Module):
         if self.pinned is not None:
             held = jnp.where(self.pinned[:, None], vertices - self.vertices, 0)
             drift.append(held.ravel())
-        if scaled is not None:
-            drift.append(jnp.where(self.is_arc, 0, scaled - self._scaled_angles()))
+        here = self._scaled_angles()
+        if scaled is not None and here is not None:
+            drift.append(jnp.where(self.is_arc, 0, scaled - here))
         return jnp.concatenate(drift)
 
     def settled(self, start: Tissue) -> Tissue:
@@ -320,7 +321,9 @@ class Tissue(eqx.Module):
         return eqx.tree_at(lambda t: t.topology, self, topology)
 
     def _scaled_angles(self) -> Float[Array, " edges"] | None:
-        return None if self.angles is None else self.angles * self.angle_length
+        if self.angles is None or self.angle_length is None:
+            return None
+        return self.angles * self.angle_length
 
     def _split(
         self, configuration: PyTree[Float[Array, "..."]]

@@ -228,7 +228,8 @@ def _with_exterior(
     image = np.pad(image, margin, constant_values=-1)
     gap = image < 0
     wide = np.asarray(distance_transform_edt(gap)) > reach
-    pieces = np.asarray(connected_regions(wide)[0])
+    pieces = np.zeros(image.shape, np.int32)
+    connected_regions(wide, output=pieces)
     core = pieces == pieces[0, 0]
     near = np.asarray(distance_transform_edt(~core)) <= reach
     return _fill_gaps(np.where(gap & near, exterior, image), periodic=False), margin
@@ -238,9 +239,8 @@ def _largest_cluster(
     image: Int[np.ndarray, "rows columns"], exterior: int
 ) -> Int[np.ndarray, "rows columns"]:
     """All clusters but the one of most pixels become exterior."""
-    cluster, n_clusters = connected_regions(image != exterior)
-    if n_clusters < 2:
-        return image
+    cluster = np.zeros(image.shape, np.int32)
+    connected_regions(image != exterior, output=cluster)
     sizes = np.bincount(cluster.ravel())
     sizes[0] = 0
     return np.where(cluster == np.argmax(sizes), image, exterior)

@@ -34,7 +34,8 @@ def labels_from_skeleton(
         )
     # Around the image there is nothing but outside, so a frame of lines encloses nothing.
     lines = np.pad(lines[1:-1, 1:-1], 1)
-    regions = np.asarray(label(~lines)[0])
+    regions = np.zeros(lines.shape, np.int32)
+    label(~lines, output=regions)
     regions[regions == regions[0, 0]] = 0
     if not regions.any():
         raise ValueError("Argument `image` must show closed lines, but they enclose nothing.")
