@@ -47,7 +47,7 @@ def pairs_in(segmentation):
     return {(min(p), max(p)) for p in pairs.tolist()}
 
 
-@pytest.mark.parametrize("seed", [0, 4])
+@pytest.mark.parametrize("seed", [6, 10])  # without holes
 def test_a_cluster_of_round_cells(seed):
     mask = round_cells(seed)
     made = from_labels(mask, boundary="free", pixel_size=1.0, gap_width=0.0)
