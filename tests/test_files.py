@@ -101,8 +101,11 @@ class TestRefusedToSave:
             def shortest(self, displacement):
                 return displacement
 
-            def drift(self, vertices, reference):
+            def drift(self, vertices, reference, pinned=None):
                 return jnp.zeros(0)
+
+            def settle(self, vertices, reference, pinned=None):
+                return vertices
 
         odd = eqx.tree_at(lambda t: t.boundary, tissue, Sphere())
         with pytest.raises(ValueError, match="no place for a boundary of class Sphere"):

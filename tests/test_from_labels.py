@@ -226,8 +226,10 @@ def test_too_few_cells_are_refused():
 
 
 def test_unknown_boundary_lists_the_valid_ones():
-    with pytest.raises(ValueError, match=re.escape("'mirrored', 'periodic', but is 'free'")):
-        from_labels(honeycomb(), boundary="free")
+    with pytest.raises(
+        ValueError, match=re.escape("'mirrored', 'periodic', 'free', but is 'open'")
+    ):
+        from_labels(honeycomb(), boundary="open")
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])

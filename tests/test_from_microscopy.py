@@ -185,7 +185,7 @@ def test_watershed_sizes_must_not_be_negative(name):
 
 def test_unknown_boundary_is_refused(small):
     with pytest.raises(ValueError, match="'mirrored', 'periodic'"):
-        from_microscopy(small[0], boundary="free")
+        from_microscopy(small[0], boundary="open")
 
 
 def test_missing_scikit_image_is_named(small, monkeypatch):

@@ -3,7 +3,7 @@ import vertax as vx
 # The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
 NAMES = """
 AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions
-AutomaticDifferentiation Equilibrium EquilibriumPropagation Fit FitError GradientOutcome History
+AutomaticDifferentiation Equilibrium EquilibriumPropagation Fit FitError Free GradientOutcome History
 ImplicitDifferentiation InverseProblem MINRES Periodic T1 Tissue Topology adjoints costs energies
 equilibrate fit initialise io load_tissue plot_history plot_recovery plot_tissue plotting save_tissue
 solvers
@@ -15,9 +15,9 @@ FAMILIES = {
     "costs": "AbstractCost AbstractLeastSquaresCost MeshImage VertexDistance WeightedSum mirror render",
     "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity LineTension LocalSum "
     "PerimeterElasticity ShapeFactorEnergy Sum",
-    "initialise": "AbstractSegmenter Cellpose Segmentation Watershed from_labels from_microscopy "
-    "hexagonal periodic_voronoi",
-    "io": "Tables atomic_write from_tables load_tissue read_image save_tissue to_tables",
+    "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
+    "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
+    "io": "BoundedTables Tables atomic_write from_tables load_tissue read_image save_tissue to_tables",
     "plotting": "cell_polygons plot_history plot_recovery plot_tissue",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
 }

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 import vertax as vx
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
-from vertax.io import Tables, from_tables, to_tables
+from vertax.io import BoundedTables, Tables, from_tables, to_tables
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "reference_cases"
 needs_data = pytest.mark.skipif(
@@ -239,7 +239,7 @@ def test_broken_tables_are_refused_by_name(tissue):
         r"vert_table.*finite": good._replace(vert_table=good.vert_table * np.nan),
         r"he_table.*shape \(half-edges, 8\)": good._replace(he_table=good.he_table[:, :7]),
         r"he_table.*integers": good._replace(he_table=good.he_table.astype(float)),
-        r"face_table.*bounded": good._replace(face_table=np.stack([good.face_table] * 2, 1)),
+        r"face_table.*BoundedTables": good._replace(face_table=np.stack([good.face_table] * 2, 1)),
         r"width and height": good._replace(height=0.0),
         r"three edges.*vertices": rows_of_one_vertex,
         r"`next` must lie in": with_he(5, 1, 10**6),
@@ -298,3 +298,102 @@ class TestAgainstTheAuthorsResults:
         pairs = lambda t: sorted(np.sort(np.asarray(t.topology.edge_cells), axis=1).tolist())
         assert counts.sum() == 3
         assert pairs(ours) == pairs(theirs) != pairs(start)
+
+
+@needs_data
+class TestBoundedReference:
+    @pytest.fixture
+    def data(self):
+        return dict(np.load(FOLDER / "bounded_N20_s1_f64.npz"))
+
+    @pytest.fixture(params=["start", "relaxed"])
+    def state(self, request, data):
+        prefix = request.param + "_"
+        own = {k.removeprefix(prefix): v for k, v in data.items() if k.startswith(prefix)}
+        names = ("vertTable", "angTable", "heTable", "faceTable")
+        return BoundedTables(*(own[name] for name in names)), own
+
+    def test_geometry(self, state):
+        tables, expected = state
+        tissue = from_tables(tables, softening=0.0)
+        assert_same_to_rounding(tissue.areas, expected["areas"])
+        assert_same_to_rounding(tissue.perimeters, expected["perimeters"])
+        # The exterior side of an arc has length 0 there.
+        pairs = expected["he_any_length"].reshape(-1, 2)
+        assert_same_to_rounding(tissue.edge_lengths, pairs.max(axis=1))
+        arcs = expected["he_surface_length"].reshape(-1, 2).max(axis=1) > 0
+        np.testing.assert_array_equal(tissue.is_arc, arcs)
+
+    def test_energy_and_its_gradients(self, state, data):
+        tables, expected = state
+        tissue = from_tables(tables, softening=0.0)
+
+        @jax.jit
+        @jax.value_and_grad
+        def energy(leaves):
+            vertices, angles, parameters = leaves
+            at = eqx.tree_at(lambda t: (t.vertices, t.angles), tissue, (vertices, angles))
+            # Theirs has no 1/2.
+            area = AreaElasticity(2.0 * float(data["K"]), float(data["target_area"]))
+            return (area + LineTension(jax.nn.sigmoid(parameters) + 1))(at)
+
+        parameters = jnp.asarray(data["he_params"])
+        value, gradients = energy((tissue.vertices, tissue.angles, parameters))
+        np.testing.assert_allclose(value, expected["energy"], rtol=1e-13)
+        names = ("gradE_vertices", "gradE_angles", "gradE_he_params")
+        for gradient, name in zip(gradients, names, strict=True):
+            np.testing.assert_allclose(gradient, expected[name], rtol=0, atol=1e-12)
+
+    def test_tables_come_back(self, state):
+        tables, _ = state
+        tissue = from_tables(tables, softening=0.0)
+        again = to_tables(tissue)
+        assert isinstance(again, BoundedTables)
+        np.testing.assert_array_equal(again.vert_table, tables.vert_table)
+        np.testing.assert_array_equal(again.ang_table, tables.ang_table)
+        # We write the cell's side of an arc first, and every exterior side after it.
+        inner = (tables.he_table[:, 5] == 0) & (tables.he_table[:, 3] != 0)
+        columns = [3, 4, 7]
+        np.testing.assert_array_equal(
+            again.he_table[inner][:, columns], tables.he_table[inner][:, columns]
+        )
+        np.testing.assert_array_equal(again.he_table[again.face_table[:, 0], 7], np.arange(20))
+        third = to_tables(from_tables(again, softening=0.0))
+        for one, other in zip(third, again, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_round_trip_of_a_free_tissue():
+    tissue = vx.initialise.free_voronoi(9, key=jax.random.key(4), softening=0.01)
+    again = from_tables(to_tables(tissue), softening=0.01)
+    np.testing.assert_array_equal(again.topology.edge_cells, tissue.topology.edge_cells)
+    np.testing.assert_array_equal(again.topology.edge_vertices, tissue.topology.edge_vertices)
+    np.testing.assert_array_equal(again.angles, tissue.angles)
+    assert_same_to_rounding(again.areas, tissue.areas)
+
+
+def test_broken_bounded_tables_are_refused_by_name():
+    good = to_tables(vx.initialise.free_voronoi(6, key=jax.random.key(1)))
+    assert isinstance(good, BoundedTables)
+
+    def with_he(row, column, value):
+        he_table = good.he_table.copy()
+        he_table[row, column] = value
+        return good._replace(he_table=he_table)
+
+    arc = int(np.flatnonzero(good.he_table[:, 5])[0])
+    broken = {
+        r"vert_table.*finite": good._replace(vert_table=good.vert_table * np.nan),
+        r"ang_table.*shape \(edges,\)": good._replace(ang_table=good.ang_table[None]),
+        r"face_table.*shape \(rows, 2\)": good._replace(face_table=good.face_table[:, 0]),
+        r"`twin` must pair up rows": with_he(0, 2, 5),
+        r"vertices must lie in 2": with_he(arc, 5, 99),
+        r"a face on one side at least": with_he(arc, 5, 0),
+        r"counter-clockwise": good._replace(vert_table=good.vert_table * [1.0, -1.0]),
+    }
+    for message, tables in broken.items():
+        with pytest.raises(ValueError, match=message):
+            from_tables(tables)
+    curved = vx.initialise.free_voronoi(6, key=jax.random.key(1), inner_arcs=True)
+    with pytest.raises(ValueError, match="arcs on the outline only"):
+        to_tables(curved)

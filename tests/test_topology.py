@@ -1,3 +1,5 @@
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,7 +44,7 @@ def test_slots_turn_around_their_vertex():
 def _break(tissue, **changes):
     m = tissue.topology
     fields = {"twin": m.twin, "cell": m.cell, "frame": m.frame, "edge": m.edge}
-    fields = {name: np.array(value) for name, value in fields.items()}
+    fields: dict[str, Any] = {name: np.array(value) for name, value in fields.items()}
     for name, change in changes.items():
         fields[name] = change(fields[name])
     return lambda: vx.Topology(**fields)

@@ -9,7 +9,11 @@ from vertax import (
     plotting as plotting,
     solvers as solvers,
 )
-from vertax._boundary import AbstractBoundary as AbstractBoundary, Periodic as Periodic
+from vertax._boundary import (
+    AbstractBoundary as AbstractBoundary,
+    Free as Free,
+    Periodic as Periodic,
+)
 from vertax._equilibrium import Equilibrium as Equilibrium, equilibrate as equilibrate
 from vertax._fit import (
     Fit as Fit,

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Num
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from vertax._misc import is_concrete
 
@@ -17,7 +17,7 @@ class AbstractBoundary(eqx.Module):
     """The space a tissue lives in: how lattice images are placed and which motions cost nothing."""
 
     @abc.abstractmethod
-    def translation(self, image: Num[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+    def translation(self, image: Num[Array, "*shape 2"]) -> Num[Array, "*shape 2"]:
         """Displacement of an integer lattice image from the home box."""
 
     @abc.abstractmethod
@@ -26,13 +26,26 @@ class AbstractBoundary(eqx.Module):
 
     @abc.abstractmethod
     def drift(
-        self, vertices: Float[Array, "vertices 2"], reference: Float[Array, "vertices 2"]
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
     ) -> Float[Array, " modes"]:
         """How far a configuration moved along the motions that change no shape.
 
         One number for each zero mode, in units of length times the square root of the number of
-        vertices: the norm of the part of the displacement that lies along that mode.
+        vertices: the norm of the part of the displacement that lies along that mode. Motions that
+        `pinned` vertices rule out are no zero modes, and count as 0.
         """
+
+    @abc.abstractmethod
+    def settle(
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
+    ) -> Float[Array, "vertices 2"]:
+        """The vertices, moved as a whole such that nothing is left of their drift."""
 
 
 class Periodic(AbstractBoundary):
@@ -94,6 +107,81 @@ class Periodic(AbstractBoundary):
         return jnp.take_along_axis(choices, best[..., None, None], axis=-2)[..., 0, :]
 
     def drift(
-        self, vertices: Float[Array, "vertices 2"], reference: Float[Array, "vertices 2"]
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
     ) -> Float[Array, " modes"]:
-        return jnp.mean(vertices - reference, axis=0) * jnp.sqrt(1.0 * vertices.shape[0])
+        return _translation_drift(vertices - reference, pinned)
+
+    def settle(
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
+    ) -> Float[Array, "vertices 2"]:
+        back = jnp.mean(reference - vertices, axis=0)
+        return vertices + (back if pinned is None else jnp.where(jnp.any(pinned), 0, back))
+
+
+class Free(AbstractBoundary):
+    """The plane: a cluster of cells with an exterior around it.
+
+    Its three zero modes are the translations and the rotation. Give the tissue `angles`, and edges with
+    the exterior on one side are circular arcs.
+    """
+
+    def translation(self, image: Num[Array, "*shape 2"]) -> Num[Array, "*shape 2"]:
+        return jnp.zeros_like(image)
+
+    def shortest(self, displacement: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+        return displacement
+
+    def drift(
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
+    ) -> Float[Array, " modes"]:
+        displacement = vertices - reference
+        centre, rotates = _pivot(reference, pinned)
+        arm = reference - centre
+        turn = jnp.sum(_cross(arm, displacement)) / jnp.sqrt(jnp.sum(arm**2))
+        turn = jnp.where(rotates, turn, 0)
+        return jnp.append(_translation_drift(displacement, pinned), turn)
+
+    def settle(
+        self,
+        vertices: Float[Array, "vertices 2"],
+        reference: Float[Array, "vertices 2"],
+        pinned: Bool[Array, " vertices"] | None = None,
+    ) -> Float[Array, "vertices 2"]:
+        (centre, rotates), (pivot, _) = _pivot(reference, pinned), _pivot(vertices, pinned)
+        arm, moved = reference - centre, vertices - pivot
+        turn = jnp.arctan2(jnp.sum(_cross(moved, arm)), jnp.sum(moved * arm))
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        aside = jnp.stack([-moved[:, 1], moved[:, 0]], axis=-1)
+        return jnp.where(rotates, centre + cos * moved + sin * aside, vertices)
+
+
+def _pivot(
+    vertices: Float[Array, "vertices 2"], pinned: Bool[Array, " vertices"] | None
+) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+    """What a free tissue can turn about, if it can: its centroid, or the one vertex that is pinned."""
+    if pinned is None:
+        return jnp.mean(vertices, axis=0), jnp.array(True)
+    n_pinned = jnp.sum(pinned)
+    counts = jnp.where(n_pinned > 0, pinned, True)[:, None]
+    centre = jnp.sum(jnp.where(counts, vertices, 0), axis=0) / jnp.sum(counts)
+    return centre, n_pinned <= 1
+
+
+def _cross(p: Float[Array, "n 2"], q: Float[Array, "n 2"]) -> Float[Array, " n"]:
+    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+
+
+def _translation_drift(
+    displacement: Float[Array, "vertices 2"], pinned: Bool[Array, " vertices"] | None
+) -> Float[Array, "2"]:
+    drift = jnp.mean(displacement, axis=0) * jnp.sqrt(1.0 * displacement.shape[0])
+    return drift if pinned is None else jnp.where(jnp.any(pinned), 0, drift)

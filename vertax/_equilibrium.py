@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._misc import is_concrete
@@ -126,14 +127,16 @@ def _equilibrate(
         relaxation, options, transitions, *frozen((tissue, energy)), max_steps=max_steps
     )
     # The second solve starts at rest and takes no step: it is there to be differentiated.
-    moved = eqx.tree_at(lambda t: t.boundary, found.tissue, tissue.boundary)
-    stiffness = mean_stiffness(found.tissue, frozen(energy))
+    # What the solver did to the whole (turned it a little, say) depends on its way there: undo that.
+    settled = found.tissue.settled(frozen(tissue))
+    moved = settled.held_as(tissue)
+    stiffness = mean_stiffness(settled, frozen(energy))
     stiffness = jnp.where(stiffness > 0, stiffness, 1)
     memory = {"stiffness": stiffness, "relaxation": relaxation, "start": found.start}
     solution = optx.minimise(
         _potential,
         AtRest(),
-        found.tissue.configuration,
+        settled.configuration,
         (moved, energy, stiffness),
         options | memory,
         max_steps=max_steps,
@@ -177,18 +180,18 @@ def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
 
 def _potential(configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Array]) -> Array:
     """The energy, and a term that pins the motions which cost nothing."""
-    # Translations are zero modes. They make the Hessian singular, and a nudged relaxation would drift
-    # along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
+    # Motions of the whole are zero modes. They make the Hessian singular, and a nudged relaxation would
+    # drift along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
     tissue, energy, gauge = args
-    drift = tissue.boundary.drift(configuration, jax.lax.stop_gradient(tissue.vertices))
+    drift = tissue.drift(configuration)
     return energy(tissue.with_configuration(configuration)) + 0.5 * gauge * jnp.sum(drift**2)
 
 
 def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:
     """The size of a typical second derivative of an energy, or of any number that a tissue has."""
     # The Rayleigh quotient of a random vector is the mean eigenvalue, near enough.
-    y = tissue.configuration
-    slope = jax.grad(lambda x: energy(tissue.with_configuration(x)))
+    y, unravel = ravel_pytree(tissue.configuration)
+    slope = jax.grad(lambda x: energy(tissue.with_configuration(unravel(x))))
     probe = jax.random.normal(jax.random.key(0), y.shape, y.dtype)
     _, response = jax.jvp(slope, (y,), (probe,))
     return jnp.abs(jnp.sum(probe * response)) / jnp.sum(probe**2)
@@ -247,7 +250,7 @@ def _search(
         state = eqx.combine(dynamic, static)
         finished = (relaxation.at_rest(state) & ~flipped) | jnp.isnan(state.force)
 
-        def step() -> tuple[Array, PyTree]:
+        def step() -> tuple[PyTree, PyTree]:
             args = (tissue, energy, no_gauge)
             y, new_state, _ = relaxation.step(
                 objective, tissue.configuration, args, options, state, tags

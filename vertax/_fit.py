@@ -356,7 +356,7 @@ def _epoch(
         parameters, shift = eqx.apply_updates(fitted, updates)
         following = equilibrium.tissue
         if shift is not None:
-            following = eqx.tree_at(lambda t: t.vertices, following, following.vertices + shift)
+            following = following.with_vertices(following.vertices + shift)
         best = _better(
             state.best,
             state.parameters,

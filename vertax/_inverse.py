@@ -158,7 +158,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
 def _moved(tissue: Tissue, shift: Float[Array, 2] | None) -> Tissue:
     if shift is None:
         return tissue
-    return eqx.tree_at(lambda t: t.vertices, tissue, tissue.vertices + shift)
+    return tissue.with_vertices(tissue.vertices + shift)
 
 
 def _placed(equilibrium: Equilibrium, shift: Float[Array, 2] | None) -> Equilibrium:

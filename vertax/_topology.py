@@ -28,6 +28,9 @@ from vertax._misc import compiled_property
 #
 # Offsets of edges follow from the frames (offset(h) = frame[next(h)] - frame[h]), so they sum to zero
 # around every cell by construction, also for a cell that spans half the box and more.
+#
+# In a free tissue the outside is one more face, so that vertices on the outline are trivalent too. Its
+# half-edges carry the label n_cells, which sums over cells drop: a segment number out of range.
 class Topology(eqx.Module):
     """The connectivity of a tissue: a trivalent half-edge rotation system.
 
@@ -39,11 +42,13 @@ class Topology(eqx.Module):
 
     - `twin`, shape `(halfedges,)`: the half-edge in the opposite direction, an involution without fixed
         points.
-    - `cell`, shape `(halfedges,)`: the cell on the left of each half-edge, `0 … n_cells - 1`.
+    - `cell`, shape `(halfedges,)`: the cell on the left of each half-edge, `0 … n_cells - 1`; and
+        `n_cells` where that is the exterior.
     - `frame`, shape `(halfedges, 2)`: integer lattice image of each half-edge's source, in the frame of
         the cell on its left. Zero where there is no periodicity.
     - `edge`, shape `(halfedges,)`: an edge number for each half-edge, shared with its twin. Numbered in
         the order of the half-edges when left out.
+    - `exterior`: whether the face of the largest label is the outside of a free tissue.
 
     **Raises:**
 
@@ -56,9 +61,11 @@ class Topology(eqx.Module):
     frame: Int[Array, "halfedges 2"]
     edge: Int[Array, " halfedges"]
     half_edge: Int[Array, " edges"]
-    """One half-edge of each edge; it gives the edge its direction."""
+    """One half-edge of each edge; it gives the edge its direction. The exterior is never on its left."""
     n_cells: int = eqx.field(static=True)
-    """Number of cells."""
+    """Number of cells, without the exterior."""
+    exterior: bool = eqx.field(static=True)
+    """Whether there is an exterior."""
 
     def __init__(
         self,
@@ -66,6 +73,8 @@ class Topology(eqx.Module):
         cell: ArrayLike,
         frame: ArrayLike,
         edge: ArrayLike | None = None,
+        *,
+        exterior: bool = False,
     ):
         twin, cell, frame = (np.asarray(x) for x in (twin, cell, frame))
         if twin.ndim != 1 or twin.size == 0 or twin.size % 6 != 0:
@@ -91,13 +100,16 @@ class Topology(eqx.Module):
                 "Argument `edge` must give each half-edge a number in 0 … n_edges - 1."
             )
         half_edge[edge[::-1]] = h[::-1]  # reversed: the first half-edge of each edge wins
+        n_cells = int(cell.max()) + (not exterior)
+        half_edge = np.where(cell[half_edge] == n_cells, twin[half_edge], half_edge)
         to_int32 = lambda x: jnp.asarray(x, jnp.int32)
         self.twin = to_int32(twin)
         self.cell = to_int32(cell)
         self.frame = to_int32(frame)
         self.edge = to_int32(edge)
         self.half_edge = to_int32(half_edge)
-        self.n_cells = int(cell.max()) + 1
+        self.n_cells = n_cells
+        self.exterior = exterior
         self.validate()
 
     @property
@@ -114,6 +126,11 @@ class Topology(eqx.Module):
     def n_edges(self) -> int:
         """Number of edges."""
         return self.n_half_edges // 2
+
+    @property
+    def n_faces(self) -> int:
+        """Number of cells and, if there is one, the exterior."""
+        return self.n_cells + self.exterior
 
     @compiled_property
     def source(self) -> Int[Array, " halfedges"]:
@@ -148,9 +165,20 @@ class Topology(eqx.Module):
 
     @compiled_property
     def edge_cells(self) -> Int[Array, "edges 2"]:
-        """The cells on the left and on the right of each edge."""
+        """The cells on the left and on the right of each edge (`n_cells`: the exterior)."""
         h = self.half_edge
         return jnp.stack([take(self.cell, h), take(self.cell, take(self.twin, h))], axis=-1)
+
+    @compiled_property
+    def forward(self) -> Bool[Array, " halfedges"]:
+        """Which half-edges run along the direction of their edge."""
+        here = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
+        return take(self.half_edge, self.edge) == here
+
+    @compiled_property
+    def on_outline(self) -> Bool[Array, " edges"]:
+        """Which edges have the exterior on one side."""
+        return take(self.cell, take(self.twin, self.half_edge)) == self.n_cells
 
     @compiled_property
     def neighbour_counts(self) -> Int[Array, " cells"]:
@@ -164,13 +192,13 @@ class Topology(eqx.Module):
         **Raises:**
 
         - `ValueError` naming what is broken: the involution, labels of cells or edges that do not
-            follow the mesh, a cell in several pieces or with fewer than three sides, lattice frames
+            follow the mesh, a cell in several pieces or with too few sides, lattice frames
             that contradict each other, a tissue in several pieces or of the wrong genus.
         """
         twin, cell, frame, edge, half_edge = (
             np.asarray(x) for x in (self.twin, self.cell, self.frame, self.edge, self.half_edge)
         )
-        n_half, n_cells = twin.size, self.n_cells
+        n_half, n_faces = twin.size, self.n_faces
         h = np.arange(n_half)
 
         def require(ok: np.ndarray | bool, what: str):
@@ -193,19 +221,25 @@ class Topology(eqx.Module):
             edge[half_edge] == np.arange(n_half // 2),
             "`half_edge` must point into its edge, at edges",
         )
-        require((cell >= 0) & (cell < n_cells), "`cell` must lie in 0 … n_cells - 1, at half-edges")
-        sides = np.bincount(cell, minlength=n_cells)
+        require((cell >= 0) & (cell < n_faces), "`cell` must lie in 0 … n_cells - 1, at half-edges")
+        sides = np.bincount(cell, minlength=n_faces)
         require(sides > 0, "every cell must have half-edges, at cells")
 
         following = np.where(twin % 3 == 0, twin + 2, twin - 1)
         require(cell[following] == cell, "`cell` must be the same all around a face, at half-edges")
-        n_faces, face = connected_components(
+        n_orbits, face = connected_components(
             coo_array((np.ones(n_half, bool), (h, following)), shape=(n_half, n_half)),
             directed=False,
         )
-        faces_of_cell = np.bincount(cell[np.unique(face, return_index=True)[1]], minlength=n_cells)
+        faces_of_cell = np.bincount(cell[np.unique(face, return_index=True)[1]], minlength=n_faces)
         require(faces_of_cell == 1, "every cell must be one face, at cells")
-        require(sides >= 3, "every cell must have at least three sides, at cells")
+        # A side on the outline may be an arc, so two sides are enough there.
+        outside = np.bincount(cell, cell[twin] == self.n_cells, n_faces) > 0
+        outside[self.n_cells :] = True
+        require(
+            sides >= np.where(outside, 2, 3),
+            "every cell must have at least three sides, or two on the outline, at cells",
+        )
 
         offset = frame[following] - frame
         require(
@@ -218,18 +252,31 @@ class Topology(eqx.Module):
             directed=False,
         )
         require(n_pieces == 1, "the tissue must be in one piece")
-        euler = n_vertices - n_half // 2 + n_faces
-        require(
-            euler == 0,
-            f"vertices - edges + cells must be 0 for a periodic tissue, but is {euler}",
-        )
+        euler = n_vertices - n_half // 2 + n_orbits
+        if self.exterior:
+            require(
+                euler == 2,
+                f"vertices - edges + cells must be 1 for a free tissue, but is {euler - 1}",
+            )
+            require(np.all(frame == 0, axis=1), "`frame` must be 0 in a free tissue, at half-edges")
+            require(cell[twin] != cell, "an edge must lie between two faces, at half-edges")
+            require(
+                cell[half_edge] != self.n_cells,
+                "the exterior must not be on the left of an edge, at edges",
+            )
+        else:
+            require(
+                euler == 0,
+                f"vertices - edges + cells must be 0 for a periodic tissue, but is {euler}",
+            )
 
 
 def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
     """Flip the marked edges (the topological part of a T1 transition).
 
     The flipped half-edges turn clockwise by a quarter turn: the cells that were at an edge's ends
-    become its two sides. No two marked edges may share a cell; geometry is left alone.
+    become its two sides. No two marked edges may share a cell (the exterior does not count); geometry is
+    left alone.
     """
     # At h = v -> w, with t its twin, the four other half-edges counter-clockwise are a, b (at v) and
     # c, d (at w). In the picture h points east; V, L, W, R are the cells around it.
@@ -265,15 +312,19 @@ def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
     fh, ft, fa, fc, fd = (at(topology.frame, slot) for slot in (h, t, a, c, d))
     step = fd - fh
     frame = put(topology.frame, (h, a, b, t, c, d), (fc - step, fh, fa, fa + step, ft, fc))
+    twin, half_edge = at(roll, at(topology.twin, unroll)), at(roll, h)
+    if topology.exterior:  # which stays on the right of edges
+        outside = at(cell, half_edge) == topology.n_cells
+        half_edge = jnp.where(outside, at(twin, half_edge), half_edge)
     return eqx.tree_at(
         lambda m: (m.twin, m.cell, m.frame, m.edge, m.half_edge),
         topology,
         (
-            at(roll, at(topology.twin, unroll)),
+            twin,
             cell,
             frame,
             at(topology.edge, unroll),
-            at(roll, h),
+            half_edge,
         ),
     )
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._arcs import length_factor
 from vertax._misc import is_concrete
 from vertax._tissue import Tissue
 from vertax._topology import edge_neighbourhood, flip_edges, source, take
@@ -39,7 +40,12 @@ class T1(AbstractTransitions):
     turned inside out are candidates too. A sweep tries every candidate once, all that share no cell
     together, shortest first.
 
-    A flip that would leave a cell with two sides, or an edge with one cell on both sides, is refused.
+    Lengths are those of arcs where edges are arcs; an edge that flips becomes straight, or an arc of
+    angle 0.
+
+    A flip that would leave a cell with two sides (with one, if the other is an arc on the outline), or
+    an edge with one cell or the exterior on both sides, is refused: so a free tissue stays in one
+    piece. Edges at pinned vertices do not flip.
 
     **Arguments:**
 
@@ -89,12 +95,11 @@ class T1(AbstractTransitions):
 
             def judge() -> tuple[Tissue, Bool[Array, " edges"]]:
                 length = jnp.maximum(corner.length, self.threshold)
-                stretch = lambda which: corner.place(tissue, which, corner.along, length)
-                flip = lambda which: eqx.tree_at(
-                    lambda t: t.topology,
-                    corner.place(tissue, which, corner.across, length),
-                    flip_edges(tissue.topology, which),
-                )
+                chord = length / corner.stretch
+                stretch = lambda which: corner.place(tissue, which, corner.along, chord)
+                flip = lambda which: _straightened(
+                    corner.place(tissue, which, corner.across, length), which
+                ).with_topology(flip_edges(tissue.topology, which))
                 if isinstance(energy, AbstractLocalEnergy):
                     accepted = _judge_local(energy, chosen, corner, stretch, flip)
                 else:
@@ -119,6 +124,7 @@ class _EdgeFrames(eqx.Module):
     cells: Int[Array, "edges 4"]  # left, right, at the start, at the end
     edges: Int[Array, "edges 5"]  # the edge itself and its four neighbours
     vector: Float[Array, "edges 2"]
+    stretch: Float[Array, " edges"]  # length over distance of the ends
     length: Float[Array, " edges"]
     along: Float[Array, "edges 2"]
     across: Float[Array, "edges 2"]
@@ -134,18 +140,24 @@ class _EdgeFrames(eqx.Module):
         self.edges = take(m.edge, jnp.stack([h, a, b, c, d], axis=-1))
         forward = tissue.edge_vectors
         # Half-edge vectors: an edge's own vector or its opposite.
-        own = take(h, m.edge) == jnp.arange(m.n_half_edges, dtype=h.dtype)
         outward = take(forward, m.edge)
-        outward = jnp.where(own[:, None], outward, -outward)
+        outward = jnp.where(m.forward[:, None], outward, -outward)
         self.vector = forward
-        self.length = jnp.sqrt(jnp.sum(forward**2, axis=-1))
+        chord = jnp.sqrt(jnp.sum(forward**2, axis=-1))
+        self.stretch = jnp.ones_like(chord)
+        leaving = outward
+        if tissue.angles is not None:
+            self.stretch = length_factor(tissue.edge_angles)
+            first, last = (take(tangent, m.edge) for tangent in tissue.edge_tangents)
+            leaving = jnp.where(m.forward[:, None], first, -last)
+        self.length = chord * self.stretch
         # At a short edge the far ends of the four neighbours show which way the edge ought to point;
         # its own vector may have shrunk to nothing or turned around.
         ahead = take(outward, c) + take(outward, d)
         behind = take(outward, a) + take(outward, b)
         axis = ahead - behind + 2 * forward
         upright = jnp.sum(axis * forward, axis=-1) >= 0
-        direction = jnp.where((self.length > 0)[:, None], forward, axis)
+        direction = jnp.where((chord > 0)[:, None], forward, axis)
         direction = jnp.where(upright[:, None], direction, -direction)
         norm = jnp.sqrt(jnp.sum(direction**2, axis=-1, keepdims=True))
         self.along = direction / jnp.where(norm > 0, norm, 1)
@@ -153,14 +165,16 @@ class _EdgeFrames(eqx.Module):
         self.across = jnp.stack([self.along[:, 1], -self.along[:, 0]], axis=-1)
         # Three directions are in counter-clockwise order if at least two of their consecutive cross
         # products are positive. An edge that passed through length 0 spoils that order at both ends.
-        u = outward.reshape(-1, 3, 2)
+        u = leaving.reshape(-1, 3, 2)
         v = jnp.roll(u, -1, axis=1)
         disordered = jnp.sum(u[..., 0] * v[..., 1] < u[..., 1] * v[..., 0], axis=1) >= 2
         self.inside_out = take(disordered, self.start) & take(disordered, self.end) & ~upright
         left, right, at_start, at_end = (self.cells[:, k] for k in range(4))
-        fewest = jnp.min(take(m.neighbour_counts, self.cells[:, :2]), axis=-1)
+        spare = jnp.min(_spare_sides(tissue), axis=-1)
         losses = jnp.where(left == right, 2, 1)
-        self.can_flip = (fewest - losses >= 3) & (at_start != at_end) & (self.start != self.end)
+        self.can_flip = (spare >= losses) & (at_start != at_end) & (self.start != self.end)
+        if tissue.pinned is not None:
+            self.can_flip &= ~take(tissue.pinned, self.start) & ~take(tissue.pinned, self.end)
 
     def place(
         self,
@@ -172,22 +186,44 @@ class _EdgeFrames(eqx.Module):
         """Lay the marked edges in a direction, about their midpoint, with a given length."""
         half = 0.5 * (direction * length[:, None] - self.vector)
         half = jnp.where(which[:, None], half, 0)
-        vertices = tissue.vertices.at[self.start].add(-half).at[self.end].add(half)
-        return eqx.tree_at(lambda t: t.vertices, tissue, vertices)
+        return tissue.with_vertices(
+            tissue.vertices.at[self.start].add(-half).at[self.end].add(half)
+        )
+
+
+def _spare_sides(tissue: Tissue) -> Int[Array, "edges 2"]:
+    """How many sides more than it needs the cell left, and right, of each edge has without its arc."""
+    m = tissue.topology
+    face_sums = lambda values: jax.ops.segment_sum(values, m.cell, m.n_faces)
+    sides = take(face_sums(jnp.ones_like(m.cell)), m.edge_cells)
+    if not m.exterior or tissue.angles is None:
+        return sides - 3
+    # Two sides bound a cell if one is an arc on the outline, other than the edge that leaves; two arcs
+    # bound the exterior.
+    arcs = take(face_sums(take(m.on_outline, m.edge).astype(m.cell.dtype)), m.edge_cells)
+    return sides - jnp.where(arcs > m.on_outline[:, None], 2, 3)
+
+
+def _straightened(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
+    if tissue.angles is None:
+        return tissue
+    return eqx.tree_at(lambda t: t.angles, tissue, jnp.where(which, 0, tissue.angles))
 
 
 def _independent(
     candidates: Bool[Array, " edges"], corner: _EdgeFrames, n_cells: int
 ) -> Bool[Array, " edges"]:
     """The candidates that are the shortest of all candidates at each of their four cells."""
-    # Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute.
+    # Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute. (An
+    # edge lies between two faces, so sharing the exterior alone is no harm.)
     n = candidates.shape[0]
     rank = (
         jnp.zeros(n, jnp.int32).at[jnp.argsort(corner.length)].set(jnp.arange(n, dtype=jnp.int32))
     )
     rank = jnp.where(candidates, rank, n)
-    best = jnp.full(n_cells, n, jnp.int32).at[corner.cells].min(rank[:, None])
-    return candidates & jnp.all(take(best, corner.cells) == rank[:, None], axis=-1)
+    best = jnp.full(n_cells, n, jnp.int32).at[corner.cells].min(rank[:, None], mode="drop")
+    first = best.at[corner.cells].get(mode="fill", fill_value=0) == rank[:, None]
+    return candidates & jnp.all(first | (corner.cells == n_cells), axis=-1)
 
 
 _Trial = Callable[[Bool[Array, " edges"]], Tissue]
@@ -209,7 +245,8 @@ def _judge_local(
     repeated = [jnp.zeros(cells.shape[0], bool)]
     for k in range(1, 4):
         repeated.append(jnp.any(cells[:, :k] == cells[:, k : k + 1], axis=-1))
-    change = jnp.where(jnp.stack(repeated, axis=-1), 0, take(by_cell, cells))
+    by_cell = by_cell.at[cells].get(mode="fill", fill_value=0)  # the exterior has no energy
+    change = jnp.where(jnp.stack(repeated, axis=-1), 0, by_cell)
     return chosen & (jnp.sum(change, axis=-1) + jnp.sum(take(by_edge, corner.edges), axis=-1) < 0)
 
 

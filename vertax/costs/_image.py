@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from vertax._boundary import Periodic
+from vertax._boundary import AbstractBoundary, Free, Periodic
 from vertax._misc import is_concrete
 from vertax._tissue import Tissue
 from vertax.costs._cost import AbstractLeastSquaresCost
@@ -27,46 +27,48 @@ def render(
     psf_width: float | Float[Array, ""],
     *,
     points_per_edge: int = 32,
+    pixel_size: float | Float[Array, ""] | None = None,
 ) -> Float[Array, "rows columns"]:
-    r"""Fluorescence image of the edges of a periodic tissue (paper, Methods, "Mesh-Image cost").
+    r"""Fluorescence image of the edges of a tissue (paper, Methods, "Mesh-Image cost").
 
-    The edges, each carrying its length, blurred by a Gaussian of standard deviation `psf_width`. The
-    image covers one period: pixel `[r, c]` is centred at the fraction $(c + \tfrac12)/columns$ of the
-    first lattice vector and $(r + \tfrac12)/rows$ of the second, so rows follow $y$.
+    The edges, arcs as arcs, each carrying its length, blurred by a Gaussian of standard deviation
+    `psf_width`. The image of a periodic tissue covers one period: pixel `[r, c]` is centred at the
+    fraction $(c + \tfrac12)/columns$ of the first lattice vector and $(r + \tfrac12)/rows$ of the second,
+    so rows follow $y$. That of a free tissue has a corner at the origin: pixel `[r, c]` is centred at
+    $x = c + \tfrac12$, $y = r + \tfrac12$ times `pixel_size`.
 
     **Arguments:**
 
-    - `tissue`: a tissue with a [`Periodic`][vertax.Periodic] boundary.
+    - `tissue`: a tissue with a [`Periodic`][vertax.Periodic] or a [`Free`][vertax.Free] boundary.
     - `shape`: rows and columns, at least 6 each.
     - `psf_width`: standard deviation of the point spread function, in units of length. Accurate to a
         few parts in a thousand from one pixel on, to parts in a million from two.
     - `points_per_edge`: quadrature points on each edge; 0.7 times this number of point spread widths is
         the longest edge that is rendered to parts in a hundred thousand.
+    - `pixel_size`: length of a pixel side, for a free tissue (and only then).
 
     **Returns:** line density (length of edge per area) at the pixel centres.
 
     **Raises:**
 
-    - `TypeError` for a boundary that is not periodic; `ValueError` for too small an image.
+    - `TypeError` for a boundary of another kind; `ValueError` for too small an image, and if
+        `pixel_size` is missing or too much.
     """
-    if not isinstance(tissue.boundary, Periodic):
-        raise TypeError(
-            f"Argument `tissue` must have a Periodic boundary, but it is {type(tissue.boundary).__name__}."
-        )
-    rows, columns = shape
     if min(shape) < _SPLINE_POINTS:
         raise ValueError(f"Argument `shape` must be at least 6 × 6 pixels, but is {shape}.")
-    lattice = tissue.boundary.lattice
+    lattice, (rows, columns) = _canvas(tissue.boundary, shape, pixel_size)
     dtype = tissue.vertices.dtype
     nodes, weights = np.polynomial.legendre.leggauss(points_per_edge)
     nodes, weights = jnp.asarray(nodes / 2 + 0.5, dtype), jnp.asarray(weights / 2, dtype)
 
-    start, vector = tissue.edge_segments
-    points = start[:, None] + nodes[:, None] * vector[:, None]
+    points = tissue.edge_points(nodes)
     mass = (tissue.edge_lengths[:, None] * weights).reshape(-1)
     # Rows of `inverse` are the reciprocal vectors: fraction = inverse @ position.
     inverse = jnp.linalg.inv(lattice).T
     fractions = points.reshape(-1, 2) @ inverse.T
+    if isinstance(tissue.boundary, Free):
+        # What is further from the image than half its size would come back in from the other side.
+        mass = jnp.where(jnp.all(jnp.abs(fractions - 0.25) < 0.5, axis=-1), mass, 0)
     column, wx = _spread(fractions[:, 0] * columns - 0.5, columns)
     row, wy = _spread(fractions[:, 1] * rows - 0.5, rows)
     index = row[:, :, None] * columns + column[:, None, :]
@@ -79,7 +81,29 @@ def render(
     spline = (jnp.sinc(kx / columns) * jnp.sinc(ky / rows)) ** _SPLINE_POINTS
     transfer = jnp.exp(-0.5 * psf_width**2 * jnp.sum(xi**2, axis=-1)) / spline
     pixel_area = jnp.linalg.det(lattice) / (rows * columns)
-    return jnp.fft.irfft2(jnp.fft.rfft2(grid) * transfer, s=shape) / pixel_area
+    image = jnp.fft.irfft2(jnp.fft.rfft2(grid) * transfer, s=(rows, columns)) / pixel_area
+    return image[: shape[0], : shape[1]]
+
+
+def _canvas(
+    boundary: AbstractBoundary, shape: tuple[int, int], pixel_size: float | Array | None
+) -> tuple[Float[Array, "2 2"], tuple[int, int]]:
+    """A periodic lattice and its number of pixels, whose first ones are the image."""
+    if isinstance(boundary, Periodic) and pixel_size is None:
+        return boundary.lattice, shape
+    if isinstance(boundary, Free) and pixel_size is not None:
+        # Twice as wide and high, so that nothing wraps around into the image.
+        rows, columns = 2 * shape[0], 2 * shape[1]
+        return jnp.diag(jnp.array([columns, rows]) * pixel_size), (rows, columns)
+    if isinstance(boundary, Periodic | Free):
+        raise ValueError(
+            "Argument `pixel_size` is needed for a free tissue, and follows from the box for a periodic "
+            f"one, but is {pixel_size} with a boundary of class {type(boundary).__name__}."
+        )
+    raise TypeError(
+        "Argument `tissue` must have a Periodic or Free boundary, but it is "
+        f"{type(boundary).__name__}."
+    )
 
 
 _SPLINE_POINTS = 6
@@ -115,12 +139,13 @@ class MeshImage(AbstractLeastSquaresCost):
 
     **Arguments:**
 
-    - `image`: the measured image of one period of the tissue, rows along y; see
-        [`mirror`][vertax.costs.mirror] for one that is not periodic.
+    - `image`: the measured image, rows along y: of one period of the tissue (see
+        [`mirror`][vertax.costs.mirror] for one that is not periodic), or of a free tissue.
     - `psf_width`: standard deviation of the point spread function, in units of length.
     - `weight`: how much each pixel counts, at least 0; all the same by default.
     - `points_per_edge`: quadrature points on each edge, see [`render`][vertax.costs.render].
     - `fit_intensity`: False compares with the image as it is ($a = 1$, $b = 0$, no standardisation).
+    - `pixel_size`: length of a pixel side, for a free tissue (and only then).
 
     **Raises:**
 
@@ -133,6 +158,7 @@ class MeshImage(AbstractLeastSquaresCost):
     weight: Float[Array, "rows columns"]
     points_per_edge: int = eqx.field(static=True)
     fit_intensity: bool = eqx.field(static=True)
+    pixel_size: Float[Array, ""] | None
 
     def __init__(
         self,
@@ -142,6 +168,7 @@ class MeshImage(AbstractLeastSquaresCost):
         weight: ArrayLike | None = None,
         points_per_edge: int = 32,
         fit_intensity: bool = True,
+        pixel_size: float | Float[Array, ""] | None = None,
     ):
         pixels = np.asarray(image, float)
         if pixels.ndim != 2 or min(pixels.shape) < _SPLINE_POINTS:
@@ -179,11 +206,20 @@ class MeshImage(AbstractLeastSquaresCost):
         self.weight = jnp.asarray(weights)
         self.points_per_edge = points_per_edge
         self.fit_intensity = fit_intensity
+        if pixel_size is not None and is_concrete(pixel_size) and not pixel_size > 0:
+            raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
+        self.pixel_size = None if pixel_size is None else jnp.asarray(pixel_size, self.image.dtype)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """Difference of the two images at each pixel, times the root of its share of the weights."""
         shape = (self.image.shape[0], self.image.shape[1])
-        model = render(tissue, shape, self.psf_width, points_per_edge=self.points_per_edge)
+        model = render(
+            tissue,
+            shape,
+            self.psf_width,
+            points_per_edge=self.points_per_edge,
+            pixel_size=self.pixel_size,
+        )
         if self.fit_intensity:
             mean = lambda x: jnp.sum(self.weight * x)
             model = model - mean(model)

@@ -84,11 +84,13 @@ class LocalSum(AbstractLocalEnergy):
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""
-        return sum((term.cell_terms(tissue) for term in self.terms), jnp.zeros(()))
+        zero = jnp.zeros((), tissue.vertices.dtype)
+        return sum((term.cell_terms(tissue) for term in self.terms), zero)
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
         """Energy of each edge."""
-        return sum((term.edge_terms(tissue) for term in self.terms), jnp.zeros(()))
+        zero = jnp.zeros((), tissue.vertices.dtype)
+        return sum((term.edge_terms(tissue) for term in self.terms), zero)
 
 
 def _terms(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:

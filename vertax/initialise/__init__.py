@@ -1,5 +1,6 @@
 """Ways to make a first tissue."""
 
+from vertax.initialise._free import free_voronoi as free_voronoi
 from vertax.initialise._labels import Segmentation as Segmentation, from_labels as from_labels
 from vertax.initialise._microscopy import from_microscopy as from_microscopy
 from vertax.initialise._segmenters import (
@@ -7,4 +8,5 @@ from vertax.initialise._segmenters import (
     Cellpose as Cellpose,
     Watershed as Watershed,
 )
+from vertax.initialise._skeleton import labels_from_skeleton as labels_from_skeleton
 from vertax.initialise._voronoi import hexagonal as hexagonal, periodic_voronoi as periodic_voronoi

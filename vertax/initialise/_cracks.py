@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -76,6 +76,8 @@ class Mesh(NamedTuple):
     frame: Int[np.ndarray, "halfedges 2"]
     cells: Int[np.ndarray, " cells"]
     """The number that each cell has in the image, ascending."""
+    bulge: Float[np.ndarray, " halfedges"]
+    """Area between each edge as the pixels have it and its chord, right of the chord, in pixels."""
 
 
 def crack_graph(image: Int[np.ndarray, "rows columns"]) -> CrackGraph:
@@ -104,8 +106,10 @@ def crack_graph(image: Int[np.ndarray, "rows columns"]) -> CrackGraph:
     )
 
 
-def enclosed_cells(graph: CrackGraph) -> dict[int, int]:
+def enclosed_cells(graph: CrackGraph, exterior: int | None = None) -> dict[int, int]:
     """Cells that lie inside another cell, singly or in groups, and the cell that encloses them.
+
+    If there is an `exterior`, its outline is one, and belongs to the tissue.
 
     **Raises:**
 
@@ -127,7 +131,10 @@ def enclosed_cells(graph: CrackGraph) -> dict[int, int]:
         + np.bincount(part_of_crack[first], minlength=n_parts)
     )
     left, right = graph.interfaces()
-    if not np.any(euler == 0):
+    is_tissue = euler == 0
+    if exterior is not None:
+        is_tissue = np.arange(n_parts) == part_of_crack[np.argmax(left == exterior)]
+    if not np.any(is_tissue):
         # The outline of a disk makes four left turns in all, that of a hole four right turns, and
         # an outline that goes around the torus none: cells without an outline of the first kind are
         # to blame.
@@ -136,7 +143,7 @@ def enclosed_cells(graph: CrackGraph) -> dict[int, int]:
         raise NotADiskError(np.setdiff1d(left, left[turns[face] == 4]))
     if n_parts == 1:
         return {}
-    in_tissue = np.isin(left, left[part_of_crack == np.argmax(euler == 0)])
+    in_tissue = np.isin(left, left[part_of_crack == np.argmax(is_tissue)])
     cells, index = np.unique(np.concatenate([left, right]), return_inverse=True)
     a, b = index[: len(left)], index[len(left) :]
     tissue = np.zeros(len(cells), bool)
@@ -203,8 +210,11 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     half_edge[crack[real]] = np.flatnonzero(real)
     every = np.arange(len(graph.target))
     onwards = np.where(degree[graph.target] == 2, graph.following, every)
-    last, way = _follow(onwards, np.tile(_STEP, (len(graph.corner), 1)))
+    last, way, swept = _follow(onwards, np.tile(_STEP, (len(graph.corner), 1)))
+    swept += _cross(way, _STEP[last % 4])
     way += _STEP[last % 4]
+    bulge = np.zeros(len(crack))
+    bulge[real] = 0.5 * swept[crack[real]]
     twin = 3 * np.repeat(partner, 3) + 2
     displacement = np.zeros((len(crack), 2), int)
     twin[real] = half_edge[graph.twin[last[crack[real]]]]
@@ -221,25 +231,33 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     first = np.unique(cell, return_index=True)[1]
     previous[first] = first
     frame = _follow(previous, step)[1]
-    return Mesh(position, twin, following, cell, frame, cells)
+    return Mesh(position, twin, following, cell, frame, cells, bulge)
 
 
 def _follow(
     pointer: Int[np.ndarray, " nodes"], value: Int[np.ndarray, "nodes 2"]
-) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, "nodes 2"]]:
+) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, "nodes 2"], Int[np.ndarray, " nodes"]]:
     """End of every chain of pointers (a node that points to itself), and the sum up to there.
+
+    Also twice the area that the chain of vectors encloses with their sum, on the right of the sum.
 
     Pointer doubling: as many passes as the longest chain has binary digits. Closed chains have no
     end; theirs means nothing.
     """
     total = np.where((pointer == np.arange(len(pointer)))[:, None], 0, value)
+    swept = np.zeros(len(pointer), int)
     for _ in range(len(pointer).bit_length()):
         onwards = pointer[pointer]
         if np.array_equal(onwards, pointer):
             break
+        swept = swept + swept[pointer] + _cross(total, total[pointer])
         total = total + total[pointer]
         pointer = onwards
-    return pointer, total
+    return pointer, total, swept
+
+
+def _cross(p: Int[np.ndarray, "n 2"], q: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
 
 
 def _components(

@@ -5,24 +5,24 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
-from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from jaxtyping import Array, Bool, Int, Shaped
 
-from vertax._boundary import Periodic
+from vertax._arcs import angle_of_area
+from vertax._boundary import Free, Periodic
 from vertax._tissue import Tissue
 from vertax._topology import Topology
-from vertax.initialise._cracks import (
-    CrackGraph,
-    Mesh,
-    NotADiskError,
-    build_mesh,
-    crack_graph,
-    enclosed_cells,
+from vertax.initialise._cracks import Mesh, crack_graph
+from vertax.initialise._repairs import (
+    fill_gaps,
+    join_pieces,
+    largest_cluster,
+    listed,
+    mesh_or_repairs,
+    untangle,
+    with_exterior,
 )
 
-_BOUNDARIES = ("mirrored", "periodic")
+_BOUNDARIES = ("mirrored", "periodic", "free")
 
 
 class Segmentation(eqx.Module):
@@ -33,7 +33,7 @@ class Segmentation(eqx.Module):
     """
 
     tissue: Tissue
-    """The tissue. The original image lies at the origin of its box."""
+    """The tissue. The original image has its corner at the origin."""
     labels: Int[np.ndarray, " cells"]
     """Label in the given mask of each cell; a mirrored cell carries the label of its original."""
     whole: Bool[np.ndarray, " cells"]
@@ -56,6 +56,7 @@ def from_labels(
     *,
     boundary: str = "mirrored",
     pixel_size: float | None = None,
+    gap_width: float = 3.0,
     softening: float | None = None,
 ) -> Segmentation:
     """Tissue with the cells and neighbours of a label image (paper, "Mesh initialization").
@@ -78,6 +79,11 @@ def from_labels(
     The last two steps are repeated until nothing is left to do. `absorbed` tells which labels are
     gone.
 
+    In a free tissue the pixels without a label are the exterior, but for lines between cells, narrow
+    bays and holes. The largest cluster of cells stays. Each piece of its outline between two
+    junctions becomes an arc, which keeps the area of its cell; a cell on the outline may have two
+    sides.
+
     A cell so concave that the polygon of its vertices has less than a hundredth of its area in the
     image, or is inside out, is inflated a little by moving its vertices; `inflated` tells which.
 
@@ -86,8 +92,11 @@ def from_labels(
     - `mask`: a label for each pixel, integers of shape (rows, columns).
     - `boundary`: how the mask becomes periodic. `"mirrored"` mirrors it about its right and bottom
         border into a box of twice the width and height, as in the paper; cells at the border merge
-        with their mirror image. `"periodic"` takes a mask that wraps around already.
+        with their mirror image. `"periodic"` takes a mask that wraps around already. `"free"` makes
+        a free cluster in an exterior, with arcs; what lies beyond the image is exterior too.
     - `pixel_size`: length of a pixel side; by default such that the mean cell area is 1.
+    - `gap_width`: how wide lines between cells may be, in pixels, not to be taken for a part of the
+        exterior of a free tissue.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
 
     **Returns:** a [`Segmentation`][vertax.initialise.Segmentation]. Cells of the original image
@@ -97,18 +106,22 @@ def from_labels(
 
     - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
         labels, or has a cell that reaches around the (mirrored) image or around all other cells;
-        for an unknown `boundary` or a `pixel_size` that is not positive.
+        for an unknown `boundary`, a `pixel_size` that is not positive or a negative `gap_width`.
     """
     check_options(boundary, pixel_size)
+    if not (np.isfinite(gap_width) and gap_width >= 0):
+        raise ValueError(f"Argument `gap_width` must be at least 0, but is {gap_width}.")
     values, image = _checked(np.asarray(mask))
+    if boundary == "free":
+        return _free_from_labels(values, image, pixel_size, gap_width, softening)
     periodic = boundary == "periodic"
-    image = _fill_gaps(image, periodic)
-    image = _join_pieces(image, periodic)
+    image = fill_gaps(image, periodic)
+    image = join_pieces(image, periodic)
 
     n = len(values)
     while True:
         cells = image if periodic else _mirror(image, n)
-        mesh = _mesh_or_repairs(crack_graph(cells), values)
+        mesh = mesh_or_repairs(crack_graph(cells), values)
         if isinstance(mesh, Mesh):
             break
         image = mesh[image]
@@ -116,13 +129,9 @@ def from_labels(
     label = mesh.cells % n
     size = np.array(cells.shape[::-1], float)
     pixels = np.bincount(cells.ravel(), minlength=4 * n)[mesh.cells]
-    vertices, moved = _untangle(mesh, size, pixels)
+    vertices, moved = untangle(mesh, size, pixels, 0 * pixels)
     if vertices is None:
-        raise ValueError(
-            "Argument `mask` must hold cells that polygons can stand for, but no polygons of "
-            f"positive area were found around the labels {_listed(values[label[moved]])}. Smooth "
-            "their outlines or merge them with a neighbour."
-        )
+        raise _no_polygons(values[label[moved]])
     if pixel_size is None:
         pixel_size = float(np.sqrt(len(label) / size.prod()))
     dtype = jnp.result_type(float)
@@ -143,6 +152,74 @@ def from_labels(
         inflated=np.unique(values[label[moved]]),
         pixel_size=float(pixel_size),
         image_shape=(int(image.shape[0]), int(image.shape[1])),
+    )
+
+
+def _free_from_labels(
+    values: Int[np.ndarray, " labels"],
+    image: Int[np.ndarray, "rows columns"],
+    pixel_size: float | None,
+    gap_width: float,
+    softening: float | None,
+) -> Segmentation:
+    """The part of `from_labels` for a free cluster."""
+    exterior = len(values)
+    rows, columns = image.shape
+    image, margin = with_exterior(image, exterior, gap_width)
+    image = join_pieces(image, periodic=False)
+    while True:
+        image = largest_cluster(image, exterior)
+        mesh = mesh_or_repairs(crack_graph(image), np.append(values, 0), exterior)
+        if isinstance(mesh, Mesh):
+            break
+        image = mesh[image]
+
+    label = mesh.cells[:-1]
+    n_cells = len(label)
+    left, right = mesh.cell, mesh.cell[mesh.twin]
+    outline = (left < n_cells) & (right == n_cells)
+    pixels = np.bincount(image.ravel(), minlength=exterior + 1)[mesh.cells]
+    bulge = np.bincount(left, np.where(outline, mesh.bulge, 0.0), n_cells + 1)
+    pixels[-1] = 0  # the exterior is no cell, and has no area
+    bulge[-1] = np.inf
+    size = np.array(image.shape[::-1], float)
+    vertices, moved = untangle(mesh, size, pixels, bulge)
+    moved = moved[:-1]
+    if vertices is None:
+        raise _no_polygons(values[label[moved]])
+    topology = Topology(mesh.twin, mesh.cell, mesh.frame, exterior=True)
+    chord = vertices[mesh.twin[outline] // 3] - np.repeat(vertices, 3, axis=0)[outline]
+    angles = np.zeros(topology.n_edges)
+    angles[np.asarray(topology.edge)[outline]] = angle_of_area(
+        mesh.bulge[outline], np.linalg.norm(chord, axis=1)
+    )
+    if pixel_size is None:
+        pixel_size = float(np.sqrt(n_cells / pixels.sum()))
+    dtype = jnp.result_type(float)
+    home = image[margin : margin + rows, margin : margin + columns]
+    top_bottom, left_right = _touching(home, exterior + 1)
+    return Segmentation(
+        tissue=Tissue(
+            jnp.asarray((vertices - margin) * pixel_size, dtype),
+            topology,
+            Free(),
+            softening,
+            angles=jnp.asarray(angles, dtype),
+        ),
+        labels=values[label],
+        whole=~(top_bottom | left_right)[label],
+        absorbed=np.setdiff1d(values, values[label]),
+        inflated=np.unique(values[label[moved]]),
+        pixel_size=float(pixel_size),
+        image_shape=(rows, columns),
+    )
+
+
+def _no_polygons(labels: Int[np.ndarray, " labels"]) -> ValueError:
+    return ValueError(
+        "Argument `mask` must hold cells that polygons can stand for, but no polygons of positive "
+        f"area were found around the labels {listed(labels)}. Smooth their outlines or merge them "
+        "with a neighbour."
     )
 
 
@@ -184,76 +261,6 @@ def _checked(
     return values.astype(np.int64), np.maximum(image, -1)
 
 
-def _fill_gaps(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.ndarray:
-    """Give each gap (-1) the nearest label."""
-    gap = image < 0
-    if not gap.any():
-        return image
-    pad = np.zeros((2, 2), int)
-    if periodic:
-        # The nearest label around the torus is no farther than the nearest within the image. (A
-        # mirror image is never nearer than its original, so a mirrored mask needs no such care.)
-        reach = np.ceil(np.asarray(distance_transform_edt(gap)).max())
-        pad = np.repeat(np.minimum(reach, image.shape)[:, None], 2, axis=1).astype(int)
-        gap = np.pad(gap, pad, mode="wrap")
-    y, x = np.asarray(distance_transform_edt(gap, return_distances=False, return_indices=True))
-    rows, columns = image.shape
-    home = (slice(pad[0, 0], pad[0, 0] + rows), slice(pad[1, 0], pad[1, 0] + columns))
-    return image[(y[home] - pad[0, 0]) % rows, (x[home] - pad[1, 0]) % columns]
-
-
-def _join_pieces(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.ndarray:
-    """Keep the largest piece of each label, and give the others to their neighbours."""
-    # Runs of equal pixels along a row are the nodes: far fewer than pixels. Two runs in adjacent
-    # rows overlap where one of them starts.
-    start = np.ones(image.shape, bool)
-    start[:, 1:] = image[:, 1:] != image[:, :-1]
-    run = np.cumsum(start.ravel()).reshape(image.shape) - 1
-    met = start[1:] | start[:-1]
-    above, below = [run[:-1][met]], [run[1:][met]]
-    if periodic:
-        above += [run[-1], run[:, -1]]
-        below += [run[0], run[:, 0]]
-    a, b = np.concatenate(above), np.concatenate(below)
-    label = image[start]
-    same = label[a] == label[b]
-    links = coo_array((np.ones(same.sum(), bool), (a[same], b[same])), shape=(len(label),) * 2)
-    n_pieces, piece = connected_components(links, directed=False)
-    n_labels = int(label.max()) + 1
-    if n_pieces == n_labels:
-        return image
-    label_of = np.zeros(n_pieces, int)
-    label_of[piece] = label
-    piece = piece[run]
-    sizes = np.bincount(piece.ravel(), minlength=n_pieces)
-    order = np.lexsort((np.arange(n_pieces), -sizes, label_of))
-    kept = np.zeros(n_pieces, bool)
-    kept[order[np.unique(label_of[order], return_index=True)[1]]] = True
-    a, b = piece[:, :-1].ravel(), piece[:, 1:].ravel()
-    c, d = piece[:-1].ravel(), piece[1:].ravel()
-    pairs = [np.stack([a, b])[:, a != b], np.stack([c, d])[:, c != d]]
-    if periodic:
-        pairs += [np.stack([piece[:, -1], piece[:, 0]]), np.stack([piece[-1], piece[0]])]
-    a, b = np.concatenate(pairs, axis=1)
-    a, b = np.concatenate([a, b]), np.concatenate([b, a])
-    while not kept.all():  # pieces among pieces wait until a neighbour has found its label
-        use = ~kept[a] & kept[b]
-        found, into = _longest_interface(a[use], label_of[b[use]])
-        label_of[found] = into
-        kept[found] = True
-    return label_of.astype(image.dtype)[piece]
-
-
-def _longest_interface(
-    a: Int[np.ndarray, " sides"], b: Int[np.ndarray, " sides"]
-) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, " found"]]:
-    """For each number in `a`, the number in `b` paired with it most often (or the smallest)."""
-    pairs, counts = np.unique(np.stack([a, b]), axis=1, return_counts=True)
-    order = np.lexsort((pairs[1], -counts, pairs[0]))
-    first = order[np.unique(pairs[0][order], return_index=True)[1]]
-    return pairs[0][first], pairs[1][first]
-
-
 def _touching(
     image: Int[np.ndarray, "rows columns"], n: int
 ) -> tuple[Bool[np.ndarray, " labels"], Bool[np.ndarray, " labels"]]:
@@ -281,85 +288,3 @@ def _mirror(image: Int[np.ndarray, "rows columns"], n: int) -> np.ndarray:
     upper = np.hstack([quadrant(0, 0)[image], quadrant(0, 1)[flipped]])
     lower = np.hstack([quadrant(1, 0)[image], quadrant(1, 1)[flipped]])
     return np.vstack([upper, lower[::-1]])
-
-
-def _mesh_or_repairs(
-    graph: CrackGraph, values: Int[np.ndarray, " labels"]
-) -> Mesh | Int[np.ndarray, " labels"]:
-    """The mesh, or which label each label must become first."""
-    n = len(values)
-    label = np.arange(n)
-    left, right = (side % n for side in graph.interfaces())
-    too_few = (
-        "Argument `mask` must hold enough cells for a mesh of cells with three sides and more, but "
-        f"of its {n} labels too few remain after those inside others or with two sides are "
-        "absorbed. Give a larger image, or a finer segmentation."
-    )
-    if len(left) == 0:
-        raise ValueError(too_few)
-    try:
-        inside = enclosed_cells(graph)
-    except NotADiskError as error:
-        raise ValueError(
-            "Argument `mask` must hold cells that do not surround the others or reach from one "
-            "border of the image to the opposite one (where they would meet themselves across the "
-            f"mirrored or periodic boundary), but the labels {_listed(values[error.cells % n])} "
-            "do. Crop the image, split them, or take a larger image."
-        ) from None
-    if inside:
-        into = label.copy()
-        into[np.array(list(inside)) % n] = np.array(list(inside.values())) % n
-        return into
-    mesh = build_mesh(graph, graph.left % n)
-    sides = np.bincount(mesh.cell)
-    if sides.min() >= 3:
-        return mesh
-    small = np.zeros(n, bool)
-    small[mesh.cells[sides < 3] % n] = True
-    found, host = _longest_interface(left[small[left]], right[small[left]])
-    # Two small cells must not go to each other: between them, the one with the shorter outline goes
-    # first. Then every chain of cells that are absorbed one into the other has an end.
-    outline = np.bincount(left, minlength=n)
-    first = ~small[host] | (outline[found] < outline[host])
-    first |= small[host] & (outline[found] == outline[host]) & (found > host)
-    into = label.copy()
-    into[found[first]] = host[first]
-    while not np.array_equal(into[into], into):
-        into = into[into]
-    return into
-
-
-def _untangle(
-    mesh: Mesh, size: Float[np.ndarray, " xy"], pixels: Int[np.ndarray, " cells"]
-) -> tuple[Float[np.ndarray, "vertices 2"] | None, Bool[np.ndarray, " cells"]]:
-    """Vertices such that every cell has a positive area, and the cells that had next to none.
-
-    Without vertices, the cells that are left over.
-    """
-    vertices = mesh.vertices.astype(float)
-    before = np.empty_like(mesh.following)
-    before[mesh.following] = np.arange(len(before))
-    # Each cell that has less than a hundredth of its pixels gets the smallest displacement of its
-    # corners that makes this two hundredths, to first order: goal - A = sum of (dA/dp) . dp has the
-    # least-norm solution dp = (goal - A) dA/dp / sum of |dA/dp|^2. A few rounds settle what cells
-    # take from each other.
-    least, goal = 0.01 * pixels, 0.02 * pixels
-    ever = bad = np.zeros(len(pixels), bool)
-    for _ in range(300):
-        corners = np.repeat(vertices, 3, axis=0) + mesh.frame * size
-        ends, starts = corners[mesh.following], corners[before]
-        areas = 0.5 * np.bincount(mesh.cell, np.linalg.det(np.stack([corners, ends], axis=1)))
-        bad = areas < least
-        if not bad.any():
-            return vertices, ever
-        ever = ever | bad
-        slope = 0.5 * (ends - starts)[:, ::-1] * [1, -1]
-        norm = np.bincount(mesh.cell, (slope**2).sum(axis=1))
-        factor = np.where(bad, (goal - areas) / np.maximum(norm, 1e-3), 0.0)
-        vertices = vertices + (factor[mesh.cell, None] * slope).reshape(-1, 3, 2).sum(axis=1)
-    return None, bad
-
-
-def _listed(labels: Int[np.ndarray, " labels"]) -> str:
-    unique = np.unique(labels).tolist()
-    return ", ".join(map(str, unique[:10])) + (" and more" if len(unique) > 10 else "")

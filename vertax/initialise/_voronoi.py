@@ -72,13 +72,7 @@ def periodic_voronoi(
         fractions = np.asarray(jax.random.uniform(key, (n_cells, 2), dtype), float)
         points = fractions[spatial_order(fractions)] @ box
 
-    for _ in range(lloyd_steps):
-        vertices, topology = _voronoi(points, box)
-        corners = np.repeat(vertices, 3, axis=0) + np.asarray(topology.frame) @ box
-        cell = np.asarray(topology.cell)
-        sides = np.bincount(cell, minlength=n_cells)
-        points = np.stack([np.bincount(cell, x, n_cells) / sides for x in corners.T], axis=1)
-    vertices, topology = _voronoi(points, box)
+    _, vertices, topology = tessellate(points, box, lloyd_steps)
     return Tissue(jnp.asarray(vertices, dtype), topology, boundary, softening)
 
 
@@ -110,6 +104,19 @@ def hexagonal(nx: int, ny: int, *, area: float = 1.0, softening: float | None = 
     seeds = spacing * np.stack([x.ravel(), y.ravel()], axis=1)
     lattice = spacing * np.array([[nx, 0.0], [0.5 * (ny % 2), ny * np.sqrt(3) / 2]])
     return periodic_voronoi(seeds=seeds, lattice=lattice, softening=softening)
+
+
+def tessellate(
+    seeds: np.ndarray, lattice: np.ndarray, lloyd_steps: int
+) -> tuple[np.ndarray, np.ndarray, Topology]:
+    """Seeds after some Lloyd iterations, and their periodic Voronoi tessellation."""
+    for _ in range(lloyd_steps):
+        vertices, topology = _voronoi(seeds, lattice)
+        corners = np.repeat(vertices, 3, axis=0) + np.asarray(topology.frame) @ lattice
+        cell = np.asarray(topology.cell)
+        sides = np.bincount(cell, minlength=len(seeds))
+        seeds = np.stack([np.bincount(cell, x, len(seeds)) / sides for x in corners.T], axis=1)
+    return seeds, *_voronoi(seeds, lattice)
 
 
 def _voronoi(seeds: np.ndarray, lattice: np.ndarray) -> tuple[np.ndarray, Topology]:

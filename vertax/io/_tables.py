@@ -1,17 +1,18 @@
-"""The paper's tables: `vertTable`, `heTable` and `faceTable` of a periodic rectangle."""
+"""The paper's tables: `vertTable`, `heTable`, `faceTable` and, of a bounded tissue, `angTable`."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vertax._boundary import Periodic
+from vertax._boundary import Free, Periodic
 from vertax._tissue import Tissue
 from vertax._topology import Topology
+from vertax.io._bounded_tables import BoundedTables, checked, with_exterior, without_exterior
 
 
 class Tables(NamedTuple):
@@ -64,7 +65,7 @@ class Tables(NamedTuple):
         return half_edges
 
 
-def from_tables(tables: Tables, *, softening: float | None = None) -> Tissue:
+def from_tables(tables: Tables | BoundedTables, *, softening: float | None = None) -> Tissue:
     """Make a tissue from the paper's tables.
 
     Vertices and cells keep their numbers. Edges are numbered and directed by their first row of
@@ -81,11 +82,12 @@ def from_tables(tables: Tables, *, softening: float | None = None) -> Tissue:
 
     **Arguments:**
 
-    - `tables`: the [`Tables`][vertax.io.Tables].
+    - `tables`: the [`Tables`][vertax.io.Tables], or the [`BoundedTables`][vertax.io.BoundedTables] of
+        a free tissue (whose cell types are not part of a tissue).
     - `softening`: passed on to [`Tissue`][vertax.Tissue]; the paper's code has none, that is 0.
 
     **Returns:** a [`Tissue`][vertax.Tissue] with a rectangular [`Periodic`][vertax.Periodic]
-    boundary.
+    boundary, or a [`Free`][vertax.Free] one.
 
     **Raises:**
 
@@ -93,20 +95,14 @@ def from_tables(tables: Tables, *, softening: float | None = None) -> Tissue:
         contradict themselves or each other, if a vertex does not join exactly three edges, or if
         the faces are not counter-clockwise and cover the box once.
     """
+    if isinstance(tables, BoundedTables):
+        return _from_bounded_tables(tables, softening)
     tables = _checked(tables)
     vert_table, he_table, face_table, width, height = tables
     _check_rows(tables)
-    following, twin, face = he_table[:, 1], he_table[:, 2], he_table[:, 5]
+    following, face = he_table[:, 1], he_table[:, 5]
     frame = _frames(following, face_table, he_table[:, 6:], np.bincount(face))
-    # Row r of the table is half-edge number[r]; `row` is the inverse.
-    number = tables.half_edges
-    row = np.argsort(number)
-    edges = tables.edges
-    topology = Topology(number[twin][row], face[row], frame[row], edges[row])
-    first_rows = np.unique(edges, return_index=True)[1]
-    topology = eqx.tree_at(
-        lambda m: m.half_edge, topology, jnp.asarray(number[first_rows], topology.half_edge.dtype)
-    )
+    topology = _topology(tables, frame, exterior=False)
     # The faces of a torus cover it a whole number of times, whatever their shapes: -1 if they all
     # run clockwise, and something else if offsets are wrong in a way that happens to close around
     # each face. (Shoelace formula, in NumPy: it would be a dozen small compilations.)
@@ -117,13 +113,54 @@ def from_tables(tables: Tables, *, softening: float | None = None) -> Tissue:
             "The faces of `he_table` must run counter-clockwise and cover the box once, but their "
             f"signed areas sum to {cover:.3g} boxes."
         )
-    # Positions in float32 stay so; all others get the precision that JAX is set to.
-    dtype = np.float32 if vert_table.dtype == np.float32 else jnp.result_type(float)
+    dtype = _dtype(vert_table)
     lattice = jnp.asarray(np.diag([width, height]), dtype)
     return Tissue(jnp.asarray(vert_table, dtype), topology, Periodic(lattice), softening)
 
 
-def to_tables(tissue: Tissue) -> Tables:
+def _from_bounded_tables(tables: BoundedTables, softening: float | None) -> Tissue:
+    tables = checked(tables)
+    vert_table, ang_table, *_ = tables
+    he_table, face_table = with_exterior(tables)
+    closed = Tables(vert_table, he_table, face_table, 1.0, 1.0)
+    _check_rows(closed)
+    topology = _topology(closed, np.zeros((len(he_table), 2), int), exterior=True)
+    # The polygon of the outline shows which way the faces run.
+    x, y = vert_table[he_table[:, 3]].T
+    u, v = vert_table[he_table[:, 4]].T
+    cover = 0.5 * np.sum((x * v - y * u)[he_table[:, 5] < len(tables.face_table)])
+    if not cover > 0:
+        raise ValueError(
+            "The faces of `he_table` must run counter-clockwise, but their signed areas sum to "
+            f"{cover:.3g}."
+        )
+    dtype = _dtype(vert_table)
+    vertices, angles = jnp.asarray(vert_table, dtype), jnp.asarray(ang_table, dtype)
+    return Tissue(vertices, topology, Free(), softening, angles=angles)
+
+
+def _topology(tables: Tables, frame: np.ndarray, *, exterior: bool) -> Topology:
+    twin, face = tables.he_table[:, 2], tables.he_table[:, 5]
+    # Row r of the table is half-edge number[r]; `row` is the inverse.
+    number = tables.half_edges
+    row = np.argsort(number)
+    edges = tables.edges
+    topology = Topology(number[twin][row], face[row], frame[row], edges[row], exterior=exterior)
+    first_rows = np.unique(edges, return_index=True)[1]
+    if exterior:
+        outside = face[first_rows] == len(tables.face_table) - 1
+        first_rows = np.where(outside, twin[first_rows], first_rows)
+    return eqx.tree_at(
+        lambda m: m.half_edge, topology, jnp.asarray(number[first_rows], topology.half_edge.dtype)
+    )
+
+
+def _dtype(positions: np.ndarray) -> Any:
+    """Positions in float32 stay so; all others get the precision that JAX is set to."""
+    return np.float32 if positions.dtype == np.float32 else jnp.result_type(float)
+
+
+def to_tables(tissue: Tissue) -> Tables | BoundedTables:
     """Write a tissue as the paper's tables.
 
     Vertices and cells keep their numbers; edge `e` becomes rows `2 e` (in the edge's direction) and
@@ -133,13 +170,15 @@ def to_tables(tissue: Tissue) -> Tables:
 
     **Arguments:**
 
-    - `tissue`: a [`Tissue`][vertax.Tissue] in a rectangular periodic box.
+    - `tissue`: a [`Tissue`][vertax.Tissue] in a rectangular periodic box, or a free one whose inner
+        edges are straight.
 
-    **Returns:** the [`Tables`][vertax.io.Tables].
+    **Returns:** the [`Tables`][vertax.io.Tables], or the [`BoundedTables`][vertax.io.BoundedTables] of
+    a free tissue (all cells of type 0).
 
     **Raises:**
 
-    - `ValueError` for a batch of tissues, if the boundary is not periodic, the box is sheared or
+    - `ValueError` for a batch of tissues, for arcs that tables cannot hold, if the box is sheared or
         its first vector is not along x, or an edge reaches beyond the neighbouring box.
     """
     if tissue.vertices.ndim != 2:
@@ -147,10 +186,18 @@ def to_tables(tissue: Tissue) -> Tables:
             "Argument `tissue` must be a single tissue, but its vertices have shape "
             f"{tissue.vertices.shape}."
         )
+    if tissue.inner_arcs:
+        raise ValueError(
+            "Tables hold arcs on the outline only. Use `save_tissue`, which keeps all."
+        )
     boundary = tissue.boundary
+    if isinstance(boundary, Free):
+        angles = np.asarray(tissue.edge_angles if tissue.angles is None else tissue.angles)
+        he_table = _rows(tissue.topology, np.zeros((tissue.topology.n_half_edges, 2), int))
+        return without_exterior(np.asarray(tissue.vertices), angles, he_table, tissue.n_cells)
     if not isinstance(boundary, Periodic):
         raise ValueError(
-            f"Tables hold periodic tissues only, but the boundary is {type(boundary).__name__}."
+            f"Tables hold periodic and free tissues, but the boundary is {type(boundary).__name__}."
         )
     lattice = np.asarray(boundary.lattice)
     if lattice[0, 1] != 0 or lattice[1, 0] != 0:
@@ -163,13 +210,9 @@ def to_tables(tissue: Tissue) -> Tables:
     vertices = np.asarray(tissue.vertices)
     image = np.floor(vertices / size).astype(int)
     wrapped = np.where(image == 0, vertices, vertices - image.astype(size.dtype) * size)
-    # Rows 2 e and 2 e + 1 are the two half-edges of edge e.
-    half_edge, twin, frame = (np.asarray(x) for x in (m.half_edge, m.twin, m.frame))
-    order = np.stack([half_edge, twin[half_edge]], axis=1).ravel()
-    row = np.argsort(order)
-    source, target = np.arange(m.n_half_edges) // 3, twin // 3
-    following = np.asarray(m.next)
-    previous = np.argsort(following)  # the inverse permutation
+    frame, following, source, target = (
+        np.asarray(x) for x in (m.frame, m.next, m.source, m.target)
+    )
     offset = frame[following] - frame + image[target] - image[source]
     if np.abs(offset).max() > 1:
         far = int(np.argmax(np.abs(offset).max(axis=1)))
@@ -177,11 +220,21 @@ def to_tables(tissue: Tissue) -> Tables:
             "Tables hold edges that reach into a neighbouring box at most, but the edge from "
             f"vertex {source[far]} to vertex {target[far]} goes {offset[far].tolist()} boxes."
         )
-    columns = [row[previous], row[following], row[twin]]
-    columns += [source, target, np.asarray(m.cell), offset[:, 0], offset[:, 1]]
-    he_table = np.stack(columns, axis=1)[order].astype(np.int32)
+    he_table = _rows(m, offset).astype(np.int32)
     face_table = np.unique(he_table[:, 5], return_index=True)[1].astype(np.int32)
     return Tables(wrapped, he_table, face_table, float(size[0]), float(size[1]))
+
+
+def _rows(m: Topology, offset: Int[np.ndarray, "halfedges 2"]) -> Int[np.ndarray, "halfedges 8"]:
+    """The half-edge table; rows 2 e and 2 e + 1 are the two half-edges of edge e."""
+    half_edge, twin, following = (np.asarray(x) for x in (m.half_edge, m.twin, m.next))
+    order = np.stack([half_edge, twin[half_edge]], axis=1).ravel()
+    row = np.argsort(order)
+    source, target = np.arange(m.n_half_edges) // 3, twin // 3
+    previous = np.argsort(following)  # the inverse permutation
+    columns = [row[previous], row[following], row[twin]]
+    columns += [source, target, np.asarray(m.cell), offset[:, 0], offset[:, 1]]
+    return np.stack(columns, axis=1)[order]
 
 
 def _checked(tables: Tables) -> Tables:
@@ -201,7 +254,7 @@ def _checked(tables: Tables) -> Tables:
     if f.ndim != 1 or f.size == 0 or f.dtype.kind not in "iu":
         raise ValueError(
             f"Table `face_table` must hold integers, shape (faces,), but has shape {f.shape} and "
-            f"type {f.dtype}. (Tables of bounded tissues are another form.)"
+            f"type {f.dtype}. (For bounded tissues pass `BoundedTables`.)"
         )
     if not (np.isfinite([width, height]).all() and width > 0 and height > 0):
         raise ValueError(f"The width and height must be positive, but are {width} and {height}.")

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vertax._boundary import AbstractBoundary, Periodic
+from vertax._boundary import AbstractBoundary, Free, Periodic
 from vertax._tissue import Tissue
 from vertax._topology import Topology
 from vertax.io._atomic import atomic_write
@@ -30,6 +30,7 @@ class _BoundaryRecord(NamedTuple):
 # A new boundary class is one more entry. Names and fields are part of the file format: they stay.
 _BOUNDARIES: dict[str, _BoundaryRecord] = {
     "periodic": _BoundaryRecord(Periodic, {"lattice": (2, 2)}),
+    "free": _BoundaryRecord(Free, {}),
 }
 
 
@@ -38,7 +39,8 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
 
     The file is a NumPy `.npz` archive without pickles, so other programs can read it. It holds
     `format`, `version` and `boundary` (the header), `vertices`, `softening`, the arrays of the
-    [`Topology`][vertax.Topology] by name, and those of the boundary as `boundary_…`. It is written
+    [`Topology`][vertax.Topology] by name, and those of the boundary as `boundary_…`; where a tissue
+    has them, `angles`, `angle_length`, `inner_arcs` and `pinned` (0 or 1). It is written
     atomically: an interrupted save leaves the old file, if any, as it was.
 
     **Arguments:**
@@ -64,6 +66,11 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
         "half_edge": topology.half_edge,
     }
     arrays |= {f"boundary_{name}": getattr(tissue.boundary, name) for name in record.fields}
+    if tissue.angles is not None:
+        arrays |= {"angles": tissue.angles, "angle_length": tissue.angle_length}
+        arrays |= {"inner_arcs": int(tissue.inner_arcs)}
+    if tissue.pinned is not None:
+        arrays |= {"pinned": np.asarray(tissue.pinned).astype(np.int8)}
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
     if arrays["vertices"].ndim != 2:
         raise ValueError(
@@ -147,8 +154,15 @@ def load_tissue(path: str | os.PathLike[str]) -> Tissue:
     fields = {
         field: get(f"boundary_{field}", "f", *shape) for field, shape in record.fields.items()
     }
+    options: dict[str, Any] = {}
+    if "angles" in arrays:
+        options["angles"] = jnp.asarray(get("angles", "f", n_half // 2))
+        options["angle_length"] = jnp.asarray(get("angle_length", "f"))
+        options["inner_arcs"] = bool(get("inner_arcs", "i"))
+    if "pinned" in arrays:
+        options["pinned"] = get("pinned", "i", n_half // 3) != 0
     try:
-        topology = Topology(twin, cell, frame, edge)
+        topology = Topology(twin, cell, frame, edge, exterior=record.build is Free)
         # The direction of an edge is not in the other arrays: after a T1 it need not be the first
         # half-edge of the pair.
         topology = eqx.tree_at(
@@ -156,7 +170,7 @@ def load_tissue(path: str | os.PathLike[str]) -> Tissue:
         )
         topology.validate()
         boundary = record.build(**{field: jnp.asarray(array) for field, array in fields.items()})
-        return Tissue(jnp.asarray(vertices), topology, boundary, jnp.asarray(softening))
+        return Tissue(jnp.asarray(vertices), topology, boundary, jnp.asarray(softening), **options)
     except ValueError as error:
         raise ValueError(f"{name} is broken: {error}") from error
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._boundary import Periodic
 from vertax._tissue import Tissue
+from vertax._topology import take
+
+_POINTS_PER_ARC = 24
 
 
 class Drawing(eqx.Module):
@@ -18,15 +22,16 @@ class Drawing(eqx.Module):
     - `tissue`: the [`Tissue`][vertax.Tissue].
     """
 
-    corners: Float[np.ndarray, "halfedges 2"]
-    """Source of each half-edge, where the cell on its left is drawn."""
+    lines: Float[np.ndarray, "halfedges points 2"]
+    """Each half-edge from its source to its target, where the cell on its left is drawn."""
     image: Int[np.ndarray, "halfedges 2"]
-    """Lattice image of that corner."""
+    """Lattice image of that source."""
     cell: Int[np.ndarray, " halfedges"]
     following: Int[np.ndarray, " halfedges"]
     twin: Int[np.ndarray, " halfedges"]
     half_edge: Int[np.ndarray, " edges"]
     edge: Int[np.ndarray, " halfedges"]
+    n_cells: int
     cell_size: float
     """Root of the mean area."""
     box: Float[np.ndarray, "5 2"] | None
@@ -34,9 +39,10 @@ class Drawing(eqx.Module):
 
     def __init__(self, tissue: Tissue):
         m = tissue.topology
-        corners, centroids, areas, following = (np.asarray(x) for x in _geometry(tissue))
-        image = np.zeros((tissue.n_cells, 2), int)
-        shift = np.zeros((tissue.n_cells, 2))
+        geometry = (np.asarray(x) for x in _geometry(tissue))
+        lines, centroids, areas, following = geometry
+        image = np.zeros((m.n_faces, 2), int)
+        shift = np.zeros((m.n_faces, 2))
         self.box = None
         if isinstance(tissue.boundary, Periodic):
             lattice = np.asarray(tissue.boundary.lattice, float)
@@ -49,8 +55,9 @@ class Drawing(eqx.Module):
             first, second = lattice
             self.box = np.stack([0 * first, first, first + second, second, 0 * first])
         self.cell = np.asarray(m.cell)
-        self.corners = corners.astype(float) + shift[self.cell]
+        self.lines = lines.astype(float) + shift[self.cell][:, None]
         self.image = np.asarray(m.frame) + image[self.cell]
+        self.n_cells = tissue.n_cells
         self.following = following
         self.twin = np.asarray(m.twin)
         self.half_edge = np.asarray(m.half_edge)
@@ -58,33 +65,35 @@ class Drawing(eqx.Module):
         self.cell_size = float(np.sqrt(np.mean(np.abs(areas.astype(float)))))
 
     def polygons(self) -> tuple[Float[np.ndarray, "cells sides 2"], Int[np.ndarray, " cells"]]:
-        """Corners of all cells and their numbers of sides, see `cell_polygons`."""
-        sides = np.bincount(self.cell)
-        half_edge = np.unique(self.cell, return_index=True)[1]
-        polygons = np.repeat(self.corners[half_edge][:, None], sides.max(), axis=1)
+        """Corners of all cells and their numbers of corners, see `cell_polygons`."""
+        n_points = self.lines.shape[1] - 1
+        sides = np.bincount(self.cell)[: self.n_cells]
+        half_edge = np.unique(self.cell, return_index=True)[1][: self.n_cells]
+        polygons = np.repeat(self.lines[half_edge, :1], n_points * sides.max(), axis=1)
         # All cells at once, one side at a time.
-        for k in range(1, sides.max()):
-            half_edge = self.following[half_edge]
+        for k in range(sides.max()):
             more = k < sides
-            polygons[more, k] = self.corners[half_edge[more]]
-        return polygons, sides
+            side = slice(k * n_points, (k + 1) * n_points)
+            polygons[more, side] = self.lines[half_edge[more], :-1]
+            half_edge = self.following[half_edge]
+        return polygons, n_points * sides
 
     def sides(
         self, mask: Bool[np.ndarray, " cells"]
-    ) -> tuple[Float[np.ndarray, "segments 2 2"], Int[np.ndarray, " segments"]]:
-        """Line segments that show each side of each marked cell once, and the edge of each.
+    ) -> tuple[Float[np.ndarray, "lines points 2"], Int[np.ndarray, " lines"]]:
+        """Lines that show each side of each marked cell once, and the edge of each.
 
-        An edge between two cells drawn side by side is one segment; one across the periodic
-        boundary shows at both cells, in two places.
+        An edge between two cells drawn side by side is one line; one across the periodic boundary
+        shows at both cells, in two places.
         """
-        segments = np.stack([self.corners, self.corners[self.following]], axis=1)
+        mask = np.append(mask, False)  # the exterior
         first, other = self.half_edge, self.twin[self.half_edge]
         # Both cells of an edge draw it in the same place if they see its first vertex in the same
         # image.
         apart = np.any(self.image[first] != self.image[self.following[other]], axis=1)
         left, right = mask[self.cell[first]], mask[self.cell[other]]
         shown = np.concatenate([first[left], other[right & (apart | ~left)]])
-        return segments[shown], self.edge[shown]
+        return self.lines[shown], self.edge[shown]
 
 
 def cell_polygons(
@@ -93,18 +102,23 @@ def cell_polygons(
     """Corners of all cells, counter-clockwise, each cell whole.
 
     In a periodic tissue each cell is placed so that its centroid lies in the home box; its corners
-    may stick out.
+    may stick out. If there are arcs, each side is a line of 24 pieces.
 
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
 
     **Returns:** the corners, in units of length, where rows of cells with fewer sides than others
-    are filled up with their first corner; and the number of sides of each cell.
+    are filled up with their first corner; and the number of corners of each cell.
     """
     return Drawing(tissue).polygons()
 
 
 @eqx.filter_jit  # one compilation instead of one for each operation
 def _geometry(tissue: Tissue) -> tuple[Array, Array, Array, Array]:
-    return tissue.corners, tissue.centroids, tissue.areas, tissue.topology.next
+    m = tissue.topology
+    fractions = jnp.linspace(0, 1, 2 if tissue.angles is None else _POINTS_PER_ARC + 1)
+    points = take(tissue.edge_points(fractions.astype(tissue.vertices.dtype)), m.edge)
+    points = jnp.where(m.forward[:, None, None], points, points[:, ::-1])
+    lines = tissue.corners[:, None] + points - points[:, :1]
+    return lines, tissue.centroids, tissue.areas, m.next

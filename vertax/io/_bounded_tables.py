@@ -1,0 +1,117 @@
+"""The paper's tables of a bounded tissue, whose outline is made of arcs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+# Vertex numbers in these tables start here: 0 and 1 mean that there is none.
+_FIRST_VERTEX = 2
+
+
+class BoundedTables(NamedTuple):
+    """A free tissue in the form of the paper's files.
+
+    NumPy arrays. Rows `2 e` and `2 e + 1` of `he_table` are the half-edges of edge `e`.
+
+    **Arguments:**
+
+    - `vert_table`: positions of the vertices, in units of length.
+    - `ang_table`: the angle of each edge's arc; any number for straight edges.
+    - `he_table`: the columns are previous, next and twin half-edge; source and target vertex of an
+        inner edge, or 0 and 1; source and target of an arc, or 0 and 1; the face on the left. Vertices
+        are numbered from 2. Faces are counter-clockwise. The exterior side of an arc is a row of
+        zeros but for its twin.
+    - `face_table`: one half-edge of each face, and the type of the cell.
+    """
+
+    vert_table: Float[np.ndarray, "vertices 2"]
+    ang_table: Float[np.ndarray, " edges"]
+    he_table: Int[np.ndarray, "halfedges 8"]
+    face_table: Int[np.ndarray, "faces 2"]
+
+
+def with_exterior(tables: BoundedTables) -> tuple[np.ndarray, np.ndarray]:
+    """The half-edge and face tables of a closed surface, the exterior as the last face.
+
+    In the form of the periodic tables, with offsets 0.
+    """
+    he, faces = tables.he_table, tables.face_table[:, 0]
+    previous, following, twin = he[:, 0].copy(), he[:, 1].copy(), he[:, 2]
+    rows = np.arange(len(he))
+    if len(he) != 2 * len(tables.ang_table) or not np.array_equal(twin, rows ^ 1):
+        raise ValueError(
+            "Table `he_table` is broken: `twin` must pair up rows 2 e and 2 e + 1, one pair for each entry "
+            "of `ang_table`."
+        )
+    outside = (he[:, 3] < _FIRST_VERTEX) & (he[:, 5] < _FIRST_VERTEX)
+    if not outside.any() or np.any(outside & outside[twin]):
+        raise ValueError(
+            "Table `he_table` is broken: an edge must have a face on one side at least, and some the "
+            "exterior on the other."
+        )
+    ends = np.where(he[:, 3:4] < _FIRST_VERTEX, he[:, 5:7], he[:, 3:5]) - _FIRST_VERTEX
+    ends = np.where(outside[:, None], ends[twin][:, ::-1], ends)
+    # Around the exterior, too, the next half-edge leaves from where one arrives.
+    leaving = np.full(len(tables.vert_table), -1)
+    leaving[ends[outside, 0]] = rows[outside]
+    following[outside] = leaving[ends[outside, 1]]
+    previous[following[outside]] = rows[outside]
+    face = np.where(outside, len(faces), he[:, 7])
+    columns = [previous, following, twin, ends[:, 0], ends[:, 1], face, 0 * face, 0 * face]
+    return np.stack(columns, axis=1), np.append(faces, np.argmax(outside))
+
+
+def without_exterior(
+    vertices: np.ndarray, angles: np.ndarray, he_table: np.ndarray, n_cells: int
+) -> BoundedTables:
+    """The reverse of `with_exterior`; all cells are of type 0."""
+    twin, source, target, face = he_table[:, 2:6].T
+    ends = np.stack([source, target], axis=1) + _FIRST_VERTEX
+    outside = face == n_cells
+    arc = (outside | outside[twin])[:, None]
+    nowhere = np.array([0, 1])
+    columns = np.concatenate(
+        [
+            he_table[:, :3],
+            np.where(arc, nowhere, ends),
+            np.where(arc & ~outside[:, None], ends, nowhere),
+            face[:, None],
+        ],
+        axis=1,
+    )
+    columns[outside] = [0, 0, 0, 0, 1, 0, 1, 0]
+    columns[outside, 2] = twin[outside]
+    first = np.unique(np.where(outside, n_cells, face), return_index=True)[1][:n_cells]
+    face_table = np.stack([first, np.zeros_like(first)], axis=1)
+    return BoundedTables(vertices, angles, columns.astype(np.int32), face_table.astype(np.int32))
+
+
+def checked(tables: BoundedTables) -> BoundedTables:
+    """The tables as arrays of the right shapes and types."""
+    v, angles, he, faces = (np.asarray(table) for table in tables)
+    if v.ndim != 2 or v.shape[1] != 2 or v.dtype.kind not in "fi" or not np.isfinite(v).all():
+        raise ValueError(
+            "Table `vert_table` must hold finite positions, shape (vertices, 2), but has shape "
+            f"{v.shape} and type {v.dtype}."
+        )
+    if angles.ndim != 1 or angles.dtype.kind not in "fi" or not np.isfinite(angles).all():
+        raise ValueError(
+            "Table `ang_table` must hold finite angles, shape (edges,), but has shape "
+            f"{angles.shape} and type {angles.dtype}."
+        )
+    for name, table, n_columns in (("he_table", he, 8), ("face_table", faces, 2)):
+        if table.ndim != 2 or table.shape[1] != n_columns or table.dtype.kind not in "iu":
+            raise ValueError(
+                f"Table `{name}` must hold integers, shape (rows, {n_columns}), but has shape "
+                f"{table.shape} and type {table.dtype}."
+            )
+    used = he[:, 3:7]
+    if used.size and used.max() >= len(v) + _FIRST_VERTEX:
+        raise ValueError(
+            f"Table `he_table` is broken: vertices must lie in {_FIRST_VERTEX} … "
+            f"{len(v) + _FIRST_VERTEX - 1}."
+        )
+    return BoundedTables(v, angles, he.astype(int), faces.astype(int))
