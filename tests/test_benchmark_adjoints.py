@@ -65,6 +65,7 @@ def test_everything(tmp_path):
         accuracy={
             "tolerances": [1e-8, 1e-3],
             "betas": [1e-5],
+            "cost_betas": [1e-2],
             "fitted_betas": [1.0],
             "n_cells": 8,
         },

@@ -86,7 +86,7 @@ def accuracy(tolerances: np.ndarray, errors: Mapping[str, np.ndarray]) -> Figure
     **Returns:** the figure.
     """
     with _style.house_style():
-        figure, (ax,) = new_figure(1, width=4.2, height=3.0)
+        figure, (ax,) = new_figure(1, width=4.8, height=2.8)
         for name, values in errors.items():
             method, _, variant = name.partition(",")
             style: Any = {"ls": "--", "mfc": "white"} if variant else {}
@@ -107,49 +107,47 @@ def accuracy(tolerances: np.ndarray, errors: Mapping[str, np.ndarray]) -> Figure
             xlabel="largest force at the end of the relaxation",
             ylabel="relative error of the hypergradient",
         )
-        ax.legend()
+        ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
 def beta_scan(
-    betas: np.ndarray, errors: Mapping[str, np.ndarray], fitted: Mapping[float, Mapping[str, Any]]
+    betas: Mapping[str, np.ndarray],
+    errors: Mapping[str, np.ndarray],
+    fitted: Mapping[float, Mapping[str, Any]],
 ) -> Figure:
     """Error of EP against the strength of the nudge, and fits with it.
 
     **Arguments:**
 
-    - `betas`: strengths.
-    - `errors`: relative errors of each estimator, shape `(betas, replicates)`.
+    - `betas`: strengths of each nudge, `"linear"` and `"cost"`.
+    - `errors`: relative errors of each estimator (`"linear, centred"`, …), shape `(betas, replicates)`.
     - `fitted`: outcome of a fit by the strength of its nudge.
 
     **Returns:** the figure.
     """
     with _style.house_style():
-        figure, (left, right) = new_figure(2, width=3.4, height=2.7)
-        for number, (name, values) in enumerate(errors.items()):
-            scale = 1e5 if name.startswith("cost") else 1.0
-            left.plot(
-                scale * betas, _centre(values), "o-", ms=3, color=_style.SERIES[number], label=name
-            )
-        left.set(
-            xscale="log",
-            yscale="log",
-            xlabel=r"$\beta$ (linear: relative; cost: energy per cost)",
-            ylabel="relative error of the hypergradient",
-            title="at true equilibria",
-        )
-        left.legend()
-        if fitted:
-            strengths = list(fitted)
-            for k, strength in enumerate(strengths):
-                points = fitted[strength]["relative_error"]
-                right.plot(np.full(len(points), k), points, "o", ms=3, color=_COLOURS["EP"])
-            right.set_xticks(range(len(strengths)), [f"{s:g}" for s in strengths])
+        figure, (linear, cost, right) = new_figure(3, width=2.4, height=2.5)
+        for ax, nudge, label in (
+            (linear, "linear", r"$\beta$, relative force"),
+            (cost, "cost", r"$\beta$, energy per cost"),
+        ):
+            for style, estimator in (("o-", "centred"), ("s--", "one-sided")):
+                values = _centre(errors[f"{nudge}, {estimator}"])
+                ax.plot(betas[nudge], values, style, ms=3, color=_COLOURS["EP"], label=estimator)
+            ax.set(xscale="log", yscale="log", xlabel=label, title=f"nudge: {nudge}")
+        linear.set_ylabel("relative error of the hypergradient")
+        linear.legend()
+        strengths = list(fitted)
+        for k, strength in enumerate(strengths):
+            points = fitted[strength]["relative_error"]
+            right.plot(np.full(len(points), k), points, "o", ms=3, color=_COLOURS["EP"])
+        right.set_xticks(range(len(strengths)), [f"{s:g}" for s in strengths])
         right.set(
             yscale="log",
             xlabel=r"$\beta$, energy per cost",
-            ylabel="mean relative error, at the end",
-            title="the paper's protocol",
+            ylabel="relative error of parameters",
+            title="fits, the paper's protocol",
         )
     return figure
 

@@ -87,9 +87,11 @@ class Accuracy(Section):
 
     tolerances: list[float] = Field(default=[1e-10, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2])
     """Forces at which the relaxation stops; none leaves this part out."""
-    betas: list[float] = Field(default=[1e-10, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2])
-    """Strengths of the nudge of EP at a true equilibrium."""
-    fitted_betas: list[float] = Field(default=[1e-2, 1e-1, 1.0, 10.0])
+    betas: list[float] = Field(default=[1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2])
+    """Strengths of the linear nudge of EP, at true equilibria."""
+    cost_betas: list[float] = Field(default=[1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0])
+    """Strengths of its nudge by the cost, energy per cost."""
+    fitted_betas: list[float] = Field(default=[1e-1, 1.0, 10.0])
     """Strengths of the nudge in fits with the paper's protocol."""
     n_cells: int = Field(default=20, ge=4)
     """Number of cells."""
@@ -373,25 +375,27 @@ def _accuracy(config: Config, folder: RunFolder) -> dict[str, Any]:
 def _beta_scan(config: Config, folder: RunFolder, progress: bool) -> dict[str, Any]:
     """Error of EP against the strength of its nudge, and what a fit makes of it."""
     cases = _cases(config)
-    betas = np.asarray(config.accuracy.betas)
-    kinds = {
-        "linear, centred": {"nudge": "linear", "centred": True},
-        "linear, one-sided": {"nudge": "linear", "centred": False},
-        "cost, centred": {"nudge": "cost", "centred": True},
-        "cost, one-sided": {"nudge": "cost", "centred": False},
+    betas = {
+        "linear": np.asarray(config.accuracy.betas),
+        "cost": np.asarray(config.accuracy.cost_betas),
     }
-    errors = {}
-    for name, kind in kinds.items():
-        # The β of the paper is an energy per cost. Times a typical one it spans the same range.
-        scale = 1e5 if kind["nudge"] == "cost" else 1.0
-        make = lambda b, kind=kind: EquilibriumPropagation(jnp.asarray(b), throw=False, **kind)
-        error = _gradient_error()
-        errors[name] = np.array(
-            [
-                [float(error(c, make(scale * b), c.settled, jnp.asarray(1e-12))) for c in cases]
-                for b in betas
+    errors: dict[str, np.ndarray] = {}
+    columns: dict[str, list[Any]] = {"nudge": [], "estimator": [], "beta": [], "error": []}
+    for nudge in ("linear", "cost"):
+        for centred in (True, False):
+            error = _gradient_error()
+            adjoints = [
+                EquilibriumPropagation(jnp.asarray(b), nudge, centred=centred, throw=False)
+                for b in betas[nudge]
             ]
-        )
+            tolerance = jnp.asarray(1e-11)
+            values = [[float(error(c, a, c.settled, tolerance)) for c in cases] for a in adjoints]
+            estimator = "centred" if centred else "one-sided"
+            errors[f"{nudge}, {estimator}"] = np.array(values)
+            columns["nudge"] += [nudge] * len(adjoints)
+            columns["estimator"] += [estimator] * len(adjoints)
+            columns["beta"] += list(betas[nudge])
+            columns["error"] += list(_geometric_mean(np.array(values)))
     batch = stack(_scenes(config, config.paper.relaxation))
     fitted = {}
     for beta in config.accuracy.fitted_betas:
@@ -406,10 +410,9 @@ def _beta_scan(config: Config, folder: RunFolder, progress: bool) -> dict[str, A
         )
         true, inferred = _shape_factors(batch.truth), _shape_factors(outcome.energy)
         fitted[beta] = _recovery(true, inferred, outcome)
-    means = {name: _geometric_mean(e) for name, e in errors.items()}
-    folder.save_table("beta", {"beta": betas} | means)
+    folder.save_table("beta", columns)
     folder.save_figure("beta", figures.beta_scan(betas, errors, fitted))
-    best = {f"{name}, smallest error": e.min() for name, e in means.items()}
+    best = {f"{name}, smallest error": _geometric_mean(e).min() for name, e in errors.items()}
     return best | {
         f"fit with β = {beta:g}, relative error": m["relative_error_mean"]
         for beta, m in fitted.items()
