@@ -33,20 +33,17 @@ ADJOINTS = [
     ("propagation", vx.EquilibriumPropagation(), {}, 1e-4),
     ("automatic", vx.AutomaticDifferentiation(), UNROLLED, 1e-4),
 ]
-all_adjoints = pytest.mark.parametrize(
-    ("adjoint", "options", "rtol"), [a[1:] for a in ADJOINTS], ids=[a[0] for a in ADJOINTS]
-)
 
 
-# Sensitivity has a test of its own beside these (`test_forward_mode_and_second_derivatives`):
-# the two forms of implicit differentiation share everything but the order of their products.
-some_adjoints = pytest.mark.parametrize(
-    ("adjoint", "options", "rtol"),
-    [
-        pytest.param(*a[1:], marks=() if a[0] != "sensitivity" else (pytest.mark.slow,), id=a[0])
-        for a in ADJOINTS
-    ],
-)
+def adjoints(*quick):
+    """All adjoints, of which those named are tried on every change and all of them by `test-slow`."""
+    return pytest.mark.parametrize(
+        ("adjoint", "options", "rtol"),
+        [
+            pytest.param(*a[1:], marks=() if a[0] in quick else (pytest.mark.slow,), id=a[0])
+            for a in ADJOINTS
+        ],
+    )
 
 
 def distance(a, b) -> float:
@@ -63,7 +60,7 @@ def start_and_cost(n_cells, seed=0):
     return tissue, energy, VertexDistance(target)
 
 
-@some_adjoints
+@adjoints("implicit", "sensitivity", "propagation", "automatic")
 @pytest.mark.parametrize("n_cells", [20, pytest.param(64, marks=pytest.mark.slow)])
 def test_hypergradient_against_a_dense_reference(adjoint, options, rtol, n_cells):
     tissue, _energy, cost = start_and_cost(n_cells)
@@ -110,7 +107,7 @@ def energies(tissue):
     return {"edges": edges, "vertices": vertices, "network": network}
 
 
-@some_adjoints
+@adjoints("propagation")
 @pytest.mark.parametrize(
     "which",
     [
@@ -141,7 +138,7 @@ def test_parameters_of_every_kind(adjoint, options, rtol, which):
     assert slope == pytest.approx(float(difference), rel=max(10 * rtol, 1e-4))
 
 
-@some_adjoints
+@adjoints("propagation", "automatic")
 def test_topology_changes_on_the_way(adjoint, options, rtol):
     tissue = vx.initialise.periodic_voronoi(16, key=jax.random.key(5))
     p0 = shape_factors(16, 3.75, 0.1)
@@ -164,7 +161,7 @@ def test_topology_changes_on_the_way(adjoint, options, rtol):
     assert distance(gradient, jax.jit(jax.grad(near))(p0)) < rtol
 
 
-@some_adjoints
+@adjoints("propagation")
 def test_vmap(adjoint, options, rtol):
     tissue, _, cost = start_and_cost(8, 2)
     p0 = shape_factors(8, 3.7, 0.1, 9)
@@ -181,7 +178,7 @@ def test_vmap(adjoint, options, rtol):
         assert distance(row, gradient(p)) < rtol
 
 
-@some_adjoints
+@adjoints("propagation")
 def test_float32(adjoint, options, rtol):
     tissue, _energy, cost = start_and_cost(12, 1)
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
@@ -205,7 +202,7 @@ def test_float32(adjoint, options, rtol):
 
 def solver_pairs():
     """Every adjoint with every solver; only some of the pairs are tried on every change."""
-    quick = {("propagation", "lbfgs"), ("implicit", "fire"), ("automatic", "gradient_descent")}
+    quick = {("propagation", "lbfgs")}
     for adjoint_name, adjoint, _, rtol in ADJOINTS:
         for name, solver, reach in SOLVERS:
             if adjoint.unrolls and name not in ("gradient_descent", "optax_adam"):
@@ -274,7 +271,7 @@ def test_an_unrolled_relaxation_that_starts_at_rest_still_has_a_gradient():
     assert distance(gradient, run(energy, vx.ImplicitDifferentiation())[0]) < 1e-4
 
 
-@pytest.mark.parametrize("mode", ["adjoint", "sensitivity"])
+@pytest.mark.parametrize("mode", ["adjoint", pytest.param("sensitivity", marks=pytest.mark.slow)])
 def test_forward_mode_and_second_derivatives(mode):
     tissue, _, cost = start_and_cost(6, 2)
     p0 = shape_factors(6, 3.65, 0.05, 1)
@@ -296,7 +293,7 @@ def test_forward_mode_and_second_derivatives(mode):
     assert distance(hessian @ direction, difference) < 1e-5
 
 
-@some_adjoints
+@adjoints("implicit")
 def test_gradient_with_respect_to_the_shape_of_the_box(adjoint, options, rtol):
     tissue, energy = relaxed(12, 4)
     strained = lambda lattice: eqx.tree_at(lambda t: t.boundary.lattice, tissue, lattice)
@@ -314,6 +311,7 @@ def test_gradient_with_respect_to_the_shape_of_the_box(adjoint, options, rtol):
     assert slope == pytest.approx(float(difference), rel=10 * rtol)
 
 
+@pytest.mark.slow
 def test_adjoint_ignores_translations():
     # A cost that pulls on the centroid alone has no gradient: no parameter moves the centroid.
     tissue, energy = relaxed(12, 1)
@@ -379,7 +377,7 @@ class TestOutcome:
 
         return jax.jit(jax.grad(loss))((energy, vx.GradientOutcome()))
 
-    @some_adjoints
+    @adjoints("propagation")
     def test_it_is_the_gradient_with_respect_to_an_empty_one(self, adjoint, options, rtol):
         gradient, outcome = self.gradient(adjoint, **options)
         assert outcome.trusted
@@ -397,15 +395,25 @@ class TestOutcome:
     @pytest.mark.parametrize(
         ("adjoint", "options"),
         [
-            (vx.ImplicitDifferentiation(linear_solver=vx.MINRES(max_steps=3)), {}),
-            (
+            pytest.param(
+                vx.ImplicitDifferentiation(linear_solver=vx.MINRES(max_steps=3)), {}, id="implicit"
+            ),
+            pytest.param(
                 vx.ImplicitDifferentiation("sensitivity", linear_solver=vx.MINRES(max_steps=3)),
                 {},
+                id="sensitivity",
+                marks=pytest.mark.slow,
             ),
-            (vx.EquilibriumPropagation(), {**MOMENTUM, "max_steps": 5}),
-            (vx.AutomaticDifferentiation(), {**MOMENTUM, "max_steps": 5}),
+            pytest.param(
+                vx.EquilibriumPropagation(),
+                {**MOMENTUM, "max_steps": 5},
+                id="propagation",
+                marks=pytest.mark.slow,
+            ),
+            pytest.param(
+                vx.AutomaticDifferentiation(), {**MOMENTUM, "max_steps": 5}, id="automatic"
+            ),
         ],
-        ids=[a[0] for a in ADJOINTS],
     )
     def test_a_gradient_that_cannot_be_trusted_is_refused(self, adjoint, options):
         tissue, energy, cost = start_and_cost(8)
@@ -470,6 +478,7 @@ class TestNudgeByTheCost:
         scaled = jax.jit(jax.grad(thrice))(energy)
         assert distance(scaled, 3 * reference.target_shape_factor) < 1e-4
 
+    @pytest.mark.slow
     def test_a_fitted_position_has_its_gradient_too(self):
         tissue, energy, cost = start_and_cost(8)
         shift = jnp.array([0.1, -0.2])

@@ -166,6 +166,7 @@ def test_levenberg_marquardt_recovers_many_digits_in_a_dozen_steps(hidden):
     assert again == pytest.approx(float(fit.cost), abs=1e-15)
 
 
+@pytest.mark.slow
 def test_levenberg_marquardt_fits_an_image_and_where_the_tissue_lies(hidden):
     target, truth, guess, start = hidden
     displaced = start.with_configuration(start.vertices + jnp.array([0.02, -0.03]))
@@ -208,7 +209,13 @@ def batch(hidden):
     return problems, stacked, truth, stack([truth] * 3)
 
 
-@pytest.mark.parametrize("optimiser", [optax.adam(1e-2), LEAST_SQUARES], ids=["adam", "lm"])
+@pytest.mark.parametrize(
+    "optimiser",
+    [
+        pytest.param(optax.adam(1e-2), id="adam"),
+        pytest.param(LEAST_SQUARES, id="lm", marks=pytest.mark.slow),
+    ],
+)
 def test_a_batch_is_fitted_as_its_members_are(batch, optimiser):
     problems, stacked, truth, truths = batch
     together = vx.fit(stacked, optimiser, 8, truth=truths, batched=True, progress=False)
@@ -329,6 +336,7 @@ def test_bad_problems_are_refused(hidden):
         vx.fit(vx.InverseProblem(start, guess, cost), optax.adam(1e-2), 0)
 
 
+@pytest.mark.slow
 def test_shape_factors_in_float32(hidden):
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     target, truth, guess, start = jax.tree.map(to32, hidden)
