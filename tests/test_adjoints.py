@@ -271,10 +271,9 @@ def test_an_unrolled_relaxation_that_starts_at_rest_still_has_a_gradient():
     assert distance(gradient, run(energy, vx.ImplicitDifferentiation())[0]) < 1e-4
 
 
-@pytest.mark.parametrize("mode", ["adjoint", pytest.param("sensitivity", marks=pytest.mark.slow)])
-def test_forward_mode_and_second_derivatives(mode):
+def implicit_loss(mode):
+    """A function of the shape factors of a few cells, and where to differentiate it."""
     tissue, _, cost = start_and_cost(6, 2)
-    p0 = shape_factors(6, 3.65, 0.05, 1)
     adjoint = vx.ImplicitDifferentiation(mode=mode)
 
     def loss(p):
@@ -282,11 +281,24 @@ def test_forward_mode_and_second_derivatives(mode):
         found = vx.equilibrate(tissue, e, adjoint=adjoint, transitions=None, tolerance=1e-12)
         return cost(found.tissue, e)
 
+    return loss, shape_factors(6, 3.65, 0.05, 1)
+
+
+@pytest.mark.parametrize("mode", ["adjoint", pytest.param("sensitivity", marks=pytest.mark.slow)])
+def test_forward_mode(mode):
+    loss, p0 = implicit_loss(mode)
     gradient = jax.jit(jax.grad(loss))(p0)
     assert distance(jax.jit(jax.jacfwd(loss))(p0), gradient) < 1e-7
     direction = random_like(p0)
     along = jax.jit(lambda p, d: jax.jvp(loss, (p,), (d,))[1])
     assert along(p0, direction) == pytest.approx(float(jnp.sum(gradient * direction)), rel=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["adjoint", "sensitivity"])
+def test_second_derivatives(mode):
+    loss, p0 = implicit_loss(mode)
+    direction = random_like(p0)
     hessian = jax.jit(jax.hessian(loss))(p0)
     np.testing.assert_allclose(hessian, hessian.T, rtol=1e-5, atol=1e-7)
     difference = central_difference(jax.jit(jax.grad(loss)), p0, direction)
@@ -475,7 +487,7 @@ class TestNudgeByTheCost:
         assert outcome.trusted
         assert distance(gradient, reference) < 1e-4
         thrice = lambda e: 3 * make(vx.EquilibriumPropagation(nudge="cost"))(e)[0]
-        scaled = jax.jit(jax.grad(thrice))(energy)
+        scaled = eqx.filter_jit(eqx.filter_grad(thrice))(energy)
         assert distance(scaled, 3 * reference.target_shape_factor) < 1e-4
 
     @pytest.mark.slow
@@ -521,12 +533,8 @@ class TestNudgeByTheCost:
 
 
 def test_bad_arguments():
-    with pytest.raises(ValueError, match=r"`mode` must be 'adjoint' or 'sensitivity'"):
-        vx.ImplicitDifferentiation("forward")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="`beta` must be positive"):
         vx.EquilibriumPropagation(beta=0.0)
-    with pytest.raises(ValueError, match="`nudge` must be"):
-        vx.EquilibriumPropagation(nudge="both")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="`checkpoints` must be at least 1"):
         vx.AutomaticDifferentiation(checkpoints=0)
     with pytest.raises(ValueError, match="`rtol` must be positive"):

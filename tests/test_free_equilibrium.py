@@ -185,9 +185,10 @@ def test_hypergradient_from_far_away_against_central_differences(inner_arcs):
     assert jnp.sum(gradient * direction) == pytest.approx(float(difference), rel=1e-6)
 
 
-@pytest.mark.parametrize("n_pinned", [1, 3])
-def test_pinned_vertices_stay_and_are_differentiable(n_pinned):
-    free = cluster(7, 6)
+# Clusters that are not about to undergo a T1 transition, where positions jump.
+@pytest.mark.parametrize(("n_pinned", "seed"), [(1, 1), (3, 6)])
+def test_pinned_vertices_stay_and_are_differentiable(n_pinned, seed):
+    free = cluster(7, seed)
     pinned = jnp.zeros(free.n_vertices, bool).at[jnp.arange(n_pinned) * 3].set(True)
     tissue = eqx.tree_at(lambda t: t.pinned, free, pinned, is_leaf=lambda x: x is None)
     loss, tension = hypergradient_problem(tissue)

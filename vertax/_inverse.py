@@ -166,16 +166,21 @@ def _placed(equilibrium: Equilibrium, shift: Float[Array, 2] | None) -> Equilibr
 
 
 class _Nudged(AbstractEnergy):
-    """An energy and a share of the cost."""
+    """An energy, a share of the cost, and springs that keep the whole where it is."""
 
     energy: AbstractEnergy
     cost: AbstractCost
     shift: Float[Array, 2] | None
     strength: Float[Array, ""]
+    settled: Tissue
+    stiffness: Float[Array, ""]
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         cost = self.cost(_moved(tissue, self.shift), self.energy)
-        return self.energy(tissue) + self.strength * cost
+        # A cost that sees positions would push a tissue away without end, with one sign or the other.
+        drift = self.settled.drift(tissue.configuration)
+        spring = 0.5 * self.stiffness * jnp.sum(drift**2)
+        return self.energy(tissue) + self.strength * cost + spring
 
 
 # Equilibrium propagation in the form of the paper: X± minimise E ± (β/2) C, with the whole cost and with
@@ -210,12 +215,14 @@ def _(
     adjoint = problem.adjoint
     assert isinstance(adjoint, EquilibriumPropagation)
     half_beta, force = _nudge(problem, adjoint, settled, energy, shift)
+    stiffness = mean_stiffness(settled, energy)
     moving, fixed = differentiable((energy, shift))
 
     def phase(sign: Array) -> tuple[PyTree[Array], Equilibrium]:
         def nudged(m: PyTree[Array]) -> _Nudged:
             energy, shift = eqx.combine(m, fixed)
-            return _Nudged(energy, problem.cost, shift, sign * half_beta)
+            strength = sign * half_beta
+            return _Nudged(energy, problem.cost, shift, strength, settled, stiffness)
 
         found = problem._relax(
             settled, nudged(moving), adjoint=None, tolerance=_tolerance(problem, adjoint, force)
