@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Key
 from pydantic import Field
 
 from vertax._equilibrium import equilibrate
@@ -48,7 +48,7 @@ class Scene(eqx.Module):
 
 
 def make_scene(
-    keys: PRNGKeyArray,
+    keys: Key[Array, "3"],
     tissue: TissueSection,
     truth: ShapeFactors,
     relaxation: Relaxation,
