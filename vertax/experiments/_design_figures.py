@@ -49,14 +49,7 @@ def mechanics(
             shrink=0.75,
             aspect=25,
         )
-        (ax,) = right
-        _shape_factors(ax, observed, targets, wanted)
-        ax.legend(loc="lower right")
-        inset = ax.inset_axes((0.13, 0.66, 0.34, 0.3))
-        early = max(len(targets) // 8, 2)
-        _shape_factors(inset, observed[:early], targets[:early], wanted)
-        inset.set(xlabel="", ylabel="")
-        inset.tick_params(labelsize=5)
+        _shape_factors(right[0], observed, targets, wanted)
     return figure
 
 
@@ -69,6 +62,8 @@ def _shape_factors(ax: Axes, observed: np.ndarray, targets: np.ndarray, wanted: 
     # Where both agree, both show.
     ax.plot(targets.mean(axis=1), color=vermilion, ls=(0, (3, 3)), lw=0.8, label="mean $p^0$")
     ax.set(xlabel="epoch", ylabel="shape factor")
+    # Above: the curves of the cells are everywhere.
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, columnspacing=1.0)
 
 
 def elongation(
