@@ -56,7 +56,7 @@ def test_a_circle_has_no_long_axis():
     assert np.isfinite(gradient).all()
 
 
-def test_aspect_aspect_ratio_a_lens_is_that_of_its_area():
+def test_aspect_ratio_of_a_lens_is_that_of_its_area():
     # Points on a fine grid, for angles on both sides of where the series of arcs ends.
     for angle in (0.3, 1.0, 2.2):
         radius, depth = 1 / np.sin(angle), 1 / np.tan(angle)
@@ -167,7 +167,11 @@ def test_slopes_of_the_costs(name):
 def test_a_gradient_through_the_equilibrium_periodic():
     tissue, start = relaxed(6, 1)
     weights = (0.5, 0.3, 0.2)
-    costs = (MeanShapeFactor(4.1), CellAreas(jnp.linspace(0.8, 1.2, 6)), HomotypicLength(two_types(6)))
+    costs = (
+        MeanShapeFactor(4.1),
+        CellAreas(jnp.linspace(0.8, 1.2, 6)),
+        HomotypicLength(two_types(6)),
+    )
     cost = sum((w * c for w, c in zip(weights[1:], costs[1:], strict=True)), weights[0] * costs[0])
     _check_hypergradient(tissue, start, cost)
 

@@ -102,9 +102,7 @@ def elongation(
             mean, deviation = squared.mean(1), squared.std(1)
             # On a logarithmic axis a bar may not go down to zero.
             below = np.minimum(deviation, 0.9 * mean)
-            error.errorbar(
-                at, mean, [below, deviation], fmt="o-", ms=3, lw=0.8, capsize=2, **style
-            )
+            error.errorbar(at, mean, [below, deviation], fmt="o-", ms=3, lw=0.8, capsize=2, **style)
         reached.set(xlabel="target aspect ratio", ylabel="aspect ratio reached")
         error.set(xlabel="target aspect ratio", ylabel="squared error", yscale="log")
         reached.legend()

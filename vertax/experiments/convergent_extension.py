@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 from pydantic import Field
@@ -120,7 +121,7 @@ def _design(config: Config, n_cells: int, progress: bool) -> tuple[Fit, Fit, np.
             InverseProblem(
                 cluster,
                 config.tensions.draw(cluster, config.spread, key),
-                AspectRatio(config.start_ratio, config.measure),
+                AspectRatio(jnp.array(config.start_ratio), config.measure),
                 adjoint=config.gradient.build(),
                 **config.relaxation.options(),
             )
@@ -129,12 +130,11 @@ def _design(config: Config, n_cells: int, progress: bool) -> tuple[Fit, Fit, np.
     # One start a replicate, repeated for each target: the fit of the same shape is compiled once.
     batch = stack([problems[k] for _, k in _members(config)])
     started, _ = design(batch, config.start, _measure, **options)
-    targets = np.array([target for target, _ in _members(config)])
-    dtype = batch.tissue.vertices.dtype
+    targets = jnp.array([target for target, _ in _members(config)])
     batch = eqx.tree_at(
         lambda p: (p.tissue, p.energy, p.cost.target),
         batch,
-        (started.tissue, started.energy, targets.astype(dtype)),
+        (started.tissue, started.energy, targets),
     )
     outcome, curves = design(batch, config.fit, _measure, **options)
     return started, outcome, curves
@@ -182,7 +182,9 @@ def _metrics(config: Config, started: Fit, outcome: Fit) -> dict[str, Any]:
     }
 
 
-def _save(config: Config, designs: dict[int, tuple[Fit, Fit, np.ndarray]], folder: RunFolder) -> None:
+def _save(
+    config: Config, designs: dict[int, tuple[Fit, Fit, np.ndarray]], folder: RunFolder
+) -> None:
     ratios = {n_cells: _ratios(config, outcome) for n_cells, (_, outcome, _) in designs.items()}
     rows = [
         (n_cells, target, k, values[i, k])
