@@ -130,7 +130,7 @@ def fitted(**curves):
     history |= dict.fromkeys((*names, "relative_error"), np.ones(n)) | {"seconds": np.ones(n)}
     history["num_steps"] = np.ones(n, int)
     best = curves.pop("best_epoch", 5)
-    tissue = vx.initialise.hexagonal(2, 2)
+    tissue = vx.initialise.hexagonal(3, 4)
     energy = vx.energies.LineTension(1.0)
     record = vx.History(**history | curves)
     return vx.Fit(energy, tissue, jnp.array(1.0), jnp.array(0.0), np.array(best), record)

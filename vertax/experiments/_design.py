@@ -46,10 +46,11 @@ class Gradient(Section):
 class Tensions(Section):
     """Line tensions of the edges and stiffness of the cells, where the mean rest area of a cell is 1."""
 
-    low: float = Field(default=0.1, ge=0)
-    """Least tension; below, an edge lengthens so easily that cells become slivers."""
-    high: float = Field(default=0.24, gt=0)
-    """Largest tension; above about twice the least one, junctions of three edges may have no balance."""
+    low: float = Field(default=0.04, ge=0)
+    """Least tension."""
+    high: float = Field(default=0.28, gt=0)
+    """Largest tension; above twice the least one, there are junctions of three edges without a balance,
+    which close to four-fold vertices."""
     stiffness: float = Field(default=1.0, gt=0)
     """Stiffness of the areas of cells."""
 
@@ -85,8 +86,10 @@ def tensions(energy: AbstractEnergy) -> Float[np.ndarray, "*batch edges"]:
 
     **Returns:** tension of each edge.
     """
-    assert isinstance(energy, LocalSum) and isinstance(energy.terms[1], BoundedTension)
-    return np.asarray(energy.terms[1].tension, float)
+    assert isinstance(energy, LocalSum)
+    _, tension = energy.terms
+    assert isinstance(tension, BoundedTension)
+    return np.asarray(tension.tension, float)
 
 
 def design(

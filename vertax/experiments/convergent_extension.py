@@ -66,11 +66,11 @@ class Config(ExperimentConfig):
     """Share of the range of tensions that the first ones are drawn from."""
     gradient: Gradient = Gradient()
     """How gradients are taken."""
-    start: Fitting = Fitting(learning_rate=0.05, epochs=100)
+    start: Fitting = Fitting(learning_rate=0.1, epochs=60)
     """How the aspect ratio to start at is reached."""
-    fit: Fitting = Fitting(learning_rate=0.05, epochs=400)
+    fit: Fitting = Fitting(learning_rate=0.1, epochs=200)
     """How the tensions (their logits) are fitted."""
-    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=300)
+    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=100)
     """How the tissue is relaxed."""
 
 
