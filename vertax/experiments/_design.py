@@ -99,7 +99,7 @@ def design(
     *,
     batched: bool,
     progress: bool,
-) -> tuple[Fit, PyTree[np.ndarray]]:
+) -> tuple[Fit, Tissue, PyTree[np.ndarray]]:
     """Fit, and measure something in each epoch.
 
     **Arguments:**
@@ -110,7 +110,8 @@ def design(
     - `batched`: whether it is a batch.
     - `progress`: show a progress bar (only on a terminal).
 
-    **Returns:** the fit; and what was measured, each array with a leading axis of epochs.
+    **Returns:** the fit; the equilibrium that it began with; and what was measured, each array with a
+    leading axis of epochs.
 
     **Raises:**
 
@@ -118,14 +119,17 @@ def design(
     """
     compiled = eqx.filter_jit(eqx.filter_vmap(measure) if batched else measure)
     rows: list[PyTree[np.ndarray]] = []
+    first: list[Tissue] = []
 
-    def note(_: int, record: Record) -> None:
+    def note(epoch: int, record: Record) -> None:
+        if epoch == 0:
+            first.append(record.tissue)
         rows.append(jax.tree.map(np.asarray, compiled(problem, record.tissue, record.parameters)))
 
     outcome = fit(
         problem, fitting.build(), fitting.epochs, batched=batched, progress=progress, callback=note
     )
-    return outcome, jax.tree.map(lambda *x: np.stack(x), *rows)
+    return outcome, first[0], jax.tree.map(lambda *x: np.stack(x), *rows)
 
 
 def member(tree: PyTree, index: int) -> Any:

@@ -70,7 +70,7 @@ class Config(ExperimentConfig):
     """How the aspect ratio to start at is reached."""
     fit: Fitting = Fitting(learning_rate=0.1, epochs=200)
     """How the tensions (their logits) are fitted."""
-    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=100)
+    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_flips=3, max_steps=100)
     """How the tissue is relaxed."""
 
 
@@ -129,14 +129,14 @@ def _design(config: Config, n_cells: int, progress: bool) -> tuple[Fit, Fit, np.
     options: dict[str, Any] = {"batched": True, "progress": progress}
     # One start a replicate, repeated for each target: the fit of the same shape is compiled once.
     batch = stack([problems[k] for _, k in _members(config)])
-    started, _ = design(batch, config.start, _measure, **options)
+    started, *_ = design(batch, config.start, _measure, **options)
     targets = jnp.array([target for target, _ in _members(config)])
     batch = eqx.tree_at(
         lambda p: (p.tissue, p.energy, p.cost.target),
         batch,
         (started.tissue, started.energy, targets),
     )
-    outcome, curves = design(batch, config.fit, _measure, **options)
+    outcome, _, curves = design(batch, config.fit, _measure, **options)
     return started, outcome, curves
 
 

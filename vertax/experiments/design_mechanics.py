@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, PyTree
 from pydantic import Field
 
-from vertax._equilibrium import equilibrate
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import MeanShapeFactor
@@ -66,7 +65,6 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
 
     - `FitError` if the fit cannot go on.
     """
-    options = config.relaxation.options()
     keys = jax.random.split(jax.random.key(config.seed))
     n_cells = config.tissue.n_cells
     noise = jax.random.normal(keys[0], (n_cells,))
@@ -74,15 +72,14 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     noise = noise - jnp.mean(noise)
     energy = ShapeFactorEnergy(config.start.mean + config.start.deviation * noise)
     drawn = periodic_voronoi(n_cells, key=keys[1], lloyd_steps=config.tissue.lloyd_steps)
-    initial = equilibrate(drawn, energy, **options, throw=False).tissue
     problem = InverseProblem(
-        initial,
+        drawn,
         energy,
         MeanShapeFactor(config.target),
         adjoint=config.gradient.build(),
-        **options,
+        **config.relaxation.options(),
     )
-    outcome, (observed, targets) = design(
+    outcome, initial, (observed, targets) = design(
         problem, config.fit, _measure, batched=False, progress=progress
     )
     _save(initial, outcome, observed, targets, config, folder)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +66,7 @@ class Config(ExperimentConfig):
     """How gradients are taken."""
     fit: Fitting = Fitting(learning_rate=0.1, epochs=60)
     """How the tensions (their logits) are fitted."""
-    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=100)
+    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_flips=3, max_steps=100)
     """How the tissue is relaxed."""
 
 
@@ -95,7 +94,9 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         for n_types in config.n_types:
             name = f"{boundary}, {n_types} types"
             batch = stack(_problems(config, boundary, n_types))
-            outcome, curves = design(batch, config.fit, _measure, batched=True, progress=progress)
+            outcome, first, curves = design(
+                batch, config.fit, _measure, batched=True, progress=progress
+            )
             shares[name] = curves
             labels = [
                 {"boundary": boundary, "n_types": str(n_types), "replicate": str(k)}
@@ -104,7 +105,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
             tables.append(histories(outcome, labels) | {"heterotypic_share": curves.T.ravel()})
             folder.save_table("history", joined(tables))
             metrics[name] = _metrics(config, outcome, curves)
-            panels = panels or _panels(batch, outcome, curves, folder)
+            panels = panels or _panels(batch, first, outcome, curves, folder)
     bounds = (config.tensions.low, config.tensions.high)
     folder.save_figure("design", figures.patterns(panels, bounds, shares))
     return metrics
@@ -169,22 +170,17 @@ def _metrics(config: Config, outcome: Fit, curves: np.ndarray) -> dict[str, Any]
 
 
 def _panels(
-    batch: Any, outcome: Fit, curves: np.ndarray, folder: RunFolder
+    batch: Any, first: Tissue, outcome: Fit, curves: np.ndarray, folder: RunFolder
 ) -> dict[str, tuple[Tissue, np.ndarray, np.ndarray]]:
     """The first replicate before and after."""
     types = np.asarray(batch.cost.cell_types)[0]
     folder.save_table("cell_types", {"cell": np.arange(len(types)), "type": types})
-    relaxed = eqx.filter_jit(_relaxed)(member(batch, 0))
     panels = {}
     for name, tissue, energy, share in (
-        ("initial", relaxed, batch.energy, curves[0, 0]),
+        ("initial", first, batch.energy, curves[0, 0]),
         ("designed", outcome.tissue, outcome.energy, _best(outcome, curves)[0]),
     ):
-        own = tissue if name == "initial" else member(tissue, 0)
+        own = member(tissue, 0)
         panels[f"{name}: {share:.1%} heterotypic"] = (own, types, tensions(energy)[0])
         folder.save_tissue(name, own)
     return panels
-
-
-def _relaxed(problem: InverseProblem) -> Tissue:
-    return problem()[1].tissue
