@@ -98,7 +98,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         **fit_metrics(outcome),
         "gradient_residual": np.nanmax(outcome.history.gradient_residual),
         "seconds": outcome.history.seconds.sum(),
-        "limited_by": limits(outcome, near[best]),
+        "limited_by": limits(outcome, np.asarray(near[best])),
     }
 
 
