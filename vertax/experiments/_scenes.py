@@ -48,7 +48,7 @@ class Scene(eqx.Module):
 
 
 def make_scene(
-    key: PRNGKeyArray,
+    keys: PRNGKeyArray,
     tissue: TissueSection,
     truth: ShapeFactors,
     relaxation: Relaxation,
@@ -59,7 +59,7 @@ def make_scene(
 
     **Arguments:**
 
-    - `key`: of everything random.
+    - `keys`: three, of the hidden shape factors, of the guess and of the tissue.
     - `tissue`, `truth`: what to draw.
     - `relaxation`: how the guess is relaxed; the hidden tissue is a true equilibrium in any case.
     - `redrawn`: guess by another draw, and not by the mean.
@@ -70,7 +70,6 @@ def make_scene(
 
     - `ValueError` if the hidden tissue does not reach equilibrium.
     """
-    keys = jax.random.split(key, 3)
     draw = lambda k: truth.mean + truth.deviation * jax.random.normal(k, (tissue.n_cells,))
     hidden = ShapeFactorEnergy(draw(keys[0]))
     guess = ShapeFactorEnergy(draw(keys[1]) if redrawn else jnp.full(tissue.n_cells, truth.mean))

@@ -236,7 +236,7 @@ def _scenes(config: Config, relaxation: Relaxation, n_cells: int | None = None) 
         tissue = tissue.model_copy(update={"n_cells": n_cells})
     scenes: list[Scene] = []
     for key in jax.random.split(jax.random.key(config.seed), 20 * config.replicates):
-        scene = make_scene(key, tissue, config.truth, Relaxation())
+        scene = make_scene(jax.random.split(key, 3), tissue, config.truth, Relaxation())
         if same_neighbours(scene.initial, scene.target):
             options = relaxation.options()
             initial = equilibrate(scene.target, scene.guess, **options, throw=False).tissue
@@ -432,9 +432,9 @@ def _scaling(config: Config, folder: RunFolder) -> dict[str, Any]:
     for name in ("equilibrium", "paper"):
         protocol = _protocol(config, name)
         for n_cells in config.scaling.sizes:
-            key = jax.random.key(config.seed)
+            keys = jax.random.split(jax.random.key(config.seed), 3)
             tissue = config.tissue.model_copy(update={"n_cells": n_cells})
-            scene = make_scene(key, tissue, config.truth, protocol.relaxation)
+            scene = make_scene(keys, tissue, config.truth, protocol.relaxation)
             for method in _measurable(config, n_cells):
                 problem = _problem(scene, protocol, method)
                 rows.append(

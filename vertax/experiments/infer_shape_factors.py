@@ -133,11 +133,11 @@ def synthetic_image(
 
 
 def _make_scene(config: Config) -> tuple[Scene, _Image]:
-    keys = jax.random.split(jax.random.key(config.seed))
+    keys = jax.random.split(jax.random.key(config.seed), 4)
     redrawn = config.guess == "redrawn"
-    scene = make_scene(keys[0], config.tissue, config.truth, config.relaxation, redrawn=redrawn)
+    scene = make_scene(keys[:3], config.tissue, config.truth, config.relaxation, redrawn=redrawn)
     needs_image = config.data != "vertices"
-    return scene, synthetic_image(scene.target, config.image, keys[1]) if needs_image else None
+    return scene, synthetic_image(scene.target, config.image, keys[3]) if needs_image else None
 
 
 def _fit(config: Config, scene: Scene, image: _Image, source: str, progress: bool) -> Fit:
