@@ -12,8 +12,9 @@ solvers
 FAMILIES = {
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
-    "costs": "AbstractCost AbstractLeastSquaresCost MeshImage VertexDistance WeightedSum mirror render",
-    "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity LineTension LocalSum "
+    "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas HomotypicLength "
+    "MeanShapeFactor MeshImage VertexDistance WeightedSum aspect_ratio mirror render",
+    "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "
     "PerimeterElasticity ShapeFactorEnergy Sum",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
     "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",

@@ -1,9 +1,12 @@
 """Costs: what we want of an equilibrium."""
 
+from vertax.costs._aspect import AspectRatio as AspectRatio, aspect_ratio as aspect_ratio
+from vertax.costs._cells import CellAreas as CellAreas, MeanShapeFactor as MeanShapeFactor
 from vertax.costs._cost import (
     AbstractCost as AbstractCost,
     AbstractLeastSquaresCost as AbstractLeastSquaresCost,
     WeightedSum as WeightedSum,
 )
 from vertax.costs._image import MeshImage as MeshImage, mirror as mirror, render as render
+from vertax.costs._interfaces import HomotypicLength as HomotypicLength
 from vertax.costs._vertices import VertexDistance as VertexDistance

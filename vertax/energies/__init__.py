@@ -11,4 +11,4 @@ from vertax.energies._energy import (
     LocalSum as LocalSum,
     Sum as Sum,
 )
-from vertax.energies._tension import LineTension as LineTension
+from vertax.energies._tension import BoundedTension as BoundedTension, LineTension as LineTension

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
 
+from vertax._misc import is_concrete
 from vertax._tissue import Tissue
 from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_edge
 
@@ -21,6 +24,53 @@ class LineTension(AbstractLocalEnergy):
     """
 
     tension: float | Float[Array, "*edges"] = eqx.field(converter=as_parameter)
+
+    def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
+        """Energy of each edge."""
+        return per_edge(self.tension, tissue, "tension") * tissue.edge_lengths
+
+
+class BoundedTension(AbstractLocalEnergy):
+    r"""Line tension that a fit cannot drive out of bounds: $\sum_e \gamma_e\,\ell_e$ with
+
+    $$\gamma_e = \gamma_\mathrm{low} + (\gamma_\mathrm{high} - \gamma_\mathrm{low})\,
+      \frac{1}{1 + e^{-z_e}}.$$
+
+    A fit adjusts the logits $z$, and whatever they become the tension stays between its bounds. With
+    [`LineTension`][vertax.energies.LineTension] an optimiser may go to negative tensions, under which
+    edges lengthen without end, or to such that cells collapse.
+
+    **Arguments:**
+
+    - `tension`: line tension $\gamma$ to begin with, energy per length; scalar array or one an edge.
+    - `low`, `high`: the bounds, which are constants.
+
+    **Raises:**
+
+    - `ValueError` if `low` is not below `high`, or a tension not between them.
+    """
+
+    logits: Float[Array, "*edges"]
+    low: float
+    high: float
+
+    def __init__(self, tension: ArrayLike, low: float, high: float):
+        if not low < high:
+            raise ValueError(f"Argument `low` must be below `high`, but they are {low} and {high}.")
+        tension = jnp.asarray(tension, jnp.result_type(float))
+        if is_concrete(tension) and not jnp.all((tension > low) & (tension < high)):
+            raise ValueError(
+                f"Argument `tension` must lie between {low} and {high}, but goes from {tension.min()} "
+                f"to {tension.max()}."
+            )
+        self.logits = jnp.log((tension - low) / (high - tension))
+        self.low = float(low)
+        self.high = float(high)
+
+    @property
+    def tension(self) -> Float[Array, "*edges"]:
+        """Line tension of each edge, energy per length."""
+        return self.low + (self.high - self.low) * jax.nn.sigmoid(self.logits)
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
         """Energy of each edge."""

@@ -7,7 +7,14 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
-from vertax.experiments import benchmark_adjoints, infer_from_microscopy, infer_shape_factors
+from vertax.experiments import (
+    benchmark_adjoints,
+    convergent_extension,
+    design_mechanics,
+    infer_from_microscopy,
+    infer_shape_factors,
+    salt_and_pepper,
+)
 from vertax.experiments._config import (
     ConfigError,
     ExperimentConfig,
@@ -52,6 +59,24 @@ _ALL = (
         benchmark_adjoints.Config,
         benchmark_adjoints.run,
         "Compare automatic and implicit differentiation and equilibrium propagation.",
+    ),
+    Experiment(
+        "design_mechanics",
+        design_mechanics.Config,
+        design_mechanics.run,
+        "Choose target shape factors of cells that give the tissue a mean shape factor.",
+    ),
+    Experiment(
+        "convergent_extension",
+        convergent_extension.Config,
+        convergent_extension.run,
+        "Choose tensions of edges that elongate a cluster of cells.",
+    ),
+    Experiment(
+        "salt_and_pepper",
+        salt_and_pepper.Config,
+        salt_and_pepper.run,
+        "Choose tensions of edges that keep cells of one type apart.",
     ),
 )
 

@@ -33,6 +33,8 @@ class Relaxation(Section):
     """Whether short edges may flip (T1 transitions)."""
     t1_threshold: float = Field(default=5e-3, gt=0)
     """Length below which an edge may flip, where the mean area of a cell is 1."""
+    max_flips: int = Field(default=20, ge=1)
+    """How often one edge may flip in a relaxation."""
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `vertax.equilibrate` and `vertax.InverseProblem`.
@@ -41,7 +43,7 @@ class Relaxation(Section):
         """
         return {
             "solver": self._minimiser(),
-            "transitions": T1(self.t1_threshold) if self.transitions else None,
+            "transitions": T1(self.t1_threshold, self.max_flips) if self.transitions else None,
             "tolerance": self.tolerance,
             "patience": self.patience,
             "max_steps": self.max_steps,

@@ -1,0 +1,124 @@
+"""The elongation of a whole cluster of cells."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vertax._arcs import arc_points, length_factor
+from vertax._boundary import Free
+from vertax._tissue import Tissue
+from vertax.costs._cost import AbstractLeastSquaresCost
+from vertax.energies import AbstractEnergy
+
+Measure = Literal["moments", "farthest"]
+
+# Moments are integrals along the outline (Green's theorem). On an arc of angle α the integrand has the
+# harmonics up to 4 α of a parameter from -1 to 1: this many Gauss-Legendre points leave only rounding
+# errors up to a whole circle, α = π; and a chord, a polynomial, they integrate exactly.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+def aspect_ratio(tissue: Tissue, measure: Measure = "moments") -> Float[Array, ""]:
+    r"""Ratio of the long to the short axis of a free tissue, $r = L/\ell \ge 1$.
+
+    **Arguments:**
+
+    - `tissue`: a free tissue.
+    - `measure`: `"moments"` is $\sqrt{\lambda_1/\lambda_2}$ with the eigenvalues of the matrix of second
+        moments of the area within the outline (its arcs included), the axis ratio of the ellipse of
+        the same moments. Every part of the outline counts and it is smooth, but at $r = 1$, where it
+        has a kink (no axis is the long one) and a derivative of 0 here. `"farthest"` is the paper's:
+        $L$ is the distance of the two vertices farthest apart, and $\ell$ the width of all vertices
+        across the line through them. Its derivative sees four vertices and jumps when others become
+        the outermost.
+
+    **Returns:** the ratio.
+
+    **Raises:**
+
+    - `ValueError` for a periodic tissue or another measure.
+    """
+    if not isinstance(tissue.boundary, Free):
+        raise ValueError(
+            "The aspect ratio is that of an outline, which only a free tissue has, but the boundary is "
+            f"{type(tissue.boundary).__name__}."
+        )
+    if measure not in ("moments", "farthest"):
+        raise ValueError(f"Argument `measure` must be 'moments' or 'farthest', but is {measure!r}.")
+    return _from_moments(tissue) if measure == "moments" else _from_farthest(tissue)
+
+
+class AspectRatio(AbstractLeastSquaresCost):
+    r"""Squared distance of the aspect ratio of a free tissue from a target (paper, "Convergent extension").
+
+    $$C = \left(\frac{L}{\ell} - r_\mathrm{target}\right)^2$$
+
+    **Arguments:**
+
+    - `target`: the ratio to reach, above 1.
+    - `measure`: how the ratio is measured, see [`aspect_ratio`][vertax.costs.aspect_ratio].
+
+    **Raises:**
+
+    - `ValueError` for a periodic tissue or another measure.
+    """
+
+    target: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    measure: Measure = eqx.field(static=True, default="moments")
+
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """The distance, times the root of 2: the paper's cost is the square, not half of it."""
+        return jnp.sqrt(2.0) * (aspect_ratio(tissue, self.measure) - self.target)[None]
+
+
+def _from_moments(tissue: Tissue) -> Float[Array, ""]:
+    xx, xy, yy = _second_moments(tissue)
+    mean, half = (xx + yy) / 2, (xx - yy) / 2
+    # The eigenvalues are mean ± spread. The `where` is doubled: the slope of a root at 0 is infinite.
+    squared = half**2 + xy**2
+    distinct = squared > 0
+    spread = jnp.where(distinct, jnp.sqrt(jnp.where(distinct, squared, 1)), 0)
+    return jnp.sqrt((mean + spread) / (mean - spread))
+
+
+def _second_moments(tissue: Tissue) -> tuple[Array, Array, Array]:
+    r"""$\int x^2, \int xy, \int y^2$ over the area within the outline, about its centroid."""
+    first, chord = tissue.edge_segments
+    angle = tissue.edge_angles
+    # Far from the origin the integrals would lose digits.
+    first = first - jnp.mean(tissue.vertices, axis=0)
+    nodes, weights = (jnp.asarray(x, chord.dtype) for x in (_NODES, _WEIGHTS / 2))
+    points = arc_points(first, chord, angle, (1 + nodes) / 2)
+    # On its way from the start to the end the tangent turns by 2 α, and is along the chord half-way.
+    turn = angle[:, None] * nodes
+    cos, sin = jnp.cos(turn)[..., None], jnp.sin(turn)[..., None]
+    left = jnp.stack([-chord[:, 1], chord[:, 0]], axis=-1)
+    velocity = length_factor(angle)[:, None, None] * (cos * chord[:, None] + sin * left[:, None])
+    # For a function f that is homogeneous of degree n, ∫ f dA = 1/(n + 2) ∮ f p × dp; on the outline the
+    # tissue is on the left of each edge. Edges inside do not count.
+    swept = points[..., 0] * velocity[..., 1] - points[..., 1] * velocity[..., 0]
+    swept = jnp.where(tissue.topology.on_outline[:, None], weights * swept, 0)
+    area = jnp.sum(swept) / 2
+    centre = jnp.sum(points * swept[..., None], axis=(0, 1)) / (3 * area)
+    x, y = points[..., 0], points[..., 1]
+    moment = lambda f, a, b: jnp.sum(f * swept) / 4 - area * a * b
+    return (
+        moment(x * x, centre[0], centre[0]),
+        moment(x * y, centre[0], centre[1]),
+        moment(y * y, centre[1], centre[1]),
+    )
+
+
+def _from_farthest(tissue: Tissue) -> Float[Array, ""]:
+    vertices = tissue.vertices
+    between = vertices[:, None] - vertices[None]
+    flat = jnp.argmax(jnp.sum(between**2, axis=-1))
+    axis = between.reshape(-1, 2)[flat]
+    length = jnp.sqrt(jnp.sum(axis**2))
+    across = (vertices[:, 0] * axis[1] - vertices[:, 1] * axis[0]) / length
+    return length / (jnp.max(across) - jnp.min(across))

@@ -1,0 +1,56 @@
+"""What is wanted of the shapes and sizes of cells."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vertax._tissue import Tissue
+from vertax.costs._cost import AbstractLeastSquaresCost
+from vertax.energies import AbstractEnergy
+
+
+class MeanShapeFactor(AbstractLeastSquaresCost):
+    r"""Squared distance of the mean observed shape factor from a target (paper, "Inverse mechanical design").
+
+    $$C = \left(\frac1N \sum_{c=1}^N \frac{P_c}{\sqrt{A_c}} - P_\mathrm{target}\right)^2$$
+
+    with the shape factors that the cells have in equilibrium. (The paper's formula has the target shape
+    factors $p^0_c$ of the energy instead, which no equilibrium is needed for. In a fluid tissue, where
+    every cell attains its target, the two are the same.)
+
+    **Arguments:**
+
+    - `target`: the mean shape factor to reach, dimensionless.
+    """
+
+    target: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """The distance, times the root of 2: the paper's cost is the square, not half of it."""
+        return jnp.sqrt(2.0) * (jnp.mean(tissue.shape_factors) - self.target)[None]
+
+
+class CellAreas(AbstractLeastSquaresCost):
+    r"""Mean squared distance of the areas of cells from those wanted, $\frac1{2N}\sum_c (A_c - A^t_c)^2$.
+
+    **Arguments:**
+
+    - `target`: areas to reach; scalar or one a cell.
+
+    **Raises:**
+
+    - `ValueError` if the number of areas is not that of the cells.
+    """
+
+    target: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """Differences of areas over the root of the number of cells."""
+        if self.target.shape not in ((), (tissue.n_cells,)):
+            raise ValueError(
+                "The target of CellAreas must be a scalar or have one entry a cell, shape "
+                f"({tissue.n_cells},), but its shape is {self.target.shape}."
+            )
+        return (tissue.areas - self.target) / jnp.sqrt(1.0 * tissue.n_cells)

@@ -1,0 +1,241 @@
+"""What experiments of inverse design have in common: their sections, their fits and what limits them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from pydantic import Field, model_validator
+
+from vertax._fit import Fit, Record, fit
+from vertax._inverse import InverseProblem
+from vertax._tissue import Tissue
+from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
+from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
+from vertax.experiments._config import Section
+from vertax.experiments._run import history_columns
+from vertax.experiments._sections import Fitting
+
+
+class Gradient(Section):
+    """How gradients through the equilibrium are taken."""
+
+    method: Literal["implicit", "propagation"] = "implicit"
+    """Implicit differentiation, or equilibrium propagation."""
+    nudge: Literal["linear", "cost"] = "linear"
+    """The nudge of equilibrium propagation; cost lets T1 transitions follow the cost."""
+    beta: float | None = Field(default=None, gt=0)
+    """Its strength; left out, it is chosen by the precision."""
+    nudged_rtol: float | None = Field(default=None, gt=0)
+    """Tolerance of nudged relaxations relative to the nudge; left out, chosen by the precision."""
+
+    def build(self) -> AbstractAdjoint:
+        """The adjoint.
+
+        **Returns:** one that goes on where a gradient did not converge: the history has its residual.
+        """
+        if self.method == "implicit":
+            return ImplicitDifferentiation(throw=False)
+        return EquilibriumPropagation(self.beta, self.nudge, rtol=self.nudged_rtol, throw=False)
+
+
+class Tensions(Section):
+    """Line tensions of the edges and stiffness of the cells, where the mean rest area of a cell is 1."""
+
+    low: float = Field(default=0.04, ge=0)
+    """Least tension."""
+    high: float = Field(default=0.28, gt=0)
+    """Largest tension; above twice the least one, there are junctions of three edges without a balance,
+    which close to four-fold vertices."""
+    stiffness: float = Field(default=1.0, gt=0)
+    """Stiffness of the areas of cells."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Tensions:
+        if not self.low < self.high:
+            raise ValueError(f"low must be below high, but they are {self.low} and {self.high}")
+        return self
+
+    def draw(self, tissue: Tissue, spread: float, key: PRNGKeyArray) -> LocalSum:
+        """The energy E2 with a tension for each edge.
+
+        **Arguments:**
+
+        - `tissue`: the tissue.
+        - `spread`: the share of the range, about its middle, that tensions are drawn from; below 1.
+        - `key`: of the draw.
+
+        **Returns:** the energy; the tensions are [`BoundedTension`][vertax.energies.BoundedTension].
+        """
+        unit = jax.random.uniform(key, (tissue.n_edges,), minval=-1.0, maxval=1.0)
+        share = 0.5 + 0.5 * spread * unit
+        tension = BoundedTension(self.low + (self.high - self.low) * share, self.low, self.high)
+        return LocalSum((AreaElasticity(self.stiffness, 1.0), tension))
+
+
+def tensions(energy: AbstractEnergy) -> Float[np.ndarray, "*batch edges"]:
+    """The tensions of an energy of [`Tensions.draw`][vertax.experiments._design.Tensions.draw].
+
+    **Arguments:**
+
+    - `energy`: the energy, or a batch.
+
+    **Returns:** tension of each edge.
+    """
+    assert isinstance(energy, LocalSum)
+    _, tension = energy.terms
+    assert isinstance(tension, BoundedTension)
+    return np.asarray(tension.tension, float)
+
+
+def design(
+    problem: InverseProblem,
+    fitting: Fitting,
+    measure: Callable[[InverseProblem, Tissue, PyTree], PyTree[Array]],
+    *,
+    batched: bool,
+    progress: bool,
+) -> tuple[Fit, Tissue, PyTree[np.ndarray]]:
+    """Fit, and measure something in each epoch.
+
+    **Arguments:**
+
+    - `problem`: the inverse problem, or a batch.
+    - `fitting`: how it is fitted.
+    - `measure`: a function of one problem, its tissue in equilibrium and the fitted leaves of the energy.
+    - `batched`: whether it is a batch.
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** the fit; the equilibrium that it began with; and what was measured, each array with a
+    leading axis of epochs.
+
+    **Raises:**
+
+    - `FitError` if the fit cannot go on.
+    """
+    compiled = eqx.filter_jit(eqx.filter_vmap(measure) if batched else measure)
+    rows: list[PyTree[np.ndarray]] = []
+    first: list[Tissue] = []
+
+    def note(epoch: int, record: Record) -> None:
+        if epoch == 0:
+            first.append(record.tissue)
+        rows.append(jax.tree.map(np.asarray, compiled(problem, record.tissue, record.parameters)))
+
+    outcome = fit(
+        problem, fitting.build(), fitting.epochs, batched=batched, progress=progress, callback=note
+    )
+    return outcome, first[0], jax.tree.map(lambda *x: np.stack(x), *rows)
+
+
+def member(tree: PyTree, index: int) -> Any:
+    """One of a batch.
+
+    **Arguments:**
+
+    - `tree`: the batch.
+    - `index`: which.
+
+    **Returns:** its member.
+    """
+    is_array = lambda x: eqx.is_array(x) or isinstance(x, np.ndarray)
+    return jax.tree.map(lambda x: x[index] if is_array(x) else x, tree)
+
+
+def histories(outcome: Fit, labels: Sequence[dict[str, str]]) -> dict[str, Any]:
+    """The table of all epochs of a batch.
+
+    **Arguments:**
+
+    - `outcome`: the fit of the batch.
+    - `labels`: of each member, what tells it apart.
+
+    **Returns:** columns by name.
+    """
+    single = lambda k: jax.tree.map(lambda x: x[:, k] if x.ndim > 1 else x, outcome.history)
+    parts = [history_columns(single(k), **label) for k, label in enumerate(labels)]
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+
+def joined(tables: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Tables one below the other, with the columns that all of them have.
+
+    **Arguments:**
+
+    - `tables`: columns by name.
+
+    **Returns:** columns by name.
+    """
+    names = [name for name in tables[0] if all(name in table for table in tables)]
+    return {name: np.concatenate([table[name] for table in tables]) for name in names}
+
+
+def limits(outcome: Fit, reached: np.ndarray) -> str | list[str]:
+    """What kept a fit from its goal, in words.
+
+    **Arguments:**
+
+    - `outcome`: the fit, or a batch.
+    - `reached`: whether its best design is good enough.
+
+    **Returns:** "reached", or the first that holds of: relaxations ended early; the cost was still
+    falling; T1 transitions went on to the end; the gradient vanished; the cost stopped falling. A list
+    for a batch.
+    """
+    history = outcome.history
+    curves = (history.converged, history.num_t1, history.gradient_norm)
+    if not reached.ndim:
+        return _limit(bool(reached), int(outcome.best_epoch), *curves)
+    return [
+        _limit(bool(done), int(best), *(curve[:, k] for curve in curves))
+        for k, (done, best) in enumerate(zip(reached, outcome.best_epoch, strict=True))
+    ]
+
+
+def _limit(
+    reached: bool, best_epoch: int, converged: np.ndarray, num_t1: np.ndarray, slope: np.ndarray
+) -> str:
+    if reached:
+        return "reached"
+    epochs = len(converged)
+    last = slice(-max(epochs // 5, 1), None)
+    if converged[last].mean() < 0.9:
+        return "relaxations ended before equilibrium"
+    if best_epoch >= 0.95 * (epochs - 1):
+        return "still falling at the last epoch"
+    if num_t1[last].any():
+        return "T1 transitions to the end, which the gradient does not foresee"
+    if np.median(slope[last]) < 1e-3 * slope.max():
+        return "gradient vanished: a minimum, or tensions at their bounds"
+    return "stopped falling"
+
+
+def mean_and_deviation(values: Any) -> dict[str, float]:
+    """Mean and standard deviation.
+
+    **Arguments:**
+
+    - `values`: numbers.
+
+    **Returns:** both by name.
+    """
+    values = np.asarray(values, float)
+    return {"mean": float(values.mean()), "deviation": float(values.std())}
+
+
+def keys_of(seed: int, n: int) -> list[PRNGKeyArray]:
+    """Random keys of replicates: those of the first do not depend on how many there are.
+
+    **Arguments:**
+
+    - `seed`: the seed of the run.
+    - `n`: number of replicates.
+
+    **Returns:** the keys.
+    """
+    return [jax.random.fold_in(jax.random.key(seed), k) for k in range(n)]
