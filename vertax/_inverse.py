@@ -214,8 +214,8 @@ def _(
     energy, shift, slot = vjp_arg
     adjoint = problem.adjoint
     assert isinstance(adjoint, EquilibriumPropagation)
-    half_beta, force = _nudge(problem, adjoint, settled, energy, shift)
     stiffness = mean_stiffness(settled, energy)
+    half_beta, force = _nudge(problem, adjoint, settled, energy, shift, stiffness)
     moving, fixed = differentiable((energy, shift))
 
     def phase(sign: Array) -> tuple[PyTree[Array], Equilibrium]:
@@ -246,6 +246,7 @@ def _nudge(
     settled: Tissue,
     energy: AbstractEnergy,
     shift: Float[Array, 2] | None,
+    stiffness: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Half of β, and a force that it exerts if not at the optimum."""
     cost = lambda tissue: problem.cost(_moved(tissue, shift), energy)
@@ -260,7 +261,7 @@ def _nudge(
     if adjoint.beta is not None:
         half_beta = jnp.asarray(adjoint.beta, value.dtype) / 2
     else:
-        units = {"stiffness": mean_stiffness(settled, energy), "length_scale": length}
+        units = {"stiffness": stiffness, "length_scale": length}
         half_beta = adjoint.strength(None, units, value.dtype) / pull
     return half_beta, half_beta * pull
 

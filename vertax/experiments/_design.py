@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
@@ -17,7 +17,6 @@ from vertax._tissue import Tissue
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
 from vertax.experiments._config import Section
-from vertax.experiments._run import history_columns
 from vertax.experiments._sections import Fitting
 
 
@@ -144,35 +143,6 @@ def member(tree: PyTree, index: int) -> Any:
     """
     is_array = lambda x: eqx.is_array(x) or isinstance(x, np.ndarray)
     return jax.tree.map(lambda x: x[index] if is_array(x) else x, tree)
-
-
-def histories(outcome: Fit, labels: Sequence[dict[str, str]]) -> dict[str, Any]:
-    """The table of all epochs of a batch.
-
-    **Arguments:**
-
-    - `outcome`: the fit of the batch.
-    - `labels`: of each member, what tells it apart.
-
-    **Returns:** columns by name.
-    """
-    single = lambda k: jax.tree.map(lambda x: x[:, k] if x.ndim > 1 else x, outcome.history)
-    parts = [history_columns(single(k), **label) for k, label in enumerate(labels)]
-    names = [name for name in parts[0] if all(name in part for part in parts)]
-    return {name: np.concatenate([part[name] for part in parts]) for name in names}
-
-
-def joined(tables: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Tables one below the other, with the columns that all of them have.
-
-    **Arguments:**
-
-    - `tables`: columns by name.
-
-    **Returns:** columns by name.
-    """
-    names = [name for name in tables[0] if all(name in table for table in tables)]
-    return {name: np.concatenate([table[name] for table in tables]) for name in names}
 
 
 def limits(outcome: Fit, reached: np.ndarray) -> str | list[str]:

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import tomli_w
 from jaxtyping import Shaped
@@ -191,6 +192,35 @@ def history_columns(history: History, **labels: str) -> dict[str, Any]:
         "epoch": np.arange(n),
         **history.columns(),
     }
+
+
+def histories(outcome: Fit, labels: Sequence[dict[str, str]]) -> dict[str, Any]:
+    """The table of all epochs of a batch.
+
+    **Arguments:**
+
+    - `outcome`: the fit of the batch.
+    - `labels`: of each member, what tells it apart.
+
+    **Returns:** columns by name.
+    """
+    single = lambda k: jax.tree.map(lambda x: x[:, k] if x.ndim > 1 else x, outcome.history)
+    parts = [history_columns(single(k), **label) for k, label in enumerate(labels)]
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+
+def joined(tables: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Tables one below the other, with the columns that all of them have.
+
+    **Arguments:**
+
+    - `tables`: columns by name.
+
+    **Returns:** columns by name.
+    """
+    names = [name for name in tables[0] if all(name in table for table in tables)]
+    return {name: np.concatenate([table[name] for table in tables]) for name in names}
 
 
 def fit_metrics(outcome: Fit) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
 from vertax.experiments import _adjoint_figures as figures
 from vertax.experiments._config import ExperimentConfig, Section
-from vertax.experiments._run import RunFolder, history_columns
+from vertax.experiments._run import RunFolder, histories, joined
 from vertax.experiments._scenes import (
     Scene,
     ShapeFactors,
@@ -177,7 +177,12 @@ def _inference(config: Config, name: str, folder: RunFolder, progress: bool) -> 
     columns = {"replicate": np.repeat(np.arange(len(true)), true.shape[1]), "true": true.ravel()}
     columns |= {"initial": initial.ravel()} | {m: values.ravel() for m, values in inferred.items()}
     folder.save_table(f"shape_factors_{name}", columns)
-    folder.save_table(f"history_{name}", _history_table(fits))
+    replicates = [str(k) for k in range(config.replicates)]
+    tables = [
+        histories(outcome, [{"method": method, "replicate": k} for k in replicates])
+        for method, outcome in fits.items()
+    ]
+    folder.save_table(f"history_{name}", joined(tables))
     title = {"paper": "the paper's protocol", "equilibrium": "true equilibria"}[name]
     figure = figures.inference(fits, true, initial, inferred, title=title)
     folder.save_figure(f"inference_{name}", figure)
@@ -211,16 +216,6 @@ def _recovery(true: np.ndarray, inferred: np.ndarray, outcome: Fit) -> dict[str,
 def _first_below(curve: np.ndarray, level: float) -> int | None:
     below = np.flatnonzero(curve < level)
     return int(below[0]) if below.size else None
-
-
-def _history_table(fits: dict[str, Fit]) -> dict[str, Any]:
-    tables = []
-    for method, outcome in fits.items():
-        for k in range(outcome.history.cost.shape[1]):
-            own = jax.tree.map(lambda x, k=k: x[:, k] if x.ndim > 1 else x, outcome.history)
-            tables.append(history_columns(own, method=method, replicate=str(k)))
-    names = [n for n in tables[0] if all(n in t for t in tables)]
-    return {n: np.concatenate([t[n] for t in tables]) for n in names}
 
 
 def _protocol(config: Config, name: str) -> Protocol:

@@ -25,15 +25,13 @@ from vertax.experiments._design import (
     Gradient,
     Tensions,
     design,
-    histories,
-    joined,
     keys_of,
     limits,
     mean_and_deviation,
     member,
     tensions,
 )
-from vertax.experiments._run import RunFolder
+from vertax.experiments._run import RunFolder, histories, joined
 from vertax.experiments._scenes import TissueSection, stack
 from vertax.experiments._sections import Fitting, Relaxation
 from vertax.initialise import free_voronoi, periodic_voronoi
