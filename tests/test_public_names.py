@@ -12,8 +12,9 @@ solvers
 FAMILIES = {
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
-    "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas HomotypicLength "
-    "MeanShapeFactor MeshImage VertexDistance WeightedSum aspect_ratio mirror render",
+    "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance "
+    "HomotypicLength IndexAwareStructural MeanShapeFactor MeshImage VertexDistance WeightedSum "
+    "adjacency aspect_ratio mirror mismatched_neighbours render",
     "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "
     "PerimeterElasticity ShapeFactorEnergy Sum",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "

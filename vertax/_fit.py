@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from tqdm.auto import tqdm
 
 from vertax._equilibrium import Equilibrium
@@ -102,6 +102,7 @@ class _Best(eqx.Module):
     tissue: Tissue
     cost: Float[Array, ""]
     max_force: Float[Array, ""]
+    guidance: Float[Array, ""]
     epoch: Int[Array, ""]
 
 
@@ -119,11 +120,12 @@ def fit(
     epochs: int,
     *,
     truth: AbstractEnergy | None = None,
+    guidance: Callable[[Int[Array, ""]], ArrayLike] | None = None,
     batched: bool = False,
     progress: bool = True,
     callback: Callable[[int, Record], None] | None = None,
 ) -> Fit[Energy]:
-    """Solve an inverse problem.
+    r"""Solve an inverse problem.
 
     Each epoch relaxes the tissue from the last equilibrium, takes the gradient of the cost through it
     and lets the optimiser, whose state lives through all epochs, update the parameters.
@@ -133,6 +135,13 @@ def fit(
     the solver does. Where the data determine the parameters it needs a dozen epochs. The cost must be
     an [`AbstractLeastSquaresCost`][vertax.costs.AbstractLeastSquaresCost] or a weighted sum of such.
 
+    If the tissue has to change its topology on the way, its own gradient need not lead there: it sees
+    one valley of a rugged landscape (paper, "Topological cost functions unlock robust parameter
+    inference"). `guidance` then lets the cost itself pull the tissue, which relaxes $E + \kappa C$, and
+    fits the parameters so that there is less and less to pull. With strong guidance the tissue is
+    where the cost wants it, and the fit balances forces there; as $\kappa \to 0$ it becomes the inverse
+    problem itself. At parameters that explain the target exactly it makes no difference.
+
     **Arguments:**
 
     - `problem`: the inverse problem.
@@ -140,6 +149,9 @@ def fit(
         or a least-squares solver of Optimistix.
     - `epochs`: number of updates.
     - `truth`: the energy with the true parameters where they are known, to record the error.
+    - `guidance`: strength $\kappa$ of the guidance by epoch, such as an Optax schedule, in place of that
+        of the problem; it should end at 0. Vertices feel a mean cost one by one: about 10 times the
+        number of cells is strong. Of an Optax optimiser only.
     - `batched`: `problem` (and `truth`) are a batch of independent problems, as made by
         `equinox.filter_vmap` or by stacking: every array has a leading axis. They are solved as one
         `vmap`, and everything in the result has that axis too. A member that breaks down stays where it
@@ -148,12 +160,13 @@ def fit(
     - `callback`: called with the number and the record of each epoch of an Optax optimiser.
 
     **Returns:** a [`Fit`][vertax.Fit] with the parameters of lowest cost among the epochs that reached
-    equilibrium. An interrupt from the keyboard ends the fit early and keeps what it has.
+    equilibrium, and among those of the weakest guidance if there is any. An interrupt from the keyboard
+    ends the fit early and keeps what it has.
 
     **Raises:**
 
-    - `ValueError` if there is nothing to fit, for less than one epoch, or for a batch whose arrays
-        differ in their leading axis.
+    - `ValueError` if there is nothing to fit, for less than one epoch, for a batch whose arrays
+        differ in their leading axis, or for `guidance` of a least-squares solver.
     - `TypeError` for a least-squares solver with a cost that is no sum of squares.
     - [`FitError`][vertax.FitError] if cost or gradient are not finite or cannot be trusted, or if no
         epoch reached equilibrium; it carries the fit so far.
@@ -168,6 +181,11 @@ def fit(
         )
     if batched:
         _check_batch((problem, truth))
+    if guidance is not None and isinstance(optimiser, optx.AbstractLeastSquaresSolver):
+        raise ValueError(
+            "Argument `guidance` goes with an Optax optimiser: a least-squares solver has no epochs of "
+            "its own. Set the guidance of the problem, or leave it out."
+        )
     # Weakly typed arrays (jnp.full(20, 3.7)) turn into strong ones at the first update, and each change
     # of type would compile the epoch anew.
     parameters = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
@@ -176,7 +194,7 @@ def fit(
     if isinstance(optimiser, optx.AbstractLeastSquaresSolver):
         best, rows, stopped = _solve(optimiser, *task)
     else:
-        best, rows, stopped = _descend(optimiser, *task, progress, callback)
+        best, rows, stopped = _descend(optimiser, *task, guidance, progress, callback)
     if not rows:
         raise FitError(f"The fit stopped: {stopped}.", None)
     history = History(**{name: np.asarray([row[name] for row in rows]) for name in rows[0]})
@@ -220,6 +238,7 @@ def _descend(
     true: PyTree[Array] | None,
     epochs: int,
     batched: bool,
+    guidance: Callable[[Int[Array, ""]], ArrayLike] | None,
     progress: bool,
     callback: Callable[[int, Record], None] | None,
 ) -> tuple[_Best, list[dict[str, Any]], str | None]:
@@ -233,8 +252,10 @@ def _descend(
     try:
         for epoch in bar:
             began = time.perf_counter()
+            number = jnp.array(epoch)
+            strength = None if guidance is None else _strength(guidance(number), problem)
             state, record = _epoch(
-                problem, optimiser, constants, true, state, jnp.array(epoch), throw, batched
+                problem, optimiser, constants, true, state, number, strength, throw, batched
             )
             sound = np.asarray(record.sound)  # waits for the epoch to be done
             rows.append(_row(record, time.perf_counter() - began))
@@ -254,6 +275,15 @@ def _descend(
     except eqx.EquinoxRuntimeError as error:
         return state.best, rows, f"epoch {len(rows)} broke down ({_first_line(error)})"
     return state.best, rows, None
+
+
+def _strength(value: ArrayLike, problem: InverseProblem) -> Float[Array, ""]:
+    strength = jnp.asarray(value, problem.tissue.vertices.dtype)
+    if strength.shape or not strength >= 0:
+        raise ValueError(
+            f"Argument `guidance` must give one number that is not negative, but gave {value}."
+        )
+    return strength
 
 
 def _row(record: Record, seconds: float) -> dict[str, Any]:
@@ -287,7 +317,7 @@ def _no_shift(problem: InverseProblem) -> Float[Array, "2"] | None:
 
 def _unbeaten(problem: InverseProblem, parameters: PyTree[Array]) -> _Best:
     infinite = jnp.asarray(jnp.inf, problem.tissue.vertices.dtype)
-    return _Best(parameters, problem.tissue, infinite, infinite, jnp.array(-1))
+    return _Best(parameters, problem.tissue, infinite, infinite, infinite, jnp.array(-1))
 
 
 def _better(
@@ -296,11 +326,20 @@ def _better(
     tissue: Tissue,
     cost: Array,
     force: Array,
+    guidance: Array,
     epoch: Array,
     ok: Array,
 ) -> _Best:
-    new = _Best(parameters, tissue, cost, force, epoch)
-    return _choose(ok & (cost < best.cost), new, best)
+    new = _Best(parameters, tissue, cost, force, guidance, epoch)
+    # Guidance makes any cost small: only costs at the same one can be compared.
+    lower = (guidance < best.guidance) | ((guidance == best.guidance) & (cost < best.cost))
+    return _choose(ok & lower, new, best)
+
+
+def _guidance_of(problem: InverseProblem) -> Float[Array, ""]:
+    return jnp.asarray(
+        0 if problem.guidance is None else problem.guidance, problem.tissue.vertices.dtype
+    )
 
 
 def _choose(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
@@ -331,6 +370,7 @@ def _epoch(
     true: PyTree[Array] | None,
     state: _State,
     epoch: Int[Array, ""],
+    guidance: Float[Array, ""] | None,
     throw: bool,
     batched: bool,
 ) -> tuple[_State, Record]:
@@ -339,6 +379,8 @@ def _epoch(
     def one(
         problem: InverseProblem, constants: PyTree, true: PyTree[Array] | None, state: _State
     ) -> tuple[_State, Record]:
+        if guidance is not None:
+            problem = dataclasses.replace(problem, guidance=guidance)
         shift = _no_shift(problem)
         value, equilibrium, gradient, outcome = problem.value_and_gradient(
             eqx.combine(state.parameters, constants), state.tissue, shift
@@ -363,6 +405,7 @@ def _epoch(
             equilibrium.tissue,
             value,
             equilibrium.max_force,
+            _guidance_of(problem),
             epoch,
             going & equilibrium.converged,
         )
@@ -506,9 +549,8 @@ def _least_squares(
             (arrays, facts) = state.aux  # those of the last accepted point, which is y
             tissue, placed = (eqx.combine(a, problem.tissue) for a in arrays)
             log = jax.tree.map(lambda rows, x: rows.at[step].set(x), log, facts)
-            best = _better(
-                best, y[0], placed, facts["cost"], facts["max_force"], step, facts["converged"]
-            )
+            reached = (facts["cost"], facts["max_force"], _guidance_of(problem))
+            best = _better(best, y[0], placed, *reached, step, facts["converged"])
             still = (step > 0) & (facts["cost"] == log["cost"][step - 1])
             done, result = solver.terminate(fn, y, tissue, options, state, tags)
             done = done | (result != optx.RESULTS.successful)

@@ -46,6 +46,9 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         of a tissue, so a cost that sees positions (an image) needs this unless they are known.
     - `adjoint`, `solver`, `transitions`, `tolerance`, `patience`, `max_steps`: passed on to
         [`equilibrate`][vertax.equilibrate].
+    - `guidance`: strength $\kappa$, energy per cost. If given, the tissue minimises $E + \kappa C$:
+        the cost pulls it, through T1 transitions too, towards what it asks for, while the parameters
+        are not yet such that it goes there by itself. See `guidance` of [`fit`][vertax.fit].
     """
 
     tissue: Tissue
@@ -59,6 +62,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     tolerance: float | Float[Array, ""] | None = None
     patience: int = 1
     max_steps: int = 2000
+    guidance: float | Float[Array, ""] | None = None
 
     def __call__(
         self,
@@ -79,21 +83,21 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         energy = self.energy if energy is None else energy
         tissue = self.tissue if tissue is None else tissue
         if isinstance(self.adjoint, EquilibriumPropagation) and self.adjoint.nudge == "cost":
-            settled = frozen(self._relax(*frozen((tissue, energy)), adjoint=None))
+            settled = frozen(self._relax(*frozen((tissue, energy, shift)), adjoint=None))
             problem = eqx.tree_at(
                 lambda p: (p.adjoint, p.energy), self, (self.adjoint.without_outcome(), None)
             )
             vjp_arg = (energy, shift, self.adjoint.outcome)
             cost = _cost_by_nudging(vjp_arg, frozen(problem), settled.tissue)
             return cost, _placed(settled, shift)
-        equilibrium = _placed(self._relax(tissue, energy, adjoint=self.adjoint), shift)
+        equilibrium = _placed(self._relax(tissue, energy, shift, adjoint=self.adjoint), shift)
         return self.cost(equilibrium.tissue, energy), equilibrium
 
     def residuals(
         self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
     ) -> tuple[Float[Array, " residuals"], Equilibrium, Tissue]:
         """Residuals of a least-squares cost, the equilibrium, and its tissue displaced by `shift`."""
-        equilibrium = self._relax(tissue, energy, adjoint=self.adjoint)
+        equilibrium = self._relax(tissue, energy, shift, adjoint=self.adjoint)
         placed = _moved(equilibrium.tissue, shift)
         return self.cost.residuals(placed, energy), equilibrium, placed
 
@@ -141,8 +145,10 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         self,
         tissue: Tissue,
         energy: AbstractEnergy,
+        shift: Float[Array, 2] | None,
         *,
         adjoint: AbstractAdjoint | None,
+        nudge: Float[Array, ""] | None = None,
         **options: Any,
     ) -> Equilibrium:
         settings: dict[str, Any] = {
@@ -152,7 +158,25 @@ class InverseProblem(eqx.Module, Generic[Energy]):
             "patience": self.patience,
             "max_steps": self.max_steps,
         }
-        return equilibrate(tissue, energy, adjoint=adjoint, throw=False, **settings | options)
+        pulled = self._pulled(tissue, energy, shift, nudge)
+        found = equilibrate(tissue, pulled, adjoint=adjoint, throw=False, **settings | options)
+        if pulled is energy:
+            return found
+        return eqx.tree_at(lambda e: e.energy, found, energy(found.tissue))
+
+    def _pulled(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        shift: Float[Array, 2] | None,
+        nudge: Float[Array, ""] | None = None,
+    ) -> AbstractEnergy:
+        """The energy that a relaxation from `tissue` minimises."""
+        if self.guidance is None and nudge is None:
+            return energy
+        strength = (0 if self.guidance is None else self.guidance) + (0 if nudge is None else nudge)
+        strength = jnp.asarray(strength, tissue.vertices.dtype)
+        return _Pulled(energy, self.cost, shift, strength, frozen(tissue))
 
 
 def _moved(tissue: Tissue, shift: Float[Array, 2] | None) -> Tissue:
@@ -165,22 +189,20 @@ def _placed(equilibrium: Equilibrium, shift: Float[Array, 2] | None) -> Equilibr
     return eqx.tree_at(lambda e: e.tissue, equilibrium, _moved(equilibrium.tissue, shift))
 
 
-class _Nudged(AbstractEnergy):
-    """An energy, a share of the cost, and springs that keep the whole where it is."""
+class _Pulled(AbstractEnergy):
+    """An energy and a share of the cost."""
 
     energy: AbstractEnergy
     cost: AbstractCost
     shift: Float[Array, 2] | None
     strength: Float[Array, ""]
-    settled: Tissue
-    stiffness: Float[Array, ""]
+    start: Tissue
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
-        cost = self.cost(_moved(tissue, self.shift), self.energy)
-        # A cost that sees positions would push a tissue away without end, with one sign or the other.
-        drift = self.settled.drift(tissue.configuration)
-        spring = 0.5 * self.stiffness * jnp.sum(drift**2)
-        return self.energy(tissue) + self.strength * cost + spring
+        # A cost that sees positions would push the whole away without end, with one sign or the other:
+        # it is that of the tissue moved back to where it was.
+        placed = _moved(tissue.settled(self.start), self.shift)
+        return self.energy(tissue) + self.strength * self.cost(placed, self.energy)
 
 
 # Equilibrium propagation in the form of the paper: X± minimise E ± (β/2) C, with the whole cost and with
@@ -214,21 +236,21 @@ def _(
     energy, shift, slot = vjp_arg
     adjoint = problem.adjoint
     assert isinstance(adjoint, EquilibriumPropagation)
-    stiffness = mean_stiffness(settled, energy)
-    half_beta, force = _nudge(problem, adjoint, settled, energy, shift, stiffness)
+    half_beta, force = _nudge(problem, adjoint, settled, energy, shift)
     moving, fixed = differentiable((energy, shift))
 
     def phase(sign: Array) -> tuple[PyTree[Array], Equilibrium]:
-        def nudged(m: PyTree[Array]) -> _Nudged:
-            energy, shift = eqx.combine(m, fixed)
-            strength = sign * half_beta
-            return _Nudged(energy, problem.cost, shift, strength, settled, stiffness)
-
-        found = problem._relax(
-            settled, nudged(moving), adjoint=None, tolerance=_tolerance(problem, adjoint, force)
+        nudge = sign * half_beta
+        tolerance = _tolerance(problem, adjoint, force)
+        found = frozen(
+            problem._relax(settled, energy, shift, adjoint=None, nudge=nudge, tolerance=tolerance)
         )
-        found = frozen(found)
-        return jax.grad(lambda m: nudged(m)(found.tissue))(moving), found
+
+        def nudged(m: PyTree[Array]) -> Float[Array, ""]:
+            energy, shift = eqx.combine(m, fixed)
+            return problem._pulled(settled, energy, shift, nudge)(found.tissue)
+
+        return jax.grad(nudged)(moving), found
 
     signs = jnp.asarray(adjoint.signs, half_beta.dtype)
     slopes, found = jax.vmap(phase)(signs)
@@ -246,7 +268,6 @@ def _nudge(
     settled: Tissue,
     energy: AbstractEnergy,
     shift: Float[Array, 2] | None,
-    stiffness: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Half of β, and a force that it exerts if not at the optimum."""
     cost = lambda tissue: problem.cost(_moved(tissue, shift), energy)
@@ -261,7 +282,7 @@ def _nudge(
     if adjoint.beta is not None:
         half_beta = jnp.asarray(adjoint.beta, value.dtype) / 2
     else:
-        units = {"stiffness": stiffness, "length_scale": length}
+        units = {"stiffness": mean_stiffness(settled, energy), "length_scale": length}
         half_beta = adjoint.strength(None, units, value.dtype) / pull
     return half_beta, half_beta * pull
 

@@ -9,4 +9,12 @@ from vertax.costs._cost import (
 )
 from vertax.costs._image import MeshImage as MeshImage, mirror as mirror, render as render
 from vertax.costs._interfaces import HomotypicLength as HomotypicLength
-from vertax.costs._vertices import VertexDistance as VertexDistance
+from vertax.costs._positions import (
+    CentroidDistance as CentroidDistance,
+    VertexDistance as VertexDistance,
+)
+from vertax.costs._structure import (
+    IndexAwareStructural as IndexAwareStructural,
+    adjacency as adjacency,
+    mismatched_neighbours as mismatched_neighbours,
+)

@@ -192,7 +192,9 @@ def scaling(rows: list[dict[str, Any]]) -> Figure:
                 ax.set(xscale="log", yscale="log", xlabel="cells", title=titles[protocol])
             time.set_ylabel("time of an epoch (ms)")
             memory.set_ylabel("working memory (kB)")
-        axes[0].legend()
+        axes[-1].legend(
+            *axes[0].get_legend_handles_labels(), loc="upper left", bbox_to_anchor=(1, 1)
+        )
     return figure
 
 

@@ -262,27 +262,42 @@ def installed_version(name: str) -> str:
 
 
 def summary(metrics: Mapping[str, Any]) -> str:
-    """Metrics as a text table, one column for each group of them.
+    """Metrics as text tables, one column for each group of them.
 
     **Arguments:**
 
     - `metrics`: numbers by name, or mappings of numbers by the name of the group; if there are
         groups, other entries are left out.
 
-    **Returns:** the table.
+    **Returns:** the tables: groups that have names in common share one.
     """
     plain: dict[str, Any] = _plain(metrics)
     groups = {"": plain} | {k: group for k, group in plain.items() if isinstance(group, dict)}
     groups = {k: group for k, group in groups.items() if any(map(_is_number, group.values()))}
     if len(groups) > 1:
         groups.pop("", None)
-    names = {n: None for group in groups.values() for n in group if _is_number(group[n])}
+    return "\n\n".join(_table(alike) for alike in _alike(groups))
+
+
+def _alike(groups: Mapping[str, dict[str, Any]]) -> list[dict[str, dict[str, Any]]]:
+    """Groups that have names in common, which make one table each."""
+    tables: list[dict[str, dict[str, Any]]] = []
+    for label, group in groups.items():
+        own = {label: {name: value for name, value in group.items() if _is_number(value)}}
+        for table in tables:
+            if any(own[label].keys() & other.keys() for other in table.values()):
+                table |= own
+                break
+        else:
+            tables.append(own)
+    return tables
+
+
+def _table(groups: Mapping[str, dict[str, Any]]) -> str:
+    names = dict.fromkeys(name for group in groups.values() for name in group)
     rows = [["", *groups]] if any(groups) else []
-    rows += [[n, *(_short(group.get(n)) for group in groups.values())] for n in names]
-    if not rows:
-        return ""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    first, *others = widths
+    rows += [[name, *(_short(group.get(name)) for group in groups.values())] for name in names]
+    first, *others = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  ".join([name.ljust(first), *map(str.rjust, entries, others)]) for name, *entries in rows
     ]

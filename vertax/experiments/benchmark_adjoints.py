@@ -141,7 +141,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         metrics["hypergradient"] = _accuracy(config, folder)
         metrics["beta"] = _beta_scan(config, folder, progress)
     if config.scaling.sizes:
-        metrics["scaling"] = _scaling(config, folder)
+        for group, measured in _scaling(config, folder).items():
+            metrics.setdefault(group, {}).update(measured)
     return metrics
 
 
@@ -421,7 +422,7 @@ def _geometric_mean(x: np.ndarray) -> np.ndarray:
 # --- time and memory -----------------------------------------------------------------------------------
 
 
-def _scaling(config: Config, folder: RunFolder) -> dict[str, Any]:
+def _scaling(config: Config, folder: RunFolder) -> dict[str, dict[str, Any]]:
     """Time and memory of an epoch against the number of cells."""
     rows: list[dict[str, Any]] = []
     for name in ("equilibrium", "paper"):
@@ -438,7 +439,7 @@ def _scaling(config: Config, folder: RunFolder) -> dict[str, Any]:
                 )
     folder.save_table("scaling", {key: [row[key] for row in rows] for key in rows[0]})
     folder.save_figure("scaling", figures.scaling(rows))
-    return _ratios(rows)
+    return _by_method(rows)
 
 
 def _measurable(config: Config, n_cells: int) -> Iterable[Method]:
@@ -477,17 +478,17 @@ def _measure(problem: InverseProblem[ShapeFactorEnergy], epochs: int) -> dict[st
     }
 
 
-def _ratios(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    metrics: dict[str, Any] = {}
+def _by_method(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The measurements of each protocol and method."""
+    memory = {(row["protocol"], row["cells"], row["method"]): row["memory_kB"] for row in rows}
+    metrics: dict[str, dict[str, Any]] = {}
     for row in rows:
-        label = f"{row['protocol']} {row['method']} {row['cells']} cells"
-        metrics[f"{label}, ms per epoch"] = row["ms_per_epoch"]
-        metrics[f"{label}, gradient over forward"] = row["gradient_over_forward"]
-        other = [
-            r
-            for r in rows
-            if (r["protocol"], r["cells"], r["method"]) == (row["protocol"], row["cells"], "EP")
-        ]
-        if row["method"] == "AD" and other:
-            metrics[f"{label}, memory over that of EP"] = row["memory_kB"] / other[0]["memory_kB"]
+        protocol, cells, method = row["protocol"], row["cells"], row["method"]
+        group = metrics.setdefault(f"{protocol} {method}", {})
+        group[f"{cells} cells, ms per epoch"] = row["ms_per_epoch"]
+        group[f"{cells} cells, gradient over forward"] = row["gradient_over_forward"]
+        group[f"{cells} cells, memory kB"] = row["memory_kB"]
+        if (protocol, cells, "EP") in memory:
+            share = row["memory_kB"] / memory[protocol, cells, "EP"]
+            group[f"{cells} cells, memory over that of EP"] = share
     return metrics
