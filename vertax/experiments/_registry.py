@@ -13,6 +13,7 @@ from vertax.experiments import (
     design_mechanics,
     infer_from_microscopy,
     infer_shape_factors,
+    inference_across_topologies,
     salt_and_pepper,
 )
 from vertax.experiments._config import (
@@ -53,6 +54,12 @@ _ALL = (
         infer_from_microscopy.Config,
         infer_from_microscopy.run,
         "Infer the target shape factors of the cells in a microscopy image.",
+    ),
+    Experiment(
+        "inference_across_topologies",
+        inference_across_topologies.Config,
+        inference_across_topologies.run,
+        "Recover shape factors where the fit has to lead through T1 transitions.",
     ),
     Experiment(
         "benchmark_adjoints",
