@@ -14,6 +14,7 @@ from vertax.experiments import (
     infer_from_microscopy,
     infer_shape_factors,
     inference_across_topologies,
+    rigidity_transition,
     salt_and_pepper,
 )
 from vertax.experiments._config import (
@@ -60,6 +61,12 @@ _ALL = (
         inference_across_topologies.Config,
         inference_across_topologies.run,
         "Recover shape factors where the fit has to lead through T1 transitions.",
+    ),
+    Experiment(
+        "rigidity_transition",
+        rigidity_transition.Config,
+        rigidity_transition.run,
+        "Where tissues turn from solid to fluid as the target shape factor grows.",
     ),
     Experiment(
         "benchmark_adjoints",
