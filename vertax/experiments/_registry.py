@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 from vertax.experiments import (
     benchmark_adjoints,
+    compare_conditions,
     convergent_extension,
     design_mechanics,
     infer_from_microscopy,
@@ -67,6 +68,12 @@ _ALL = (
         rigidity_transition.Config,
         rigidity_transition.run,
         "Where tissues turn from solid to fluid as the target shape factor grows.",
+    ),
+    Experiment(
+        "compare_conditions",
+        compare_conditions.Config,
+        compare_conditions.run,
+        "Tell a stiff from a fluid-like epithelium by its microscopy images.",
     ),
     Experiment(
         "benchmark_adjoints",

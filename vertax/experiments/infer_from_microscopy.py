@@ -11,28 +11,31 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
-from pydantic import Field
-from scipy.ndimage import gaussian_filter, zoom
+from jaxtyping import Bool, Float
 
-from vertax._equilibrium import Equilibrium, equilibrate
-from vertax._fit import Fit, FitError, fit
-from vertax._inverse import InverseProblem
+from vertax._equilibrium import Equilibrium
+from vertax._fit import Fit, FitError
 from vertax._tissue import Tissue
-from vertax.costs import MeshImage, mirror
+from vertax.costs import MeshImage
 from vertax.energies import ShapeFactorEnergy
 from vertax.experiments import _figures
-from vertax.experiments._config import ConfigError, ExperimentConfig, Section
+from vertax.experiments._config import ConfigError, ExperimentConfig
+from vertax.experiments._imaging import (
+    Model,
+    Preparation,
+    SegmentationSection,
+    correlation,
+    read,
+)
 from vertax.experiments._run import RunFolder, fit_metrics, history_columns
 from vertax.experiments._sections import Fitting, Relaxation
-from vertax.initialise import Cellpose, Segmentation, Watershed, from_microscopy
+from vertax.initialise import Segmentation
 from vertax.io import read_image
 
 
-class ImageSection(Section):
+class ImageSection(Preparation):
     """The image, and how it is prepared for the comparison with the model."""
 
     path: str = ""
@@ -41,40 +44,6 @@ class ImageSection(Section):
     """Which channel, if there are several."""
     plane: int | None = None
     """Which plane, if it is a stack."""
-    pixels: int = Field(default=256, ge=32)
-    """Longer side, in pixels, of the image that the model is compared with."""
-    background_width: float = Field(default=0.5, gt=0)
-    """Width of the filter that evens out the illumination, in mean cell diameters."""
-    psf_width: float | None = Field(default=None, gt=0)
-    """Standard deviation of the blur, in pixels of the file; left out, the one that fits best."""
-
-
-class SegmentationSection(Section):
-    """How the cells are found."""
-
-    method: Literal["watershed", "cellpose"] = "watershed"
-    """Cellpose needs its own extra and downloads a model."""
-    cell_size: float | None = Field(default=None, gt=0)
-    """Typical diameter of a cell in pixels of the file; left out, estimated from the image."""
-
-    def build(self) -> Watershed | Cellpose:
-        """The segmenter.
-
-        **Returns:** a [`Watershed`][vertax.initialise.Watershed] or
-        [`Cellpose`][vertax.initialise.Cellpose].
-        """
-        if self.method == "cellpose":
-            return Cellpose(diameter=self.cell_size)
-        return Watershed(cell_size=self.cell_size)
-
-
-class Model(Section):
-    """The energy, E1 with a rest area for each cell, and the first guess."""
-
-    target_shape_factor: float = Field(default=3.7, gt=0)
-    """First guess of the target shape factor of every cell."""
-    fit_areas: bool = True
-    """Fit the rest areas too; the first guess are the areas of the segmented cells."""
 
 
 class Config(ExperimentConfig):
@@ -118,28 +87,19 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
             "`image.path` is missing: name a membrane image, as in --set image.path=IMAGE.tif."
         )
     pixels = read_image(config.image.path, channel=config.image.channel, plane=config.image.plane)
-    found = from_microscopy(pixels, segmenter=config.segmentation.build())
-    seen = _prepare(np.asarray(pixels, float), found, config.image)
-    width = _psf_width(found, seen, config.image)
-    cost = MeshImage(mirror(seen), width, points_per_edge=_POINTS)
-
-    segmented = found.tissue
-    guess = ShapeFactorEnergy(
-        jnp.full(segmented.n_cells, config.model.target_shape_factor), segmented.areas
+    reading = read(
+        np.asarray(pixels, float),
+        config.image,
+        config.segmentation,
+        config.model,
+        config.relaxation,
     )
-    options = config.relaxation.options()
-    first: Equilibrium = equilibrate(segmented, guess, **options, throw=False)
-    folder.save_tissue("target", segmented)
+    found, seen, width, first, problem = reading
+    folder.save_tissue("target", found.tissue)
     folder.save_tissue("initial", first.tissue)
     folder.save_array("image", seen)
-
-    fitted = eqx.tree_at(
-        lambda e: (e.target_shape_factor, e.mean_area), guess, (True, config.model.fit_areas)
-    )
-    # The mirror planes hold the tissue in its place: there is no position to fit.
-    problem = InverseProblem(first.tissue, guess, cost, fitted, **options)
     try:
-        outcome = fit(problem, config.fit.build(), config.fit.epochs, progress=progress)
+        outcome = reading.fit(config.fit, progress=progress)
     except FitError as error:
         if error.fit is not None:
             folder.save_table("history", history_columns(error.fit.history))
@@ -149,55 +109,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     folder.save_table("history", history_columns(outcome.history))
     folder.save_table("cells", _cell_table(found, outcome))
     _draw(found, np.asarray(pixels, float), first.tissue, outcome, folder)
-    return _metrics(found, seen, cost, first, outcome, width)
-
-
-_POINTS = 48
-
-
-def _prepare(
-    pixels: Float[np.ndarray, "rows columns"], found: Segmentation, options: ImageSection
-) -> Float[np.ndarray, "coarse_rows coarse_columns"]:
-    """The image in even light, and no finer than it need be."""
-    # The logarithm brings bright junctions and faint membranes together, as the segmentation does.
-    bright = pixels - pixels.min()
-    bright = np.log1p(bright / bright.mean())
-    diameter = 1 / found.pixel_size  # the mean cell area is 1
-    even = bright - gaussian_filter(bright, options.background_width * diameter, mode="reflect")
-    factor = options.pixels / max(pixels.shape)
-    if factor >= 1:
-        return even
-    shape = [max(16, round(side * factor)) for side in pixels.shape]
-    smooth = gaussian_filter(even, 0.35 / factor, mode="reflect")
-    steps = [new / old for new, old in zip(shape, pixels.shape, strict=True)]
-    # Pixels as areas: the coarse image covers the same extent as the fine one.
-    return np.asarray(zoom(smooth, steps, order=1, mode="reflect", grid_mode=True))
-
-
-def _psf_width(
-    found: Segmentation, seen: Float[np.ndarray, "rows columns"], options: ImageSection
-) -> float:
-    """Width of the blur in units of length: as configured, or as fits the segmented mesh best."""
-    if options.psf_width is not None:
-        return options.psf_width * found.pixel_size
-    image = mirror(seen)
-    pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
-
-    @eqx.filter_jit
-    def misfit(width: Float[Array, ""]) -> Float[Array, ""]:
-        return MeshImage(image, width, points_per_edge=_POINTS)(found.tissue, _NO_ENERGY)
-
-    widths = pixel * np.geomspace(1.0, 12.0, 30)
-    return float(widths[np.argmin([float(misfit(jnp.asarray(w))) for w in widths])])
-
-
-_NO_ENERGY = ShapeFactorEnergy(0.0)  # the image cost does not look at the energy
-
-
-def _correlation(cost: MeshImage, tissue: Tissue) -> float:
-    """Correlation of the blurred mesh with the image: the cost is half of 1 - ρ²."""
-    value = eqx.filter_jit(lambda t: cost(t, _NO_ENERGY))(tissue)
-    return float(np.sqrt(max(0.0, 1 - 2 * float(value))))
+    assert isinstance(problem.cost, MeshImage)
+    return _metrics(found, seen, problem.cost, first, outcome, width)
 
 
 def _membrane_contrast(
@@ -228,7 +141,7 @@ def _metrics(
     factors = _shape_factors(outcome)[whole]
     metrics: dict[str, Any] = {}
     for name, tissue in meshes.items():
-        metrics[f"correlation_{name}"] = _correlation(cost, tissue)
+        metrics[f"correlation_{name}"] = correlation(cost, tissue)
         metrics[f"membrane_contrast_{name}"] = _membrane_contrast(tissue, found, seen)
     corners = outcome.tissue.boundary.shortest(outcome.tissue.vertices - found.tissue.vertices)
     return metrics | {
