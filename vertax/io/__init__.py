@@ -1,7 +1,13 @@
-"""Tissues in files: saving and loading, and the paper's tables."""
+"""Files: tissues, energies and inverse problems, and the paper's tables."""
 
 from vertax.io._atomic import atomic_write as atomic_write
 from vertax.io._bounded_tables import BoundedTables as BoundedTables
 from vertax.io._image import read_image as read_image
+from vertax.io._module_file import (
+    load_energy as load_energy,
+    load_problem as load_problem,
+    save_energy as save_energy,
+    save_problem as save_problem,
+)
 from vertax.io._tables import Tables as Tables, from_tables as from_tables, to_tables as to_tables
 from vertax.io._tissue_file import load_tissue as load_tissue, save_tissue as save_tissue
