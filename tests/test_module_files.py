@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optax
-import optimistix as optx
 import pytest
 from free_helpers import cluster
 from helpers import random_tissue
@@ -271,15 +270,15 @@ class TestRefusedToSave:
         [
             (
                 {"solver": vx.solvers.Optax(optax.adam(1e-2))},
-                r"`solver\.optimiser` is a GradientTransf.*replace\(problem, solver=None\)",
+                r"`solver\.optimiser` is of type GradientTransf.*replace\(problem, solver=None\)",
             ),
             ({"solver": vx.solvers.LBFGS()}, r"`solver\.optimiser`"),
             ({"trainable": lambda x: True}, r"`trainable` is a function.*jax\.tree\.map"),
-            ({"energy": Anything({1, 2})}, r"`energy\.value` is a set"),
-            ({"energy": Anything((0, {3: 4}))}, r"`energy\.value\.1` is a dict"),
+            ({"energy": Anything({1, 2})}, r"`energy\.value` is of type set"),
+            ({"energy": Anything((0, {3: 4}))}, r"`energy\.value\.1` is of type dict"),
             ({"energy": Anything(jax.random.key(0))}, r"`energy\.value` is key"),
             ({"energy": Anything(jnp.ones(2, jnp.bfloat16))}, r"`energy\.value` is bfloat16"),
-            ({"energy": Anything(optax.EmptyState())}, r"`energy\.value` is a EmptyState"),
+            ({"energy": Anything(optax.EmptyState())}, r"`energy\.value` is of type EmptyState"),
         ],
     )
     def test_what_has_no_place_in_a_file(self, path, tissues, options, message):
@@ -289,7 +288,7 @@ class TestRefusedToSave:
         assert os.listdir(path.parent) == []
 
     def test_parts_of_vertax_that_belong_elsewhere(self, path):
-        with pytest.raises(ValueError, match=r"`value` is a AtRest, .*no energy, cost"):
+        with pytest.raises(ValueError, match=r"`value` is of class AtRest, .*no energy, cost"):
             save_energy(path, Anything(AtRest()))
 
     def test_something_else(self, path, tissues):

@@ -1,7 +1,13 @@
-"""Files: tissues, energies and inverse problems, and the paper's tables."""
+"""Files: tissues, energies, inverse problems and trajectories; and for other programs."""
 
 from vertax.io._atomic import atomic_write as atomic_write
 from vertax.io._bounded_tables import BoundedTables as BoundedTables
+from vertax.io._data_tables import (
+    cell_table as cell_table,
+    edge_table as edge_table,
+    write_csv as write_csv,
+)
+from vertax.io._geojson import write_geojson as write_geojson
 from vertax.io._image import read_image as read_image
 from vertax.io._module_file import (
     load_energy as load_energy,
@@ -11,3 +17,4 @@ from vertax.io._module_file import (
 )
 from vertax.io._tables import Tables as Tables, from_tables as from_tables, to_tables as to_tables
 from vertax.io._tissue_file import load_tissue as load_tissue, save_tissue as save_tissue
+from vertax.io._vtk import write_vtk as write_vtk

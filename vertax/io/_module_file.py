@@ -228,9 +228,9 @@ class _Writer:
         for name, function in _FUNCTIONS.items():
             if value is function:
                 return {"kind": "function", "name": name}
-        what = "function" if inspect.isroutine(value) else type(value).__name__
+        what = "a function" if inspect.isroutine(value) else f"of type {type(value).__name__}"
         raise ValueError(
-            f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is a {what}, which has no place "
+            f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is {what}, which has no place "
             f"in a file. {self.remedy(path)}"
         )
 
@@ -258,8 +258,8 @@ class _Writer:
         name = self.names.get(cls)
         if name is None and cls.__module__.split(".")[0] == "vertax":
             raise ValueError(
-                f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is a {cls.__name__}, which "
-                f"is no energy, cost, adjoint, solver or other part of a problem. {self.remedy(path)}"
+                f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is of class {cls.__name__}, "
+                f"which is no energy, cost, adjoint, solver or other part of a problem. {self.remedy(path)}"
             )
         held = vars(module)
         names = [field.name for field in dataclasses.fields(cls) if field.name in held]
