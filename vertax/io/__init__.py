@@ -17,4 +17,10 @@ from vertax.io._module_file import (
 )
 from vertax.io._tables import Tables as Tables, from_tables as from_tables, to_tables as to_tables
 from vertax.io._tissue_file import load_tissue as load_tissue, save_tissue as save_tissue
+from vertax.io._trajectory import (
+    Trajectory as Trajectory,
+    load_trajectory as load_trajectory,
+    record_relaxation as record_relaxation,
+    save_trajectory as save_trajectory,
+)
 from vertax.io._vtk import write_vtk as write_vtk
