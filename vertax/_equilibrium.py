@@ -48,7 +48,7 @@ def equilibrate(
     tissue: Tissue,
     energy: AbstractEnergy,
     *,
-    solver: optx.AbstractMinimiser | None = None,
+    solver: optx.AbstractMinimiser[Any, Any, Any] | None = None,
     adjoint: AbstractAdjoint | None = None,
     transitions: AbstractTransitions | None = T1(),
     tolerance: float | Float[Array, ""] | None = None,

@@ -149,7 +149,7 @@ def record_relaxation(
     energy: AbstractEnergy,
     *,
     every: int = 1,
-    solver: optx.AbstractMinimiser | None = None,
+    solver: optx.AbstractMinimiser[Any, Any, Any] | None = None,
     transitions: AbstractTransitions | None = T1(),
     tolerance: float | Float[Array, ""] | None = None,
     patience: int = 1,
