@@ -8,6 +8,7 @@ import sys
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import meshio
 import numpy as np
 import pytest
 from free_helpers import cluster
@@ -16,8 +17,6 @@ from helpers import random_tissue
 import vertax as vx
 from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vtk
 from vertax.plotting import cell_polygons
-
-meshio = pytest.importorskip("meshio")
 
 
 def single(tree):

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 import vertax as vx
 from vertax.io import load_energy, load_problem, save_energy, save_problem
-from vertax.io._module_file import _save
+from vertax.io._module_file import _public_classes, _save
 from vertax.solvers._relaxation import AtRest
 
 
@@ -425,6 +425,16 @@ class TestRefusedToLoad:
         rewritten(path, **{"data.tissue.vertices": np.zeros((3, 2))})
         with pytest.raises(ValueError, match=r"`problem\.tissue`: `vertices` has shape \(3, 2\)"):
             load_problem(path)
+
+
+def test_every_public_part_of_a_problem_has_a_place_in_files():
+    # A new boundary or rule of transitions is one more entry; the families are looked through.
+    parts = (vx.AbstractBoundary, vx.AbstractTransitions, vx.AbstractCost, vx.AbstractEnergy)
+    parts += (vx.adjoints.AbstractAdjoint, vx.solvers.AbstractSolver)
+    for family in (vx, vx.adjoints, vx.costs, vx.energies, vx.solvers):
+        for name, cls in vars(family).items():
+            if isinstance(cls, type) and issubclass(cls, parts) and "Abstract" not in name:
+                assert cls in _public_classes().values(), name
 
 
 def test_saving_again_replaces(path):
