@@ -1,6 +1,7 @@
 """Trajectories of relaxations and fits, in memory and in files."""
 
 import os
+from itertools import pairwise
 
 import equinox as eqx
 import jax
@@ -56,15 +57,15 @@ def path(tmp_path):
 
 class TestRelaxation:
     def test_it_goes_from_the_tissue_to_its_equilibrium(self, flowing):
-        tissue, _, equilibrium, way = flowing
+        tissue, energy, equilibrium, way = flowing
         assert same_bits(way[0], tissue)
         assert same_bits(way[-1], equilibrium.tissue)
-        assert equilibrium.converged
         assert way.values["num_steps"][-1] == equilibrium.num_steps
         assert way.values["num_t1"][-1] == equilibrium.num_t1
-        assert way.values["max_force"][-1] == equilibrium.max_force < 1e-9
-        assert way.values["energy"][-1] == equilibrium.energy
-        assert all(np.diff(way.values["num_steps"][:-1]) == 2)
+        assert way.values["max_force"][-1] < 1e-9
+        assert set(np.diff(way.values["num_steps"][:-1])) == {2}
+        # Being watched changes nothing.
+        assert same_bits(equilibrium.tissue, vx.equilibrate(tissue, energy).tissue)
 
     def test_frames_have_their_own_topology_energy_and_force(self, flowing):
         _, energy, equilibrium, way = flowing
@@ -73,45 +74,58 @@ class TestRelaxation:
         slope = eqx.filter_jit(jax.grad(lambda v, t: energy(t.with_vertices(v))))
         for k, frame in enumerate(way):
             frame.topology.validate()
-            np.testing.assert_allclose(
-                energy(frame), way.values["energy"][k], rtol=1e-12, atol=1e-20
-            )
-            force = jnp.abs(slope(frame.vertices, frame)).max()
+            value, force = energy(frame), jnp.abs(slope(frame.vertices, frame)).max()
+            np.testing.assert_allclose(value, way.values["energy"][k], rtol=1e-12, atol=1e-20)
             np.testing.assert_allclose(force, way.values["max_force"][k], rtol=1e-5, atol=1e-12)
+        flips = np.diff(way.values["num_t1"])
+        changed = [not eqx.tree_equal(a.topology, b.topology) for a, b in pairwise(way)]
+        np.testing.assert_array_equal(flips > 0, changed)
 
-    def test_in_one_piece_it_is_that_of_equilibrate(self):
+    def test_fewer_frames_are_some_of_more(self, flowing):
+        tissue, energy, _, way = flowing
+        _, sparse = record_relaxation(tissue, energy, every=4)
+        numbers = way.values["num_steps"].tolist()
+        for k, frame in zip(sparse.values["num_steps"].tolist(), sparse, strict=True):
+            assert same_bits(frame, way[numbers.index(k)])
+
+    def test_a_free_cluster_does_not_turn(self):
         tissue = cluster(5)
-        equilibrium, way = record_relaxation(tissue, tension(tissue), every=2000)
-        assert same_bits(equilibrium.tissue, vx.equilibrate(tissue, tension(tissue)).tissue)
-        assert len(way) == 2
+        equilibrium, way = record_relaxation(tissue, tension(tissue), every=5)
+        assert same_bits(way[-1], equilibrium.tissue)
+        assert len(way) > 2
+        for frame in way:
+            drift = frame.boundary.drift(frame.vertices, tissue.vertices)
+            np.testing.assert_allclose(drift, 0, atol=1e-12)
 
     def test_at_rest_there_is_one_frame(self, flowing):
         _, energy, equilibrium, _ = flowing
-        again, way = record_relaxation(equilibrium.tissue, energy, every=2)
+        again, way = record_relaxation(equilibrium.tissue, energy)
         assert again.converged
         assert len(way) == 1
 
     def test_options(self):
-        tissue = random_tissue(4)
-        energy = vx.energies.ShapeFactorEnergy(3.7)
+        tissue = single(random_tissue(4))
         found, way = record_relaxation(
             tissue,
-            energy,
-            every=500,
+            vx.energies.ShapeFactorEnergy(3.7),
+            every=100,
             solver=vx.solvers.FIRE(),
             transitions=None,
-            tolerance=1e-3,
+            tolerance=1e-2,
             patience=3,
         )
         assert found.converged
-        assert found.max_force < 1e-3
+        assert found.max_force < 1e-2
         assert way.values["num_t1"].max() == 0
+        assert way[1].vertices.dtype == jnp.float32
         assert same_bits(way[0].topology, way[-1].topology)
 
     def test_refusals(self):
         tissue, energy = random_tissue(4), vx.energies.ShapeFactorEnergy(3.7)
-        with pytest.raises(ValueError, match=r"`every` must be at least `patience` \(3\)"):
-            record_relaxation(tissue, energy, every=2, patience=3)
+        with pytest.raises(ValueError, match="`every` must be at least 1"):
+            record_relaxation(tissue, energy, every=0)
+        with pytest.raises(ValueError, match="`tolerance` must be positive"):
+            record_relaxation(tissue, energy, tolerance=0.0)
         with pytest.raises(RuntimeError, match=r"no equilibrium in 3 steps.*throw=False"):
             record_relaxation(tissue, energy, every=2, max_steps=3)
         found, way = record_relaxation(tissue, energy, every=2, max_steps=3, throw=False)

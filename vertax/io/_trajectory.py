@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, overload
 
 import equinox as eqx
@@ -11,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Float, Shaped
+from jax.experimental import io_callback
+from jaxtyping import Array, ArrayLike, Float, Int, Shaped
 
 from vertax._equilibrium import Equilibrium, equilibrate
 from vertax._fit import Record
@@ -156,72 +158,104 @@ def record_relaxation(
     max_steps: int = 2000,
     throw: bool = True,
 ) -> tuple[Equilibrium, Trajectory]:
-    """Relax a tissue and record its way.
-
-    This is [`equilibrate`][vertax.equilibrate] in pieces of a few steps, each from where the last one
-    ended. At the start of each the solver forgets what it knows, and `T1` how often each edge has
-    flipped, so the way is not quite that of a relaxation in one piece. The default solver hardly minds;
-    one that lives on its memory, such as `FIRE`, needs pieces of some hundred steps.
+    """Relax a tissue as [`equilibrate`][vertax.equilibrate] does, and record its way.
 
     **Arguments:**
 
     - `tissue`, `energy`: what to relax.
     - `every`: number of steps from one frame to the next.
     - `solver`, `transitions`, `tolerance`, `patience`, `max_steps`: see
-        [`equilibrate`][vertax.equilibrate]; `patience` is at most `every`.
+        [`equilibrate`][vertax.equilibrate].
     - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
 
-    **Returns:** the equilibrium, with all steps and T1 transitions; and the trajectory, from `tissue` to
-    the tissue of the equilibrium, with the values `num_steps` and `num_t1` (so far), `energy` and
-    `max_force`.
+    **Returns:** the equilibrium; and the trajectory, from `tissue` to the tissue of the equilibrium, with
+    the values `num_steps` and `num_t1` (both so far), `energy` and `max_force`.
 
     **Raises:**
 
-    - `ValueError` if `every` is less than `patience`, and as [`equilibrate`][vertax.equilibrate].
+    - `ValueError` if `every` is less than 1, for a batch of tissues, and as
+        [`equilibrate`][vertax.equilibrate].
     - `RuntimeError` if `throw` and the relaxation did not converge.
     """
-    if every < max(patience, 1):
-        raise ValueError(
-            f"Argument `every` must be at least `patience` ({patience}), or no piece of the relaxation "
-            f"can find that it has arrived, but is {every}."
-        )
+    if every < 1:
+        raise ValueError(f"Argument `every` must be at least 1, but is {every}.")
     trajectory = Trajectory()
-    value, force = _energy_and_force(tissue, energy)
-    trajectory.append(tissue, num_steps=0, num_t1=0, energy=value, max_force=force)
-    num_steps = num_t1 = 0
-    while True:
-        piece = min(every, max_steps - num_steps)
+    tissue = jax.tree.map(jnp.asarray, tissue)
+
+    def add(frame: Tissue, num_steps: ArrayLike, num_t1: ArrayLike) -> None:
+        value, force = _energy_and_force(frame, energy)
+        trajectory.append(frame, num_steps=num_steps, num_t1=num_t1, energy=value, max_force=force)
+
+    add(tissue, 0, 0)
+    seen: list[tuple[int, np.ndarray, tuple[np.ndarray, ...]]] = []
+    n_sweeps = itertools.count()
+
+    def see(num_t1: np.ndarray, *leaves: np.ndarray) -> None:
+        num_steps = next(n_sweeps)
+        if num_steps > 0 and num_steps % every == 0:
+            seen.append((num_steps, num_t1, leaves))
+
+    ticket = next(_TICKETS)
+    _OBSERVERS[ticket] = see
+    try:
         found = equilibrate(
             tissue,
             energy,
             solver=solver,
-            transitions=transitions,
+            transitions=_Observed(transitions, jnp.asarray(ticket)),
             tolerance=tolerance,
             patience=patience,
-            max_steps=piece,
+            max_steps=max_steps,
             throw=False,
         )
-        tissue = found.tissue
-        num_steps, num_t1 = num_steps + int(found.num_steps), num_t1 + int(found.num_t1)
-        # A tissue that is at rest takes no step, and needs no second frame.
-        if found.num_steps > 0 or found.num_t1 > 0:
-            trajectory.append(
-                tissue,
-                num_steps=num_steps,
-                num_t1=num_t1,
-                energy=found.energy,
-                max_force=found.max_force,
-            )
-        if found.converged or found.num_steps < piece or num_steps >= max_steps:
-            break
+        jax.effects_barrier()
+    finally:
+        del _OBSERVERS[ticket]
+    structure = jax.tree.structure(tissue)
+    for num_steps, num_t1, leaves in seen:
+        if num_steps < found.num_steps:
+            frame: Tissue = jax.tree.unflatten(structure, map(jnp.asarray, leaves))
+            add(_settled(frame, tissue), num_steps, num_t1)
+    if found.num_steps > 0:
+        add(found.tissue, found.num_steps, found.num_t1)
     if throw and not found.converged:
         raise RuntimeError(
-            f"The relaxation reached no equilibrium in {num_steps} steps (largest force "
+            f"The relaxation reached no equilibrium in {int(found.num_steps)} steps (largest force "
             f"{float(found.max_force):.1e}). Raise `max_steps`, or pass throw=False to see its frames."
         )
-    counts = lambda e: (e.num_steps, e.num_t1)
-    total = [jnp.asarray(n, found.num_steps.dtype) for n in (num_steps, num_t1)]
-    return eqx.tree_at(counts, found, total), trajectory
+    return found, trajectory
+
+
+# The tissue is looked at where a relaxation sweeps it for transitions, once before each step. A function
+# in the compiled program would be another one for each recording, and compile it anew; so there is one
+# for all, and a number, which is data, tells it whom to call.
+_OBSERVERS: dict[int, Callable[..., None]] = {}
+_TICKETS = itertools.count()
+
+
+def _notify(ticket: ArrayLike, *arrays: ArrayLike) -> None:
+    _OBSERVERS[int(np.asarray(ticket))](*map(np.array, arrays))
+
+
+class _Observed(AbstractTransitions):
+    """A rule for transitions that shows the tissue to an observer."""
+
+    transitions: AbstractTransitions | None
+    ticket: Int[Array, ""]
+
+    def init(self, tissue: Tissue) -> Int[Array, " edges"]:
+        if self.transitions is None:
+            return jnp.zeros(tissue.n_edges, jnp.int32)
+        return self.transitions.init(tissue)
+
+    def sweep(
+        self, tissue: Tissue, energy: AbstractEnergy, counts: Int[Array, " edges"]
+    ) -> tuple[Tissue, Int[Array, " edges"]]:
+        if self.transitions is not None:
+            tissue, counts = self.transitions.sweep(tissue, energy, counts)
+        leaves = jax.tree.leaves(tissue)
+        io_callback(_notify, None, self.ticket, jnp.sum(counts), *leaves, ordered=True)
+        return tissue, counts
 
 
 def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
@@ -315,6 +349,11 @@ def _energy_and_force(
     at = lambda y: energy(tissue.with_configuration(y))
     value, slope = jax.value_and_grad(at)(tissue.configuration)
     return value, optx.max_norm(slope)
+
+
+@eqx.filter_jit
+def _settled(tissue: Tissue, start: Tissue) -> Tissue:
+    return tissue.settled(start)
 
 
 def _number(name: str, value: Any) -> int | float:
