@@ -124,6 +124,8 @@ class TestRelaxation:
         tissue, energy = random_tissue(4), vx.energies.ShapeFactorEnergy(3.7)
         with pytest.raises(ValueError, match="`every` must be at least 1"):
             record_relaxation(tissue, energy, every=0)
+        with pytest.raises(ValueError, match="single tissue"):
+            record_relaxation(jax.tree.map(lambda x: jnp.stack([x, x]), tissue), energy)
         with pytest.raises(ValueError, match="`tolerance` must be positive"):
             record_relaxation(tissue, energy, tolerance=0.0)
         with pytest.raises(RuntimeError, match=r"no equilibrium in 3 steps.*throw=False"):
