@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from free_helpers import cluster
 from helpers import SOLVERS, dense_hessian, random_tissue, relaxed, shape_factors
 
 import vertax as vx
@@ -176,3 +177,31 @@ def test_no_retracing_between_calls():
             first = len(traces)
     # Evaluating the final energy outside of the compiled part would count here too.
     assert len(traces) == first
+
+
+class Substrate(vx.AbstractEnergy):
+    """Springs from each vertex to a place of its own: an energy that knows where the tissue is."""
+
+    home: jax.Array
+    stiffness: float = 0.3
+
+    def __call__(self, tissue):
+        tug = jnp.sum((tissue.vertices - self.home) ** 2)
+        return vx.energies.ShapeFactorEnergy(3.6)(tissue) + 0.5 * self.stiffness * tug
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "free"])
+def test_an_energy_may_know_where_the_tissue_is(boundary):
+    tissue = random_tissue(9, 1) if boundary == "periodic" else cluster(6, 1, lloyd_steps=2)
+    home = tissue.vertices + jnp.array([0.4, -0.2])
+    found = vx.equilibrate(tissue, Substrate(home), transitions=None)
+    assert found.converged
+    slope = jax.grad(lambda x: Substrate(home)(found.tissue.with_vertices(x)))(
+        found.tissue.vertices
+    )
+    assert float(jnp.max(jnp.abs(slope))) < 1e-8
+    # Inner forces move no centroid, so that of the springs decides.
+    np.testing.assert_allclose(jnp.mean(found.tissue.vertices - home, axis=0), 0, atol=1e-8)
+    # Without springs the whole stays where it was.
+    stays = vx.equilibrate(tissue, vx.energies.ShapeFactorEnergy(3.6), transitions=None).tissue
+    np.testing.assert_allclose(jnp.mean(stays.vertices - tissue.vertices, axis=0), 0, atol=1e-9)

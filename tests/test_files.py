@@ -107,6 +107,9 @@ class TestRefusedToSave:
             def settle(self, vertices, reference, pinned=None):
                 return vertices
 
+            def motions(self, vertices, distance):
+                return jnp.zeros((0, *vertices.shape))
+
         odd = eqx.tree_at(lambda t: t.boundary, tissue, Sphere())
         with pytest.raises(ValueError, match="no place for a boundary of class Sphere"):
             save_tissue(tmp_path / "sphere.npz", odd)

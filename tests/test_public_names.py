@@ -4,9 +4,9 @@ import vertax as vx
 NAMES = """
 AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions
 AutomaticDifferentiation Equilibrium EquilibriumPropagation Fit FitError Free GradientOutcome History
-ImplicitDifferentiation InverseProblem MINRES Periodic T1 Tissue Topology adjoints costs energies
-equilibrate fit initialise io load_tissue plot_history plot_recovery plot_tissue plotting save_tissue
-solvers
+ImplicitDifferentiation InverseProblem MINRES Periodic T1 Tissue Topology Uncertainty adjoints costs
+energies equilibrate fit initialise io load_tissue plot_history plot_recovery plot_tissue plotting save_tissue
+solvers uncertainty
 """
 
 FAMILIES = {

@@ -25,6 +25,7 @@ from vertax._inverse import InverseProblem as InverseProblem
 from vertax._tissue import Tissue as Tissue
 from vertax._topology import Topology as Topology
 from vertax._transitions import T1 as T1, AbstractTransitions as AbstractTransitions
+from vertax._uncertainty import Uncertainty as Uncertainty, uncertainty as uncertainty
 from vertax.adjoints import (
     AutomaticDifferentiation as AutomaticDifferentiation,
     EquilibriumPropagation as EquilibriumPropagation,

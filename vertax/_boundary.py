@@ -47,6 +47,12 @@ class AbstractBoundary(eqx.Module):
     ) -> Float[Array, "vertices 2"]:
         """The vertices, moved as a whole such that nothing is left of their drift."""
 
+    @abc.abstractmethod
+    def motions(
+        self, vertices: Float[Array, "vertices 2"], distance: Float[Array, ""]
+    ) -> Float[Array, "modes vertices 2"]:
+        """The vertices, moved as a whole by about a distance, for each of the modes of `drift`."""
+
 
 class Periodic(AbstractBoundary):
     """A periodic box spanned by two lattice vectors; differentiable, sheared boxes included.
@@ -123,6 +129,11 @@ class Periodic(AbstractBoundary):
         back = jnp.mean(reference - vertices, axis=0)
         return vertices + (back if pinned is None else jnp.where(jnp.any(pinned), 0, back))
 
+    def motions(
+        self, vertices: Float[Array, "vertices 2"], distance: Float[Array, ""]
+    ) -> Float[Array, "modes vertices 2"]:
+        return vertices + distance * jnp.eye(2, dtype=vertices.dtype)[:, None]
+
 
 class Free(AbstractBoundary):
     """The plane: a cluster of cells with an exterior around it.
@@ -162,6 +173,17 @@ class Free(AbstractBoundary):
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         aside = jnp.stack([-moved[:, 1], moved[:, 0]], axis=-1)
         return jnp.where(rotates, centre + cos * moved + sin * aside, vertices)
+
+    def motions(
+        self, vertices: Float[Array, "vertices 2"], distance: Float[Array, ""]
+    ) -> Float[Array, "modes vertices 2"]:
+        shifted = vertices + distance * jnp.eye(2, dtype=vertices.dtype)[:, None]
+        centre = jnp.mean(vertices, axis=0)
+        arm = vertices - centre
+        turn = distance / jnp.sqrt(jnp.mean(jnp.sum(arm**2, axis=-1)))
+        aside = jnp.stack([-arm[:, 1], arm[:, 0]], axis=-1)
+        turned = centre + jnp.cos(turn) * arm + jnp.sin(turn) * aside
+        return jnp.concatenate([shifted, turned[None]])
 
 
 def _pivot(

@@ -127,17 +127,20 @@ def _equilibrate(
         relaxation, options, transitions, *frozen((tissue, energy)), max_steps=max_steps
     )
     # The second solve starts at rest and takes no step: it is there to be differentiated.
-    # What the solver did to the whole (turned it a little, say) depends on its way there: undo that.
-    settled = found.tissue.settled(frozen(tissue))
-    moved = settled.held_as(tissue)
-    stiffness = mean_stiffness(settled, frozen(energy))
+    stiffness = mean_stiffness(found.tissue, frozen(energy))
     stiffness = jnp.where(stiffness > 0, stiffness, 1)
+    free = _free_motions(found.tissue, frozen(energy), scale, stiffness)
+    # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
+    # unless the energy has something to say about where the tissue is.
+    settled = _choose(jnp.all(free), found.tissue.settled(frozen(tissue)), found.tissue)
+    moved = settled.held_as(_choose(jnp.all(free), tissue, found.tissue))
+    springs = jnp.ones_like(moved.drift(settled.configuration)).at[: len(free)].set(free)
     memory = {"stiffness": stiffness, "relaxation": relaxation, "start": found.start}
     solution = optx.minimise(
         _potential,
         AtRest(),
         settled.configuration,
-        (moved, energy, stiffness),
+        (moved, energy, stiffness * springs),
         options | memory,
         max_steps=max_steps,
         adjoint=adjoint,
@@ -178,13 +181,31 @@ def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
         )
 
 
+def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
+    """The vertices of one tissue or another; pinned ones are where the first has them."""
+    if one.pinned is not None:
+        condition = condition | one.pinned[:, None]
+    return one.with_vertices(jnp.where(condition, one.vertices, other.vertices))
+
+
+def _free_motions(
+    tissue: Tissue, energy: AbstractEnergy, scale: Float[Array, ""], stiffness: Float[Array, ""]
+) -> Bool[Array, " modes"]:
+    """Which motions of the whole cost nothing: all, unless the energy knows positions."""
+    there = tissue.boundary.motions(tissue.vertices, 0.3 * scale)
+    energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(there)
+    here = energy(tissue)
+    rounding = jnp.finfo(here.dtype).eps ** 0.6
+    return jnp.abs(energies - here) <= rounding * (jnp.abs(here) + stiffness * scale**2)
+
+
 def _potential(configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Array]) -> Array:
     """The energy, and a term that pins the motions which cost nothing."""
     # Motions of the whole are zero modes. They make the Hessian singular, and a nudged relaxation would
     # drift along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
     tissue, energy, gauge = args
     drift = tissue.drift(configuration)
-    return energy(tissue.with_configuration(configuration)) + 0.5 * gauge * jnp.sum(drift**2)
+    return energy(tissue.with_configuration(configuration)) + 0.5 * jnp.sum(gauge * drift**2)
 
 
 def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:

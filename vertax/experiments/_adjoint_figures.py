@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vertax._fit import Fit
-from vertax.experiments._figures import new_figure
+from vertax.experiments._figures import band, boxes, new_figure
 from vertax.plotting import _style
 
 # The colours of the paper, in shades that are told apart with any colour vision.
@@ -60,7 +60,7 @@ def inference(
             ("error", "relative_error", "relative error"),
         ):
             for method, fit in fits.items():
-                _band(grid[key], getattr(fit.history, name), method)
+                band(grid[key], getattr(fit.history, name), method, _COLOURS[method])
             grid[key].set(xlabel="epoch", ylabel=label, yscale="log")
         grid["cost"].legend(ncols=2, columnspacing=0.8)
         pearson = {
@@ -68,9 +68,9 @@ def inference(
             for m, p in inferred.items()
         }
         error = {m: np.mean(np.abs(p - true) / np.abs(true), axis=1) for m, p in inferred.items()}
-        _boxes(grid["pearson"], {m: 1 - np.asarray(r) for m, r in pearson.items()})
+        boxes(grid["pearson"], {m: 1 - np.asarray(r) for m, r in pearson.items()}, _COLOURS)
         grid["pearson"].set_ylabel("1 − Pearson $r$ at the end")
-        _boxes(grid["final"], error)
+        boxes(grid["final"], error, _COLOURS)
         grid["final"].set_ylabel("relative error at the end")
     return figure
 
@@ -214,28 +214,6 @@ def _scatter(ax: Axes, true: np.ndarray, found: Mapping[str, np.ndarray], title:
         )
     ax.set(xlim=ends, ylim=ends, xlabel=r"true $p_0$", ylabel=r"inferred $p_0$", title=title)
     ax.set_aspect("equal")
-
-
-def _band(ax: Axes, curves: np.ndarray, method: str) -> None:
-    """Mean over replicates, and one standard deviation, both of the logarithm."""
-    logarithm = np.log(np.maximum(curves, 1e-300))
-    mean, deviation = logarithm.mean(axis=1), logarithm.std(axis=1)
-    epochs, colour = np.arange(len(curves)), _COLOURS[method]
-    ax.plot(epochs, np.exp(mean), color=colour, label=method, lw=1)
-    ax.fill_between(
-        epochs, np.exp(mean - deviation), np.exp(mean + deviation), color=colour, alpha=0.15, lw=0
-    )
-
-
-def _boxes(ax: Axes, values: Mapping[str, Any]) -> None:
-    data = [np.maximum(np.asarray(v, float), 1e-17) for v in values.values()]
-    drawn = ax.boxplot(data, widths=0.5, showfliers=False, medianprops={"color": _style.INK})
-    for k, (method, points) in enumerate(zip(values, data, strict=True), start=1):
-        ax.plot(np.full(len(points), k), points, ".", ms=4, color=_COLOURS[method], zorder=3)
-    for line in (*drawn["boxes"], *drawn["whiskers"], *drawn["caps"]):
-        line.set(color="0.5", lw=0.8)
-    ax.set_xticks(range(1, len(values) + 1), list(values))
-    ax.set_yscale("log")
 
 
 def _centre(values: np.ndarray) -> np.ndarray:

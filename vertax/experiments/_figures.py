@@ -75,6 +75,48 @@ def recovery(truth: Cells, inferred: Cells, initial: Cells, *, name: str) -> Fig
     return figure
 
 
+def band(ax: Axes, curves: np.ndarray, label: str, colour: str) -> None:
+    """Curves of replicates by epoch: their mean, and one standard deviation, of the logarithm.
+
+    **Arguments:**
+
+    - `ax`: where to draw.
+    - `curves`: positive numbers, shape `(epochs, replicates)`.
+    - `label`, `colour`: of the mean.
+    """
+    logarithm = np.log(np.maximum(curves, 1e-300))
+    mean, deviation = logarithm.mean(axis=1), logarithm.std(axis=1)
+    epochs = np.arange(len(curves))
+    ax.plot(epochs, np.exp(mean), color=colour, label=label, lw=1)
+    ax.fill_between(
+        epochs, np.exp(mean - deviation), np.exp(mean + deviation), color=colour, alpha=0.15, lw=0
+    )
+
+
+def boxes(
+    ax: Axes, values: Mapping[str, np.ndarray], colours: Mapping[str, str], *, log: bool = True
+) -> None:
+    """A box of each group, and all its points.
+
+    **Arguments:**
+
+    - `ax`: where to draw.
+    - `values`, `colours`: numbers and colour by the name of the group.
+    - `log`: on a logarithmic axis.
+    """
+    data = [np.asarray(v, float) for v in values.values()]
+    if log:
+        data = [np.maximum(points, 1e-17) for points in data]
+    drawn = ax.boxplot(data, widths=0.5, showfliers=False, medianprops={"color": _style.INK})
+    for k, (name, points) in enumerate(zip(values, data, strict=True), start=1):
+        ax.plot(np.full(len(points), k), points, ".", ms=4, color=colours[name], zorder=3)
+    for line in (*drawn["boxes"], *drawn["whiskers"], *drawn["caps"]):
+        line.set(color="0.5", lw=0.8)
+    ax.set_xticks(range(1, len(values) + 1), list(values))
+    if log:
+        ax.set_yscale("log")
+
+
 def overlays(
     image: Float[np.ndarray, "rows columns"],
     panels: Mapping[str, Tissue | None],

@@ -13,6 +13,8 @@ from vertax.experiments import (
     design_mechanics,
     infer_from_microscopy,
     infer_shape_factors,
+    inference_across_topologies,
+    rigidity_transition,
     salt_and_pepper,
 )
 from vertax.experiments._config import (
@@ -53,6 +55,18 @@ _ALL = (
         infer_from_microscopy.Config,
         infer_from_microscopy.run,
         "Infer the target shape factors of the cells in a microscopy image.",
+    ),
+    Experiment(
+        "inference_across_topologies",
+        inference_across_topologies.Config,
+        inference_across_topologies.run,
+        "Recover shape factors where the fit has to lead through T1 transitions.",
+    ),
+    Experiment(
+        "rigidity_transition",
+        rigidity_transition.Config,
+        rigidity_transition.run,
+        "Where tissues turn from solid to fluid as the target shape factor grows.",
     ),
     Experiment(
         "benchmark_adjoints",

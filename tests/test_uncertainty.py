@@ -1,0 +1,127 @@
+"""The Laplace approximation: how well data determine parameters."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+from helpers import p0_of, relaxed
+
+import vertax as vx
+from vertax.costs import CentroidDistance, MeanShapeFactor, MeshImage, VertexDistance, render
+
+
+@pytest.fixture(scope="module")
+def hidden():
+    return relaxed(8, 3)
+
+
+def fitted(tissue, energy, cost, **options):
+    problem = vx.InverseProblem(tissue, energy, cost, transitions=None, **options)
+    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
+    return problem, vx.fit(problem, solver, 15, progress=False)
+
+
+def test_it_is_the_scatter_of_repeated_fits(hidden):
+    tissue, truth = hidden
+    noise = 1e-4
+
+    def once(key):
+        target = tissue.with_vertices(
+            tissue.vertices + noise * jax.random.normal(key, tissue.vertices.shape)
+        )
+        # Noise has no mean here: no parameter moves the centroid.
+        target = target.settled(tissue)
+        return VertexDistance(target)
+
+    keys = jax.random.split(jax.random.key(0), 60)
+    problems = eqx.filter_vmap(
+        lambda key: vx.InverseProblem(tissue, truth, once(key), transitions=None),
+        out_axes=eqx.if_array(0),
+    )(keys)
+    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
+    fits = vx.fit(problems, solver, 12, batched=True, progress=False)
+    scatter = np.std(np.asarray(p0_of(fits.energy)), axis=0)
+    one = lambda tree: jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, tree)
+    said = vx.uncertainty(one(problems), one(fits))
+    np.testing.assert_allclose(p0_of(said.deviation), scatter, rtol=0.6)
+    mean_ratio = float(np.mean(p0_of(said.deviation) / scatter))
+    assert 0.75 < mean_ratio < 1.3
+    np.testing.assert_allclose(np.diag(said.covariance) ** 0.5, p0_of(said.deviation))
+
+
+def test_it_follows_its_formula(hidden):
+    tissue, truth = hidden
+    target = tissue.with_vertices(
+        tissue.vertices + 1e-3 * jax.random.normal(jax.random.key(1), tissue.vertices.shape)
+    )
+    problem, fit = fitted(tissue, truth, VertexDistance(target))
+    said = vx.uncertainty(problem, fit)
+
+    def residuals(p0):
+        return problem.residuals(vx.energies.ShapeFactorEnergy(p0), fit.tissue, None)[0]
+
+    p0 = p0_of(fit.energy)
+    step = 1e-5 * np.eye(8)
+    jacobian = np.stack([(residuals(p0 + e) - residuals(p0 - e)) / 2e-5 for e in step], axis=1)
+    left = np.asarray(residuals(p0))
+    expected = np.linalg.inv(jacobian.T @ jacobian) * (left @ left) / (len(left) - 8)
+    np.testing.assert_allclose(said.covariance, expected, rtol=1e-3, atol=1e-4 * expected.max())
+    # A narrow prior leaves little to learn.
+    narrow = vx.uncertainty(problem, fit, prior=1e-7)
+    np.testing.assert_allclose(p0_of(narrow.deviation), 1e-7, rtol=1e-2)
+    # Fewer independent residuals say less.
+    fewer = vx.uncertainty(problem, fit, n_independent=16)
+    assert (p0_of(fewer.deviation) > p0_of(said.deviation)).all()
+
+
+def test_it_names_what_the_data_do_not_determine(hidden):
+    tissue, truth = hidden
+    cost = MeanShapeFactor(3.8) + CentroidDistance(tissue)
+
+    class OneNumber(vx.costs.AbstractLeastSquaresCost):
+        def residuals(self, tissue, energy):
+            return jnp.ones(20) * (tissue.perimeters[0] - 3.6)
+
+    problem = vx.InverseProblem(tissue, truth, OneNumber(), transitions=None)
+    fit = vx.fit(problem, optax.adam(1e-3), 3, progress=False)
+    said = vx.uncertainty(problem, fit)
+    assert int(jnp.sum(jnp.isinf(said.deviations))) == 7
+    assert np.isinf(p0_of(said.deviation)).any()
+    with_prior = vx.uncertainty(problem, fit, prior=0.3)
+    assert np.isfinite(p0_of(with_prior.deviation)).all()
+    assert float(jnp.max(with_prior.deviations)) == pytest.approx(0.3, rel=1e-3)
+    assert cost(tissue, truth) > 0
+
+
+def test_a_fitted_position_adds_to_the_uncertainty(hidden):
+    tissue, truth = hidden
+    width = 0.12
+    image = np.asarray(render(tissue, (48, 48), width))
+    image = image + 0.05 * image.max() * np.random.default_rng(0).normal(size=image.shape)
+    cost = MeshImage(image, width)
+    fit = vx.fit(
+        vx.InverseProblem(tissue, truth, cost, transitions=None),
+        optax.adam(1e-3),
+        2,
+        progress=False,
+    )
+    known, unknown = (
+        vx.uncertainty(
+            vx.InverseProblem(tissue, truth, cost, transitions=None, fit_position=moves), fit
+        )
+        for moves in (False, True)
+    )
+    assert (p0_of(unknown.deviation) > p0_of(known.deviation)).all()
+    assert float(jnp.max(p0_of(unknown.deviation) / p0_of(known.deviation))) < 3
+
+
+def test_bad_arguments_are_refused(hidden):
+    tissue, truth = hidden
+    problem, fit = fitted(tissue, truth, VertexDistance(tissue))
+    with pytest.raises(ValueError, match="`prior` must be positive"):
+        vx.uncertainty(problem, fit, prior=0.0)
+    with pytest.raises(ValueError, match="more independent residuals than parameters"):
+        vx.uncertainty(problem, fit, n_independent=8)

@@ -1,0 +1,84 @@
+"""Pictures of the rigidity transition, beginning with the paper's Figure 3g, left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from vertax.experiments._figures import new_figure
+from vertax.plotting import _style
+
+REFERENCE = 3.81
+"""The transition of disordered tissues, from D. Bi et al. 2015."""
+
+
+class Curve(NamedTuple):
+    """Fractions of tissues at zero energy, and the logistic curve through them."""
+
+    name: str
+    fraction: Float[np.ndarray, " values"]
+    centre: float
+    width: float
+
+
+def transition(
+    shape_factors: Float[np.ndarray, " values"],
+    curves: Sequence[Curve],
+    energies: Float[np.ndarray, "values tissues cycles"],
+    shapes: Float[np.ndarray, "values tissues"],
+    modes: Float[np.ndarray, "values some"],
+) -> Figure:
+    """Zero-energy states, energies, observed shapes and zero modes against the shape factor.
+
+    **Arguments:**
+
+    - `shape_factors`: target shape factors.
+    - `curves`: fractions at zero energy after more and more driving.
+    - `energies`: per cell.
+    - `shapes`: mean observed shape factor of each tissue at the end.
+    - `modes`: number of zero modes of some tissues; none leaves the panel out.
+
+    **Returns:** the figure.
+    """
+    with _style.house_style():
+        figure, axes = new_figure(4 if modes.size else 3, width=2.2, height=2.3)
+        fine = np.linspace(shape_factors.min(), shape_factors.max(), 400)
+        for curve, colour in zip(curves, (*_style.SERIES, "0.4"), strict=False):
+            axes[0].plot(shape_factors, curve.fraction, "o", ms=3, color=colour, label=curve.name)
+            if np.isfinite(curve.centre):
+                z = np.clip((fine - curve.centre) / curve.width, -50, 50)
+                axes[0].plot(fine, 1 / (1 + np.exp(-z)), color=colour, lw=1)
+        axes[0].axvline(REFERENCE, color=_style.INK, lw=0.7, ls=":")
+        axes[0].set(ylabel="fraction at zero energy", ylim=(-0.03, 1.03))
+        axes[0].legend(loc="upper left")
+        for cycle, colour, name in (
+            (0, _style.SERIES[0], "quench"),
+            (-1, _style.SERIES[1], "driven"),
+        ):
+            low, middle, high = np.percentile(
+                np.maximum(energies[..., cycle], 1e-16), [10, 50, 90], axis=1
+            )
+            axes[1].plot(shape_factors, middle, color=colour, label=name)
+            axes[1].fill_between(shape_factors, low, high, color=colour, alpha=0.15, lw=0)
+        axes[1].set(yscale="log", ylabel="energy per cell")
+        axes[1].legend(loc="lower left")
+        ends = [shape_factors.min(), shape_factors.max()]
+        axes[2].plot(ends, ends, color=_style.INK, lw=0.7, ls=":")
+        mean, deviation = shapes.mean(axis=1), shapes.std(axis=1)
+        axes[2].errorbar(
+            shape_factors, mean, deviation, fmt="o", ms=3, lw=0.8, color=_style.SERIES[1]
+        )
+        axes[2].set(ylabel="mean observed shape factor")
+        if modes.size:
+            mean, deviation = modes.mean(axis=1), modes.std(axis=1)
+            axes[3].errorbar(
+                shape_factors, mean, deviation, fmt="o", ms=3, lw=0.8, color=_style.SERIES[1]
+            )
+            axes[3].set(ylabel="zero modes of a tissue")
+        for ax in axes:
+            ax.set_xlabel("target shape factor $p_0$")
+    return figure
