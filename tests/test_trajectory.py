@@ -64,8 +64,13 @@ class TestRelaxation:
         assert way.values["num_t1"][-1] == equilibrium.num_t1
         assert way.values["max_force"][-1] < 1e-9
         assert set(np.diff(way.values["num_steps"][:-1])) == {2}
-        # Being watched changes nothing.
-        assert same_bits(equilibrium.tissue, vx.equilibrate(tissue, energy).tissue)
+        # Being watched changes nothing but the rounding, since another program is compiled.
+        unwatched = vx.equilibrate(tissue, energy)
+        assert unwatched.num_steps == equilibrium.num_steps
+        assert same_bits(unwatched.tissue.topology, equilibrium.tissue.topology)
+        np.testing.assert_allclose(
+            unwatched.tissue.vertices, equilibrium.tissue.vertices, rtol=0, atol=1e-8
+        )
 
     def test_frames_have_their_own_topology_energy_and_force(self, flowing):
         _, energy, equilibrium, way = flowing
@@ -75,8 +80,8 @@ class TestRelaxation:
         for k, frame in enumerate(way):
             frame.topology.validate()
             value, force = energy(frame), jnp.abs(slope(frame.vertices, frame)).max()
-            np.testing.assert_allclose(value, way.values["energy"][k], rtol=1e-12, atol=1e-20)
-            np.testing.assert_allclose(force, way.values["max_force"][k], rtol=1e-5, atol=1e-12)
+            np.testing.assert_allclose(value, way.values["energy"][k], rtol=1e-9, atol=1e-15)
+            np.testing.assert_allclose(force, way.values["max_force"][k], rtol=1e-5, atol=1e-10)
         flips = np.diff(way.values["num_t1"])
         changed = [not eqx.tree_equal(a.topology, b.topology) for a, b in pairwise(way)]
         np.testing.assert_array_equal(flips > 0, changed)
@@ -96,6 +101,20 @@ class TestRelaxation:
         for frame in way:
             drift = frame.boundary.drift(frame.vertices, tissue.vertices)
             np.testing.assert_allclose(drift, 0, atol=1e-12)
+
+    def test_an_energy_that_knows_positions_may_move_the_whole(self):
+        class Trap(vx.AbstractEnergy):
+            stiffness: float = 1.0
+
+            def __call__(self, tissue):
+                return 0.5 * self.stiffness * jnp.sum((tissue.vertices - 9.0) ** 2)
+
+        tissue = cluster(3)
+        energy = tension(tissue) + Trap()
+        found, way = record_relaxation(tissue, energy, transitions=None, solver=vx.solvers.FIRE())
+        np.testing.assert_allclose(found.tissue.vertices.mean(axis=0), 9.0, atol=1e-6)
+        steps = np.diff([np.asarray(frame.vertices.mean(axis=0)) for frame in way], axis=0)
+        assert np.abs(steps).max() < 0.2
 
     def test_at_rest_there_is_one_frame(self, flowing):
         _, energy, equilibrium, _ = flowing

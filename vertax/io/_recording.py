@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.experimental import io_callback
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._equilibrium import Equilibrium, equilibrate
+from vertax._equilibrium import Equilibrium, equilibrate, free_motions, mean_stiffness
 from vertax._tissue import Tissue
 from vertax._transitions import T1, AbstractTransitions
 from vertax.energies import AbstractEnergy
@@ -89,10 +89,11 @@ def record_relaxation(
     finally:
         del _OBSERVERS[ticket]
     structure = jax.tree.structure(tissue)
+    adrift = _adrift(found.tissue, energy)
     for num_steps, num_t1, leaves in seen:
         if num_steps < found.num_steps:
             frame: Tissue = jax.tree.unflatten(structure, map(jnp.asarray, leaves))
-            add(_settled(frame, tissue), num_steps, num_t1)
+            add(_settled(frame, tissue) if adrift else frame, num_steps, num_t1)
     if found.num_steps > 0:
         add(found.tissue, found.num_steps, found.num_t1)
     if throw and not found.converged:
@@ -142,6 +143,13 @@ def _energy_and_force(
     at = lambda y: energy(tissue.with_configuration(y))
     value, slope = jax.value_and_grad(at)(tissue.configuration)
     return value, optx.max_norm(slope)
+
+
+@eqx.filter_jit
+def _adrift(tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, ""]:
+    """Whether the energy does not mind where the tissue is, so that `equilibrate` moves it back."""
+    scale = jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
+    return jnp.all(free_motions(tissue, energy, scale, mean_stiffness(tissue, energy)))
 
 
 @eqx.filter_jit
