@@ -34,8 +34,9 @@ format: $(VENV)/.dev ## mend style and format where a program can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-types: $(VENV)/.dev ## static types
+types: $(VENV)/.dev ## static types; those of a project that builds on vertax strictly
 	$(BIN)/pyright
+	$(BIN)/pyright --project tests/downstream
 
 benchmark: $(VENV)/.dev ## measure speed; nothing else should run meanwhile
 	@for script in benchmarks/[a-z]*.py; do \

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import vertax as vx
-from vertax.experiments import EXPERIMENTS
+from vertax.experiments import EXPERIMENTS, RunFolder
 from vertax.experiments.command_line import app
 
 ROOT = Path(__file__).parents[1]
@@ -143,8 +143,81 @@ def test_help_version_list_and_describe(tiny):
     assert "There is no experiment 'infer'" in unknown.stderr
 
 
+METRICS = {"initial": {"cost": 2.5, "epochs": 3}, "fitted": {"cost": 0.125, "epochs": 3}}
+
+
+@pytest.fixture
+def done(tmp_path, monkeypatch):
+    """The working directory holds a finished run in runs/done."""
+    monkeypatch.chdir(tmp_path)
+    folder = RunFolder.claim("done")
+    (folder.path / "config.toml").write_text("")
+    folder.save_table("cells", {"cell": [0, 1]})
+    (folder.path / "figures").mkdir()
+    (folder.path / "figures" / "recovery.png").write_bytes(b"")
+    folder.save_metrics(METRICS)
+    return folder.path
+
+
+def test_show_prints_the_metrics_and_lists_figures_and_files(done):
+    outcome = vertax("show", str(done))
+    assert outcome.exit_code == 0, outcome.output
+    assert outcome.output == (
+        "        initial  fitted\n"
+        "cost        2.5   0.125\n"
+        "epochs        3       3\n"
+        "Figures:\n  runs/done/figures/recovery.png\n"
+        "Files:\n  runs/done/cells.csv\n  runs/done/config.toml\n  runs/done/metrics.json\n"
+    )
+
+
+def test_show_shows_what_run_showed(tiny, instead):
+    instead(lambda config, folder, *, progress: METRICS | {"note": "text"})
+    ran = vertax("run", "tiny.toml")
+    shown = vertax("show", "runs/tiny")
+    table = ran.output.split("runs/tiny\n")[1].split("Results:")[0]
+    assert shown.output.startswith(table)
+
+
+def test_show_of_an_unfinished_run_is_exit_code_1(done):
+    (done / "metrics.json").unlink()
+    outcome = vertax("show", str(done))
+    assert outcome.exit_code == 1
+    assert outcome.stdout == ""
+    assert "The run in runs/done is unfinished: it has no metrics.json" in outcome.stderr
+    assert "vertax run runs/done/config.toml" in outcome.stderr
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (lambda run: (run / "config.toml").unlink(), "there is no config.toml in it"),
+        (lambda run: (run / "metrics.json").write_text("{"), "metrics.json is no JSON"),
+        (lambda run: (run / "metrics.json").write_bytes(b"\xff"), "metrics.json is no JSON"),
+        (lambda run: (run / "metrics.json").write_text("[1]"), "holds no metrics by name"),
+    ],
+)
+def test_show_of_a_folder_that_is_no_run_is_exit_code_2(done, broken, said):
+    broken(done)
+    outcome = vertax("show", str(done))
+    assert outcome.exit_code == 2
+    assert said in outcome.stderr
+    assert "Traceback" not in outcome.output
+
+
+def test_show_of_no_folder_is_exit_code_2(done):
+    assert "there is none" in vertax("show", "runs/none").stderr
+    assert "it is a file" in vertax("show", "runs/done/cells.csv").stderr
+    assert vertax("show", "runs/none").exit_code == 2
+    assert vertax("show").exit_code == 2
+
+
+def test_help_tells_the_exit_codes():
+    assert "Exit codes: 0 all went well, 1 the run failed" in vertax("--help").output
+
+
 def test_the_program_runs_as_a_process():
-    command = [sys.executable, "-m", "vertax.experiments.command_line", "run", "none.toml"]
+    command = [sys.executable, "-m", "vertax", "run", "none.toml"]
     outcome = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert outcome.returncode == 2
     assert outcome.stderr == "Error: There is no configuration file none.toml.\n"

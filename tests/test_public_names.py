@@ -19,7 +19,10 @@ FAMILIES = {
     "PerimeterElasticity ShapeFactorEnergy Sum",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
     "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
-    "io": "BoundedTables Tables atomic_write from_tables load_tissue read_image save_tissue to_tables",
+    "io": "BoundedTables Tables Trajectory atomic_write cell_table edge_table from_tables "
+    "load_energy load_problem load_tissue load_trajectory read_image record_relaxation "
+    "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
+    "write_geojson write_vtk",
     "plotting": "cell_polygons plot_history plot_recovery plot_tissue",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
 }

@@ -12,7 +12,8 @@ README = Path(__file__).parents[1] / "README.md"
 
 
 @pytest.mark.slow
-def test_the_examples_of_the_readme_run():
+def test_the_examples_of_the_readme_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # they write files
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     # A reader who writes an energy of her own imports these; `Float` is the only thing left unsaid.
     names = {"eqx": eqx, "Array": Array, "Float": Float}

@@ -48,7 +48,7 @@ def equilibrate(
     tissue: Tissue,
     energy: AbstractEnergy,
     *,
-    solver: optx.AbstractMinimiser | None = None,
+    solver: optx.AbstractMinimiser[Any, Any, Any] | None = None,
     adjoint: AbstractAdjoint | None = None,
     transitions: AbstractTransitions | None = T1(),
     tolerance: float | Float[Array, ""] | None = None,
@@ -129,7 +129,7 @@ def _equilibrate(
     # The second solve starts at rest and takes no step: it is there to be differentiated.
     stiffness = mean_stiffness(found.tissue, frozen(energy))
     stiffness = jnp.where(stiffness > 0, stiffness, 1)
-    free = _free_motions(found.tissue, frozen(energy), scale, stiffness)
+    free = free_motions(found.tissue, frozen(energy), scale, stiffness)
     # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
     # unless the energy has something to say about where the tissue is.
     settled = _choose(jnp.all(free), found.tissue.settled(frozen(tissue)), found.tissue)
@@ -188,7 +188,7 @@ def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
     return one.with_vertices(jnp.where(condition, one.vertices, other.vertices))
 
 
-def _free_motions(
+def free_motions(
     tissue: Tissue, energy: AbstractEnergy, scale: Float[Array, ""], stiffness: Float[Array, ""]
 ) -> Bool[Array, " modes"]:
     """Which motions of the whole cost nothing: all, unless the energy knows positions."""

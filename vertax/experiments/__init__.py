@@ -18,6 +18,7 @@ from vertax.experiments._registry import (
 from vertax.experiments._run import (
     RunFolder as RunFolder,
     RunFolderError as RunFolderError,
+    UnfinishedRunError as UnfinishedRunError,
     installed_version as installed_version,
     summary as summary,
 )

@@ -29,7 +29,11 @@ _LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", "figures/*.png")
 
 
 class RunFolderError(ValueError):
-    """A folder that a run must not write to."""
+    """A folder that a run must not write to, or that holds none."""
+
+
+class UnfinishedRunError(RunFolderError):
+    """The folder of a run that did not come to its end."""
 
 
 class RunFolder:
@@ -89,6 +93,30 @@ class RunFolder:
             raise RunFolderError(
                 f"Cannot use {error.filename} as a folder: there is a file of that name."
             ) from None
+        return cls(folder)
+
+    @classmethod
+    def existing(cls, path: str | os.PathLike[str]) -> RunFolder:
+        """The folder of an earlier run.
+
+        **Arguments:**
+
+        - `path`: the folder.
+
+        **Returns:** the folder.
+
+        **Raises:**
+
+        - `RunFolderError` if there is no such folder, or if it is not that of a run.
+        """
+        folder = Path(path)
+        if not folder.is_dir():
+            what = "it is a file" if folder.exists() else "there is none"
+            raise RunFolderError(f"{folder} is not the folder of a run: {what}.")
+        if not (folder / CONFIG).is_file():
+            raise RunFolderError(
+                f"{folder} is not the folder of a run: there is no {CONFIG} in it, which a run writes first."
+            )
         return cls(folder)
 
     def save_config(self, config: ExperimentConfig) -> None:
@@ -168,6 +196,37 @@ class RunFolder:
         with atomic_write(self.path / METRICS) as file:
             json.dump(_plain(metrics), file, indent=2, allow_nan=False)
             file.write("\n")
+
+    def metrics(self) -> dict[str, Any]:
+        """The metrics of a finished run.
+
+        **Returns:** what was given to [`save_metrics`][vertax.experiments.RunFolder.save_metrics].
+
+        **Raises:**
+
+        - `UnfinishedRunError` if the run did not come to its end.
+        - `RunFolderError` if the metrics cannot be read.
+        """
+        file = self.path / METRICS
+        try:
+            metrics = json.loads(file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise UnfinishedRunError(
+                f"The run in {self.path} is unfinished: it has no {METRICS}, which is written last. It is "
+                f"still going or it failed; to repeat it: vertax run {self.path / CONFIG}"
+            ) from None
+        except ValueError as error:
+            raise RunFolderError(f"{file} is no JSON ({error}).") from None
+        if not isinstance(metrics, dict):
+            raise RunFolderError(f"{file} is broken: it holds no metrics by name.")
+        return metrics
+
+    def files(self) -> list[Path]:
+        """All files, those of other programs too.
+
+        **Returns:** their paths, sorted by name.
+        """
+        return sorted(file for file in self.path.rglob("*") if file.is_file())
 
     def figures(self) -> list[Path]:
         """The pictures written so far.

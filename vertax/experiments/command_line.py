@@ -11,6 +11,7 @@ import typer
 
 app = typer.Typer(
     help="A differentiable vertex model of epithelial tissue.",
+    epilog="Exit codes: 0 all went well, 1 the run failed or is unfinished, 2 wrong use.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -128,6 +129,31 @@ def run(
         typer.echo(f"Results: {folder.path}")
         for figure in folder.figures():
             typer.echo(f"  {figure}")
+
+
+@app.command()
+def show(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, e.g. runs/demo.")],
+) -> None:
+    """Print the metrics of a finished run, and list its figures and files."""
+    from vertax.experiments import RunFolder, RunFolderError, UnfinishedRunError, summary
+
+    try:
+        run = RunFolder.existing(folder)
+        metrics = run.metrics()
+    except UnfinishedRunError as error:
+        _stop(error, FAILURE)
+    except RunFolderError as error:
+        _stop(error, USAGE)
+    figures = run.figures()
+    others = [file for file in run.files() if file not in figures]
+    if table := summary(metrics):
+        typer.echo(table)
+    for title, files in (("Figures", figures), ("Files", others)):
+        if files:
+            typer.echo(f"{title}:")
+        for file in files:
+            typer.echo(f"  {file}")
 
 
 def _stop(error: Exception, code: int) -> NoReturn:

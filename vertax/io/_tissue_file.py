@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,9 +13,8 @@ import numpy as np
 from vertax._boundary import AbstractBoundary, Free, Periodic
 from vertax._tissue import Tissue
 from vertax._topology import Topology
-from vertax.io._atomic import atomic_write
+from vertax.io._archive import as_jax, read_archive, write_archive
 
-_FORMAT = "vertax-tissue"
 _VERSION = 1
 
 
@@ -54,9 +53,34 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
         that has no place in the format.
     - `OSError` if the file cannot be written.
     """
+    write_archive(path, "tissue", _VERSION, tissue_arrays(tissue))
+
+
+def load_tissue(path: str | os.PathLike[str]) -> Tissue:
+    """Load a tissue that [`save_tissue`][vertax.io.save_tissue] wrote.
+
+    **Arguments:**
+
+    - `path`: the file.
+
+    **Returns:** the [`Tissue`][vertax.Tissue], bit for bit as it was saved.
+
+    **Raises:**
+
+    - `FileNotFoundError` if there is no such file.
+    - `ValueError`, with the file's name, if it is not a tissue file, is truncated or damaged, was
+        written by a newer version, contradicts itself, or holds float64 numbers while JAX is
+        limited to float32 (nothing is rounded silently: enable `jax_enable_x64`).
+    """
+    return tissue_from(read_archive(path, "tissue", _VERSION), os.fspath(path))
+
+
+def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
+    """All that a tissue consists of by name, see `save_tissue`; the way back is `tissue_from`."""
     topology = tissue.topology
     kind, record = _record_of(tissue.boundary)
     arrays: dict[str, Any] = {
+        "boundary": kind,
         "vertices": tissue.vertices,
         "softening": tissue.softening,
         "twin": topology.twin,
@@ -78,44 +102,30 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
             f"{arrays['vertices'].shape}. Save the members of a batch one by one."
         )
     for name, array in arrays.items():
-        if array.dtype.kind not in "fi":  # bfloat16 and the like come back from a file as raw bytes
+        # bfloat16 and the like come back from a file as raw bytes.
+        if name != "boundary" and array.dtype.kind not in "fi":
             raise ValueError(
                 "Argument `tissue` must hold numbers of a type NumPy knows, but "
                 f"`{name}` is {array.dtype}."
             )
-    header = {"format": _FORMAT, "version": _VERSION, "boundary": kind}
-    with atomic_write(path, "wb") as file:
-        np.savez_compressed(file, **{k: np.asarray(v) for k, v in header.items()}, **arrays)
+    return arrays
 
 
-def load_tissue(path: str | os.PathLike[str]) -> Tissue:
-    """Load a tissue that [`save_tissue`][vertax.io.save_tissue] wrote.
+def tissue_from(
+    arrays: Mapping[str, np.ndarray], name: str, topology: Topology | None = None
+) -> Tissue:
+    """The tissue of some arrays, checked.
 
     **Arguments:**
 
-    - `path`: the file.
+    - `arrays`: as of `tissue_arrays`.
+    - `name`: of the file they come from.
+    - `topology`: that of `arrays`, if it is known already.
 
-    **Returns:** the [`Tissue`][vertax.Tissue], bit for bit as it was saved.
+    **Returns:** the tissue.
 
-    **Raises:**
-
-    - `FileNotFoundError` if there is no such file.
-    - `ValueError`, with the file's name, if it is not a tissue file, is truncated or damaged, was
-        written by a newer version, contradicts itself, or holds float64 numbers while JAX is
-        limited to float32 (nothing is rounded silently: enable `jax_enable_x64`).
+    **Raises:** see `load_tissue`.
     """
-    name = os.fspath(path)
-    arrays = _read(name)
-    if "format" not in arrays or str(arrays["format"]) != _FORMAT:
-        raise ValueError(f"{name} is not a vertax tissue file: it has no header saying so.")
-    version = arrays.get("version", np.asarray(""))
-    if version.shape != () or version.dtype.kind != "i" or version < 1:
-        raise ValueError(f"{name} has a broken header: its version is {version}.")
-    if version > _VERSION:
-        raise ValueError(
-            f"{name} has version {version} of the tissue format, but this vertax reads up to "
-            f"version {_VERSION}. Update vertax."
-        )
     kind = str(arrays.get("boundary"))
     if kind not in _BOUNDARIES:
         raise ValueError(
@@ -139,11 +149,8 @@ def load_tissue(path: str | os.PathLike[str]) -> Tissue:
                 f"{name} is broken: `{key}` has shape {array.shape} and type {array.dtype}, but "
                 f"must have shape {wanted} and hold {what}."
             )
-        if array.dtype.kind == "f" and jnp.asarray(array).dtype != array.dtype:
-            raise ValueError(
-                f"{name} holds {array.dtype} numbers, but JAX is limited to float32, which would "
-                'round them. Call jax.config.update("jax_enable_x64", True) first.'
-            )
+        if array.dtype.kind == "f":
+            as_jax(array, name)
         return array
 
     twin = get("twin", "i", None)
@@ -162,17 +169,29 @@ def load_tissue(path: str | os.PathLike[str]) -> Tissue:
     if "pinned" in arrays:
         options["pinned"] = get("pinned", "i", n_half // 3) != 0
     try:
-        topology = Topology(twin, cell, frame, edge, exterior=record.build is Free)
-        # The direction of an edge is not in the other arrays: after a T1 it need not be the first
-        # half-edge of the pair.
-        topology = eqx.tree_at(
-            lambda m: m.half_edge, topology, jnp.asarray(half_edge, topology.half_edge.dtype)
-        )
-        topology.validate()
+        if topology is None:
+            topology = _topology_from(twin, cell, frame, edge, half_edge, record.build is Free)
         boundary = record.build(**{field: jnp.asarray(array) for field, array in fields.items()})
         return Tissue(jnp.asarray(vertices), topology, boundary, jnp.asarray(softening), **options)
     except ValueError as error:
         raise ValueError(f"{name} is broken: {error}") from error
+
+
+def _topology_from(
+    twin: np.ndarray,
+    cell: np.ndarray,
+    frame: np.ndarray,
+    edge: np.ndarray,
+    half_edge: np.ndarray,
+    exterior: bool,
+) -> Topology:
+    topology = Topology(twin, cell, frame, edge, exterior=exterior)
+    # The direction of an edge is not in the other arrays: after a T1 it need not be the first half-edge
+    # of the pair.
+    direction = jnp.asarray(half_edge, topology.half_edge.dtype)
+    topology = eqx.tree_at(lambda m: m.half_edge, topology, direction)
+    topology.validate()
+    return topology
 
 
 def _record_of(boundary: AbstractBoundary) -> tuple[str, _BoundaryRecord]:
@@ -183,17 +202,3 @@ def _record_of(boundary: AbstractBoundary) -> tuple[str, _BoundaryRecord]:
         f"The tissue format has no place for a boundary of class {type(boundary).__name__}; it "
         f"knows: {', '.join(_BOUNDARIES)}."
     )
-
-
-def _read(name: str) -> dict[str, np.ndarray]:
-    """All arrays of an archive, read in full so that damage shows here."""
-    with open(name, "rb") as file:
-        if file.read(2) not in (b"PK", b""):
-            raise ValueError(f"{name} is not a vertax tissue file (nor any .npz archive).")
-        file.seek(0)
-        try:
-            with np.load(file, allow_pickle=False) as archive:
-                return {key: np.asarray(archive[key]) for key in archive.files}
-        # The archive reader fails in a dozen ways, depending on which byte is wrong.
-        except Exception as error:
-            raise ValueError(f"{name} is truncated or damaged: {error}") from error

@@ -20,6 +20,7 @@ class Drawing(eqx.Module):
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
+    - `points_per_arc`: number of straight pieces that an arc is drawn in.
     """
 
     lines: Float[np.ndarray, "halfedges points 2"]
@@ -32,14 +33,16 @@ class Drawing(eqx.Module):
     half_edge: Int[np.ndarray, " edges"]
     edge: Int[np.ndarray, " halfedges"]
     n_cells: int
+    centroids: Float[np.ndarray, "cells 2"]
+    """Of the cells, where they are drawn."""
     cell_size: float
     """Root of the mean area."""
     box: Float[np.ndarray, "5 2"] | None
     """Outline of the periodic box, closed; None without one."""
 
-    def __init__(self, tissue: Tissue):
+    def __init__(self, tissue: Tissue, points_per_arc: int = _POINTS_PER_ARC):
         m = tissue.topology
-        geometry = (np.asarray(x) for x in _geometry(tissue))
+        geometry = (np.asarray(x) for x in _geometry(tissue, points_per_arc))
         lines, centroids, areas, following = geometry
         image = np.zeros((m.n_faces, 2), int)
         shift = np.zeros((m.n_faces, 2))
@@ -58,6 +61,7 @@ class Drawing(eqx.Module):
         self.lines = lines.astype(float) + shift[self.cell][:, None]
         self.image = np.asarray(m.frame) + image[self.cell]
         self.n_cells = tissue.n_cells
+        self.centroids = centroids.astype(float) + shift[: tissue.n_cells]
         self.following = following
         self.twin = np.asarray(m.twin)
         self.half_edge = np.asarray(m.half_edge)
@@ -115,9 +119,9 @@ def cell_polygons(
 
 
 @eqx.filter_jit  # one compilation instead of one for each operation
-def _geometry(tissue: Tissue) -> tuple[Array, Array, Array, Array]:
+def _geometry(tissue: Tissue, points_per_arc: int) -> tuple[Array, Array, Array, Array]:
     m = tissue.topology
-    fractions = jnp.linspace(0, 1, 2 if tissue.angles is None else _POINTS_PER_ARC + 1)
+    fractions = jnp.linspace(0, 1, 2 if tissue.angles is None else points_per_arc + 1)
     points = take(tissue.edge_points(fractions.astype(tissue.vertices.dtype)), m.edge)
     points = jnp.where(m.forward[:, None, None], points, points[:, ::-1])
     lines = tissue.corners[:, None] + points - points[:, :1]

@@ -1,0 +1,97 @@
+"""What a project that builds on vertax looks like: an energy and a cost of its own, fitted and saved.
+
+`make types` checks it in strict mode, as such a project would; what JAX, Optax and Optimistix leave
+unknown is excused line by line. `test_downstream.py` runs it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax  # pyright: ignore[reportMissingTypeStubs]
+from jaxtyping import Array, Float
+
+import vertax as vx
+
+
+class Contractility(vx.AbstractLocalEnergy):
+    """Cells that contract their perimeter, each with its own strength."""
+
+    strength: Float[Array, " cells"]
+    rest: float = 0.0
+
+    def cell_terms(self, tissue: vx.Tissue) -> Float[Array, " cells"]:
+        """Energy of each cell."""
+        return 0.5 * self.strength * (tissue.perimeters - self.rest) ** 2
+
+
+class Evenness(vx.AbstractCost):
+    """How much the areas of cells differ."""
+
+    weight: float = 1.0
+
+    def __call__(self, tissue: vx.Tissue, energy: vx.AbstractEnergy) -> Float[Array, ""]:
+        """Variance of the areas."""
+        return self.weight * jnp.var(tissue.areas)
+
+
+def relax(tissue: vx.Tissue, strength: Float[Array, " cells"]) -> vx.Equilibrium:
+    """The equilibrium of contractile cells."""
+    energy = vx.energies.AreaElasticity(1.0, 1.0) + Contractility(strength)
+    return vx.equilibrate(tissue, energy, solver=vx.solvers.NewtonCG(), tolerance=1e-6)
+
+
+def problem(tissue: vx.Tissue) -> vx.InverseProblem[vx.AbstractEnergy]:
+    """Contractilities that make all cells alike."""
+    number = jnp.arange(tissue.n_cells)  # pyright: ignore[reportUnknownMemberType]
+    strength = 0.1 * (1 + number)
+    energy = vx.energies.AreaElasticity(1.0, 1.0) + Contractility(strength)
+    cost = Evenness() + 0.1 * vx.costs.CellAreas(jnp.mean(tissue.areas))
+    return vx.InverseProblem(tissue=tissue, energy=energy, cost=cost, tolerance=1e-6)
+
+
+def gradient(tissue: vx.Tissue, strength: Float[Array, " cells"]) -> Float[Array, " cells"]:
+    """The gradient of a cost through the equilibrium, without an inverse problem."""
+
+    def cost(strength: Float[Array, " cells"]) -> Float[Array, ""]:
+        return jnp.var(relax(tissue, strength).tissue.areas)
+
+    slope = jax.grad(cost)  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    return cast(Array, slope(strength))
+
+
+def fit(
+    problem: vx.InverseProblem[vx.AbstractEnergy], folder: Path, epochs: int
+) -> vx.Fit[vx.AbstractEnergy]:
+    """Solve the problem, and leave everything in a folder."""
+    trajectory = vx.io.Trajectory()
+    optimiser = optax.adam(1e-2)
+    outcome = vx.fit(  # pyright: ignore[reportUnknownMemberType]
+        problem, optimiser, epochs, progress=False, callback=trajectory
+    )
+    vx.save_tissue(folder / "tissue.npz", outcome.tissue)
+    vx.io.save_energy(folder / "energy.npz", outcome.energy)
+    vx.io.save_problem(folder / "problem.npz", problem)
+    vx.io.save_trajectory(folder / "fit.npz", trajectory)
+    vx.io.write_csv(folder / "cells.csv", vx.io.cell_table(outcome.tissue))
+    numbers = np.arange(outcome.tissue.n_cells)
+    vx.io.write_geojson(folder / "cells.geojson", outcome.tissue, cells={"number": numbers})
+    return outcome
+
+
+def again(folder: Path) -> tuple[float, vx.InverseProblem[vx.AbstractEnergy]]:
+    """What is in the folder: the cost of the fit, and the problem with the fitted energy."""
+    classes: list[type[eqx.Module]] = [Contractility, Evenness]
+    tissue = vx.load_tissue(folder / "tissue.npz")
+    energy = vx.io.load_energy(folder / "energy.npz", classes=classes)
+    problem = vx.io.load_problem(folder / "problem.npz", classes=classes)
+    frames = vx.io.load_trajectory(folder / "fit.npz")
+    assert len(frames) == len(frames.values["cost"])
+    cost = problem.cost(tissue, energy)
+    return float(cost), dataclasses.replace(problem, energy=energy)

@@ -1,0 +1,182 @@
+"""Cells and edges as tables, for pandas, R and spreadsheets."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Array, Shaped
+
+from vertax._tissue import Tissue
+from vertax.io._atomic import atomic_write
+from vertax.plotting._polygons import Drawing
+
+Column: TypeAlias = Array | np.ndarray | Sequence[Any]
+
+
+def cell_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray, " cells"]]:
+    """The cells of a tissue as a table, one row a cell.
+
+    ```python
+    table = vx.io.cell_table(fit.tissue, p0=fit.energy.target_shape_factor)
+    frame = pandas.DataFrame(table)
+    ```
+
+    **Arguments:**
+
+    - `tissue`: the [`Tissue`][vertax.Tissue].
+    - `columns`: columns of your own, one entry a cell.
+
+    **Returns:** NumPy arrays by the name of the column: `cell`, the number, from 0; `x` and `y`, the
+    centroid, in the home box of a periodic tissue; `area`, `perimeter` and `shape_factor`; `sides`, the
+    number of edges; `on_outline`, whether the cell borders on the exterior; and those of `columns`.
+
+    **Raises:**
+
+    - `ValueError` for a batch of tissues, and for a column of another length or with a name that is
+        taken.
+    """
+    check_single(tissue)
+    return cell_columns(tissue, Drawing(tissue), columns)
+
+
+def edge_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray, " edges"]]:
+    """The edges of a tissue as a table, one row an edge.
+
+    **Arguments:**
+
+    - `tissue`: the [`Tissue`][vertax.Tissue].
+    - `columns`: columns of your own, one entry an edge.
+
+    **Returns:** NumPy arrays by the name of the column: `edge`, the number, from 0; `left_cell` and
+    `right_cell`, where -1 is the exterior; `start_vertex` and `end_vertex`; `start_x`, `start_y`,
+    `end_x` and `end_y`, where the cell on the left is; `length`; `angle`, between chord and tangents, 0
+    for a straight edge; `on_outline`; and those of `columns`.
+
+    **Raises:** as [`cell_table`][vertax.io.cell_table].
+    """
+    check_single(tissue)
+    return edge_columns(tissue, Drawing(tissue), columns)
+
+
+def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None:
+    """Write a table to a CSV file.
+
+    ```python
+    vx.io.write_csv("cells.csv", vx.io.cell_table(tissue))
+    ```
+
+    Numbers are written such that reading them gives the same bits. NaN is an empty field, which
+    pandas and R take for a missing value. The file is written atomically.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `table`: columns by name, all of one length: numbers, booleans or text.
+
+    **Raises:**
+
+    - `ValueError` for columns of different lengths, or of more than one dimension.
+    """
+    columns = {name: np.asarray(column) for name, column in table.items()}
+    for name, column in columns.items():
+        if column.ndim != 1:
+            raise ValueError(
+                f"Argument `table` must hold columns of one dimension, but `{name}` has shape "
+                f"{column.shape}."
+            )
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(
+            f"Argument `table` must hold columns of one length, but they have {lengths}."
+        )
+    rows = zip(*(map(_text, column) for column in columns.values()), strict=True)
+    with atomic_write(path, newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def cell_columns(
+    tissue: Tissue, drawing: Drawing, columns: Mapping[str, Column]
+) -> dict[str, np.ndarray]:
+    """The columns of `cell_table`, cells placed as in a drawing."""
+    m = tissue.topology
+    outline = np.asarray(m.edge_cells)[np.asarray(m.on_outline)]
+    table = {
+        "cell": np.arange(tissue.n_cells),
+        "x": drawing.centroids[:, 0],
+        "y": drawing.centroids[:, 1],
+        "area": tissue.areas,
+        "perimeter": tissue.perimeters,
+        "shape_factor": tissue.shape_factors,
+        "sides": tissue.neighbour_counts,
+        "on_outline": np.isin(np.arange(tissue.n_cells), outline),
+    }
+    return _joined(table, columns, "cell", tissue.n_cells)
+
+
+def edge_columns(
+    tissue: Tissue, drawing: Drawing, columns: Mapping[str, Column]
+) -> dict[str, np.ndarray]:
+    """The columns of `edge_table`, edges placed as in a drawing."""
+    m = tissue.topology
+    cells, vertices = np.asarray(m.edge_cells), np.asarray(m.edge_vertices)
+    cells = np.where(cells == tissue.n_cells, -1, cells)
+    lines = drawing.lines[drawing.half_edge]
+    table = {
+        "edge": np.arange(tissue.n_edges),
+        "left_cell": cells[:, 0],
+        "right_cell": cells[:, 1],
+        "start_vertex": vertices[:, 0],
+        "end_vertex": vertices[:, 1],
+        "start_x": lines[:, 0, 0],
+        "start_y": lines[:, 0, 1],
+        "end_x": lines[:, -1, 0],
+        "end_y": lines[:, -1, 1],
+        "length": tissue.edge_lengths,
+        "angle": tissue.edge_angles,
+        "on_outline": m.on_outline,
+    }
+    return _joined(table, columns, "edge", tissue.n_edges)
+
+
+def check_single(tissue: Tissue) -> None:
+    """Refuse a batch."""
+    if tissue.vertices.ndim != 2:
+        raise ValueError(
+            "Argument `tissue` must be a single tissue, but its vertices have shape "
+            f"{tissue.vertices.shape}. Write the members of a batch one by one."
+        )
+
+
+def _joined(
+    table: Mapping[str, Any], columns: Mapping[str, Column], what: str, size: int
+) -> dict[str, np.ndarray]:
+    joined = {name: np.asarray(column) for name, column in table.items()}
+    for name, column in columns.items():
+        if name in joined:
+            raise ValueError(
+                f"There is a column `{name}` already; the columns of the table are: {', '.join(table)}. "
+                "Choose another name."
+            )
+        joined[name] = np.asarray(column)
+        if joined[name].shape != (size,):
+            raise ValueError(
+                f"Column `{name}` must have one entry for each {what}, shape ({size},), but has shape "
+                f"{joined[name].shape}."
+            )
+    return joined
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float | np.floating):
+        if math.isnan(value):
+            return ""
+        if math.isinf(value):
+            return "Inf" if value > 0 else "-Inf"
+    return str(value)

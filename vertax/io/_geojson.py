@@ -1,0 +1,103 @@
+"""Cells and edges as GeoJSON, for geopandas, sf and QGIS."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vertax._tissue import Tissue
+from vertax.io._atomic import atomic_write
+from vertax.io._data_tables import Column, cell_columns, check_single, edge_columns
+from vertax.plotting._polygons import Drawing
+
+
+def write_geojson(
+    path: str | os.PathLike[str],
+    tissue: Tissue,
+    *,
+    cells: Mapping[str, Column] | None = None,
+    edges: Mapping[str, Column] | None = None,
+    points_per_arc: int = 24,
+) -> None:
+    """Write the cells of a tissue as polygons to a GeoJSON file (RFC 7946).
+
+    A `FeatureCollection` with one `Polygon` a cell, whose properties are the columns of
+    [`cell_table`][vertax.io.cell_table]. Periodic cells are whole, as in pictures. Coordinates are in
+    the tissue's units of length, and stand for no place on earth. The JSON is strict: a property that
+    is not finite is null. The file is written atomically.
+
+    ```python
+    vx.io.write_geojson("cells.geojson", tissue, cells={"pressure": pressure})
+    ```
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `tissue`: the [`Tissue`][vertax.Tissue].
+    - `cells`: more properties of the cells by name, one entry a cell.
+    - `edges`: properties of the edges. If given (`{}` will do), the edges are written as `LineString`,
+        with the columns of [`edge_table`][vertax.io.edge_table], to a second file:
+        `cells-edges.geojson` next to `cells.geojson`.
+    - `points_per_arc`: number of straight pieces of an arc.
+
+    **Raises:**
+
+    - `ValueError` for a batch of tissues, positions that are not finite, less than one point an arc,
+        and as [`cell_table`][vertax.io.cell_table].
+    """
+    drawing = checked_drawing(tissue, points_per_arc)
+    if not np.isfinite(drawing.lines).all():
+        raise ValueError(
+            "Argument `tissue` must have finite positions: JSON has no numbers that are not."
+        )
+    polygons, counts = drawing.polygons()
+    # A ring ends where it began.
+    rings = [
+        [[*polygon[:n].tolist(), polygon[0].tolist()]]
+        for polygon, n in zip(polygons, counts, strict=True)
+    ]
+    files = {Path(path): ("Polygon", rings, cell_columns(tissue, drawing, cells or {}))}
+    if edges is not None:
+        lines = drawing.lines[drawing.half_edge].tolist()
+        files[edge_path(path)] = ("LineString", lines, edge_columns(tissue, drawing, edges))
+    for file_path, (kind, shapes, table) in files.items():
+        collection = {"type": "FeatureCollection", "features": _features(kind, shapes, table)}
+        with atomic_write(file_path) as file:
+            json.dump(collection, file, allow_nan=False)
+            file.write("\n")
+
+
+def checked_drawing(tissue: Tissue, points_per_arc: int) -> Drawing:
+    """The geometry that files need, arguments checked."""
+    check_single(tissue)
+    if points_per_arc < 1:
+        raise ValueError(f"Argument `points_per_arc` must be at least 1, but is {points_per_arc}.")
+    return Drawing(tissue, points_per_arc)
+
+
+def edge_path(path: str | os.PathLike[str]) -> Path:
+    """The file of the edges that goes with a file of the cells."""
+    path = Path(path)
+    return path.with_name(f"{path.stem}-edges{path.suffix}")
+
+
+def _features(kind: str, shapes: list[Any], table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    columns = [[_strict(x) for x in column.tolist()] for column in table.values()]
+    return [
+        {
+            "type": "Feature",
+            "geometry": {"type": kind, "coordinates": shape},
+            "properties": dict(zip(table, row, strict=True)),
+        }
+        for shape, *row in zip(shapes, *columns, strict=True)
+    ]
+
+
+def _strict(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value

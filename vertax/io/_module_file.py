@@ -1,0 +1,380 @@
+"""Energies and inverse problems in files: a tree of class names and fields, and the arrays beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import json
+import math
+import os
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from vertax import adjoints, costs, energies, solvers
+from vertax._boundary import Free, Periodic
+from vertax._inverse import InverseProblem
+from vertax._tissue import Tissue
+from vertax._topology import Topology
+from vertax._transitions import T1
+from vertax.energies import AbstractEnergy
+from vertax.io._archive import as_jax, read_archive, write_archive
+
+_VERSION = 1
+
+_Module = TypeVar("_Module", bound=eqx.Module)
+
+# The functions that a field may hold, by the name that a file knows them by.
+_FUNCTIONS: dict[str, Callable] = {
+    "equinox.is_array": eqx.is_array,
+    "equinox.is_array_like": eqx.is_array_like,
+    "equinox.is_inexact_array": eqx.is_inexact_array,
+    "equinox.is_inexact_array_like": eqx.is_inexact_array_like,
+    "optimistix.max_norm": optx.max_norm,
+    "optimistix.rms_norm": optx.rms_norm,
+    "optimistix.two_norm": optx.two_norm,
+}
+_ODD_FLOATS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+
+
+def save_energy(path: str | os.PathLike[str], energy: AbstractEnergy) -> None:
+    """Save an energy with its parameters to a file, exactly.
+
+    Arrays keep their bits and their precision, and Python numbers stay what they are: what a fit
+    adjusts by default, and what not, is the same after loading.
+
+    The file is a NumPy `.npz` archive without pickles: `format` and `version` (the header), `tree` (the
+    classes and their fields, as JSON), and each array by its place in the tree, such as
+    `data.terms.0.stiffness`. It is written atomically: an interrupted save leaves the old file, if
+    any, as it was.
+
+    **Arguments:**
+
+    - `path`: the file, by custom with the ending `.npz`; taken as it is.
+    - `energy`: an energy of vertax or of your own, or a sum of such. Fields may hold arrays, numbers,
+        text, None, tuples, lists, dictionaries and modules.
+
+    **Raises:**
+
+    - `TypeError` if `energy` is none.
+    - `ValueError`, naming the field, for what has no place in a file (functions, say), and for
+        numbers of a precision that NumPy does not know.
+    - `OSError` if the file cannot be written.
+    """
+    _save(path, "energy", energy, AbstractEnergy)
+
+
+def load_energy(
+    path: str | os.PathLike[str], *, classes: Iterable[type[eqx.Module]] = ()
+) -> AbstractEnergy:
+    """Load an energy that [`save_energy`][vertax.io.save_energy] wrote.
+
+    A file names classes, but brings no code: they are those of vertax, and those that you pass.
+
+    ```python
+    energy = vx.io.load_energy("energy.npz", classes=[Contractility])
+    ```
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `classes`: classes of your own that the energy is made of, found by their name. Objects are made
+        without calling `__init__`. A field that was added to a class since gets its default.
+
+    **Returns:** the energy, bit for bit as it was saved.
+
+    **Raises:**
+
+    - `FileNotFoundError` if there is no such file.
+    - `ValueError`, with the file's name, if it is no energy file, is truncated or damaged, was written
+        by a newer version, names a class that is not known, or holds 64-bit numbers while JAX is
+        limited to 32 bits (nothing is rounded silently: enable `jax_enable_x64`).
+    """
+    return _load(path, "energy", AbstractEnergy, classes)
+
+
+def save_problem(path: str | os.PathLike[str], problem: InverseProblem[Any]) -> None:
+    """Save an inverse problem with all that it consists of: tissue, energy, cost and settings.
+
+    The file is like that of [`save_energy`][vertax.io.save_energy]. A batch of problems, as
+    [`fit`][vertax.fit] takes it, is one file too.
+
+    Functions have no place in a file (but the default `trainable`, and a few others of Equinox and
+    Optimistix). So a solver such as [`Optax`][vertax.solvers.Optax] is left out and given again:
+
+    ```python
+    vx.io.save_problem("problem.npz", dataclasses.replace(problem, solver=None))
+    problem = dataclasses.replace(vx.io.load_problem("problem.npz"), solver=solver)
+    ```
+
+    and a `trainable` of your own is written as booleans, `jax.tree.map(trainable, energy)`.
+
+    **Arguments:**
+
+    - `path`: the file, by custom with the ending `.npz`; taken as it is.
+    - `problem`: the [`InverseProblem`][vertax.InverseProblem].
+
+    **Raises:** as [`save_energy`][vertax.io.save_energy].
+    """
+    _save(path, "problem", problem, InverseProblem)
+
+
+def load_problem(
+    path: str | os.PathLike[str], *, classes: Iterable[type[eqx.Module]] = ()
+) -> InverseProblem[AbstractEnergy]:
+    """Load an inverse problem that [`save_problem`][vertax.io.save_problem] wrote.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `classes`: classes other than those of vertax (energies, costs, solvers, …), see
+        [`load_energy`][vertax.io.load_energy].
+
+    **Returns:** the [`InverseProblem`][vertax.InverseProblem], bit for bit as it was saved.
+
+    **Raises:** as [`load_energy`][vertax.io.load_energy].
+    """
+    return _load(path, "problem", InverseProblem, classes)
+
+
+def _save(
+    path: str | os.PathLike[str], what: str, module: eqx.Module, kind: type[eqx.Module]
+) -> None:
+    if not isinstance(module, kind):
+        raise TypeError(
+            f"Argument `{what}` must be an {kind.__name__}, but is {type(module).__name__}."
+        )
+    writer = _Writer(what)
+    tree = json.dumps(writer.node(module, ""), allow_nan=False)
+    write_archive(path, what, _VERSION, {"tree": np.asarray(tree)} | writer.arrays)
+
+
+def _load(
+    path: str | os.PathLike[str],
+    what: str,
+    kind: type[_Module],
+    classes: Iterable[type[eqx.Module]],
+) -> _Module:
+    name = os.fspath(path)
+    own: dict[str, type[eqx.Module]] = {}
+    for cls in classes:
+        if own.setdefault(cls.__name__, cls) is not cls:
+            raise ValueError(
+                f"Argument `classes` holds two classes of the name {cls.__name__}, which a file cannot "
+                "tell apart. Rename one."
+            )
+    arrays = read_archive(path, what, _VERSION)
+    try:
+        tree = json.loads(str(arrays.get("tree", "")))
+        module = _Reader(name, arrays, own).node(tree, what)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"{name} is broken: its `tree` cannot be read ({error}).") from error
+    if not isinstance(module, kind):
+        raise ValueError(
+            f"{name} is broken: it must hold an {kind.__name__}, but holds {type(module).__name__}."
+        )
+    return module
+
+
+@functools.cache
+def _public_classes() -> dict[str, type[eqx.Module]]:
+    """The classes of vertax by the name that a file knows them by."""
+    single = (Free, InverseProblem, Periodic, T1, Tissue, Topology)
+    classes: dict[str, type[eqx.Module]] = {cls.__name__: cls for cls in single}
+    for family in (adjoints, costs, energies, solvers):
+        for name, cls in vars(family).items():
+            if (
+                isinstance(cls, type)
+                and issubclass(cls, eqx.Module)
+                and not inspect.isabstract(cls)
+            ):
+                classes[f"{family.__name__.removeprefix('vertax.')}.{name}"] = cls
+    return classes
+
+
+class _Writer:
+    """Turns modules into what JSON can hold, and puts arrays aside."""
+
+    def __init__(self, argument: str):
+        self.argument = argument
+        self.arrays: dict[str, np.ndarray] = {}
+        self.names = {cls: name for name, cls in _public_classes().items()}
+
+    def node(self, value: Any, path: str) -> Any:
+        if value is None or type(value) in (bool, int, str):
+            return value
+        if type(value) is float:
+            return value if math.isfinite(value) else {"kind": "float", "value": str(value)}
+        if type(value) in (tuple, list):
+            items = [self.node(item, f"{path}.{i}") for i, item in enumerate(value)]
+            return {"kind": type(value).__name__, "items": items}
+        if type(value) is dict and all(type(key) is str for key in value):
+            nodes = [self.node(item, f"{path}.{i}") for i, item in enumerate(value.values())]
+            return {"kind": "dict", "keys": list(value), "items": nodes}
+        if isinstance(value, jax.Array):
+            return self.array("array", value, path) | {"weak": bool(value.weak_type)}
+        if isinstance(value, np.ndarray) and type(value) is np.ndarray:
+            return self.array("numpy", value, path)
+        if isinstance(value, np.generic):
+            return self.array("scalar", value, path)
+        if isinstance(value, eqx.Module):
+            return self.module(value, path)
+        for name, function in _FUNCTIONS.items():
+            if value is function:
+                return {"kind": "function", "name": name}
+        what = "a function" if inspect.isroutine(value) else f"of type {type(value).__name__}"
+        raise ValueError(
+            f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is {what}, which has no place "
+            f"in a file. {self.remedy(path)}"
+        )
+
+    def remedy(self, path: str) -> str:
+        if self.argument == "problem" and path.startswith(".trainable"):
+            return "Give booleans: dataclasses.replace(problem, trainable=jax.tree.map(trainable, energy))."
+        if self.argument == "problem" and path.startswith(".solver"):
+            return "Save dataclasses.replace(problem, solver=None), and give the solver again after loading."
+        return "Take it out before saving (equinox.tree_at), and put it back after loading."
+
+    def array(self, kind: str, value: Any, path: str) -> dict[str, Any]:
+        dtype = value.dtype
+        # bfloat16 and the like come back from a file as raw bytes; keys of random numbers are no NumPy.
+        if not isinstance(dtype, np.dtype) or dtype.kind not in "biufc":
+            raise ValueError(
+                f"Argument `{self.argument}` must hold numbers of a type NumPy knows, but its "
+                f"`{path[1:]}` is {dtype}."
+            )
+        name = f"data{path}"
+        self.arrays[name] = np.asarray(value)
+        return {"kind": kind, "name": name}
+
+    def module(self, module: eqx.Module, path: str) -> dict[str, Any]:
+        cls = type(module)
+        name = self.names.get(cls)
+        if name is None and cls.__module__.split(".")[0] == "vertax":
+            raise ValueError(
+                f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is of class {cls.__name__}, "
+                f"which is no energy, cost, adjoint, solver or other part of a problem. {self.remedy(path)}"
+            )
+        held = vars(module)
+        names = [field.name for field in dataclasses.fields(cls) if field.name in held]
+        fields = {field: self.node(held[field], f"{path}.{field}") for field in names}
+        kind, name = ("own", cls.__name__) if name is None else ("vertax", name)
+        return {"kind": kind, "class": name, "fields": fields}
+
+
+class _Reader:
+    """The way back from what `_Writer` wrote; nothing in a file is taken for granted."""
+
+    def __init__(self, file: str, arrays: dict[str, np.ndarray], own: dict[str, type[eqx.Module]]):
+        self.file = file
+        self.arrays = arrays
+        self.own = own
+
+    def node(self, node: Any, path: str) -> Any:
+        if node is None or isinstance(node, bool | int | float | str):
+            return node
+        match node:
+            case {"kind": "float", "value": "nan" | "inf" | "-inf" as value}:
+                return _ODD_FLOATS[value]
+            case {"kind": "tuple" | "list" as kind, "items": list(nodes)}:
+                items = [self.node(item, f"{path}.{i}") for i, item in enumerate(nodes)]
+                return items if kind == "list" else tuple(items)
+            case {"kind": "dict", "keys": list(keys), "items": list(nodes)} if len(keys) == len(
+                nodes
+            ):
+                items = [self.node(item, f"{path}.{i}") for i, item in enumerate(nodes)]
+                return dict(zip(map(str, keys), items, strict=True))
+            case {"kind": "array", "name": str(name), "weak": bool(weak)}:
+                array = as_jax(self.array(name), self.file)
+                return _weakly_typed(array) if weak else array
+            case {"kind": "numpy", "name": str(name)}:
+                return self.array(name)
+            case {"kind": "scalar", "name": str(name)}:
+                return self.array(name)[()]
+            case {"kind": "function", "name": str(name)} if name in _FUNCTIONS:
+                return _FUNCTIONS[name]
+            case {"kind": "vertax" | "own" as kind, "class": str(name), "fields": dict(fields)}:
+                return self.module(self.find(kind, name, path), fields, path)
+        raise ValueError(
+            f"{self.file} is broken: `{path}` is none of the things that a file may hold."
+        )
+
+    def array(self, name: str) -> np.ndarray:
+        if name not in self.arrays:
+            raise ValueError(f"{self.file} is incomplete: it has no array `{name}`.")
+        return self.arrays[name]
+
+    def find(self, kind: str, name: str, path: str) -> type[eqx.Module]:
+        if kind == "vertax":
+            if name not in _public_classes():
+                raise ValueError(
+                    f"{self.file} names {name} of vertax (at `{path}`), which this vertax does not have. "
+                    "Update vertax."
+                )
+            return _public_classes()[name]
+        if name not in self.own:
+            raise ValueError(
+                f"{self.file} holds an object of the class {name} (at `{path}`), which is not one of "
+                f"vertax. Pass the class: classes=[{name}]."
+            )
+        return self.own[name]
+
+    def module(self, cls: type[eqx.Module], nodes: dict[str, Any], path: str) -> eqx.Module:
+        known = {field.name: field for field in dataclasses.fields(cls)}
+        for name in nodes:
+            if name not in known:
+                raise ValueError(
+                    f"{self.file} has a field `{name}` (at `{path}`) that the class {cls.__name__} does "
+                    "not have: it was written with another version of that class."
+                )
+        # As Equinox does when it rebuilds a tree. What `__init__` makes of its arguments has happened.
+        module = object.__new__(cls)
+        for name, field in known.items():
+            if name in nodes:
+                value = self.node(nodes[name], f"{path}.{name}")
+            else:
+                value = self.default(cls, field, path)
+            object.__setattr__(module, name, value)
+        self.check(module, path)
+        return module
+
+    def default(self, cls: type[eqx.Module], field: dataclasses.Field[Any], path: str) -> Any:
+        convert = field.metadata.get("converter", lambda x: x)
+        if field.default is not dataclasses.MISSING:
+            return convert(field.default)
+        if field.default_factory is not dataclasses.MISSING:
+            return convert(field.default_factory())
+        raise ValueError(
+            f"{self.file} has no field `{field.name}` (at `{path}`) of the class {cls.__name__}, which has "
+            "no default: it was written with another version of that class."
+        )
+
+    def check(self, module: eqx.Module, path: str) -> None:
+        """Check what would go unnoticed later: JAX has no error for an index that is out of range."""
+        # In a batch, and where booleans stand for what is trainable, there is no single tissue.
+        try:
+            if isinstance(module, Topology) and np.ndim(module.twin) == 1:
+                module.validate()
+            if isinstance(module, Tissue) and np.ndim(module.vertices) == 2:
+                wanted = (module.topology.n_vertices, 2)
+                if module.vertices.shape != wanted:
+                    raise ValueError(
+                        f"`vertices` has shape {module.vertices.shape}, but must have {wanted}."
+                    )
+        except Exception as error:
+            raise ValueError(f"{self.file} is broken: `{path}`: {error}") from error
+
+
+def _weakly_typed(array: jax.Array) -> jax.Array:
+    """The same numbers as what JAX makes of a Python number, which takes the precision of its partner."""
+    zero = {"i": 0, "f": 0.0, "c": 0j}.get(array.dtype.kind)
+    filled = None if zero is None else jnp.full(array.shape, zero)
+    if filled is None or filled.dtype != array.dtype:
+        return array
+    return filled.at[...].set(array)
