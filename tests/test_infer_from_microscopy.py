@@ -70,3 +70,34 @@ def test_the_defaults_of_the_file_are_those_of_the_experiment(pytestconfig):
     text = json.dumps(config.model_dump(mode="json"))
     assert '"epochs": 150' in text
     assert config.fit.learning_rate == 2e-2
+
+
+CONDITIONS = """
+experiment = "compare_conditions"
+images = 1
+tissue = { n_cells = 16, lloyd_steps = 2 }
+microscope = { pixels = 128, snr = [20] }
+preparation = { pixels = 96 }
+fit = { learning_rate = 2e-2, epochs = 25 }
+"""
+
+
+def test_two_conditions_go_from_pixels_to_shape_factors(tmp_path):
+    (tmp_path / "tiny.toml").write_text(CONDITIONS)
+    experiment, config = load_config(tmp_path / "tiny.toml", ())
+    folder = RunFolder.claim("x", tmp_path / "run")
+    metrics = experiment.run(config, folder, progress=False)["SNR 20"]
+    assert metrics["images"] == metrics["images_wanted"] == 2
+    with open(tmp_path / "run" / "cells.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == metrics["cells"] >= 6
+    true, inferred, deviation = (
+        np.array([row[name] for row in rows], float) for name in ("true", "inferred", "deviation")
+    )
+    assert np.sqrt(np.mean((true - inferred) ** 2)) == pytest.approx(metrics["error_rms"])
+    assert (deviation > 0).all()
+    assert (deviation <= 0.3 * (1 + 1e-9)).all()  # the prior
+    assert metrics["image_correlation"] > 0.6
+    assert 0 <= metrics["fluid_is_larger"] <= 1
+    for name in ("conditions", "images"):
+        assert (tmp_path / "run" / "figures" / f"{name}.png").stat().st_size > 5000

@@ -116,7 +116,7 @@ class _State(eqx.Module):
 
 def fit(
     problem: InverseProblem[Energy],
-    optimiser: optax.GradientTransformation | optx.AbstractLeastSquaresSolver,
+    optimiser: optax.GradientTransformation | optx.AbstractLeastSquaresSolver[Any, Any, Any, Any],
     epochs: int,
     *,
     truth: AbstractEnergy | None = None,

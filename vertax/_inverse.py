@@ -57,7 +57,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     trainable: PyTree[bool] | Callable[[Any], bool] = eqx.is_inexact_array
     fit_position: bool = False
     adjoint: AbstractAdjoint = eqx.field(default_factory=ImplicitDifferentiation)
-    solver: optx.AbstractMinimiser | None = None
+    solver: optx.AbstractMinimiser[Any, Any, Any] | None = None
     transitions: AbstractTransitions | None = T1()
     tolerance: float | Float[Array, ""] | None = None
     patience: int = 1

@@ -72,9 +72,7 @@ def fit(
     """Solve the problem, and leave everything in a folder."""
     trajectory = vx.io.Trajectory()
     optimiser = optax.adam(1e-2)
-    outcome = vx.fit(  # pyright: ignore[reportUnknownMemberType]
-        problem, optimiser, epochs, progress=False, callback=trajectory
-    )
+    outcome = vx.fit(problem, optimiser, epochs, progress=False, callback=trajectory)
     vx.save_tissue(folder / "tissue.npz", outcome.tissue)
     vx.io.save_energy(folder / "energy.npz", outcome.energy)
     vx.io.save_problem(folder / "problem.npz", problem)

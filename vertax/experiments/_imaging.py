@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from pydantic import Field
-from scipy.ndimage import gaussian_filter, zoom
+from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter, zoom
 
 from vertax._equilibrium import Equilibrium, equilibrate
 from vertax._fit import Fit, fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import MeshImage, mirror
-from vertax.energies import ShapeFactorEnergy
+from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.experiments._config import Section
 from vertax.experiments._sections import Fitting, Relaxation
-from vertax.initialise import Cellpose, Segmentation, Watershed, from_microscopy
+from vertax.initialise import Cellpose, Segmentation, Watershed, from_labels, from_microscopy
 
 
 class Preparation(Section):
@@ -58,10 +57,16 @@ class Model(Section):
 
     target_shape_factor: float = Field(default=3.7, gt=0)
     """First guess of the target shape factor of every cell."""
+    border: Literal["mirrored", "pinned"] = "mirrored"
+    """What holds the tissue at the border of the image: the image is mirrored, cells that the border cuts
+    included (as in the paper); or the outline of the cells that lie whole in it is pinned."""
+    pixel_size: float | None = Field(default=None, gt=0)
+    """Length of a pixel of the file, where rest areas are 1 (of a pinned border only); left out, the mean
+    area of the cells that are seen whole is 1. In a rigid tissue all shape factors depend on it."""
     rest_areas: Literal["fitted", "observed", "equal"] = "fitted"
     """Rest areas of the cells: fitted too, beginning with those of the segmented cells; as those are;
     or the mean area in all cells but those that the border cuts, which determines shape factors best
-    where it is true."""
+    where it is true (and is what a pinned border goes with)."""
 
 
 class Reading(NamedTuple):
@@ -69,16 +74,18 @@ class Reading(NamedTuple):
 
     found: Segmentation
     """The segmented cells."""
+    whole: Bool[np.ndarray, " cells"]
+    """Which of them are reported: no part of them, nor of what they touch, is out of sight."""
     seen: Float[np.ndarray, "rows columns"]
     """The image that the model is compared with."""
     psf_width: float
     """Width of the blur, in units of length."""
     first: Equilibrium
     """The relaxed tissue of the first guess."""
-    problem: InverseProblem[ShapeFactorEnergy]
+    problem: InverseProblem[Any]
     """The inverse problem, which starts from it."""
 
-    def fit(self, fitting: Fitting, *, progress: bool) -> Fit[ShapeFactorEnergy]:
+    def fit(self, fitting: Fitting, *, progress: bool) -> Fit[Any]:
         """Solve the inverse problem.
 
         **Arguments:**
@@ -101,8 +108,6 @@ def read(
     segmentation: SegmentationSection,
     model: Model,
     relaxation: Relaxation,
-    *,
-    perturbed: Callable[[Tissue], Tissue] | None = None,
 ) -> Reading:
     """Segment an image and set up the inverse problem of its shape factors.
 
@@ -110,7 +115,6 @@ def read(
 
     - `pixels`: the image, bright membranes on dark cells.
     - `preparation`, `segmentation`, `model`, `relaxation`: how.
-    - `perturbed`: what to do to the segmented mesh before it is relaxed, by default nothing.
 
     **Returns:** the [`Reading`][vertax.experiments._imaging.Reading].
 
@@ -118,10 +122,12 @@ def read(
 
     - `ValueError` for an image that cannot be used.
     """
+    if model.border == "pinned":
+        return _read_pinned(pixels, preparation, segmentation, model, relaxation)
     found = from_microscopy(pixels, segmenter=segmentation.build())
     seen = _prepare(np.asarray(pixels, float), found, preparation)
-    width = _psf_width(found, seen, preparation)
-    cost = MeshImage(mirror(seen), width, points_per_edge=POINTS)
+    image = {"image": mirror(seen), "points_per_edge": POINTS}
+    width = _psf_width(found, seen, preparation, image)
     segmented = found.tissue
     areas = segmented.areas
     if model.rest_areas == "equal":
@@ -130,14 +136,89 @@ def read(
         areas = jnp.where(np.isin(labels, labels[whole]), 1.0, areas)
     guess = ShapeFactorEnergy(jnp.full(segmented.n_cells, model.target_shape_factor), areas)
     options = relaxation.options()
-    start = segmented if perturbed is None else perturbed(segmented)
-    first: Equilibrium = equilibrate(start, guess, **options, throw=False)
+    first: Equilibrium = equilibrate(segmented, guess, **options, throw=False)
     fitted = eqx.tree_at(
         lambda e: (e.target_shape_factor, e.mean_area), guess, (True, model.rest_areas == "fitted")
     )
     # The mirror planes hold the tissue in its place: there is no position to fit.
-    problem = InverseProblem(first.tissue, guess, cost, fitted, **options)
-    return Reading(found, seen, width, first, problem)
+    problem = InverseProblem(
+        first.tissue, guess, MeshImage(psf_width=width, **image), fitted, **options
+    )
+    return Reading(found, np.asarray(found.whole), seen, width, first, problem)
+
+
+class BorderedEnergy(AbstractEnergy):
+    """E1 of cells of rest area 1, but for those at the border of what is seen.
+
+    What a cell at the border feels from beyond it is not known, so its rest area is free.
+    """
+
+    target_shape_factor: Float[Array, " cells"]
+    border_area: Float[Array, " cells"]
+    inner: Bool[np.ndarray, " cells"]
+
+    def __call__(self, tissue: Tissue) -> Float[Array, ""]:
+        """The energy."""
+        areas = jnp.where(self.inner, 1.0, self.border_area)
+        return ShapeFactorEnergy(self.target_shape_factor, areas)(tissue)
+
+
+def _read_pinned(
+    pixels: Float[np.ndarray, "rows columns"],
+    preparation: Preparation,
+    segmentation: SegmentationSection,
+    model: Model,
+    relaxation: Relaxation,
+) -> Reading:
+    """The cells that lie whole in the image, as a free tissue whose outline does not move."""
+    labels = np.asarray(segmentation.build()(pixels))
+    rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    labels = np.where(np.isin(labels, rim), 0, labels)
+    found = from_labels(labels, boundary="free", pixel_size=model.pixel_size)
+    cluster = found.tissue
+    on_outline = np.asarray(cluster.topology.on_outline)
+    outline = np.asarray(cluster.topology.edge_cells)[on_outline]
+    inner = ~np.isin(np.arange(cluster.n_cells), outline)
+    ends = np.asarray(cluster.topology.edge_vertices)[on_outline]
+    pinned = np.isin(np.arange(cluster.n_vertices), ends)
+    segmented = Tissue(
+        cluster.vertices, cluster.topology, cluster.boundary, cluster.softening, pinned=pinned
+    )
+    seen = _prepare(np.asarray(pixels, float), found, preparation)
+    scale = seen.shape[1] / found.image_shape[1]
+    pixel = found.pixel_size / scale
+    weight = _away_from(segmented, on_outline, labels > 0, pixel, seen.shape)
+    image = {"image": seen, "points_per_edge": POINTS, "weight": weight, "pixel_size": pixel}
+    width = _psf_width(found, seen, preparation, image)
+    guess = BorderedEnergy(
+        jnp.full(segmented.n_cells, model.target_shape_factor), segmented.areas, inner
+    )
+    options = relaxation.options()
+    first: Equilibrium = equilibrate(segmented, guess, **options, throw=False)
+    problem = InverseProblem(first.tissue, guess, MeshImage(psf_width=width, **image), **options)
+    return Reading(found, inner, seen, width, first, problem)
+
+
+def _away_from(
+    tissue: Tissue,
+    on_outline: Bool[np.ndarray, " edges"],
+    cells: Bool[np.ndarray, "rows columns"],
+    pixel: float,
+    shape: tuple[int, int],
+) -> Float[np.ndarray, "coarse_rows coarse_columns"]:
+    """1 where pixels count: inside of the outline, in the image and in the mesh, and not close to it."""
+    # The outline is no interface of two cells, and the mesh cuts its corners: it is not compared.
+    inside = binary_closing(np.pad(cells, 8), iterations=6)[8:-8, 8:-8]
+    margin = 0.15 / pixel * cells.shape[1] / shape[1]
+    inside = distance_transform_edt(inside) > margin
+    steps = [new / old for new, old in zip(shape, cells.shape, strict=True)]
+    near = np.asarray(zoom(inside.astype(float), steps, order=1, grid_mode=True, mode="nearest"))
+    start, vector = (np.asarray(x, float)[on_outline, None] for x in tissue.edge_segments)
+    points = ((np.indices(shape)[::-1] + 0.5) * pixel).reshape(2, -1).T
+    along = np.sum((points - start) * vector, axis=-1) / np.sum(vector**2, axis=-1)
+    foot = start + np.clip(along, 0, 1)[..., None] * vector
+    distance = np.linalg.norm(points - foot, axis=-1).min(axis=0).reshape(shape)
+    return np.where(distance > 0.15, np.clip(near, 0, 1), 0.0)
 
 
 POINTS = 48
@@ -164,17 +245,19 @@ def _prepare(
 
 
 def _psf_width(
-    found: Segmentation, seen: Float[np.ndarray, "rows columns"], options: Preparation
+    found: Segmentation,
+    seen: Float[np.ndarray, "rows columns"],
+    options: Preparation,
+    image: dict[str, Any],
 ) -> float:
     """Width of the blur in units of length: as configured, or as fits the segmented mesh best."""
     if options.psf_width is not None:
         return options.psf_width * found.pixel_size
-    image = mirror(seen)
     pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
 
     @eqx.filter_jit
     def misfit(width: Float[Array, ""]) -> Float[Array, ""]:
-        return MeshImage(image, width, points_per_edge=POINTS)(found.tissue, NO_ENERGY)
+        return MeshImage(psf_width=width, **image)(found.tissue, NO_ENERGY)
 
     widths = pixel * np.geomspace(1.0, 12.0, 30)
     return float(widths[np.argmin([float(misfit(jnp.asarray(w))) for w in widths])])

@@ -44,7 +44,7 @@ from vertax.initialise import periodic_voronoi
 class Microscope(Section):
     """How the tissues are seen; intensities are relative to the brightest membrane."""
 
-    pixels: int = Field(default=224, ge=64)
+    pixels: int = Field(default=288, ge=64)
     """Side of an image in pixels."""
     psf_width: float = Field(default=2.0, ge=1)
     """Standard deviation of the blur in pixels."""
@@ -69,7 +69,7 @@ class Config(ExperimentConfig):
     """Shape factors of the other."""
     images: int = Field(default=3, ge=1)
     """Images of each condition; the same tissues are seen at all signal-to-noise ratios."""
-    tissue: TissueSection = TissueSection(n_cells=36, lloyd_steps=1)
+    tissue: TissueSection = TissueSection(n_cells=64, lloyd_steps=1)
     """The tissue of an image."""
     microscope: Microscope = Microscope()
     """How it is seen."""
@@ -77,8 +77,8 @@ class Config(ExperimentConfig):
     """How images are prepared."""
     segmentation: SegmentationSection = SegmentationSection()
     """How cells are found."""
-    model: Model = Model(rest_areas="equal")
-    """The energy and the first guess, the same for both conditions."""
+    model: Model = Model(border="pinned", rest_areas="equal")
+    """The energy and the first guess, the same for both conditions. The scale of the images is known."""
     fit: Fitting = Fitting(learning_rate=2e-2, epochs=120)
     """How the parameters are fitted."""
     prior: float = Field(default=0.3, gt=0)
@@ -191,10 +191,12 @@ def _infer(
     config: Config, pixels: Float[np.ndarray, "rows columns"], progress: bool
 ) -> tuple[Reading, Any, Float[np.ndarray, " cells"], int] | None:
     """From pixels to shape factors and their uncertainty; None for an image that shows no tissue."""
+    model = config.model
+    if model.pixel_size is None:
+        side = float(np.sqrt(config.tissue.n_cells))
+        model = model.model_copy(update={"pixel_size": side / config.microscope.pixels})
     try:
-        reading = read(
-            pixels, config.preparation, config.segmentation, config.model, config.relaxation
-        )
+        reading = read(pixels, config.preparation, config.segmentation, model, config.relaxation)
     except ValueError:
         return None
     try:
@@ -209,7 +211,7 @@ def _infer(
     area = max(1.0, 4 * np.pi * (reading.psf_width / pixel) ** 2)
     fitted = eqx.filter(outcome.energy, reading.problem.trainable)
     n_fitted = sum(x.size for x in jax.tree.leaves(fitted))
-    independent = max(4 * rows * columns / area, 2.0 * n_fitted)
+    independent = max(rows * columns / area, 2.0 * n_fitted)
     said = uncertainty(reading.problem, outcome, prior=config.prior, n_independent=independent)
     deviation = np.asarray(said.deviation.target_shape_factor)  # pyright: ignore
     undetermined = int(np.sum(np.asarray(said.deviations) > 0.9 * config.prior))
@@ -223,7 +225,7 @@ def _mesh_cost(reading: Reading) -> MeshImage:
 
 def _counterparts(config: Config, reading: Reading, tissue: Tissue) -> Int[np.ndarray, "pairs 2"]:
     """Whole cells of the segmented mesh, and the true cells whose centre is in the same place."""
-    whole = np.flatnonzero(np.asarray(reading.found.whole))
+    whole = np.flatnonzero(reading.whole)
     pixel = float(np.sqrt(tissue.n_cells)) / config.microscope.pixels
     ours = np.asarray(reading.found.tissue.centroids)[whole] / reading.found.pixel_size * pixel
     away = tissue.boundary.shortest(jnp.asarray(ours)[:, None] - tissue.centroids[None])

@@ -94,7 +94,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         config.model,
         config.relaxation,
     )
-    found, seen, width, first, problem = reading
+    found, _, seen, width, first, problem = reading
     folder.save_tissue("target", found.tissue)
     folder.save_tissue("initial", first.tissue)
     folder.save_array("image", seen)
