@@ -75,9 +75,9 @@ def test_the_defaults_of_the_file_are_those_of_the_experiment(pytestconfig):
 CONDITIONS = """
 experiment = "compare_conditions"
 images = 1
-tissue = { n_cells = 16, lloyd_steps = 2 }
-microscope = { pixels = 128, snr = [20] }
-preparation = { pixels = 96 }
+tissue = { n_cells = 49, lloyd_steps = 2 }
+microscope = { pixels = 240, snr = [20] }
+preparation = { pixels = 160 }
 fit = { learning_rate = 2e-2, epochs = 25 }
 """
 

@@ -312,6 +312,9 @@ def _copy(data: Any) -> Any:
 
 
 def _in_toml(value: Any) -> str:
+    if isinstance(value, Section):
+        entries = [f"{name} = {_in_toml(entry)}" for name, entry in value.model_dump().items()]
+        return f"{{ {', '.join(entries)} }}"
     if isinstance(value, Mapping):
         return "a table"
     if isinstance(value, bool):
