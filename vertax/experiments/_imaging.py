@@ -112,7 +112,7 @@ def read(
     - `preparation`, `segmentation`, `model`, `relaxation`: how.
     - `perturbed`: what to do to the segmented mesh before it is relaxed, by default nothing.
 
-    **Returns:** the [`Reading`][vertax.experiments._imaging.Reading].
+    **Returns:** the `Reading`.
 
     **Raises:**
 
