@@ -12,7 +12,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint format types benchmark build clean
+.PHONY: help demo test test-slow lint format types docs benchmark build clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 22
@@ -38,6 +38,11 @@ types: $(VENV)/.dev ## static types; those of a project that builds on vertax st
 	$(BIN)/pyright
 	$(BIN)/pyright --project tests/downstream
 
+# Material announces a change of MkDocs that pyproject.toml rules out.
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: $(VENV)/.docs ## the documentation in site; what it cannot resolve is an error
+	$(BIN)/python -m mkdocs build --strict
+
 benchmark: $(VENV)/.dev ## measure speed; nothing else should run meanwhile
 	@for script in benchmarks/[a-z]*.py; do \
 	    echo "== $$script"; $(BIN)/python "$$script" || exit 1; \
@@ -48,7 +53,7 @@ build: $(VENV)/.dev ## wheel and source archive in dist
 	$(BIN)/python -m build
 
 clean: ## remove the environment, caches and builds, but no results
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is newer than pyproject.toml when the environment holds what that asks for. The package itself
@@ -61,6 +66,11 @@ $(VENV)/.base: pyproject.toml | $(BIN)/python
 $(VENV)/.dev: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV) for development; this takes a few minutes and happens once."
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@ $(VENV)/.base
+
+$(VENV)/.docs: pyproject.toml | $(BIN)/python
+	@echo "Setting up $(VENV) for the documentation; this takes a minute or two and happens once."
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	@touch $@ $(VENV)/.base
 
 $(BIN)/python:

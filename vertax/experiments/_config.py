@@ -190,7 +190,7 @@ def allowed(field: FieldInfo) -> str:
 
     **Arguments:**
 
-    - `field`: the field of the key, see [`fields`][vertax.experiments.fields].
+    - `field`: the field of the key, see `fields`.
 
     **Returns:** e.g. `"an integer, at least 1"`.
     """

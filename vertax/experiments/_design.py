@@ -77,7 +77,7 @@ class Tensions(Section):
 
 
 def tensions(energy: AbstractEnergy) -> Float[np.ndarray, "*batch edges"]:
-    """The tensions of an energy of [`Tensions.draw`][vertax.experiments._design.Tensions.draw].
+    """The tensions of an energy of `Tensions.draw`.
 
     **Arguments:**
 

@@ -116,7 +116,7 @@ def read(
     - `pixels`: the image, bright membranes on dark cells.
     - `preparation`, `segmentation`, `model`, `relaxation`: how.
 
-    **Returns:** the [`Reading`][vertax.experiments._imaging.Reading].
+    **Returns:** the `Reading`.
 
     **Raises:**
 

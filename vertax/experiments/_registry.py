@@ -133,7 +133,7 @@ def load_config(
 
     - `path`: a TOML file; its key `experiment` says which experiment it configures.
     - `overrides`: texts `key=value` that set single keys, see
-        [`apply_overrides`][vertax.experiments.apply_overrides].
+        `apply_overrides`.
 
     **Returns:** the experiment and its configuration, an instance of `experiment.config`.
 

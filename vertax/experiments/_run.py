@@ -44,7 +44,7 @@ class RunFolder:
 
     **Arguments:**
 
-    - `path`: an existing folder; [`claim`][vertax.experiments.RunFolder.claim] finds or makes one.
+    - `path`: an existing folder; `claim` finds or makes one.
     """
 
     path: Path
@@ -200,7 +200,7 @@ class RunFolder:
     def metrics(self) -> dict[str, Any]:
         """The metrics of a finished run.
 
-        **Returns:** what was given to [`save_metrics`][vertax.experiments.RunFolder.save_metrics].
+        **Returns:** what was given to `save_metrics`.
 
         **Raises:**
 

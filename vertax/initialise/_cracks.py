@@ -113,7 +113,7 @@ def enclosed_cells(graph: CrackGraph, exterior: int | None = None) -> dict[int, 
 
     **Raises:**
 
-    - [`NotADiskError`][vertax.initialise._cracks.NotADiskError] if no set of cells cuts the torus
+    - `NotADiskError` if no set of cells cuts the torus
         into disks.
     """
     n_corners = len(graph.corner)

@@ -29,7 +29,7 @@ class AbstractSegmenter(eqx.Module):
         **Raises:**
 
         - `ValueError` for an image that cannot be segmented (see
-            [`check_image`][vertax.initialise._segmenters.check_image]).
+            [`from_microscopy`][vertax.initialise.from_microscopy]).
         """
 
 

@@ -14,7 +14,7 @@ from vertax.solvers._solver import AbstractSolver
 
 
 class RelaxationState(eqx.Module):
-    """State of a [`Relaxation`][vertax.solvers.Relaxation]."""
+    """State of a `Relaxation`."""
 
     inner: PyTree
     force: Float[Array, ""]
