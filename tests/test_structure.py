@@ -170,8 +170,8 @@ def test_derivatives_of_the_structural_cost(dtype):
     ("adjoint", "accuracy"),
     [
         (vx.ImplicitDifferentiation(), 1e-7),
-        (vx.EquilibriumPropagation(), 1e-5),
-        (vx.AutomaticDifferentiation(), 1e-4),
+        pytest.param(vx.EquilibriumPropagation(), 1e-5, marks=pytest.mark.slow),
+        pytest.param(vx.AutomaticDifferentiation(), 1e-4, marks=pytest.mark.slow),
     ],
     ids=["ID", "EP", "AD"],
 )
@@ -268,6 +268,7 @@ def crossing():
     return truth, target, vx.InverseProblem(initial, guess, cost)
 
 
+@pytest.mark.slow  # tests of the experiments have a smaller one
 def test_guidance_leads_through_t1s_to_the_hidden_parameters(crossing):
     truth, target, problem = crossing
     guidance = lambda epoch: jnp.where(epoch < 100, 500 * 1e-2 ** (epoch / 100), 0.0)
@@ -282,7 +283,10 @@ def test_guidance_leads_through_t1s_to_the_hidden_parameters(crossing):
 
 @pytest.mark.parametrize(
     "adjoint",
-    [vx.ImplicitDifferentiation(), vx.EquilibriumPropagation(nudge="cost")],
+    [
+        vx.ImplicitDifferentiation(),
+        pytest.param(vx.EquilibriumPropagation(nudge="cost"), marks=pytest.mark.slow),
+    ],
     ids=["ID", "EP"],
 )
 def test_gradients_under_guidance(crossing, adjoint):

@@ -96,6 +96,7 @@ def test_it_names_what_the_data_do_not_determine(hidden):
     assert cost(tissue, truth) > 0
 
 
+@pytest.mark.slow
 def test_a_fitted_position_adds_to_the_uncertainty(hidden):
     tissue, truth = hidden
     width = 0.12
