@@ -154,12 +154,12 @@ class BorderedEnergy(AbstractEnergy):
     """
 
     target_shape_factor: Float[Array, " cells"]
-    border_area: Float[Array, " cells"]
+    log_border_area: Float[Array, " cells"]
     inner: Bool[np.ndarray, " cells"]
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The energy."""
-        areas = jnp.where(self.inner, 1.0, self.border_area)
+        areas = jnp.where(self.inner, 1.0, jnp.exp(self.log_border_area))
         return ShapeFactorEnergy(self.target_shape_factor, areas)(tissue)
 
 
@@ -190,9 +190,9 @@ def _read_pinned(
     weight = _away_from(segmented, on_outline, labels > 0, pixel, seen.shape)
     image = {"image": seen, "points_per_edge": POINTS, "weight": weight, "pixel_size": pixel}
     width = _psf_width(found, seen, preparation, image)
-    guess = BorderedEnergy(
-        jnp.full(segmented.n_cells, model.target_shape_factor), segmented.areas, inner
-    )
+    # Straight edges cut off the corners of cells on the outline, of some nearly all of the cell.
+    areas = jnp.log(jnp.maximum(segmented.areas, 0.2))
+    guess = BorderedEnergy(jnp.full(cluster.n_cells, model.target_shape_factor), areas, inner)
     options = relaxation.options()
     first: Equilibrium = equilibrate(segmented, guess, **options, throw=False)
     problem = InverseProblem(first.tissue, guess, MeshImage(psf_width=width, **image), **options)

@@ -112,9 +112,14 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     **Returns:** the metrics by signal-to-noise ratio: correlation and error of the inferred shape
     factors, how often the truth lies within two standard deviations, the means of both conditions, and
     the Mann-Whitney test between them (probability that a cell of the fluid condition has the larger
-    shape factor, and p-value).
+    shape factor, and p-value). `failures` says of images that could not be read why.
+
+    **Raises:**
+
+    - `ValueError` if no image could be read.
     """
     found: list[_Image] = []
+    failures: list[str] = []
     pictures: dict[str, Any] = {}
     key = jax.random.key(config.seed)
     for snr_index, snr in enumerate(config.microscope.snr):
@@ -126,7 +131,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
                 noise = jax.random.fold_in(noise, snr_index)
                 pixels = _seen(tissue, config.microscope, snr, noise)
                 result = _infer(config, pixels, progress)
-                if result is None:
+                if isinstance(result, str):
+                    failures.append(f"{kind} {number}, SNR {snr:g}: {result}")
                     continue
                 reading, outcome, deviation, n_undetermined = result
                 cells = _counterparts(config, reading, tissue)
@@ -144,9 +150,14 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
                 _save_table(found, folder)
                 if number == 0:
                     pictures[f"{kind}, SNR {snr:g}"] = (pixels, reading.found, outcome)
+    if not found:
+        raise ValueError(f"No image could be read: {'; '.join(failures)}")
     folder.save_figure("conditions", figures.conditions(found))
     folder.save_figure("images", figures.images(pictures))
-    return {f"SNR {snr:g}": _metrics(config, found, snr) for snr in config.microscope.snr}
+    metrics: dict[str, Any] = {
+        f"SNR {snr:g}": _metrics(config, found, snr) for snr in config.microscope.snr
+    }
+    return metrics | {"failures": failures}
 
 
 def _tissue(
@@ -189,21 +200,21 @@ def _seen(
 
 def _infer(
     config: Config, pixels: Float[np.ndarray, "rows columns"], progress: bool
-) -> tuple[Reading, Any, Float[np.ndarray, " cells"], int] | None:
-    """From pixels to shape factors and their uncertainty; None for an image that shows no tissue."""
+) -> tuple[Reading, Any, Float[np.ndarray, " cells"], int] | str:
+    """From pixels to shape factors and their uncertainty; or what was in the way."""
     model = config.model
     if model.pixel_size is None:
         side = float(np.sqrt(config.tissue.n_cells))
         model = model.model_copy(update={"pixel_size": side / config.microscope.pixels})
     try:
         reading = read(pixels, config.preparation, config.segmentation, model, config.relaxation)
-    except ValueError:
-        return None
+    except ValueError as error:
+        return str(error)
     try:
         outcome = reading.fit(config.fit, progress=progress)
     except FitError as error:
         if error.fit is None:
-            return None
+            return str(error)
         outcome = error.fit
     # What is left of the misfit is correlated over the blur: so many pixels say one thing.
     rows, columns = reading.seen.shape
