@@ -5,7 +5,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # Tests compile a lot: two processes are nearly twice as fast as one, more need more memory. A file of
-# tests stays in one process, so that what it shares is made once.
+# tests stays in one process, so that what it shares is made once. The tests run in two lots, because a
+# process that has compiled very much dies in the compiler.
 WORKERS ?= 2
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -21,7 +22,8 @@ demo: $(VENV)/.base ## infer hidden shape factors of a synthetic tissue and show
 	$(BIN)/vertax run configs/demo.toml $(DEMO_OPTIONS)
 
 test: $(VENV)/.dev ## the tests that run on every change
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_OPTIONS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_OPTIONS) tests/test_[a-f]*.py
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_OPTIONS) tests/test_[g-z]*.py
 
 test-slow: $(VENV)/.dev ## the longer scientific checks
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m slow $(PYTEST_OPTIONS)

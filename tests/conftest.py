@@ -26,5 +26,5 @@ def _few_compiled_functions():
     """Forget compiled functions before there are too many."""
     # Each holds some memory maps, of which Linux allows a process 65530; beyond, the compiler aborts.
     yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 25_000:
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 15_000:
         eqx.clear_caches()

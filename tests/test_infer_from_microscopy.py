@@ -82,6 +82,7 @@ fit = { learning_rate = 2e-2, epochs = 25 }
 """
 
 
+@pytest.mark.slow
 def test_two_conditions_go_from_pixels_to_shape_factors(tmp_path):
     (tmp_path / "tiny.toml").write_text(CONDITIONS)
     experiment, config = load_config(tmp_path / "tiny.toml", ())
