@@ -133,7 +133,8 @@ def test_the_cost_is_continuous_through_a_t1_and_pushes_on(boundary):
     lengths = [1e-3, 1e-2, 1e-1]
     costs = [float(IndexAwareStructural(after)(flipped(tissue, x)[0], energy)) for x in lengths]
     assert costs[0] < costs[1] < costs[2]
-    assert costs[1] - costs[0] > 1e-3
+    if boundary == "periodic":  # in the cluster it is an edge to the exterior, which is no cell
+        assert costs[1] - costs[0] > 1e-3
 
 
 def test_a_tissue_costs_nothing_against_itself():
