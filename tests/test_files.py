@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import rewritten
 
 import vertax as vx
 from vertax._topology import flip_edges
@@ -33,14 +34,6 @@ def same_bits(a, b):
     return jax.tree.structure(a) == jax.tree.structure(b) and (
         [bits(x) for x in jax.tree.leaves(a)] == [bits(x) for x in jax.tree.leaves(b)]
     )
-
-
-def rewritten(path, **changes):
-    """The file with some of its arrays replaced, or removed where None."""
-    with np.load(path) as archive:
-        arrays = dict(archive) | changes
-    np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
-    return path
 
 
 class TestRoundTrip:

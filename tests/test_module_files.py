@@ -13,7 +13,7 @@ import numpy as np
 import optax
 import pytest
 from free_helpers import cluster
-from helpers import random_tissue
+from helpers import random_tissue, rewritten
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from jaxtyping import Array, Float
@@ -74,14 +74,6 @@ def same(a, b):
 def single(tree):
     """The tree in float32."""
     return jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, tree)
-
-
-def rewritten(path, **changes):
-    """The file with some of its arrays replaced, or removed where None."""
-    with np.load(path) as archive:
-        arrays = dict(archive) | changes
-    np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
-    return path
 
 
 def tree_of(path):

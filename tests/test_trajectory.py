@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 from free_helpers import cluster
-from helpers import random_tissue
+from helpers import random_tissue, rewritten
 
 import vertax as vx
 from vertax._topology import flip_edges
@@ -30,13 +30,6 @@ def same_bits(a, b):
 
 def same(a, b):
     return len(a) == len(b) and all(map(same_bits, a, b)) and a.values.keys() == b.values.keys()
-
-
-def rewritten(path, **changes):
-    with np.load(path) as archive:
-        arrays = dict(archive) | changes
-    np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
-    return path
 
 
 def tension(tissue):

@@ -170,9 +170,7 @@ class Free(AbstractBoundary):
         (centre, rotates), (pivot, _) = _pivot(reference, pinned), _pivot(vertices, pinned)
         arm, moved = reference - centre, vertices - pivot
         turn = jnp.arctan2(jnp.sum(_cross(moved, arm)), jnp.sum(moved * arm))
-        cos, sin = jnp.cos(turn), jnp.sin(turn)
-        aside = jnp.stack([-moved[:, 1], moved[:, 0]], axis=-1)
-        return jnp.where(rotates, centre + cos * moved + sin * aside, vertices)
+        return jnp.where(rotates, centre + _turned(moved, turn), vertices)
 
     def motions(
         self, vertices: Float[Array, "vertices 2"], distance: Float[Array, ""]
@@ -181,9 +179,7 @@ class Free(AbstractBoundary):
         centre = jnp.mean(vertices, axis=0)
         arm = vertices - centre
         turn = distance / jnp.sqrt(jnp.mean(jnp.sum(arm**2, axis=-1)))
-        aside = jnp.stack([-arm[:, 1], arm[:, 0]], axis=-1)
-        turned = centre + jnp.cos(turn) * arm + jnp.sin(turn) * aside
-        return jnp.concatenate([shifted, turned[None]])
+        return jnp.concatenate([shifted, (centre + _turned(arm, turn))[None]])
 
 
 def _pivot(
@@ -196,6 +192,12 @@ def _pivot(
     counts = jnp.where(n_pinned > 0, pinned, True)[:, None]
     centre = jnp.sum(jnp.where(counts, vertices, 0), axis=0) / jnp.sum(counts)
     return centre, n_pinned <= 1
+
+
+def _turned(p: Float[Array, "n 2"], angle: Float[Array, ""]) -> Float[Array, "n 2"]:
+    """Vectors turned counter-clockwise."""
+    aside = jnp.stack([-p[:, 1], p[:, 0]], axis=-1)
+    return jnp.cos(angle) * p + jnp.sin(angle) * aside
 
 
 def _cross(p: Float[Array, "n 2"], q: Float[Array, "n 2"]) -> Float[Array, " n"]:

@@ -80,9 +80,7 @@ class IndexAwareStructural(AbstractCost):
             length = 0.1 * jnp.sqrt(jnp.mean(self.target.areas))
         rows = structure(adjacency(tissue, length))
         columns = structure(adjacency(self.target, length))
-        squares = jnp.sum(rows**2, axis=1)[:, None] + jnp.sum(columns**2, axis=1)[None, :]
-        squares = jnp.maximum(squares - 2 * rows @ columns.T, 0)
-        return jnp.sqrt(squares + self.softening**2) - self.softening
+        return jnp.sqrt(_squared_distances(rows, columns) + self.softening**2) - self.softening
 
 
 def adjacency(
@@ -100,16 +98,16 @@ def adjacency(
     """
     m = tissue.topology
     left, right = m.edge_cells.T
-    # Softened lengths do not vanish with their edge: what is left of them is taken away.
-    rest = tissue.softening
-    if tissue.angles is not None:
-        rest = rest * length_factor(tissue.edge_angles)
-    lengths = tissue.edge_lengths - rest
-    weights = jnp.ones_like(lengths)
+    weights = jnp.ones(tissue.n_edges, tissue.vertices.dtype)
     if interface_length is not None:
+        # Softened lengths do not vanish with their edge: what is left of them is taken away.
+        rest = tissue.softening
+        if tissue.angles is not None:
+            rest = rest * length_factor(tissue.edge_angles)
+        lengths = tissue.edge_lengths - rest
         weights = lengths / (lengths + interface_length)
     weights = jnp.where(left == right, 0, weights)
-    matrix = jnp.zeros((m.n_faces, m.n_faces), lengths.dtype)
+    matrix = jnp.zeros((m.n_faces, m.n_faces), weights.dtype)
     matrix = matrix.at[left, right].add(weights).at[right, left].add(weights)
     matrix = matrix[: m.n_cells, : m.n_cells]
     return matrix if interface_length is not None else jnp.minimum(matrix, 1)
@@ -139,8 +137,15 @@ def mismatched_neighbours(tissue: Tissue, target: Tissue) -> int:
     - `ValueError` if the numbers of cells differ.
     """
     check_equal("mismatched_neighbours", tissue, target, "cells")
-    ours, theirs = (np.asarray(adjacency(t), float) for t in (tissue, target))
-    rows, columns = (np.asarray(structure(jnp.asarray(a))) for a in (ours, theirs))
-    squares = np.sum(rows**2, axis=1)[:, None] + np.sum(columns**2, axis=1) - 2 * rows @ columns.T
-    _, assigned = linear_sum_assignment(np.sqrt(np.maximum(squares, 0)))
-    return round(float(np.sum(np.abs(ours - theirs[assigned]))) / 2)
+    ours, theirs = adjacency(tissue), adjacency(target)
+    distances = jnp.sqrt(_squared_distances(structure(ours), structure(theirs)))
+    _, assigned = linear_sum_assignment(np.asarray(distances))
+    return round(float(jnp.sum(jnp.abs(ours - theirs[assigned]))) / 2)
+
+
+def _squared_distances(
+    rows: Float[Array, "cells cells"], columns: Float[Array, "cells cells"]
+) -> Float[Array, "cells cells"]:
+    """Squared distance of each row of one matrix from each row of another."""
+    squares = jnp.sum(rows**2, axis=1)[:, None] + jnp.sum(columns**2, axis=1)[None, :]
+    return jnp.maximum(squares - 2 * rows @ columns.T, 0)

@@ -12,6 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vertax._fit import Fit
 from vertax.experiments._figures import band, boxes, new_figure
+from vertax.experiments._scenes import pearson_of
 from vertax.plotting import _style
 
 # The colours of the paper, in shades that are told apart with any colour vision.
@@ -63,12 +64,8 @@ def inference(
                 band(grid[key], getattr(fit.history, name), method, _COLOURS[method])
             grid[key].set(xlabel="epoch", ylabel=label, yscale="log")
         grid["cost"].legend(ncols=2, columnspacing=0.8)
-        pearson = {
-            m: [np.corrcoef(a, b)[0, 1] for a, b in zip(true, p, strict=True)]
-            for m, p in inferred.items()
-        }
         error = {m: np.mean(np.abs(p - true) / np.abs(true), axis=1) for m, p in inferred.items()}
-        boxes(grid["pearson"], {m: 1 - np.asarray(r) for m, r in pearson.items()}, _COLOURS)
+        boxes(grid["pearson"], {m: 1 - pearson_of(true, p) for m, p in inferred.items()}, _COLOURS)
         grid["pearson"].set_ylabel("1 − Pearson $r$ at the end")
         boxes(grid["final"], error, _COLOURS)
         grid["final"].set_ylabel("relative error at the end")

@@ -185,8 +185,7 @@ def _read_pinned(
         cluster.vertices, cluster.topology, cluster.boundary, cluster.softening, pinned=pinned
     )
     seen = _prepare(np.asarray(pixels, float), found, preparation)
-    scale = seen.shape[1] / found.image_shape[1]
-    pixel = found.pixel_size / scale
+    pixel = pixel_of(found, seen)
     weight = _away_from(segmented, on_outline, labels > 0, pixel, seen.shape)
     image = {"image": seen, "points_per_edge": POINTS, "weight": weight, "pixel_size": pixel}
     width = _psf_width(found, seen, preparation, image)
@@ -221,6 +220,19 @@ def _away_from(
     return np.where(distance > 0.15, np.clip(near, 0, 1), 0.0)
 
 
+def pixel_of(found: Segmentation, seen: Float[np.ndarray, "rows columns"]) -> float:
+    """Length of a pixel side of the prepared image, which may be coarser than the file.
+
+    **Arguments:**
+
+    - `found`: the segmented cells.
+    - `seen`: the prepared image.
+
+    **Returns:** the length, in units of the tissue.
+    """
+    return found.pixel_size * found.image_shape[1] / seen.shape[1]
+
+
 POINTS = 48
 """Quadrature points on each edge."""
 
@@ -253,13 +265,12 @@ def _psf_width(
     """Width of the blur in units of length: as configured, or as fits the segmented mesh best."""
     if options.psf_width is not None:
         return options.psf_width * found.pixel_size
-    pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
 
     @eqx.filter_jit
     def misfit(width: Float[Array, ""]) -> Float[Array, ""]:
         return MeshImage(psf_width=width, **image)(found.tissue, NO_ENERGY)
 
-    widths = pixel * np.geomspace(1.0, 12.0, 30)
+    widths = pixel_of(found, seen) * np.geomspace(1.0, 12.0, 30)
     return float(widths[np.argmin([float(misfit(jnp.asarray(w))) for w in widths])])
 
 

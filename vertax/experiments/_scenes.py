@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 from pydantic import Field
 
 from vertax._equilibrium import equilibrate
@@ -95,6 +95,13 @@ def same_neighbours(tissue: Tissue, other: Tissue) -> bool:
         return sorted(np.sort(np.asarray(t.topology.edge_cells), axis=1).tolist())
 
     return pairs(tissue) == pairs(other)
+
+
+def pearson_of(
+    true: Float[np.ndarray, "replicates cells"], inferred: Float[np.ndarray, "replicates cells"]
+) -> Float[np.ndarray, " replicates"]:
+    """Pearson's correlation of inferred with true parameters, for each replicate."""
+    return np.array([np.corrcoef(a, b)[0, 1] for a, b in zip(true, inferred, strict=True)])
 
 
 Tree = TypeVar("Tree", bound=Any)

@@ -39,6 +39,7 @@ from vertax.experiments._scenes import (
     ShapeFactors,
     TissueSection,
     make_scene,
+    pearson_of,
     same_neighbours,
     stack,
 )
@@ -195,7 +196,7 @@ def _inference(config: Config, name: str, folder: RunFolder, progress: bool) -> 
 
 def _recovery(true: np.ndarray, inferred: np.ndarray, outcome: Fit) -> dict[str, Any]:
     history = outcome.history
-    pearson = np.array([np.corrcoef(a, b)[0, 1] for a, b in zip(true, inferred, strict=True)])
+    pearson = pearson_of(true, inferred)
     error = np.mean(np.abs(inferred - true) / np.abs(true), axis=1)
     return {
         "pearson_mean": pearson.mean(),

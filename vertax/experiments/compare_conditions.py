@@ -33,6 +33,7 @@ from vertax.experiments._imaging import (
     Reading,
     SegmentationSection,
     correlation,
+    pixel_of,
     read,
 )
 from vertax.experiments._run import RunFolder
@@ -218,8 +219,8 @@ def _infer(
         outcome = error.fit
     # What is left of the misfit is correlated over the blur: so many pixels say one thing.
     rows, columns = reading.seen.shape
-    pixel = reading.found.pixel_size * reading.found.image_shape[1] / columns
-    area = max(1.0, 4 * np.pi * (reading.psf_width / pixel) ** 2)
+    width = reading.psf_width / pixel_of(reading.found, reading.seen)
+    area = max(1.0, 4 * np.pi * width**2)
     fitted = eqx.filter(outcome.energy, reading.problem.trainable)
     n_fitted = sum(x.size for x in jax.tree.leaves(fitted))
     independent = max(rows * columns / area, 2.0 * n_fitted)

@@ -27,6 +27,7 @@ from vertax.experiments._imaging import (
     Preparation,
     SegmentationSection,
     correlation,
+    pixel_of,
     read,
 )
 from vertax.experiments._run import RunFolder, fit_metrics, history_columns
@@ -121,7 +122,7 @@ def _membrane_contrast(
     steps = (np.arange(32) + 0.5) / 32
     points = (start[:, None] + steps[:, None] * vector[:, None]).reshape(-1, 2)
     length = np.repeat(np.linalg.norm(vector, axis=1), 32)
-    pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
+    pixel = pixel_of(found, seen)
     column, row = np.floor(points / pixel).astype(int).T
     inside = (row >= 0) & (row < seen.shape[0]) & (column >= 0) & (column < seen.shape[1])
     values = (seen - seen.mean()) / seen.std()

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Int
 from pydantic import Field
 
 from vertax._equilibrium import equilibrate
@@ -33,7 +33,7 @@ from vertax.experiments import _topology_figures as figures
 from vertax.experiments._config import ExperimentConfig, Section
 from vertax.experiments._design import Gradient, member
 from vertax.experiments._run import RunFolder, histories, joined
-from vertax.experiments._scenes import Scene, ShapeFactors, TissueSection, stack
+from vertax.experiments._scenes import Scene, ShapeFactors, TissueSection, pearson_of, stack
 from vertax.experiments._sections import Fitting, Relaxation
 from vertax.initialise import periodic_voronoi
 
@@ -205,7 +205,7 @@ class _Watcher:
 
     def __call__(self, epoch: int, record: Record) -> None:
         inferred = np.asarray(record.parameters.target_shape_factor)
-        self.pearson.append(_pearson(self._true, inferred))
+        self.pearson.append(pearson_of(self._true, inferred))
         cells = np.asarray(record.tissue.topology.cell)
         self.mismatched.append([self._count(k, record, row) for k, row in enumerate(cells)])
 
@@ -223,12 +223,6 @@ class _Watcher:
             pearson=np.asarray(self.pearson),
             mismatched=np.asarray(self.mismatched),
         )
-
-
-def _pearson(
-    true: Float[np.ndarray, "replicates cells"], inferred: Float[np.ndarray, "replicates cells"]
-) -> Float[np.ndarray, " replicates"]:
-    return np.array([np.corrcoef(a, b)[0, 1] for a, b in zip(true, inferred, strict=True)])
 
 
 def _fit(config: Config, method: Method, batch: Scene, progress: bool) -> tuple[Fit, _Watcher]:
@@ -272,7 +266,7 @@ def _summary_of_mismatch(counts: list[int], interfaces: int) -> dict[str, Any]:
 def _metrics(batch: Scene, outcome: Fit, final: list[int], interfaces: int) -> dict[str, Any]:
     true = np.asarray(batch.truth.target_shape_factor)
     inferred = np.asarray(outcome.energy.target_shape_factor)
-    pearson = _pearson(true, inferred)
+    pearson = pearson_of(true, inferred)
     error = np.mean(np.abs(inferred - true) / np.abs(true), axis=1)
     succeeded = (np.asarray(final) == 0) & (pearson > 0.999) & (error < 1e-3)
     history = outcome.history
