@@ -243,7 +243,7 @@ def test_a_member_that_breaks_down_leaves_the_others_alone(batch):
     )
     fit = vx.fit(broken, optax.adam(1e-2), 30, truth=truths, batched=True, progress=False)
     error = fit.history.relative_error
-    assert (error[-1, [0, 2]] < 0.8 * error[0, [0, 2]]).all()
+    assert (error[-1, [0, 2]] < 0.9 * error[0, [0, 2]]).all()
     assert (error[:, 1] == error[0, 1]).all()
     assert list(fit.best_epoch == -1) == [False, True, False]
     assert list(jnp.isfinite(fit.cost)) == [True, False, True]

@@ -137,6 +137,39 @@ def test_the_number_of_flips_of_an_edge_is_bounded():
     np.testing.assert_array_equal(counts, full)
 
 
+@pytest.mark.parametrize("boundary", ["periodic", "free"])
+def test_edges_of_high_tension_end_in_four_fold_vertices(boundary):
+    # An edge under five times the tension of its neighbours shrinks to nothing in either configuration
+    # (two pull at each end, with at most twice their tension). It must come to rest there, not flip for
+    # ever; and the solver must find its way with many such vertices, each a thousand times stiffer
+    # against opening than against being moved.
+    make = vx.initialise.free_voronoi if boundary == "free" else vx.initialise.periodic_voronoi
+    tissue = make(16, key=jax.random.key(1))
+    tense = jax.random.bernoulli(jax.random.key(2), 0.3, (tissue.n_edges,))
+    energy = vx.energies.AreaElasticity(20.0, 1.0) + LineTension(jnp.where(tense, 1.5, 0.3))
+    relaxed = vx.equilibrate(tissue, energy, tolerance=1e-8, max_steps=1000)
+    assert int(jnp.sum(relaxed.tissue.edge_lengths < 2 * tissue.softening)) >= 3
+    assert 3 <= relaxed.num_t1 < tissue.n_edges
+
+
+def test_an_edge_that_flipped_flips_again_only_if_it_grows():
+    # Cells pull the two at the ends of the edge together; only its own tension says whether it grows.
+    tissue = vx.initialise.hexagonal(4, 4)
+    edge = 8
+    v, w = np.asarray(tissue.topology.edge_vertices)[edge]
+    half = 0.5 * tissue.edge_vectors[edge] * (1 - 0.01 / tissue.edge_lengths[edge])
+    short = tissue.with_configuration(tissue.vertices.at[v].add(half).at[w].add(-half))
+    loose = jnp.full(16, 4.5).at[tissue.topology.edge_cells[edge]].set(3.3)
+    once = jnp.zeros(tissue.n_edges, jnp.int32).at[edge].set(1)
+    for tension, flips_again in ((0.0, True), (20.0, False)):
+        energy = ShapeFactorEnergy(loose) + LineTension(jnp.zeros(48).at[edge].set(tension))
+        for wrapped in (energy, Opaque(energy)):
+            _, counts = sweep(short, wrapped, vx.T1(threshold=0.02))
+            assert counts[edge] == 1, tension
+            _, counts = sweep(short, wrapped, vx.T1(threshold=0.02), once)
+            assert (counts[edge] == 2) == flips_again
+
+
 def test_sweeps_vmap_over_tissues():
     batch = [random_tissue(20, s) for s in range(4)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *batch)

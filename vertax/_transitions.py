@@ -40,6 +40,10 @@ class T1(AbstractTransitions):
     turned inside out are candidates too. A sweep tries every candidate once, all that share no cell
     together, shortest first.
 
+    An edge that flipped before in the same relaxation must also want to grow in its new place: where
+    four cells meet in one point because its tension is too high for either configuration, it would
+    otherwise flip to and fro for ever.
+
     Lengths are those of arcs where edges are arcs; an edge that flips becomes straight, or an arc of
     angle 0.
 
@@ -51,8 +55,7 @@ class T1(AbstractTransitions):
 
     - `threshold`: length below which an edge may flip, in units of length. The default suits tissues of
         mean cell area 1; smaller values (5e-3 in the paper) reach the same states in more steps.
-    - `max_flips`: how often one edge may flip in a relaxation: the guard against an edge flipping to
-        and fro for ever.
+    - `max_flips`: how often one edge may flip in a relaxation: a last guard against flipping for ever.
 
     **Raises:**
 
@@ -97,13 +100,17 @@ class T1(AbstractTransitions):
                 length = jnp.maximum(corner.length, self.threshold)
                 chord = length / corner.stretch
                 stretch = lambda which: corner.place(tissue, which, corner.along, chord)
-                flip = lambda which: _straightened(
-                    corner.place(tissue, which, corner.across, length), which
-                ).with_topology(flip_edges(tissue.topology, which))
-                if isinstance(energy, AbstractLocalEnergy):
-                    accepted = _judge_local(energy, chosen, corner, stretch, flip)
-                else:
-                    accepted = _judge_total(energy, chosen, corner, stretch, flip)
+
+                def flip(which: Bool[Array, " edges"], share: float = 1.0) -> Tissue:
+                    placed = corner.place(tissue, which, corner.across, share * length)
+                    flipped = flip_edges(tissue.topology, which)
+                    return _straightened(placed, which).with_topology(flipped)
+
+                lowers = _judge_local if isinstance(energy, AbstractLocalEnergy) else _judge_total
+                accepted = lowers(energy, chosen, corner, stretch, flip)
+                again = accepted & (counts > 0)
+                grows = lowers(energy, again, corner, lambda which: flip(which, 0.5), flip)
+                accepted &= ~again | grows
                 return flip(accepted), accepted
 
             new, accepted = jax.lax.cond(

@@ -68,7 +68,7 @@ class Config(ExperimentConfig):
     """How the aspect ratio to start at is reached."""
     fit: Fitting = Fitting(learning_rate=0.1, epochs=200)
     """How the tensions (their logits) are fitted."""
-    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_flips=3, max_steps=100)
+    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=300)
     """How the tissue is relaxed."""
 
 
