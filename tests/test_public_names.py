@@ -12,7 +12,7 @@ solvers uncertainty
 FAMILIES = {
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
-    "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance "
+    "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance EdgeDistance "
     "HomotypicLength IndexAwareStructural MeanShapeFactor MeshImage VertexDistance WeightedSum "
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "

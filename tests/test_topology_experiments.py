@@ -8,7 +8,7 @@ from test_experiments import run, table
 
 import vertax as vx
 from vertax.costs import mismatched_neighbours
-from vertax.experiments.rigidity_transition import fit_transition
+from vertax.experiments.rigidity_transition import fit_onset, fit_transition
 
 ACROSS = """
 experiment = "inference_across_topologies"
@@ -88,3 +88,14 @@ def test_the_curve_of_a_transition():
     step = fit_transition(p0, 100.0 * (p0 > 3.81), 100)
     assert 3.80 <= step.centre <= 3.82
     assert np.isnan(fit_transition(p0, np.zeros(21), 100).centre)
+
+
+def test_the_onset_is_where_the_root_of_the_energy_ends():
+    p0 = np.linspace(3.6, 4.0, 21)
+    spread = 1 + 0.1 * np.random.default_rng(0).standard_normal((21, 40))
+    energies = np.maximum(3.85 - p0, 0)[:, None] ** 2 * spread**2
+    onset = fit_onset(p0, energies)
+    assert onset is not None
+    assert onset.centre == pytest.approx(3.85, abs=0.01)
+    assert onset.width == pytest.approx(1, rel=0.1)
+    assert fit_onset(p0, 0 * energies) is None

@@ -460,6 +460,11 @@ def _solve(
     batched: bool,
 ) -> tuple[_Best, list[dict[str, Any]], str | None]:
     """Epochs of a least-squares solver."""
+    # It judges each step by the cost itself, so a wrong slope costs a step and no more. And Optimistix
+    # makes a Jacobian of zeros before the first step, of which no adjoint could be sure.
+    problem = dataclasses.replace(
+        problem, adjoint=dataclasses.replace(problem.adjoint, throw=False)
+    )
     began = time.perf_counter()
     best, n_done, record = jax.block_until_ready(
         _least_squares(solver, problem, parameters, constants, true, epochs, batched)

@@ -106,10 +106,14 @@ class T1(AbstractTransitions):
                     flipped = flip_edges(tissue.topology, which)
                     return _straightened(placed, which).with_topology(flipped)
 
-                lowers = _judge_local if isinstance(energy, AbstractLocalEnergy) else _judge_total
-                accepted = lowers(energy, chosen, corner, stretch, flip)
+                def lowers(which: Bool[Array, " edges"], other: _Trial) -> Bool[Array, " edges"]:
+                    if isinstance(energy, AbstractLocalEnergy):
+                        return _judge_local(energy, which, corner, other, flip)
+                    return _judge_total(energy, which, corner, other, flip)
+
+                accepted = lowers(chosen, stretch)
                 again = accepted & (counts > 0)
-                grows = lowers(energy, again, corner, lambda which: flip(which, 0.5), flip)
+                grows = lowers(again, lambda which: flip(which, 0.5))
                 accepted &= ~again | grows
                 return flip(accepted), accepted
 

@@ -11,6 +11,7 @@ from vertax.costs._image import MeshImage as MeshImage, mirror as mirror, render
 from vertax.costs._interfaces import HomotypicLength as HomotypicLength
 from vertax.costs._positions import (
     CentroidDistance as CentroidDistance,
+    EdgeDistance as EdgeDistance,
     VertexDistance as VertexDistance,
 )
 from vertax.costs._structure import (

@@ -62,6 +62,50 @@ class VertexDistance(AbstractLeastSquaresCost):
         return displacement.ravel() / jnp.sqrt(1.0 * tissue.n_vertices)
 
 
+class EdgeDistance(AbstractLeastSquaresCost):
+    r"""Mean squared distance of the edges, arcs included, to those of a target tissue.
+
+    $$C = \frac{1}{2L}\sum_e \ell_{\mathrm{target},e}
+      \int_0^1 \|x_e(s) - x_{\mathrm{target},e}(s)\|^2\,\mathrm ds$$
+
+    at the same share $s$ of the length of an edge, with the length $L$ of all edges of the target; in
+    units of length squared; across a periodic boundary the shorter way counts. Where edges are arcs it
+    sees how they bend, which [`VertexDistance`][vertax.costs.VertexDistance] does not; and it weighs what
+    is drawn of a tissue, so that a short edge, whose direction and angle are mostly noise, counts little.
+    Edges are compared by number, so tissue and target should have one topology.
+
+    **Arguments:**
+
+    - `target`: the target tissue, with as many edges.
+    - `points_per_edge`: points of the quadrature (midpoint rule) on each edge.
+
+    **Raises:**
+
+    - `ValueError` if the numbers of edges differ, or for fewer than two points.
+    """
+
+    target: Tissue
+    points_per_edge: int = eqx.field(static=True, default=5)
+
+    def __check_init__(self):
+        if self.points_per_edge < 2:
+            raise ValueError(
+                "Argument `points_per_edge` of EdgeDistance must be at least 2, but is "
+                f"{self.points_per_edge}."
+            )
+
+    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
+        """Displacements of points on edges, times the root of the share of length they stand for."""
+        check_equal(type(self).__name__, tissue, self.target, "edges")
+        fractions = (jnp.arange(self.points_per_edge) + 0.5) / self.points_per_edge
+        fractions = fractions.astype(tissue.vertices.dtype)
+        goal = self.target.edge_points(fractions)
+        displacement = tissue.boundary.shortest(tissue.edge_points(fractions) - goal)
+        lengths = self.target.edge_lengths
+        share = lengths / (jnp.sum(lengths) * self.points_per_edge)
+        return (jnp.sqrt(share)[:, None, None] * displacement).ravel()
+
+
 class CentroidDistance(AbstractLeastSquaresCost):
     r"""Mean squared distance of the centroids of cells to those of a target tissue.
 

@@ -54,6 +54,11 @@ class AreaElasticity(AbstractLocalEnergy):
         target = per_cell(self.target_area, tissue, "target_area")
         return 0.5 * stiffness * (tissue.areas - target) ** 2
 
+    def pressures(self, tissue: Tissue) -> Float[Array, " cells"]:
+        r"""Pressure in each cell, $-\partial E/\partial A_c = K_c (A^0_c - A_c)$, energy per area."""
+        stiffness = per_cell(self.stiffness, tissue, "stiffness")
+        return stiffness * (per_cell(self.target_area, tissue, "target_area") - tissue.areas)
+
 
 class PerimeterElasticity(AbstractLocalEnergy):
     r"""$\tfrac12\sum_c K_c\,(P_c - P^0_c)^2$ (Farhadifar et al. 2007, doi:10.1016/j.cub.2007.11.049).

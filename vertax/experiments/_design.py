@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import concurrent.futures
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from pydantic import Field, model_validator
+from tqdm.auto import tqdm
 
-from vertax._fit import Fit, Record, fit
+from vertax._fit import Fit, History, Record, fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
 from vertax.experiments._config import Section
+from vertax.experiments._scenes import stack
 from vertax.experiments._sections import Fitting
 
 
@@ -91,22 +98,20 @@ def tensions(energy: AbstractEnergy) -> Float[np.ndarray, "*batch edges"]:
     return np.asarray(tension.tension, float)
 
 
+Measure = Callable[[InverseProblem, Tissue, PyTree], PyTree[Array]]
+
+
 def design(
-    problem: InverseProblem,
-    fitting: Fitting,
-    measure: Callable[[InverseProblem, Tissue, PyTree], PyTree[Array]],
-    *,
-    batched: bool,
-    progress: bool,
+    problem: InverseProblem, fitting: Fitting, measure: Measure, *, progress: bool
 ) -> tuple[Fit, Tissue, PyTree[np.ndarray]]:
     """Fit, and measure something in each epoch.
 
     **Arguments:**
 
-    - `problem`: the inverse problem, or a batch.
+    - `problem`: the inverse problem.
     - `fitting`: how it is fitted.
-    - `measure`: a function of one problem, its tissue in equilibrium and the fitted leaves of the energy.
-    - `batched`: whether it is a batch.
+    - `measure`: a function of the problem, its tissue in equilibrium and the fitted leaves of the energy;
+        the same function compiles once.
     - `progress`: show a progress bar (only on a terminal).
 
     **Returns:** the fit; the equilibrium that it began with; and what was measured, each array with a
@@ -116,19 +121,72 @@ def design(
 
     - `FitError` if the fit cannot go on.
     """
-    compiled = eqx.filter_jit(eqx.filter_vmap(measure) if batched else measure)
     rows: list[PyTree[np.ndarray]] = []
     first: list[Tissue] = []
 
     def note(epoch: int, record: Record) -> None:
         if epoch == 0:
             first.append(record.tissue)
-        rows.append(jax.tree.map(np.asarray, compiled(problem, record.tissue, record.parameters)))
+        found = _measured(measure, problem, record.tissue, record.parameters)
+        rows.append(jax.tree.map(np.asarray, found))
 
-    outcome = fit(
-        problem, fitting.build(), fitting.epochs, batched=batched, progress=progress, callback=note
-    )
+    outcome = fit(problem, fitting.build(), fitting.epochs, progress=progress, callback=note)
     return outcome, first[0], jax.tree.map(lambda *x: np.stack(x), *rows)
+
+
+@eqx.filter_jit
+def _measured(
+    measure: Measure, problem: InverseProblem, tissue: Tissue, parameters: PyTree
+) -> PyTree[Array]:
+    return measure(problem, tissue, parameters)
+
+
+def designs(
+    problems: Sequence[InverseProblem], fitting: Fitting, measure: Measure, *, progress: bool
+) -> tuple[Fit, Tissue, PyTree[np.ndarray]]:
+    """Fit problems of one shape side by side, one thread a core.
+
+    As a batch they would all wait, in each epoch, for the one that takes the most steps to relax; with
+    T1 transitions that is many times as many as the others take.
+
+    **Arguments:**
+
+    - `problems`, `fitting`, `measure`: see `design`.
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** what `design` returns, as of a batch; seconds are those of all members, over the number
+    of threads.
+
+    **Raises:**
+
+    - `FitError` if a fit cannot go on.
+    """
+    threads = os.cpu_count() or 1
+    one = functools.partial(design, fitting=fitting, measure=measure, progress=False)
+    with tqdm(total=len(problems), unit="fit", disable=None if progress else True) as bar:
+        found = [one(problems[0])]  # the first one compiles
+        bar.update()
+        # What is compiled runs outside of Python's lock.
+        with concurrent.futures.ThreadPoolExecutor(threads) as pool:
+            for each in pool.map(one, problems[1:]):
+                found.append(each)
+                bar.update()
+    outcomes, firsts, curves = zip(*found, strict=True)
+    epochs = min(len(outcome.history.cost) for outcome in outcomes)
+    columns = [
+        np.stack([getattr(outcome.history, field.name)[:epochs] for outcome in outcomes], axis=1)
+        for field in dataclasses.fields(History)
+    ]
+    batch = Fit(
+        energy=stack([outcome.energy for outcome in outcomes]),
+        tissue=stack([outcome.tissue for outcome in outcomes]),
+        cost=jnp.stack([outcome.cost for outcome in outcomes]),
+        max_force=jnp.stack([outcome.max_force for outcome in outcomes]),
+        best_epoch=np.stack([outcome.best_epoch for outcome in outcomes]),
+        history=History(*columns[:-1], seconds=columns[-1].sum(axis=1) / threads),
+    )
+    measured = jax.tree.map(lambda *x: np.stack([y[:epochs] for y in x], axis=1), *curves)
+    return batch, stack(firsts), measured
 
 
 def member(tree: PyTree, index: int) -> Any:

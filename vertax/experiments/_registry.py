@@ -14,6 +14,7 @@ from vertax.experiments import (
     design_mechanics,
     infer_from_microscopy,
     infer_shape_factors,
+    infer_tensions,
     inference_across_topologies,
     rigidity_transition,
     salt_and_pepper,
@@ -56,6 +57,12 @@ _ALL = (
         infer_from_microscopy.Config,
         infer_from_microscopy.run,
         "Infer the target shape factors of the cells in a microscopy image.",
+    ),
+    Experiment(
+        "infer_tensions",
+        infer_tensions.Config,
+        infer_tensions.run,
+        "Infer relative tensions and pressures of a cluster from its segmented image.",
     ),
     Experiment(
         "inference_across_topologies",

@@ -17,18 +17,22 @@ REFERENCE = 3.81
 
 
 class Curve(NamedTuple):
-    """Fractions of tissues at zero energy, and the logistic curve through them."""
+    """Fractions of tissues at zero energy, and energies, with what was fitted to them."""
 
     name: str
     fraction: Float[np.ndarray, " values"]
     centre: float
     width: float
+    """Of the logistic curve through the fractions."""
+    root_energy: Float[np.ndarray, " values"]
+    """Mean root of the energy per cell."""
+    onset: tuple[float, float] | None
+    """Where the line through it ends, and its inverse slope."""
 
 
 def transition(
     shape_factors: Float[np.ndarray, " values"],
     curves: Sequence[Curve],
-    energies: Float[np.ndarray, "values tissues cycles"],
     shapes: Float[np.ndarray, "values tissues"],
     modes: Float[np.ndarray, "values some"],
 ) -> Figure:
@@ -37,8 +41,7 @@ def transition(
     **Arguments:**
 
     - `shape_factors`: target shape factors.
-    - `curves`: fractions at zero energy after more and more driving.
-    - `energies`: per cell.
+    - `curves`: fractions at zero energy, and energies, after more and more driving.
     - `shapes`: mean observed shape factor of each tissue at the end.
     - `modes`: number of zero modes of some tissues; none leaves the panel out.
 
@@ -55,17 +58,18 @@ def transition(
         axes[0].axvline(REFERENCE, color=_style.INK, lw=0.7, ls=":")
         axes[0].set(ylabel="fraction at zero energy", ylim=(-0.03, 1.03))
         axes[0].legend(loc="upper left")
-        for cycle, colour, name in (
-            (0, _style.SERIES[0], "quench"),
-            (-1, _style.SERIES[1], "driven"),
-        ):
-            low, middle, high = np.percentile(
-                np.maximum(energies[..., cycle], 1e-16), [10, 50, 90], axis=1
-            )
-            axes[1].plot(shape_factors, middle, color=colour, label=name)
-            axes[1].fill_between(shape_factors, low, high, color=colour, alpha=0.15, lw=0)
-        axes[1].set(yscale="log", ylabel="energy per cell")
-        axes[1].legend(loc="lower left")
+        for curve, colour in zip(curves, (*_style.SERIES, "0.4"), strict=False):
+            axes[1].plot(shape_factors, curve.root_energy, "o", ms=3, color=colour)
+            if curve.onset is not None:
+                onset, width = curve.onset
+                axes[1].plot(
+                    [shape_factors[0], onset],
+                    [(onset - shape_factors[0]) / width, 0],
+                    color=colour,
+                    lw=1,
+                )
+        axes[1].axvline(REFERENCE, color=_style.INK, lw=0.7, ls=":")
+        axes[1].set_ylabel("root of energy per cell")
         ends = [shape_factors.min(), shape_factors.max()]
         axes[2].plot(ends, ends, color=_style.INK, lw=0.7, ls=":")
         mean, deviation = shapes.mean(axis=1), shapes.std(axis=1)

@@ -24,7 +24,7 @@ from vertax.experiments._config import ExperimentConfig
 from vertax.experiments._design import (
     Gradient,
     Tensions,
-    design,
+    designs,
     keys_of,
     limits,
     mean_and_deviation,
@@ -32,7 +32,6 @@ from vertax.experiments._design import (
     tensions,
 )
 from vertax.experiments._run import RunFolder, histories, joined
-from vertax.experiments._scenes import stack
 from vertax.experiments._sections import Fitting, Relaxation
 from vertax.initialise import free_voronoi
 
@@ -124,17 +123,13 @@ def _design(config: Config, n_cells: int, progress: bool) -> tuple[Fit, Fit, np.
                 **config.relaxation.options(),
             )
         )
-    options: dict[str, Any] = {"batched": True, "progress": progress}
-    # One start a replicate, repeated for each target: the fit of the same shape is compiled once.
-    batch = stack([problems[k] for _, k in _members(config)])
-    started, *_ = design(batch, config.start, _measure, **options)
-    targets = jnp.array([target for target, _ in _members(config)])
-    batch = eqx.tree_at(
-        lambda p: (p.tissue, p.energy, p.cost.target),
-        batch,
-        (started.tissue, started.energy, targets),
-    )
-    outcome, _, curves = design(batch, config.fit, _measure, **options)
+    started, *_ = designs(problems, config.start, _measure, progress=progress)
+    bound = []
+    for target, k in _members(config):
+        tissue, energy = member((started.tissue, started.energy), k)
+        replaced = (tissue, energy, AspectRatio(jnp.array(target), config.measure))
+        bound.append(eqx.tree_at(lambda p: (p.tissue, p.energy, p.cost), problems[k], replaced))
+    outcome, _, curves = designs(bound, config.fit, _measure, progress=progress)
     return started, outcome, curves
 
 
@@ -144,10 +139,10 @@ def _measure(problem: InverseProblem, tissue: Tissue, parameters: PyTree) -> Arr
 
 
 def _ratios(config: Config, outcome: Fit) -> np.ndarray:
-    """Aspect ratios of the best designs, shape `(targets, replicates)`."""
+    """Aspect ratios of the best designs, shape `(targets, replicates)`, or `(1, replicates)` at the start."""
     measured = eqx.filter_vmap(lambda tissue: aspect_ratio(tissue, config.measure))
     ratios = np.asarray(eqx.filter_jit(measured)(outcome.tissue), float)
-    return ratios.reshape(len(config.targets), config.replicates)
+    return ratios.reshape(-1, config.replicates)
 
 
 def _metrics(config: Config, started: Fit, outcome: Fit) -> dict[str, Any]:
@@ -198,10 +193,10 @@ def _save(
     index = int(np.argmin(np.abs(np.array(config.targets) - config.shown_target)))
     started, outcome, _ = designs[n_cells]
     panels = {}
-    for name, fitted in (("initial", started), ("designed", outcome)):
+    for name, fitted, row in (("initial", started, 0), ("designed", outcome, index)):
         # The first replicate.
-        own = member((fitted.tissue, fitted.energy), index * config.replicates)
-        ratio = _ratios(config, fitted)[index, 0]
+        own = member((fitted.tissue, fitted.energy), row * config.replicates)
+        ratio = _ratios(config, fitted)[row, 0]
         panels[f"{name}: $r$ = {ratio:.2f}"] = (own[0], tensions(own[1]))
         folder.save_tissue(name, own[0])
     bounds = (config.tensions.low, config.tensions.high)

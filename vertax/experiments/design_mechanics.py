@@ -79,9 +79,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         adjoint=config.gradient.build(),
         **config.relaxation.options(),
     )
-    outcome, initial, (observed, targets) = design(
-        problem, config.fit, _measure, batched=False, progress=progress
-    )
+    outcome, initial, (observed, targets) = design(problem, config.fit, _measure, progress=progress)
     _save(initial, outcome, observed, targets, config, folder)
     mean, of_parameters = observed.mean(axis=1), targets.mean(axis=1)
     off = np.abs(mean - config.target)

@@ -93,7 +93,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
 
     **Returns:** the metrics: the shape factor at which half of the tissues have no energy, after the
     quench and after driving, with the 95 % interval of a bootstrap over tissues, and the width of the
-    transition.
+    transition; and, likewise, the onset: where the energy of rigid tissues would vanish.
     """
     began = time.perf_counter()
     options = config.relaxation.options()
@@ -251,6 +251,52 @@ def _interval(
     return best, (float(low), float(high))
 
 
+def fit_onset(
+    shape_factors: Float[np.ndarray, " values"], energies: Float[np.ndarray, "values tissues"]
+) -> Transition | None:
+    r"""Where rigid tissues would lose their energy: $\sqrt{E} \propto p^* - p^0$, extrapolated.
+
+    A rigid tissue keeps the perimeters that it can get, so its energy grows like the square of what is
+    missing. Unlike the count of tissues at zero energy this does not ask that the last cell of a tissue
+    be content.
+
+    **Arguments:**
+
+    - `shape_factors`: target shape factors, ascending.
+    - `energies`: per cell, of tissues at each.
+
+    **Returns:** the line through the lower half of the values that have energy: where it ends, and its
+    slope as the width; None if there are fewer than three.
+    """
+    roots = np.sqrt(np.maximum(energies, 0)).mean(axis=1)
+    rigid = np.flatnonzero(roots > 0.1 * roots.max())
+    if len(rigid) < 3:
+        return None
+    lower = rigid[: max(3, (len(rigid) + 1) // 2)]
+    slope, offset = np.polyfit(shape_factors[lower], roots[lower], 1)
+    return Transition(float(-offset / slope), float(-1 / slope))
+
+
+def _onset(
+    shape_factors: np.ndarray, energies: Float[np.ndarray, "values tissues"], config: Config
+) -> tuple[Transition | None, dict[str, float]]:
+    best = fit_onset(shape_factors, energies)
+    if best is None:
+        return None, {}
+    rng = np.random.default_rng(config.seed)
+    trials = energies.shape[1]
+    draws = [
+        fit_onset(shape_factors, energies[:, rng.integers(trials, size=trials)])
+        for _ in range(config.resamples)
+    ]
+    low, high = np.percentile([d.centre for d in draws if d is not None], [2.5, 97.5])
+    return best, {
+        "onset": best.centre,
+        "onset_low": float(low),
+        "onset_high": float(high),
+    }
+
+
 def _report(
     config: Config,
     folder: RunFolder,
@@ -269,8 +315,18 @@ def _report(
     ):
         best, (low, high) = _interval(shape_factors, zero[..., cycle], config)
         name = "quench" if cycle == 0 else f"{cycle} cycles" if cycle > 1 else "1 cycle"
-        curves.append(figures.Curve(name, zero[..., cycle].mean(axis=1), best.centre, best.width))
-        metrics[name] = {
+        onset, found = _onset(shape_factors, energies[..., cycle], config)
+        curves.append(
+            figures.Curve(
+                name,
+                zero[..., cycle].mean(axis=1),
+                best.centre,
+                best.width,
+                np.sqrt(np.maximum(energies[..., cycle], 0)).mean(axis=1),
+                None if onset is None else (onset.centre, onset.width),
+            )
+        )
+        metrics[name] = found | {
             "p0_star": best.centre,
             "p0_star_low": low,
             "p0_star_high": high,
@@ -288,9 +344,7 @@ def _report(
         columns["zero_modes"] = modes.mean(axis=1)
     folder.save_table("transition", columns)
     folder.save_array("energies", energies)
-    folder.save_figure(
-        "transition", figures.transition(shape_factors, curves, energies, shapes, modes)
-    )
+    folder.save_figure("transition", figures.transition(shape_factors, curves, shapes, modes))
     totals = {
         "converged_fraction": converged.mean(),
         "least_converged": converged.mean(axis=1).min(),

@@ -24,7 +24,7 @@ from vertax.experiments._config import ExperimentConfig
 from vertax.experiments._design import (
     Gradient,
     Tensions,
-    design,
+    designs,
     keys_of,
     limits,
     mean_and_deviation,
@@ -32,7 +32,7 @@ from vertax.experiments._design import (
     tensions,
 )
 from vertax.experiments._run import RunFolder, histories, joined
-from vertax.experiments._scenes import TissueSection, stack
+from vertax.experiments._scenes import TissueSection
 from vertax.experiments._sections import Fitting, Relaxation
 from vertax.initialise import free_voronoi, periodic_voronoi
 
@@ -91,10 +91,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     for boundary in config.boundaries:
         for n_types in config.n_types:
             name = f"{boundary}, {n_types} types"
-            batch = stack(_problems(config, boundary, n_types))
-            outcome, first, curves = design(
-                batch, config.fit, _measure, batched=True, progress=progress
-            )
+            problems = _problems(config, boundary, n_types)
+            outcome, first, curves = designs(problems, config.fit, _measure, progress=progress)
             shares[name] = curves
             labels = [
                 {"boundary": boundary, "n_types": str(n_types), "replicate": str(k)}
@@ -103,7 +101,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
             tables.append(histories(outcome, labels) | {"heterotypic_share": curves.T.ravel()})
             folder.save_table("history", joined(tables))
             metrics[name] = _metrics(config, outcome, curves)
-            panels = panels or _panels(batch, first, outcome, curves, folder)
+            panels = panels or _panels(problems[0], first, outcome, curves, folder)
     bounds = (config.tensions.low, config.tensions.high)
     folder.save_figure("design", figures.patterns(panels, bounds, shares))
     return metrics
@@ -168,17 +166,17 @@ def _metrics(config: Config, outcome: Fit, curves: np.ndarray) -> dict[str, Any]
 
 
 def _panels(
-    batch: Any, first: Tissue, outcome: Fit, curves: np.ndarray, folder: RunFolder
+    problem: InverseProblem, first: Tissue, outcome: Fit, curves: np.ndarray, folder: RunFolder
 ) -> dict[str, tuple[Tissue, np.ndarray, np.ndarray]]:
     """The first replicate before and after."""
-    types = np.asarray(batch.cost.cell_types)[0]
+    assert isinstance(problem.cost, HomotypicLength)
+    types = np.asarray(problem.cost.cell_types)
     folder.save_table("cell_types", {"cell": np.arange(len(types)), "type": types})
     panels = {}
     for name, tissue, energy, share in (
-        ("initial", first, batch.energy, curves[0, 0]),
-        ("designed", outcome.tissue, outcome.energy, _best(outcome, curves)[0]),
+        ("initial", member(first, 0), problem.energy, curves[0, 0]),
+        ("designed", *member((outcome.tissue, outcome.energy), 0), _best(outcome, curves)[0]),
     ):
-        own = member(tissue, 0)
-        panels[f"{name}: {share:.1%} heterotypic"] = (own, types, tensions(energy)[0])
-        folder.save_tissue(name, own)
+        panels[f"{name}: {share:.1%} heterotypic"] = (tissue, types, tensions(energy))
+        folder.save_tissue(name, tissue)
     return panels

@@ -58,6 +58,7 @@ def from_labels(
     pixel_size: float | None = None,
     gap_width: float = 3.0,
     softening: float | None = None,
+    inner_arcs: bool = False,
 ) -> Segmentation:
     """Tissue with the cells and neighbours of a label image (paper, "Mesh initialization").
 
@@ -98,6 +99,9 @@ def from_labels(
     - `gap_width`: how wide lines between cells may be, in pixels, not to be taken for a part of the
         exterior of a free tissue.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
+    - `inner_arcs`: make every edge an arc, with the area that its cells have over its chord in the image,
+        and not only those on the outline of a free tissue. Of edges a few pixels long, the angle is
+        noise.
 
     **Returns:** a [`Segmentation`][vertax.initialise.Segmentation]. Cells of the original image
     come first, in the order of their labels, then the mirrored ones.
@@ -113,7 +117,7 @@ def from_labels(
         raise ValueError(f"Argument `gap_width` must be at least 0, but is {gap_width}.")
     values, image = _checked(np.asarray(mask))
     if boundary == "free":
-        return _free_from_labels(values, image, pixel_size, gap_width, softening)
+        return _free_from_labels(values, image, pixel_size, gap_width, softening, inner_arcs)
     periodic = boundary == "periodic"
     image = fill_gaps(image, periodic)
     image = join_pieces(image, periodic)
@@ -129,23 +133,28 @@ def from_labels(
     label = mesh.cells % n
     size = np.array(cells.shape[::-1], float)
     pixels = np.bincount(cells.ravel(), minlength=4 * n)[mesh.cells]
-    vertices, moved = untangle(mesh, size, pixels, 0 * pixels)
+    bulge = np.bincount(mesh.cell, mesh.bulge, len(label)) if inner_arcs else 0.0 * pixels
+    vertices, moved = untangle(mesh, size, pixels, bulge)
     if vertices is None:
         raise _no_polygons(values[label[moved]])
     if pixel_size is None:
         pixel_size = float(np.sqrt(len(label) / size.prod()))
     dtype = jnp.result_type(float)
+    tissue = Tissue(
+        jnp.asarray(vertices * pixel_size, dtype),
+        Topology(mesh.twin, mesh.cell, mesh.frame),
+        Periodic(jnp.asarray(np.diag(size * pixel_size), dtype)),
+        softening,
+    )
+    if inner_arcs:
+        curved = np.full(len(mesh.cell), True)
+        tissue = _with_arcs(tissue, mesh, curved, pixel_size, inner_arcs=True)
     whole = np.ones(len(label), bool)
     if not periodic:
         top_bottom, left_right = _touching(image, n)
         whole = (mesh.cells < n) & ~(top_bottom | left_right)[label]
     return Segmentation(
-        tissue=Tissue(
-            jnp.asarray(vertices * pixel_size, dtype),
-            Topology(mesh.twin, mesh.cell, mesh.frame),
-            Periodic(jnp.asarray(np.diag(size * pixel_size), dtype)),
-            softening,
-        ),
+        tissue=tissue,
         labels=values[label],
         whole=whole,
         absorbed=np.setdiff1d(values, values[label]),
@@ -161,6 +170,7 @@ def _free_from_labels(
     pixel_size: float | None,
     gap_width: float,
     softening: float | None,
+    inner_arcs: bool,
 ) -> Segmentation:
     """The part of `from_labels` for a free cluster."""
     exterior = len(values)
@@ -177,9 +187,9 @@ def _free_from_labels(
     label = mesh.cells[:-1]
     n_cells = len(label)
     left, right = mesh.cell, mesh.cell[mesh.twin]
-    outline = (left < n_cells) & (right == n_cells)
+    curved = np.full(len(left), True) if inner_arcs else (left == n_cells) | (right == n_cells)
     pixels = np.bincount(image.ravel(), minlength=exterior + 1)[mesh.cells]
-    bulge = np.bincount(left, np.where(outline, mesh.bulge, 0.0), n_cells + 1)
+    bulge = np.bincount(left, np.where(curved, mesh.bulge, 0.0), n_cells + 1)
     pixels[-1] = 0  # the exterior is no cell, and has no area
     bulge[-1] = np.inf
     size = np.array(image.shape[::-1], float)
@@ -188,30 +198,43 @@ def _free_from_labels(
     if vertices is None:
         raise _no_polygons(values[label[moved]])
     topology = Topology(mesh.twin, mesh.cell, mesh.frame, exterior=True)
-    chord = vertices[mesh.twin[outline] // 3] - np.repeat(vertices, 3, axis=0)[outline]
-    angles = np.zeros(topology.n_edges)
-    angles[np.asarray(topology.edge)[outline]] = angle_of_area(
-        mesh.bulge[outline], np.linalg.norm(chord, axis=1)
-    )
     if pixel_size is None:
         pixel_size = float(np.sqrt(n_cells / pixels.sum()))
     dtype = jnp.result_type(float)
+    corners = jnp.asarray((vertices - margin) * pixel_size, dtype)
+    straight = Tissue(corners, topology, Free(), softening)
     home = image[margin : margin + rows, margin : margin + columns]
     top_bottom, left_right = _touching(home, exterior + 1)
     return Segmentation(
-        tissue=Tissue(
-            jnp.asarray((vertices - margin) * pixel_size, dtype),
-            topology,
-            Free(),
-            softening,
-            angles=jnp.asarray(angles, dtype),
-        ),
+        tissue=_with_arcs(straight, mesh, curved, pixel_size, inner_arcs=inner_arcs),
         labels=values[label],
         whole=~(top_bottom | left_right)[label],
         absorbed=np.setdiff1d(values, values[label]),
         inflated=np.unique(values[label[moved]]),
         pixel_size=float(pixel_size),
         image_shape=(rows, columns),
+    )
+
+
+def _with_arcs(
+    straight: Tissue,
+    mesh: Mesh,
+    curved: Bool[np.ndarray, " halfedges"],
+    pixel_size: float,
+    *,
+    inner_arcs: bool,
+) -> Tissue:
+    """The tissue with arcs that bound the areas which edges bound in the image."""
+    half_edge = np.asarray(straight.topology.half_edge)
+    chord = np.linalg.norm(np.asarray(straight.edge_vectors, float), axis=1) / pixel_size
+    angles = np.where(curved[half_edge], angle_of_area(mesh.bulge[half_edge], chord), 0.0)
+    return Tissue(
+        straight.vertices,
+        straight.topology,
+        straight.boundary,
+        straight.softening,
+        angles=jnp.asarray(angles, straight.vertices.dtype),
+        inner_arcs=inner_arcs,
     )
 
 
