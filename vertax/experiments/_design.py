@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from pydantic import Field, model_validator
 
-from vertax._fit import Fit, Record, fit
+from vertax._history import Fit, Record
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
 from vertax.experiments._config import Section
+from vertax.experiments._run import RunFolder
 from vertax.experiments._sections import Fitting
 
 
@@ -92,6 +94,8 @@ def tensions(energy: AbstractEnergy) -> Float[np.ndarray, "*batch edges"]:
 
 
 def design(
+    folder: RunFolder,
+    name: str,
     problem: InverseProblem,
     fitting: Fitting,
     measure: Callable[[InverseProblem, Tissue, PyTree], PyTree[Array]],
@@ -103,6 +107,7 @@ def design(
 
     **Arguments:**
 
+    - `folder`, `name`: see `RunFolder.fit`.
     - `problem`: the inverse problem, or a batch.
     - `fitting`: how it is fitted.
     - `measure`: a function of one problem, its tissue in equilibrium and the fitted leaves of the energy.
@@ -117,18 +122,35 @@ def design(
     - `FitError` if the fit cannot go on.
     """
     compiled = eqx.filter_jit(eqx.filter_vmap(measure) if batched else measure)
-    rows: list[PyTree[np.ndarray]] = []
-    first: list[Tissue] = []
-
-    def note(epoch: int, record: Record) -> None:
-        if epoch == 0:
-            first.append(record.tissue)
-        rows.append(jax.tree.map(np.asarray, compiled(problem, record.tissue, record.parameters)))
-
-    outcome = fit(
-        problem, fitting.build(), fitting.epochs, batched=batched, progress=progress, callback=note
+    example = eqx.filter_eval_shape(
+        compiled, problem, problem.tissue, eqx.filter(problem.energy, problem.trainable)
     )
-    return outcome, first[0], jax.tree.map(lambda *x: np.stack(x), *rows)
+    leaves, structure = jax.tree.flatten(problem.tissue)
+
+    def note(epoch: int, record: Record) -> dict[str, Any]:
+        if epoch == 0:
+            start = jax.tree.leaves(record.tissue)
+            folder.part(f"{name} start", lambda: _by_number(start))
+        return _by_number(jax.tree.leaves(compiled(problem, record.tissue, record.parameters)))
+
+    outcome = folder.fit(
+        name,
+        problem,
+        fitting.build(),
+        fitting.epochs,
+        batched=batched,
+        progress=progress,
+        callback=note,
+    )
+    start = folder.part(f"{name} start", dict)
+    first = jax.tree.unflatten(structure, [jnp.asarray(start[str(i)]) for i in range(len(leaves))])
+    n_measured = len(outcome.notes)
+    measured = [outcome.notes[str(i)] for i in range(n_measured)]
+    return outcome, first, jax.tree.unflatten(jax.tree.structure(example), measured)
+
+
+def _by_number(leaves: Sequence[Array]) -> dict[str, np.ndarray]:
+    return {str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
 
 
 def member(tree: PyTree, index: int) -> Any:

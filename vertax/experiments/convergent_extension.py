@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 from pydantic import Field
 
-from vertax._fit import Fit
+from vertax._history import Fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import AspectRatio, aspect_ratio
@@ -31,9 +31,10 @@ from vertax.experiments._design import (
     member,
     tensions,
 )
-from vertax.experiments._run import RunFolder, histories, joined
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import stack
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import histories, joined
 from vertax.initialise import free_voronoi
 
 
@@ -92,7 +93,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     designs: dict[int, tuple[Fit, Fit, np.ndarray]] = {}
     tables: list[dict[str, Any]] = []
     for n_cells in config.n_cells:
-        designs[n_cells] = started, outcome, curves = _design(config, n_cells, progress)
+        designs[n_cells] = started, outcome, curves = _design(config, n_cells, folder, progress)
         labels = [
             {"n_cells": str(n_cells), "target": str(target), "replicate": str(k)}
             for target, k in _members(config)
@@ -110,7 +111,9 @@ def _members(config: Config) -> list[tuple[float, int]]:
     return [(target, k) for target in config.targets for k in range(config.replicates)]
 
 
-def _design(config: Config, n_cells: int, progress: bool) -> tuple[Fit, Fit, np.ndarray]:
+def _design(
+    config: Config, n_cells: int, folder: RunFolder, progress: bool
+) -> tuple[Fit, Fit, np.ndarray]:
     """The fits to the ratio at which designs start and to the targets; the ratios over epochs."""
     problems = []
     for key in keys_of(config.seed, config.replicates):
@@ -127,14 +130,14 @@ def _design(config: Config, n_cells: int, progress: bool) -> tuple[Fit, Fit, np.
     options: dict[str, Any] = {"batched": True, "progress": progress}
     # One start a replicate, repeated for each target: the fit of the same shape is compiled once.
     batch = stack([problems[k] for _, k in _members(config)])
-    started, *_ = design(batch, config.start, _measure, **options)
+    started, *_ = design(folder, f"{n_cells} cells first", batch, config.start, _measure, **options)
     targets = jnp.array([target for target, _ in _members(config)])
     batch = eqx.tree_at(
         lambda p: (p.tissue, p.energy, p.cost.target),
         batch,
         (started.tissue, started.energy, targets),
     )
-    outcome, _, curves = design(batch, config.fit, _measure, **options)
+    outcome, _, curves = design(folder, f"{n_cells} cells", batch, config.fit, _measure, **options)
     return started, outcome, curves
 
 

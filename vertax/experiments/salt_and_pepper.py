@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 from pydantic import Field
 
-from vertax._fit import Fit
+from vertax._history import Fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import HomotypicLength
@@ -31,9 +31,10 @@ from vertax.experiments._design import (
     member,
     tensions,
 )
-from vertax.experiments._run import RunFolder, histories, joined
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import TissueSection, stack
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import histories, joined
 from vertax.initialise import free_voronoi, periodic_voronoi
 
 Boundary = Literal["periodic", "free"]
@@ -93,7 +94,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
             name = f"{boundary}, {n_types} types"
             batch = stack(_problems(config, boundary, n_types))
             outcome, first, curves = design(
-                batch, config.fit, _measure, batched=True, progress=progress
+                folder, name, batch, config.fit, _measure, batched=True, progress=progress
             )
             shares[name] = curves
             labels = [

@@ -39,6 +39,8 @@ class Drawing(eqx.Module):
     """Root of the mean area."""
     box: Float[np.ndarray, "5 2"] | None
     """Outline of the periodic box, closed; None without one."""
+    lattice: Float[np.ndarray, "2 2"] | None
+    """Its sides."""
 
     def __init__(self, tissue: Tissue, points_per_arc: int = _POINTS_PER_ARC):
         m = tissue.topology
@@ -46,9 +48,9 @@ class Drawing(eqx.Module):
         lines, centroids, areas, following = geometry
         image = np.zeros((m.n_faces, 2), int)
         shift = np.zeros((m.n_faces, 2))
-        self.box = None
+        self.box = self.lattice = None
         if isinstance(tissue.boundary, Periodic):
-            lattice = np.asarray(tissue.boundary.lattice, float)
+            self.lattice = lattice = np.asarray(tissue.boundary.lattice, float)
             fractions = centroids.astype(float) @ np.linalg.inv(lattice)
             # The margin keeps a centroid on the side of the box (a regular lattice, say) from
             # jumping to the other side by rounding. A cell of area 0 has no centroid and stays put.
