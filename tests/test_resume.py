@@ -57,7 +57,7 @@ def tables(run):
     """All tables of a run, without times; and its metrics."""
     found = {}
     for file in sorted(Path(run).glob("*.csv")):
-        rows = list(csv.DictReader(file.open()))
+        rows = list(csv.DictReader(file.read_text().splitlines()))
         found[file.name] = [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
     metrics = json.loads((Path(run) / "metrics.json").read_text())
     for group in (metrics, metrics["vertices"], metrics["image"]):

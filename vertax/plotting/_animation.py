@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Real
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
@@ -21,7 +21,7 @@ from vertax._atomic import atomic_draft
 from vertax._tissue import Tissue
 from vertax.plotting import _style
 from vertax.plotting._polygons import Drawing
-from vertax.plotting._tissue import line_width, plot_tissue, size_of, view_of
+from vertax.plotting._tissue import Colours, colour_map, draw, line_width, size_of, view_of
 
 CellValues: TypeAlias = (
     Callable[[Tissue], Real[Array | np.ndarray, " cells"]]
@@ -34,14 +34,14 @@ def animate(
     path: str | os.PathLike[str],
     cells: CellValues | None = None,
     *,
-    fps: float = 10.0,
+    fps: SupportsFloat = 10.0,
     mark_t1: int = 6,
     cmap: str | Colormap = "viridis",
     vmin: SupportsFloat | None = None,
     vmax: SupportsFloat | None = None,
     label: str | None = None,
     captions: Sequence[str] | None = None,
-    linger: float = 1.5,
+    linger: SupportsFloat = 1.5,
     dpi: int = 120,
 ) -> None:
     """Draw a trajectory as an animation, one picture a frame.
@@ -78,6 +78,7 @@ def animate(
     - `OSError` if the file cannot be written.
     """
     frames = list(trajectory)
+    fps, linger = float(fps), float(linger)
     _check(frames, fps, mark_t1, captions, linger, dpi)
     write = _writer(path)
     values = _cell_values(cells, frames)
@@ -85,7 +86,7 @@ def animate(
         frames, values, _limits(values, vmin, vmax), cmap, label, captions, mark_t1, dpi
     )
     with atomic_draft(path) as draft:
-        write(draft, pictures, float(fps), float(linger))
+        write(draft, pictures, fps, linger)
 
 
 def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
@@ -187,29 +188,44 @@ def _pictures(
     dpi: int,
 ) -> Iterator[np.ndarray]:
     """Pixels of each frame, all of one size."""
-    drawings = [Drawing(tissue) for tissue in frames]
+    drawings = _placed(frames)
     views = [view_of(drawing.polygons()[0], drawing.box) for drawing in drawings]
     low, high = np.min([v[0] for v in views], axis=0), np.max([v[1] for v in views], axis=0)
     with _style.house_style():
         figure, ax = _figure(high - low, values is not None, captions is not None, dpi)
         if values is not None:
-            scale = ScalarMappable(Normalize(*limits), cmap)
+            scale = ScalarMappable(Normalize(*limits), colour_map(cmap))
             bar = figure.colorbar(scale, ax=ax, aspect=22, shrink=0.9, label=label or "")
             bar.outline.set_linewidth(0.4)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         width = line_width(drawings[0], ax)
-    options: dict[str, Any] = {"vmin": limits[0], "vmax": limits[1], "cmap": cmap}
-    for k, (tissue, marked) in enumerate(zip(frames, _marks(frames, mark_t1), strict=True)):
+    colours = Colours(cmap, *limits)
+    for k, (drawing, marked) in enumerate(zip(drawings, _marks(frames, mark_t1), strict=True)):
         ax.clear()
         own = None if values is None else values[k]
         with _style.house_style():
-            plot_tissue(
-                tissue, own, ax=ax, highlight=marked, colorbar=False, linewidth=width, **options
+            draw(
+                drawing,
+                own,
+                ax=ax,
+                highlight=marked,
+                cell_colours=colours,
+                colorbar=False,
+                linewidth=width,
             )
             ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             if captions is not None:
                 ax.set_title(captions[k])
             yield _pixels(figure)
+
+
+def _placed(frames: list[Tissue]) -> list[Drawing]:
+    """The drawings of all frames, in which no cell jumps from one side of a periodic box to the other."""
+    drawings: list[Drawing] = []
+    for tissue in frames:
+        near = drawings[-1].centroids if drawings else None
+        drawings.append(Drawing(tissue, near=near))
+    return drawings
 
 
 def _figure(extent: np.ndarray, bar: bool, caption: bool, dpi: int) -> tuple[Figure, Axes]:
@@ -259,10 +275,7 @@ def _check_ffmpeg() -> None:
 
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: float) -> None:
     images = [Image.fromarray(pixels) for pixels in pictures]
-    # One palette for all frames: with one each, colours that stand still would flicker.
-    some = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), 8)).astype(int)]
-    montage = np.concatenate([np.asarray(image) for image in some])
-    palette = Image.fromarray(montage).quantize(255, Image.Quantize.MEDIANCUT)
+    palette = _palette(images)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # The format counts in hundredths of a second, and viewers slow down what is shorter than two.
     frame = 10 * max(2, round(100 / fps))
@@ -271,6 +284,21 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: f
     first.save(
         path, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=True
     )
+
+
+def _palette(images: list[Image.Image]) -> Image.Image:
+    """One palette for all frames: with one each, colours that stand still would flicker."""
+    some = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), 8)).astype(int)]
+    montage = np.concatenate([np.asarray(image) for image in some])
+    frequent = Image.fromarray(montage).quantize(250, Image.Quantize.MEDIANCUT)
+    colours = np.reshape(frequent.getpalette() or [], (-1, 3))
+    # The paper is white and nothing near it, and marks keep their colour, however small they are.
+    sure = np.array([to_rgb("white"), to_rgb(_style.MARK)]) * 255
+    away = np.abs(colours[:, None] - sure).max(axis=-1).min(axis=-1)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate([colours[away > 8], sure]).astype(np.uint8).tobytes())
+    palette.load()
+    return palette
 
 
 def _write_film(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: float) -> None:
@@ -282,7 +310,8 @@ def _write_film(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: 
     FigureCanvasAgg(figure)
     shown = figure.figimage(first)
     # A pixel format that every player knows.
-    writer = FFMpegWriter(fps=fps, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "18"])
+    rate: Any = fps  # ffmpeg takes any number
+    writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "18"])
     with writer.saving(figure, str(path), 100):
         writer.grab_frame()
         for pixels in pictures:

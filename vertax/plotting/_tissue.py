@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, SupportsFloat
+from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 from jaxtyping import Array, Bool, Real
@@ -93,19 +93,63 @@ def plot_tissue(
             "Argument `tissue` must be a single tissue, but its vertices have shape "
             f"{tissue.vertices.shape}."
         )
-    cell_values = _values("cells", cells, tissue.n_cells)
-    edge_values = _values("edges", edges, tissue.n_edges)
-    shown = _values("mask", mask, tissue.n_cells)
-    shown = np.ones(tissue.n_cells, bool) if shown is None else shown.astype(bool)
-    marked = _values("highlight", highlight, tissue.n_edges)
+    return draw(
+        Drawing(tissue),
+        cells,
+        edges,
+        ax=ax,
+        mask=mask,
+        highlight=highlight,
+        cell_colours=Colours(cmap, vmin, vmax, label),
+        edge_colours=Colours(edge_cmap, edge_vmin, edge_vmax, edge_label),
+        colorbar=colorbar,
+        alpha=alpha,
+        linewidth=linewidth,
+        image=image,
+        pixel_size=float(pixel_size),
+    )
+
+
+class Colours(NamedTuple):
+    """How values become colours."""
+
+    cmap: str | Colormap | None = None
+    low: SupportsFloat | None = None
+    high: SupportsFloat | None = None
+    label: str | None = None
+
+
+_DEFAULT = Colours()
+
+
+def draw(
+    drawing: Drawing,
+    cells: Any = None,
+    edges: Any = None,
+    *,
+    ax: Axes | None = None,
+    mask: Any = None,
+    highlight: Any = None,
+    cell_colours: Colours = _DEFAULT,
+    edge_colours: Colours = _DEFAULT,
+    colorbar: bool = True,
+    alpha: SupportsFloat | None = None,
+    linewidth: SupportsFloat | None = None,
+    image: np.ndarray | None = None,
+    pixel_size: float = 1.0,
+) -> Axes:
+    """Draw what `plot_tissue` draws, with cells placed as in `drawing`."""
+    cell_values = _values("cells", cells, drawing.n_cells)
+    edge_values = _values("edges", edges, drawing.n_edges)
+    shown = _values("mask", mask, drawing.n_cells)
+    shown = np.ones(drawing.n_cells, bool) if shown is None else shown.astype(bool)
+    marked = _values("highlight", highlight, drawing.n_edges)
     opacity = float(alpha if alpha is not None else 1 if image is None else 0.5)
     if not 0 <= opacity <= 1:
         raise ValueError(f"Argument `alpha` must lie in 0 … 1, but is {opacity}.")
-    pixel_size = float(pixel_size)
     if not (np.isfinite(pixel_size) and pixel_size > 0):
         raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
 
-    drawing = Drawing(tissue)
     polygons, polygon_cells = drawing.polygons()[0][shown], np.flatnonzero(shown)
     segments, segment_edges = drawing.sides(shown)
     n_bars = colorbar * ((cells is not None) + (edges is not None))
@@ -137,8 +181,8 @@ def plot_tissue(
         bars: list[tuple[ScalarMappable, np.ndarray, str | None]] = []
         if cell_values is not None:
             drawn = cell_values[polygon_cells]
-            _colour(faces, drawn, cmap, vmin, vmax)
-            bars.append((faces, drawn, label))
+            _colour(faces, drawn, cell_colours)
+            bars.append((faces, drawn, cell_colours.label))
         else:
             faces.set_facecolor(_style.BLANK if image is None else "none")
         faces.set_alpha(opacity)
@@ -147,15 +191,16 @@ def plot_tissue(
         lines = LineCollection(list(segments), capstyle="round", zorder=2)
         if edge_values is not None:
             drawn = edge_values[segment_edges]
-            if edge_cmap is None:
-                edge_cmap = _EDGES_ON_PALE if image is None else _EDGES_ON_DARK
-            _colour(lines, drawn, edge_cmap, edge_vmin, edge_vmax)
+            if edge_colours.cmap is None:
+                own = _EDGES_ON_PALE if image is None else _EDGES_ON_DARK
+                edge_colours = edge_colours._replace(cmap=own)
+            _colour(lines, drawn, edge_colours)
             if cell_values is not None:  # a casing sets coloured lines off from coloured faces
                 casing = LineCollection(list(segments), colors="w", linewidths=4.5 * linewidth)
                 casing.set(capstyle="round", zorder=1.5)
                 ax.add_collection(casing, autolim=False)
             lines.set_linewidth(3 * linewidth)
-            bars.append((lines, drawn, edge_label))
+            bars.append((lines, drawn, edge_colours.label))
         else:
             lines.set_color(_style.INK if image is None else _style.HIGHLIGHT)
             lines.set_linewidth(linewidth)
@@ -198,8 +243,9 @@ def line_width(drawing: Drawing, ax: Axes) -> float:
 
 def _mark(ax: Axes, segments: np.ndarray, linewidth: float) -> None:
     """Marked edges: thick, in a colour that no colour map of cells or edges has, on a white casing."""
-    for width, colour in ((6.5, "w"), (4.0, _style.MARK)):
-        lines = LineCollection(list(segments), colors=colour, linewidths=width * linewidth)
+    width = max(4.5 * linewidth, 2.5)  # an edge that has just flipped is short, and must be seen
+    for extra, colour in ((1.6, "w"), (0.0, _style.MARK)):
+        lines = LineCollection(list(segments), colors=colour, linewidths=width + extra)
         lines.set(capstyle="round", zorder=2.5)
         ax.add_collection(lines, autolim=False)
 
@@ -261,21 +307,20 @@ def _scale(ax: Axes) -> float:
     return float(72 * np.min(inches / np.abs([x1 - x0, y1 - y0])))
 
 
-def _colour(
-    artist: PolyCollection | LineCollection,
-    values: np.ndarray,
-    cmap: str | Colormap,
-    vmin: SupportsFloat | None,
-    vmax: SupportsFloat | None,
-) -> None:
-    colours = (colormaps[cmap] if isinstance(cmap, str) else cmap).with_extremes(bad=_style.MISSING)
+def _colour(artist: PolyCollection | LineCollection, values: np.ndarray, colours: Colours) -> None:
     finite = values[np.isfinite(values)]
     low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-    artist.set_cmap(colours)
-    low = low if vmin is None else float(vmin)
-    high = high if vmax is None else float(vmax)
+    low = low if colours.low is None else float(colours.low)
+    high = high if colours.high is None else float(colours.high)
+    artist.set_cmap(colour_map(colours.cmap))
     artist.set_norm(Normalize(low, high))
     artist.set_array(np.ma.masked_invalid(values))
+
+
+def colour_map(cmap: str | Colormap | None) -> Colormap:
+    """A colour map with the colour of what has no value."""
+    named = colormaps[cmap or "viridis"] if not isinstance(cmap, Colormap) else cmap
+    return named.with_extremes(bad=_style.MISSING)
 
 
 def _colour_bar(
