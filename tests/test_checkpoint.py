@@ -149,6 +149,11 @@ def test_a_truncated_checkpoint_is_refused(kept, path):
         run("adam", 3, checkpoint=path)
 
 
+def test_a_checkpoint_needs_a_folder(path):
+    with pytest.raises(FileNotFoundError, match=r"no folder .*none\. Make it first"):
+        run("adam", 3, checkpoint=path.parent / "none" / "fit.npz", callback=pytest.fail)
+
+
 def test_foreign_files_are_refused(path):
     vx.save_tissue(path, PROBLEM.tissue)
     with pytest.raises(ValueError, match=r"is not a vertax checkpoint file.*Delete the file"):

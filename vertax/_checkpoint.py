@@ -79,6 +79,12 @@ class Keeper:
     """
 
     def __init__(self, checkpoint: Checkpoint | None, identity: Callable[[], dict[str, str]]):
+        if checkpoint is not None and not checkpoint.path.absolute().parent.is_dir():
+            # Said now, and not when hours of work are to be written.
+            raise FileNotFoundError(
+                f"Argument `checkpoint` is {os.fspath(checkpoint.path)!r}, but there is no folder "
+                f"{checkpoint.path.parent}. Make it first."
+            )
         self._checkpoint = checkpoint
         self._identity = identity() if checkpoint is not None else {}
         self._due = 0.0 if checkpoint is None else time.perf_counter() + checkpoint.every

@@ -87,6 +87,7 @@ def fit(
     - `ValueError` if there is nothing to fit, for less than one epoch, for a batch whose arrays
         differ in their leading axis, for `guidance` of a least-squares solver, for a `callback` whose
         notes change their names, and for a checkpoint that is broken or that of another fit.
+    - `FileNotFoundError` if there is no folder for the checkpoint.
     - `TypeError` for a least-squares solver with a cost that is no sum of squares.
     - [`FitError`][vertax.FitError] if cost or gradient are not finite or cannot be trusted, or if no
         epoch reached equilibrium; it carries the fit so far.

@@ -6,7 +6,6 @@ import contextlib
 import csv
 import importlib.metadata
 import json
-import math
 import os
 import platform
 import re
@@ -26,6 +25,7 @@ from vertax._history import Fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.experiments._config import ExperimentConfig, read_toml, validate
+from vertax.experiments._summary import plain
 from vertax.io import atomic_write, save_tissue
 
 CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
@@ -301,7 +301,7 @@ class RunFolder:
             not have, become null.
         """
         with atomic_write(self.path / METRICS) as file:
-            json.dump(_plain(metrics), file, indent=2, allow_nan=False)
+            json.dump(plain(metrics), file, indent=2, allow_nan=False)
             file.write("\n")
 
     def metrics(self) -> dict[str, Any]:
@@ -359,49 +359,6 @@ def installed_version(name: str) -> str:
         return "(not installed)"
 
 
-def summary(metrics: Mapping[str, Any]) -> str:
-    """Metrics as text tables, one column for each group of them.
-
-    **Arguments:**
-
-    - `metrics`: numbers by name, or mappings of numbers by the name of the group; if there are
-        groups, other entries are left out.
-
-    **Returns:** the tables: groups that have names in common share one.
-    """
-    plain: dict[str, Any] = _plain(metrics)
-    groups = {"": plain} | {k: group for k, group in plain.items() if isinstance(group, dict)}
-    groups = {k: group for k, group in groups.items() if any(map(_is_number, group.values()))}
-    if len(groups) > 1:
-        groups.pop("", None)
-    return "\n\n".join(_table(alike) for alike in _alike(groups))
-
-
-def _alike(groups: Mapping[str, dict[str, Any]]) -> list[dict[str, dict[str, Any]]]:
-    """Groups that have names in common, which make one table each."""
-    tables: list[dict[str, dict[str, Any]]] = []
-    for label, group in groups.items():
-        own = {label: {name: value for name, value in group.items() if _is_number(value)}}
-        for table in tables:
-            if any(own[label].keys() & other.keys() for other in table.values()):
-                table |= own
-                break
-        else:
-            tables.append(own)
-    return tables
-
-
-def _table(groups: Mapping[str, dict[str, Any]]) -> str:
-    names = dict.fromkeys(name for group in groups.values() for name in group)
-    rows = [["", *groups]] if any(groups) else []
-    rows += [[name, *(_short(group.get(name)) for group in groups.values())] for name in names]
-    first, *others = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join([name.ljust(first), *map(str.rjust, entries, others)]) for name, *entries in rows
-    ]
-    return "\n".join(lines)
-
-
 def _numbered(path: Path) -> Path:
     """The first of path, path-2, path-3, … that is free, made."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -437,24 +394,3 @@ def _changes(then: Any, now: Any, name: str = "") -> list[str]:
         inside = lambda key: f"{name}.{key}" if name else key
         return [c for k in keys for c in _changes(then.get(k), now.get(k), inside(k))]
     return [] if then == now else [f"`{name}` was {then!r} and is {now!r}"]
-
-
-def _plain(value: Any) -> Any:
-    """A value that strict JSON can hold."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):  # arrays and scalars of NumPy and JAX
-        return _plain(np.asarray(value).tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if _is_number(value) else ""
