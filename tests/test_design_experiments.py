@@ -127,7 +127,10 @@ def fitted(**curves):
         "gradient_norm": np.ones(n),
     }
     names = ("cost", "max_force", "num_steps", "gradient_residual", "gradient_steps")
-    history |= dict.fromkeys((*names, "relative_error"), np.ones(n)) | {"seconds": np.ones(n)}
+    history |= dict.fromkeys((*names, "relative_error"), np.ones(n)) | {
+        "seconds": np.ones(n),
+        "guidance": np.ones(n),
+    }
     history["num_steps"] = np.ones(n, int)
     best = curves.pop("best_epoch", 5)
     tissue = vx.initialise.hexagonal(3, 4)

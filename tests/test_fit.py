@@ -307,7 +307,25 @@ def test_an_interrupt_keeps_what_there_is(hidden):
 
     problem = vx.InverseProblem(start, guess, VertexDistance(target))
     fit = vx.fit(problem, optax.adam(1e-2), 100, progress=False, callback=interrupt)
-    assert len(fit.history.cost) == 5
+    # Epoch 4 was not done.
+    assert len(fit.history.cost) == 4
+    assert fit.interrupted
+
+
+def test_an_interrupt_ends_a_least_squares_fit_too(hidden):
+    target, truth, guess, start = hidden
+
+    def interrupt(epoch, record):
+        if epoch == 3:
+            raise KeyboardInterrupt
+        return {"cost": record.cost}
+
+    problem = vx.InverseProblem(start, guess, VertexDistance(target))
+    fit = vx.fit(problem, LEAST_SQUARES, 12, truth=truth, progress=False, callback=interrupt)
+    assert fit.interrupted
+    np.testing.assert_array_equal(fit.notes["cost"], fit.history.cost)
+    assert len(fit.history.cost) == 3
+    assert fit.cost < 1e-2 * fit.history.cost[0]
 
 
 def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):

@@ -3,10 +3,10 @@ import vertax as vx
 # The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
 NAMES = """
 AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions
-AutomaticDifferentiation Equilibrium EquilibriumPropagation Fit FitError Free GradientOutcome History
-ImplicitDifferentiation InverseProblem MINRES Periodic T1 Tissue Topology Uncertainty adjoints costs
-energies equilibrate fit initialise io load_tissue plot_history plot_recovery plot_tissue plotting save_tissue
-solvers uncertainty
+AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation Fit FitError Free GradientOutcome
+History ImplicitDifferentiation InverseProblem MINRES Periodic Record T1 Tissue Topology Uncertainty adjoints
+animate costs energies equilibrate fit initialise io load_tissue plot_history plot_recovery plot_tissue
+plotting save_tissue solvers uncertainty
 """
 
 FAMILIES = {
@@ -23,7 +23,7 @@ FAMILIES = {
     "load_energy load_problem load_tissue load_trajectory read_image record_relaxation "
     "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
     "write_geojson write_vtk",
-    "plotting": "cell_polygons plot_history plot_recovery plot_tissue",
+    "plotting": "animate cell_polygons flipped_edges plot_history plot_recovery plot_tissue",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
 }
 

@@ -14,12 +14,14 @@ from vertax._boundary import (
     Free as Free,
     Periodic as Periodic,
 )
+from vertax._checkpoint import Checkpoint as Checkpoint
 from vertax._equilibrium import Equilibrium as Equilibrium, equilibrate as equilibrate
-from vertax._fit import (
+from vertax._fit import fit as fit
+from vertax._history import (
     Fit as Fit,
     FitError as FitError,
     History as History,
-    fit as fit,
+    Record as Record,
 )
 from vertax._inverse import InverseProblem as InverseProblem
 from vertax._tissue import Tissue as Tissue
@@ -39,6 +41,7 @@ from vertax.energies import (
 )
 from vertax.io import load_tissue as load_tissue, save_tissue as save_tissue
 from vertax.plotting import (
+    animate as animate,
     plot_history as plot_history,
     plot_recovery as plot_recovery,
     plot_tissue as plot_tissue,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -26,3 +27,8 @@ else:
 def is_concrete(value: Any) -> bool:
     """Whether the numbers of an array can be looked at (outside of `jax.jit` and `jax.grad`)."""
     return not isinstance(value, jax.core.Tracer)
+
+
+def without_addresses(text: str) -> str:
+    """A text in which no address of an object in memory is left, so that two processes write the same."""
+    return re.sub(r" at 0x[0-9a-f]+", "", text)

@@ -10,7 +10,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from vertax._fit import Fit
+from vertax._history import Fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.energies import AbstractEnergy

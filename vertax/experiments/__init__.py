@@ -20,5 +20,5 @@ from vertax.experiments._run import (
     RunFolderError as RunFolderError,
     UnfinishedRunError as UnfinishedRunError,
     installed_version as installed_version,
-    summary as summary,
 )
+from vertax.experiments._summary import summary as summary

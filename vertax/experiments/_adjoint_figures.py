@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from vertax._fit import Fit
+from vertax._history import Fit
 from vertax.experiments._figures import band, boxes, new_figure
 from vertax.experiments._scenes import pearson_of
 from vertax.plotting import _style

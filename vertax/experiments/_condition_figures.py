@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vertax.experiments import _figures
-from vertax.plotting import _style
+from vertax.plotting import _style, plot_tissue
+from vertax.plotting._tissue import draw_image
 
 _COLOURS = {"stiff": _style.SERIES[0], "fluid": _style.SERIES[1]}
 
@@ -74,13 +75,10 @@ def images(pictures: Mapping[str, tuple[np.ndarray, Any, Any]]) -> Figure:
             ax.set_axis_off()
         for k, (title, (pixels, found, outcome)) in enumerate(pictures.items()):
             raw, fitted = axes[k % 2, 2 * (k // 2) : 2 * (k // 2) + 2]
-            side = found.pixel_size * np.array(pixels.shape)
-            for ax in (raw, fitted):
-                ax.imshow(
-                    pixels, cmap="gray", extent=(0, side[1], side[0], 0), interpolation="nearest"
-                )
-            _figures.draw_membranes(fitted, outcome.tissue)
-            fitted.set(xlim=(0, side[1]), ylim=(side[0], 0))
+            draw_image(raw, pixels, found.pixel_size)
+            plot_tissue(
+                outcome.tissue, ax=fitted, image=pixels, pixel_size=found.pixel_size, linewidth=0.9
+            )
             raw.set_title(title)
             fitted.set_title("fitted mesh")
     return figure

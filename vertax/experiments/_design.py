@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
-import functools
 import os
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -15,14 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from pydantic import Field, model_validator
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
-from vertax._fit import Fit, History, Record, fit
+from vertax._history import Fit, History, Record
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
 from vertax.experiments._config import Section
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import stack
 from vertax.experiments._sections import Fitting
 
@@ -102,12 +102,19 @@ Measure = Callable[[InverseProblem, Tissue, PyTree], PyTree[Array]]
 
 
 def design(
-    problem: InverseProblem, fitting: Fitting, measure: Measure, *, progress: bool
+    folder: RunFolder,
+    name: str,
+    problem: InverseProblem,
+    fitting: Fitting,
+    measure: Measure,
+    *,
+    progress: bool,
 ) -> tuple[Fit, Tissue, PyTree[np.ndarray]]:
     """Fit, and measure something in each epoch.
 
     **Arguments:**
 
+    - `folder`, `name`: see `RunFolder.fit`.
     - `problem`: the inverse problem.
     - `fitting`: how it is fitted.
     - `measure`: a function of the problem, its tissue in equilibrium and the fitted leaves of the energy;
@@ -121,17 +128,26 @@ def design(
 
     - `FitError` if the fit cannot go on.
     """
-    rows: list[PyTree[np.ndarray]] = []
-    first: list[Tissue] = []
+    parameters = eqx.filter(problem.energy, problem.trainable)
+    example = eqx.filter_eval_shape(_measured, measure, problem, problem.tissue, parameters)
+    leaves, structure = jax.tree.flatten(problem.tissue)
 
-    def note(epoch: int, record: Record) -> None:
+    def note(epoch: int, record: Record) -> dict[str, Any]:
+        if folder.interrupted:  # Ctrl-C reaches one thread only
+            raise KeyboardInterrupt
         if epoch == 0:
-            first.append(record.tissue)
+            start = jax.tree.leaves(record.tissue)
+            folder.part(f"{name} start", lambda: _by_number(start))
         found = _measured(measure, problem, record.tissue, record.parameters)
-        rows.append(jax.tree.map(np.asarray, found))
+        return _by_number(jax.tree.leaves(found))
 
-    outcome = fit(problem, fitting.build(), fitting.epochs, progress=progress, callback=note)
-    return outcome, first[0], jax.tree.map(lambda *x: np.stack(x), *rows)
+    outcome = folder.fit(
+        name, problem, fitting.build(), fitting.epochs, progress=progress, callback=note
+    )
+    start = folder.part(f"{name} start", dict)
+    first = jax.tree.unflatten(structure, [jnp.asarray(start[str(i)]) for i in range(len(leaves))])
+    measured = [outcome.notes[str(i)] for i in range(len(outcome.notes))]
+    return outcome, first, jax.tree.unflatten(jax.tree.structure(example), measured)
 
 
 @eqx.filter_jit
@@ -142,7 +158,13 @@ def _measured(
 
 
 def designs(
-    problems: Sequence[InverseProblem], fitting: Fitting, measure: Measure, *, progress: bool
+    folder: RunFolder,
+    name: str,
+    problems: Sequence[InverseProblem],
+    fitting: Fitting,
+    measure: Measure,
+    *,
+    progress: bool,
 ) -> tuple[Fit, Tissue, PyTree[np.ndarray]]:
     """Fit problems of one shape side by side, one thread a core.
 
@@ -151,7 +173,7 @@ def designs(
 
     **Arguments:**
 
-    - `problems`, `fitting`, `measure`: see `design`.
+    - `folder`, `name`, `problems`, `fitting`, `measure`: see `design`.
     - `progress`: show a progress bar (only on a terminal).
 
     **Returns:** what `design` returns, as of a batch; seconds are those of all members, over the number
@@ -162,31 +184,46 @@ def designs(
     - `FitError` if a fit cannot go on.
     """
     threads = os.cpu_count() or 1
-    one = functools.partial(design, fitting=fitting, measure=measure, progress=False)
+
+    def one(k: int) -> tuple[Fit, Tissue, PyTree[np.ndarray]]:
+        return design(folder, f"{name} {k}", problems[k], fitting, measure, progress=False)
+
     with tqdm(total=len(problems), unit="fit", disable=None if progress else True) as bar:
-        found = [one(problems[0])]  # the first one compiles
+        found = [one(0)]  # the first one compiles
         bar.update()
         # What is compiled runs outside of Python's lock.
         with concurrent.futures.ThreadPoolExecutor(threads) as pool:
-            for each in pool.map(one, problems[1:]):
-                found.append(each)
-                bar.update()
+            try:
+                for each in pool.map(one, range(1, len(problems))):
+                    found.append(each)
+                    bar.update()
+            except KeyboardInterrupt:
+                folder.interrupted = True
+                raise
     outcomes, firsts, curves = zip(*found, strict=True)
     epochs = min(len(outcome.history.cost) for outcome in outcomes)
-    columns = [
-        np.stack([getattr(outcome.history, field.name)[:epochs] for outcome in outcomes], axis=1)
+    columns = {
+        field.name: [getattr(outcome.history, field.name)[:epochs] for outcome in outcomes]
         for field in dataclasses.fields(History)
-    ]
+    }
+    seconds, guidance = (np.stack(columns.pop(key)) for key in ("seconds", "guidance"))
+    stacked = {key: np.stack(column, axis=1) for key, column in columns.items()}
     batch = Fit(
         energy=stack([outcome.energy for outcome in outcomes]),
         tissue=stack([outcome.tissue for outcome in outcomes]),
         cost=jnp.stack([outcome.cost for outcome in outcomes]),
         max_force=jnp.stack([outcome.max_force for outcome in outcomes]),
         best_epoch=np.stack([outcome.best_epoch for outcome in outcomes]),
-        history=History(*columns[:-1], seconds=columns[-1].sum(axis=1) / threads),
+        history=History(**stacked, seconds=seconds.sum(axis=0) / threads, guidance=guidance[0]),
+        notes={},
+        interrupted=any(outcome.interrupted for outcome in outcomes),
     )
     measured = jax.tree.map(lambda *x: np.stack([y[:epochs] for y in x], axis=1), *curves)
     return batch, stack(firsts), measured
+
+
+def _by_number(leaves: Sequence[Array]) -> dict[str, np.ndarray]:
+    return {str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
 
 
 def member(tree: PyTree, index: int) -> Any:

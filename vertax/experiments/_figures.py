@@ -7,14 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from vertax._boundary import Periodic
-from vertax._fit import History
+from vertax._history import History
 from vertax._tissue import Tissue
 from vertax.plotting import _style, plot_history, plot_recovery, plot_tissue
+from vertax.plotting._tissue import draw_image
 
 Cells = Float[Array | np.ndarray, " cells"]
 
@@ -137,17 +136,17 @@ def overlays(
     **Returns:** the figure.
     """
     rows, columns = image.shape
-    extent = (0.0, columns * pixel_size, rows * pixel_size, 0.0)
-    dark, bright = np.percentile(image, [0.5, 99.8])
     with _style.house_style():
         figure, axes = new_figure(len(panels), width=2.6, height=2.6 * rows / columns + 0.2)
         for ax, (title, tissue) in zip(axes, panels.items(), strict=True):
-            ax.imshow(image, cmap="gray", vmin=dark, vmax=bright, extent=extent)
-            ax.set_axis_off()
+            if tissue is None:
+                draw_image(ax, image, pixel_size)
+                ax.set_axis_off()
+            else:
+                plot_tissue(tissue, ax=ax, image=image, pixel_size=pixel_size, linewidth=0.9)
             ax.set_title(title)
-            if tissue is not None:
-                draw_membranes(ax, tissue)
-            ax.set(xlim=extent[:2], ylim=extent[:1:-1] if upright else extent[2:])
+            if upright:
+                ax.invert_yaxis()
     return figure
 
 
@@ -179,30 +178,6 @@ def cells_on_image(
             tissue, values, ax=ax, mask=mask, image=image, pixel_size=pixel_size, label=label
         )
     return figure
-
-
-def draw_membranes(ax: Axes, tissue: Tissue, *, color: str = _style.HIGHLIGHT) -> None:
-    """All edges of a tissue as lines, in every periodic image that the axes show.
-
-    **Arguments:**
-
-    - `ax`: axes with limits set.
-    - `tissue`: the tissue.
-    - `color`: of the lines.
-    """
-    start, vector = (np.asarray(x, float) for x in tissue.edge_segments)
-    segments = np.stack([start, start + vector], axis=1)
-    if isinstance(tissue.boundary, Periodic):
-        # Each edge once with its middle in the home box, then the eight boxes around that.
-        lattice = np.asarray(tissue.boundary.lattice, float)
-        home = np.floor(segments.mean(axis=1) @ np.linalg.inv(lattice)) @ lattice
-        steps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) @ lattice
-        shifts = steps[:, None] - home
-        segments = (segments + shifts[:, :, None]).reshape(-1, 2, 2)
-    ax.add_collection(
-        LineCollection(list(segments), colors=color, linewidths=0.9, capstyle="round"),
-        autolim=False,
-    )
 
 
 def new_figure(

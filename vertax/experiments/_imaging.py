@@ -12,12 +12,13 @@ from pydantic import Field
 from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter, zoom
 
 from vertax._equilibrium import Equilibrium, equilibrate
-from vertax._fit import Fit, fit
+from vertax._history import Fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import MeshImage, mirror
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.experiments._config import Section
+from vertax.experiments._run import RunFolder
 from vertax.experiments._sections import Fitting, Relaxation
 from vertax.initialise import Cellpose, Segmentation, Watershed, from_labels, from_microscopy
 
@@ -85,11 +86,12 @@ class Reading(NamedTuple):
     problem: InverseProblem[Any]
     """The inverse problem, which starts from it."""
 
-    def fit(self, fitting: Fitting, *, progress: bool) -> Fit[Any]:
+    def fit(self, folder: RunFolder, name: str, fitting: Fitting, *, progress: bool) -> Fit[Any]:
         """Solve the inverse problem.
 
         **Arguments:**
 
+        - `folder`, `name`: see `RunFolder.fit`.
         - `fitting`: how.
         - `progress`: show a progress bar (only on a terminal).
 
@@ -99,7 +101,7 @@ class Reading(NamedTuple):
 
         - `FitError` if it cannot go on.
         """
-        return fit(self.problem, fitting.build(), fitting.epochs, progress=progress)
+        return folder.fit(name, self.problem, fitting.build(), fitting.epochs, progress=progress)
 
 
 def read(

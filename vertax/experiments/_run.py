@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib.metadata
 import json
-import math
 import os
 import platform
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import tomli_w
 from jaxtyping import Shaped
 from matplotlib.figure import Figure
 
-from vertax._fit import Fit, History
+from vertax._archive import read_archive, write_archive
+from vertax._checkpoint import Checkpoint
+from vertax._fit import fit
+from vertax._history import Fit
+from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
-from vertax.experiments._config import ExperimentConfig
+from vertax.experiments._config import ExperimentConfig, read_toml, validate
+from vertax.experiments._summary import plain
 from vertax.io import atomic_write, save_tissue
 
-CONFIG, METRICS = "config.toml", "metrics.json"
+CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
 # What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
-_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", "figures/*.png")
+_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", "figures/*.png", f"{PARTS}/*.npz")
 
 
 class RunFolderError(ValueError):
@@ -48,9 +53,12 @@ class RunFolder:
     """
 
     path: Path
+    interrupted: bool
+    """Whether an interrupt from the keyboard ended a fit of this run: no other one begins."""
 
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
+        self.interrupted = False
 
     @classmethod
     def claim(
@@ -118,6 +126,105 @@ class RunFolder:
                 f"{folder} is not the folder of a run: there is no {CONFIG} in it, which a run writes first."
             )
         return cls(folder)
+
+    @classmethod
+    def unfinished(cls, path: str | os.PathLike[str], config: ExperimentConfig) -> RunFolder:
+        """The folder of an earlier run that did not come to its end, to go on with it.
+
+        **Arguments:**
+
+        - `path`: the folder.
+        - `config`: the configuration, which must be that of the run.
+
+        **Returns:** the folder.
+
+        **Raises:**
+
+        - `RunFolderError` if it is not the folder of a run, if the run is finished, or if its
+            configuration is another one.
+        """
+        run = cls.existing(path)
+        if (run.path / METRICS).exists():
+            raise RunFolderError(
+                f"The run in {run.path} is finished: there is nothing to resume. To see what it found: "
+                f"vertax show {run.path}"
+            )
+        earlier = read_toml(run.path / CONFIG)
+        if earlier.get("experiment") != (config.model_dump().get("experiment")):
+            raise RunFolderError(
+                f"The run in {run.path} is one of the experiment {earlier.get('experiment')!r}. Give its "
+                f"own configuration: vertax run {run.path / CONFIG} --resume {run.path}"
+            )
+        then = validate(type(config), earlier, str(run.path / CONFIG))
+        if then != config:
+            changed = _changes(then.model_dump(mode="json"), config.model_dump(mode="json"))
+            raise RunFolderError(
+                f"The run in {run.path} has another configuration: {'; '.join(changed)}. Give its own, "
+                f"vertax run {run.path / CONFIG} --resume {run.path}, or begin a new run without --resume."
+            )
+        return run
+
+    def fit(
+        self, name: str, problem: InverseProblem[Any], optimiser: Any, epochs: int, **options: Any
+    ) -> Fit[Any]:
+        """Solve an inverse problem, with a checkpoint in this folder that a resumed run goes on from.
+
+        **Arguments:**
+
+        - `name`: of this fit; no other one of the run has it.
+        - `problem`, `optimiser`, `epochs`, `options`: as of [`fit`][vertax.fit].
+
+        **Returns:** the [`Fit`][vertax.Fit], also if it was interrupted; `interrupted` of the folder then
+        tells so.
+
+        **Raises:**
+
+        - `KeyboardInterrupt` if an earlier fit was interrupted, or this one before it had anything.
+        - others as [`fit`][vertax.fit].
+        """
+        if self.interrupted:
+            raise KeyboardInterrupt
+        checkpoint = Checkpoint(self._part(name))
+        outcome = fit(problem, optimiser, epochs, checkpoint=checkpoint, **options)
+        self.interrupted = outcome.interrupted
+        return outcome
+
+    def part(
+        self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
+    ) -> dict[str, Shaped[np.ndarray, "..."]]:
+        """Arrays that a resumed run does not compute again.
+
+        **Arguments:**
+
+        - `name`: of this part; no other part or fit of the run has it.
+        - `compute`: makes the arrays, by name.
+
+        **Returns:** the arrays.
+        """
+        file = self._part(name)
+        if not file.exists():
+            write_archive(file, "part", 1, compute())
+        arrays = read_archive(file, "part", 1)
+        return {key: array for key, array in arrays.items() if key not in ("format", "version")}
+
+    def parts(self) -> list[Path]:
+        """The fits and other parts that a resumed run goes on from.
+
+        **Returns:** the paths of their files, sorted by name.
+        """
+        return sorted(self.path.glob(f"{PARTS}/*.npz"))
+
+    def forget_parts(self) -> None:
+        """Remove them: the run is finished."""
+        for file in self.parts():
+            file.unlink()
+        with contextlib.suppress(OSError):  # not there, or a file of somebody else in it
+            (self.path / PARTS).rmdir()
+
+    def _part(self, name: str) -> Path:
+        folder = self.path / PARTS
+        folder.mkdir(exist_ok=True)
+        return folder / f"{re.sub('[^0-9A-Za-z.-]+', '_', name)}.npz"
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Write the resolved configuration, with every default spelled out.
@@ -194,7 +301,7 @@ class RunFolder:
             not have, become null.
         """
         with atomic_write(self.path / METRICS) as file:
-            json.dump(_plain(metrics), file, indent=2, allow_nan=False)
+            json.dump(plain(metrics), file, indent=2, allow_nan=False)
             file.write("\n")
 
     def metrics(self) -> dict[str, Any]:
@@ -213,7 +320,8 @@ class RunFolder:
         except FileNotFoundError:
             raise UnfinishedRunError(
                 f"The run in {self.path} is unfinished: it has no {METRICS}, which is written last. It is "
-                f"still going or it failed; to repeat it: vertax run {self.path / CONFIG}"
+                f"still going, it was interrupted or it failed; to go on: vertax run {self.path / CONFIG} "
+                f"--resume {self.path}"
             ) from None
         except ValueError as error:
             raise RunFolderError(f"{file} is no JSON ({error}).") from None
@@ -236,75 +344,6 @@ class RunFolder:
         return sorted(self.path.glob("figures/*.png"))
 
 
-def history_columns(history: History, **labels: str) -> dict[str, Any]:
-    """The columns of a table of the epochs of a fit.
-
-    **Arguments:**
-
-    - `history`: a [`History`][vertax.History].
-    - `labels`: columns of one repeated text each, to tell fits apart in one table.
-
-    **Returns:** the labels, the number of the epoch and every known curve of the history.
-    """
-    n = len(history.cost)
-    return {name: [text] * n for name, text in labels.items()} | {
-        "epoch": np.arange(n),
-        **history.columns(),
-    }
-
-
-def histories(outcome: Fit, labels: Sequence[dict[str, str]]) -> dict[str, Any]:
-    """The table of all epochs of a batch.
-
-    **Arguments:**
-
-    - `outcome`: the fit of the batch.
-    - `labels`: of each member, what tells it apart.
-
-    **Returns:** columns by name.
-    """
-    single = lambda k: jax.tree.map(lambda x: x[:, k] if x.ndim > 1 else x, outcome.history)
-    parts = [history_columns(single(k), **label) for k, label in enumerate(labels)]
-    names = [name for name in parts[0] if all(name in part for part in parts)]
-    return {name: np.concatenate([part[name] for part in parts]) for name in names}
-
-
-def joined(tables: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Tables one below the other, with the columns that all of them have.
-
-    **Arguments:**
-
-    - `tables`: columns by name.
-
-    **Returns:** columns by name.
-    """
-    names = [name for name in tables[0] if all(name in table for table in tables)]
-    return {name: np.concatenate([table[name] for table in tables]) for name in names}
-
-
-def fit_metrics(outcome: Fit) -> dict[str, Any]:
-    """What every fit has to tell.
-
-    **Arguments:**
-
-    - `outcome`: the fit.
-
-    **Returns:** costs, largest force, epochs, seconds and T1 transitions.
-    """
-    history = outcome.history
-    return {
-        "cost_initial": history.cost[0],
-        "cost_final": outcome.cost,
-        "max_force": outcome.max_force,
-        "epochs": len(history.cost),
-        "best_epoch": outcome.best_epoch,
-        # The first epoch is the one that is compiled.
-        "seconds_per_epoch": np.median(history.seconds[1:]) if len(history.cost) > 1 else np.nan,
-        "num_t1": history.num_t1.sum(),
-        "converged_fraction": history.converged.mean(),
-    }
-
-
 def installed_version(name: str) -> str:
     """Version of an installed package.
 
@@ -318,49 +357,6 @@ def installed_version(name: str) -> str:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return "(not installed)"
-
-
-def summary(metrics: Mapping[str, Any]) -> str:
-    """Metrics as text tables, one column for each group of them.
-
-    **Arguments:**
-
-    - `metrics`: numbers by name, or mappings of numbers by the name of the group; if there are
-        groups, other entries are left out.
-
-    **Returns:** the tables: groups that have names in common share one.
-    """
-    plain: dict[str, Any] = _plain(metrics)
-    groups = {"": plain} | {k: group for k, group in plain.items() if isinstance(group, dict)}
-    groups = {k: group for k, group in groups.items() if any(map(_is_number, group.values()))}
-    if len(groups) > 1:
-        groups.pop("", None)
-    return "\n\n".join(_table(alike) for alike in _alike(groups))
-
-
-def _alike(groups: Mapping[str, dict[str, Any]]) -> list[dict[str, dict[str, Any]]]:
-    """Groups that have names in common, which make one table each."""
-    tables: list[dict[str, dict[str, Any]]] = []
-    for label, group in groups.items():
-        own = {label: {name: value for name, value in group.items() if _is_number(value)}}
-        for table in tables:
-            if any(own[label].keys() & other.keys() for other in table.values()):
-                table |= own
-                break
-        else:
-            tables.append(own)
-    return tables
-
-
-def _table(groups: Mapping[str, dict[str, Any]]) -> str:
-    names = dict.fromkeys(name for group in groups.values() for name in group)
-    rows = [["", *groups]] if any(groups) else []
-    rows += [[name, *(_short(group.get(name)) for group in groups.values())] for name in names]
-    first, *others = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join([name.ljust(first), *map(str.rjust, entries, others)]) for name, *entries in rows
-    ]
-    return "\n".join(lines)
 
 
 def _numbered(path: Path) -> Path:
@@ -391,22 +387,10 @@ def _clear(folder: Path) -> None:
             file.unlink()
 
 
-def _plain(value: Any) -> Any:
-    """A value that strict JSON can hold."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):  # arrays and scalars of NumPy and JAX
-        return _plain(np.asarray(value).tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if _is_number(value) else ""
+def _changes(then: Any, now: Any, name: str = "") -> list[str]:
+    """What differs between two configurations, in words."""
+    if isinstance(then, Mapping) and isinstance(now, Mapping):
+        keys = dict.fromkeys([*then, *now])
+        inside = lambda key: f"{name}.{key}" if name else key
+        return [c for k in keys for c in _changes(then.get(k), now.get(k), inside(k))]
+    return [] if then == now else [f"`{name}` was {then!r} and is {now!r}"]

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from vertax._fit import Fit
+from vertax._history import Fit
 from vertax.experiments import _figures
 from vertax.experiments._scenes import Scene
 from vertax.plotting import _style

@@ -21,7 +21,7 @@ import optimistix as optx
 from pydantic import Field
 
 from vertax._equilibrium import equilibrate
-from vertax._fit import Fit, fit
+from vertax._history import Fit
 from vertax._inverse import InverseProblem
 from vertax.adjoints import (
     AbstractAdjoint,
@@ -33,7 +33,7 @@ from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
 from vertax.experiments import _adjoint_figures as figures
 from vertax.experiments._config import ExperimentConfig, Section
-from vertax.experiments._run import RunFolder, histories, joined
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import (
     Scene,
     ShapeFactors,
@@ -44,6 +44,7 @@ from vertax.experiments._scenes import (
     stack,
 )
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import histories, joined
 
 Method = Literal["AD", "Adj-ID", "Sen-ID", "EP"]
 _METHODS: tuple[Method, ...] = ("AD", "Adj-ID", "Sen-ID", "EP")
@@ -158,7 +159,8 @@ def _inference(config: Config, name: str, folder: RunFolder, progress: bool) -> 
     fits: dict[str, Fit] = {}
     for method in config.methods:
         problem = _problem(batch, protocol, method)
-        fits[method] = fit(
+        fits[method] = folder.fit(
+            f"{name} {method}",
             problem,
             protocol.fit.build(),
             protocol.fit.epochs,
@@ -167,12 +169,14 @@ def _inference(config: Config, name: str, folder: RunFolder, progress: bool) -> 
             progress=progress,
         )
     if name == "equilibrium" and config.least_squares_steps:
-        fits["LM"] = fit(
+        fits["LM"] = folder.fit(
+            f"{name} LM",
             _problem(batch, protocol, "Adj-ID"),
             optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12),
             config.least_squares_steps,
             truth=batch.truth,
             batched=True,
+            progress=progress,
         )
     true, initial = _shape_factors(batch.truth), _shape_factors(batch.guess)
     inferred = {method: _shape_factors(outcome.energy) for method, outcome in fits.items()}
@@ -397,7 +401,8 @@ def _beta_scan(config: Config, folder: RunFolder, progress: bool) -> dict[str, A
     fitted = {}
     for beta in config.accuracy.fitted_betas:
         protocol = config.paper.model_copy(update={"beta": beta})
-        outcome = fit(
+        outcome = folder.fit(
+            f"beta {beta:g}",
             _problem(batch, protocol, "EP"),
             protocol.fit.build(),
             protocol.fit.epochs,

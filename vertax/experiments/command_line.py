@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
+
+if TYPE_CHECKING:
+    from vertax.experiments import RunFolder
 
 # JAX and the experiments are imported by the commands that need them, so that help comes quickly.
 
 app = typer.Typer(
     help="A differentiable vertex model of epithelial tissue.",
-    epilog="Exit codes: 0 all went well, 1 the run failed or is unfinished, 2 wrong use.",
+    epilog="Exit codes: 0 all went well, 1 the run failed or is unfinished, 2 wrong use, 130 interrupted.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 
-USAGE, FAILURE = 2, 1
+USAGE, FAILURE, INTERRUPTED = 2, 1, 130
 
 
 def main() -> None:
@@ -89,6 +94,14 @@ def run(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
     ] = False,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Go on with the interrupted run in this folder: fits continue where they were, what is "
+            "no fit begins again.",
+        ),
+    ] = None,
     quiet: Annotated[
         bool, typer.Option("--quiet", help="Show no progress bar and no summary.")
     ] = False,
@@ -103,18 +116,32 @@ def run(
     from vertax import FitError
     from vertax.experiments import ConfigError, RunFolder, RunFolderError, load_config, summary
 
+    folder: RunFolder | None = None
     # Figures go to files only, also where there is a screen.
     matplotlib.use("Agg")
     try:
         experiment, settings = load_config(config, overrides or ())
         # The library leaves the precision of JAX to the user; here the configuration decides.
         jax.config.update("jax_enable_x64", settings.precision == "float64")
-        folder = RunFolder.claim(config.stem, output, overwrite=overwrite)
-        folder.save_config(settings)
+        if resume is None:
+            folder = RunFolder.claim(config.stem, output, overwrite=overwrite)
+            folder.save_config(settings)
+        elif output is not None or overwrite:
+            raise RunFolderError(
+                "--resume goes with neither --output nor --overwrite: leave them out."
+            )
+        else:
+            folder = RunFolder.unfinished(resume, settings)
         if not quiet:
-            typer.echo(f"{experiment.name}: {config} → {folder.path}")
+            typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
         metrics = experiment.run(settings, folder, progress=not quiet)
+        if folder.interrupted:
+            raise KeyboardInterrupt
         folder.save_metrics(metrics)
+        folder.forget_parts()
+    except KeyboardInterrupt:
+        typer.echo(_interrupted(config, overrides or (), folder), err=True)
+        raise typer.Exit(INTERRUPTED) from None
     # What a user can cause and mend gets a message; anything else is our fault, with a traceback.
     except (ConfigError, RunFolderError) as error:
         if debug:
@@ -154,6 +181,22 @@ def show(
             typer.echo(f"{title}:")
         for file in files:
             typer.echo(f"  {file}")
+
+
+def _found(folder: RunFolder) -> str:
+    """What a resumed run begins with."""
+    parts = folder.parts()
+    return f" (resumed; kept so far: {', '.join(part.stem for part in parts)})" if parts else ""
+
+
+def _interrupted(config: Path, overrides: Iterable[str], folder: RunFolder | None) -> str:
+    if folder is None:
+        return "Interrupted before the run began."
+    changes = "".join(f" --set {shlex.quote(override)}" for override in overrides)
+    command = (
+        f"vertax run {shlex.quote(str(config))}{changes} --resume {shlex.quote(str(folder.path))}"
+    )
+    return f"Interrupted. What there is lies in {folder.path}. To go on: {command}"
 
 
 def _stop(error: Exception, code: int) -> NoReturn:

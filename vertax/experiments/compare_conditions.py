@@ -20,7 +20,7 @@ from pydantic import Field
 from scipy.stats import mannwhitneyu
 
 from vertax._equilibrium import equilibrate
-from vertax._fit import FitError
+from vertax._history import FitError
 from vertax._tissue import Tissue
 from vertax._uncertainty import uncertainty
 from vertax.costs import MeshImage, render
@@ -131,7 +131,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
                 tissue, truth = _tissue(config, factors, draw)
                 noise = jax.random.fold_in(noise, snr_index)
                 pixels = _seen(tissue, config.microscope, snr, noise)
-                result = _infer(config, pixels, progress)
+                name = f"{kind} {number} SNR {snr:g}"
+                result = _infer(config, pixels, folder, name, progress)
                 if isinstance(result, str):
                     failures.append(f"{kind} {number}, SNR {snr:g}: {result}")
                     continue
@@ -200,7 +201,11 @@ def _seen(
 
 
 def _infer(
-    config: Config, pixels: Float[np.ndarray, "rows columns"], progress: bool
+    config: Config,
+    pixels: Float[np.ndarray, "rows columns"],
+    folder: RunFolder,
+    name: str,
+    progress: bool,
 ) -> tuple[Reading, Any, Float[np.ndarray, " cells"], int] | str:
     """From pixels to shape factors and their uncertainty; or what was in the way."""
     model = config.model
@@ -212,7 +217,7 @@ def _infer(
     except ValueError as error:
         return str(error)
     try:
-        outcome = reading.fit(config.fit, progress=progress)
+        outcome = reading.fit(folder, name, config.fit, progress=progress)
     except FitError as error:
         if error.fit is None:
             return str(error)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 from pydantic import Field
 
-from vertax._fit import Fit
+from vertax._history import Fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import AspectRatio, aspect_ratio
@@ -31,8 +31,9 @@ from vertax.experiments._design import (
     member,
     tensions,
 )
-from vertax.experiments._run import RunFolder, histories, joined
+from vertax.experiments._run import RunFolder
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import histories, joined
 from vertax.initialise import free_voronoi
 
 
@@ -91,7 +92,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     designs: dict[int, tuple[Fit, Fit, np.ndarray]] = {}
     tables: list[dict[str, Any]] = []
     for n_cells in config.n_cells:
-        designs[n_cells] = started, outcome, curves = _design(config, n_cells, progress)
+        designs[n_cells] = started, outcome, curves = _design(config, n_cells, folder, progress)
         labels = [
             {"n_cells": str(n_cells), "target": str(target), "replicate": str(k)}
             for target, k in _members(config)
@@ -109,7 +110,9 @@ def _members(config: Config) -> list[tuple[float, int]]:
     return [(target, k) for target in config.targets for k in range(config.replicates)]
 
 
-def _design(config: Config, n_cells: int, progress: bool) -> tuple[Fit, Fit, np.ndarray]:
+def _design(
+    config: Config, n_cells: int, folder: RunFolder, progress: bool
+) -> tuple[Fit, Fit, np.ndarray]:
     """The fits to the ratio at which designs start and to the targets; the ratios over epochs."""
     problems = []
     for key in keys_of(config.seed, config.replicates):
@@ -123,13 +126,15 @@ def _design(config: Config, n_cells: int, progress: bool) -> tuple[Fit, Fit, np.
                 **config.relaxation.options(),
             )
         )
-    started, *_ = designs(problems, config.start, _measure, progress=progress)
+    options: dict[str, Any] = {"progress": progress}
+    name = f"{n_cells} cells"
+    started, *_ = designs(folder, f"{name} first", problems, config.start, _measure, **options)
     bound = []
     for target, k in _members(config):
         tissue, energy = member((started.tissue, started.energy), k)
         replaced = (tissue, energy, AspectRatio(jnp.array(target), config.measure))
         bound.append(eqx.tree_at(lambda p: (p.tissue, p.energy, p.cost), problems[k], replaced))
-    outcome, _, curves = designs(bound, config.fit, _measure, progress=progress)
+    outcome, _, curves = designs(folder, name, bound, config.fit, _measure, **options)
     return started, outcome, curves
 
 

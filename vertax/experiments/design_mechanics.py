@@ -22,9 +22,10 @@ from vertax.experiments import _design_figures as figures
 from vertax.experiments._config import ExperimentConfig
 from vertax.experiments._design import Gradient, design, limits
 from vertax.experiments._figures import convergence
-from vertax.experiments._run import RunFolder, fit_metrics, history_columns
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import ShapeFactors, TissueSection
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import fit_metrics, history_columns
 from vertax.initialise import periodic_voronoi
 
 
@@ -79,7 +80,9 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         adjoint=config.gradient.build(),
         **config.relaxation.options(),
     )
-    outcome, initial, (observed, targets) = design(problem, config.fit, _measure, progress=progress)
+    outcome, initial, (observed, targets) = design(
+        folder, "design", problem, config.fit, _measure, progress=progress
+    )
     _save(initial, outcome, observed, targets, config, folder)
     mean, of_parameters = observed.mean(axis=1), targets.mean(axis=1)
     off = np.abs(mean - config.target)

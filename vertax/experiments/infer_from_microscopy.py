@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vertax._equilibrium import Equilibrium
-from vertax._fit import Fit, FitError
+from vertax._history import Fit, FitError
 from vertax._tissue import Tissue
 from vertax.costs import MeshImage
 from vertax.energies import ShapeFactorEnergy
@@ -30,8 +30,9 @@ from vertax.experiments._imaging import (
     pixel_of,
     read,
 )
-from vertax.experiments._run import RunFolder, fit_metrics, history_columns
+from vertax.experiments._run import RunFolder
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import fit_metrics, history_columns
 from vertax.initialise import Segmentation
 from vertax.io import read_image
 
@@ -100,7 +101,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     folder.save_tissue("initial", first.tissue)
     folder.save_array("image", seen)
     try:
-        outcome = reading.fit(config.fit, progress=progress)
+        outcome = reading.fit(folder, "fit", config.fit, progress=progress)
     except FitError as error:
         if error.fit is not None:
             folder.save_table("history", history_columns(error.fit.history))

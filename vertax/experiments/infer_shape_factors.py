@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
-from vertax._fit import Fit, FitError, fit
+from vertax._history import Fit, FitError
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import AbstractCost, MeshImage, VertexDistance, render
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.experiments import _figures
 from vertax.experiments._config import ExperimentConfig, Section
-from vertax.experiments._run import RunFolder, fit_metrics, history_columns
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import (
     Scene,
     ShapeFactors,
@@ -32,6 +32,7 @@ from vertax.experiments._scenes import (
     same_neighbours,
 )
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import fit_metrics, history_columns
 
 _NAME = r"$p_0$"
 _Image = Float[np.ndarray, "rows columns"] | None
@@ -97,7 +98,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     fits: dict[str, Fit] = {}
     for source in ("vertices", "image") if both else (config.data,):
         try:
-            fits[source] = _fit(config, scene, image, source, progress)
+            fits[source] = _fit(config, scene, image, source, folder, progress)
         except FitError as error:
             if error.fit is not None:
                 _save_tables(scene, fits | {source: error.fit}, folder)
@@ -140,7 +141,9 @@ def _make_scene(config: Config) -> tuple[Scene, _Image]:
     return scene, synthetic_image(scene.target, config.image, keys[3]) if needs_image else None
 
 
-def _fit(config: Config, scene: Scene, image: _Image, source: str, progress: bool) -> Fit:
+def _fit(
+    config: Config, scene: Scene, image: _Image, source: str, folder: RunFolder, progress: bool
+) -> Fit:
     cost: AbstractCost
     if source == "image":
         assert image is not None
@@ -156,8 +159,8 @@ def _fit(config: Config, scene: Scene, image: _Image, source: str, progress: boo
         fit_position=source == "image",
         **config.relaxation.options(),
     )
-    optimiser = config.fit.build()
-    return fit(problem, optimiser, config.fit.epochs, truth=scene.truth, progress=progress)
+    optimiser, epochs = config.fit.build(), config.fit.epochs
+    return folder.fit(source, problem, optimiser, epochs, truth=scene.truth, progress=progress)
 
 
 def _metrics(scene: Scene, outcome: Fit) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from scipy.optimize import lsq_linear
 
 from vertax._equilibrium import equilibrate
-from vertax._fit import Fit, FitError, fit
+from vertax._history import Fit, FitError
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax._uncertainty import uncertainty
@@ -31,9 +31,10 @@ from vertax.costs import AbstractLeastSquaresCost, EdgeDistance
 from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
 from vertax.experiments import _tension_figures as figures
 from vertax.experiments._config import ExperimentConfig, Section
-from vertax.experiments._run import RunFolder, fit_metrics, history_columns
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import pearson_of
 from vertax.experiments._sections import Relaxation
+from vertax.experiments._tables import fit_metrics, history_columns
 from vertax.initialise import Segmentation, free_voronoi, from_labels, labels_from_skeleton
 from vertax.io import read_image
 
@@ -164,7 +165,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     problem, balanced = problem_of(config, found)
     try:
         solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-        outcome = fit(problem, solver, config.epochs, progress=progress)
+        outcome = folder.fit("tensions", problem, solver, config.epochs, progress=progress)
     except FitError as error:
         if error.fit is not None:
             folder.save_table("history", history_columns(error.fit.history))

@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Int
 from pydantic import Field
 
 from vertax._equilibrium import equilibrate
-from vertax._fit import Fit, FitError, Record, fit
+from vertax._history import Fit, FitError, Record
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import (
@@ -32,9 +32,10 @@ from vertax.energies import ShapeFactorEnergy
 from vertax.experiments import _topology_figures as figures
 from vertax.experiments._config import ExperimentConfig, Section
 from vertax.experiments._design import Gradient, member
-from vertax.experiments._run import RunFolder, histories, joined
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import Scene, ShapeFactors, TissueSection, pearson_of, stack
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import histories, joined
 from vertax.initialise import periodic_voronoi
 
 
@@ -137,9 +138,12 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     fits: dict[str, Fit] = {}
     tables = []
     for method in config.methods:
-        outcome, watcher = _fit(config, method, batch, progress)
-        fits[method.name] = outcome
-        curves[method.name] = watcher.curves(outcome)
+        fits[method.name] = outcome = _fit(config, method, batch, folder, progress)
+        curves[method.name] = figures.Curves(
+            relative_error=outcome.history.relative_error,
+            pearson=outcome.notes["pearson"],
+            mismatched=outcome.notes["mismatched"],
+        )
         final = [
             mismatched_neighbours(member(outcome.tissue, k), s.target) for k, s in enumerate(scenes)
         ]
@@ -200,14 +204,12 @@ class _Watcher:
         self._true = np.asarray(batch.truth.target_shape_factor)
         self._targets = [member(batch.target, k) for k in range(len(self._true))]
         self._topology: list[tuple[np.ndarray, int] | None] = [None] * len(self._true)
-        self.pearson: list[np.ndarray] = []
-        self.mismatched: list[list[int]] = []
 
-    def __call__(self, epoch: int, record: Record) -> None:
+    def __call__(self, epoch: int, record: Record) -> dict[str, np.ndarray]:
         inferred = np.asarray(record.parameters.target_shape_factor)
-        self.pearson.append(pearson_of(self._true, inferred))
         cells = np.asarray(record.tissue.topology.cell)
-        self.mismatched.append([self._count(k, record, row) for k, row in enumerate(cells)])
+        mismatched = [self._count(k, record, row) for k, row in enumerate(cells)]
+        return {"pearson": pearson_of(self._true, inferred), "mismatched": np.asarray(mismatched)}
 
     def _count(self, k: int, record: Record, cells: np.ndarray) -> int:
         # Most epochs have no T1 transition, and the assignment of cells takes a while.
@@ -217,16 +219,8 @@ class _Watcher:
             self._topology[k] = known = (cells, count)
         return known[1]
 
-    def curves(self, outcome: Fit) -> figures.Curves:
-        return figures.Curves(
-            relative_error=outcome.history.relative_error,
-            pearson=np.asarray(self.pearson),
-            mismatched=np.asarray(self.mismatched),
-        )
 
-
-def _fit(config: Config, method: Method, batch: Scene, progress: bool) -> tuple[Fit, _Watcher]:
-    watcher = _Watcher(batch)
+def _fit(config: Config, method: Method, batch: Scene, folder: RunFolder, progress: bool) -> Fit:
     cost = eqx.filter_vmap(lambda target: _cost(method, target))(batch.target)
     problem = InverseProblem(
         batch.initial,
@@ -237,7 +231,8 @@ def _fit(config: Config, method: Method, batch: Scene, progress: bool) -> tuple[
     )
     guidance = config.guidance.schedule(config.tissue.n_cells) if method.guided else None
     try:
-        outcome = fit(
+        return folder.fit(
+            method.name,
             problem,
             config.fit.build(),
             config.fit.epochs,
@@ -245,13 +240,12 @@ def _fit(config: Config, method: Method, batch: Scene, progress: bool) -> tuple[
             guidance=guidance,
             batched=True,
             progress=progress,
-            callback=watcher,
+            callback=_Watcher(batch),
         )
     except FitError as error:
         if error.fit is None:
             raise
-        outcome = error.fit
-    return outcome, watcher
+        return error.fit
 
 
 def _summary_of_mismatch(counts: list[int], interfaces: int) -> dict[str, Any]:

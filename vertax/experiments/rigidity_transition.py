@@ -100,7 +100,10 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     transitions = options.pop("transitions")
     shape_factors = np.asarray(config.shape_factors)
 
-    def one(index: int) -> tuple[_Outcome, np.ndarray, np.ndarray]:
+    def one(index: int) -> dict[str, np.ndarray]:
+        return folder.part(f"p0 {shape_factors[index]:g}", lambda: compute(index))
+
+    def compute(index: int) -> dict[str, np.ndarray]:
         key = jax.random.fold_in(jax.random.key(config.seed), index)
         keys = jax.random.split(key, config.replicates + 1)
         n, steps = config.tissue.n_cells, config.tissue.lloyd_steps
@@ -112,7 +115,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         shapes = np.asarray(jax.vmap(lambda t: t.shape_factors)(outcome.tissue)).mean(axis=1)
         some = jax.tree.map(lambda x: x[: config.modes], outcome.tissue)
         modes = np.asarray(_zero_modes(some, p0), float) if config.modes else np.zeros(0)
-        return outcome, shapes, modes
+        outcomes = {name: np.asarray(getattr(outcome, name)) for name in _Outcome._fields[:-1]}
+        return outcomes | {"shapes": shapes, "modes": modes}
 
     # One thread a core: what is compiled runs outside of Python's lock. The first one compiles.
     indices = range(len(shape_factors))
@@ -121,23 +125,25 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     bar.update()
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         waiting = {pool.submit(one, index): index for index in indices[1:]}
-        for done in concurrent.futures.as_completed(waiting):
-            results[waiting[done]] = done.result()
-            bar.update()
+        try:
+            for done in concurrent.futures.as_completed(waiting):
+                results[waiting[done]] = done.result()
+                bar.update()
+        except KeyboardInterrupt:  # what is being computed is finished and kept, the rest not begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     bar.close()
-    outcomes, shapes, modes = zip(*(results[index] for index in indices), strict=True)
-    energies = np.stack([np.asarray(o.energy) for o in outcomes]) / config.tissue.n_cells
-    converged = np.stack([np.asarray(o.converged) for o in outcomes])
+    found = {name: np.stack([results[i][name] for i in indices]) for name in results[0]}
     return _report(
         config,
         folder,
-        energies,
-        converged,
-        np.stack(shapes),
-        np.stack(modes),
+        found["energy"] / config.tissue.n_cells,
+        found["converged"],
+        found["shapes"],
+        found["modes"],
         {
             "seconds": time.perf_counter() - began,
-            "num_t1": sum(int(o.num_t1.sum()) for o in outcomes),
+            "num_t1": int(found["num_t1"].sum()),
         },
     )
 

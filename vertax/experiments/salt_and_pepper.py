@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 from pydantic import Field
 
-from vertax._fit import Fit
+from vertax._history import Fit
 from vertax._inverse import InverseProblem
 from vertax._tissue import Tissue
 from vertax.costs import HomotypicLength
@@ -31,9 +31,10 @@ from vertax.experiments._design import (
     member,
     tensions,
 )
-from vertax.experiments._run import RunFolder, histories, joined
+from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import TissueSection
 from vertax.experiments._sections import Fitting, Relaxation
+from vertax.experiments._tables import histories, joined
 from vertax.initialise import free_voronoi, periodic_voronoi
 
 Boundary = Literal["periodic", "free"]
@@ -92,7 +93,9 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         for n_types in config.n_types:
             name = f"{boundary}, {n_types} types"
             problems = _problems(config, boundary, n_types)
-            outcome, first, curves = designs(problems, config.fit, _measure, progress=progress)
+            outcome, first, curves = designs(
+                folder, name, problems, config.fit, _measure, progress=progress
+            )
             shares[name] = curves
             labels = [
                 {"boundary": boundary, "n_types": str(n_types), "replicate": str(k)}

@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Array, Shaped
 
+from vertax._atomic import atomic_write
 from vertax._tissue import Tissue
-from vertax.io._atomic import atomic_write
 from vertax.plotting._polygons import Drawing
 
 Column: TypeAlias = Array | np.ndarray | Sequence[Any]

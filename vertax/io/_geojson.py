@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from vertax._atomic import atomic_write
 from vertax._tissue import Tissue
-from vertax.io._atomic import atomic_write
 from vertax.io._data_tables import Column, cell_columns, check_single, edge_columns
 from vertax.plotting._polygons import Drawing
 

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Shaped
 
-from vertax._fit import Record
+from vertax._archive import read_archive, write_archive
+from vertax._history import Record
 from vertax._tissue import Tissue
 from vertax._topology import Topology
-from vertax.io._archive import read_archive, write_archive
 from vertax.io._tissue_file import tissue_arrays, tissue_from
 
 _VERSION = 1

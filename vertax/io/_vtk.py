@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vertax._atomic import atomic_draft
 from vertax._tissue import Tissue
-from vertax.io._atomic import atomic_write
 from vertax.io._data_tables import Column, cell_columns, edge_columns
 from vertax.io._geojson import checked_drawing, edge_path
 
@@ -116,9 +115,5 @@ def _numbers(name: str, column: np.ndarray) -> np.ndarray:
 
 def _write(path: Path, mesh: Any) -> None:
     # meshio writes to a name and not to an open file.
-    with tempfile.TemporaryDirectory() as folder:
-        draft = Path(folder) / f"draft{path.suffix}"
+    with atomic_draft(path) as draft:
         mesh.write(draft)
-        content = draft.read_bytes()
-    with atomic_write(path, "wb") as file:
-        file.write(content)

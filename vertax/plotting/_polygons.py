@@ -21,6 +21,8 @@ class Drawing(eqx.Module):
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
     - `points_per_arc`: number of straight pieces that an arc is drawn in.
+    - `near`: if given, periodic cells are placed as near as can be to these points, and not in the home
+        box: in an animation, to where they were.
     """
 
     lines: Float[np.ndarray, "halfedges points 2"]
@@ -33,27 +35,39 @@ class Drawing(eqx.Module):
     half_edge: Int[np.ndarray, " edges"]
     edge: Int[np.ndarray, " halfedges"]
     n_cells: int
+    n_edges: int
     centroids: Float[np.ndarray, "cells 2"]
     """Of the cells, where they are drawn."""
     cell_size: float
     """Root of the mean area."""
     box: Float[np.ndarray, "5 2"] | None
     """Outline of the periodic box, closed; None without one."""
+    lattice: Float[np.ndarray, "2 2"] | None
+    """Its sides."""
 
-    def __init__(self, tissue: Tissue, points_per_arc: int = _POINTS_PER_ARC):
+    def __init__(
+        self,
+        tissue: Tissue,
+        points_per_arc: int = _POINTS_PER_ARC,
+        near: Float[np.ndarray, "cells 2"] | None = None,
+    ):
         m = tissue.topology
         geometry = (np.asarray(x) for x in _geometry(tissue, points_per_arc))
         lines, centroids, areas, following = geometry
         image = np.zeros((m.n_faces, 2), int)
         shift = np.zeros((m.n_faces, 2))
-        self.box = None
+        self.box = self.lattice = None
         if isinstance(tissue.boundary, Periodic):
-            lattice = np.asarray(tissue.boundary.lattice, float)
+            self.lattice = lattice = np.asarray(tissue.boundary.lattice, float)
             fractions = centroids.astype(float) @ np.linalg.inv(lattice)
             # The margin keeps a centroid on the side of the box (a regular lattice, say) from
             # jumping to the other side by rounding. A cell of area 0 has no centroid and stays put.
             fractions = np.nan_to_num(fractions, posinf=0, neginf=0)
             image = -np.floor(fractions + 1e-6).astype(int)
+            if near is not None:
+                image[: tissue.n_cells] = np.rint(
+                    near @ np.linalg.inv(lattice) - fractions[: tissue.n_cells]
+                )
             shift = image @ lattice
             first, second = lattice
             self.box = np.stack([0 * first, first, first + second, second, 0 * first])
@@ -61,6 +75,7 @@ class Drawing(eqx.Module):
         self.lines = lines.astype(float) + shift[self.cell][:, None]
         self.image = np.asarray(m.frame) + image[self.cell]
         self.n_cells = tissue.n_cells
+        self.n_edges = tissue.n_edges
         self.centroids = centroids.astype(float) + shift[: tissue.n_cells]
         self.following = following
         self.twin = np.asarray(m.twin)

@@ -18,6 +18,8 @@ INK = "0.15"
 """Cell outlines and text."""
 HIGHLIGHT = "#ffb000"
 """Membranes over a grey image."""
+MARK = "#e8308a"
+"""Marked edges: not in viridis, not in inferno, and no grey."""
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 """Blue, vermilion, green, purple of Okabe and Ito, told apart with any colour vision."""
 

@@ -6,6 +6,7 @@ import contextlib
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -72,6 +73,26 @@ def atomic_write(
         temporary.unlink(missing_ok=True)
         raise
     _sync_folder(folder)
+
+
+@contextlib.contextmanager
+def atomic_draft(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A file that another program writes, and that appears under its name only once it is complete.
+
+    **Arguments:**
+
+    - `path`: the file to write.
+
+    **Returns:** a context manager that gives the path of a draft with the same ending.
+
+    **Raises:** as `atomic_write`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder) / f"draft{Path(path).suffix}"
+        with atomic_write(path, "wb") as file:  # what is wrong with `path` shows before the work
+            yield draft
+            with draft.open("rb") as content:
+                shutil.copyfileobj(content, file)
 
 
 def _sync_folder(folder: Path) -> None:

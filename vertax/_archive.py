@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Shaped
 
-from vertax.io._atomic import atomic_write
+from vertax._atomic import atomic_write
 
 
 def write_archive(

@@ -1,0 +1,321 @@
+"""Tissues that move."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, SupportsFloat, TypeAlias
+
+import numpy as np
+from jaxtyping import Array, Bool, Real
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from PIL import Image
+
+from vertax._atomic import atomic_draft
+from vertax._tissue import Tissue
+from vertax.plotting import _style
+from vertax.plotting._polygons import Drawing
+from vertax.plotting._tissue import Colours, colour_map, draw, line_width, size_of, view_of
+
+CellValues: TypeAlias = (
+    Callable[[Tissue], Real[Array | np.ndarray, " cells"]]
+    | Real[Array | np.ndarray, "frames cells"]
+)
+
+
+def animate(
+    trajectory: Sequence[Tissue],
+    path: str | os.PathLike[str],
+    cells: CellValues | None = None,
+    *,
+    fps: SupportsFloat = 10.0,
+    mark_t1: int = 6,
+    cmap: str | Colormap = "viridis",
+    vmin: SupportsFloat | None = None,
+    vmax: SupportsFloat | None = None,
+    label: str | None = None,
+    captions: Sequence[str] | None = None,
+    linger: SupportsFloat = 1.5,
+    dpi: int = 120,
+) -> None:
+    """Draw a trajectory as an animation, one picture a frame.
+
+    The part of the plane that is shown and the limits of the colours are the same in all frames. Edges that
+    have just flipped (T1 transitions) are marked.
+
+    ```python
+    _, way = vx.io.record_relaxation(tissue, energy)
+    vx.animate(way, "relaxation.gif", lambda t: t.shape_factors, label="shape factor")
+    ```
+
+    **Arguments:**
+
+    - `trajectory`: the tissues, of one size: a [`Trajectory`][vertax.io.Trajectory] of a relaxation or of
+        a fit, or a list.
+    - `path`: the file, which is complete or not there at all: a GIF if it ends in `.gif`; a film if it ends
+        in `.mp4`, for which Matplotlib has to find the program ffmpeg.
+    - `cells`: the value of each cell: a function of the tissue, or an array of shape `(frames, cells)`.
+        Left out: pale faces.
+    - `fps`: frames a second.
+    - `mark_t1`: for how many frames edges that have flipped are marked; 0 is not at all.
+    - `cmap`, `label`: colour map of the cells, and label of its bar.
+    - `vmin`, `vmax`: limits of the colours; by default those of all frames together.
+    - `captions`: a text above each frame.
+    - `linger`: seconds that the last frame stays.
+    - `dpi`: pixels an inch; the tissue is about three inches wide.
+
+    **Raises:**
+
+    - `ValueError`, naming the argument, for no frame or frames of different sizes, values or captions that
+        do not go with the frames, `fps` or `dpi` that are not positive, or a path of another kind.
+    - `RuntimeError` for a film without ffmpeg.
+    - `OSError` if the file cannot be written.
+    """
+    frames = list(trajectory)
+    fps, linger = float(fps), float(linger)
+    _check(frames, fps, mark_t1, captions, linger, dpi)
+    write = _writer(path)
+    values = _cell_values(cells, frames)
+    pictures = _pictures(
+        frames, values, _limits(values, vmin, vmax), cmap, label, captions, mark_t1, dpi
+    )
+    with atomic_draft(path) as draft:
+        write(draft, pictures, fps, linger)
+
+
+def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
+    """Edges that lie between other cells than before: those of T1 transitions.
+
+    ```python
+    vx.plot_tissue(after, highlight=vx.plotting.flipped_edges(before, after))
+    ```
+
+    **Arguments:**
+
+    - `before`, `after`: two states of one tissue.
+
+    **Returns:** a boolean for each edge.
+
+    **Raises:**
+
+    - `ValueError` if they differ in size.
+    """
+    if before.n_edges != after.n_edges or before.n_cells != after.n_cells:
+        raise ValueError(
+            "Argument `after` must be another state of the same tissue, but has "
+            f"{after.n_cells} cells and {after.n_edges} edges instead of {before.n_cells} and "
+            f"{before.n_edges}."
+        )
+    then, now = (np.sort(np.asarray(t.topology.edge_cells), axis=1) for t in (before, after))
+    return np.any(then != now, axis=1)
+
+
+def _check(
+    frames: list[Tissue],
+    fps: float,
+    mark_t1: int,
+    captions: Sequence[str] | None,
+    linger: float,
+    dpi: int,
+) -> None:
+    if not frames:
+        raise ValueError("Argument `trajectory` must have at least one frame, but is empty.")
+    sizes = {tissue.vertices.shape for tissue in frames}
+    if len(sizes) > 1 or frames[0].vertices.ndim != 2:
+        raise ValueError(
+            "Argument `trajectory` must hold single tissues of one size, but their vertices have the "
+            f"shapes {sorted(sizes)}."
+        )
+    for name, value in (("fps", fps), ("dpi", dpi)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+    for name, value in (("mark_t1", mark_t1), ("linger", linger)):
+        if not value >= 0:
+            raise ValueError(f"Argument `{name}` must not be negative, but is {value}.")
+    if captions is not None and len(captions) != len(frames):
+        raise ValueError(
+            f"Argument `captions` must have one text for each of the {len(frames)} frames, but has "
+            f"{len(captions)}."
+        )
+
+
+def _cell_values(cells: CellValues | None, frames: list[Tissue]) -> np.ndarray | None:
+    if cells is None:
+        return None
+    if callable(cells):
+        values = np.stack([np.asarray(cells(tissue), float) for tissue in frames])
+    else:
+        values = np.asarray(cells, float)
+    wanted = (len(frames), frames[0].n_cells)
+    if values.shape != wanted:
+        raise ValueError(
+            f"Argument `cells` must give one value for each frame and cell, shape {wanted}, but gives "
+            f"{values.shape}."
+        )
+    return values
+
+
+def _limits(
+    values: np.ndarray | None, vmin: SupportsFloat | None, vmax: SupportsFloat | None
+) -> tuple[float, float]:
+    finite = np.zeros(0) if values is None else values[np.isfinite(values)]
+    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+    return float(low if vmin is None else vmin), float(high if vmax is None else vmax)
+
+
+def _marks(frames: list[Tissue], duration: int) -> Iterator[np.ndarray]:
+    """Edges to mark in each frame: those that flipped in the last few."""
+    left = np.zeros(frames[0].n_edges, int)
+    for before, after in zip([frames[0], *frames], frames, strict=False):
+        left = np.where(flipped_edges(before, after), duration, np.maximum(left - 1, 0))
+        yield left > 0
+
+
+def _pictures(
+    frames: list[Tissue],
+    values: np.ndarray | None,
+    limits: tuple[float, float],
+    cmap: str | Colormap,
+    label: str | None,
+    captions: Sequence[str] | None,
+    mark_t1: int,
+    dpi: int,
+) -> Iterator[np.ndarray]:
+    """Pixels of each frame, all of one size."""
+    drawings = _placed(frames)
+    views = [view_of(drawing.polygons()[0], drawing.box) for drawing in drawings]
+    low, high = np.min([v[0] for v in views], axis=0), np.max([v[1] for v in views], axis=0)
+    with _style.house_style():
+        figure, ax = _figure(high - low, values is not None, captions is not None, dpi)
+        if values is not None:
+            scale = ScalarMappable(Normalize(*limits), colour_map(cmap))
+            bar = figure.colorbar(scale, ax=ax, aspect=22, shrink=0.9, label=label or "")
+            bar.outline.set_linewidth(0.4)
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        width = line_width(drawings[0], ax)
+    colours = Colours(cmap, *limits)
+    for k, (drawing, marked) in enumerate(zip(drawings, _marks(frames, mark_t1), strict=True)):
+        ax.clear()
+        own = None if values is None else values[k]
+        with _style.house_style():
+            draw(
+                drawing,
+                own,
+                ax=ax,
+                highlight=marked,
+                cell_colours=colours,
+                colorbar=False,
+                linewidth=width,
+            )
+            ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+            if captions is not None:
+                ax.set_title(captions[k])
+            yield _pixels(figure)
+
+
+def _placed(frames: list[Tissue]) -> list[Drawing]:
+    """The drawings of all frames, in which no cell jumps from one side of a periodic box to the other."""
+    drawings: list[Drawing] = []
+    for tissue in frames:
+        near = drawings[-1].centroids if drawings else None
+        drawings.append(Drawing(tissue, near=near))
+    return drawings
+
+
+def _figure(extent: np.ndarray, bar: bool, caption: bool, dpi: int) -> tuple[Figure, Axes]:
+    width, height = size_of(extent)
+    layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04)
+    size = (width + 0.8 * bar + 0.1, height + 0.25 * caption + 0.1)
+    figure = Figure(figsize=size, dpi=dpi, layout=layout)
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots()
+
+
+def _pixels(figure: Figure) -> np.ndarray:
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    # Films are made of blocks of two by two.
+    rows, columns = (2 * (n // 2) for n in pixels.shape[:2])
+    return pixels[:rows, :columns].copy()
+
+
+_Write: TypeAlias = Callable[[Path, Iterator[np.ndarray], float, float], None]
+
+
+def _writer(path: str | os.PathLike[str]) -> _Write:
+    ending = Path(path).suffix.lower()
+    writers: dict[str, _Write] = {".gif": _write_gif, ".mp4": _write_film}
+    if ending not in writers:
+        raise ValueError(
+            f"Argument `path` must end in {' or '.join(writers)}, but is {os.fspath(path)!r}."
+        )
+    if ending == ".mp4":
+        _check_ffmpeg()
+    return writers[ending]
+
+
+def _check_ffmpeg() -> None:
+    from matplotlib.animation import FFMpegWriter  # here: only films need it
+
+    if not FFMpegWriter.isAvailable():
+        raise RuntimeError(
+            "Cannot write a film: Matplotlib finds no program ffmpeg. Install ffmpeg, or set "
+            'matplotlib.rcParams["animation.ffmpeg_path"] to where it is, or write a GIF (a path that ends '
+            "in .gif)."
+        )
+
+
+def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: float) -> None:
+    images = [Image.fromarray(pixels) for pixels in pictures]
+    palette = _palette(images)
+    indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    # The format counts in hundredths of a second, and viewers slow down what is shorter than two.
+    frame = 10 * max(2, round(100 / fps))
+    durations = [frame] * (len(images) - 1) + [frame + round(1000 * linger)]
+    first, *others = indexed
+    first.save(
+        path, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=True
+    )
+
+
+def _palette(images: list[Image.Image]) -> Image.Image:
+    """One palette for all frames: with one each, colours that stand still would flicker."""
+    some = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), 8)).astype(int)]
+    montage = np.concatenate([np.asarray(image) for image in some])
+    frequent = Image.fromarray(montage).quantize(250, Image.Quantize.MEDIANCUT)
+    colours = np.reshape(frequent.getpalette() or [], (-1, 3))
+    # The paper is white and nothing near it, and marks keep their colour, however small they are.
+    sure = np.array([to_rgb("white"), to_rgb(_style.MARK)]) * 255
+    away = np.abs(colours[:, None] - sure).max(axis=-1).min(axis=-1)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate([colours[away > 8], sure]).astype(np.uint8).tobytes())
+    palette.load()
+    return palette
+
+
+def _write_film(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: float) -> None:
+    from matplotlib.animation import FFMpegWriter
+
+    first = next(pictures)
+    rows, columns = first.shape[:2]
+    figure = Figure(figsize=(columns / 100, rows / 100), dpi=100)
+    FigureCanvasAgg(figure)
+    shown = figure.figimage(first)
+    # A pixel format that every player knows.
+    rate: Any = fps  # ffmpeg takes any number
+    writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "18"])
+    with writer.saving(figure, str(path), 100):
+        writer.grab_frame()
+        for pixels in pictures:
+            shown.set_data(pixels)
+            writer.grab_frame()
+        for _ in range(round(linger * fps)):
+            writer.grab_frame()
