@@ -14,7 +14,7 @@ import numpy as np
 import optax
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from vertax._equilibrium import Equilibrium
 from vertax._inverse import Energy, InverseProblem
