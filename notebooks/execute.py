@@ -18,7 +18,10 @@ def execute(path: Path, timeout: int) -> NotebookNode:
     """The notebook, executed from its first cell to its last in a process of its own."""
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(
-        notebook, timeout=timeout, resources={"metadata": {"path": str(FOLDER)}}
+        notebook,
+        timeout=timeout,
+        resources={"metadata": {"path": str(FOLDER)}},
+        extra_arguments=["--log-level=40"],  # errors, and no warnings
     )
     client.execute()
     return tidied(notebook)
