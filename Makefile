@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint format types docs benchmark build clean
+.PHONY: help demo test test-slow notebooks notebooks-write lint format types docs benchmark build clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 22
@@ -27,6 +27,12 @@ test: $(VENV)/.dev ## the tests that run on every change
 
 test-slow: $(VENV)/.dev ## the longer scientific checks
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m slow $(PYTEST_OPTIONS)
+
+notebooks: $(VENV)/.dev ## execute the notebooks, shortened; their outputs stay as they are
+	$(BIN)/python notebooks/execute.py --light
+
+notebooks-write: $(VENV)/.dev ## execute the notebooks in full and keep the outputs
+	$(BIN)/python notebooks/execute.py --write
 
 lint: $(VENV)/.dev ## style and format
 	$(BIN)/ruff check .

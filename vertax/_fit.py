@@ -14,7 +14,7 @@ import numpy as np
 import optax
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Int, PyTree
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from vertax._checkpoint import Checkpoint, Keeper, Progress, Row, columns_of, identity_of
 from vertax._descent import Descent

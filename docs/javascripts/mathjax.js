@@ -1,8 +1,10 @@
+// Of a page, only what the build marked as mathematics; of a notebook, what stands between dollar signs.
+const notebook = document.querySelector(".jupyter-wrapper") !== null;
 window.MathJax = {
   tex: {
-    inlineMath: [["\\(", "\\)"]],
-    displayMath: [["\\[", "\\]"]],
+    inlineMath: [notebook ? ["$", "$"] : ["\\(", "\\)"]],
+    displayMath: [notebook ? ["$$", "$$"] : ["\\[", "\\]"]],
     processEscapes: true,
   },
-  options: { ignoreHtmlClass: ".*|", processHtmlClass: "arithmatex" },
+  options: notebook ? {} : { ignoreHtmlClass: ".*|", processHtmlClass: "arithmatex" },
 };

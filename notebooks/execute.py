@@ -1,0 +1,65 @@
+"""Execute the notebooks: `python notebooks/execute.py --help`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+from nbformat import NotebookNode
+
+FOLDER = Path(__file__).resolve().parent
+
+
+def execute(path: Path, timeout: int) -> NotebookNode:
+    """The notebook, executed from its first cell to its last in a process of its own."""
+    notebook = nbformat.read(path, as_version=4)
+    client = NotebookClient(
+        notebook,
+        timeout=timeout,
+        resources={"metadata": {"path": str(FOLDER)}},
+        extra_arguments=["--log-level=40"],  # errors, and no warnings
+    )
+    client.execute()
+    return tidied(notebook)
+
+
+def tidied(notebook: NotebookNode) -> NotebookNode:
+    """Without what differs from run to run or from machine to machine, so that changes show."""
+    notebook.metadata = NotebookNode(
+        kernelspec={"display_name": "Python 3", "language": "python", "name": "python3"},
+        language_info={"name": "python"},
+    )
+    for number, cell in enumerate(notebook.cells, start=1):
+        cell.id = f"cell-{number:02d}"
+        cell.metadata = NotebookNode()
+    return notebook
+
+
+def main() -> None:
+    """Execute some notebooks, or all; the first error ends it."""
+    parser = argparse.ArgumentParser(description="Execute the notebooks.")
+    parser.add_argument("notebooks", nargs="*", type=Path, help="which ones; all by default")
+    parser.add_argument("--light", action="store_true", help="fewer epochs, smaller tissues")
+    parser.add_argument("--write", action="store_true", help="keep the outputs in the notebooks")
+    parser.add_argument("--timeout", type=int, default=600, help="seconds for a cell, at most")
+    options = parser.parse_args()
+    if options.light and options.write:
+        parser.error("the outputs that are kept are those of the full setting")
+    if options.light:
+        os.environ["VERTAX_LIGHT"] = "1"
+    else:
+        os.environ.pop("VERTAX_LIGHT", None)
+    for path in options.notebooks or sorted(FOLDER.glob("*.ipynb")):
+        began = time.perf_counter()
+        notebook = execute(path, options.timeout)
+        print(f"{path.name}: {time.perf_counter() - began:.0f} s", flush=True)
+        if options.write:
+            nbformat.write(notebook, path)
+
+
+if __name__ == "__main__":
+    main()
