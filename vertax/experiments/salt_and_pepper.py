@@ -63,7 +63,7 @@ class Config(ExperimentConfig):
     """Share of the range of tensions that the first ones are drawn from; 0: all are equal."""
     gradient: Gradient = Gradient()
     """How gradients are taken."""
-    fit: Fitting = Fitting(learning_rate=0.1, epochs=60)
+    fit: Fitting = Fitting(learning_rate=0.1, epochs=150)
     """How the tensions (their logits) are fitted."""
     relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=300)
     """How the tissue is relaxed."""
