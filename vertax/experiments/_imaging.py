@@ -67,7 +67,7 @@ class Model(Section):
     rest_areas: Literal["fitted", "observed", "equal"] = "fitted"
     """Rest areas of the cells: fitted too, beginning with those of the segmented cells; as those are;
     or the mean area in all cells but those that the border cuts, which determines shape factors best
-    where it is true (and is what a pinned border goes with)."""
+    where it is true. A pinned border goes with equal ones, whatever is said here."""
 
 
 class Reading(NamedTuple):
@@ -159,10 +159,29 @@ class BorderedEnergy(AbstractEnergy):
     log_border_area: Float[Array, " cells"]
     inner: Bool[np.ndarray, " cells"]
 
+    @property
+    def mean_area(self) -> Float[Array, " cells"]:
+        """Rest areas."""
+        return jnp.where(self.inner, 1.0, jnp.exp(self.log_border_area))
+
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The energy."""
-        areas = jnp.where(self.inner, 1.0, jnp.exp(self.log_border_area))
-        return ShapeFactorEnergy(self.target_shape_factor, areas)(tissue)
+        return ShapeFactorEnergy(self.target_shape_factor, self.mean_area)(tissue)
+
+
+def parameters_of(
+    energy: AbstractEnergy,
+) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
+    """What was fitted to an image.
+
+    **Arguments:**
+
+    - `energy`: of a fit of a `Reading`.
+
+    **Returns:** target shape factor and rest area of each cell.
+    """
+    assert isinstance(energy, ShapeFactorEnergy | BorderedEnergy)
+    return np.asarray(energy.target_shape_factor, float), np.asarray(energy.mean_area, float)
 
 
 def _read_pinned(

@@ -3,8 +3,8 @@
 The image is segmented into cells, the cells become a mesh, the mesh a model tissue in mechanical
 equilibrium; then target shape factor and rest area of every cell are adjusted until the edges of the
 relaxed tissue, blurred as by a microscope, match the image (paper, "Inference of mechanical parameters
-from microscopy image"). The image is mirrored to make it periodic, and only whole cells of the original
-are reported.
+from microscopy image"). The image is mirrored to make it periodic, as in the paper, and whole cells of the
+original are reported; or the outline of its whole cells is pinned (`model.border`), and those within are.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from vertax._equilibrium import Equilibrium
 from vertax._history import Fit, FitError
 from vertax._tissue import Tissue
 from vertax.costs import MeshImage
-from vertax.energies import ShapeFactorEnergy
 from vertax.experiments import _figures
 from vertax.experiments._config import ConfigError, ExperimentConfig
 from vertax.experiments._imaging import (
@@ -27,6 +26,7 @@ from vertax.experiments._imaging import (
     Preparation,
     SegmentationSection,
     correlation,
+    parameters_of,
     pixel_of,
     read,
 )
@@ -96,7 +96,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         config.model,
         config.relaxation,
     )
-    found, _, seen, width, first, problem = reading
+    found, whole, seen, width, first, problem = reading
     folder.save_tissue("target", found.tissue)
     folder.save_tissue("initial", first.tissue)
     folder.save_array("image", seen)
@@ -109,10 +109,10 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         raise
     folder.save_tissue("fitted", outcome.tissue)
     folder.save_table("history", history_columns(outcome.history))
-    folder.save_table("cells", _cell_table(found, outcome))
-    _draw(found, np.asarray(pixels, float), first.tissue, outcome, folder)
+    folder.save_table("cells", _cell_table(found, whole, outcome))
+    _draw(found, whole, np.asarray(pixels, float), first.tissue, outcome, folder)
     assert isinstance(problem.cost, MeshImage)
-    return _metrics(found, seen, problem.cost, first, outcome, width)
+    return _metrics(found, whole, seen, problem.cost, first, outcome, width)
 
 
 def _membrane_contrast(
@@ -132,15 +132,15 @@ def _membrane_contrast(
 
 def _metrics(
     found: Segmentation,
+    whole: Bool[np.ndarray, " cells"],
     seen: Float[np.ndarray, "rows columns"],
     cost: MeshImage,
     first: Equilibrium,
     outcome: Fit,
     width: float,
 ) -> dict[str, Any]:
-    whole = np.asarray(found.whole)
     meshes = {"segmented": found.tissue, "initial": first.tissue, "fitted": outcome.tissue}
-    factors = _shape_factors(outcome)[whole]
+    factors = parameters_of(outcome.energy)[0][whole]
     metrics: dict[str, Any] = {}
     for name, tissue in meshes.items():
         metrics[f"correlation_{name}"] = correlation(cost, tissue)
@@ -161,20 +161,16 @@ def _metrics(
     }
 
 
-def _shape_factors(outcome: Fit) -> Float[np.ndarray, " cells"]:
-    assert isinstance(outcome.energy, ShapeFactorEnergy)
-    return np.asarray(outcome.energy.target_shape_factor, float)
-
-
-def _cell_table(found: Segmentation, outcome: Fit) -> dict[str, np.ndarray]:
+def _cell_table(
+    found: Segmentation, whole: Bool[np.ndarray, " cells"], outcome: Fit
+) -> dict[str, np.ndarray]:
     """One row a whole cell of the original image."""
-    assert isinstance(outcome.energy, ShapeFactorEnergy)
-    whole: Bool[np.ndarray, " cells"] = np.asarray(found.whole)
-    tissue, energy = outcome.tissue, outcome.energy
+    tissue = outcome.tissue
+    shape_factors, rest_areas = parameters_of(outcome.energy)
     columns = {
         "label": found.labels,
-        "target_shape_factor": energy.target_shape_factor,
-        "rest_area": energy.mean_area,
+        "target_shape_factor": shape_factors,
+        "rest_area": rest_areas,
         "shape_factor": tissue.shape_factors,
         "area": tissue.areas,
         "perimeter": tissue.perimeters,
@@ -186,6 +182,7 @@ def _cell_table(found: Segmentation, outcome: Fit) -> dict[str, np.ndarray]:
 
 def _draw(
     found: Segmentation,
+    whole: Bool[np.ndarray, " cells"],
     pixels: Float[np.ndarray, "rows columns"],
     initial: Tissue,
     outcome: Fit,
@@ -197,8 +194,8 @@ def _draw(
     figure = _figures.cells_on_image(
         pixels,
         outcome.tissue,
-        _shape_factors(outcome),
-        np.asarray(found.whole),
+        parameters_of(outcome.energy)[0],
+        whole,
         pixel_size=found.pixel_size,
         label="target shape factor $p_0$",
     )
