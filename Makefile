@@ -5,9 +5,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # Tests compile a lot: two processes are nearly twice as fast as one, more need more memory. A file of
-# tests stays in one process, so that what it shares is made once. The tests run in two lots, because a
+# tests stays in one process, so that what it shares is made once. The tests run in lots, because a
 # process that has compiled very much dies in the compiler.
 WORKERS ?= 2
+LOTS := a-c d-e f-l m-z
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -22,14 +23,15 @@ demo: $(VENV)/.base ## infer hidden shape factors of a synthetic tissue and show
 	$(BIN)/vertax run configs/demo.toml $(DEMO_OPTIONS)
 
 test: $(VENV)/.dev ## the tests that run on every change
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_OPTIONS) tests/test_[a-f]*.py
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_OPTIONS) tests/test_[g-z]*.py
+	@for lot in $(LOTS); do \
+	    $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_OPTIONS) tests/test_[$$lot]*.py || exit 1; \
+	done
 
 test-slow: $(VENV)/.dev ## the longer scientific checks
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m slow $(PYTEST_OPTIONS)
 
 notebooks: $(VENV)/.dev ## execute the notebooks, shortened; their outputs stay as they are
-	$(BIN)/python notebooks/execute.py --light
+	$(BIN)/python notebooks/execute.py --light --jobs $(WORKERS)
 
 notebooks-write: $(VENV)/.dev ## execute the notebooks in full and keep the outputs
 	$(BIN)/python notebooks/execute.py --write

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
@@ -46,6 +47,7 @@ def main() -> None:
     parser.add_argument("--light", action="store_true", help="fewer epochs, smaller tissues")
     parser.add_argument("--write", action="store_true", help="keep the outputs in the notebooks")
     parser.add_argument("--timeout", type=int, default=600, help="seconds for a cell, at most")
+    parser.add_argument("--jobs", type=int, default=1, help="how many at a time")
     options = parser.parse_args()
     if options.light and options.write:
         parser.error("the outputs that are kept are those of the full setting")
@@ -53,12 +55,18 @@ def main() -> None:
         os.environ["VERTAX_LIGHT"] = "1"
     else:
         os.environ.pop("VERTAX_LIGHT", None)
-    for path in options.notebooks or sorted(FOLDER.glob("*.ipynb")):
+
+    def one(path: Path) -> None:
         began = time.perf_counter()
         notebook = execute(path, options.timeout)
         print(f"{path.name}: {time.perf_counter() - began:.0f} s", flush=True)
         if options.write:
             nbformat.write(notebook, path)
+
+    # Each has a process of its own, and this one only waits for them.
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for _ in pool.map(one, options.notebooks or sorted(FOLDER.glob("*.ipynb"))):
+            pass
 
 
 if __name__ == "__main__":

@@ -124,6 +124,7 @@ def test_a_shape_that_no_tensions_hold_is_met_as_well_as_can_be(foam):
     assert value(eqx.apply_updates(guess, downhill)) < 0.95 * value(guess)
 
 
+@pytest.mark.slow  # compiles for a minute
 def test_the_experiment_finds_what_it_drew(tmp_path):
     (tmp_path / "tiny.toml").write_text(TINY)
     folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out")

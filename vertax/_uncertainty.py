@@ -94,7 +94,8 @@ def uncertainty(
     if prior is not None:
         known = known + prior**-2 * jnp.eye(len(flat), dtype=flat.dtype)
     values, vectors = jnp.linalg.eigh((known + known.T) / 2)
-    unknown = values <= 1e-12 * values[-1]
+    # Slopes through the equilibrium are known to about 1e-6, their squares to the square of that.
+    unknown = values <= 1e-10 * values[-1]
     inverse = jnp.where(unknown, 0, 1 / jnp.where(unknown, 1, values))
     covariance = (vectors * inverse) @ vectors.T
     lost = jnp.sum(jnp.where(unknown, vectors**2, 0), axis=1) > 1e-9
