@@ -154,6 +154,15 @@ def test_weighted_sums():
         a + 1.0  # pyright: ignore
 
 
+def test_a_negative_weight_has_no_residuals():
+    tissue = random_tissue(5)
+    moved = tissue.with_vertices(tissue.vertices + 0.1)
+    cost = VertexDistance(tissue) + -0.1 * VertexDistance(moved)
+    assert cost(moved, energy) == pytest.approx(0.01)  # 0.02 / 2 - 0
+    with pytest.raises(RuntimeError, match="negative weight is no sum of squares"):
+        cost.residuals(moved, energy)
+
+
 def test_a_cost_of_the_parameters():
     class Regularised(vx.AbstractCost):
         weight: Float[Array, ""]

@@ -80,8 +80,20 @@ class WeightedSum(AbstractCost):
         return jnp.sum(self.weights * jnp.stack([cost(tissue, energy) for cost in self.costs]))
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """The residuals of all terms, times the roots of the weights, which must not be negative."""
-        roots = jnp.sqrt(self.weights)
+        """The residuals of all terms, times the roots of the weights.
+
+        **Raises:**
+
+        - `RuntimeError` (of Equinox, also inside `jax.jit`) for a negative weight, of which there is no root.
+        - `TypeError` if a term is no sum of squares.
+        """
+        weights = eqx.error_if(
+            self.weights,
+            self.weights < 0,
+            "A weighted sum of costs with a negative weight is no sum of squares, which a least-squares "
+            "solver needs: make the weight positive, or fit with an Optax optimiser.",
+        )
+        roots = jnp.sqrt(weights)
         parts = [cost.residuals(tissue, energy) for cost in self.costs]
         return jnp.concatenate([root * part for root, part in zip(roots, parts, strict=True)])
 
