@@ -74,7 +74,13 @@ def path(tmp_path):
     return tmp_path / "fit.npz"
 
 
-@pytest.mark.parametrize("case", CASES)
+COMPILES_LONG = ("least squares, batch", "batch")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=[pytest.mark.slow] if c in COMPILES_LONG else []) for c in CASES],
+)
 def test_an_interrupted_fit_goes_on_to_the_same_numbers(case, path):
     whole = run(case, callback=interrupt_at(None))
     stopped = run(case, callback=interrupt_at(3), checkpoint=path)
