@@ -24,6 +24,7 @@ def fitted(tissue, energy, cost, **options):
     return problem, vx.fit(problem, solver, 15, progress=False)
 
 
+@pytest.mark.slow  # sixty fits
 def test_it_is_the_scatter_of_repeated_fits(hidden):
     tissue, truth = hidden
     noise = 1e-4
