@@ -92,10 +92,23 @@ def tensions(energy: AbstractEnergy) -> Float[np.ndarray, "*batch edges"]:
 
     **Returns:** tension of each edge.
     """
+    return np.asarray(terms_of(energy)[1].tension, float)
+
+
+def terms_of(energy: AbstractEnergy) -> tuple[AreaElasticity, BoundedTension]:
+    """The two parts of an energy E2 whose tensions have bounds.
+
+    **Arguments:**
+
+    - `energy`: the energy, or a batch.
+
+    **Returns:** the areas' part, and that of the tensions.
+    """
     assert isinstance(energy, LocalSum)
-    _, tension = energy.terms
+    area, tension = energy.terms
+    assert isinstance(area, AreaElasticity)
     assert isinstance(tension, BoundedTension)
-    return np.asarray(tension.tension, float)
+    return area, tension
 
 
 Measure = Callable[[InverseProblem, Tissue, PyTree], PyTree[Array]]

@@ -31,6 +31,7 @@ from vertax.costs import AbstractLeastSquaresCost, EdgeDistance
 from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
 from vertax.experiments import _tension_figures as figures
 from vertax.experiments._config import ExperimentConfig, Section
+from vertax.experiments._design import terms_of
 from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import pearson_of
 from vertax.experiments._sections import Relaxation
@@ -122,16 +123,7 @@ def tension_of(energy: AbstractEnergy) -> Float[Array, " edges"]:
 
     **Returns:** the tensions.
     """
-    _, tension = _terms(energy)
-    return tension.tension
-
-
-def _terms(energy: AbstractEnergy) -> tuple[AreaElasticity, BoundedTension]:
-    assert isinstance(energy, LocalSum)
-    area, tension = energy.terms
-    assert isinstance(area, AreaElasticity)
-    assert isinstance(tension, BoundedTension)
-    return area, tension
+    return terms_of(energy)[1].tension
 
 
 def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
@@ -308,7 +300,7 @@ def _result(config: Config, problem: InverseProblem, outcome: Fit) -> Result:
     # Areas follow their targets, so a pressure changes with the equilibrium.
     def relative(x: Float[Array, " parameters"]) -> Float[Array, " edges_and_cells"]:
         energy = eqx.combine(unravel(x), constants)
-        area, tension = _terms(energy)
+        area, tension = terms_of(energy)
         relaxed = equilibrate(outcome.tissue, energy, **options, throw=False).tissue
         values = jnp.concatenate([tension.tension, area.pressures(relaxed)])
         return values / jnp.mean(tension.tension)
@@ -346,7 +338,7 @@ def _tables(
     }
     if truth is not None:
         energy, relaxed = truth
-        area, tension = _terms(energy)
+        area, tension = terms_of(energy)
         # Labels are the numbers of the true cells, from 1.
         number = np.append(np.arange(1, relaxed.n_cells + 1), 0)
         true_between = np.sort(number[np.asarray(relaxed.topology.edge_cells)], axis=1)
