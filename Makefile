@@ -46,7 +46,7 @@ format: $(VENV)/.dev ## mend style and format where a program can
 
 types: $(VENV)/.dev ## static types; those of a project that builds on vertax strictly
 	$(BIN)/pyright
-	$(BIN)/pyright --project tests/downstream
+	$(BIN)/pyright --project tests/project/downstream
 
 # Material announces a change of MkDocs that pyproject.toml rules out.
 docs: export NO_MKDOCS_2_WARNING := 1

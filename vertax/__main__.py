@@ -1,5 +1,5 @@
 """`python -m vertax` is the command `vertax`."""
 
-from vertax.experiments.command_line import main
+from vertax.runs.command_line import main
 
 main()

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vertax._arcs import arc_points, length_factor
-from vertax._boundary import Free
-from vertax._tissue import Tissue
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
+from vertax.mesh import Free, Tissue
+from vertax.mesh._arcs import arc_points, length_factor
 
 Measure = Literal["moments", "farthest"]
 

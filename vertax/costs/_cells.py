@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vertax._tissue import Tissue
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
+from vertax.mesh import Tissue
 
 
 class MeanShapeFactor(AbstractLeastSquaresCost):

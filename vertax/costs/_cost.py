@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._tissue import Tissue
 from vertax.energies import AbstractEnergy
+from vertax.mesh import Tissue
 
 
 class AbstractCost(eqx.Module):

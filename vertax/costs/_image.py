@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from vertax._boundary import AbstractBoundary, Free, Periodic
-from vertax._misc import is_concrete
-from vertax._tissue import Tissue
+from vertax._base.modules import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
+from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue
 
 
 # The paper convolves the mesh, a measure carried by its edges, with a Gaussian point spread function in

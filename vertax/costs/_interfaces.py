@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vertax._tissue import Tissue
-from vertax._topology import take
 from vertax.costs._cost import AbstractCost
 from vertax.energies import AbstractEnergy
+from vertax.mesh import Tissue
+from vertax.mesh._topology import take
 
 
 class HomotypicLength(AbstractCost):

@@ -8,10 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._tissue import Tissue
-from vertax._topology import take
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
+from vertax.mesh import Tissue
+from vertax.mesh._topology import take
 
 Matching = Literal["number", "cells"]
 

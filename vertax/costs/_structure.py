@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
-from vertax._arcs import length_factor
-from vertax._misc import is_concrete
-from vertax._tissue import Tissue
+from vertax._base.modules import is_concrete
 from vertax.costs._cost import AbstractCost
 from vertax.costs._positions import check_equal
 from vertax.costs._transport import entropic_transport
 from vertax.energies import AbstractEnergy
+from vertax.mesh import Tissue
+from vertax.mesh._arcs import length_factor
 
 
 class IndexAwareStructural(AbstractCost):

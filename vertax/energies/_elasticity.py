@@ -5,8 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from vertax._tissue import Tissue
 from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_cell
+from vertax.mesh import Tissue
 
 
 class ShapeFactorEnergy(AbstractLocalEnergy):

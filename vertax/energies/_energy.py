@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._tissue import Tissue
+from vertax.mesh import Tissue
 
 
 class AbstractEnergy(eqx.Module):

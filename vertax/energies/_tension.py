@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._misc import is_concrete
-from vertax._tissue import Tissue
+from vertax._base.modules import is_concrete
 from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_edge
+from vertax.mesh import Tissue
 
 
 class LineTension(AbstractLocalEnergy):

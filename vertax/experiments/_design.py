@@ -16,15 +16,14 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
-from vertax._history import Fit, History, Record
-from vertax._inverse import InverseProblem
-from vertax._tissue import Tissue
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
-from vertax.experiments._config import Section
-from vertax.experiments._run import RunFolder
 from vertax.experiments._scenes import stack
-from vertax.experiments._sections import Fitting
+from vertax.fitting import Fit, History, InverseProblem, Record
+from vertax.mesh import Tissue
+from vertax.runs._config import Section
+from vertax.runs._folder import RunFolder
+from vertax.runs._sections import Fitting
 
 
 class Gradient(Section):

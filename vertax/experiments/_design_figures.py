@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import PercentFormatter
 
-from vertax._tissue import Tissue
+from vertax.mesh import Tissue
 from vertax.plotting import _style, plot_tissue
 
 # Pale enough for dark outlines and coloured edges on top.

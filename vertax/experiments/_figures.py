@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from vertax._history import History
-from vertax._tissue import Tissue
+from vertax.fitting import History
+from vertax.mesh import Tissue
 from vertax.plotting import _style, plot_history, plot_recovery, plot_tissue
 from vertax.plotting._tissue import draw_image
 

@@ -11,16 +11,15 @@ from jaxtyping import Array, Bool, Float
 from pydantic import Field
 from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter, zoom
 
-from vertax._equilibrium import Equilibrium, equilibrate
-from vertax._history import Fit
-from vertax._inverse import InverseProblem
-from vertax._tissue import Tissue
 from vertax.costs import MeshImage, mirror
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
-from vertax.experiments._config import Section
-from vertax.experiments._run import RunFolder
-from vertax.experiments._sections import Fitting, Relaxation
+from vertax.fitting import Fit, InverseProblem
 from vertax.initialise import Cellpose, Segmentation, Watershed, from_labels, from_microscopy
+from vertax.mesh import Tissue
+from vertax.responses import Equilibrium, equilibrate
+from vertax.runs._config import Section
+from vertax.runs._folder import RunFolder
+from vertax.runs._sections import Fitting, Relaxation
 
 
 class Preparation(Section):

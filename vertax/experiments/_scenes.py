@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 from pydantic import Field
 
-from vertax._equilibrium import equilibrate
-from vertax._tissue import Tissue
 from vertax.energies import ShapeFactorEnergy
-from vertax.experiments._config import Section
-from vertax.experiments._sections import Relaxation
 from vertax.initialise import periodic_voronoi
+from vertax.mesh import Tissue
+from vertax.responses import equilibrate
+from vertax.runs._config import Section
+from vertax.runs._sections import Relaxation
 
 
 class TissueSection(Section):

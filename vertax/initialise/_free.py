@@ -7,12 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from vertax._arcs import angle_of_area
-from vertax._boundary import Free
-from vertax._tissue import Tissue
-from vertax._topology import Topology
 from vertax.initialise._order import spatial_order
 from vertax.initialise._voronoi import tessellate
+from vertax.mesh import Free, Tissue, Topology
+from vertax.mesh._arcs import angle_of_area
 
 
 def free_voronoi(

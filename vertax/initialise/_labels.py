@@ -7,10 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Shaped
 
-from vertax._arcs import angle_of_area
-from vertax._boundary import Free, Periodic
-from vertax._tissue import Tissue
-from vertax._topology import Topology
 from vertax.initialise._cracks import Mesh, crack_graph
 from vertax.initialise._repairs import (
     fill_gaps,
@@ -21,6 +17,8 @@ from vertax.initialise._repairs import (
     untangle,
     with_exterior,
 )
+from vertax.mesh import Free, Periodic, Tissue, Topology
+from vertax.mesh._arcs import angle_of_area
 
 _BOUNDARIES = ("mirrored", "periodic", "free")
 

@@ -8,10 +8,8 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray
 from scipy.spatial import Delaunay, KDTree
 
-from vertax._boundary import Periodic
-from vertax._tissue import Tissue
-from vertax._topology import Topology
 from vertax.initialise._order import spatial_order
+from vertax.mesh import Periodic, Tissue, Topology
 
 
 def periodic_voronoi(

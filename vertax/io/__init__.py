@@ -1,6 +1,6 @@
 """Files: tissues, energies, inverse problems and trajectories; and for other programs."""
 
-from vertax._atomic import atomic_write as atomic_write
+from vertax._base.atomic import atomic_write as atomic_write
 from vertax.io._bounded_tables import BoundedTables as BoundedTables
 from vertax.io._data_tables import (
     cell_table as cell_table,

@@ -11,9 +11,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Array, Shaped
 
-from vertax._atomic import atomic_write
-from vertax._tissue import Tissue
-from vertax.plotting._polygons import Drawing
+from vertax._base.atomic import atomic_write
+from vertax.mesh import Tissue
+from vertax.mesh._outlines import Drawing
 
 Column: TypeAlias = Array | np.ndarray | Sequence[Any]
 

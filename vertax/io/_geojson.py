@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from vertax._atomic import atomic_write
-from vertax._tissue import Tissue
+from vertax._base.atomic import atomic_write
 from vertax.io._data_tables import Column, cell_columns, check_single, edge_columns
-from vertax.plotting._polygons import Drawing
+from vertax.mesh import Tissue
+from vertax.mesh._outlines import Drawing
 
 
 def write_geojson(

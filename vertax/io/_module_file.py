@@ -18,13 +18,11 @@ import numpy as np
 import optimistix as optx
 
 from vertax import adjoints, costs, energies, solvers
-from vertax._archive import as_jax, read_archive, write_archive
-from vertax._boundary import Free, Periodic
-from vertax._inverse import InverseProblem
-from vertax._tissue import Tissue
-from vertax._topology import Topology
-from vertax._transitions import T1
+from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax.energies import AbstractEnergy
+from vertax.fitting import InverseProblem
+from vertax.mesh import Free, Periodic, Tissue, Topology
+from vertax.transitions import T1
 
 _VERSION = 1
 

@@ -14,12 +14,12 @@ import optimistix as optx
 from jax.experimental import io_callback
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._equilibrium import Equilibrium, equilibrate, free_motions, mean_stiffness
-from vertax._tissue import Tissue
-from vertax._transitions import T1, AbstractTransitions
 from vertax.energies import AbstractEnergy
 from vertax.io._data_tables import check_single
 from vertax.io._trajectory import Trajectory
+from vertax.mesh import Tissue
+from vertax.responses._relaxation import Equilibrium, equilibrate, free_motions, mean_stiffness
+from vertax.transitions import T1, AbstractTransitions
 
 
 def record_relaxation(

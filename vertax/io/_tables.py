@@ -9,10 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vertax._boundary import Free, Periodic
-from vertax._tissue import Tissue
-from vertax._topology import Topology
 from vertax.io._bounded_tables import BoundedTables, checked, with_exterior, without_exterior
+from vertax.mesh import Free, Periodic, Tissue, Topology
 
 
 class Tables(NamedTuple):

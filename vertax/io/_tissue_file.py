@@ -10,10 +10,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vertax._archive import as_jax, read_archive, write_archive
-from vertax._boundary import AbstractBoundary, Free, Periodic
-from vertax._tissue import Tissue
-from vertax._topology import Topology
+from vertax._base.archive import as_jax, read_archive, write_archive
+from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue, Topology
 
 _VERSION = 1
 

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Shaped
 
-from vertax._archive import read_archive, write_archive
-from vertax._history import Record
-from vertax._tissue import Tissue
-from vertax._topology import Topology
+from vertax._base.archive import read_archive, write_archive
+from vertax.fitting import Record
 from vertax.io._tissue_file import tissue_arrays, tissue_from
+from vertax.mesh import Tissue, Topology
 
 _VERSION = 1
 _TOPOLOGY = ("twin", "cell", "frame", "edge", "half_edge")

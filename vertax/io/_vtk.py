@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from vertax._atomic import atomic_draft
-from vertax._tissue import Tissue
+from vertax._base.atomic import atomic_draft
 from vertax.io._data_tables import Column, cell_columns, edge_columns
 from vertax.io._geojson import checked_drawing, edge_path
+from vertax.mesh import Tissue
 
 _SUFFIXES = (".vtu", ".vtk")
 

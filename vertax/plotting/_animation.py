@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
-from vertax._atomic import atomic_draft
-from vertax._tissue import Tissue
+from vertax._base.atomic import atomic_draft
+from vertax.mesh import Tissue
+from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
-from vertax.plotting._polygons import Drawing
 from vertax.plotting._tissue import Colours, colour_map, draw, line_width, size_of, view_of
 
 CellValues: TypeAlias = (

@@ -9,7 +9,7 @@ from jaxtyping import Array, Real
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from vertax._history import History
+from vertax.fitting import History
 from vertax.plotting import _style
 
 # What a history may hold, in the order of the panels: its name there, and the scale of its axis.

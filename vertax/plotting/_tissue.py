@@ -13,9 +13,9 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.lines import Line2D
 
-from vertax._tissue import Tissue
+from vertax.mesh import Tissue
+from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
-from vertax.plotting._polygons import Drawing
 
 # Of inferno, the light end would vanish on pale faces, and the dark end on an image.
 _EDGES_ON_PALE = ListedColormap(colormaps["inferno"](np.linspace(0, 0.82, 256)), "inferno_dark")

@@ -1,0 +1,318 @@
+"""Costs that see through T1 transitions: structures, transport, centroids, vertices by their cells."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+from free_helpers import cluster
+from helpers import (
+    central_difference,
+    dense_hypergradient,
+    edge_cell_sets,
+    p0_of,
+    random_like,
+    random_tissue,
+    relaxed,
+)
+from hypothesis import given, settings, strategies as st
+from scipy.optimize import linear_sum_assignment
+
+import vertax as vx
+from vertax.costs import (
+    CentroidDistance,
+    IndexAwareStructural,
+    VertexDistance,
+    adjacency,
+    mismatched_neighbours,
+)
+from vertax.costs._positions import matching_vertices
+from vertax.costs._transport import entropic_transport, transport_plan
+from vertax.mesh._topology import flip_edges
+
+energy = vx.energies.ShapeFactorEnergy(3.7)
+
+
+def flipped(tissue, length=1e-9):
+    """The tissue with its shortest edge shrunk to a length, and the same after a T1 of that edge."""
+    edge = int(jnp.argmin(tissue.edge_lengths))
+    half = tissue.topology.half_edge[edge]
+    start, end = half // 3, tissue.topology.twin[half] // 3
+    vector = tissue.edge_vectors[edge]
+    unit = vector / jnp.linalg.norm(vector)
+    middle = tissue.vertices[start] + vector / 2
+
+    def laid(direction):
+        away = direction * length / 2
+        offset = tissue.vertices[end] - (tissue.vertices[start] + vector)
+        return tissue.vertices.at[start].set(middle - away).at[end].set(middle + away + offset)
+
+    before = tissue.with_vertices(laid(unit))
+    across = jnp.stack([unit[1], -unit[0]])
+    which = jnp.arange(tissue.n_edges) == edge
+    after = tissue.with_vertices(laid(across)).with_topology(flip_edges(tissue.topology, which))
+    return before, after
+
+
+# --- transport
+
+
+@pytest.mark.parametrize("epsilon", [1e-3, 0.1, 3.0])
+@pytest.mark.parametrize("n", [2, 20, 60])
+def test_the_plan_is_balanced_whatever_the_entropy(n, epsilon):
+    costs = 3 * jax.random.uniform(jax.random.key(n), (n, n))
+    log_plan = np.asarray(jax.jit(transport_plan)(costs, jnp.asarray(epsilon)))
+    plan = np.exp(log_plan)
+    np.testing.assert_allclose(plan.sum(axis=0), 1 / n, rtol=1e-11)
+    np.testing.assert_allclose(plan.sum(axis=1), 1 / n, rtol=1e-11)
+    # What makes a plan optimal: its logarithm is -C/ε and a sum of potentials of rows and columns.
+    potentials = log_plan + np.asarray(costs) / epsilon
+    mixed = potentials - potentials[:1] - potentials[:, :1] + potentials[0, 0]
+    assert np.abs(mixed).max() < 1e-9 * np.abs(potentials).max()
+
+
+def test_little_entropy_gives_the_best_assignment():
+    costs = jax.random.uniform(jax.random.key(3), (15, 15))
+    rows, columns = linear_sum_assignment(costs)
+    best = float(np.mean(np.asarray(costs)[rows, columns]))
+    assert entropic_transport(costs, jnp.asarray(1e-4)) == pytest.approx(best, abs=1e-5)
+
+
+def test_a_nearly_one_to_one_plan_is_found_at_once():
+    # Sinkhorn's sweeps alone would need about 1e6 of them.
+    costs = jnp.where(jnp.eye(20, dtype=bool), 0.9, 2.4) + 0.1 * jax.random.uniform(
+        jax.random.key(0), (20, 20)
+    )
+    plan = np.exp(transport_plan(costs, jnp.asarray(0.1)))
+    np.testing.assert_allclose(plan.sum(axis=1), 1 / 20, rtol=1e-11)
+
+
+@pytest.mark.parametrize("epsilon", [0.05, 0.5])
+def test_derivatives_of_transport(epsilon):
+    costs = 2 * jax.random.uniform(jax.random.key(5), (8, 8))
+    at = (costs, jnp.asarray(epsilon))
+    slope = jax.jit(jax.grad(entropic_transport, argnums=(0, 1)))
+    direction = (random_like(costs), jnp.asarray(0.3))
+    first = sum(jnp.sum(a * b) for a, b in zip(slope(*at), direction, strict=True))
+    expected = central_difference(lambda x: entropic_transport(*x), at, direction, 1e-6)
+    assert first == pytest.approx(float(expected), rel=1e-7)
+    _, second = jax.jvp(slope, at, direction)
+    along = lambda x: slope(*x)[0]
+    np.testing.assert_allclose(
+        second[0], central_difference(along, at, direction, 1e-6), rtol=1e-5, atol=1e-7
+    )
+
+
+# --- the structural cost
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.integers(0, 1000), st.sampled_from([5, 12, 30]))
+def test_adjacency_knows_who_touches(seed, n_cells):
+    tissue = random_tissue(n_cells, seed)
+    matrix = np.asarray(adjacency(tissue))
+    expected = np.zeros((n_cells, n_cells))
+    for i, j in edge_cell_sets(tissue):
+        if i != j:
+            expected[i, j] = expected[j, i] = 1
+    np.testing.assert_array_equal(matrix, expected)
+    weighted = np.asarray(adjacency(tissue, 0.1))
+    np.testing.assert_allclose(weighted, weighted.T)
+    assert ((weighted > 0) == (matrix > 0)).all()
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "free"])
+def test_the_cost_is_continuous_through_a_t1_and_pushes_on(boundary):
+    tissue = random_tissue(12, 4) if boundary == "periodic" else cluster(12, 4, lloyd_steps=2)
+    cost = IndexAwareStructural(tissue)
+    before, after = flipped(tissue)
+    assert cost(before, energy) == pytest.approx(float(cost(after, energy)), abs=1e-6)
+    # Of the edge that ought not to be there: the shorter the better, down to length zero.
+    lengths = [1e-3, 1e-2, 1e-1]
+    costs = [float(IndexAwareStructural(after)(flipped(tissue, x)[0], energy)) for x in lengths]
+    assert costs[0] < costs[1] < costs[2]
+    if boundary == "periodic":  # in the cluster it is an edge to the exterior, which is no cell
+        assert costs[1] - costs[0] > 1e-3
+
+
+def test_a_tissue_costs_nothing_against_itself():
+    tissue = random_tissue(20, 1)
+    cost = IndexAwareStructural(tissue)
+    assert cost(tissue, energy) == pytest.approx(0, abs=1e-6)
+    assert cost(random_tissue(20, 2), energy) > 0.1
+    # All that counts is who touches, and how long: not where.
+    moved = tissue.with_vertices(tissue.vertices + jnp.array([0.3, -7.0]))
+    assert cost(moved, energy) == pytest.approx(float(cost(tissue, energy)), abs=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_derivatives_of_the_structural_cost(dtype):
+    tissue, target = (
+        jax.tree.map(
+            lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, random_tissue(12, k)
+        )
+        for k in (0, 1)
+    )
+    cost = IndexAwareStructural(target)
+    at = jax.jit(lambda x: cost(tissue.with_vertices(x), energy))
+    x, direction = tissue.vertices, random_like(tissue.vertices)
+    step, close = (1e-6, 1e-7) if dtype == jnp.float64 else (1e-2, 3e-2)
+    slope = jax.jit(jax.grad(at))
+    first = float(jnp.sum(slope(x) * direction))
+    assert first == pytest.approx(float(central_difference(at, x, direction, step)), rel=close)
+    _, second = jax.jvp(slope, (x,), (direction,))
+    expected = central_difference(slope, x, direction, step)
+    np.testing.assert_allclose(second, expected, atol=10 * close * float(jnp.abs(expected).max()))
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "accuracy"),
+    [
+        (vx.ImplicitDifferentiation(), 1e-7),
+        pytest.param(vx.EquilibriumPropagation(), 1e-5, marks=pytest.mark.slow),
+        pytest.param(vx.AutomaticDifferentiation(), 1e-4, marks=pytest.mark.slow),
+    ],
+    ids=["ID", "EP", "AD"],
+)
+def test_the_structural_cost_has_a_useful_derivative_for_all_adjoints(adjoint, accuracy):
+    tissue, own = relaxed(12, 3)
+    cost = IndexAwareStructural(random_tissue(12, 5))
+    momentum = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
+    solver = momentum if adjoint.unrolls else None
+    problem = vx.InverseProblem(
+        tissue, own, cost, adjoint=adjoint, solver=solver, transitions=None, max_steps=20_000
+    )
+    _, _, (gradient, _), _ = eqx.filter_jit(problem.value_and_gradient)()
+    expected = dense_hypergradient(tissue, own, cost)
+    error = np.linalg.norm(p0_of(gradient) - expected) / np.linalg.norm(expected)
+    assert error < accuracy
+
+
+def test_a_t1_changes_two_neighbourships():
+    tissue = random_tissue(20, 6)
+    assert mismatched_neighbours(tissue, tissue) == 0
+    before, after = flipped(random_tissue(40, 3))  # large enough: no two cells touch twice
+    assert mismatched_neighbours(after, before) == 2
+    assert mismatched_neighbours(tissue, random_tissue(20, 7)) > 20
+
+
+@pytest.mark.parametrize("name", ["interface_length", "epsilon", "softening"])
+def test_settings_must_be_positive(name):
+    with pytest.raises(ValueError, match=rf"`{name}` of IndexAwareStructural must be positive"):
+        IndexAwareStructural(random_tissue(5), **{name: 0.0})
+
+
+def test_tissues_of_other_sizes_are_refused():
+    small, large = random_tissue(9), random_tissue(12)
+    for cost in (IndexAwareStructural(small), CentroidDistance(small)):
+        with pytest.raises(ValueError, match="must have 12 cells, as the tissue has, but has 9"):
+            cost(large, energy)
+    with pytest.raises(ValueError, match="mismatched_neighbours must have 12 cells"):
+        mismatched_neighbours(large, small)
+
+
+# --- positions
+
+
+def test_centroids_follow_their_formula_and_gradient():
+    tissue, target = random_tissue(10, 0), random_tissue(10, 1)
+    cost = CentroidDistance(target)
+    away = tissue.boundary.shortest(tissue.centroids - target.centroids)
+    assert cost(tissue, energy) == pytest.approx(float(jnp.sum(away**2)) / 20)
+    at = lambda x: cost(tissue.with_vertices(x), energy)
+    direction = random_like(tissue.vertices)
+    expected = central_difference(at, tissue.vertices, direction)
+    assert jnp.sum(jax.grad(at)(tissue.vertices) * direction) == pytest.approx(
+        float(expected), rel=1e-7
+    )
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 1000), st.sampled_from([9, 20]))
+def test_vertices_are_known_by_their_cells(seed, n_cells):
+    tissue = random_tissue(n_cells, seed)
+    own, found = matching_vertices(tissue, tissue)
+    unique = np.asarray(found)
+    np.testing.assert_array_equal(np.asarray(own)[unique], np.arange(tissue.n_vertices)[unique])
+    if n_cells >= 20:
+        assert unique.mean() > 0.9
+
+
+def test_vertices_of_a_flipped_edge_have_no_counterpart():
+    before, after = flipped(random_tissue(30, 2))
+    counterpart, found = jax.jit(matching_vertices)(after, before)
+    assert int(jnp.sum(~found)) == 2
+    np.testing.assert_array_equal(
+        np.asarray(counterpart)[np.asarray(found)], np.flatnonzero(np.asarray(found))
+    )
+    by_cells = VertexDistance(before, match="cells")
+    assert by_cells(after, energy) == pytest.approx(0, abs=1e-12)
+    with pytest.raises((ValueError, TypeError), match="match"):
+        VertexDistance(before, match="nearest")  # pyright: ignore[reportArgumentType]
+
+
+# --- guidance
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    """A hidden tissue, and a guess that relaxed into another topology."""
+    keys = jax.random.split(jax.random.key(1), 3)
+    draw = lambda k: vx.energies.ShapeFactorEnergy(3.7 + 0.2 * jax.random.normal(k, (20,)))
+    truth, guess = draw(keys[0]), draw(keys[1])
+    first = vx.initialise.periodic_voronoi(20, key=keys[2])
+    target, initial = (vx.equilibrate(first, e).tissue for e in (truth, guess))
+    assert mismatched_neighbours(initial, target) >= 4
+    cost = 0.99 * CentroidDistance(target) + 0.01 * IndexAwareStructural(target)
+    return truth, target, vx.InverseProblem(initial, guess, cost)
+
+
+@pytest.mark.slow  # tests of the experiments have a smaller one
+def test_guidance_leads_through_t1s_to_the_hidden_parameters(crossing):
+    truth, target, problem = crossing
+    guidance = lambda epoch: jnp.where(epoch < 100, 500 * 1e-2 ** (epoch / 100), 0.0)
+    fit = vx.fit(problem, optax.adam(2e-2), 180, truth=truth, guidance=guidance, progress=False)
+    assert mismatched_neighbours(fit.tissue, target) == 0
+    assert np.max(np.abs(p0_of(fit.energy) / p0_of(truth) - 1)) < 1e-3
+    assert fit.history.num_t1.sum() > 0
+    # The best epoch is one without guidance, under which costs are smaller anyway.
+    assert fit.best_epoch >= 100
+    assert fit.history.cost[99] < fit.history.cost[100]
+
+
+@pytest.mark.parametrize(
+    "adjoint",
+    [
+        vx.ImplicitDifferentiation(),
+        pytest.param(vx.EquilibriumPropagation(nudge="cost"), marks=pytest.mark.slow),
+    ],
+    ids=["ID", "EP"],
+)
+def test_gradients_under_guidance(crossing, adjoint):
+    _, target, problem = crossing
+    tissue = vx.equilibrate(target, problem.energy, transitions=None).tissue
+    cost = CentroidDistance(target)
+    problem = vx.InverseProblem(
+        tissue, problem.energy, cost, adjoint=adjoint, transitions=None, guidance=3.0
+    )
+    value = eqx.filter_jit(lambda p0: problem(vx.energies.ShapeFactorEnergy(p0))[0])
+    p0 = p0_of(problem.energy)
+    direction = random_like(p0)
+    slope = jnp.sum(jax.grad(value)(p0) * direction)
+    expected = float(central_difference(value, p0, direction, 1e-4))
+    accuracy = 1e-5 if isinstance(adjoint, vx.ImplicitDifferentiation) else 1e-3
+    assert slope == pytest.approx(expected, rel=accuracy)
+    # Guided, the tissue comes closer than of itself.
+    free = vx.InverseProblem(tissue, problem.energy, cost, transitions=None)
+    assert value(p0) < 0.9 * float(free()[0])
+
+
+def test_bad_guidance_is_refused(crossing):
+    *_, problem = crossing
+    with pytest.raises(ValueError, match=r"`guidance` must give one number that is not negative"):
+        vx.fit(problem, optax.adam(1e-2), 2, guidance=lambda epoch: -1.0, progress=False)
+    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    with pytest.raises(ValueError, match="`guidance` goes with an Optax optimiser"):
+        vx.fit(problem, solver, 2, guidance=lambda epoch: 1.0, progress=False)

@@ -1,0 +1,154 @@
+"""Inverse design: tiny runs of each experiment, and what they leave."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from run_helpers import run, table
+
+import vertax as vx
+from vertax.costs import HomotypicLength, aspect_ratio
+from vertax.experiments._design import Tensions, limits
+
+MECHANICS = """
+experiment = "design_mechanics"
+tissue = { n_cells = 6, lloyd_steps = 2 }
+target = 3.95
+accuracy = 5e-3
+fit = { learning_rate = 1e-2, epochs = 12 }
+"""
+ELONGATION = """
+experiment = "convergent_extension"
+n_cells = [6]
+targets = [1.6]
+start_ratio = 1.3
+replicates = 2
+accuracy = 0.05
+start = { learning_rate = 0.2, epochs = 8 }
+fit = { learning_rate = 0.2, epochs = 15 }
+"""
+PATTERN = """
+experiment = "salt_and_pepper"
+boundaries = ["free"]
+n_types = [2]
+replicates = 2
+tissue = { n_cells = 7, lloyd_steps = 3 }
+fit = { learning_rate = 0.3, epochs = 8 }
+"""
+
+
+def files(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    "method", ["implicit", pytest.param("propagation", marks=pytest.mark.slow)]
+)
+def test_mechanics_reaches_its_target(tmp_path, method):
+    (tmp_path / "tiny.toml").write_text(MECHANICS)
+    folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out", f"gradient.method={method}")
+    assert metrics["mean_parameter_initial"] == pytest.approx(3.91)
+    assert metrics["distance_final"] < 5e-3
+    assert metrics["limited_by"] == "reached"
+    assert metrics["max_force"] < 1e-9
+    tissue = vx.load_tissue(folder / "designed.npz")
+    assert float(jnp.mean(tissue.shape_factors)) == pytest.approx(metrics["mean_final"])
+    observed = np.array(table(folder / "cells.csv")["observed_final"], float)
+    np.testing.assert_allclose(observed, tissue.shape_factors)
+    assert len(table(folder / "history.csv")["mean_observed"]) == 12
+    assert len(table(folder / "cells_by_epoch.csv")["target"]) == 12 * 6
+    assert {"figures/design.png", "figures/convergence.png"} <= files(folder)
+
+
+@pytest.mark.parametrize(
+    "method", ["implicit", pytest.param("propagation", marks=pytest.mark.slow)]
+)
+def test_a_cluster_elongates(tmp_path, method):
+    (tmp_path / "tiny.toml").write_text(ELONGATION)
+    folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out", f"gradient.method={method}")
+    six = metrics["6 cells"]
+    said = six["targets"]["1.6"]["ratios"]
+    assert np.allclose(said, 1.6, atol=0.1)
+    rows = table(folder / "aspect_ratios.csv")
+    np.testing.assert_allclose(np.array(rows["aspect_ratio"], float), said)
+    first = vx.load_tissue(folder / "designed.npz")
+    assert float(aspect_ratio(first)) == pytest.approx(said[0])
+    assert six["max_force"] < 1e-9
+    curve = np.array(table(folder / "history.csv")["aspect_ratio"], float).reshape(2, 15)
+    best = six["targets"]["1.6"]["best_epoch"]
+    np.testing.assert_allclose(curve[[0, 1], best], said)
+    assert "figures/design.png" in files(folder)
+
+
+@pytest.mark.parametrize(
+    "method", ["implicit", pytest.param("propagation", marks=pytest.mark.slow)]
+)
+def test_cells_of_one_type_part(tmp_path, method):
+    (tmp_path / "tiny.toml").write_text(PATTERN)
+    nudge = ("gradient.nudge=cost", "gradient.nudged_rtol=1e-3") if method != "implicit" else ()
+    folder, metrics = run(
+        tmp_path / "tiny.toml", tmp_path / "out", f"gradient.method={method}", *nudge
+    )
+    (kind,) = metrics.values()
+    assert kind["share_best"]["mean"] > kind["share_initial"]["mean"] + 0.1
+    types = jnp.asarray(np.array(table(folder / "cell_types.csv")["type"], int))
+    tissue = vx.load_tissue(folder / "designed.npz")
+    shares = np.array(table(folder / "history.csv")["heterotypic_share"], float).reshape(2, 8)
+    left = HomotypicLength(types, relative=True)(tissue, vx.energies.LineTension(1.0))
+    assert 1 - float(left) == pytest.approx(shares[0, kind["best_epoch"][0]])
+    assert json.loads((folder / "metrics.json").read_text()) == metrics
+
+
+def test_bounds_of_tensions_are_ordered():
+    with pytest.raises(ValueError, match="low must be below high"):
+        Tensions(low=0.3, high=0.2)
+
+
+def test_tensions_are_drawn_about_the_middle_of_their_range():
+    import jax
+
+    tissue = vx.initialise.free_voronoi(8, key=jax.random.key(0))
+    equal = Tensions(low=0.1, high=0.3).draw(tissue, 0.0, jax.random.key(1)).terms[1]
+    assert isinstance(equal, vx.energies.BoundedTension)
+    np.testing.assert_allclose(equal.tension, 0.2)
+    varied = Tensions(low=0.1, high=0.3).draw(tissue, 0.5, jax.random.key(1)).terms[1]
+    assert isinstance(varied, vx.energies.BoundedTension)
+    assert np.ptp(varied.tension) > 0.05
+    assert ((varied.tension > 0.15) & (varied.tension < 0.25)).all()
+
+
+def fitted(**curves):
+    """The parts of a fit that tell what limits it."""
+    n = 20
+    history = {
+        "converged": np.full(n, True),
+        "num_t1": np.zeros(n, int),
+        "gradient_norm": np.ones(n),
+    }
+    names = ("cost", "max_force", "num_steps", "gradient_residual", "gradient_steps")
+    history |= dict.fromkeys((*names, "relative_error"), np.ones(n)) | {
+        "seconds": np.ones(n),
+        "guidance": np.ones(n),
+    }
+    history["num_steps"] = np.ones(n, int)
+    best = curves.pop("best_epoch", 5)
+    tissue = vx.initialise.hexagonal(3, 4)
+    energy = vx.energies.LineTension(1.0)
+    record = vx.History(**history | curves)
+    return vx.Fit(energy, tissue, jnp.array(1.0), jnp.array(0.0), np.array(best), record)
+
+
+@pytest.mark.parametrize(
+    ("curves", "word"),
+    [
+        ({"converged": np.full(20, False)}, "relaxations"),
+        ({"best_epoch": 19}, "still falling"),
+        ({"num_t1": np.full(20, 3)}, "T1"),
+        ({"gradient_norm": np.logspace(0, -9, 20)}, "vanished"),
+        ({}, "stopped falling"),
+    ],
+)
+def test_what_limits_a_design_is_named(curves, word):
+    assert word in limits(fitted(**curves), np.array(False))
+    assert limits(fitted(**curves), np.array(True)) == "reached"

@@ -1,0 +1,101 @@
+"""Inference across topologies and the rigidity transition, on small tissues."""
+
+import json
+
+import numpy as np
+import pytest
+from run_helpers import run, table
+
+import vertax as vx
+from vertax.costs import mismatched_neighbours
+from vertax.experiments.rigidity_transition.experiment import fit_onset, fit_transition
+
+ACROSS = """
+experiment = "inference_across_topologies"
+replicates = 2
+least_mismatch = 2
+tissue = { n_cells = 12 }
+guidance = { epochs = 80 }
+fit = { learning_rate = 2e-2, epochs = 130 }
+
+[[methods]]
+name = "guided"
+distance = "centroids"
+guided = true
+"""
+RIGIDITY = """
+experiment = "rigidity_transition"
+shape_factors = [3.4, 4.1]
+replicates = 3
+modes = 2
+resamples = 20
+tissue = { n_cells = 12 }
+driving = { cycles = 1 }
+"""
+
+
+def test_guidance_crosses_topologies(tmp_path):
+    (tmp_path / "tiny.toml").write_text(ACROSS)
+    folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out")
+    assert min(metrics["start"]["mismatched_neighbours"]) >= 2
+    found = metrics["guided"]
+    assert found["mismatched_neighbours"] == [0, 0]
+    assert found["relative_error_most"] < 1e-3
+    assert found["succeeded"] == 1
+    target, fitted = (vx.load_tissue(folder / f"{n}.npz") for n in ("target", "fitted_guided"))
+    assert mismatched_neighbours(fitted, target) == 0
+    rows = table(folder / "shape_factors.csv")
+    error = np.abs(np.array(rows["guided"], float) / np.array(rows["true"], float) - 1)
+    assert np.mean(error.reshape(2, 12), axis=1) == pytest.approx(found["relative_error"])
+    assert len(table(folder / "history.csv")["cost"]) == 2 * 130
+    assert json.loads((folder / "metrics.json").read_text()) == metrics
+    for name in ("inference", "tissues"):
+        assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000
+
+
+def test_too_similar_draws_are_refused(tmp_path):
+    (tmp_path / "tiny.toml").write_text(ACROSS)
+    with pytest.raises(ValueError, match="choose a smaller least_mismatch"):
+        run(tmp_path / "tiny.toml", tmp_path / "out", "least_mismatch=30", "replicates=1")
+
+
+def test_tissues_turn_from_solid_to_fluid(tmp_path):
+    (tmp_path / "tiny.toml").write_text(RIGIDITY)
+    folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out")
+    rows = {
+        name: np.array(column, float) for name, column in table(folder / "transition.csv").items()
+    }
+    np.testing.assert_array_equal(rows["zero_after_0"], [0, 1])
+    # Energy only falls under driving.
+    energies = np.load(folder / "energies.npy")
+    assert energies.shape == (2, 3, 2)
+    assert (np.diff(energies, axis=-1) <= 0).all()
+    # A rigid tissue has no soft motion; in a floppy one every cell has the shape it wants.
+    assert rows["zero_modes"][0] == 0
+    assert rows["zero_modes"][1] > 0
+    assert rows["shape_factor"][1] == pytest.approx(4.1, abs=1e-4)
+    assert 3.4 < metrics["quench"]["p0_star"] < 4.1
+    assert metrics["run"]["converged_fraction"] == 1
+
+
+def test_the_curve_of_a_transition():
+    p0 = np.linspace(3.6, 4.0, 21)
+    share = 1 / (1 + np.exp(-(p0 - 3.83) / 0.03))
+    found = fit_transition(p0, 1e4 * share, 10_000)
+    assert found.centre == pytest.approx(3.83, abs=1e-4)
+    assert found.width == pytest.approx(0.03, rel=1e-2)
+    # A step between two values lies between them.
+    step = fit_transition(p0, 100.0 * (p0 > 3.81), 100)
+    assert 3.80 <= step.centre <= 3.82
+    assert np.isnan(fit_transition(p0, np.zeros(21), 100).centre)
+
+
+def test_the_onset_is_where_the_root_of_the_energy_ends():
+    p0 = np.linspace(3.6, 4.0, 21)
+    spread = 1 + 0.1 * np.random.default_rng(0).standard_normal((21, 40))
+    energies = np.maximum(3.85 - p0, 0)[:, None] ** 2 * spread**2
+    onset = fit_onset(p0, energies)
+    assert onset is not None
+    assert onset.centre == pytest.approx(3.85, abs=0.01)
+    assert onset.width == pytest.approx(1, rel=0.1)
+    assert fit_onset(p0, 0 * energies) is None

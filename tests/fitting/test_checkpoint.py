@@ -1,0 +1,197 @@
+"""Fits that stop in the middle and go on."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+from helpers import random_like, relaxed, rewritten
+
+import vertax as vx
+from vertax.costs import VertexDistance
+from vertax.energies import ShapeFactorEnergy
+from vertax.experiments._scenes import stack
+
+ADAM = optax.adam(1e-2)
+LEAST_SQUARES = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+EPOCHS = 6
+
+
+def problem_of(seed=0, **options):
+    target, truth = relaxed(6, 1)
+    guess = ShapeFactorEnergy(jnp.full(6, 3.7) + 0.05 * random_like(jnp.zeros(6), seed))
+    return vx.InverseProblem(target, guess, VertexDistance(target), **options), truth
+
+
+PROBLEM, TRUTH = problem_of()
+BATCH = stack([PROBLEM, problem_of(1)[0]])
+TRUTHS = stack([TRUTH, TRUTH])
+
+
+def kappa(epoch):
+    return 10.0 * 0.5**epoch
+
+
+CASES = {
+    "adam": (PROBLEM, TRUTH, ADAM, {}),
+    "guided": (PROBLEM, TRUTH, ADAM, {"guidance": kappa}),
+    "position": (dataclasses.replace(PROBLEM, fit_position=True), TRUTH, ADAM, {}),
+    "noisy": (PROBLEM, TRUTH, optax.chain(optax.add_noise(1e-3, 0.5, 3), ADAM), {}),
+    "batch": (BATCH, TRUTHS, ADAM, {"batched": True}),
+    "least squares": (PROBLEM, TRUTH, LEAST_SQUARES, {}),
+    "least squares, batch": (BATCH, TRUTHS, LEAST_SQUARES, {"batched": True}),
+}
+
+
+def run(case, epochs=EPOCHS, **changes):
+    problem, truth, optimiser, options = CASES[case]
+    return vx.fit(
+        problem, optimiser, epochs, truth=truth, progress=False, **(dict(options) | changes)
+    )
+
+
+def bits(outcome):
+    """All numbers of a fit but the time that it took."""
+    timeless = dataclasses.replace(outcome.history, seconds=np.zeros_like(outcome.history.seconds))
+    leaves = jax.tree.leaves(dataclasses.replace(outcome, history=timeless))
+    return [(np.shape(x), np.asarray(x).tobytes()) for x in leaves]
+
+
+def interrupt_at(epoch):
+    def watch(number, record):
+        if number == epoch:
+            raise KeyboardInterrupt
+        return {"cost": record.cost}
+
+    return watch
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "fit.npz"
+
+
+COMPILES_LONG = ("least squares, batch", "batch")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=[pytest.mark.slow] if c in COMPILES_LONG else []) for c in CASES],
+)
+def test_an_interrupted_fit_goes_on_to_the_same_numbers(case, path):
+    whole = run(case, callback=interrupt_at(None))
+    stopped = run(case, callback=interrupt_at(3), checkpoint=path)
+    assert stopped.interrupted
+    assert len(stopped.history.cost) == 3
+    seen = []
+    watch = lambda epoch, record: seen.append(epoch) or {"cost": record.cost}
+    again = run(case, callback=watch, checkpoint=path)
+    assert not again.interrupted
+    assert seen == list(range(3, len(whole.history.cost)))
+    assert bits(again) == bits(whole)
+    np.testing.assert_array_equal(again.notes["cost"], whole.history.cost)
+
+
+def test_a_fit_that_is_done_is_not_repeated_but_may_be_continued(path):
+    done = run("adam", checkpoint=path)
+    refuse = lambda *_: pytest.fail("an epoch was repeated")
+    again = run("adam", checkpoint=path, callback=refuse)
+    assert bits(again) == bits(done)
+    np.testing.assert_array_equal(again.history.seconds, done.history.seconds)
+    longer = run("adam", EPOCHS + 3, checkpoint=path)
+    assert bits(longer) == bits(run("adam", EPOCHS + 3))
+    with pytest.raises(ValueError, match=f"holds {EPOCHS + 3} epochs, but argument `epochs` is 2"):
+        run("adam", 2, checkpoint=path)
+
+
+def test_a_killed_fit_goes_on_from_its_last_checkpoint(path):
+    def kill(epoch, record):
+        if epoch == 4:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run("adam", callback=kill, checkpoint=vx.Checkpoint(path, every=0.0))
+    with np.load(path) as archive:
+        assert 1 <= archive["epochs"] <= 4
+    assert bits(run("adam", checkpoint=path)) == bits(run("adam"))
+    assert [file.name for file in path.parent.iterdir()] == ["fit.npz"]
+
+
+def test_a_short_fit_is_written_once(path, monkeypatch):
+    written = []
+    monkeypatch.setattr("vertax.fitting._checkpoint._save", lambda *_: written.append(1))
+    run("adam", checkpoint=path)
+    assert len(written) == 1
+
+
+OTHERS = {
+    "with another optimiser": {"optimiser": optax.adam(2e-2)},
+    "sizes.*: the default and not max_steps=300": {"problem": problem_of(max_steps=300)[0]},
+    "numbers in its arrays": {"problem": problem_of(2)[0]},
+    "another `guidance`: nan and not 10.0 in epoch 0": {"guidance": kappa},
+    "sizes, classes or settings": {"truth": None},
+}
+
+
+@pytest.mark.parametrize("message", OTHERS)
+def test_the_checkpoint_of_another_fit_is_refused(message, path):
+    run("adam", 2, checkpoint=path)
+    before = path.read_bytes()
+    arguments = {"problem": PROBLEM, "optimiser": ADAM, "truth": TRUTH} | OTHERS[message]
+    with pytest.raises(ValueError, match=f"{message}.*elete the file to start"):
+        vx.fit(epochs=3, progress=False, checkpoint=path, **arguments)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
+def test_a_truncated_checkpoint_is_refused(kept, path):
+    run("adam", 2, checkpoint=path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(ValueError, match=r"fit\.npz is truncated or damaged.*Delete the file"):
+        run("adam", 3, checkpoint=path)
+
+
+def test_a_checkpoint_needs_a_folder(path):
+    with pytest.raises(FileNotFoundError, match=r"no folder .*none\. Make it first"):
+        run("adam", 3, checkpoint=path.parent / "none" / "fit.npz", callback=pytest.fail)
+
+
+def test_foreign_files_are_refused(path):
+    vx.save_tissue(path, PROBLEM.tissue)
+    with pytest.raises(ValueError, match=r"is not a vertax checkpoint file.*Delete the file"):
+        run("adam", 3, checkpoint=path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"version": 2}, "version 2 of the checkpoint format.*Update vertax"),
+        ({"state_0": None}, "is broken: its state does not go with the fit"),
+        ({"state_0": np.zeros(3)}, "is broken: its state does not go with the fit"),
+        ({"epochs": 3}, "is broken: its state does not go with the fit"),
+        ({"identity": "{"}, "is the checkpoint of a fit with another problem"),
+    ],
+)
+def test_contradictions_are_refused(changes, message, path):
+    run("adam", 2, checkpoint=path)
+    rewritten(path, **changes)
+    with pytest.raises(ValueError, match=rf"fit\.npz.*{message}"):
+        run("adam", 3, checkpoint=path)
+
+
+def test_notes_keep_their_names():
+    with pytest.raises(
+        ValueError, match=r"same names in each epoch \(a\), but returned b in epoch 1"
+    ):
+        run("adam", 3, callback=lambda epoch, _: {"ab"[epoch]: 1.0})
+    with pytest.raises(ValueError, match=r"\(nothing\), but returned a in epoch 1"):
+        run("adam", 3, callback=lambda epoch, _: {"a": 1.0} if epoch else None)
+
+
+def test_checkpoints_are_written_at_times_that_make_sense(path):
+    with pytest.raises(ValueError, match="`every` must not be negative"):
+        vx.Checkpoint(path, every=-1)

@@ -1,0 +1,272 @@
+"""Saving and loading a tissue, and writing files atomically."""
+
+import os
+import stat
+import zipfile
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import rewritten
+
+import vertax as vx
+from vertax.io import atomic_write, load_tissue, save_tissue
+from vertax.mesh._topology import flip_edges
+
+
+@pytest.fixture(scope="module")
+def tissue():
+    lattice = np.array([[4.0, 0.1], [1.3, 3.7]])
+    return vx.initialise.periodic_voronoi(11, key=jax.random.key(5), lattice=lattice)
+
+
+@pytest.fixture
+def saved(tissue, tmp_path):
+    path = tmp_path / "tissue.npz"
+    save_tissue(path, tissue)
+    return path
+
+
+def same_bits(a, b):
+    bits = lambda x: (x.dtype, x.shape, np.asarray(x).tobytes())
+    return jax.tree.structure(a) == jax.tree.structure(b) and (
+        [bits(x) for x in jax.tree.leaves(a)] == [bits(x) for x in jax.tree.leaves(b)]
+    )
+
+
+class TestRoundTrip:
+    def test_every_bit(self, tissue, saved):
+        assert same_bits(load_tissue(saved), tissue)
+
+    def test_float32(self, tissue, tmp_path):
+        single = jax.tree.map(
+            lambda x: x.astype(np.float32) if eqx.is_inexact_array(x) else x, tissue
+        )
+        save_tissue(tmp_path / "single", single)
+        loaded = load_tissue(tmp_path / "single")
+        assert loaded.vertices.dtype == jnp.float32
+        assert same_bits(loaded, single)
+        with jax.enable_x64(False):
+            assert same_bits(load_tissue(tmp_path / "single"), single)
+
+    def test_after_a_transition(self, tissue, tmp_path):
+        # A flip turns edges around: their labels and directions no longer follow from their order.
+        flipped = tissue
+        for edge in (0, 7, 20):
+            flip = jnp.arange(tissue.n_edges) == edge
+            flipped = flipped.with_topology(flip_edges(flipped.topology, flip))
+        plain = vx.Topology(*jax.tree.leaves(flipped.topology)[:4])
+        assert not same_bits(plain, flipped.topology)
+        save_tissue(tmp_path / "flipped.npz", flipped)
+        assert same_bits(load_tissue(tmp_path / "flipped.npz"), flipped)
+
+    def test_negative_zero_and_no_softening(self, tissue, tmp_path):
+        odd = vx.Tissue(tissue.vertices.at[0].set(-0.0), tissue.topology, tissue.boundary, 0.0)
+        save_tissue(tmp_path / "odd.npz", odd)
+        assert same_bits(load_tissue(tmp_path / "odd.npz"), odd)
+
+    def test_saving_again_replaces(self, tissue, saved):
+        moved = tissue.with_configuration(tissue.vertices + 1)
+        save_tissue(saved, moved)
+        assert same_bits(load_tissue(saved), moved)
+        assert os.listdir(saved.parent) == [saved.name]
+
+
+class TestRefusedToSave:
+    def test_a_batch(self, tissue, tmp_path):
+        batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
+        with pytest.raises(ValueError, match="must be a single tissue"):
+            save_tissue(tmp_path / "batch.npz", batch)
+        assert os.listdir(tmp_path) == []
+
+    def test_bfloat16(self, tissue, tmp_path):
+        half = tissue.with_configuration(tissue.vertices.astype(jnp.bfloat16))
+        with pytest.raises(ValueError, match="`vertices` is bfloat16"):
+            save_tissue(tmp_path / "half.npz", half)
+
+    def test_unknown_boundary(self, tissue, tmp_path):
+        class Sphere(vx.AbstractBoundary):
+            def translation(self, image):
+                return 0.0 * image
+
+            def shortest(self, displacement):
+                return displacement
+
+            def drift(self, vertices, reference, pinned=None):
+                return jnp.zeros(0)
+
+            def settle(self, vertices, reference, pinned=None):
+                return vertices
+
+            def motions(self, vertices, distance):
+                return jnp.zeros((0, *vertices.shape))
+
+        odd = eqx.tree_at(lambda t: t.boundary, tissue, Sphere())
+        with pytest.raises(ValueError, match="no place for a boundary of class Sphere"):
+            save_tissue(tmp_path / "sphere.npz", odd)
+
+
+class TestRefusedToLoad:
+    def test_missing(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match=r"nowhere\.npz"):
+            load_tissue(tmp_path / "nowhere.npz")
+
+    def test_float64_without_x64(self, saved):
+        with (
+            jax.enable_x64(False),
+            pytest.raises(ValueError, match=r"tissue\.npz.*jax_enable_x64"),
+        ):
+            load_tissue(saved)
+
+    @pytest.mark.parametrize("kept", [0.0, 0.01, 0.5, 0.999])
+    def test_truncated(self, saved, kept):
+        content = saved.read_bytes()
+        saved.write_bytes(content[: int(kept * len(content))])
+        with pytest.raises(ValueError, match=r"tissue\.npz is truncated or damaged"):
+            load_tissue(saved)
+
+    def test_any_flipped_byte_is_found_or_harmless(self, tissue, saved):
+        content = bytearray(saved.read_bytes())
+        rng = np.random.default_rng(0)
+        refused, harmless = 0, 0
+        for position in rng.choice(len(content), 60, replace=False):
+            damaged = content.copy()
+            damaged[position] ^= rng.integers(1, 256)
+            saved.write_bytes(damaged)
+            try:
+                loaded = load_tissue(saved)
+            except ValueError as error:
+                refused += str(saved) in str(error)
+            else:  # a byte of the archive that nobody reads (a date, say) may change
+                harmless += same_bits(loaded, tissue)
+        assert refused + harmless == 60
+        assert refused > 40
+
+    def test_not_an_archive(self, tmp_path):
+        (tmp_path / "notes.txt").write_text("cells and vertices")
+        with pytest.raises(ValueError, match=r"notes\.txt is not a vertax tissue file"):
+            load_tissue(tmp_path / "notes.txt")
+        np.save(tmp_path / "array.npy", np.arange(3))
+        with pytest.raises(ValueError, match=r"array\.npy is not a vertax tissue file"):
+            load_tissue(tmp_path / "array.npy")
+
+    def test_foreign_archives(self, tmp_path):
+        np.savez(tmp_path / "other.npz", vertices=np.zeros((4, 2)))
+        with pytest.raises(ValueError, match=r"other\.npz is not a vertax tissue file"):
+            load_tissue(tmp_path / "other.npz")
+        with zipfile.ZipFile(tmp_path / "letters.zip", "w") as archive:
+            archive.writestr("a.txt", "text")
+        with pytest.raises(ValueError, match=r"letters\.zip is not a vertax tissue file"):
+            load_tissue(tmp_path / "letters.zip")
+
+    def test_pickles(self, saved):
+        rewritten(saved, format=np.array([{"an": "object"}], dtype=object))
+        with pytest.raises(ValueError, match=r"tissue\.npz.*allow_pickle=False"):
+            load_tissue(saved)
+
+    def test_newer_version(self, saved):
+        rewritten(saved, version=2)
+        with pytest.raises(ValueError, match=r"tissue\.npz has version 2.*Update vertax"):
+            load_tissue(saved)
+
+    def test_unknown_boundary(self, saved):
+        rewritten(saved, boundary="sphere")
+        with pytest.raises(ValueError, match=r"'sphere'; known are: periodic"):
+            load_tissue(saved)
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"version": 0}, "broken header"),
+            ({"version": None}, "broken header"),
+            ({"twin": None}, "no array `twin`"),
+            ({"boundary_lattice": None}, "no array `boundary_lattice`"),
+            ({"vertices": np.zeros((3, 2))}, r"`vertices` has shape \(3, 2\).*\(22, 2\)"),
+            ({"twin": np.zeros(66)}, "`twin`.*hold integers"),
+            ({"frame": np.zeros((66, 3), int)}, r"`frame`.*\(66, 2\)"),
+            ({"boundary_lattice": np.eye(3)}, r"`boundary_lattice`.*\(2, 2\)"),
+            # The mesh and the box judge for themselves; the file's name is put in front.
+            ({"twin": np.zeros(66, int)}, "is broken: Argument `twin` must be an involution"),
+            ({"cell": np.zeros(66, int)}, "is broken: The topology is broken: .*one face"),
+            ({"half_edge": np.zeros(33, int)}, "`half_edge` must point into its edge"),
+            ({"boundary_lattice": -np.eye(2)[::-1]}, "right-handed"),
+            ({"vertices": np.full((22, 2), np.nan)}, "must be finite"),
+            ({"softening": np.array(-1.0)}, "`softening` must be at least 0"),
+        ],
+    )
+    def test_contradictions(self, saved, changes, message):
+        rewritten(saved, **changes)
+        with pytest.raises(ValueError, match=rf"tissue\.npz.*{message}"):
+            load_tissue(saved)
+
+
+class TestAtomicWrite:
+    def test_text_and_bytes(self, tmp_path):
+        with atomic_write(tmp_path / "a.txt") as file:
+            file.write("Zellfläche µm²\n")
+        assert (tmp_path / "a.txt").read_text("utf-8") == "Zellfläche µm²\n"
+        with atomic_write(tmp_path / "a.bin", "wb") as file:
+            file.write(b"\x00\xff")
+        assert (tmp_path / "a.bin").read_bytes() == b"\x00\xff"
+        with atomic_write(tmp_path / "a.csv", newline="") as file:
+            file.write("1,2\r\n")
+        assert (tmp_path / "a.csv").read_bytes() == b"1,2\r\n"
+
+    @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+    def test_a_failure_leaves_everything_as_it_was(self, tmp_path, failure):
+        path = tmp_path / "a.txt"
+        path.write_text("old")
+
+        def interrupted():
+            with atomic_write(path) as file:
+                file.write("half of the n")
+                raise failure
+
+        with pytest.raises(failure):
+            interrupted()
+        assert path.read_text() == "old"
+        assert os.listdir(tmp_path) == ["a.txt"]
+
+    def test_nothing_under_the_name_before_the_end(self, tmp_path):
+        path = tmp_path / "a.txt"
+        with atomic_write(path) as file:
+            file.write("new")
+            file.flush()
+            assert not path.exists()
+            # In the same folder: a rename across file systems is not atomic.
+            assert len(os.listdir(tmp_path)) == 1
+        assert path.read_text() == "new"
+
+    def test_permissions_are_those_of_any_new_file(self, tmp_path):
+        (tmp_path / "plain").write_text("")
+        with atomic_write(tmp_path / "a.txt"):
+            pass
+        mode = lambda name: stat.S_IMODE((tmp_path / name).stat().st_mode)
+        assert mode("a.txt") == mode("plain")
+        os.chmod(tmp_path / "a.txt", 0o640)
+        with atomic_write(tmp_path / "a.txt") as file:
+            file.write("again")
+        assert mode("a.txt") == 0o640
+
+    def test_a_link_keeps_its_target(self, tmp_path):
+        (tmp_path / "runs").mkdir()
+        (tmp_path / "runs" / "a.txt").write_text("old")
+        (tmp_path / "link").symlink_to(tmp_path / "runs" / "a.txt")
+        with atomic_write(tmp_path / "link") as file:
+            file.write("new")
+        assert (tmp_path / "link").is_symlink()
+        assert (tmp_path / "runs" / "a.txt").read_text() == "new"
+
+    def test_refusals(self, tmp_path):
+        with pytest.raises(ValueError, match="`mode`"), atomic_write(tmp_path / "a", "a"):
+            pass
+        with (
+            pytest.raises(FileNotFoundError, match="no folder"),
+            atomic_write(tmp_path / "b" / "a"),
+        ):
+            pass
+        with pytest.raises(IsADirectoryError, match="is a folder"), atomic_write(tmp_path):
+            pass
+        assert os.listdir(tmp_path) == []

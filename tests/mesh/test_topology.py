@@ -1,0 +1,163 @@
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_tissue, tissues
+from hypothesis import given, settings, strategies as st
+
+import vertax as vx
+from vertax.mesh._topology import clockwise, counter_clockwise, flip_edges
+
+flip = jax.jit(flip_edges)
+
+
+@settings(max_examples=12, deadline=None)
+@given(tissues())
+def test_rotation_system_is_consistent(recipe):
+    tissue = recipe()
+    m = tissue.topology
+    names = ("twin", "next", "previous", "source", "target", "cell", "offset")
+    twin, following, previous, source, target, cell, offset = (
+        np.asarray(getattr(m, n)) for n in names
+    )
+    h = np.arange(m.n_half_edges)
+    assert (twin[twin] == h).all()
+    assert (following[previous] == h).all()
+    assert (previous[following] == h).all()
+    assert (target == source[twin]).all()
+    assert (cell[following] == cell).all()
+    assert (offset[twin] == -offset).all()
+    assert m.n_vertices - m.n_edges + m.n_cells == 0
+    assert m.neighbour_counts.sum() == m.n_half_edges
+
+
+def test_slots_turn_around_their_vertex():
+    h = jnp.arange(30, dtype=jnp.int32)
+    np.testing.assert_array_equal(clockwise(counter_clockwise(h)), h)
+    np.testing.assert_array_equal(clockwise(h) // 3, h // 3)
+    np.testing.assert_array_equal(clockwise(clockwise(clockwise(h))), h)
+    assert counter_clockwise(jnp.int32(4)) == 5
+
+
+def _break(tissue, **changes):
+    m = tissue.topology
+    fields = {"twin": m.twin, "cell": m.cell, "frame": m.frame, "edge": m.edge}
+    fields: dict[str, Any] = {name: np.array(value) for name, value in fields.items()}
+    for name, change in changes.items():
+        fields[name] = change(fields[name])
+    return lambda: vx.Topology(**fields)
+
+
+def _swap_twins(twin):
+    twin = twin.copy()
+    a, b = 0, 7
+    ta, tb = twin[a], twin[b]
+    twin[[a, tb]], twin[[b, ta]] = [tb, a], [ta, b]
+    return twin
+
+
+def _set(index, value):
+    def change(array):
+        array = array.copy()
+        array[index] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"twin": _set(0, 5)}, "involution"),
+        ({"twin": lambda t: np.arange(len(t))}, "its own twin"),
+        ({"twin": lambda t: t[:-1]}, "three half-edges"),
+        ({"twin": _swap_twins}, "broken"),
+        ({"cell": _set(0, 3)}, "broken"),
+        ({"cell": lambda c: np.where(c == 4, 3, c)}, "broken"),
+        ({"cell": lambda c: np.where(c == 4, 40, c)}, "every cell must have half-edges"),
+        ({"cell": lambda c: c[:-1]}, "`cell` must have one entry"),
+        ({"frame": _set((0, 1), 7)}, "opposite lattice offsets"),
+        ({"frame": lambda f: f[:, :1]}, "two entries"),
+        ({"edge": _set(0, 3)}, "`edge`|edge number"),
+        ({"edge": lambda e: e + 1}, "`edge`"),
+    ],
+)
+def test_broken_invariants_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        _break(random_tissue(8), **changes)()
+
+
+def test_two_separate_tissues_are_refused():
+    m = random_tissue(8).topology
+    n = m.n_half_edges
+    with pytest.raises(ValueError, match="in one piece"):
+        vx.Topology(
+            np.concatenate([m.twin, m.twin + n]),
+            np.concatenate([m.cell, m.cell + m.n_cells]),
+            np.concatenate([m.frame, m.frame]),
+        )
+
+
+def test_a_two_sided_cell_is_refused():
+    # Flip an edge of a three-sided cell by hand: the transition rule would refuse it.
+    for seed in range(50):
+        m = random_tissue(20, seed).topology
+        cells = np.asarray(m.edge_cells)
+        triangle = np.flatnonzero(np.asarray(m.neighbour_counts) == 3)
+        if len(triangle):
+            edge = np.flatnonzero((cells == triangle[0]).any(axis=1))[0]
+            broken = flip(m, jnp.arange(m.n_edges) == edge)
+            with pytest.raises(ValueError, match="at least three sides"):
+                broken.validate()
+            return
+    pytest.fail("no three-sided cell among the test tissues")
+
+
+def _flippable(m):
+    sides = np.asarray(m.neighbour_counts)
+    h, cell = np.asarray(m.half_edge), np.asarray(m.cell)
+    turn = lambda x: np.where(x % 3 == 2, x - 2, x + 1)
+    ends = np.stack([cell[turn(x)] for x in (h, np.asarray(m.twin)[h])], axis=-1)
+    left, right = np.asarray(m.edge_cells).T
+    ok = (sides[left] > 3) & (sides[right] > 3) & (left != right) & (ends[:, 0] != ends[:, 1])
+    return np.flatnonzero(ok), ends
+
+
+@settings(max_examples=10, deadline=None)
+@given(tissues(min_cells=5), st.lists(st.integers(0, 10**6), min_size=1, max_size=8))
+def test_flips_keep_every_invariant(recipe, choices):
+    tissue = recipe()
+    area = float(tissue.areas.sum())
+    for choice in choices:
+        m = tissue.topology
+        possible, ends = _flippable(m)
+        edge = possible[choice % len(possible)]
+        flipped = flip(m, jnp.asarray(np.arange(m.n_edges) == edge))
+        flipped.validate()
+        assert set(np.asarray(flipped.edge_cells)[edge]) == set(ends[edge])
+        others = np.arange(m.n_edges) != edge
+        before, after = np.asarray(m.edge_cells), np.asarray(flipped.edge_cells)
+        # All other edges stay between their cells, and carry their numbers along.
+        assert (np.sort(before[others]) == np.sort(after[others])).all()
+        tissue = tissue.with_topology(flipped)
+        assert float(tissue.areas.sum()) == pytest.approx(area, rel=1e-12)
+
+
+@pytest.mark.parametrize("edge", [0, 7, 31])
+def test_a_flip_and_its_inverse_are_the_identity(edge):
+    m = random_tissue(16, 3).topology
+    mark = jnp.arange(m.n_edges) == edge
+    twice = flip(flip(m, mark), mark)
+    # Two quarter turns exchange the ends of the edge; four change nothing at all.
+    assert (twice.edge_cells[edge] == m.edge_cells[edge][::-1]).all()
+    again = flip(flip(twice, mark), mark)
+    for name in ("twin", "cell", "frame", "edge", "half_edge"):
+        assert (getattr(again, name) == getattr(m, name)).all(), name
+
+
+def test_flipping_nothing_changes_nothing():
+    m = random_tissue(16, 3).topology
+    same = flip(m, jnp.zeros(m.n_edges, bool))
+    assert all(jax.tree.leaves(jax.tree.map(lambda a, b: bool((a == b).all()), m, same)))

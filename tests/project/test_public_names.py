@@ -1,0 +1,58 @@
+import vertax as vx
+
+# The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
+NAMES = """
+AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions
+AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation Fit FitError Free GradientOutcome
+History ImplicitDifferentiation InverseProblem MINRES Periodic Record T1 Tissue Topology Uncertainty adjoints
+animate costs energies equilibrate fit fitting initialise io load_tissue mesh plot_history plot_recovery
+plot_tissue plotting responses runs save_tissue solvers transitions uncertainty
+"""
+
+FAMILIES = {
+    "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
+    "ImplicitDifferentiation",
+    "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance EdgeDistance "
+    "HomotypicLength IndexAwareStructural MeanShapeFactor MeshImage VertexDistance WeightedSum "
+    "adjacency aspect_ratio mirror mismatched_neighbours render",
+    "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "
+    "PerimeterElasticity ShapeFactorEnergy Sum",
+    "fitting": "Checkpoint Fit FitError History InverseProblem Record Uncertainty fit uncertainty",
+    "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
+    "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
+    "io": "BoundedTables Tables Trajectory atomic_write cell_table edge_table from_tables "
+    "load_energy load_problem load_tissue load_trajectory read_image record_relaxation "
+    "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
+    "write_geojson write_vtk",
+    "mesh": "AbstractBoundary Free Periodic Tissue Topology",
+    "plotting": "animate cell_polygons flipped_edges plot_history plot_recovery plot_tissue",
+    "responses": "Equilibrium equilibrate",
+    "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
+    "transitions": "AbstractTransitions T1",
+}
+
+
+def public(module):
+    # The hook that checks types in tests leaves its own name behind.
+    return sorted(n for n in vars(module) if not n.startswith("_") and n != "jaxtyping")
+
+
+def test_top_level_names():
+    assert sorted(dir(vx)) == NAMES.split()
+    assert all(hasattr(vx, name) for name in NAMES.split())
+
+
+def test_names_of_the_families():
+    for family, names in FAMILIES.items():
+        assert public(getattr(vx, family)) == names.split(), family
+
+
+def test_importing_changes_no_setting_of_jax():
+    import subprocess
+    import sys
+
+    code = (
+        "import jax; before = dict(jax.config.values); import vertax; import vertax.experiments; "
+        "assert dict(jax.config.values) == before"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,20 @@
+"""Runs of experiments for the tests, and what they leave."""
+
+import csv
+import json
+
+from vertax.runs import RunFolder, load_config
+
+
+def run(path, output, *overrides):
+    experiment, config = load_config(path, overrides)
+    folder = RunFolder.claim(path.stem, output)
+    folder.save_config(config)
+    folder.save_metrics(experiment.run(config, folder, progress=False))
+    return folder.path, json.loads((folder.path / "metrics.json").read_text())
+
+
+def table(path):
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: [row[name] for row in rows] for name in rows[0]}

@@ -1,0 +1,223 @@
+"""The command `vertax`: options, exit codes and messages."""
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+from typer.testing import CliRunner
+
+import vertax as vx
+from vertax.runs import EXPERIMENTS, RunFolder
+from vertax.runs.command_line import app
+
+ROOT = Path(__file__).parents[2]
+
+TINY = """
+experiment = "infer_shape_factors"
+tissue.n_cells = 6
+fit.epochs = 3
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """The working directory holds tiny.toml."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.toml").write_text(TINY)
+    return tmp_path
+
+
+@pytest.fixture
+def same_precision():
+    """A run sets the precision of JAX; the tests go on with theirs."""
+    yield
+    jax.config.update("jax_enable_x64", True)
+
+
+def vertax(*arguments):
+    return CliRunner().invoke(app, list(arguments))
+
+
+def test_run_writes_results_and_says_where(tiny):
+    outcome = vertax("run", "tiny.toml", "--set", "fit.epochs=2", "--set", "seed=3")
+    assert outcome.exit_code == 0, outcome.output
+    metrics = json.loads((tiny / "runs/tiny/metrics.json").read_text())
+    assert metrics["epochs"] == 2
+    assert "pearson" in outcome.output
+    assert "runs/tiny/figures/recovery.png" in outcome.output
+
+
+def test_a_second_run_gets_a_folder_of_its_own(tiny):
+    (tiny / "runs" / "tiny").mkdir(parents=True)
+    (tiny / "runs" / "tiny" / "metrics.json").write_text("precious")
+    outcome = vertax("run", "tiny.toml", "--quiet")
+    assert outcome.exit_code == 0
+    assert outcome.output == ""
+    assert (tiny / "runs/tiny/metrics.json").read_text() == "precious"
+    assert (tiny / "runs/tiny-2/metrics.json").is_file()
+
+
+def test_a_chosen_folder_is_overwritten_only_if_told_to(tiny):
+    (tiny / "out").mkdir()
+    (tiny / "out" / "config.toml").write_text("")
+    (tiny / "out" / "metrics.json").write_text("precious")
+    outcome = vertax("run", "tiny.toml", "--output", "out")
+    assert outcome.exit_code == 2
+    assert "--overwrite" in outcome.stderr
+    assert (tiny / "out/metrics.json").read_text() == "precious"
+    assert vertax("run", "tiny.toml", "--output", "out", "--overwrite").exit_code == 0
+    assert json.loads((tiny / "out/metrics.json").read_text())["epochs"] == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["none.toml"], "There is no configuration file none.toml"),
+        (["tiny.toml", "--set", "fit.epoch=3"], "did you mean `fit.epochs`"),
+        (["tiny.toml", "--set", "fit.epochs=x"], "`fit.epochs` must be an integer"),
+        (["tiny.toml", "--set", "fit.epochs"], "must have the form key=value"),
+    ],
+)
+def test_a_wrong_configuration_is_a_message_and_exit_code_2(tiny, arguments, said):
+    outcome = vertax("run", *arguments)
+    assert outcome.exit_code == 2
+    assert said in outcome.stderr
+    assert "Traceback" not in outcome.output
+    assert not (tiny / "runs").exists()
+
+
+@pytest.fixture
+def instead(monkeypatch):
+    """Puts another function in the place of the experiment: nothing to compile."""
+
+    def instead(run):
+        monkeypatch.setattr(importlib.import_module("vertax.experiments.infer_shape_factors"), "run", run)
+
+    return instead
+
+
+@pytest.mark.parametrize("error", [vx.FitError("It broke.", None), OSError("It broke.")])
+def test_a_failed_run_is_a_message_and_exit_code_1(tiny, instead, error):
+    def fail(config, folder, *, progress):
+        raise error
+
+    instead(fail)
+    outcome = vertax("run", "tiny.toml")
+    assert outcome.exit_code == 1
+    assert outcome.stderr == "Error: It broke.\n"
+    # A folder without metrics is one of a run that did not end.
+    assert [path.name for path in (tiny / "runs/tiny").iterdir()] == ["config.toml"]
+    assert vertax("run", "tiny.toml", "--debug").exception is error
+
+
+def test_a_fault_of_the_program_keeps_its_traceback(tiny, instead):
+    instead(lambda config, folder, *, progress: {}["missing"])
+    assert isinstance(vertax("run", "tiny.toml").exception, KeyError)
+
+
+@pytest.mark.usefixtures("same_precision")
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_the_configuration_decides_the_precision(tiny, instead, precision):
+    instead(lambda config, folder, *, progress: {"precision": str(jnp.ones(1).dtype)})
+    outcome = vertax("run", "tiny.toml", "--set", f"precision={precision}")
+    assert outcome.exit_code == 0, outcome.output
+    assert json.loads((tiny / "runs/tiny/metrics.json").read_text()) == {"precision": precision}
+
+
+def test_help_version_list_and_describe(tiny):
+    assert "run" in vertax("--help").output
+    assert vertax("--version").output.startswith("vertax ")
+    listed = vertax("list").output
+    # However many there are, and however wide their names.
+    assert [line.split()[0] for line in listed.splitlines()] == list(EXPERIMENTS)
+    described = vertax("describe", "infer_shape_factors")
+    (tiny / "described.toml").write_text(described.output)
+    assert vertax("run", "described.toml", "--set", "fit.epochs=0").exit_code == 2
+    unknown = vertax("describe", "infer")
+    assert unknown.exit_code == 2
+    assert "There is no experiment 'infer'" in unknown.stderr
+
+
+METRICS = {"initial": {"cost": 2.5, "epochs": 3}, "fitted": {"cost": 0.125, "epochs": 3}}
+
+
+@pytest.fixture
+def done(tmp_path, monkeypatch):
+    """The working directory holds a finished run in runs/done."""
+    monkeypatch.chdir(tmp_path)
+    folder = RunFolder.claim("done")
+    (folder.path / "config.toml").write_text("")
+    folder.save_table("cells", {"cell": [0, 1]})
+    (folder.path / "figures").mkdir()
+    (folder.path / "figures" / "recovery.png").write_bytes(b"")
+    folder.save_metrics(METRICS)
+    return folder.path
+
+
+def test_show_prints_the_metrics_and_lists_figures_and_files(done):
+    outcome = vertax("show", str(done))
+    assert outcome.exit_code == 0, outcome.output
+    assert outcome.output == (
+        "        initial  fitted\n"
+        "cost        2.5   0.125\n"
+        "epochs        3       3\n"
+        "Figures:\n  runs/done/figures/recovery.png\n"
+        "Files:\n  runs/done/cells.csv\n  runs/done/config.toml\n  runs/done/metrics.json\n"
+    )
+
+
+def test_show_shows_what_run_showed(tiny, instead):
+    instead(lambda config, folder, *, progress: METRICS | {"note": "text"})
+    ran = vertax("run", "tiny.toml")
+    shown = vertax("show", "runs/tiny")
+    table = ran.output.split("runs/tiny\n")[1].split("Results:")[0]
+    assert shown.output.startswith(table)
+
+
+def test_show_of_an_unfinished_run_is_exit_code_1(done):
+    (done / "metrics.json").unlink()
+    outcome = vertax("show", str(done))
+    assert outcome.exit_code == 1
+    assert outcome.stdout == ""
+    assert "The run in runs/done is unfinished: it has no metrics.json" in outcome.stderr
+    assert "vertax run runs/done/config.toml" in outcome.stderr
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (lambda run: (run / "config.toml").unlink(), "there is no config.toml in it"),
+        (lambda run: (run / "metrics.json").write_text("{"), "metrics.json is no JSON"),
+        (lambda run: (run / "metrics.json").write_bytes(b"\xff"), "metrics.json is no JSON"),
+        (lambda run: (run / "metrics.json").write_text("[1]"), "holds no metrics by name"),
+    ],
+)
+def test_show_of_a_folder_that_is_no_run_is_exit_code_2(done, broken, said):
+    broken(done)
+    outcome = vertax("show", str(done))
+    assert outcome.exit_code == 2
+    assert said in outcome.stderr
+    assert "Traceback" not in outcome.output
+
+
+def test_show_of_no_folder_is_exit_code_2(done):
+    assert "there is none" in vertax("show", "runs/none").stderr
+    assert "it is a file" in vertax("show", "runs/done/cells.csv").stderr
+    assert vertax("show", "runs/none").exit_code == 2
+    assert vertax("show").exit_code == 2
+
+
+def test_help_tells_the_exit_codes():
+    assert "Exit codes: 0 all went well, 1 the run failed" in vertax("--help").output
+
+
+def test_the_program_runs_as_a_process():
+    command = [sys.executable, "-m", "vertax", "run", "none.toml"]
+    outcome = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert outcome.returncode == 2
+    assert outcome.stderr == "Error: There is no configuration file none.toml.\n"

@@ -1,0 +1,255 @@
+"""Configuration files: what is accepted, and how mistakes are reported."""
+
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from pydantic import Field
+
+from vertax.runs import (
+    EXPERIMENTS,
+    ConfigError,
+    ExperimentConfig,
+    Section,
+    apply_overrides,
+    fields,
+    load_config,
+    template,
+)
+from vertax.runs._config import validate
+
+CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
+VALID = 'experiment = "infer_shape_factors"\n[fit]\nepochs = 7\n'
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text, name="some.toml"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def refusal(path, *overrides):
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, overrides)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_every_config_of_the_repository_is_valid(path):
+    load_config(path)
+
+
+def test_there_are_configs():
+    assert {"demo", "infer_shape_factors"} <= {path.stem for path in CONFIGS}
+
+
+def test_keys_left_out_have_their_defaults(write):
+    experiment, config = load_config(write(VALID))
+    assert experiment is EXPERIMENTS["infer_shape_factors"]
+    assert config.fit.epochs == 7
+    assert config.fit.learning_rate == type(config)().fit.learning_rate
+
+
+@pytest.mark.parametrize(
+    ("override", "get", "expected"),
+    [
+        ("fit.epochs=50", lambda c: c.fit.epochs, 50),
+        ("fit.learning_rate=1", lambda c: c.fit.learning_rate, 1.0),
+        (" fit . optimiser = nadam ", lambda c: c.fit.optimiser, "nadam"),
+        ('data="image"', lambda c: c.data, "image"),
+        ("relaxation.transitions=false", lambda c: c.relaxation.transitions, False),
+        ("fit={epochs=3}", lambda c: c.fit.epochs, 3),
+    ],
+)
+def test_an_override_sets_one_key(write, override, get, expected):
+    assert get(load_config(write(VALID), [override])[1]) == expected
+
+
+def test_the_last_override_wins(write):
+    assert load_config(write(VALID), ["seed=1", "seed=2"])[1].seed == 2
+
+
+def test_overrides_leave_the_original_alone_and_cannot_add_keys():
+    data = {"a": {"b": 1}}
+    text = "1\nc = 2"
+    assert apply_overrides(data, ["a.b=2", "d.e=x y", f"f={text}"]) == {
+        "a": {"b": 2},
+        "d": {"e": "x y"},
+        "f": text,
+    }
+    assert data == {"a": {"b": 1}}
+
+
+@pytest.mark.parametrize("override", ["fit.epochs", "=3", "fit.=3", ".epochs=3"])
+def test_an_override_of_another_form_is_refused(write, override):
+    message = refusal(write(VALID), override)
+    assert repr(override) in message
+    assert "key=value" in message
+
+
+def test_a_key_inside_a_value_is_refused(write):
+    assert "`data` is a value and not a table" in refusal(write(VALID), "data=image", "data.x=1")
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("tissue.n_cell=3", ["`tissue.n_cell`", "`tissue.n_cells`", "an integer, at least 4"]),
+        ("epochs=3", ["`epochs`", "`fit.epochs`", "an integer, at least 1"]),
+        ("fit.optimizer=adam", ["`fit.optimizer`", "`fit.optimiser`", '"adam", "nadam"']),
+        ("relaxation.t1_treshold=1", ["`relaxation.t1_threshold`", "a number, above 0"]),
+        ("fits.epochs=1", ["`fits`", "`fit`", "a table with the keys optimiser, learning_rate"]),
+        ("fit.xyz=1", ["`fit.xyz`", "`fit.optimiser`", "`fit.learning_rate`", "`fit.epochs`"]),
+    ],
+)
+def test_an_unknown_key_is_refused_by_name_with_the_nearest_right_one(write, override, said):
+    message = refusal(write(VALID), override)
+    for part in ["there is no key", *said]:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("fit.epochs=many", '`fit.epochs` must be an integer, at least 1, but is "many"'),
+        ("fit.epochs=2.5", "`fit.epochs` must be an integer, at least 1, but is 2.5"),
+        ("fit.epochs=true", "`fit.epochs` must be an integer, at least 1, but is true"),
+        ("fit.epochs=0", "`fit.epochs` must be an integer, at least 1, but is 0"),
+        ("fit.learning_rate=nan", "`fit.learning_rate` must be a number, above 0, but is nan"),
+        ("image.uneven_gain=1", "must be a number, at least 0, below 1, but is 1"),
+        ("relaxation.transitions=1", "`relaxation.transitions` must be true or false, but is 1"),
+        ("relaxation.tolerance=-1", "`relaxation.tolerance` must be a number, above 0, but is -1"),
+        ("data=pixels", '`data` must be one of "vertices", "image", "both", but is "pixels"'),
+        ("tissue=20", "`tissue` must be a table with the keys n_cells, lloyd_steps, but is 20"),
+        ("seed={a=1}", "`seed` must be an integer, at least 0, but is a table"),
+    ],
+)
+def test_an_ill_typed_key_is_refused_by_name_with_what_is_allowed(write, override, said):
+    assert said in refusal(write(VALID), override)
+
+
+def test_all_mistakes_are_reported_at_once_with_the_file(write):
+    path = write(VALID)
+    message = refusal(path, "fit.epochs=0", "seeds=1", "data=3")
+    assert message.startswith(f"In {path}:")
+    assert all(part in message for part in ("`fit.epochs`", "`seeds`", "`data`"))
+
+
+def test_a_missing_file_and_bad_toml_are_named(write, tmp_path):
+    assert f"no configuration file {tmp_path / 'none.toml'}" in refusal(tmp_path / "none.toml")
+    assert f"Cannot read {tmp_path}" in refusal(tmp_path)
+    bad = write("fit = [", "bad.toml")
+    assert f"{bad} is not valid TOML" in refusal(bad)
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    assert f"{binary} is not valid TOML" in refusal(binary)
+
+
+def test_the_experiment_must_be_named_and_exist(write):
+    assert "`experiment` is missing" in refusal(write("seed = 1"))
+    message = refusal(write('experiment = "infer_shape_factor"'))
+    assert "did you mean 'infer_shape_factors'?" in message
+    assert "there are: benchmark_adjoints" in refusal(write("experiment = 3"))
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
+def test_every_key_has_a_description(experiment):
+    assert all(field.description for field in fields(experiment.config).values())
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
+def test_the_template_is_a_configuration_with_all_defaults(experiment):
+    required = {k for k, f in fields(experiment.config).items() if f.is_required()}
+    text = template(experiment.config, experiment.name)
+    if not required:
+        assert validate(experiment.config, tomllib.loads(text)) == experiment.config()
+    for key in fields(experiment.config):
+        assert f"{key.rpartition('.')[2]} =" in text or f"[{key}]" in text
+
+
+class _Camera(Section):
+    """A table."""
+
+    path: Path = Field(strict=False)
+    """Where it is."""
+    crop: list[int] = Field(default=[0, 0])
+    """Corner."""
+
+
+class _Config(ExperimentConfig):
+    """A configuration."""
+
+    experiment: Literal["x"] = "x"
+    """Which."""
+    camera: _Camera
+    """A camera."""
+
+
+class _Deep(ExperimentConfig):
+    """A configuration with its own defaults for shared tables."""
+
+    experiment: Literal["x"] = "x"
+    """Which."""
+    outer: "_Outer" = Field(default_factory=lambda: _Outer())
+    """A table."""
+    camera: _Camera = _Camera(path=Path("here.tif"), crop=[1, 2])
+    """A camera."""
+
+
+class _Inner(Section):
+    """A table in a table."""
+
+    a: int = 1
+    """A."""
+    b: int = 2
+    """B."""
+
+
+class _Outer(Section):
+    """A table."""
+
+    inner: _Inner = _Inner(a=10)
+    """The inner one."""
+
+
+_Deep.model_rebuild()
+
+
+def test_a_table_of_which_one_key_is_given_keeps_the_defaults_of_the_others():
+    assert validate(_Deep, {"camera": {"crop": [3, 4]}}).camera.path == Path("here.tif")
+    inner = validate(_Deep, {"outer": {"inner": {"b": 5}}}).outer.inner
+    assert (inner.a, inner.b) == (10, 5)
+    assert "a = 10" in template(_Deep, "x")
+    with pytest.raises(ConfigError, match=r"`camera` must be a table"):
+        validate(_Deep, {"camera": 3})
+    with pytest.raises(ConfigError, match=r"no key `outer.inner.aa`"):
+        validate(_Deep, {"outer": {"inner": {"aa": 5}}})
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
+def test_setting_a_default_changes_nothing(experiment):
+    default = experiment.config().model_dump(exclude_none=True)
+    for table, keys in default.items():
+        for key, value in keys.items() if isinstance(keys, dict) else ():
+            assert validate(experiment.config, {table: {key: value}}) == experiment.config()
+
+
+def test_missing_keys_paths_and_lists_are_explained():
+    with pytest.raises(
+        ConfigError, match=r"`camera` is missing; it must be a table with the keys path"
+    ):
+        validate(_Config, {})
+    with pytest.raises(
+        ConfigError, match=r"`camera.path` is missing; it must be a string, the path"
+    ):
+        validate(_Config, {"camera": {}})
+    with pytest.raises(
+        ConfigError, match=r"`camera.crop.1` must be a list, each entry an integer, but is 2.5"
+    ):
+        validate(_Config, {"camera": {"path": "a", "crop": [1, 2.5]}})
+    assert validate(_Config, {"camera": {"path": "a.tif"}}).camera.path == Path("a.tif")

@@ -1,0 +1,53 @@
+from . import (
+    adjoints as adjoints,
+    costs as costs,
+    energies as energies,
+    fitting as fitting,
+    initialise as initialise,
+    io as io,
+    mesh as mesh,
+    plotting as plotting,
+    responses as responses,
+    runs as runs,
+    solvers as solvers,
+    transitions as transitions,
+)
+from .adjoints import (
+    AutomaticDifferentiation as AutomaticDifferentiation,
+    EquilibriumPropagation as EquilibriumPropagation,
+    GradientOutcome as GradientOutcome,
+    ImplicitDifferentiation as ImplicitDifferentiation,
+)
+from .costs import AbstractCost as AbstractCost
+from .energies import (
+    AbstractEnergy as AbstractEnergy,
+    AbstractLocalEnergy as AbstractLocalEnergy,
+)
+from .fitting import (
+    Checkpoint as Checkpoint,
+    Fit as Fit,
+    FitError as FitError,
+    History as History,
+    InverseProblem as InverseProblem,
+    Record as Record,
+    Uncertainty as Uncertainty,
+    fit as fit,
+    uncertainty as uncertainty,
+)
+from .io import load_tissue as load_tissue, save_tissue as save_tissue
+from .mesh import (
+    AbstractBoundary as AbstractBoundary,
+    Free as Free,
+    Periodic as Periodic,
+    Tissue as Tissue,
+    Topology as Topology,
+)
+from .plotting import (
+    animate as animate,
+    plot_history as plot_history,
+    plot_recovery as plot_recovery,
+    plot_tissue as plot_tissue,
+)
+from .responses import Equilibrium as Equilibrium, equilibrate as equilibrate
+from .solvers import MINRES as MINRES
+from .transitions import T1 as T1, AbstractTransitions as AbstractTransitions

@@ -1,0 +1,133 @@
+"""Choose target shape factors of cells that give the tissue a mean shape factor (paper, Figure 4a).
+
+A periodic tissue of the energy E1 starts from random target shape factors. They are adjusted until the
+mean of the shape factors that the cells have in equilibrium is the one asked for.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+from pydantic import Field
+
+from vertax.costs import MeanShapeFactor
+from vertax.energies import ShapeFactorEnergy
+from vertax.experiments import _design_figures as figures
+from vertax.experiments._design import Gradient, design, limits
+from vertax.experiments._figures import convergence
+from vertax.experiments._scenes import ShapeFactors, TissueSection
+from vertax.fitting import InverseProblem
+from vertax.initialise import periodic_voronoi
+from vertax.mesh import Tissue
+from vertax.runs._config import ExperimentConfig
+from vertax.runs._folder import RunFolder
+from vertax.runs._sections import Fitting, Relaxation
+from vertax.runs._tables import fit_metrics, history_columns
+
+
+class Config(ExperimentConfig):
+    """Configuration of this experiment."""
+
+    experiment: Literal["design_mechanics"] = "design_mechanics"
+    """Which experiment this is."""
+    target: float = Field(default=4.10, gt=0)
+    """The mean shape factor to reach."""
+    accuracy: float = Field(default=1e-3, gt=0)
+    """Distance from the target that counts as reached."""
+    tissue: TissueSection = TissueSection()
+    """The tissue."""
+    start: ShapeFactors = ShapeFactors(mean=3.91, deviation=0.1)
+    """Distribution of the target shape factors to begin with."""
+    gradient: Gradient = Gradient()
+    """How gradients are taken."""
+    fit: Fitting = Fitting(learning_rate=2e-3)
+    """How the parameters are fitted."""
+    relaxation: Relaxation = Relaxation()
+    """How the tissue is relaxed."""
+
+
+def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
+    """Run the experiment.
+
+    **Arguments:**
+
+    - `config`: its configuration.
+    - `folder`: where the results go.
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** the metrics: mean shape factor in equilibrium and of the parameters, at the start and at
+    the end, and the epoch at which the target was reached.
+
+    **Raises:**
+
+    - `FitError` if the fit cannot go on.
+    """
+    keys = jax.random.split(jax.random.key(config.seed))
+    n_cells = config.tissue.n_cells
+    noise = jax.random.normal(keys[0], (n_cells,))
+    # The sample, and not only its distribution, has the mean to start from.
+    noise = noise - jnp.mean(noise)
+    energy = ShapeFactorEnergy(config.start.mean + config.start.deviation * noise)
+    drawn = periodic_voronoi(n_cells, key=keys[1], lloyd_steps=config.tissue.lloyd_steps)
+    problem = InverseProblem(
+        drawn,
+        energy,
+        MeanShapeFactor(config.target),
+        adjoint=config.gradient.build(),
+        **config.relaxation.options(),
+    )
+    outcome, initial, (observed, targets) = design(
+        folder, "design", problem, config.fit, _measure, progress=progress
+    )
+    _save(initial, outcome, observed, targets, config, folder)
+    mean, of_parameters = observed.mean(axis=1), targets.mean(axis=1)
+    off = np.abs(mean - config.target)
+    best, near = int(outcome.best_epoch), off <= config.accuracy
+    return {
+        "target": config.target,
+        "mean_initial": mean[0],
+        "mean_final": mean[best],
+        "distance_final": off[best],
+        "mean_parameter_initial": of_parameters[0],
+        "mean_parameter_final": of_parameters[best],
+        "mismatch_of_cells_final": np.abs(observed - targets)[best].mean(),
+        "reached_at_epoch": int(np.argmax(near)) if near.any() else None,
+        **fit_metrics(outcome),
+        "gradient_residual": np.nanmax(outcome.history.gradient_residual),
+        "seconds": outcome.history.seconds.sum(),
+        "limited_by": limits(outcome, np.asarray(near[best])),
+    }
+
+
+def _measure(problem: InverseProblem, tissue: Tissue, parameters: PyTree) -> tuple[Array, Array]:
+    return tissue.shape_factors, jnp.asarray(parameters.target_shape_factor)
+
+
+def _save(
+    initial: Tissue,
+    outcome: Any,
+    observed: np.ndarray,
+    targets: np.ndarray,
+    config: Config,
+    folder: RunFolder,
+) -> None:
+    best = int(outcome.best_epoch)
+    folder.save_tissue("initial", initial)
+    folder.save_tissue("designed", outcome.tissue)
+    means = {"mean_observed": observed.mean(axis=1), "mean_parameter": targets.mean(axis=1)}
+    folder.save_table("history", history_columns(outcome.history) | means)
+    cells = np.arange(targets.shape[1])
+    columns = {"cell": cells, "target_initial": targets[0], "target_final": targets[best]}
+    columns |= {"observed_initial": observed[0], "observed_final": observed[best]}
+    folder.save_table("cells", columns)
+    epochs, cell = (x.ravel() for x in np.indices(targets.shape))
+    every = {"epoch": epochs, "cell": cell, "target": targets.ravel(), "observed": observed.ravel()}
+    folder.save_table("cells_by_epoch", every)
+    panels = {"initial": (initial, observed[0]), "designed": (outcome.tissue, observed[best])}
+    figure = figures.mechanics(panels, observed, targets, config.target)
+    folder.save_figure("design", figure)
+    folder.save_figure("convergence", convergence(outcome.history))

@@ -1,0 +1,229 @@
+"""Recover hidden target shape factors of a synthetic tissue from its vertices or an image of it.
+
+A periodic Voronoi tissue gets a target shape factor for each cell, drawn at random, and is relaxed.
+What is seen of it (its vertices, or a microscopy image) and its topology are all that the fit is
+given; it starts from a guess of the shape factors and has to find the hidden ones (paper,
+"Benchmarking bilevel optimization approaches on vertex models").
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field
+
+from vertax.costs import AbstractCost, MeshImage, VertexDistance, render
+from vertax.energies import AbstractEnergy, ShapeFactorEnergy
+from vertax.experiments import _figures
+from vertax.experiments._scenes import (
+    Scene,
+    ShapeFactors,
+    TissueSection,
+    make_scene,
+    same_neighbours,
+)
+from vertax.fitting import Fit, FitError, InverseProblem
+from vertax.mesh import Tissue
+from vertax.runs._config import ExperimentConfig, Section
+from vertax.runs._folder import RunFolder
+from vertax.runs._sections import Fitting, Relaxation
+from vertax.runs._tables import fit_metrics, history_columns
+
+_NAME = r"$p_0$"
+_Image = Float[np.ndarray, "rows columns"] | None
+
+
+class ImageSection(Section):
+    """The synthetic microscopy image; intensities are relative to the brightest membrane."""
+
+    pixels: int = Field(default=128, ge=16)
+    """Side of the image in pixels."""
+    psf_width: float = Field(default=2.0, ge=1)
+    """Standard deviation of the point spread function in pixels."""
+    noise: float = Field(default=0.05, ge=0)
+    """Standard deviation of the noise of a pixel."""
+    background: float = Field(default=0.1, ge=0)
+    """Intensity where there is no membrane."""
+    uneven_gain: float = Field(default=0.0, ge=0, lt=1)
+    """Amplitude of a slow variation of brightness over the image."""
+
+
+class Config(ExperimentConfig):
+    """Configuration of this experiment."""
+
+    experiment: Literal["infer_shape_factors"] = "infer_shape_factors"
+    """Which experiment this is."""
+    data: Literal["vertices", "image", "both"] = "vertices"
+    """What the fit is given; both makes one fit from each."""
+    guess: Literal["redrawn", "mean"] = "redrawn"
+    """Where the fit starts: another draw of the distribution, or its mean in all cells."""
+    tissue: TissueSection = TissueSection()
+    """The tissue."""
+    truth: ShapeFactors = ShapeFactors()
+    """Distribution of the hidden shape factors."""
+    image: ImageSection = ImageSection()
+    """The synthetic microscopy image."""
+    fit: Fitting = Fitting()
+    """How the parameters are fitted."""
+    relaxation: Relaxation = Relaxation()
+    """How the tissue is relaxed."""
+
+
+def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
+    """Run the experiment.
+
+    **Arguments:**
+
+    - `config`: its configuration.
+    - `folder`: where the results go.
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** the metrics: `pearson`, `relative_error`, `cost_initial`, `cost_final`, `max_force`
+    and others of the fit; if there are two kinds of data, those of the vertices and a mapping for
+    each.
+
+    **Raises:**
+
+    - `FitError` if a fit cannot go on; the folder then holds what came before.
+    """
+    scene, image = _make_scene(config)
+    _save_scene(scene, image, folder)
+    both = config.data == "both"
+    metrics: dict[str, dict[str, Any]] = {}
+    fits: dict[str, Fit] = {}
+    for source in ("vertices", "image") if both else (config.data,):
+        try:
+            fits[source] = _fit(config, scene, image, source, folder, progress)
+        except FitError as error:
+            if error.fit is not None:
+                _save_tables(scene, fits | {source: error.fit}, folder)
+            raise
+        _save_tables(scene, fits, folder)
+        _save_fit(config, scene, image, source, fits[source], folder)
+        metrics[source] = _metrics(scene, fits[source])
+    # The same keys are at the top whatever the data; the exact data, vertices, come first.
+    return metrics["vertices"] | metrics if both else metrics[config.data]
+
+
+def synthetic_image(
+    tissue: Tissue, options: ImageSection, key: PRNGKeyArray
+) -> Float[np.ndarray, "rows columns"]:
+    """What a microscope might see of a tissue: blurred membranes on a background, uneven and noisy.
+
+    **Arguments:**
+
+    - `tissue`: a tissue in a square periodic box.
+    - `options`: the microscope.
+    - `key`: of the noise.
+
+    **Returns:** the image of one period, rows along y.
+    """
+    shape = (options.pixels, options.pixels)
+    width = options.psf_width * _pixel_size(tissue, options)
+    membranes = np.asarray(eqx.filter_jit(render)(tissue, shape, width), float)
+    # Brightest off the centre, and periodic as the tissue is.
+    phase = 2 * np.pi * (np.arange(options.pixels) + 0.5) / options.pixels
+    gain = 1 + 0.5 * options.uneven_gain * (np.sin(phase)[:, None] + np.cos(phase)[None, :])
+    noise = np.asarray(jax.random.normal(key, shape), float)
+    return gain * (membranes / membranes.max() + options.background) + options.noise * noise
+
+
+def _make_scene(config: Config) -> tuple[Scene, _Image]:
+    keys = jax.random.split(jax.random.key(config.seed), 4)
+    redrawn = config.guess == "redrawn"
+    scene = make_scene(keys[:3], config.tissue, config.truth, config.relaxation, redrawn=redrawn)
+    needs_image = config.data != "vertices"
+    return scene, synthetic_image(scene.target, config.image, keys[3]) if needs_image else None
+
+
+def _fit(
+    config: Config, scene: Scene, image: _Image, source: str, folder: RunFolder, progress: bool
+) -> Fit:
+    cost: AbstractCost
+    if source == "image":
+        assert image is not None
+        width = config.image.psf_width * _pixel_size(scene.target, config.image)
+        cost = MeshImage(image, width)
+    else:
+        cost = VertexDistance(scene.target)
+    problem = InverseProblem(
+        scene.initial,
+        scene.guess,
+        cost,
+        # Vertices keep their centroid while they relax; an image does not say where it was.
+        fit_position=source == "image",
+        **config.relaxation.options(),
+    )
+    optimiser, epochs = config.fit.build(), config.fit.epochs
+    return folder.fit(source, problem, optimiser, epochs, truth=scene.truth, progress=progress)
+
+
+def _metrics(scene: Scene, outcome: Fit) -> dict[str, Any]:
+    true, inferred = _parameters(scene.truth), _parameters(outcome.energy)
+    history = outcome.history
+    varied = np.ptp(true) > 0 and np.ptp(inferred) > 0
+    return {
+        "pearson": np.corrcoef(true, inferred)[0, 1] if varied else np.nan,
+        "relative_error": np.mean(np.abs(inferred - true) / np.abs(true)),
+        "relative_error_initial": history.relative_error[0],
+        **fit_metrics(outcome),
+        "same_neighbours": same_neighbours(outcome.tissue, scene.target),
+    }
+
+
+def _save_scene(scene: Scene, image: _Image, folder: RunFolder) -> None:
+    folder.save_tissue("target", scene.target)
+    folder.save_tissue("initial", scene.initial)
+    panels = {"target": (scene.target, _parameters(scene.truth))}
+    folder.save_figure("target", _figures.tissues(panels, label=f"true {_NAME}"))
+    if image is not None:
+        folder.save_array("image", image)
+
+
+def _save_tables(scene: Scene, fits: dict[str, Fit], folder: RunFolder) -> None:
+    inferred = {
+        "inferred" if len(fits) == 1 else f"inferred_{source}": _parameters(outcome.energy)
+        for source, outcome in fits.items()
+    }
+    true, initial = _parameters(scene.truth), _parameters(scene.guess)
+    cells = {"cell": np.arange(len(true)), "true": true, "initial": initial} | inferred
+    folder.save_table("shape_factors", cells)
+    epochs = [history_columns(outcome.history, data=source) for source, outcome in fits.items()]
+    folder.save_table(
+        "history", {name: np.concatenate([e[name] for e in epochs]) for name in epochs[0]}
+    )
+
+
+def _save_fit(
+    config: Config, scene: Scene, image: _Image, source: str, outcome: Fit, folder: RunFolder
+) -> None:
+    ending = f"_{source}" if config.data == "both" else ""
+    folder.save_tissue(f"fitted{ending}", outcome.tissue)
+    true, inferred, initial = map(_parameters, (scene.truth, outcome.energy, scene.guess))
+    panels = {
+        "initial guess": (scene.initial, initial),
+        "fitted": (outcome.tissue, inferred),
+        "target": (scene.target, true),
+    }
+    label = f"target shape factor {_NAME}"
+    folder.save_figure(f"before_after{ending}", _figures.tissues(panels, label=label))
+    folder.save_figure(f"convergence{ending}", _figures.convergence(outcome.history))
+    folder.save_figure(f"recovery{ending}", _figures.recovery(true, inferred, initial, name=_NAME))
+    if source == "image" and image is not None:
+        overlays = {"image": None, "initial guess": scene.initial, "fitted": outcome.tissue}
+        pixel = _pixel_size(scene.target, config.image)
+        figure = _figures.overlays(image, overlays, pixel_size=pixel, upright=True)
+        folder.save_figure(f"overlay{ending}", figure)
+
+
+def _parameters(energy: AbstractEnergy) -> Float[np.ndarray, " cells"]:
+    assert isinstance(energy, ShapeFactorEnergy)
+    return np.asarray(energy.target_shape_factor, float)
+
+
+def _pixel_size(tissue: Tissue, options: ImageSection) -> float:
+    return float(np.sqrt(tissue.n_cells)) / options.pixels

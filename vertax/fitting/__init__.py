@@ -1,0 +1,12 @@
+"""Inverse problems: parameters whose equilibrium minimises a cost."""
+
+from vertax.fitting._checkpoint import Checkpoint as Checkpoint
+from vertax.fitting._fit import fit as fit
+from vertax.fitting._history import (
+    Fit as Fit,
+    FitError as FitError,
+    History as History,
+    Record as Record,
+)
+from vertax.fitting._inverse import InverseProblem as InverseProblem
+from vertax.fitting._uncertainty import Uncertainty as Uncertainty, uncertainty as uncertainty

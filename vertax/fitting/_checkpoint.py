@@ -1,0 +1,231 @@
+"""A fit in the middle of its way, in a file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import PyTree, Shaped
+
+from vertax._base.archive import as_jax, read_archive, write_archive
+from vertax._base.modules import without_addresses
+
+_VERSION = 1
+# Writing takes no more than this share of the time of a fit, however slow the disk.
+_SHARE = 0.02
+
+Row = Mapping[str, Any]
+
+
+class Checkpoint(eqx.Module):
+    """Where, and how often, [`fit`][vertax.fit] writes down how far it has come.
+
+    ```python
+    fit = vx.fit(problem, optax.adam(1e-2), epochs=5000, checkpoint="fit.npz")
+    ```
+
+    If the file is there, the same call goes on from it, and ends at the same numbers, bit for bit on one
+    machine, as if it had never stopped; a fit that has come to its end is not repeated. Delete the file to
+    start anew. A greater number of `epochs` continues a fit that is done.
+
+    The file is a NumPy `.npz` archive without pickles: the state of the optimiser, the parameters, the
+    tissue, the best point so far and the history. It is written at the end of the fit, at an
+    interrupt from the keyboard, and between epochs, atomically: a process that is killed while it writes
+    leaves the last one.
+
+    **Arguments:**
+
+    - `path`: the file, by custom with the ending `.npz`.
+    - `every`: least number of seconds from one to the next; 0 is after each epoch, unless writing takes
+        more than 2 % of the time.
+
+    **Raises:**
+
+    - `ValueError` if `every` is negative.
+    """
+
+    path: Path = eqx.field(converter=Path)
+    every: float = eqx.field(default=10.0, converter=float)
+
+    def __check_init__(self) -> None:
+        if not self.every >= 0:
+            raise ValueError(f"Argument `every` must not be negative, but is {self.every}.")
+
+
+class Progress(NamedTuple):
+    """How far a fit has come: a new one after each epoch, so that an interrupt finds a whole one."""
+
+    state: PyTree
+    rows: tuple[Row, ...] = ()
+    notes: tuple[Row, ...] = ()
+
+
+class Keeper:
+    """Reads and writes the checkpoints of one fit.
+
+    **Arguments:**
+
+    - `checkpoint`: where and how often; None for not at all.
+    - `identity`: what makes this fit another one than others, see `identity_of`; only called if there
+        is something to read or to write.
+    """
+
+    def __init__(self, checkpoint: Checkpoint | None, identity: Callable[[], dict[str, str]]):
+        if checkpoint is not None and not checkpoint.path.absolute().parent.is_dir():
+            # Said now, and not when hours of work are to be written.
+            raise FileNotFoundError(
+                f"Argument `checkpoint` is {os.fspath(checkpoint.path)!r}, but there is no folder "
+                f"{checkpoint.path.parent}. Make it first."
+            )
+        self._checkpoint = checkpoint
+        self._identity = identity() if checkpoint is not None else {}
+        self._due = 0.0 if checkpoint is None else time.perf_counter() + checkpoint.every
+
+    def load(self, start: PyTree) -> Progress:
+        """The progress in the file, or that of a fit which starts now."""
+        if self._checkpoint is None or not self._checkpoint.path.exists():
+            return Progress(start)
+        return _load(self._checkpoint.path, self._identity, start)
+
+    def note(self, progress: Progress) -> None:
+        """Write it, if it is time to."""
+        if self._checkpoint is None or time.perf_counter() < self._due:
+            return
+        began = time.perf_counter()
+        self.save(progress)
+        ended = time.perf_counter()
+        self._due = ended + max(self._checkpoint.every, (ended - began) / _SHARE)
+
+    def save(self, progress: Progress) -> None:
+        """Write it now."""
+        if self._checkpoint is not None:
+            _save(self._checkpoint.path, self._identity, progress)
+
+
+def identity_of(problem: PyTree, truth: PyTree, optimiser: str, batched: bool) -> dict[str, str]:
+    """What makes a fit another one than others, by what it is called in messages."""
+    layout = eqx.tree_pformat((problem, truth), short_arrays=True, width=100)
+    return {
+        "problem (sizes, classes or settings)": without_addresses(layout),
+        "problem (numbers in its arrays)": _digest((problem, truth)),
+        "optimiser": optimiser,
+        "setting of `batched`": str(batched),
+    }
+
+
+def _digest(tree: PyTree) -> str:
+    numbers = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        if eqx.is_array_like(leaf):
+            numbers.update(np.ascontiguousarray(_plain(leaf)).tobytes())
+    return numbers.hexdigest()
+
+
+def _save(path: Path, identity: Mapping[str, str], progress: Progress) -> None:
+    state = [_plain(x) for x in _arrays(progress.state)]
+    arrays = {
+        "identity": np.asarray(json.dumps(identity)),
+        "epochs": np.asarray(len(progress.rows)),
+    }
+    arrays |= {f"state_{i}": x for i, x in enumerate(state)}
+    arrays |= {f"row_{name}": column for name, column in columns_of(progress.rows).items()}
+    arrays |= {f"note_{name}": column for name, column in columns_of(progress.notes).items()}
+    write_archive(path, "checkpoint", _VERSION, arrays)
+
+
+def _load(path: Path, identity: Mapping[str, str], start: PyTree) -> Progress:
+    name = os.fspath(path)
+    try:
+        arrays = read_archive(path, "checkpoint", _VERSION)
+    except ValueError as error:
+        raise ValueError(f"{error} {_REMEDY}") from error
+    _check_identity(name, str(arrays.get("identity", "{}")), identity)
+    n = arrays.get("epochs", np.asarray(-1))
+    rows, notes = (_rows(arrays, prefix) for prefix in ("row_", "note_"))
+    fresh = _arrays(start)
+    stored = [arrays.get(f"state_{i}", np.zeros(0, bool)) for i in range(len(fresh))]
+    if n.shape or n != len(rows) or len(notes) not in (0, n) or not all(map(_alike, stored, fresh)):
+        raise ValueError(f"{name} is broken: its state does not go with the fit. {_REMEDY}")
+    restored = [_restored(x, like, name) for x, like in zip(stored, fresh, strict=True)]
+    dynamic, static = eqx.partition(start, eqx.is_array)
+    state = eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), restored), static)
+    return Progress(state, rows, notes)
+
+
+_REMEDY = "Delete the file to start this fit anew."
+
+
+def _check_identity(name: str, text: str, wanted: Mapping[str, str]) -> None:
+    try:
+        found = json.loads(text)
+    except json.JSONDecodeError:
+        found = {}
+    for part, value in wanted.items():
+        if found.get(part) != value:
+            raise ValueError(
+                f"{name} is the checkpoint of a fit with another {part}{_difference(found, part, value)}. "
+                f"Give the same one again, or choose another file as `checkpoint`. {_REMEDY}"
+            )
+
+
+def _difference(found: Mapping[str, str], part: str, value: str) -> str:
+    """What stands in one description and not in the other."""
+    then, now = (
+        [line.strip(" ,") for line in text.splitlines()] for text in (found.get(part, ""), value)
+    )
+    lines = (
+        [line for line in then if line not in now][:1],
+        [line for line in now if line not in then][:1],
+    )
+    # What a description leaves out has its default.
+    texts = [next(iter(own), "the default") for own in lines]
+    return "" if max(map(len, texts)) > 60 or not any(lines) else f": {texts[0]} and not {texts[1]}"
+
+
+def columns_of(rows: Sequence[Row]) -> dict[str, np.ndarray]:
+    """Rows with the same names as columns, the first axis being that of the rows."""
+    return {name: np.asarray([row[name] for row in rows]) for name in rows[0]} if rows else {}
+
+
+def _rows(arrays: Mapping[str, np.ndarray], prefix: str) -> tuple[Row, ...]:
+    columns = {k.removeprefix(prefix): a for k, a in arrays.items() if k.startswith(prefix)}
+    if not columns or min(a.ndim for a in columns.values()) == 0:
+        return ()
+    length = min(len(column) for column in columns.values())
+    return tuple({name: column[i] for name, column in columns.items()} for i in range(length))
+
+
+def _arrays(tree: PyTree) -> list[Any]:
+    return jax.tree.leaves(eqx.filter(tree, eqx.is_array))
+
+
+def _is_key(x: Any) -> bool:
+    return eqx.is_array(x) and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _plain(x: Any) -> Shaped[np.ndarray, "..."]:
+    """An array as NumPy can write it: random keys are made of numbers."""
+    return np.asarray(jax.random.key_data(x) if _is_key(x) else x)
+
+
+def _alike(stored: np.ndarray, fresh: Any) -> bool:
+    like = _plain(fresh)
+    # A file holds numbers that NumPy does not know, such as bfloat16, as raw bytes.
+    return (stored.shape, stored.itemsize) == (like.shape, like.itemsize)
+
+
+def _restored(stored: np.ndarray, fresh: Any, name: str) -> Any:
+    array = as_jax(stored.view(_plain(fresh).dtype), name)
+    return (
+        jax.random.wrap_key_data(array, impl=jax.random.key_impl(fresh))
+        if _is_key(fresh)
+        else array
+    )

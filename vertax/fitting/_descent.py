@@ -1,0 +1,196 @@
+"""Epochs of an Optax optimiser."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+
+from vertax._base.modules import without_addresses
+from vertax.adjoints import GradientOutcome
+from vertax.fitting._epoch import (
+    AbstractMethod,
+    Best,
+    better,
+    choose,
+    guidance_of,
+    no_shift,
+    relative_error,
+    unbeaten,
+)
+from vertax.fitting._history import Record
+from vertax.fitting._inverse import InverseProblem
+from vertax.mesh import Tissue
+from vertax.responses import Equilibrium
+
+
+class State(eqx.Module):
+    """Where an epoch begins."""
+
+    parameters: PyTree[Array]
+    optimiser: PyTree
+    tissue: Tissue
+    best: Best
+    going: Bool[Array, "*batch"]
+    """False once an epoch was not sound."""
+
+
+class Descent(AbstractMethod):
+    """Epochs of an Optax optimiser."""
+
+    optimiser: optax.GradientTransformation
+    problem: InverseProblem
+    parameters: PyTree[Array]
+    constants: PyTree
+    true: PyTree[Array] | None
+    batched: bool
+    guidance: Callable[[Int[Array, ""]], ArrayLike] | None
+
+    def start(self) -> State:
+        return _start(self._lenient(), self.optimiser, self.parameters, self.batched)
+
+    def advance(self, state: State, epoch: int) -> tuple[State, Record]:
+        strength = None
+        if self.guidance is not None:
+            strength = jnp.asarray(self.strength(epoch), self.problem.tissue.vertices.dtype)
+        return _epoch(
+            self._lenient(),
+            self.optimiser,
+            self.constants,
+            self.true,
+            state,
+            jnp.array(epoch),
+            strength,
+            self.problem.adjoint.throw,
+            self.batched,
+        )
+
+    def description(self) -> str:
+        # An Optax optimiser is made of functions, which have no names for their constants. What they
+        # compute has.
+        fitted = cast(optax.Params, (self.parameters, no_shift(self.problem)))
+        value = jax.ShapeDtypeStruct((), self.problem.tissue.vertices.dtype)
+        update = optax.with_extra_args_support(self.optimiser).update
+
+        def calculation(fitted: optax.Params, value: Array) -> optax.Params:
+            state = self.optimiser.init(fitted)
+            return update(fitted, state, fitted, value=value, grad=fitted)[0]
+
+        return without_addresses(str(jax.make_jaxpr(calculation)(fitted, value)))
+
+    def strength(self, epoch: int) -> float:
+        if self.guidance is None:
+            return float("nan")
+        value = np.asarray(self.guidance(jnp.array(epoch)))
+        if value.shape or not value >= 0:
+            raise ValueError(
+                f"Argument `guidance` must give one number that is not negative, but gave {value}."
+            )
+        return float(value)
+
+    def _lenient(self) -> InverseProblem:
+        # A step that cannot be trusted is refused here, one member of a batch at a time.
+        return eqx.tree_at(lambda p: p.adjoint.throw, self.problem, False)
+
+
+@eqx.filter_jit
+def _start(
+    problem: InverseProblem,
+    optimiser: optax.GradientTransformation,
+    parameters: PyTree[Array],
+    batched: bool,
+) -> State:
+    def start(problem: InverseProblem, parameters: PyTree[Array]) -> State:
+        fitted = cast(optax.Params, (parameters, no_shift(problem)))
+        best = unbeaten(problem, parameters)
+        return State(parameters, optimiser.init(fitted), problem.tissue, best, jnp.array(True))
+
+    return (eqx.filter_vmap(start) if batched else start)(problem, parameters)
+
+
+@eqx.filter_jit
+def _epoch(
+    problem: InverseProblem,
+    optimiser: optax.GradientTransformation,
+    constants: PyTree,
+    true: PyTree[Array] | None,
+    state: State,
+    epoch: Int[Array, ""],
+    guidance: Float[Array, ""] | None,
+    throw: bool,
+    batched: bool,
+) -> tuple[State, Record]:
+    """One relaxation, gradient and update, for each of the batch."""
+
+    def one(
+        problem: InverseProblem, constants: PyTree, true: PyTree[Array] | None, state: State
+    ) -> tuple[State, Record]:
+        if guidance is not None:
+            problem = dataclasses.replace(problem, guidance=guidance)
+        shift = no_shift(problem)
+        value, equilibrium, gradient, outcome = problem.value_and_gradient(
+            eqx.combine(state.parameters, constants), state.tissue, shift
+        )
+        record = _record(state.parameters, value, equilibrium, gradient, outcome, true, throw)
+        going = state.going & record.sound
+        fitted = (state.parameters, shift)
+        updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
+            cast(optax.Updates, gradient),
+            state.optimiser,
+            cast(optax.Params, fitted),
+            value=value,
+            grad=gradient,
+        )
+        parameters, shift = eqx.apply_updates(fitted, updates)
+        following = equilibrium.tissue
+        if shift is not None:
+            following = following.with_vertices(following.vertices + shift)
+        best = better(
+            state.best,
+            state.parameters,
+            equilibrium.tissue,
+            value,
+            equilibrium.max_force,
+            guidance_of(problem),
+            epoch,
+            going & equilibrium.converged,
+        )
+        moved = State(parameters, optimiser_state, following, best, going)
+        # A relaxation that broke down must not be where the next one starts.
+        return choose(going, moved, eqx.tree_at(lambda s: s.going, state, going)), record
+
+    arguments = (problem, constants, true, state)
+    return (eqx.filter_vmap(one) if batched else one)(*arguments)
+
+
+def _record(
+    parameters: PyTree[Array],
+    value: Array,
+    equilibrium: Equilibrium,
+    gradient: PyTree[Array],
+    outcome: GradientOutcome,
+    true: PyTree[Array] | None,
+    throw: bool,
+) -> Record:
+    norm = optax.tree.norm(gradient)
+    finite = jnp.isfinite(value) & jnp.isfinite(norm)
+    return Record(
+        parameters=parameters,
+        tissue=equilibrium.tissue,
+        cost=value,
+        max_force=equilibrium.max_force,
+        converged=equilibrium.converged,
+        num_steps=equilibrium.num_steps,
+        num_t1=equilibrium.num_t1,
+        gradient_norm=norm,
+        outcome=outcome,
+        relative_error=relative_error(parameters, true),
+        sound=finite & outcome.trusted if throw else finite,
+    )

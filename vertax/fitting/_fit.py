@@ -1,0 +1,267 @@
+"""Solving an inverse problem: the loop over epochs, and what it records."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import optax
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Int, PyTree
+from tqdm import tqdm
+
+from vertax.energies import AbstractEnergy
+from vertax.fitting._checkpoint import Checkpoint, Keeper, Progress, Row, columns_of, identity_of
+from vertax.fitting._descent import Descent
+from vertax.fitting._epoch import AbstractMethod
+from vertax.fitting._history import Fit, FitError, History, Record
+from vertax.fitting._inverse import Energy, InverseProblem
+from vertax.fitting._least_squares import LeastSquares
+
+Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
+
+
+def fit(
+    problem: InverseProblem[Energy],
+    optimiser: optax.GradientTransformation | optx.AbstractLeastSquaresSolver[Any, Any, Any, Any],
+    epochs: int,
+    *,
+    truth: AbstractEnergy | None = None,
+    guidance: Callable[[Int[Array, ""]], ArrayLike] | None = None,
+    batched: bool = False,
+    progress: bool = True,
+    callback: Callback | None = None,
+    checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
+) -> Fit[Energy]:
+    r"""Solve an inverse problem.
+
+    Each epoch relaxes the tissue from the last equilibrium, takes the gradient of the cost through it
+    and lets the optimiser, whose state lives through all epochs, update the parameters.
+
+    With a least-squares solver, such as `optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)`, each
+    epoch takes the Jacobian of all residuals, and the fit ends when the solver does. Where the data
+    determine the parameters it needs a dozen epochs. The cost must be an
+    [`AbstractLeastSquaresCost`][vertax.costs.AbstractLeastSquaresCost] or a weighted sum of such.
+
+    If the tissue has to change its topology on the way, its own gradient need not lead there: it sees
+    one valley of a rugged landscape (paper, "Topological cost functions unlock robust parameter
+    inference"). `guidance` then lets the cost itself pull the tissue, which relaxes $E + \kappa C$, and
+    fits the parameters so that there is less and less to pull. With strong guidance the tissue is
+    where the cost wants it, and the fit balances forces there; as $\kappa \to 0$ it becomes the inverse
+    problem itself. At parameters that explain the target exactly it makes no difference.
+
+    **Arguments:**
+
+    - `problem`: the inverse problem.
+    - `optimiser`: an Optax optimiser, e.g. `optax.adam(1e-2)`, or `optax.nadam(1e-3)` as in the paper;
+        or a least-squares solver of Optimistix.
+    - `epochs`: number of updates.
+    - `truth`: the energy with the true parameters where they are known, to record the error.
+    - `guidance`: strength $\kappa$ of the guidance by epoch, such as an Optax schedule, in place of that
+        of the problem; it should end at 0. Vertices feel a mean cost one by one: about 10 times the
+        number of cells is strong. Of an Optax optimiser only.
+    - `batched`: `problem` (and `truth`) are a batch of independent problems, as made by
+        `equinox.filter_vmap` or by stacking: every array has a leading axis. They are solved as one
+        `vmap`, and everything in the result has that axis too. A member that breaks down stays where it
+        was, and the others go on.
+    - `progress`: show a progress bar (only on a terminal).
+    - `callback`: called with the number and the [`Record`][vertax.Record] of each epoch. If it returns
+        arrays or numbers by name, the same names each time, they are in `notes` of the fit.
+    - `checkpoint`: a file, or a [`Checkpoint`][vertax.Checkpoint], to write down how far the fit has come,
+        and to go on from if it is there. The callback sees only the epochs that are still to do; its notes
+        are those of all.
+
+    **Returns:** a [`Fit`][vertax.Fit] with the parameters of lowest cost among the epochs that reached
+    equilibrium, and among those of the weakest guidance if there is any. An interrupt from the keyboard
+    (Ctrl-C) ends the fit early, as soon as the epoch that runs is done, and keeps what came before;
+    `interrupted` tells so.
+
+    **Raises:**
+
+    - `ValueError` if there is nothing to fit, for less than one epoch, for a batch whose arrays
+        differ in their leading axis, for `guidance` of a least-squares solver, for a `callback` whose
+        notes change their names, and for a checkpoint that is broken or that of another fit.
+    - `FileNotFoundError` if there is no folder for the checkpoint.
+    - `TypeError` for a least-squares solver with a cost that is no sum of squares.
+    - [`FitError`][vertax.FitError] if cost or gradient are not finite or cannot be trusted, or if no
+        epoch reached equilibrium; it carries the fit so far.
+    """
+    if epochs < 1:
+        raise ValueError(f"Argument `epochs` must be at least 1, but is {epochs}.")
+    parameters, constants = eqx.partition(problem.energy, problem.trainable)
+    if not jax.tree.leaves(parameters):
+        raise ValueError(
+            "There is nothing to fit: no leaf of the energy is selected by `trainable`. Parameters are "
+            "arrays, as in LineTension(jnp.full(n_edges, 1.0)); Python floats are constants."
+        )
+    if batched:
+        _check_batch((problem, truth))
+    # Weakly typed arrays (jnp.full(20, 3.7)) turn into strong ones at the first update, and each change
+    # of type would compile the epoch anew.
+    parameters = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
+    true = None if truth is None else eqx.filter(truth, problem.trainable)
+    method: AbstractMethod
+    if isinstance(optimiser, optx.AbstractLeastSquaresSolver):
+        if guidance is not None:
+            raise ValueError(
+                "Argument `guidance` goes with an Optax optimiser: a least-squares solver judges its steps "
+                "by one cost. Set the guidance of the problem, or leave it out."
+            )
+        # It judges each step by the cost itself, so a wrong slope costs a step and no more. And Optimistix
+        # makes a Jacobian of zeros before the first step, of which no adjoint could be sure.
+        lenient = dataclasses.replace(problem.adjoint, throw=False)
+        problem = dataclasses.replace(problem, adjoint=lenient)
+        method = LeastSquares(optimiser, problem, parameters, constants, true, batched)
+    else:
+        method = Descent(optimiser, problem, parameters, constants, true, batched, guidance)
+    if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
+        checkpoint = Checkpoint(checkpoint)
+    keeper = Keeper(checkpoint, lambda: identity_of(problem, true, method.description(), batched))
+    done, stopped, interrupted = _run(method, keeper, epochs, progress, callback)
+    if not done.rows:
+        raise FitError(f"The fit stopped: {stopped}.", None)
+    best = done.state.best
+    history = History(**columns_of(done.rows))
+    if not np.isfinite(best.cost).any():
+        raise FitError(
+            "No epoch of the fit reached equilibrium: raise `max_steps`, loosen `tolerance`, or use the "
+            f"default solver (largest force: {history.max_force.min():.1e}). Stopped because "
+            f"{stopped or 'all epochs were done'}.",
+            None,
+        )
+    outcome = Fit(
+        eqx.combine(best.parameters, constants),
+        best.tissue,
+        best.cost,
+        best.max_force,
+        np.asarray(best.epoch),
+        history,
+        columns_of(done.notes),
+        interrupted,
+    )
+    if stopped is not None:
+        raise FitError(f"The fit stopped: {stopped}. Try a smaller step of the optimiser.", outcome)
+    return outcome
+
+
+def _check_batch(tree: PyTree) -> None:
+    arrays = [x for x in jax.tree.leaves(tree) if eqx.is_array(x)]
+    sizes = {x.shape[0] if x.ndim else None for x in arrays}
+    if len(sizes) != 1 or None in sizes:
+        raise ValueError(
+            "Argument `problem` (and `truth`) must be a batch if `batched` is set: all arrays need one "
+            "leading axis of one size, but there are "
+            f"{sorted('none' if s is None else str(s) for s in sizes)}. Make it with "
+            "equinox.filter_vmap, or stack problems with jax.tree.map."
+        )
+
+
+def _run(
+    method: AbstractMethod,
+    keeper: Keeper,
+    epochs: int,
+    progress: bool,
+    callback: Callback | None,
+) -> tuple[Progress, str | None, bool]:
+    """How far the fit came, why it could not go on, and whether it was interrupted."""
+    done = Progress(None)
+    try:
+        done = keeper.load(method.start())
+        _check_progress(done, method, epochs)
+        bar = tqdm(
+            total=epochs,
+            initial=len(done.rows),
+            unit="epoch",
+            disable=None if progress else True,
+        )
+        while len(done.rows) < epochs and np.any(done.state.going):
+            epoch, began = len(done.rows), time.perf_counter()
+            state, record = method.advance(done.state, epoch)
+            sound = np.asarray(record.sound)  # waits for the epoch to be done
+            row = _row(record, time.perf_counter() - began, method.strength(epoch))
+            if not sound.any():
+                return (
+                    Progress(state, (*done.rows, row), done.notes),
+                    _trouble(record, epoch),
+                    False,
+                )
+            notes = None if callback is None else callback(epoch, record)
+            done = Progress(state, (*done.rows, row), _noted(done.notes, notes, epoch))
+            bar.set_postfix(
+                cost=f"{np.nanmean(row['cost']):.3e}",
+                force=f"{np.max(row['max_force']):.1e}",
+                t1=int(np.sum(row["num_t1"])),
+            )
+            bar.update()
+            keeper.note(done)
+    except KeyboardInterrupt:
+        if not done.rows or not np.isfinite(done.state.best.cost).any():
+            raise
+        keeper.save(done)
+        return done, None, True
+    except eqx.EquinoxRuntimeError as error:
+        return done, f"epoch {len(done.rows)} broke down ({_first_line(error)})", False
+    keeper.save(done)
+    return done, None, False
+
+
+def _check_progress(done: Progress, method: AbstractMethod, epochs: int) -> None:
+    """Whether a checkpoint goes with what the fit is to do."""
+    if len(done.rows) > epochs:
+        raise ValueError(
+            f"The checkpoint holds {len(done.rows)} epochs, but argument `epochs` is {epochs}. Raise it, "
+            "choose another file as `checkpoint`, or delete the file to start this fit anew."
+        )
+    for epoch, row in enumerate(done.rows):
+        then, now = float(row["guidance"]), method.strength(epoch)
+        if not np.array_equal(then, now, equal_nan=True):
+            raise ValueError(
+                f"The checkpoint is that of a fit with another `guidance`: {then} and not {now} in epoch "
+                f"{epoch}. Give the same one again, or delete the file to start this fit anew."
+            )
+
+
+def _noted(
+    notes: tuple[Row, ...], new: Mapping[str, ArrayLike] | None, epoch: int
+) -> tuple[Row, ...]:
+    """The notes of all epochs, with those of another one."""
+    names = set() if new is None else set(new)
+    if epoch > 0 and names != (set(notes[0]) if notes else set()):
+        before = ", ".join(notes[0]) if notes else "nothing"
+        raise ValueError(
+            f"Argument `callback` must return the same names in each epoch ({before}), but returned "
+            f"{', '.join(sorted(names)) or 'nothing'} in epoch {epoch}."
+        )
+    if new is None or not names:
+        return notes
+    return (*notes, {name: np.asarray(value) for name, value in new.items()})
+
+
+def _row(record: Record, seconds: float, guidance: float) -> Row:
+    names = [field.name for field in dataclasses.fields(History)]
+    known = {name: getattr(record, name) for name in names if hasattr(record, name)}
+    known["gradient_residual"] = record.outcome.residual
+    known["gradient_steps"] = record.outcome.num_steps
+    row = {name: np.asarray(value) for name, value in known.items()}
+    return row | {"seconds": seconds, "guidance": guidance}
+
+
+def _trouble(record: Record, epoch: int) -> str:
+    cost, slope = np.asarray(record.cost), np.asarray(record.gradient_norm)
+    if np.isfinite(cost).all() and np.isfinite(slope).all():
+        residual = np.max(record.outcome.residual)
+        return (
+            f"the gradient of epoch {epoch} cannot be trusted (residual {residual:.1e}; an adjoint with "
+            "throw=False goes on all the same)"
+        )
+    return f"cost ({cost}) or gradient ({slope}) is not finite in epoch {epoch}"
+
+
+def _first_line(error: Exception) -> str:
+    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)

@@ -1,0 +1,239 @@
+"""Epochs of a least-squares solver of Optimistix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from vertax._base.modules import without_addresses
+from vertax.adjoints import GradientOutcome, ImplicitDifferentiation
+from vertax.fitting._epoch import (
+    AbstractMethod,
+    Best,
+    better,
+    choose,
+    guidance_of,
+    no_shift,
+    relative_error,
+    unbeaten,
+)
+from vertax.fitting._history import Record
+from vertax.fitting._inverse import InverseProblem
+from vertax.mesh import Tissue
+
+# Steps in a row that a solver may refuse before it counts as done.
+_PATIENCE = 8
+_TAGS: frozenset[object] = frozenset()
+
+
+class State(eqx.Module):
+    """Where an epoch begins."""
+
+    fitted: PyTree[Array]
+    """Parameters and position of the last accepted step."""
+    solver: list[Array]
+    """The arrays of the solver's state. What else it holds are programs, which each compilation makes
+    anew."""
+    tissue: Tissue
+    """Where the next relaxation starts."""
+    placed: Tissue
+    """The equilibrium of the accepted step, displaced as it says."""
+    facts: dict[str, Array]
+    """What there is to know of it."""
+    scale: Float[Array, "*batch"]
+    """Of the residuals that the solver sees."""
+    best: Best
+    n_still: Int[Array, "*batch"]
+    """Steps in a row that were refused."""
+    going: Bool[Array, "*batch"]
+    """False once the solver is done."""
+
+
+class LeastSquares(AbstractMethod):
+    """Epochs of a least-squares solver."""
+
+    solver: optx.AbstractLeastSquaresSolver
+    problem: InverseProblem
+    parameters: PyTree[Array]
+    constants: PyTree
+    true: PyTree[Array] | None
+    batched: bool
+
+    def start(self) -> State:
+        return _start(
+            self.solver, self.problem, self.constants, self.true, self.parameters, self.batched
+        )
+
+    def advance(self, state: State, epoch: int) -> tuple[State, Record]:
+        return _epoch(
+            self.solver,
+            self.problem,
+            self.constants,
+            self.true,
+            state,
+            jnp.array(epoch),
+            self.batched,
+        )
+
+    def description(self) -> str:
+        return without_addresses(eqx.tree_pformat(self.solver, short_arrays=False))
+
+    def strength(self, epoch: int) -> float:
+        return float("nan")
+
+
+class _Machine(eqx.Module):
+    """The solver, set up for one problem."""
+
+    solver: optx.AbstractLeastSquaresSolver
+    evaluate: Callable
+    blank: Any
+    """A state of the solver that has not seen anything yet."""
+    aux: Any
+    options: dict[str, Any]
+
+    def __init__(
+        self,
+        solver: optx.AbstractLeastSquaresSolver,
+        problem: InverseProblem,
+        constants: PyTree,
+        true: PyTree[Array] | None,
+        fitted: PyTree[Array],
+        scale: Float[Array, ""],
+    ):
+        evaluate = _residuals(problem, constants, true, scale)
+        # Forward mode solves the systems of all parameters as one batch; other adjoints have none.
+        forward = isinstance(problem.adjoint, ImplicitDifferentiation)
+        self.options = {"jac": "fwd" if forward else "bwd"}
+        self.solver = solver
+        fn = eqx.filter_closure_convert(evaluate, fitted, problem.tissue)
+        residuals, self.aux = fn.out_struct  # pyright: ignore[reportFunctionMemberAccess]
+        self.blank = solver.init(
+            fn, fitted, problem.tissue, self.options, residuals, self.aux, _TAGS
+        )
+        self.evaluate = fn
+
+    def restored(self, leaves: list[Array]) -> Any:
+        """The state of the solver that consists of these arrays."""
+        dynamic, static = eqx.partition(self.blank, eqx.is_array)
+        return eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), leaves), static)
+
+    def step(self, state: State) -> tuple[PyTree, Any, Bool[Array, ""]]:
+        """The last accepted point, the solver's state, and whether it is done."""
+        solver_state = self.restored(state.solver)
+        arguments = (self.options, solver_state, _TAGS)
+        y, solver_state, _ = self.solver.step(self.evaluate, state.fitted, state.tissue, *arguments)
+        arguments = (self.options, solver_state, _TAGS)
+        done, result = self.solver.terminate(self.evaluate, y, state.tissue, *arguments)
+        return y, solver_state, done | (result != optx.RESULTS.successful)
+
+
+def _residuals(
+    problem: InverseProblem,
+    constants: PyTree,
+    true: PyTree[Array] | None,
+    scale: Float[Array, ""],
+) -> Callable[[PyTree, Tissue], tuple[Array, tuple]]:
+    """The residuals of some parameters, and what there is to know of their equilibrium."""
+
+    def evaluate(y: PyTree, tissue: Tissue) -> tuple[Array, tuple]:
+        parameters, shift = y
+        energy = eqx.combine(parameters, constants)
+        residuals, relaxed, placed = problem.residuals(energy, tissue, shift)
+        # A relaxation that did not arrive says nothing of these parameters: the solver must not
+        # go there, and comes closer if the cost is worse than any other.
+        worst = jnp.asarray(jnp.finfo(residuals.dtype).max ** 0.25, residuals.dtype)
+        ok = relaxed.converged & jnp.all(jnp.isfinite(residuals))
+        residuals = jnp.where(ok, scale * residuals, worst)
+        facts = {
+            "cost": 0.5 * jnp.sum((residuals / scale) ** 2),
+            "max_force": relaxed.max_force,
+            "converged": ok,
+            "num_steps": relaxed.num_steps,
+            "num_t1": relaxed.num_t1,
+            "relative_error": relative_error(parameters, true),
+        }
+        return residuals, (eqx.filter((relaxed.tissue, placed), eqx.is_array), facts)
+
+    return evaluate
+
+
+@eqx.filter_jit
+def _start(
+    solver: optx.AbstractLeastSquaresSolver,
+    problem: InverseProblem,
+    constants: PyTree,
+    true: PyTree[Array] | None,
+    parameters: PyTree[Array],
+    batched: bool,
+) -> State:
+    def start(
+        problem: InverseProblem, constants: PyTree, true: PyTree, parameters: PyTree
+    ) -> State:
+        # The damping that a solver begins with suits residuals of order one.
+        fitted = (parameters, no_shift(problem))
+        one = jnp.ones((), problem.tissue.vertices.dtype)
+        first, _ = _residuals(problem, constants, true, one)(fitted, problem.tissue)
+        scale = jax.lax.rsqrt(jnp.maximum(jnp.sum(first**2), jnp.finfo(first.dtype).tiny))
+        machine = _Machine(solver, problem, constants, true, fitted, scale)
+        leaves = jax.tree.leaves(eqx.filter(machine.blank, eqx.is_array))
+        facts = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), machine.aux[1])
+        facts["cost"] = facts["cost"] + jnp.nan
+        best = unbeaten(problem, parameters)
+        tissues = (problem.tissue, problem.tissue)
+        still, going = jnp.array(0), jnp.array(True)
+        return State(fitted, leaves, *tissues, facts, scale, best, still, going)
+
+    arguments = (problem, constants, true, parameters)
+    return (eqx.filter_vmap(start) if batched else start)(*arguments)
+
+
+@eqx.filter_jit
+def _epoch(
+    solver: optx.AbstractLeastSquaresSolver,
+    problem: InverseProblem,
+    constants: PyTree,
+    true: PyTree[Array] | None,
+    state: State,
+    epoch: Int[Array, ""],
+    batched: bool,
+) -> tuple[State, Record]:
+    """One relaxation, Jacobian and step, for each of the batch that is not done."""
+
+    def one(
+        problem: InverseProblem, constants: PyTree, true: PyTree[Array] | None, state: State
+    ) -> tuple[State, Record]:
+        machine = _Machine(solver, problem, constants, true, state.fitted, state.scale)
+        y, solver_state, done = machine.step(state)
+        arrays, facts = solver_state.aux  # those of the last accepted point, which is y
+        tissue, placed = (eqx.combine(a, problem.tissue) for a in arrays)
+        reached = (facts["cost"], facts["max_force"], guidance_of(problem))
+        best = better(state.best, y[0], placed, *reached, epoch, facts["converged"])
+        n_still = jnp.where(facts["cost"] == state.facts["cost"], state.n_still + 1, 0)
+        leaves = jax.tree.leaves(eqx.filter(solver_state, eqx.is_array))
+        going = ~done & (n_still < _PATIENCE)
+        moved = State(y, leaves, tissue, placed, facts, state.scale, best, n_still, going)
+        # In a batch a member that was done earlier stands still.
+        state = choose(state.going, moved, state)
+        return state, _record(state)
+
+    arguments = (problem, constants, true, state)
+    return (eqx.filter_vmap(one) if batched else one)(*arguments)
+
+
+def _record(state: State) -> Record:
+    unknown = jnp.full_like(state.scale, jnp.nan)
+    return Record(
+        parameters=state.fitted[0],
+        tissue=state.placed,
+        gradient_norm=unknown,
+        outcome=GradientOutcome(unknown, unknown, unknown, unknown),
+        sound=jnp.array(True),
+        **state.facts,
+    )

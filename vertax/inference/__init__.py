@@ -1,0 +1,1 @@
+"""Inference: from images and masks to parameters."""

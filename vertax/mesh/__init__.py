@@ -1,0 +1,9 @@
+"""The mesh: who is next to whom, and where."""
+
+from vertax.mesh._boundary import (
+    AbstractBoundary as AbstractBoundary,
+    Free as Free,
+    Periodic as Periodic,
+)
+from vertax.mesh._tissue import Tissue as Tissue
+from vertax.mesh._topology import Topology as Topology

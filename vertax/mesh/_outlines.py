@@ -1,0 +1,143 @@
+"""Cells as polygons, for drawing."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax.mesh._boundary import Periodic
+from vertax.mesh._tissue import Tissue
+from vertax.mesh._topology import take
+
+_POINTS_PER_ARC = 24
+
+
+class Drawing(eqx.Module):
+    """The geometry that pictures need, each cell placed with its centroid in the home box.
+
+    **Arguments:**
+
+    - `tissue`: the [`Tissue`][vertax.Tissue].
+    - `points_per_arc`: number of straight pieces that an arc is drawn in.
+    - `near`: if given, periodic cells are placed as near as can be to these points, and not in the home
+        box: in an animation, to where they were.
+    """
+
+    lines: Float[np.ndarray, "halfedges points 2"]
+    """Each half-edge from its source to its target, where the cell on its left is drawn."""
+    image: Int[np.ndarray, "halfedges 2"]
+    """Lattice image of that source."""
+    cell: Int[np.ndarray, " halfedges"]
+    following: Int[np.ndarray, " halfedges"]
+    twin: Int[np.ndarray, " halfedges"]
+    half_edge: Int[np.ndarray, " edges"]
+    edge: Int[np.ndarray, " halfedges"]
+    n_cells: int
+    n_edges: int
+    centroids: Float[np.ndarray, "cells 2"]
+    """Of the cells, where they are drawn."""
+    cell_size: float
+    """Root of the mean area."""
+    box: Float[np.ndarray, "5 2"] | None
+    """Outline of the periodic box, closed; None without one."""
+    lattice: Float[np.ndarray, "2 2"] | None
+    """Its sides."""
+
+    def __init__(
+        self,
+        tissue: Tissue,
+        points_per_arc: int = _POINTS_PER_ARC,
+        near: Float[np.ndarray, "cells 2"] | None = None,
+    ):
+        m = tissue.topology
+        geometry = (np.asarray(x) for x in _geometry(tissue, points_per_arc))
+        lines, centroids, areas, following = geometry
+        image = np.zeros((m.n_faces, 2), int)
+        shift = np.zeros((m.n_faces, 2))
+        self.box = self.lattice = None
+        if isinstance(tissue.boundary, Periodic):
+            self.lattice = lattice = np.asarray(tissue.boundary.lattice, float)
+            fractions = centroids.astype(float) @ np.linalg.inv(lattice)
+            # The margin keeps a centroid on the side of the box (a regular lattice, say) from
+            # jumping to the other side by rounding. A cell of area 0 has no centroid and stays put.
+            fractions = np.nan_to_num(fractions, posinf=0, neginf=0)
+            image = -np.floor(fractions + 1e-6).astype(int)
+            if near is not None:
+                image[: tissue.n_cells] = np.rint(
+                    near @ np.linalg.inv(lattice) - fractions[: tissue.n_cells]
+                )
+            shift = image @ lattice
+            first, second = lattice
+            self.box = np.stack([0 * first, first, first + second, second, 0 * first])
+        self.cell = np.asarray(m.cell)
+        self.lines = lines.astype(float) + shift[self.cell][:, None]
+        self.image = np.asarray(m.frame) + image[self.cell]
+        self.n_cells = tissue.n_cells
+        self.n_edges = tissue.n_edges
+        self.centroids = centroids.astype(float) + shift[: tissue.n_cells]
+        self.following = following
+        self.twin = np.asarray(m.twin)
+        self.half_edge = np.asarray(m.half_edge)
+        self.edge = np.asarray(m.edge)
+        self.cell_size = float(np.sqrt(np.mean(np.abs(areas.astype(float)))))
+
+    def polygons(self) -> tuple[Float[np.ndarray, "cells sides 2"], Int[np.ndarray, " cells"]]:
+        """Corners of all cells and their numbers of corners, see `cell_polygons`."""
+        n_points = self.lines.shape[1] - 1
+        sides = np.bincount(self.cell)[: self.n_cells]
+        half_edge = np.unique(self.cell, return_index=True)[1][: self.n_cells]
+        polygons = np.repeat(self.lines[half_edge, :1], n_points * sides.max(), axis=1)
+        # All cells at once, one side at a time.
+        for k in range(sides.max()):
+            more = k < sides
+            side = slice(k * n_points, (k + 1) * n_points)
+            polygons[more, side] = self.lines[half_edge[more], :-1]
+            half_edge = self.following[half_edge]
+        return polygons, n_points * sides
+
+    def sides(
+        self, mask: Bool[np.ndarray, " cells"]
+    ) -> tuple[Float[np.ndarray, "lines points 2"], Int[np.ndarray, " lines"]]:
+        """Lines that show each side of each marked cell once, and the edge of each.
+
+        An edge between two cells drawn side by side is one line; one across the periodic boundary
+        shows at both cells, in two places.
+        """
+        mask = np.append(mask, False)  # the exterior
+        first, other = self.half_edge, self.twin[self.half_edge]
+        # Both cells of an edge draw it in the same place if they see its first vertex in the same
+        # image.
+        apart = np.any(self.image[first] != self.image[self.following[other]], axis=1)
+        left, right = mask[self.cell[first]], mask[self.cell[other]]
+        shown = np.concatenate([first[left], other[right & (apart | ~left)]])
+        return self.lines[shown], self.edge[shown]
+
+
+def cell_polygons(
+    tissue: Tissue,
+) -> tuple[Float[np.ndarray, "cells sides 2"], Int[np.ndarray, " cells"]]:
+    """Corners of all cells, counter-clockwise, each cell whole.
+
+    In a periodic tissue each cell is placed so that its centroid lies in the home box; its corners
+    may stick out. If there are arcs, each side is a line of 24 pieces.
+
+    **Arguments:**
+
+    - `tissue`: the [`Tissue`][vertax.Tissue].
+
+    **Returns:** the corners, in units of length, where rows of cells with fewer sides than others
+    are filled up with their first corner; and the number of corners of each cell.
+    """
+    return Drawing(tissue).polygons()
+
+
+@eqx.filter_jit  # one compilation instead of one for each operation
+def _geometry(tissue: Tissue, points_per_arc: int) -> tuple[Array, Array, Array, Array]:
+    m = tissue.topology
+    fractions = jnp.linspace(0, 1, 2 if tissue.angles is None else points_per_arc + 1)
+    points = take(tissue.edge_points(fractions.astype(tissue.vertices.dtype)), m.edge)
+    points = jnp.where(m.forward[:, None, None], points, points[:, ::-1])
+    lines = tissue.corners[:, None] + points - points[:, :1]
+    return lines, tissue.centroids, tissue.areas, m.next

@@ -1,0 +1,381 @@
+"""A tissue and its geometry."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+
+from vertax._base.modules import compiled_property, is_concrete
+from vertax.mesh._arcs import arc_points, area_factor, bounded, length_factor, moment_factor
+from vertax.mesh._boundary import AbstractBoundary, Free
+from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
+
+
+class Tissue(eqx.Module):
+    r"""A planar tissue: vertices, their connectivity and the space they live in.
+
+    Geometry is differentiable in `vertices`, in `angles` and in the boundary (the lattice of a periodic
+    box).
+
+    Edges are straight, or circular arcs (paper, Methods, "Bounded mode"): an arc with the angle
+    $\alpha$ between its chord $c$ and its tangents has the radius $R = c / (2 \sin\alpha)$ and the length
+    $c\,\alpha / \sin\alpha$, and adds the area $c^2 (\alpha - \sin\alpha\cos\alpha) / (4 \sin^2\alpha)$
+    to the cell on the left of its edge, which it bulges out of if $\alpha > 0$. On the outline of a
+    free tissue the cell is always on the left.
+
+    **Arguments:**
+
+    - `vertices`, shape `(vertices, 2)`: positions, in units of length; they may lie outside the periodic box.
+    - `topology`: the [`Topology`][vertax.Topology].
+    - `boundary`: the space, [`Periodic`][vertax.Periodic] or [`Free`][vertax.Free].
+    - `softening`: the length $\varepsilon$ below which an edge is rounded off,
+        $\ell = \sqrt{|d|^2 + \varepsilon^2}$; it makes a four-fold vertex (an edge of length 0) a smooth
+        point of every energy. 0 switches it off; by default $10^{-3}$ of the root mean cell area,
+        which changes the length of a typical edge by parts in a million. (Of an arc, it is the chord.)
+    - `angles`, shape `(edges,)`: the angle $\alpha$ of each edge, in radians. Every edge owns one,
+        since a T1 transition may put it on the outline, but only those of arcs count. Beyond 0.98 π
+        (nearly a circle) they are bounded smoothly, see `edge_angles`. Left out: all edges are
+        straight.
+    - `inner_arcs`: whether edges between two cells are arcs too, as in a foam; otherwise the edges on
+        the outline are.
+    - `pinned`, shape `(vertices,)`: which vertices do not move when the tissue relaxes. T1 transitions
+        leave edges alone that end at one.
+    - `angle_length`: the length that makes an angle a degree of freedom like a position, so that
+        solvers may measure steps and forces without knowing which is which; by default half the root
+        mean cell area, about what moves the middle of an arc as far as a vertex.
+
+    **Raises:**
+
+    - `ValueError` for positions, angles or pins of the wrong shape or that are not finite, a negative
+        softening, an `angle_length` that is not positive, a boundary that does not go with the topology
+        (free if and only if there is an exterior), or angles where no edge can be an arc.
+    """
+
+    vertices: Float[Array, "vertices 2"]
+    topology: Topology
+    boundary: AbstractBoundary
+    softening: Float[Array, ""]
+    angles: Float[Array, " edges"] | None
+    pinned: Bool[Array, " vertices"] | None
+    angle_length: Float[Array, ""] | None
+    inner_arcs: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        vertices: ArrayLike,
+        topology: Topology,
+        boundary: AbstractBoundary,
+        softening: float | Float[Array, ""] | None = None,
+        *,
+        angles: ArrayLike | None = None,
+        inner_arcs: bool = False,
+        pinned: ArrayLike | None = None,
+        angle_length: float | Float[Array, ""] | None = None,
+    ):
+        vertices = jnp.asarray(vertices, jnp.result_type(vertices, jnp.float32))
+        if vertices.shape != (topology.n_vertices, 2):
+            raise ValueError(
+                f"Argument `vertices` must have shape ({topology.n_vertices}, 2) to match the topology, "
+                f"but has {vertices.shape}."
+            )
+        if is_concrete(vertices) and not np.isfinite(np.asarray(vertices)).all():
+            raise ValueError("Argument `vertices` must be finite, but holds NaN or infinity.")
+        if isinstance(boundary, Free) != topology.exterior:
+            raise ValueError(
+                "Argument `boundary` must be Free() if the topology has an exterior, and only then, but "
+                f"it is {type(boundary).__name__} with {'an' if topology.exterior else 'no'} exterior."
+            )
+        self.vertices = vertices
+        self.topology = topology
+        self.boundary = boundary
+        self.angles = None if angles is None else _checked_angles(angles, vertices.dtype, topology)
+        if angles is not None and not (topology.exterior or inner_arcs):
+            raise ValueError(
+                "Argument `angles` is for arcs, but a periodic tissue has none: pass `inner_arcs=True`, "
+                "or no angles."
+            )
+        self.inner_arcs = inner_arcs
+        self.pinned = None if pinned is None else jnp.asarray(pinned, bool)
+        if self.pinned is not None and self.pinned.shape != (topology.n_vertices,):
+            raise ValueError(
+                f"Argument `pinned` must have shape ({topology.n_vertices},), but has "
+                f"{self.pinned.shape}."
+            )
+        self.softening = jnp.zeros((), vertices.dtype)
+        self.angle_length = None
+        if softening is None or (angles is not None and angle_length is None):
+            size = jnp.sqrt(jax.lax.stop_gradient(_mean_area(self)))
+            softening = 1e-3 * size if softening is None else softening
+            angle_length = 0.5 * size if angle_length is None else angle_length
+        softening = jnp.asarray(softening, vertices.dtype)
+        if is_concrete(softening) and not softening >= 0:
+            raise ValueError(f"Argument `softening` must be at least 0, but is {softening}.")
+        self.softening = softening
+        if angles is not None:
+            self.angle_length = jnp.asarray(angle_length, vertices.dtype)
+            if is_concrete(self.angle_length) and not self.angle_length > 0:
+                raise ValueError(
+                    f"Argument `angle_length` must be positive, but is {self.angle_length}."
+                )
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return self.topology.n_cells
+
+    @property
+    def n_edges(self) -> int:
+        """Number of edges."""
+        return self.topology.n_edges
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices."""
+        return self.topology.n_vertices
+
+    @compiled_property
+    def neighbour_counts(self) -> Int[Array, " cells"]:
+        """Number of sides of each cell."""
+        return self.topology.neighbour_counts
+
+    @compiled_property
+    def edge_segments(self) -> tuple[Float[Array, "edges 2"], Float[Array, "edges 2"]]:
+        """First vertex of each edge, and the edge as a vector from there across periodic boundaries."""
+        m = self.topology
+        twin, _, _, _, following = edge_neighbourhood(m)
+        offset = take(m.frame, following) - take(m.frame, m.half_edge)
+        first = take(self.vertices, source(m.half_edge))
+        last = take(self.vertices, source(twin))
+        return first, last + self.boundary.translation(offset) - first
+
+    @compiled_property
+    def edge_vectors(self) -> Float[Array, "edges 2"]:
+        """Each edge as a vector, from its first to its second vertex across periodic boundaries."""
+        return self.edge_segments[1]
+
+    def edge_points(self, fractions: Float[Array, " points"]) -> Float[Array, "edges points 2"]:
+        """Points on each edge at some fractions (0 to 1) of its length.
+
+        Edges across a periodic boundary go on beyond the box.
+        """
+        first, vector = self.edge_segments
+        if self.angles is None:
+            return first[:, None] + fractions[:, None] * vector[:, None]
+        return arc_points(first, vector, self.edge_angles, fractions)
+
+    @property
+    def is_arc(self) -> Bool[Array, " edges"]:
+        """Which edges are arcs; the angles of the others do not count."""
+        if self.angles is None:
+            return jnp.zeros(self.n_edges, bool)
+        return jnp.ones(self.n_edges, bool) if self.inner_arcs else self.topology.on_outline
+
+    @compiled_property
+    def edge_angles(self) -> Float[Array, " edges"]:
+        """Angle between the chord and the tangents of each edge, positive if it bulges to its right.
+
+        That is out of the cell on its left; 0 for straight edges. Always between -π and π, where an
+        edge is an arc: a minimiser may overstep that in `angles`, but not here.
+        """
+        if self.angles is None:
+            return jnp.zeros(self.n_edges, self.vertices.dtype)
+        return jnp.where(self.is_arc, bounded(self.angles), 0)
+
+    @compiled_property
+    def edge_curvatures(self) -> Float[Array, " edges"]:
+        r"""Curvature $1/R$ of each edge, with the sign of its angle.
+
+        In equilibrium under a line tension $\gamma$ this is the difference of the pressures on its left
+        and right over $\gamma$ (Young–Laplace).
+        """
+        chord = self._lengths(self.edge_vectors)
+        return 2 * jnp.sin(self.edge_angles) / jnp.where(chord > 0, chord, 1)
+
+    @compiled_property
+    def edge_tangents(self) -> tuple[Float[Array, "edges 2"], Float[Array, "edges 2"]]:
+        """Unit vectors along each edge at its first and at its second vertex."""
+        chord, angle = self.edge_vectors, self.edge_angles
+        squared = jnp.sum(chord**2, axis=-1, keepdims=True)
+        unit = chord / jnp.sqrt(jnp.where(squared > 0, squared, 1))
+        left = jnp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
+        along, aside = jnp.cos(angle)[:, None] * unit, jnp.sin(angle)[:, None] * left
+        return along - aside, along + aside
+
+    @compiled_property
+    def edge_lengths(self) -> Float[Array, " edges"]:
+        """Length of each edge (softened, see the class)."""
+        lengths = self._lengths(self.edge_vectors)
+        return lengths if self.angles is None else lengths * length_factor(self.edge_angles)
+
+    @compiled_property
+    def areas(self) -> Float[Array, " cells"]:
+        """Signed area of each cell, positive for an upright (counter-clockwise) cell."""
+        return self._cell_sums(self._area_shares())
+
+    @compiled_property
+    def perimeters(self) -> Float[Array, " cells"]:
+        """Perimeter of each cell (softened, see the class)."""
+        lengths = self.edge_lengths
+        return self._cell_sums((lengths, lengths))
+
+    @compiled_property
+    def shape_factors(self) -> Float[Array, " cells"]:
+        r"""Observed shape factor $P/\sqrt{A}$ of each cell (Bi et al. 2015, doi:10.1038/nphys3471)."""
+        return self.perimeters / jnp.sqrt(self.areas)
+
+    @compiled_property
+    def corners(self) -> Float[Array, "halfedges 2"]:
+        """Source of each half-edge, in the frame of the cell on its left.
+
+        The corners of one cell, in the order of `topology.next`, are its polygon drawn whole.
+        """
+        return jnp.repeat(self.vertices, 3, axis=0) + self.boundary.translation(self.topology.frame)
+
+    @compiled_property
+    def centroids(self) -> Float[Array, "cells 2"]:
+        """Centre of area of each cell, in the frame of the cell."""
+        # Relative to the mean corner: the polygon formula loses digits far from the origin.
+        m, corners = self.topology, self.corners
+        face_sums = lambda values: jax.ops.segment_sum(values, m.cell, m.n_faces)
+        centre = face_sums(corners) / face_sums(jnp.ones_like(corners[:, :1]))
+        p = corners - take(centre, m.cell)
+        q = take(p, m.next)
+        area = _cross(p, q) / 2
+        moment = (p + q) * area[:, None] / 3
+        if self.angles is not None:
+            angle = take(self.edge_angles, m.edge)
+            angle = jnp.where(m.forward, angle, -angle)
+            chord = q - p
+            squared = jnp.sum(chord**2, axis=-1)
+            bulge = squared * area_factor(angle)
+            right = jnp.stack([chord[:, 1], -chord[:, 0]], axis=-1)
+            area += bulge
+            moment += (p + q) * bulge[:, None] / 2
+            moment += right * (squared * moment_factor(angle))[:, None]
+        return (centre + face_sums(moment) / face_sums(area)[:, None])[: self.n_cells]
+
+    @property
+    def configuration(self) -> PyTree[Float[Array, "..."]]:
+        """The degrees of freedom that an equilibrium relaxes: `vertices`.
+
+        With arcs a pair, `(vertices, angles * angle_length)`.
+        """
+        return self.vertices if self.angles is None else (self.vertices, self._scaled_angles())
+
+    def with_configuration(self, configuration: PyTree[Float[Array, "..."]]) -> Tissue:
+        """The same tissue with its degrees of freedom replaced.
+
+        What cannot move (pinned vertices, and angles of straight edges) stays as it is.
+        """
+        vertices, scaled = self._split(configuration)
+        if self.pinned is not None:
+            vertices = jnp.where(self.pinned[:, None], self.vertices, vertices)
+        moved = self.with_vertices(vertices)
+        if scaled is None or self.angles is None or self.angle_length is None:
+            return moved
+        angles = jnp.where(self.is_arc, scaled / self.angle_length, self.angles)
+        return eqx.tree_at(lambda t: t.angles, moved, angles)
+
+    def with_vertices(self, vertices: Float[Array, "vertices 2"]) -> Tissue:
+        """The same tissue with its vertices, also pinned ones, elsewhere."""
+        return eqx.tree_at(lambda t: t.vertices, self, vertices)
+
+    def drift(self, configuration: PyTree[Float[Array, "..."]]) -> Float[Array, " modes"]:
+        """How far a configuration strayed from that of this tissue in ways that have no energy.
+
+        These are the motions of the whole, see [`AbstractBoundary`][vertax.AbstractBoundary], and the
+        degrees of freedom that `with_configuration` ignores. All are lengths.
+        """
+        vertices, scaled = self._split(configuration)
+        drift = [self.boundary.drift(vertices, self.vertices, self.pinned)]
+        if self.pinned is not None:
+            held = jnp.where(self.pinned[:, None], vertices - self.vertices, 0)
+            drift.append(held.ravel())
+        here = self._scaled_angles()
+        if scaled is not None and here is not None:
+            drift.append(jnp.where(self.is_arc, 0, scaled - here))
+        return jnp.concatenate(drift)
+
+    def settled(self, start: Tissue) -> Tissue:
+        """The same shape, moved as a whole to where it has no drift from the vertices of `start`."""
+        settle = self.boundary.settle
+        return self.with_vertices(settle(self.vertices, start.vertices, self.pinned))
+
+    def held_as(self, start: Tissue) -> Tissue:
+        """This tissue in the boundary of `start` and with its vertices.
+
+        What it lends to a configuration (pinned vertices, what `drift` counts from) is then that of
+        `start`; differentiable are the boundary and the pinned vertices.
+        """
+        vertices = jax.lax.stop_gradient(start.vertices)
+        if start.pinned is not None:
+            vertices = jnp.where(start.pinned[:, None], start.vertices, vertices)
+        lent = (start.boundary, vertices)
+        return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, lent)
+
+    def with_topology(self, topology: Topology) -> Tissue:
+        """The same vertices, connected in another way."""
+        return eqx.tree_at(lambda t: t.topology, self, topology)
+
+    def _scaled_angles(self) -> Float[Array, " edges"] | None:
+        if self.angles is None or self.angle_length is None:
+            return None
+        return self.angles * self.angle_length
+
+    def _split(
+        self, configuration: PyTree[Float[Array, "..."]]
+    ) -> tuple[Float[Array, "vertices 2"], Float[Array, " edges"] | None]:
+        return (configuration, None) if self.angles is None else configuration
+
+    def _lengths(self, vectors: Float[Array, "edges 2"]) -> Float[Array, " edges"]:
+        squared = vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + self.softening**2
+        # An edge of length exactly 0 without softening has no direction; the inner `where` keeps the
+        # derivative of the square root finite there (0, the middle of all its one-sided slopes).
+        at_zero = squared == 0
+        return jnp.where(at_zero, 0, jnp.sqrt(jnp.where(at_zero, 1, squared)))
+
+    def _area_shares(self) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
+        """What each edge contributes to the areas of its left and right cell (shoelace formula)."""
+        m = self.topology
+        first, vector = self.edge_segments
+        left = first + self.boundary.translation(take(m.frame, m.half_edge))
+        # The right cell's corner at the first vertex is one slot clockwise.
+        right = first + self.boundary.translation(take(m.frame, clockwise(m.half_edge)))
+        area_left, area_right = 0.5 * _cross(left, vector), -0.5 * _cross(right, vector)
+        if self.angles is None:
+            return area_left, area_right
+        bulge = (vector[:, 0] ** 2 + vector[:, 1] ** 2) * area_factor(self.edge_angles)
+        return area_left + bulge, area_right - bulge
+
+    def _cell_sums(
+        self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]
+    ) -> Float[Array, " cells"]:
+        # The exterior, number n_cells, is out of range and dropped.
+        cells = self.topology.edge_cells
+        ids = jnp.concatenate([cells[:, 0], cells[:, 1]])
+        return jax.ops.segment_sum(jnp.concatenate(shares), ids, self.n_cells)
+
+
+def _checked_angles(
+    angles: ArrayLike, dtype: jnp.dtype, topology: Topology
+) -> Float[Array, " edges"]:
+    angles = jnp.asarray(angles, dtype)
+    if angles.shape != (topology.n_edges,):
+        raise ValueError(
+            f"Argument `angles` must have shape ({topology.n_edges},), but has {angles.shape}."
+        )
+    if is_concrete(angles) and not np.isfinite(np.asarray(angles)).all():
+        raise ValueError("Argument `angles` must be finite, but holds NaN or infinity.")
+    return angles
+
+
+@eqx.filter_jit
+def _mean_area(tissue: Tissue) -> Float[Array, ""]:
+    return jnp.mean(jnp.abs(tissue.areas))
+
+
+def _cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
+    return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]

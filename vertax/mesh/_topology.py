@@ -1,0 +1,365 @@
+"""Who is next to whom: the trivalent half-edge mesh."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Int, Shaped
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from vertax._base.modules import compiled_property
+
+
+# Every vertex joins exactly three edges, so half-edge h = 3 v + k is the k-th edge leaving vertex v in
+# counter-clockwise order, and needs no table of sources. With `twin` that is the whole connectivity:
+#
+#     source(h) = h // 3,   target(h) = twin[h] // 3,   next(h) = one slot clockwise of twin[h].
+#
+#              \ cell[a] = V /                A half-edge also names a *corner*: the wedge between it
+#               a           b                 and the following slot of its vertex, which belongs to
+#                \         /                  the cell on its left. `cell` and `frame` are stored there.
+#                 v = h//3
+#      cell[h] = L | h     R = cell[b]        In a periodic tissue the corners of a cell lie in different
+#                  v                          images of the box. `frame[h]` says which: the corner sits at
+#                                             vertices[v] + frame[h] @ lattice, in one frame per cell.
+#
+# Offsets of edges follow from the frames (offset(h) = frame[next(h)] - frame[h]), so they sum to zero
+# around every cell by construction, also for a cell that spans half the box and more.
+#
+# In a free tissue the outside is one more face, so that vertices on the outline are trivalent too. Its
+# half-edges carry the label n_cells, which sums over cells drop: a segment number out of range.
+class Topology(eqx.Module):
+    """The connectivity of a tissue: a trivalent half-edge rotation system.
+
+    Half-edge `h` leaves vertex `h // 3`; the three half-edges of a vertex are in counter-clockwise
+    order. Labels of cells and edges survive T1 transitions, so that per-cell and per-edge parameters
+    stay with their cell and edge.
+
+    **Arguments:**
+
+    - `twin`, shape `(halfedges,)`: the half-edge in the opposite direction, an involution without fixed
+        points.
+    - `cell`, shape `(halfedges,)`: the cell on the left of each half-edge, `0 … n_cells - 1`; and
+        `n_cells` where that is the exterior.
+    - `frame`, shape `(halfedges, 2)`: integer lattice image of each half-edge's source, in the frame of
+        the cell on its left. Zero where there is no periodicity.
+    - `edge`, shape `(halfedges,)`: an edge number for each half-edge, shared with its twin. Numbered in
+        the order of the half-edges when left out.
+    - `exterior`: whether the face of the largest label is the outside of a free tissue.
+
+    **Raises:**
+
+    - `ValueError` naming the broken invariant (see [`Topology.validate`][vertax.Topology.validate]),
+        for concrete arrays; inside `jax.jit` only shapes are checked.
+    """
+
+    twin: Int[Array, " halfedges"]
+    cell: Int[Array, " halfedges"]
+    frame: Int[Array, "halfedges 2"]
+    edge: Int[Array, " halfedges"]
+    half_edge: Int[Array, " edges"]
+    """One half-edge of each edge; it gives the edge its direction. The exterior is never on its left."""
+    n_cells: int = eqx.field(static=True)
+    """Number of cells, without the exterior."""
+    exterior: bool = eqx.field(static=True)
+    """Whether there is an exterior."""
+
+    def __init__(
+        self,
+        twin: ArrayLike,
+        cell: ArrayLike,
+        frame: ArrayLike,
+        edge: ArrayLike | None = None,
+        *,
+        exterior: bool = False,
+    ):
+        twin, cell, frame = (np.asarray(x) for x in (twin, cell, frame))
+        if twin.ndim != 1 or twin.size == 0 or twin.size % 6 != 0:
+            raise ValueError(
+                "Argument `twin` must list three half-edges for each of an even number of vertices, "
+                f"but its shape is {twin.shape}."
+            )
+        h = np.arange(twin.size)
+        if twin.min() < 0 or twin.max() >= twin.size or np.any(twin[twin] != h):
+            raise ValueError("Argument `twin` must be an involution: twin[twin[h]] == h.")
+        if np.any(twin == h):
+            raise ValueError(
+                f"Argument `twin` must not have fixed points, but half-edge {np.argmax(twin == h)} is "
+                "its own twin."
+            )
+        if edge is None:
+            first = np.minimum(h, twin)
+            edge = np.unique(first, return_inverse=True)[1]
+        edge = np.asarray(edge)
+        half_edge = np.full(twin.size // 2, -1)
+        if edge.shape != twin.shape or edge.min() < 0 or edge.max() >= half_edge.size:
+            raise ValueError(
+                "Argument `edge` must give each half-edge a number in 0 … n_edges - 1."
+            )
+        half_edge[edge[::-1]] = h[::-1]  # reversed: the first half-edge of each edge wins
+        n_cells = int(cell.max()) + (not exterior)
+        half_edge = np.where(cell[half_edge] == n_cells, twin[half_edge], half_edge)
+        to_int32 = lambda x: jnp.asarray(x, jnp.int32)
+        self.twin = to_int32(twin)
+        self.cell = to_int32(cell)
+        self.frame = to_int32(frame)
+        self.edge = to_int32(edge)
+        self.half_edge = to_int32(half_edge)
+        self.n_cells = n_cells
+        self.exterior = exterior
+        self.validate()
+
+    @property
+    def n_half_edges(self) -> int:
+        """Number of half-edges."""
+        return self.twin.shape[-1]
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices."""
+        return self.n_half_edges // 3
+
+    @property
+    def n_edges(self) -> int:
+        """Number of edges."""
+        return self.n_half_edges // 2
+
+    @property
+    def n_faces(self) -> int:
+        """Number of cells and, if there is one, the exterior."""
+        return self.n_cells + self.exterior
+
+    @compiled_property
+    def source(self) -> Int[Array, " halfedges"]:
+        """Vertex that each half-edge leaves."""
+        return source(jnp.arange(self.n_half_edges, dtype=self.twin.dtype))
+
+    @compiled_property
+    def target(self) -> Int[Array, " halfedges"]:
+        """Vertex that each half-edge reaches."""
+        return source(self.twin)
+
+    @compiled_property
+    def next(self) -> Int[Array, " halfedges"]:
+        """Following half-edge, counter-clockwise around the cell on the left."""
+        return clockwise(self.twin)
+
+    @compiled_property
+    def previous(self) -> Int[Array, " halfedges"]:
+        """Preceding half-edge around the cell on the left."""
+        here = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
+        return take(self.twin, counter_clockwise(here))
+
+    @compiled_property
+    def offset(self) -> Int[Array, "halfedges 2"]:
+        """Lattice image of each half-edge's target, relative to its source."""
+        return take(self.frame, self.next) - self.frame
+
+    @compiled_property
+    def edge_vertices(self) -> Int[Array, "edges 2"]:
+        """The two ends of each edge, from → to."""
+        return source(jnp.stack([self.half_edge, take(self.twin, self.half_edge)], axis=-1))
+
+    @compiled_property
+    def edge_cells(self) -> Int[Array, "edges 2"]:
+        """The cells on the left and on the right of each edge (`n_cells`: the exterior)."""
+        h = self.half_edge
+        return jnp.stack([take(self.cell, h), take(self.cell, take(self.twin, h))], axis=-1)
+
+    @compiled_property
+    def forward(self) -> Bool[Array, " halfedges"]:
+        """Which half-edges run along the direction of their edge."""
+        here = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
+        return take(self.half_edge, self.edge) == here
+
+    @compiled_property
+    def on_outline(self) -> Bool[Array, " edges"]:
+        """Which edges have the exterior on one side."""
+        return take(self.cell, take(self.twin, self.half_edge)) == self.n_cells
+
+    @compiled_property
+    def neighbour_counts(self) -> Int[Array, " cells"]:
+        """Number of sides of each cell."""
+        ones = jnp.ones_like(self.cell)
+        return jax.ops.segment_sum(ones, self.cell, self.n_cells)
+
+    def validate(self) -> None:
+        """Check every invariant of the mesh, on concrete arrays.
+
+        **Raises:**
+
+        - `ValueError` naming what is broken: the involution, labels of cells or edges that do not
+            follow the mesh, a cell in several pieces or with too few sides, lattice frames
+            that contradict each other, a tissue in several pieces or of the wrong genus.
+        """
+        twin, cell, frame, edge, half_edge = (
+            np.asarray(x) for x in (self.twin, self.cell, self.frame, self.edge, self.half_edge)
+        )
+        n_half, n_faces = twin.size, self.n_faces
+        h = np.arange(n_half)
+
+        def require(ok: np.ndarray | bool, what: str):
+            if not np.all(ok):
+                bad = np.flatnonzero(~np.atleast_1d(ok))[:3].tolist()
+                raise ValueError(f"The topology is broken: {what} (first offenders: {bad}).")
+
+        require(cell.shape == (n_half,), "`cell` must have one entry a half-edge")
+        require(frame.shape == (n_half, 2), "`frame` must have two entries a half-edge")
+        require(twin[twin] == h, "`twin` must be an involution, twin[twin[h]] == h, at half-edges")
+        require(twin != h, "no half-edge may be its own twin, at half-edges")
+        require(
+            edge[twin] == edge, "a half-edge and its twin must carry one edge number, at half-edges"
+        )
+        require(
+            np.bincount(edge, minlength=n_half // 2) == 2,
+            "each edge must have two half-edges, at edges",
+        )
+        require(
+            edge[half_edge] == np.arange(n_half // 2),
+            "`half_edge` must point into its edge, at edges",
+        )
+        require((cell >= 0) & (cell < n_faces), "`cell` must lie in 0 … n_cells - 1, at half-edges")
+        sides = np.bincount(cell, minlength=n_faces)
+        require(sides > 0, "every cell must have half-edges, at cells")
+
+        following = np.where(twin % 3 == 0, twin + 2, twin - 1)
+        require(cell[following] == cell, "`cell` must be the same all around a face, at half-edges")
+        n_orbits, face = connected_components(
+            coo_array((np.ones(n_half, bool), (h, following)), shape=(n_half, n_half)),
+            directed=False,
+        )
+        faces_of_cell = np.bincount(cell[np.unique(face, return_index=True)[1]], minlength=n_faces)
+        require(faces_of_cell == 1, "every cell must be one face, at cells")
+        # A side on the outline may be an arc, so two sides are enough there.
+        outside = np.bincount(cell, cell[twin] == self.n_cells, n_faces) > 0
+        outside[self.n_cells :] = True
+        require(
+            sides >= np.where(outside, 2, 3),
+            "every cell must have at least three sides, or two on the outline, at cells",
+        )
+
+        offset = frame[following] - frame
+        require(
+            np.all(offset[twin] == -offset, axis=1),
+            "`frame` must give a half-edge and its twin opposite lattice offsets, at half-edges",
+        )
+        n_vertices = n_half // 3
+        n_pieces, _ = connected_components(
+            coo_array((np.ones(n_half, bool), (h // 3, twin // 3)), shape=(n_vertices, n_vertices)),
+            directed=False,
+        )
+        require(n_pieces == 1, "the tissue must be in one piece")
+        euler = n_vertices - n_half // 2 + n_orbits
+        if self.exterior:
+            require(
+                euler == 2,
+                f"vertices - edges + cells must be 1 for a free tissue, but is {euler - 1}",
+            )
+            require(np.all(frame == 0, axis=1), "`frame` must be 0 in a free tissue, at half-edges")
+            require(cell[twin] != cell, "an edge must lie between two faces, at half-edges")
+            require(
+                cell[half_edge] != self.n_cells,
+                "the exterior must not be on the left of an edge, at edges",
+            )
+        else:
+            require(
+                euler == 0,
+                f"vertices - edges + cells must be 0 for a periodic tissue, but is {euler}",
+            )
+
+
+def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
+    """Flip the marked edges (the topological part of a T1 transition).
+
+    The flipped half-edges turn clockwise by a quarter turn: the cells that were at an edge's ends
+    become its two sides. No two marked edges may share a cell (the exterior does not count); geometry is
+    left alone.
+    """
+    # At h = v -> w, with t its twin, the four other half-edges counter-clockwise are a, b (at v) and
+    # c, d (at w). In the picture h points east; V, L, W, R are the cells around it.
+    #
+    #       a     L     d                     b    L    a
+    #        \         /          roll           \     /
+    #     V   v --h-- w   W      ======>       V    v    W
+    #        /         \                            |h
+    #       b     R     c                           w
+    #                                             /   \
+    #                                            c  R  d
+    #
+    # What hung on a moves to b, b to c, c to d and d to a, taking twin, cell and edge along. `roll` is
+    # that permutation of half-edges and `unroll` its inverse, so a mesh relabelled by it is
+    # twin' = roll ∘ twin ∘ unroll, which stays an involution even if two of the four are twins.
+    t, a, b, c, d = edge_neighbourhood(topology)
+    h = topology.half_edge
+    n = topology.n_half_edges
+    identity = jnp.arange(n, dtype=h.dtype)
+
+    def put(array: Array, index: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
+        # Only at flipped edges: the other indices point outside, and are dropped.
+        where = jnp.concatenate([jnp.where(flip, i, n) for i in index])
+        return array.at[where].set(jnp.concatenate(values), mode="drop")
+
+    roll = put(identity, (a, b, c, d), (b, c, d, a))
+    unroll = put(identity, (b, c, d, a), (a, b, c, d))
+    at = lambda array, index: take(array, index)
+    cell = at(topology.cell, unroll)
+    cell = put(cell, (h, t), (at(topology.cell, c), at(topology.cell, a)))
+    # Corners: v stays a corner of L and V and becomes one of W; w stays one of R and W and becomes one
+    # of V. A new corner is one step of the flipped edge away from the other end's.
+    fh, ft, fa, fc, fd = (at(topology.frame, slot) for slot in (h, t, a, c, d))
+    step = fd - fh
+    frame = put(topology.frame, (h, a, b, t, c, d), (fc - step, fh, fa, fa + step, ft, fc))
+    twin, half_edge = at(roll, at(topology.twin, unroll)), at(roll, h)
+    if topology.exterior:  # which stays on the right of edges
+        outside = at(cell, half_edge) == topology.n_cells
+        half_edge = jnp.where(outside, at(twin, half_edge), half_edge)
+    return eqx.tree_at(
+        lambda m: (m.twin, m.cell, m.frame, m.edge, m.half_edge),
+        topology,
+        (
+            twin,
+            cell,
+            frame,
+            at(topology.edge, unroll),
+            half_edge,
+        ),
+    )
+
+
+def edge_neighbourhood(topology: Topology) -> tuple[Int[Array, " edges"], ...]:
+    """The twin `t` of each edge's half-edge and the four half-edges `a, b, c, d` around it.
+
+    Counter-clockwise: `a`, `b` leave the source of the edge, `c`, `d` its target.
+    """
+    h = topology.half_edge
+    t = take(topology.twin, h)
+    return t, counter_clockwise(h), clockwise(h), counter_clockwise(t), clockwise(t)
+
+
+# Written for speed of compilation as much as of execution: `//`, `%` and `[]` of jax.numpy each expand
+# into a dozen operations that guard against signs and bounds, and every property uses these.
+
+
+def source(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
+    """The vertex that a half-edge leaves."""
+    return jax.lax.div(h, jnp.asarray(3, h.dtype))
+
+
+def clockwise(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
+    """The half-edge one slot clockwise around the same vertex."""
+    slot = jax.lax.rem(h, jnp.asarray(3, h.dtype))
+    return h + jax.lax.select(slot == 0, jnp.full_like(h, 2), jnp.full_like(h, -1))
+
+
+def counter_clockwise(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
+    """The half-edge one slot counter-clockwise around the same vertex."""
+    slot = jax.lax.rem(h, jnp.asarray(3, h.dtype))
+    return h + jax.lax.select(slot == 2, jnp.full_like(h, -2), jnp.full_like(h, 1))
+
+
+def take(array: Shaped[Array, "n *shape"], index: Int[Array, "..."]) -> Shaped[Array, "..."]:
+    """`array[index]` for indices known to be valid."""
+    return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)

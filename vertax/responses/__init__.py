@@ -1,0 +1,3 @@
+"""Responses: how a tissue answers to its energy."""
+
+from vertax.responses._relaxation import Equilibrium as Equilibrium, equilibrate as equilibrate

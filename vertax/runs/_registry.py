@@ -1,0 +1,108 @@
+"""All experiments by name, found in their folder."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import importlib
+import importlib.resources
+import os
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+from vertax.runs._config import (
+    ConfigError,
+    ExperimentConfig,
+    apply_overrides,
+    read_toml,
+    validate,
+)
+
+_PACKAGE = "vertax.experiments"
+
+
+class Experiment(NamedTuple):
+    """One experiment: a package that has a configuration `Config` and a function `run`.
+
+    `run(config, folder, *, progress)` writes its results to the [`RunFolder`][vertax.runs.RunFolder] and
+    returns its metrics.
+    """
+
+    name: str
+    summary: str
+    """The first line of the docstring of the package."""
+
+    @property
+    def config(self) -> type[ExperimentConfig]:
+        """What configures it."""
+        return self._package.Config
+
+    @property
+    def run(self) -> Callable[..., Mapping[str, Any]]:
+        """What runs it."""
+        return self._package.run
+
+    @property
+    def _package(self) -> Any:
+        return importlib.import_module(f"{_PACKAGE}.{self.name}")
+
+
+def _found() -> dict[str, Experiment]:
+    # Their docstrings are read and nothing is imported: lists and help come at once.
+    experiments: dict[str, Experiment] = {}
+    for folder in sorted(importlib.resources.files(_PACKAGE).iterdir(), key=lambda f: f.name):
+        source = folder / "__init__.py"
+        if folder.is_dir() and source.is_file() and not folder.name.startswith("_"):
+            text = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
+            experiments[folder.name] = Experiment(folder.name, text.partition("\n")[0])
+    return experiments
+
+
+EXPERIMENTS: dict[str, Experiment] = _found()
+
+
+def find_experiment(name: Any) -> Experiment:
+    """The experiment of a name.
+
+    **Arguments:**
+
+    - `name`: as in the key `experiment` of a configuration.
+
+    **Returns:** the experiment.
+
+    **Raises:**
+
+    - `ConfigError` with the nearest name if there is none of this name.
+    """
+    if isinstance(name, str) and name in EXPERIMENTS:
+        return EXPERIMENTS[name]
+    near = difflib.get_close_matches(str(name), EXPERIMENTS, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(EXPERIMENTS)}."
+    raise ConfigError(f"There is no experiment {name!r}; {hint}")
+
+
+def load_config(
+    path: str | os.PathLike[str], overrides: Iterable[str] = ()
+) -> tuple[Experiment, Any]:
+    """Read and check a configuration file.
+
+    **Arguments:**
+
+    - `path`: a TOML file; its key `experiment` says which experiment it configures.
+    - `overrides`: texts `key=value` that set single keys, see
+        `apply_overrides`.
+
+    **Returns:** the experiment and its configuration, an instance of `experiment.config`.
+
+    **Raises:**
+
+    - `ConfigError` if the file is missing or no TOML, or for an unknown or ill-typed key.
+    """
+    data = apply_overrides(read_toml(path), overrides)
+    if "experiment" not in data:
+        raise ConfigError(
+            f"In {os.fspath(path)}: `experiment` is missing; it names the experiment to run, one "
+            f"of {', '.join(EXPERIMENTS)}."
+        )
+    experiment = find_experiment(data["experiment"])
+    return experiment, validate(experiment.config, data, os.fspath(path))

@@ -1,0 +1,208 @@
+"""The command `vertax`."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from vertax.runs import RunFolder
+
+# JAX and the experiments are imported by the commands that need them, so that help comes quickly.
+
+app = typer.Typer(
+    help="A differentiable vertex model of epithelial tissue.",
+    epilog="Exit codes: 0 all went well, 1 the run failed or is unfinished, 2 wrong use, 130 interrupted.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+USAGE, FAILURE, INTERRUPTED = 2, 1, 130
+
+
+def main() -> None:
+    """Entry point of the program `vertax`."""
+    app()
+
+
+def _show_version(wanted: bool) -> bool:
+    if wanted:
+        from vertax.runs import installed_version
+
+        typer.echo(f"vertax {installed_version('vertax')}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _options(
+    show_version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command("list")
+def list_experiments() -> None:
+    """List all experiments."""
+    from vertax.runs import EXPERIMENTS
+
+    width = max(map(len, EXPERIMENTS))
+    for name, experiment in EXPERIMENTS.items():
+        typer.echo(f"{name:{width}}  {experiment.summary}")
+
+
+@app.command()
+def describe(
+    experiment: Annotated[str, typer.Argument(help="Name of an experiment, see `vertax list`.")],
+) -> None:
+    """Print a configuration file with every key of an experiment, explained and at its default."""
+    from vertax.runs import ConfigError, find_experiment, template
+
+    try:
+        found = find_experiment(experiment)
+    except ConfigError as error:
+        _stop(error, USAGE)
+    typer.echo(template(found.config, experiment), nl=False)
+
+
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(help="Configuration file, e.g. configs/demo.toml.")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Set one key, e.g. fit.epochs=50; may be repeated."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the results; by default runs/NAME of the configuration, or NAME-2, … "
+            "if there is one already.",
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
+    ] = False,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Go on with the interrupted run in this folder: fits continue where they were, what is "
+            "no fit begins again.",
+        ),
+    ] = None,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Show no progress bar and no summary.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show where in the program an error occurred.")
+    ] = False,
+) -> None:
+    """Run the experiment that a configuration file describes."""
+    import jax
+    import matplotlib
+
+    from vertax import FitError
+    from vertax.runs import ConfigError, RunFolder, RunFolderError, load_config, summary
+
+    folder: RunFolder | None = None
+    # Figures go to files only, also where there is a screen.
+    matplotlib.use("Agg")
+    try:
+        experiment, settings = load_config(config, overrides or ())
+        # The library leaves the precision of JAX to the user; here the configuration decides.
+        jax.config.update("jax_enable_x64", settings.precision == "float64")
+        if resume is None:
+            folder = RunFolder.claim(config.stem, output, overwrite=overwrite)
+            folder.save_config(settings)
+        elif output is not None or overwrite:
+            raise RunFolderError(
+                "--resume goes with neither --output nor --overwrite: leave them out."
+            )
+        else:
+            folder = RunFolder.unfinished(resume, settings)
+        if not quiet:
+            typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
+        metrics = experiment.run(settings, folder, progress=not quiet)
+        if folder.interrupted:
+            raise KeyboardInterrupt
+        folder.save_metrics(metrics)
+        folder.forget_parts()
+    except KeyboardInterrupt:
+        typer.echo(_interrupted(config, overrides or (), folder), err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    # What a user can cause and mend gets a message; anything else is our fault, with a traceback.
+    except (ConfigError, RunFolderError) as error:
+        if debug:
+            raise
+        _stop(error, USAGE)
+    except (FitError, ValueError, OSError, RuntimeError) as error:
+        if debug:
+            raise
+        _stop(error, FAILURE)
+    if not quiet:
+        typer.echo(summary(metrics))
+        typer.echo(f"Results: {folder.path}")
+        for figure in folder.figures():
+            typer.echo(f"  {figure}")
+
+
+@app.command()
+def show(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, e.g. runs/demo.")],
+) -> None:
+    """Print the metrics of a finished run, and list its figures and files."""
+    from vertax.runs import RunFolder, RunFolderError, UnfinishedRunError, summary
+
+    try:
+        run = RunFolder.existing(folder)
+        metrics = run.metrics()
+    except UnfinishedRunError as error:
+        _stop(error, FAILURE)
+    except RunFolderError as error:
+        _stop(error, USAGE)
+    figures = run.figures()
+    others = [file for file in run.files() if file not in figures]
+    if table := summary(metrics):
+        typer.echo(table)
+    for title, files in (("Figures", figures), ("Files", others)):
+        if files:
+            typer.echo(f"{title}:")
+        for file in files:
+            typer.echo(f"  {file}")
+
+
+def _found(folder: RunFolder) -> str:
+    """What a resumed run begins with."""
+    parts = folder.parts()
+    return f" (resumed; kept so far: {', '.join(part.stem for part in parts)})" if parts else ""
+
+
+def _interrupted(config: Path, overrides: Iterable[str], folder: RunFolder | None) -> str:
+    if folder is None:
+        return "Interrupted before the run began."
+    changes = "".join(f" --set {shlex.quote(override)}" for override in overrides)
+    command = (
+        f"vertax run {shlex.quote(str(config))}{changes} --resume {shlex.quote(str(folder.path))}"
+    )
+    return f"Interrupted. What there is lies in {folder.path}. To go on: {command}"
+
+
+def _stop(error: Exception, code: int) -> NoReturn:
+    typer.echo(f"Error: {error}", err=True)
+    raise typer.Exit(code)
+
+
+if __name__ == "__main__":
+    main()

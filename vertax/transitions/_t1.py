@@ -1,0 +1,266 @@
+"""T1 transitions: an edge flips."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax._base.modules import is_concrete
+from vertax.energies import AbstractEnergy, AbstractLocalEnergy
+from vertax.mesh import Tissue
+from vertax.mesh._arcs import length_factor
+from vertax.mesh._topology import edge_neighbourhood, flip_edges, source, take
+from vertax.transitions._transitions import AbstractTransitions
+
+
+class T1(AbstractTransitions):
+    r"""T1 transitions by the rule of the paper (Methods, "T1 transitions").
+
+    An edge shorter than the threshold is compared in two configurations of the same length: stretched
+    along itself, and flipped (the two cells at its ends become neighbours). If the flipped one has the
+    lower energy it is taken; otherwise the vertices stay where they are. Edges that a large step has
+    turned inside out are candidates too. A sweep tries every candidate once, all that share no cell
+    together, shortest first.
+
+    An edge that flipped before in the same relaxation must also want to grow in its new place: where
+    four cells meet in one point because its tension is too high for either configuration, it would
+    otherwise flip to and fro for ever.
+
+    Lengths are those of arcs where edges are arcs; an edge that flips becomes straight, or an arc of
+    angle 0.
+
+    A flip that would leave a cell with two sides (with one, if the other is an arc on the outline), or
+    an edge with one cell or the exterior on both sides, is refused: so a free tissue stays in one
+    piece. Edges at pinned vertices do not flip.
+
+    **Arguments:**
+
+    - `threshold`: length below which an edge may flip, in units of length. The default suits tissues of
+        mean cell area 1; smaller values (5e-3 in the paper) reach the same states in more steps.
+    - `max_flips`: how often one edge may flip in a relaxation: a last guard against flipping for ever.
+
+    **Raises:**
+
+    - `ValueError` for a threshold that is not positive, or `max_flips` below 1.
+    """
+
+    threshold: float = 0.02
+    max_flips: int = eqx.field(static=True, default=20)
+
+    def __check_init__(self):
+        if is_concrete(self.threshold) and not self.threshold > 0:
+            raise ValueError(
+                f"Argument `threshold` must be positive, but is {self.threshold}. To switch T1 "
+                "transitions off pass `transitions=None`."
+            )
+        if self.max_flips < 1:
+            raise ValueError(f"Argument `max_flips` must be at least 1, but is {self.max_flips}.")
+
+    def init(self, tissue: Tissue) -> Int[Array, " edges"]:
+        """How often each edge flipped: never yet."""
+        return jnp.zeros(tissue.n_edges, jnp.int32)
+
+    def sweep(
+        self, tissue: Tissue, energy: AbstractEnergy, counts: Int[Array, " edges"]
+    ) -> tuple[Tissue, Int[Array, " edges"]]:
+        """Try every candidate once; returns the new tissue and the updated counts."""
+
+        # Rounds of candidates that share no cell, until all were tried: one that is refused must not
+        # keep its neighbours from being tried. `todo` loses at least one edge a round.
+        def unfinished(carry: tuple) -> Bool[Array, ""]:
+            *_, todo = carry
+            return jnp.any(todo)
+
+        def one_round(carry: tuple) -> tuple:
+            tissue, counts, todo = carry
+            corner = _EdgeFrames(tissue)
+            todo &= (corner.length < self.threshold) | corner.inside_out
+            todo &= corner.can_flip & (counts < self.max_flips)
+            chosen = _independent(todo, corner, tissue.n_cells)
+
+            def judge() -> tuple[Tissue, Bool[Array, " edges"]]:
+                length = jnp.maximum(corner.length, self.threshold)
+                chord = length / corner.stretch
+                stretch = lambda which: corner.place(tissue, which, corner.along, chord)
+
+                def flip(which: Bool[Array, " edges"], share: float = 1.0) -> Tissue:
+                    placed = corner.place(tissue, which, corner.across, share * length)
+                    flipped = flip_edges(tissue.topology, which)
+                    return _straightened(placed, which).with_topology(flipped)
+
+                def lowers(which: Bool[Array, " edges"], other: _Trial) -> Bool[Array, " edges"]:
+                    if isinstance(energy, AbstractLocalEnergy):
+                        return _judge_local(energy, which, corner, other, flip)
+                    return _judge_total(energy, which, corner, other, flip)
+
+                accepted = lowers(chosen, stretch)
+                again = accepted & (counts > 0)
+                grows = lowers(again, lambda which: flip(which, 0.5))
+                accepted &= ~again | grows
+                return flip(accepted), accepted
+
+            new, accepted = jax.lax.cond(
+                jnp.any(chosen), judge, lambda: (tissue, jnp.zeros_like(chosen))
+            )
+            return new, counts + accepted, todo & ~chosen
+
+        start = (tissue, counts, jnp.ones(tissue.n_edges, bool))
+        tissue, counts, _ = jax.lax.while_loop(unfinished, one_round, start)
+        return tissue, counts
+
+
+class _EdgeFrames(eqx.Module):
+    """The surroundings of every edge: its cells, its length and the directions a T1 places it in."""
+
+    start: Int[Array, " edges"]
+    end: Int[Array, " edges"]
+    cells: Int[Array, "edges 4"]  # left, right, at the start, at the end
+    edges: Int[Array, "edges 5"]  # the edge itself and its four neighbours
+    vector: Float[Array, "edges 2"]
+    stretch: Float[Array, " edges"]  # length over distance of the ends
+    length: Float[Array, " edges"]
+    along: Float[Array, "edges 2"]
+    across: Float[Array, "edges 2"]
+    inside_out: Bool[Array, " edges"]
+    can_flip: Bool[Array, " edges"]
+
+    def __init__(self, tissue: Tissue):
+        m = tissue.topology
+        h = m.half_edge
+        t, a, b, c, d = edge_neighbourhood(m)
+        self.start, self.end = source(h), source(t)
+        self.cells = take(m.cell, jnp.stack([h, t, a, c], axis=-1))
+        self.edges = take(m.edge, jnp.stack([h, a, b, c, d], axis=-1))
+        forward = tissue.edge_vectors
+        # Half-edge vectors: an edge's own vector or its opposite.
+        outward = take(forward, m.edge)
+        outward = jnp.where(m.forward[:, None], outward, -outward)
+        self.vector = forward
+        chord = jnp.sqrt(jnp.sum(forward**2, axis=-1))
+        self.stretch = jnp.ones_like(chord)
+        leaving = outward
+        if tissue.angles is not None:
+            self.stretch = length_factor(tissue.edge_angles)
+            first, last = (take(tangent, m.edge) for tangent in tissue.edge_tangents)
+            leaving = jnp.where(m.forward[:, None], first, -last)
+        self.length = chord * self.stretch
+        # At a short edge the far ends of the four neighbours show which way the edge ought to point;
+        # its own vector may have shrunk to nothing or turned around.
+        ahead = take(outward, c) + take(outward, d)
+        behind = take(outward, a) + take(outward, b)
+        axis = ahead - behind + 2 * forward
+        upright = jnp.sum(axis * forward, axis=-1) >= 0
+        direction = jnp.where((chord > 0)[:, None], forward, axis)
+        direction = jnp.where(upright[:, None], direction, -direction)
+        norm = jnp.sqrt(jnp.sum(direction**2, axis=-1, keepdims=True))
+        self.along = direction / jnp.where(norm > 0, norm, 1)
+        # A flipped half-edge has turned clockwise, see `flip_edges`.
+        self.across = jnp.stack([self.along[:, 1], -self.along[:, 0]], axis=-1)
+        # Three directions are in counter-clockwise order if at least two of their consecutive cross
+        # products are positive. An edge that passed through length 0 spoils that order at both ends.
+        u = leaving.reshape(-1, 3, 2)
+        v = jnp.roll(u, -1, axis=1)
+        disordered = jnp.sum(u[..., 0] * v[..., 1] < u[..., 1] * v[..., 0], axis=1) >= 2
+        self.inside_out = take(disordered, self.start) & take(disordered, self.end) & ~upright
+        left, right, at_start, at_end = (self.cells[:, k] for k in range(4))
+        spare = jnp.min(_spare_sides(tissue), axis=-1)
+        losses = jnp.where(left == right, 2, 1)
+        self.can_flip = (spare >= losses) & (at_start != at_end) & (self.start != self.end)
+        if tissue.pinned is not None:
+            self.can_flip &= ~take(tissue.pinned, self.start) & ~take(tissue.pinned, self.end)
+
+    def place(
+        self,
+        tissue: Tissue,
+        which: Bool[Array, " edges"],
+        direction: Float[Array, "edges 2"],
+        length: Float[Array, " edges"],
+    ) -> Tissue:
+        """Lay the marked edges in a direction, about their midpoint, with a given length."""
+        half = 0.5 * (direction * length[:, None] - self.vector)
+        half = jnp.where(which[:, None], half, 0)
+        return tissue.with_vertices(
+            tissue.vertices.at[self.start].add(-half).at[self.end].add(half)
+        )
+
+
+def _spare_sides(tissue: Tissue) -> Int[Array, "edges 2"]:
+    """How many sides more than it needs the cell left, and right, of each edge has without its arc."""
+    m = tissue.topology
+    face_sums = lambda values: jax.ops.segment_sum(values, m.cell, m.n_faces)
+    sides = take(face_sums(jnp.ones_like(m.cell)), m.edge_cells)
+    if not m.exterior or tissue.angles is None:
+        return sides - 3
+    # Two sides bound a cell if one is an arc on the outline, other than the edge that leaves; two arcs
+    # bound the exterior.
+    arcs = take(face_sums(take(m.on_outline, m.edge).astype(m.cell.dtype)), m.edge_cells)
+    return sides - jnp.where(arcs > m.on_outline[:, None], 2, 3)
+
+
+def _straightened(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
+    if tissue.angles is None:
+        return tissue
+    return eqx.tree_at(lambda t: t.angles, tissue, jnp.where(which, 0, tissue.angles))
+
+
+def _independent(
+    candidates: Bool[Array, " edges"], corner: _EdgeFrames, n_cells: int
+) -> Bool[Array, " edges"]:
+    """The candidates that are the shortest of all candidates at each of their four cells."""
+    # Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute. (An
+    # edge lies between two faces, so sharing the exterior alone is no harm.)
+    n = candidates.shape[0]
+    rank = (
+        jnp.zeros(n, jnp.int32).at[jnp.argsort(corner.length)].set(jnp.arange(n, dtype=jnp.int32))
+    )
+    rank = jnp.where(candidates, rank, n)
+    best = jnp.full(n_cells, n, jnp.int32).at[corner.cells].min(rank[:, None], mode="drop")
+    first = best.at[corner.cells].get(mode="fill", fill_value=0) == rank[:, None]
+    return candidates & jnp.all(first | (corner.cells == n_cells), axis=-1)
+
+
+_Trial = Callable[[Bool[Array, " edges"]], Tissue]
+
+
+def _judge_local(
+    energy: AbstractLocalEnergy,
+    chosen: Bool[Array, " edges"],
+    corner: _EdgeFrames,
+    stretch: _Trial,
+    flip: _Trial,
+) -> Bool[Array, " edges"]:
+    """Which flips lower a local energy: all at once, each by the terms of its own cells and edges."""
+    stretched, flipped = stretch(chosen), flip(chosen)
+    by_cell = energy.cell_terms(flipped) - energy.cell_terms(stretched)
+    by_edge = energy.edge_terms(flipped) - energy.edge_terms(stretched)
+    # In a very small tissue one cell can be two of the four: count it once.
+    cells = corner.cells
+    repeated = [jnp.zeros(cells.shape[0], bool)]
+    for k in range(1, 4):
+        repeated.append(jnp.any(cells[:, :k] == cells[:, k : k + 1], axis=-1))
+    by_cell = by_cell.at[cells].get(mode="fill", fill_value=0)  # the exterior has no energy
+    change = jnp.where(jnp.stack(repeated, axis=-1), 0, by_cell)
+    return chosen & (jnp.sum(change, axis=-1) + jnp.sum(take(by_edge, corner.edges), axis=-1) < 0)
+
+
+def _judge_total(
+    energy: AbstractEnergy,
+    chosen: Bool[Array, " edges"],
+    corner: _EdgeFrames,
+    stretch: _Trial,
+    flip: _Trial,
+) -> Bool[Array, " edges"]:
+    """Which flips lower an arbitrary energy: one candidate after the other, by the total."""
+    edges = jnp.arange(chosen.shape[0])
+    order = jnp.argsort(jnp.where(chosen, corner.length, jnp.inf))
+
+    def body(i: Array, accepted: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
+        # The candidates share no cell, so settled ones need not be flipped to judge the next.
+        this = edges == order[i]
+        return accepted | (this & (energy(flip(this)) < energy(stretch(this))))
+
+    return jax.lax.fori_loop(0, jnp.sum(chosen), body, jnp.zeros_like(chosen))
