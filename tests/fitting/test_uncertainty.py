@@ -19,7 +19,9 @@ def hidden():
 
 
 def fitted(tissue, energy, cost, **options):
-    problem = vx.InverseProblem(tissue, energy, cost, transitions=None, **options)
+    problem = vx.InverseProblem(
+        tissue, energy, cost, response=vx.Relaxation(transitions=None), **options
+    )
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
     return problem, vx.fit(problem, solver, 15, progress=False)
 
@@ -39,7 +41,9 @@ def test_it_is_the_scatter_of_repeated_fits(hidden):
 
     keys = jax.random.split(jax.random.key(0), 60)
     problems = eqx.filter_vmap(
-        lambda key: vx.InverseProblem(tissue, truth, once(key), transitions=None),
+        lambda key: vx.InverseProblem(
+            tissue, truth, once(key), response=vx.Relaxation(transitions=None)
+        ),
         out_axes=eqx.if_array(0),
     )(keys)
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
@@ -86,7 +90,9 @@ def test_it_names_what_the_data_do_not_determine(hidden):
         def residuals(self, tissue, energy):
             return jnp.ones(20) * (tissue.perimeters[0] - 3.6)
 
-    problem = vx.InverseProblem(tissue, truth, OneNumber(), transitions=None)
+    problem = vx.InverseProblem(
+        tissue, truth, OneNumber(), response=vx.Relaxation(transitions=None)
+    )
     fit = vx.fit(problem, optax.adam(1e-3), 3, progress=False)
     said = vx.uncertainty(problem, fit)
     assert int(jnp.sum(jnp.isinf(said.deviations))) == 7
@@ -105,14 +111,17 @@ def test_a_fitted_position_adds_to_the_uncertainty(hidden):
     image = image + 0.05 * image.max() * np.random.default_rng(0).normal(size=image.shape)
     cost = MeshImage(image, width)
     fit = vx.fit(
-        vx.InverseProblem(tissue, truth, cost, transitions=None),
+        vx.InverseProblem(tissue, truth, cost, response=vx.Relaxation(transitions=None)),
         optax.adam(1e-3),
         2,
         progress=False,
     )
     known, unknown = (
         vx.uncertainty(
-            vx.InverseProblem(tissue, truth, cost, transitions=None, fit_position=moves), fit
+            vx.InverseProblem(
+                tissue, truth, cost, response=vx.Relaxation(transitions=None), fit_position=moves
+            ),
+            fit,
         )
         for moves in (False, True)
     )

@@ -71,7 +71,7 @@ def test_a_gif_has_a_picture_for_each_frame_and_marks_transitions(way, tmp_path)
 
 def test_values_may_be_a_function_and_clusters_have_arcs(tmp_path):
     tissue = cluster(5)
-    way = vx.io.Trajectory()
+    way = vx.responses.Trajectory()
     for scale in (1.0, 1.1):
         way.append(tissue.with_vertices(scale * tissue.vertices))
     vx.animate(way, tmp_path / "free.gif", lambda t: t.areas, dpi=60)

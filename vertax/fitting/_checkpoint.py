@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,6 @@ import numpy as np
 from jaxtyping import PyTree, Shaped
 
 from vertax._base.archive import as_jax, read_archive, write_archive
-from vertax._base.modules import without_addresses
 
 _VERSION = 1
 # Writing takes no more than this share of the time of a fit, however slow the disk.
@@ -119,6 +119,11 @@ def identity_of(problem: PyTree, truth: PyTree, optimiser: str, batched: bool) -
         "optimiser": optimiser,
         "setting of `batched`": str(batched),
     }
+
+
+def without_addresses(text: str) -> str:
+    """A text in which no address of an object in memory is left, so that two processes write the same."""
+    return re.sub(r" at 0x[0-9a-f]+", "", text)
 
 
 def _digest(tree: PyTree) -> str:
