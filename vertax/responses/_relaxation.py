@@ -189,8 +189,8 @@ def _equilibrate(
 ) -> Equilibrium:
     start, constant = frozen((tissue, energy))
     search = response.search(start, constant)
-    found = search.advance(search.begin(start, constant), constant, response.max_steps)
-    return conclude(search, found, tissue, energy, adjoint, response.max_steps)
+    end = search.advance(search.begin(start, constant), constant, response.max_steps)
+    return conclude(search, end, tissue, energy, adjoint, response.max_steps)
 
 
 def conclude(
