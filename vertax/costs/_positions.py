@@ -56,8 +56,8 @@ class VertexDistance(AbstractLeastSquaresCost):
         goal = self.target.vertices
         if self.match == "cells":
             check_equal(type(self).__name__, tissue, self.target, "cells")
-            counterpart, found = matching_vertices(tissue, self.target)
-            goal = jnp.where(found[:, None], take(goal, counterpart), tissue.vertices)
+            counterpart, matched = matching_vertices(tissue, self.target)
+            goal = jnp.where(matched[:, None], take(goal, counterpart), tissue.vertices)
         displacement = tissue.boundary.shortest(tissue.vertices - goal)
         return displacement.ravel() / jnp.sqrt(1.0 * tissue.n_vertices)
 
@@ -157,8 +157,8 @@ def matching_vertices(
     # Rows that are no pair write to a place past the end, which is dropped.
     place = jnp.where(pair, first, n)
     counterpart = jnp.zeros(n, order.dtype).at[place].set(second - n, mode="drop")
-    found = jnp.zeros(n, bool).at[place].set(True, mode="drop")
-    return counterpart, found
+    matched = jnp.zeros(n, bool).at[place].set(True, mode="drop")
+    return counterpart, matched
 
 
 def _meeting_cells(tissue: Tissue) -> Int[Array, "vertices 3"]:

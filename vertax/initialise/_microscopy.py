@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Array, Int, Shaped
 
+from vertax._base.checks import check_concrete
 from vertax.initialise._labels import Segmentation, check_options, from_labels
 from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
 
@@ -43,9 +44,15 @@ def from_microscopy(
         finds fewer than two cells; and as `from_labels` does.
     - `ImportError` if what the segmenter needs is not installed.
     """
+    check_concrete("from_microscopy", image, pixel_size)
     check_options(boundary, pixel_size)
     pixels = check_image(image)
     segmenter = Watershed() if segmenter is None else segmenter
+    if not callable(segmenter) or isinstance(segmenter, type):
+        raise TypeError(
+            "Argument `segmenter` must be a segmenter, such as Watershed(), or a function from an image to "
+            f"its labels, but is {segmenter!r}."
+        )
     segment = _segment_periodic if boundary == "periodic" else _segment
     labels = segment(pixels, segmenter)
     n_cells = len(np.unique(labels[labels > 0]))

@@ -14,6 +14,7 @@ from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue, Topology
 
 _VERSION = 1
+_INT32 = np.iinfo(np.int32)
 
 
 class _BoundaryRecord(NamedTuple):
@@ -149,6 +150,11 @@ def tissue_from(
             )
         if array.dtype.kind == "f":
             as_jax(array, name)
+        elif array.size and not (_INT32.min <= array.min() and array.max() <= _INT32.max):
+            raise ValueError(
+                f"{name} is broken: `{key}` holds numbers from {array.min()} to {array.max()}, which "
+                "number nothing in a tissue."
+            )
         return array
 
     twin = get("twin", "i", None)
