@@ -18,6 +18,7 @@ from vertax.initialise import (
     Watershed,
     from_labels,
     from_microscopy,
+    labels_from_skeleton,
     periodic_voronoi,
 )
 from vertax.initialise._segmenters import estimate_cell_size
@@ -399,3 +400,30 @@ def test_real_image_edges_lie_on_membranes(real):
     centres = np.asarray(real.tissue.centroids)[cell][inside] / real.pixel_size
     at = lambda points: image[tuple(points[:, ::-1].astype(int).T)]
     assert np.mean(at(middles) > at(centres)) > 0.97
+
+
+@pytest.mark.parametrize("name", ["cell_size", "smoothing"])
+def test_lengths_beyond_the_image_are_refused(small, name):
+    with pytest.raises(ValueError, match=f"`{name}` of Watershed is in pixels .* 200, but is 1e"):
+        Watershed(**{name: 1e9})(small[0])
+
+
+def test_a_segmenter_that_is_a_function_is_called_by_its_name(small):
+    def nothing(image):
+        return np.zeros(image.shape, int)
+
+    with pytest.raises(ValueError, match="but nothing found 0"):
+        from_microscopy(small[0], segmenter=nothing)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.eye(9) * 1j, "must hold real numbers, but its dtype is complex128"),
+        (np.full((9, 9), np.nan), "must be finite"),
+        (np.full((9, 9), "a"), "must hold real numbers"),
+    ],
+)
+def test_what_is_no_skeleton_is_refused(image, message):
+    with pytest.raises(ValueError, match=f"Argument `image` {message}"):
+        labels_from_skeleton(image)

@@ -171,3 +171,13 @@ def test_inside_transformations_the_remedy_is_told(as_a_user):
     tissues = [periodic_voronoi(5, key=key) for key in keys]
     batch = jax.tree.map(lambda *x: jax.numpy.stack(x), *tissues)
     assert eqx.filter_vmap(lambda tissue: tissue.areas)(batch).shape == (2, 5)
+
+
+def test_seeds_out_of_reach_are_refused():
+    seeds = np.random.default_rng(0).random((5, 2))
+    with pytest.raises(ValueError, match="`seeds` must lie within 1e.08 boxes of the origin"):
+        periodic_voronoi(seeds=seeds * 1e300)
+    shifted = periodic_voronoi(seeds=seeds + 1e5 * np.sqrt(5))
+    np.testing.assert_allclose(
+        np.sort(shifted.areas), np.sort(periodic_voronoi(seeds=seeds).areas), rtol=1e-6
+    )

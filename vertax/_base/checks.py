@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import numbers
 from collections.abc import Sequence
 from typing import Any
@@ -23,7 +22,7 @@ def check_number(
     *,
     above: float | int | None = None,
     least: float | int | None = None,
-    infinite: bool = False,
+    many: bool = False,
 ) -> None:
     """Refuse what is no real number, or not in range. The value of a traced number is not looked at.
 
@@ -32,14 +31,14 @@ def check_number(
     - `name`: of the argument, or what the message is to say of it.
     - `value`: a number, or an array of no dimension.
     - `above`, `least`: what it must exceed, or at least be.
-    - `infinite`: whether it may be infinite.
+    - `many`: whether it may be an array, all entries of which are checked.
 
     **Raises:**
 
     - `TypeError` for what is no real number.
     - `ValueError` for a number out of range, NaN, or infinity.
     """
-    wanted = "a finite number" if not infinite else "a number"
+    wanted = "finite"
     if above is not None:
         wanted = "positive" if above == 0 else f"above {above:g}"
     elif least is not None:
@@ -47,18 +46,23 @@ def check_number(
     dtype = _dtype(value)
     # Booleans are numbers to Python, but no length or strength.
     if dtype is None or not (dtype.kind in "iu" or _floating(dtype)):
-        raise TypeError(f"Argument `{name}` must be one real number, but is {_described(value)}.")
-    if np.shape(value) != ():
-        raise ValueError(f"Argument `{name}` must be one number, but is {_described(value)}.")
+        what = "hold real numbers" if many else "be one real number"
+        raise TypeError(f"Argument `{name}` must {what}, but is {named(value)}.")
+    if np.shape(value) != () and not many:
+        raise ValueError(f"Argument `{name}` must be one number, but is {named(value)}.")
     if not is_concrete(value):
         return
-    number = float(value)
-    outside = (above is not None and not number > above) or (
-        least is not None and not number >= least
-    )
-    if outside or math.isnan(number) or (math.isinf(number) and not infinite):
-        finite = " and finite" if math.isinf(number) and not outside else ""
-        raise ValueError(f"Argument `{name}` must be {wanted}{finite}, but is {value}.")
+    numbers_given = np.asarray(value).astype(float)
+    inside = ~np.isnan(numbers_given)
+    if above is not None:
+        inside &= numbers_given > above
+    if least is not None:
+        inside &= numbers_given >= least
+    if not inside.all():
+        raise ValueError(f"Argument `{name}` must be {wanted}, but is {_shown(value)}.")
+    if np.isinf(numbers_given).any():
+        finite = "" if wanted == "finite" else " and finite"
+        raise ValueError(f"Argument `{name}` must be {wanted}{finite}, but is {_shown(value)}.")
 
 
 def check_whole(name: str, value: Any, *, least: int | None = None) -> None:
@@ -78,7 +82,7 @@ def check_whole(name: str, value: Any, *, least: int | None = None) -> None:
     wanted = "a whole number" if least is None else f"at least {least}"
     if not isinstance(value, numbers.Integral) or isinstance(value, bool | np.bool_):
         raise TypeError(
-            f"Argument `{name}` must be {wanted} (a Python integer), but is {_described(value)}."
+            f"Argument `{name}` must be {wanted} (a Python integer), but is {named(value)}."
         )
     if least is not None and value < least:
         raise ValueError(f"Argument `{name}` must be {wanted}, but is {value}.")
@@ -98,9 +102,9 @@ def check_concrete(what: str, *arguments: Any) -> None:
     """
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves(arguments)):
         raise TypeError(
-            f"{what} needs arrays whose numbers it can look at: how a mesh is connected depends on them. "
-            "So it does not work inside jax.jit, jax.vmap or jax.grad. Call it outside, once for each "
-            "tissue; tissues of one size make a batch by "
+            f"{what} needs arrays whose numbers it can look at, so it does not work inside jax.jit, "
+            "jax.vmap or jax.grad. Call it outside, once for each tissue; tissues of one size make a batch "
+            "by "
             "jax.tree.map(lambda *x: jax.numpy.stack(x), *tissues)."
         )
 
@@ -129,7 +133,7 @@ def as_key(key: PRNGKeyArray | int) -> PRNGKeyArray:
     if not isinstance(key, jax.Array | np.ndarray):
         raise TypeError(
             "Argument `key` must be a key from jax.random.key(seed) or a seed, but is "
-            f"{_described(key)}."
+            f"{named(key)}."
         )
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     if typed and key.shape == ():
@@ -185,7 +189,7 @@ def as_doubles(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray
 def _check_real(name: str, value: Any) -> None:
     dtype = _dtype(value)
     if dtype is None or dtype.kind == "c":
-        was = _described(value) if dtype is None else f"an array of type {dtype}"
+        was = named(value) if dtype is None else f"an array of type {dtype}"
         raise TypeError(f"Argument `{name}` must hold real numbers, but is {was}.")
     if is_concrete(value) and not np.isfinite(np.asarray(value)).all():
         raise ValueError(f"Argument `{name}` must be finite, but holds NaN or infinity.")
@@ -207,9 +211,18 @@ def _floating(dtype: np.dtype) -> bool:
     return bool(jnp.issubdtype(dtype, jnp.floating))
 
 
-def _described(value: Any) -> str:
+def named(value: Any) -> str:
+    """What a message says of a value that is of the wrong type: itself if it is short."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
     if hasattr(value, "shape") and np.shape(value) != ():
         return f"an array of shape {np.shape(value)} and type {value.dtype}"
     if isinstance(value, str | bytes | numbers.Number | np.generic) or value is None:
         return repr(value)
-    return f"of type {type(value).__name__}"
+    return f"an object of type {type(value).__name__}"
+
+
+def _shown(value: Any) -> str:
+    """A number, or the range of some."""
+    array = np.asarray(value)
+    return str(value) if array.shape == () else f"from {array.min()} to {array.max()}"

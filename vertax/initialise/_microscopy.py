@@ -58,7 +58,7 @@ def from_microscopy(
     n_cells = len(np.unique(labels[labels > 0]))
     if n_cells < 2:
         raise ValueError(
-            f"Argument `image` must show at least two cells, but {type(segmenter).__name__} found "
+            f"Argument `image` must show at least two cells, but {_name(segmenter)} found "
             f"{n_cells}. Check that membranes are bright on dark cells, and that the segmenter "
             "knows the size of the cells."
         )
@@ -66,8 +66,13 @@ def from_microscopy(
         return from_labels(labels, boundary=boundary, pixel_size=pixel_size, softening=softening)
     except ValueError as error:
         raise ValueError(
-            f"The labels that {type(segmenter).__name__} found in `image` make no tissue. {error}"
+            f"The labels that {_name(segmenter)} found in `image` make no tissue. {error}"
         ) from error
+
+
+def _name(segmenter: AbstractSegmenter) -> str:
+    """What messages call it; a segmenter of one's own may be a function."""
+    return getattr(segmenter, "__name__", type(segmenter).__name__)
 
 
 def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray, "rows columns"]:
@@ -75,7 +80,7 @@ def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray,
     if labels.shape != image.shape or labels.dtype.kind not in "iu":
         raise ValueError(
             f"Argument `segmenter` must return an integer label for each pixel, shape "
-            f"{image.shape}, but {type(segmenter).__name__} returned {labels.dtype} of shape "
+            f"{image.shape}, but {_name(segmenter)} returned {labels.dtype} of shape "
             f"{labels.shape}."
         )
     return labels

@@ -84,6 +84,13 @@ class Watershed(AbstractSegmenter):
             for name in ("measure", "morphology", "segmentation")
         )
         pixels = check_image(image)
+        for name in ("cell_size", "smoothing"):
+            length = getattr(self, name)
+            if length is not None and length > max(pixels.shape):
+                raise ValueError(
+                    f"Argument `{name}` of Watershed is in pixels and must be at most the side of the image, "
+                    f"{max(pixels.shape)}, but is {length}."
+                )
         # The logarithm makes bright and faint membranes comparable; the mean sets where it bends.
         pixels = pixels - pixels.min()
         pixels = np.log1p(pixels / pixels.mean())

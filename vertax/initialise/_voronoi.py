@@ -12,6 +12,9 @@ from vertax._base.checks import as_doubles, as_key, check_concrete, check_number
 from vertax.initialise._order import spatial_order
 from vertax.mesh import Periodic, Tissue, Topology
 
+# Beyond, what is left of the digits of a position tells little of where in the box it is.
+_FARTHEST = 1e8
+
 
 def periodic_voronoi(
     n_cells: int | None = None,
@@ -153,6 +156,11 @@ def _periodic_delaunay(
     # A reduced basis (Lagrange-Gauss) keeps the images that matter few, also in sheared boxes.
     basis, change = _reduce(lattice)
     fractions = seeds @ np.linalg.inv(basis)
+    if np.abs(fractions).max() > _FARTHEST:
+        raise ValueError(
+            f"Argument `seeds` must lie within {_FARTHEST:.0e} boxes of the origin, but the farthest is "
+            f"{np.abs(fractions).max():.0e} boxes away."
+        )
     home = np.floor(fractions).astype(int)
     fractions = fractions - home
     spacing = 1 / np.sqrt(n)

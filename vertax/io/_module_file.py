@@ -19,6 +19,7 @@ import optimistix as optx
 
 from vertax import adjoints, costs, energies, solvers
 from vertax._base.archive import as_jax, read_archive, write_archive
+from vertax._base.checks import named
 from vertax.energies import AbstractEnergy
 from vertax.fitting import InverseProblem
 from vertax.mesh import Free, Periodic, Tissue, Topology
@@ -161,7 +162,14 @@ def _load(
 ) -> _Module:
     name = os.fspath(path)
     user_classes: dict[str, type[eqx.Module]] = {}
+    if isinstance(classes, type) or not isinstance(classes, Iterable):
+        raise TypeError(f"Argument `classes` must be a list of classes, but is {named(classes)}.")
     for cls in classes:
+        if not (isinstance(cls, type) and issubclass(cls, eqx.Module)):
+            raise TypeError(
+                "Argument `classes` must hold classes, subclasses of equinox.Module, but holds "
+                f"{named(cls)}."
+            )
         if user_classes.setdefault(cls.__name__, cls) is not cls:
             raise ValueError(
                 f"Argument `classes` holds two classes of the name {cls.__name__}, which a file cannot "
