@@ -58,7 +58,7 @@ def batch(tissue):
         (
             lambda: costs.EdgeDistance(3),
             TypeError,
-            "EdgeDistance must be a Tissue, but is of type int",
+            "EdgeDistance must be a Tissue, but is 3",
         ),
         (lambda: costs.IndexAwareStructural("t"), TypeError, "must be a Tissue"),
         (
@@ -181,7 +181,7 @@ def test_what_cannot_be_rendered(tissue, arguments, error, message):
 
 
 def test_a_batch_is_rendered_by_vmap(tissue, batch):
-    with pytest.raises(ValueError, match="must be a single tissue.*filter_vmap"):
+    with pytest.raises(ValueError, match=r"must be a single tissue.*filter_vmap"):
         costs.render(batch, (9, 9), 0.3)
     images = eqx.filter_vmap(lambda one: costs.render(one, (9, 9), 0.3))(batch)
     np.testing.assert_allclose(images[1], costs.render(tissue, (9, 9), 0.3), rtol=1e-9)

@@ -175,7 +175,7 @@ def test_inside_transformations_the_remedy_is_told(as_a_user):
 
 def test_seeds_out_of_reach_are_refused():
     seeds = np.random.default_rng(0).random((5, 2))
-    with pytest.raises(ValueError, match="`seeds` must lie within 1e.08 boxes of the origin"):
+    with pytest.raises(ValueError, match=r"`seeds` must lie within 1e.08 boxes of the origin"):
         periodic_voronoi(seeds=seeds * 1e300)
     shifted = periodic_voronoi(seeds=seeds + 1e5 * np.sqrt(5))
     np.testing.assert_allclose(

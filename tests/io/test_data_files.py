@@ -281,7 +281,7 @@ def test_tables_are_of_one_tissue(read, as_a_user):
         read(batch)
     member = jax.tree.map(lambda x: x[0], batch)  # what the message says
     np.testing.assert_array_equal(read(member)["on_outline"], read(tissue)["on_outline"])
-    with pytest.raises(TypeError, match="`tissue` must be a vertax.Tissue, but is None"):
+    with pytest.raises(TypeError, match=r"`tissue` must be a vertax.Tissue, but is None"):
         read(None)
     with pytest.raises(TypeError, match=r"does not work inside jax.jit.*Call it outside"):
         jax.jit(lambda tissue: read(tissue)["on_outline"])(tissue)
@@ -318,7 +318,7 @@ def test_dates_are_text_in_geojson(tmp_path):
 
 @pytest.mark.parametrize("write", [vx.io.save_tissue, lambda path, tissue: vx.io.to_tables(tissue)])
 def test_what_is_no_tissue_is_not_written(tmp_path, write, as_a_user):
-    with pytest.raises(TypeError, match="`tissue` must be a vertax.Tissue, but is 'tissue'"):
+    with pytest.raises(TypeError, match=r"`tissue` must be a vertax.Tissue, but is 'tissue'"):
         write(tmp_path / "tissue.npz", "tissue")
 
 
