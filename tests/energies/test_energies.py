@@ -179,6 +179,6 @@ def test_a_batch_of_tissues_wants_vmap():
     tissue = random_tissue(6)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
     energy = ShapeFactorEnergy(3.7) + LineTension(0.1)
-    with pytest.raises(ValueError, match=r"single tissue, but .* filter_vmap"):
+    with pytest.raises(ValueError, match=r"single tissue, but .*filter_vmap"):
         energy(batch)
     np.testing.assert_allclose(eqx.filter_vmap(energy)(batch), energy(tissue), rtol=1e-12)
