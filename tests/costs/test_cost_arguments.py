@@ -1,4 +1,7 @@
+# pyright: reportArgumentType=false, reportOperatorIssue=false
 """What costs refuse, and how."""
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -199,8 +202,10 @@ def test_image_costs_may_be_made_under_vmap(tissue):
 def test_costs_and_energies_add_up_by_sum(tissue):
     energy = vx.energies.ShapeFactorEnergy(3.7)
     terms = [costs.MeanShapeFactor(3.8), costs.CellAreas(2.0)]
-    assert sum(terms)(tissue, energy) == pytest.approx(float((terms[0] + terms[1])(tissue, energy)))
+    total: Any = sum(terms)
+    assert total(tissue, energy) == pytest.approx(float((terms[0] + terms[1])(tissue, energy)))
     assert (np.float64(2) * terms[0])(tissue, energy) == 2 * terms[0](tissue, energy)
-    assert sum([energy, energy])(tissue) == pytest.approx(2 * float(energy(tissue)))
+    twice: Any = sum([energy, energy])
+    assert twice(tissue) == pytest.approx(2 * float(energy(tissue)))
     with pytest.raises(TypeError, match="unsupported operand"):
         sum(terms, 1)

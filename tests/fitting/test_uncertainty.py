@@ -1,6 +1,7 @@
 """The Laplace approximation: how well data determine parameters."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -176,12 +177,13 @@ def test_a_fitted_position_adds_to_the_uncertainty(hidden):
 def test_bad_arguments_are_refused(hidden, as_a_user):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, VertexDistance(tissue))
+    every: Any = "all"
     with pytest.raises(ValueError, match="`prior` must be positive"):
         vx.uncertainty(problem, fit, prior=0.0)
     with pytest.raises(ValueError, match="`prior` must be positive and finite"):
         vx.uncertainty(problem, fit, prior=float("inf"))
     with pytest.raises(TypeError, match="`n_independent` must be one real number"):
-        vx.uncertainty(problem, fit, n_independent="all")
+        vx.uncertainty(problem, fit, n_independent=every)
     stack = lambda tree: jax.tree.map(lambda x: jnp.stack([x, x]) if eqx.is_array(x) else x, tree)
     with pytest.raises(ValueError, match="must be single ones"):
         vx.uncertainty(stack(problem), stack(fit))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 from jaxtyping import Array, Int, Shaped
 
@@ -9,11 +12,13 @@ from vertax._base.checks import check_concrete
 from vertax.initialise._labels import Segmentation, check_options, from_labels
 from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
 
+Segmenter: TypeAlias = Callable[[np.ndarray], np.ndarray]
+
 
 def from_microscopy(
     image: Shaped[np.ndarray | Array, " *shape"],
     *,
-    segmenter: AbstractSegmenter | None = None,
+    segmenter: AbstractSegmenter | Segmenter | None = None,
     boundary: str = "mirrored",
     pixel_size: float | None = None,
     softening: float | None = None,
@@ -31,7 +36,7 @@ def from_microscopy(
     - `image`: intensities of shape (rows, columns), e.g. from
         [`vertax.io.read_image`][vertax.io.read_image].
     - `segmenter`: [`Watershed`][vertax.initialise.Watershed] by default, or
-        [`Cellpose`][vertax.initialise.Cellpose], or one of your own.
+        [`Cellpose`][vertax.initialise.Cellpose], or one of your own: a function from pixels to labels.
     - `boundary`, `pixel_size`, `softening`: as for `from_labels`. With `boundary="periodic"` cells
         are found across the border of the image.
 
@@ -70,12 +75,12 @@ def from_microscopy(
         ) from error
 
 
-def _name(segmenter: AbstractSegmenter) -> str:
+def _name(segmenter: Segmenter) -> str:
     """What messages call it; a segmenter of one's own may be a function."""
     return getattr(segmenter, "__name__", type(segmenter).__name__)
 
 
-def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray, "rows columns"]:
+def _segment(image: np.ndarray, segmenter: Segmenter) -> Int[np.ndarray, "rows columns"]:
     labels = np.asarray(segmenter(image))
     if labels.shape != image.shape or labels.dtype.kind not in "iu":
         raise ValueError(
@@ -86,9 +91,7 @@ def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray,
     return labels
 
 
-def _segment_periodic(
-    image: np.ndarray, segmenter: AbstractSegmenter
-) -> Int[np.ndarray, "rows columns"]:
+def _segment_periodic(image: np.ndarray, segmenter: Segmenter) -> Int[np.ndarray, "rows columns"]:
     """Labels of a periodic image, with cells that cross its border whole.
 
     Every cell lies whole somewhere in the image continued by half of itself on all sides. There it

@@ -64,7 +64,13 @@ def write_geojson(
         [[*polygon[:n].tolist(), polygon[0].tolist()]]
         for polygon, n in zip(polygons, counts, strict=True)
     ]
-    files = {Path(path): ("Polygon", rings, cell_columns(tissue, drawing, cells or {}))}
+    files = {
+        Path(path): (
+            "Polygon",
+            rings,
+            cell_columns(tissue, drawing, {} if cells is None else cells),
+        )
+    }
     if edges is not None:
         lines = drawing.lines[drawing.half_edge].tolist()
         files[edge_path(path)] = ("LineString", lines, edge_columns(tissue, drawing, edges))
