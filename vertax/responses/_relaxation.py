@@ -21,6 +21,7 @@ from vertax.mesh import Tissue
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._search import Search, SearchState, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
+from vertax.solvers._optimistix import check_solver
 from vertax.solvers._patience import AtRest, Patient
 from vertax.transitions import T1, AbstractTransitions
 
@@ -61,11 +62,7 @@ class Relaxation(AbstractResponse):
     max_steps: int | Int[Array, ""] = 2000
 
     def __check_init__(self):
-        if not isinstance(self.solver, optx.AbstractMinimiser):
-            raise TypeError(
-                "Argument `solver` must be a minimiser of vertax.solvers or of Optimistix, e.g. "
-                f"vertax.solvers.LBFGS(), but is {self.solver!r}."
-            )
+        check_solver(self.solver)
         if not isinstance(self.transitions, AbstractTransitions | None):
             raise TypeError(
                 "Argument `transitions` must be a rule for topology changes, e.g. vertax.T1(), or None, "
