@@ -6,6 +6,7 @@ from ._config import (
     apply_overrides as apply_overrides,
     fields as fields,
     template as template,
+    validate as validate,
 )
 from ._registry import (
     EXPERIMENTS as EXPERIMENTS,
@@ -19,4 +20,26 @@ from ._folder import (
     UnfinishedRunError as UnfinishedRunError,
     installed_version as installed_version,
 )
+from ._pool import fit_side_by_side as fit_side_by_side, side_by_side as side_by_side
+from ._sections import (
+    Fitting as Fitting,
+    Gradient as Gradient,
+    ImageFile as ImageFile,
+    Microscope as Microscope,
+    Preparation as Preparation,
+    Relaxation as Relaxation,
+    Segmenter as Segmenter,
+    ShapeFactors as ShapeFactors,
+    TensionRange as TensionRange,
+    TissueSection as TissueSection,
+    micrograph_options as micrograph_options,
+    replicate_keys as replicate_keys,
+    spread_of as spread_of,
+)
 from ._summary import summary as summary
+from ._tables import (
+    fit_metrics as fit_metrics,
+    histories as histories,
+    history_columns as history_columns,
+    joined as joined,
+)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import importlib.metadata
 import json
 import os
@@ -14,19 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import optimistix as optx
 import tomli_w
-from jaxtyping import Shaped
+from jaxtyping import ArrayLike, Shaped
 from matplotlib.figure import Figure
 
 from vertax._base.archive import read_archive, write_archive
-from vertax.fitting import Checkpoint
-from vertax.fitting import fit
-from vertax.fitting import Fit
-from vertax.fitting import InverseProblem
+from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
+from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
 from vertax.runs._config import ExperimentConfig, read_toml, validate
 from vertax.runs._summary import plain
-from vertax.io import atomic_write, save_tissue
+from vertax.runs._tables import histories, history_columns
+
+Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 
 CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
 # What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
@@ -59,6 +59,7 @@ class RunFolder:
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
         self.interrupted = False
+        self._warnings: dict[str, list[str]] = {}
 
     @classmethod
     def claim(
@@ -165,14 +166,26 @@ class RunFolder:
         return run
 
     def fit(
-        self, name: str, problem: InverseProblem[Any], optimiser: Any, epochs: int, **options: Any
+        self,
+        name: str,
+        problem: InverseProblem[Any],
+        optimiser: Any,
+        epochs: int,
+        *,
+        partial: bool = False,
+        callback: Callback | None = None,
+        **options: Any,
     ) -> Fit[Any]:
         """Solve an inverse problem, with a checkpoint in this folder that a resumed run goes on from.
+
+        A fit that is not at its end is one of `warnings`. One that cannot go on leaves the table of its
+        epochs and, if it is no batch, its best tissue, both named after it.
 
         **Arguments:**
 
         - `name`: of this fit; no other one of the run has it.
-        - `problem`, `optimiser`, `epochs`, `options`: as of [`fit`][vertax.fit].
+        - `problem`, `optimiser`, `epochs`, `callback`, `options`: as of [`fit`][vertax.fit].
+        - `partial`: take what there is of a fit that cannot go on, with a warning.
 
         **Returns:** the [`Fit`][vertax.Fit], also if it was interrupted; `interrupted` of the folder then
         tells so.
@@ -180,14 +193,68 @@ class RunFolder:
         **Raises:**
 
         - `KeyboardInterrupt` if an earlier fit was interrupted, or this one before it had anything.
+        - `FitError` if it cannot go on and `partial` is not set, or if there is nothing of it.
         - others as [`fit`][vertax.fit].
         """
+
+        def watch(epoch: int, record: Record) -> Mapping[str, ArrayLike] | None:
+            if self.interrupted:  # Ctrl-C reaches one thread only
+                raise KeyboardInterrupt
+            return None if callback is None else callback(epoch, record)
+
         if self.interrupted:
             raise KeyboardInterrupt
         checkpoint = Checkpoint(self._part(name))
-        outcome = fit(problem, optimiser, epochs, checkpoint=checkpoint, **options)
-        self.interrupted = outcome.interrupted
+        try:
+            outcome = fit(
+                problem, optimiser, epochs, checkpoint=checkpoint, callback=watch, **options
+            )
+        except FitError as error:
+            if error.fit is None:
+                raise
+            self._save_failed(name, error.fit)
+            if not partial:
+                raise
+            self.warn(str(error), name)
+            return error.fit
+        # Several fits may go side by side: none takes back what another one says.
+        self.interrupted |= outcome.interrupted
+        if not outcome.interrupted:
+            self._judge(name, optimiser, epochs, outcome)
         return outcome
+
+    def _judge(self, name: str, optimiser: Any, epochs: int, outcome: Fit[Any]) -> None:
+        """Warn of a fit that is not at its end."""
+        for doubt in doubts(outcome):
+            self.warn(doubt, name)
+        solver = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
+        if solver and len(outcome.history.cost) >= epochs:
+            self.warn(f"the least-squares solver did not end within {epochs} epochs (raise them)", name)
+
+    def _save_failed(self, name: str, outcome: Fit[Any]) -> None:
+        ending = _safe(name)
+        if outcome.history.cost.ndim == 1:
+            self.save_table(f"history_{ending}", history_columns(outcome.history))
+            self.save_tissue(f"fitted_{ending}", outcome.tissue)
+        else:
+            members = range(outcome.history.cost.shape[1])
+            labels = [{"member": str(k)} for k in members]
+            self.save_table(f"history_{ending}", histories(outcome, labels))
+
+    def warn(self, text: str, who: str | None = None) -> None:
+        """Note something that whoever reads the results must know: it is in the metrics and on the screen.
+
+        **Arguments:**
+
+        - `text`: a sentence without a full stop.
+        - `who`: what it holds for, such as the name of a fit; equal texts are joined to one.
+        """
+        self._warnings.setdefault(text, []).extend([] if who is None else [who])
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was noted by `warn`, one sentence each."""
+        return [_sentence(text, sorted(whom)) for text, whom in self._warnings.items()]
 
     def part(
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
@@ -224,7 +291,7 @@ class RunFolder:
     def _part(self, name: str) -> Path:
         folder = self.path / PARTS
         folder.mkdir(exist_ok=True)
-        return folder / f"{re.sub('[^0-9A-Za-z.-]+', '_', name)}.npz"
+        return folder / f"{_safe(name)}.npz"
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Write the resolved configuration, with every default spelled out.
@@ -262,7 +329,7 @@ class RunFolder:
             np.save(file, array, allow_pickle=False)
 
     def save_table(self, name: str, columns: Mapping[str, Sequence[Any] | np.ndarray]) -> None:
-        """Write a table to `name.csv`.
+        """Write a table to `name.csv`, as [`write_csv`][vertax.io.write_csv]: NaN is an empty field.
 
         **Arguments:**
 
@@ -273,11 +340,7 @@ class RunFolder:
 
         - `ValueError` if the columns differ in length.
         """
-        rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
-        with atomic_write(self.path / f"{name}.csv", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(rows)
+        write_csv(self.path / f"{name}.csv", columns)
 
     def save_figure(self, name: str, figure: Figure) -> None:
         """Write a picture to `figures/name.png`.
@@ -298,8 +361,10 @@ class RunFolder:
         **Arguments:**
 
         - `metrics`: numbers, texts, lists and mappings; NaN and infinity, which strict JSON does
-            not have, become null.
+            not have, become null. `warnings` of this folder are added, if there are any.
         """
+        if self.warnings:
+            metrics = {**metrics, "warnings": self.warnings}
         with atomic_write(self.path / METRICS) as file:
             json.dump(plain(metrics), file, indent=2, allow_nan=False)
             file.write("\n")
@@ -357,6 +422,16 @@ def installed_version(name: str) -> str:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return "(not installed)"
+
+
+def _safe(name: str) -> str:
+    """A name as a part of the name of a file."""
+    return re.sub("[^0-9A-Za-z.-]+", "_", name)
+
+
+def _sentence(text: str, whom: Sequence[str]) -> str:
+    shown = ", ".join(whom[:3]) + (f" and {len(whom) - 3} more" if len(whom) > 3 else "")
+    return f"{shown}: {text}." if whom else f"{text[:1].upper()}{text[1:]}."
 
 
 def _numbered(path: Path) -> Path:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import ast
 import difflib
 import importlib
-import importlib.resources
+import importlib.util
 import os
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from vertax.runs._config import (
     ConfigError,
     ExperimentConfig,
     apply_overrides,
+    named,
     read_toml,
     validate,
 )
@@ -34,8 +36,8 @@ class Experiment(NamedTuple):
 
     @property
     def config(self) -> type[ExperimentConfig]:
-        """What configures it."""
-        return self._package.Config
+        """What configures it: the `Config` of the package, and the name of its folder as `experiment`."""
+        return named(self._package.Config, self.name)
 
     @property
     def run(self) -> Callable[..., Mapping[str, Any]]:
@@ -49,12 +51,14 @@ class Experiment(NamedTuple):
 
 def _found() -> dict[str, Experiment]:
     # Their docstrings are read and nothing is imported: lists and help come at once.
+    spec = importlib.util.find_spec(_PACKAGE)
+    places = spec.submodule_search_locations or () if spec is not None else ()
     experiments: dict[str, Experiment] = {}
-    for folder in sorted(importlib.resources.files(_PACKAGE).iterdir(), key=lambda f: f.name):
-        source = folder / "__init__.py"
-        if folder.is_dir() and source.is_file() and not folder.name.startswith("_"):
+    for source in sorted(file for place in places for file in Path(place).glob("*/__init__.py")):
+        name = source.parent.name
+        if not name.startswith("_"):
             text = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
-            experiments[folder.name] = Experiment(folder.name, text.partition("\n")[0])
+            experiments[name] = Experiment(name, text.partition("\n")[0])
     return experiments
 
 
