@@ -6,17 +6,13 @@ import ast
 import difflib
 import importlib
 import importlib.resources
-import os
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from vertax.runs._config import (
-    ConfigError,
-    ExperimentConfig,
-    apply_overrides,
-    read_toml,
-    validate,
-)
+from vertax.runs._errors import ConfigError
+
+if TYPE_CHECKING:  # `vertax list` does without what configurations are made of
+    from vertax.runs._config import ExperimentConfig
 
 _PACKAGE = "vertax.experiments"
 
@@ -79,30 +75,3 @@ def find_experiment(name: Any) -> Experiment:
     near = difflib.get_close_matches(str(name), EXPERIMENTS, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(EXPERIMENTS)}."
     raise ConfigError(f"There is no experiment {name!r}; {hint}")
-
-
-def load_config(
-    path: str | os.PathLike[str], overrides: Iterable[str] = ()
-) -> tuple[Experiment, Any]:
-    """Read and check a configuration file.
-
-    **Arguments:**
-
-    - `path`: a TOML file; its key `experiment` says which experiment it configures.
-    - `overrides`: texts `key=value` that set single keys, see
-        `apply_overrides`.
-
-    **Returns:** the experiment and its configuration, an instance of `experiment.config`.
-
-    **Raises:**
-
-    - `ConfigError` if the file is missing or no TOML, or for an unknown or ill-typed key.
-    """
-    data = apply_overrides(read_toml(path), overrides)
-    if "experiment" not in data:
-        raise ConfigError(
-            f"In {os.fspath(path)}: `experiment` is missing; it names the experiment to run, one "
-            f"of {', '.join(EXPERIMENTS)}."
-        )
-    experiment = find_experiment(data["experiment"])
-    return experiment, validate(experiment.config, data, os.fspath(path))
