@@ -1,5 +1,5 @@
+from ._cache import enable_cache as enable_cache
 from ._config import (
-    ConfigError as ConfigError,
     ExperimentConfig as ExperimentConfig,
     Section as Section,
     allowed as allowed,
@@ -8,19 +8,19 @@ from ._config import (
     template as template,
     validate as validate,
 )
+from ._errors import (
+    ConfigError as ConfigError,
+    RunFolderError as RunFolderError,
+    UnfinishedRunError as UnfinishedRunError,
+)
+from ._folder import RunFolder as RunFolder
+from ._load import load_config as load_config
+from ._pool import fit_side_by_side as fit_side_by_side, side_by_side as side_by_side
 from ._registry import (
     EXPERIMENTS as EXPERIMENTS,
     Experiment as Experiment,
     find_experiment as find_experiment,
-    load_config as load_config,
 )
-from ._folder import (
-    RunFolder as RunFolder,
-    RunFolderError as RunFolderError,
-    UnfinishedRunError as UnfinishedRunError,
-    installed_version as installed_version,
-)
-from ._pool import fit_side_by_side as fit_side_by_side, side_by_side as side_by_side
 from ._sections import (
     Fitting as Fitting,
     Gradient as Gradient,
@@ -43,3 +43,4 @@ from ._tables import (
     history_columns as history_columns,
     joined as joined,
 )
+from ._versions import installed_version as installed_version

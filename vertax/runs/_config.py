@@ -11,13 +11,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
-import annotated_types
-import pydantic
-from pydantic.fields import FieldInfo
+from vertax._base.extras import needing
+from vertax.runs._errors import ConfigError
 
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message says where and what would be right."""
+with needing("run", "The configuration of experiments"):
+    import annotated_types
+    import pydantic
+    from pydantic.fields import FieldInfo
 
 
 class Section(pydantic.BaseModel):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -14,31 +13,30 @@ from typing import Any
 
 import numpy as np
 import optimistix as optx
-import tomli_w
 from jaxtyping import ArrayLike, Shaped
-from matplotlib.figure import Figure
 
 from vertax._base.archive import read_archive, write_archive
+from vertax._base.extras import needing
 from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
 from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
 from vertax.runs._config import ExperimentConfig, read_toml, validate
+from vertax.runs._errors import RunFolderError, UnfinishedRunError
+from vertax.runs._figures import FIGURE_FORMATS, checked_formats, write_figure
 from vertax.runs._summary import plain
 from vertax.runs._tables import histories, history_columns
+from vertax.runs._versions import installed_version
+
+with needing("run", "The folder of a run"):
+    import tomli_w
+    from matplotlib.figure import Figure
 
 Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 
 CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
+_FIGURES = tuple(f"figures/*.{ending}" for ending in FIGURE_FORMATS)
 # What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
-_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", "figures/*.png", f"{PARTS}/*.npz")
-
-
-class RunFolderError(ValueError):
-    """A folder that a run must not write to, or that holds none."""
-
-
-class UnfinishedRunError(RunFolderError):
-    """The folder of a run that did not come to its end."""
+_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", *_FIGURES, f"{PARTS}/*.npz")
 
 
 class RunFolder:
@@ -50,14 +48,22 @@ class RunFolder:
     **Arguments:**
 
     - `path`: an existing folder; `claim` finds or makes one.
+    - `figures`: formats of the pictures, of `"png"`, `"pdf"` and `"svg"`; each picture is written in all
+        of them.
+
+    **Raises:**
+
+    - `RunFolderError` for another format.
     """
 
     path: Path
+    figure_formats: tuple[str, ...]
     interrupted: bool
     """Whether an interrupt from the keyboard ended a fit of this run: no other one begins."""
 
-    def __init__(self, path: str | os.PathLike[str]):
+    def __init__(self, path: str | os.PathLike[str], *, figures: Sequence[str] = ("png",)):
         self.path = Path(path)
+        self.figure_formats = checked_formats(figures)
         self.interrupted = False
         self._warnings: dict[str, list[str]] = {}
 
@@ -69,6 +75,7 @@ class RunFolder:
         *,
         overwrite: bool = False,
         root: str | os.PathLike[str] = "runs",
+        figures: Sequence[str] = ("png",),
     ) -> RunFolder:
         """Make the folder of a new run, without touching an earlier one.
 
@@ -78,17 +85,19 @@ class RunFolder:
         - `output`: the folder itself, if the user chose one.
         - `overwrite`: clear a folder that holds an earlier run, and use it again.
         - `root`: folder of all runs.
+        - `figures`: formats of the pictures.
 
         **Returns:** the folder, which holds no results.
 
         **Raises:**
 
         - `RunFolderError` if `output` is not empty and `overwrite` is not set, if what is to be
-            overwritten is not the folder of a run, or if a file is in the way.
+            overwritten is not the folder of a run, if a file is in the way, or for another format.
         """
+        figures = checked_formats(figures)  # before anything is made or cleared
         try:
             if output is None and not overwrite:
-                return cls(_numbered(Path(root) / name))
+                return cls(_numbered(Path(root) / name), figures=figures)
             folder = Path(root) / name if output is None else Path(output)
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.iterdir()):
@@ -102,7 +111,7 @@ class RunFolder:
             raise RunFolderError(
                 f"Cannot use {error.filename} as a folder: there is a file of that name."
             ) from None
-        return cls(folder)
+        return cls(folder, figures=figures)
 
     @classmethod
     def existing(cls, path: str | os.PathLike[str]) -> RunFolder:
@@ -129,22 +138,29 @@ class RunFolder:
         return cls(folder)
 
     @classmethod
-    def unfinished(cls, path: str | os.PathLike[str], config: ExperimentConfig) -> RunFolder:
+    def unfinished(
+        cls,
+        path: str | os.PathLike[str],
+        config: ExperimentConfig,
+        *,
+        figures: Sequence[str] = ("png",),
+    ) -> RunFolder:
         """The folder of an earlier run that did not come to its end, to go on with it.
 
         **Arguments:**
 
         - `path`: the folder.
         - `config`: the configuration, which must be that of the run.
+        - `figures`: formats of the pictures; they may be others than before.
 
         **Returns:** the folder.
 
         **Raises:**
 
-        - `RunFolderError` if it is not the folder of a run, if the run is finished, or if its
-            configuration is another one.
+        - `RunFolderError` if it is not the folder of a run, if the run is finished, if its
+            configuration is another one, or for another format.
         """
-        run = cls.existing(path)
+        run = cls(cls.existing(path).path, figures=figures)
         if (run.path / METRICS).exists():
             raise RunFolderError(
                 f"The run in {run.path} is finished: there is nothing to resume. To see what it found: "
@@ -343,7 +359,7 @@ class RunFolder:
         write_csv(self.path / f"{name}.csv", columns)
 
     def save_figure(self, name: str, figure: Figure) -> None:
-        """Write a picture to `figures/name.png`.
+        """Write a picture to `figures/name.png`, or in the other formats that were asked for.
 
         **Arguments:**
 
@@ -352,8 +368,8 @@ class RunFolder:
         """
         folder = self.path / "figures"
         folder.mkdir(exist_ok=True)
-        with atomic_write(folder / f"{name}.png", "wb") as file:
-            figure.savefig(file, format="png", dpi=200)
+        for ending in self.figure_formats:
+            write_figure(folder / f"{name}.{ending}", figure)
 
     def save_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write the metrics; the last thing a run does.
@@ -406,22 +422,7 @@ class RunFolder:
 
         **Returns:** their paths, sorted by name.
         """
-        return sorted(self.path.glob("figures/*.png"))
-
-
-def installed_version(name: str) -> str:
-    """Version of an installed package.
-
-    **Arguments:**
-
-    - `name`: of the package.
-
-    **Returns:** its version, or `"(not installed)"` for one that runs from its source folder.
-    """
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"
+        return sorted(file for pattern in _FIGURES for file in self.path.glob(pattern))
 
 
 def _safe(name: str) -> str:

@@ -6,19 +6,14 @@ import ast
 import difflib
 import importlib
 import importlib.util
-import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from vertax.runs._config import (
-    ConfigError,
-    ExperimentConfig,
-    apply_overrides,
-    named,
-    read_toml,
-    validate,
-)
+from vertax.runs._errors import ConfigError
+
+if TYPE_CHECKING:  # `vertax list` does without what configurations are made of
+    from vertax.runs._config import ExperimentConfig
 
 _PACKAGE = "vertax.experiments"
 
@@ -37,6 +32,8 @@ class Experiment(NamedTuple):
     @property
     def config(self) -> type[ExperimentConfig]:
         """What configures it: the `Config` of the package, and the name of its folder as `experiment`."""
+        from vertax.runs._config import named
+
         return named(self._package.Config, self.name)
 
     @property
@@ -83,30 +80,3 @@ def find_experiment(name: Any) -> Experiment:
     near = difflib.get_close_matches(str(name), EXPERIMENTS, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(EXPERIMENTS)}."
     raise ConfigError(f"There is no experiment {name!r}; {hint}")
-
-
-def load_config(
-    path: str | os.PathLike[str], overrides: Iterable[str] = ()
-) -> tuple[Experiment, Any]:
-    """Read and check a configuration file.
-
-    **Arguments:**
-
-    - `path`: a TOML file; its key `experiment` says which experiment it configures.
-    - `overrides`: texts `key=value` that set single keys, see
-        `apply_overrides`.
-
-    **Returns:** the experiment and its configuration, an instance of `experiment.config`.
-
-    **Raises:**
-
-    - `ConfigError` if the file is missing or no TOML, or for an unknown or ill-typed key.
-    """
-    data = apply_overrides(read_toml(path), overrides)
-    if "experiment" not in data:
-        raise ConfigError(
-            f"In {os.fspath(path)}: `experiment` is missing; it names the experiment to run, one "
-            f"of {', '.join(EXPERIMENTS)}."
-        )
-    experiment = find_experiment(data["experiment"])
-    return experiment, validate(experiment.config, data, os.fspath(path))

@@ -25,7 +25,8 @@ from vertax.initialise import Cellpose, Watershed
 from vertax.io import read_image
 from vertax.mesh import Tissue
 from vertax.responses import Relaxation as Response
-from vertax.runs._config import ConfigError, Section
+from vertax.runs._config import Section
+from vertax.runs._errors import ConfigError
 from vertax.transitions import T1
 
 
