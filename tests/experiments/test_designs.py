@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_helpers import run, table
+from vertax.experiments._design import Tensions, limits
 
 import vertax as vx
 from vertax.costs import HomotypicLength, aspect_ratio
-from vertax.experiments._design import Tensions, limits
 
 MECHANICS = """
 experiment = "design_mechanics"

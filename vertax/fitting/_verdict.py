@@ -65,7 +65,9 @@ def doubts(fit: Fit[Any]) -> list[str]:
     ]
 
 
-def still_falling(cost: Float[np.ndarray, " epochs"], converged: Bool[np.ndarray, " epochs"]) -> bool:
+def still_falling(
+    cost: Float[np.ndarray, " epochs"], converged: Bool[np.ndarray, " epochs"]
+) -> bool:
     """Whether the last tenth of the epochs made more than a hundredth of the way down.
 
     Optimisers that take small steps go on for ever: a cost that has come down by all but a hundredth is

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from vertax.costs import MeshImage, mirror
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.fitting import Fit, InverseProblem, Uncertainty, uncertainty
+from vertax.inference._preparation import away_from_outline, best_psf_width, in_even_light
 from vertax.initialise import (
     AbstractSegmenter,
     Segmentation,
@@ -20,7 +21,6 @@ from vertax.initialise import (
     from_labels,
     from_microscopy,
 )
-from vertax.inference._preparation import away_from_outline, best_psf_width, in_even_light
 from vertax.mesh import Tissue
 from vertax.responses import Equilibrium, Relaxation
 

@@ -76,7 +76,9 @@ class Microscope(eqx.Module):
         - `ValueError` for another boundary.
         """
         boundary = tissue.boundary
-        lattice = np.asarray(boundary.lattice) if isinstance(boundary, Periodic) else np.zeros((2, 2))
+        lattice = (
+            np.asarray(boundary.lattice) if isinstance(boundary, Periodic) else np.zeros((2, 2))
+        )
         side = lattice[0, 0]
         if side <= 0 or not np.allclose(lattice, side * np.eye(2)):
             raise ValueError(
@@ -85,9 +87,7 @@ class Microscope(eqx.Module):
             )
         return float(side) / self.pixels
 
-    def __call__(
-        self, tissue: Tissue, *, key: Key[Array, ""]
-    ) -> Float[np.ndarray, "rows columns"]:
+    def __call__(self, tissue: Tissue, *, key: Key[Array, ""]) -> Float[np.ndarray, "rows columns"]:
         """What it sees of one period of the tissue.
 
         **Arguments:**

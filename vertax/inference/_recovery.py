@@ -84,7 +84,9 @@ class RecoveryWatch:
     def __init__(self, truth: ShapeFactorEnergy, targets: Tissue):
         self._true = np.asarray(truth.target_shape_factor)
         self._targets = [member(targets, k) for k in range(len(self._true))]
-        self._known: list[tuple[Int[np.ndarray, " halfedges"], int] | None] = [None] * len(self._true)
+        self._known: list[tuple[Int[np.ndarray, " halfedges"], int] | None] = [None] * len(
+            self._true
+        )
 
     def __call__(self, epoch: int, record: Record) -> dict[str, np.ndarray]:
         """The notes of an epoch."""

@@ -59,8 +59,8 @@ def shape_factor_scene(
     - `start`: where the guess relaxes from: the target, so that vertices can be compared by number if no T1
         transition occurs; or the tissue that the target came from, which leads to other neighbours.
     - `response`: how the guess is relaxed, [`Relaxation`][vertax.Relaxation]`()` by default.
-    - `target_response`: how the hidden tissue is relaxed, with the default settings if left out: it is a
-        true equilibrium, however coarsely the guess relaxes.
+    - `target_response`: how the hidden tissue is relaxed; left out, with the transitions of `response` and
+        otherwise by default: it is a true equilibrium, however coarsely the guess relaxes.
 
     **Returns:** the [`Scene`][vertax.inference.Scene].
 
@@ -77,7 +77,8 @@ def shape_factor_scene(
                 f"Argument `{name}` must be {known[0]!r} or {known[1]!r}, but is {value!r}."
             )
     response = Relaxation() if response is None else response
-    target_response = Relaxation() if target_response is None else target_response
+    if target_response is None:
+        target_response = Relaxation(transitions=response.transitions)
     keys = key if key.ndim else jax.random.split(key, 3)
     draw = lambda k: mean + deviation * jax.random.normal(k, (n_cells,))
     hidden = ShapeFactorEnergy(draw(keys[0]))

@@ -138,7 +138,8 @@ class TensionProblem(eqx.Module):
 
     def _relaxed(self, tissue: Any, energy: AbstractEnergy) -> Any:
         settings = {
-            field.name: getattr(self.problem, field.name) for field in dataclasses.fields(Relaxation)
+            field.name: getattr(self.problem, field.name)
+            for field in dataclasses.fields(Relaxation)
         }
         return Relaxation(**settings)(tissue, energy, throw=False).tissue
 

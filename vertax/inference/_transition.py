@@ -15,8 +15,8 @@ class Transition(NamedTuple):
     centre: float
     """The value of the parameter."""
     width: float
-    """Of a logistic curve, see [`fit_transition`][vertax.inference.fit_transition]; or the inverse of a slope,
-    see [`fit_onset`][vertax.inference.fit_onset]."""
+    """Of a logistic curve, see [`fit_transition`][vertax.inference.fit_transition]; or the inverse of a
+    slope, see [`fit_onset`][vertax.inference.fit_onset]."""
 
 
 def fit_transition(

@@ -25,6 +25,7 @@ from ._sections import (
     Fitting as Fitting,
     Gradient as Gradient,
     ImageFile as ImageFile,
+    MicrographModel as MicrographModel,
     Microscope as Microscope,
     Preparation as Preparation,
     Relaxation as Relaxation,
@@ -32,7 +33,7 @@ from ._sections import (
     ShapeFactors as ShapeFactors,
     TensionRange as TensionRange,
     TissueSection as TissueSection,
-    micrograph_options as micrograph_options,
+    read_micrograph as read_micrograph,
     replicate_keys as replicate_keys,
     spread_of as spread_of,
 )

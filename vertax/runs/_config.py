@@ -78,7 +78,9 @@ def named(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
     """
     key = pydantic.Field(name, description=config.model_fields["experiment"].description)
     fields: dict[str, Any] = {"experiment": (Literal[name], key)}
-    return pydantic.create_model(config.__name__, __base__=config, __module__=config.__module__, **fields)
+    return pydantic.create_model(
+        config.__name__, __base__=config, __module__=config.__module__, **fields
+    )
 
 
 Model = TypeVar("Model", bound=Section)

@@ -245,7 +245,9 @@ class RunFolder:
             self.warn(doubt, name)
         solver = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
         if solver and len(outcome.history.cost) >= epochs:
-            self.warn(f"the least-squares solver did not end within {epochs} epochs (raise them)", name)
+            self.warn(
+                f"the least-squares solver did not end within {epochs} epochs (raise them)", name
+            )
 
     def _save_failed(self, name: str, outcome: Fit[Any]) -> None:
         ending = _safe(name)

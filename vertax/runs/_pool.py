@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import concurrent.futures
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
+from jaxtyping import ArrayLike
 from tqdm import tqdm
 
-from vertax.fitting import Fit, InverseProblem, stack_fits
+from vertax.fitting import Fit, InverseProblem, Record, stack_fits
 from vertax.runs._folder import RunFolder
 from vertax.runs._sections import Fitting
 
@@ -76,8 +77,8 @@ def fit_side_by_side(
     problems: Sequence[InverseProblem[Any]],
     fitting: Fitting,
     *,
+    notes: Callable[[InverseProblem[Any], Record], Mapping[str, ArrayLike]] | None = None,
     progress: bool = True,
-    **options: Any,
 ) -> Fit[Any]:
     """Fit problems of one shape side by side.
 
@@ -90,8 +91,8 @@ def fit_side_by_side(
     - `name`: of these fits; they are numbered from 0.
     - `problems`: the inverse problems.
     - `fitting`: how they are fitted.
+    - `notes`: what is kept of each epoch, from its problem and its [`Record`][vertax.Record].
     - `progress`: show a progress bar (only on a terminal).
-    - `options`: as of [`RunFolder.fit`][vertax.runs.RunFolder.fit].
 
     **Returns:** the fit of all as of a batch, with notes; seconds are those of all, over the number of
     threads.
@@ -102,13 +103,14 @@ def fit_side_by_side(
     """
 
     def one(index: int) -> Fit[Any]:
+        problem = problems[index]
+
+        def noted(epoch: int, record: Record) -> Mapping[str, ArrayLike] | None:
+            return None if notes is None else notes(problem, record)
+
+        optimiser, epochs = fitting.build(), fitting.epochs
         return folder.fit(
-            f"{name} {index}",
-            problems[index],
-            fitting.build(),
-            fitting.epochs,
-            progress=False,
-            **options,
+            f"{name} {index}", problem, optimiser, epochs, callback=noted, progress=False
         )
 
     fits = side_by_side(one, len(problems), folder, progress=progress, unit="fit")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import numpy as np
@@ -20,7 +20,12 @@ from vertax.adjoints import (
     ImplicitDifferentiation,
 )
 from vertax.energies import LocalSum
-from vertax.inference import Microscope as SyntheticMicroscope, foam_energy
+from vertax.inference import (
+    Micrograph,
+    Microscope as SyntheticMicroscope,
+    foam_energy,
+    micrograph_problem,
+)
 from vertax.initialise import Cellpose, Watershed
 from vertax.io import read_image
 from vertax.mesh import Tissue
@@ -219,13 +224,6 @@ class Preparation(Section):
     psf_width: float | None = Field(default=None, gt=0)
     """Standard deviation of the blur, in pixels of the file; left out, the one that fits best."""
 
-    def options(self) -> dict[str, Any]:
-        """The settings by name.
-
-        **Returns:** keyword arguments of [`micrograph_problem`][vertax.inference.micrograph_problem].
-        """
-        return {name: getattr(self, name) for name in Preparation.model_fields}
-
 
 class Segmenter(Section):
     """How the cells are found."""
@@ -244,6 +242,23 @@ class Segmenter(Section):
         if self.method == "cellpose":
             return Cellpose(diameter=self.cell_size)
         return Watershed(cell_size=self.cell_size)
+
+
+class MicrographModel(Section):
+    """The energy, E1 with a rest area for each cell, and the first guess."""
+
+    target_shape_factor: float = Field(default=3.7, gt=0)
+    """First guess of the target shape factor of every cell."""
+    border: Literal["mirrored", "pinned"] = "mirrored"
+    """What holds the tissue at the border of the image: the image is mirrored, cells that the border cuts
+    included (as in the paper); or the outline of the cells that lie whole in it is pinned."""
+    pixel_size: float | None = Field(default=None, gt=0)
+    """Length of a pixel of the file, where rest areas are 1 (of a pinned border only); left out, the mean
+    area of the cells that are seen whole is 1. In a rigid tissue all shape factors depend on it."""
+    rest_areas: Literal["fitted", "observed", "equal"] = "fitted"
+    """Rest areas of the cells: fitted too, beginning with those of the segmented cells; as those are;
+    or the mean area in all cells but those that the border cuts, which determines shape factors best
+    where it is true. A pinned border goes with equal ones, whatever is said here."""
 
 
 class Microscope(Section):
@@ -276,24 +291,31 @@ class Microscope(Section):
         )
 
 
-def micrograph_options(
-    preparation: Preparation, segmenter: Segmenter, relaxation: Relaxation, model: Section
-) -> dict[str, Any]:
-    """Keyword arguments of `vertax.inference.micrograph_problem`.
+def read_micrograph(
+    image: Shaped[np.ndarray, "rows columns"],
+    preparation: Preparation,
+    segmenter: Segmenter,
+    model: MicrographModel,
+    relaxation: Relaxation,
+) -> Micrograph:
+    """Segment an image and set up the inverse problem of its shape factors.
 
     **Arguments:**
 
-    - `preparation`, `segmenter`, `relaxation`: tables of the configuration.
-    - `model`: one whose keys are arguments themselves.
+    - `image`: the image, bright membranes on dark cells.
+    - `preparation`, `segmenter`, `model`, `relaxation`: how.
 
-    **Returns:** the arguments by name.
+    **Returns:** the [`Micrograph`][vertax.inference.Micrograph].
+
+    **Raises:** as [`micrograph_problem`][vertax.inference.micrograph_problem].
     """
-    names = type(model).model_fields
-    return preparation.options() | {
-        **{name: getattr(model, name) for name in names},
-        "segmenter": segmenter.build(),
-        "response": relaxation.build(),
-    }
+    return micrograph_problem(
+        np.asarray(image, float),
+        segmenter=segmenter.build(),
+        response=relaxation.build(),
+        **{name: getattr(preparation, name) for name in Preparation.model_fields},
+        **model.model_dump(),
+    )
 
 
 def replicate_keys(seed: int, n: int) -> list[PRNGKeyArray]:
