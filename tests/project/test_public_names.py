@@ -5,8 +5,8 @@ NAMES = """
 AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions
 AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation Fit FitError Free GradientOutcome
 History ImplicitDifferentiation InverseProblem MINRES Periodic Record T1 Tissue Topology Uncertainty adjoints
-animate costs energies equilibrate fit fitting inference initialise io load_tissue mesh plot_history plot_recovery
-plot_tissue plotting responses runs save_tissue solvers transitions uncertainty
+animate costs energies equilibrate fit fitting inference initialise io load_tissue mesh plot_history
+plot_recovery plot_tissue plotting responses runs save_tissue solvers transitions uncertainty
 """
 
 FAMILIES = {

@@ -231,7 +231,7 @@ class RunFolder:
             self._save_failed(name, error.fit)
             if not partial:
                 raise
-            self.warn(str(error), name)
+            self.warn(str(error).rstrip("."), name)
             return error.fit
         # Several fits may go side by side: none takes back what another one says.
         self.interrupted |= outcome.interrupted

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import difflib
 import importlib
-import importlib.util
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -48,10 +47,9 @@ class Experiment(NamedTuple):
 
 def _found() -> dict[str, Experiment]:
     # Their docstrings are read and nothing is imported: lists and help come at once.
-    spec = importlib.util.find_spec(_PACKAGE)
-    places = spec.submodule_search_locations or () if spec is not None else ()
+    places = map(Path, importlib.import_module(_PACKAGE).__path__)
     experiments: dict[str, Experiment] = {}
-    for source in sorted(file for place in places for file in Path(place).glob("*/__init__.py")):
+    for source in sorted(file for place in places for file in place.glob("*/__init__.py")):
         name = source.parent.name
         if not name.startswith("_"):
             text = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""

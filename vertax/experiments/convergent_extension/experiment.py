@@ -20,7 +20,6 @@ from vertax.experiments import _design_figures as figures
 from vertax.fitting import Fit, InverseProblem, Record, limits, member
 from vertax.inference import foam_terms
 from vertax.initialise import free_voronoi
-from vertax.mesh import Tissue
 from vertax.runs import (
     ExperimentConfig,
     Fitting,
