@@ -1,6 +1,7 @@
 """Independent runs in threads: their order, their errors, and Ctrl-C."""
 
 import contextlib
+import dataclasses
 import threading
 import time
 
@@ -59,58 +60,52 @@ def test_after_an_interrupt_nothing_else_begins(tmp_path, monkeypatch):
     assert len(begun) < 10
 
 
-class Outcome:
-    """What a folder reads of a fit."""
+def problem(p0):
+    tissue = random_tissue(6)
+    energy = vx.energies.ShapeFactorEnergy(jnp.full(6, p0))
+    return vx.InverseProblem(tissue, energy, vx.costs.VertexDistance(tissue))
 
-    best_epoch = np.array(0)
-    tissue = energy = None
 
-    def __init__(self, interrupted):
-        self.interrupted = interrupted
-        falling = np.ones(3)
-        self.history = vx.History(
-            **dict.fromkeys(
-                ("cost", "max_force", "gradient_norm", "gradient_residual", "gradient_steps"),
-                falling,
-            ),
-            **dict.fromkeys(("relative_error", "seconds", "guidance"), falling),
-            converged=np.ones(3, bool),
-            num_steps=np.ones(3, int),
-            num_t1=np.zeros(3, int),
-        )
+def outcome(problem, interrupted):
+    """A fit of three epochs."""
+    curves = {field.name: np.ones(3) for field in dataclasses.fields(vx.History)}
+    counts = {
+        "converged": np.ones(3, bool),
+        "num_steps": np.ones(3, int),
+        "num_t1": np.zeros(3, int),
+    }
+    history = vx.History(**curves | counts)
+    best = (jnp.array(1.0), jnp.array(0.0), np.array(0))
+    return vx.Fit(problem.energy, problem.tissue, *best, history, interrupted=interrupted)
 
 
 def test_a_fit_that_ends_does_not_take_back_an_interrupt(tmp_path, monkeypatch):
     folder = RunFolder(tmp_path)
-    first_runs, second_is_done = threading.Event(), threading.Event()
+    long, short = problem(3.6), problem(3.7)
+    long_goes, short_is_done = threading.Event(), threading.Event()
 
-    def fit(problem, *_, **options):
-        if problem == "long":
-            first_runs.set()
-            assert second_is_done.wait(10)
-            return Outcome(interrupted=False)
-        assert first_runs.wait(10)
-        return Outcome(interrupted=True)
+    def fit(fitted, *_, **options):
+        if fitted is long:
+            long_goes.set()
+            assert short_is_done.wait(10)
+        else:
+            assert long_goes.wait(10)
+        return outcome(fitted, interrupted=fitted is short)
 
     monkeypatch.setattr(_folder, "fit", fit)
-    long = threading.Thread(target=lambda: folder.fit("a", "long", None, 3))
-    long.start()
-    folder.fit("b", "interrupted", None, 3)
-    second_is_done.set()
-    long.join()
+    thread = threading.Thread(target=lambda: folder.fit("a", long, None, 3))
+    thread.start()
+    folder.fit("b", short, None, 3)
+    short_is_done.set()
+    thread.join()
     assert folder.interrupted
     with pytest.raises(KeyboardInterrupt):
-        folder.fit("c", "another", None, 3)
+        folder.fit("c", short, None, 3)
 
 
 def test_an_interrupt_ends_fits_in_other_threads_after_their_epoch(tmp_path):
     """Ctrl-C reaches one thread; here it comes while the second of three fits is at its third epoch."""
-    tissue = random_tissue(6)
-    cost = vx.costs.VertexDistance(tissue)
-    problems = [
-        vx.InverseProblem(tissue, vx.energies.ShapeFactorEnergy(jnp.full(6, p)), cost)
-        for p in (3.6, 3.65, 3.7)
-    ]
+    problems = [problem(p0) for p0 in (3.6, 3.65, 3.7)]
     folder = RunFolder(tmp_path)
     epochs = {index: [] for index in range(3)}
 
@@ -131,12 +126,7 @@ def test_an_interrupt_ends_fits_in_other_threads_after_their_epoch(tmp_path):
 
 
 def test_fits_side_by_side_are_those_of_one_after_the_other(tmp_path):
-    target = random_tissue(6, 1)
-    cost = vx.costs.VertexDistance(target)
-    problems = [
-        vx.InverseProblem(target, vx.energies.ShapeFactorEnergy(jnp.full(6, p)), cost)
-        for p in (3.6, 3.7)
-    ]
+    problems = [problem(3.6), problem(3.7)]
     notes = lambda problem, record: {"twice": 2 * record.cost}
     fitting = Fitting(epochs=4)
     batch = fit_side_by_side(
@@ -144,7 +134,7 @@ def test_fits_side_by_side_are_those_of_one_after_the_other(tmp_path):
     )
     assert batch.history.cost.shape == (4, 2)
     np.testing.assert_array_equal(batch.notes["twice"], 2 * batch.history.cost)
-    for k, problem in enumerate(problems):
-        alone = vx.fit(problem, fitting.build(), 4, progress=False)
+    for k, one in enumerate(problems):
+        alone = vx.fit(one, fitting.build(), 4, progress=False)
         np.testing.assert_array_equal(alone.history.cost, batch.history.cost[:, k])
         assert alone.best_epoch == batch.best_epoch[k]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -155,8 +155,8 @@ def micrograph_problem(
     *,
     segmenter: AbstractSegmenter | None = None,
     target_shape_factor: float = 3.7,
-    border: Literal["mirrored", "pinned"] = "mirrored",
-    rest_areas: Literal["fitted", "observed", "equal"] = "fitted",
+    border: str = "mirrored",
+    rest_areas: str = "fitted",
     pixel_size: float | None = None,
     pixels: int = 256,
     background_width: float = 0.5,
@@ -182,11 +182,11 @@ def micrograph_problem(
     - `image`: intensities, bright membranes on dark cells.
     - `segmenter`: how cells are found, [`Watershed`][vertax.initialise.Watershed]`()` by default.
     - `target_shape_factor`: first guess for every cell.
-    - `border`: what holds the tissue at the border of the image: the image is mirrored, cells that the
-        border cuts included (as in the paper); or the outline of the cells that lie whole in it is pinned.
-    - `rest_areas`: of the cells: fitted too, beginning with those of the segmented cells; as those are;
-        or the mean area in all cells but those that the border cuts, which determines shape factors best
-        where it is true. A pinned border goes with equal ones, whatever is said here.
+    - `border`: what holds the tissue at the border of the image: it is `"mirrored"`, cells that the border
+        cuts included (as in the paper); or the outline of the cells that lie whole in it is `"pinned"`.
+    - `rest_areas`: of the cells: `"fitted"` too, beginning with those of the segmented cells; as those are
+        `"observed"`; or `"equal"` to the mean area in all cells but those that the border cuts, which
+        determines shape factors best where it is true. A pinned border goes with equal ones in any case.
     - `pixel_size`: length of a pixel, where rest areas are 1 (of a pinned border only); left out, the mean
         area of the cells that are seen whole is 1. In a rigid tissue all shape factors depend on it.
     - `pixels`: longer side of the image that the model is compared with; finer ones are made coarser.

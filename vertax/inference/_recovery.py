@@ -48,7 +48,7 @@ def relative_error(true: Values, inferred: Values) -> Float[np.ndarray, "*batch"
     - `ValueError` if the shapes differ.
     """
     true, inferred = _alike(true, inferred)
-    return np.mean(np.abs(inferred - true) / np.abs(true), axis=-1)
+    return np.asarray(np.mean(np.abs(inferred - true) / np.abs(true), axis=-1))
 
 
 def same_neighbours(tissue: Tissue, other: Tissue) -> bool:

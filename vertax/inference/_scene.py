@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -37,8 +35,8 @@ def shape_factor_scene(
     mean: float = 3.7,
     deviation: float = 0.1,
     lloyd_steps: int = 0,
-    guess: Literal["redrawn", "mean"] = "redrawn",
-    start: Literal["target", "first"] = "target",
+    guess: str = "redrawn",
+    start: str = "target",
     response: Relaxation | None = None,
     target_response: Relaxation | None = None,
 ) -> Scene:
@@ -55,9 +53,9 @@ def shape_factor_scene(
     - `key`: of all draws; or three keys: of the hidden shape factors, of the guess and of the tissue.
     - `mean`, `deviation`: of the normal distribution of the shape factors.
     - `lloyd_steps`: steps of Lloyd's algorithm, which make the first tissue more regular.
-    - `guess`: start from another draw, or from the mean in all cells.
-    - `start`: where the guess relaxes from: the target, so that vertices can be compared by number if no T1
-        transition occurs; or the tissue that the target came from, which leads to other neighbours.
+    - `guess`: start from another draw (`"redrawn"`), or from the mean in all cells (`"mean"`).
+    - `start`: where the guess relaxes from: the `"target"`, so that vertices can be compared by number if no
+        T1 transition occurs; or the `"first"` tissue, which the target came from, so that neighbours differ.
     - `response`: how the guess is relaxed, [`Relaxation`][vertax.Relaxation]`()` by default.
     - `target_response`: how the hidden tissue is relaxed; left out, with the transitions of `response` and
         otherwise by default: it is a true equilibrium, however coarsely the guess relaxes.
