@@ -1,5 +1,6 @@
 """Synthetic inverse problems, and how well they are solved."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,7 +66,7 @@ def test_the_watch_counts_what_differs():
     watch = RecoveryWatch(truth, stack(targets))
     numbers, counts, yes = jnp.zeros(2), jnp.zeros(2, int), jnp.ones(2, bool)
     record = vx.Record(
-        parameters=truth,
+        parameters=eqx.filter(truth, eqx.is_array),
         tissue=tissues,
         converged=yes,
         num_steps=counts,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -211,16 +213,14 @@ def micrograph_problem(
     segmenter = Watershed() if segmenter is None else segmenter
     response = Relaxation() if response is None else response
     intensities = np.asarray(image, float)
-    read = _mirrored if border == "mirrored" else _pinned
-    found, guess, trainable, whole, seen, options = read(
-        intensities,
-        segmenter,
-        target_shape_factor,
-        rest_areas,
-        pixel_size,
-        pixels,
-        background_width,
+    prepare = functools.partial(
+        in_even_light, intensities, background_width=background_width, longest_side=pixels
     )
+    if border == "mirrored":
+        read = _mirrored(intensities, segmenter, target_shape_factor, rest_areas, prepare)
+    else:
+        read = _pinned(intensities, segmenter, target_shape_factor, pixel_size, prepare)
+    found, guess, trainable, whole, seen, options = read
     tissue = found.tissue
     width = (
         best_psf_width(tissue, options, seen.shape)
@@ -235,9 +235,15 @@ def micrograph_problem(
     return Micrograph(problem, found, whole, seen, width, first)
 
 
-_Read = tuple[
-    Segmentation, Any, Any, Bool[np.ndarray, " cells"], Float[np.ndarray, "rows columns"], dict
-]
+class _Read(NamedTuple):
+    """What is compared with what."""
+
+    found: Segmentation
+    guess: AbstractEnergy
+    trainable: Any
+    whole: Bool[np.ndarray, " cells"]
+    image: Float[np.ndarray, "rows columns"]
+    options: dict[str, Any]
 
 
 def _mirrored(
@@ -245,13 +251,11 @@ def _mirrored(
     segmenter: AbstractSegmenter,
     target_shape_factor: float,
     rest_areas: str,
-    pixel_size: float | None,
-    pixels: int,
-    background_width: float,
+    prepare: Callable[[float], np.ndarray],
 ) -> _Read:
     """All cells, and their mirror images."""
     found = from_microscopy(image, segmenter=segmenter)
-    seen = in_even_light(image, found.pixel_size, background_width, pixels)
+    seen = prepare(found.pixel_size)
     areas, whole = found.tissue.areas, np.asarray(found.whole)
     if rest_areas == "equal":
         # Cells and their mirror images have one label; the mean area is the unit.
@@ -262,17 +266,15 @@ def _mirrored(
         lambda e: (e.target_shape_factor, e.mean_area), guess, (True, rest_areas == "fitted")
     )
     options = {"image": mirror(seen), "points_per_edge": _POINTS_PER_EDGE}
-    return found, guess, trainable, whole, seen, options
+    return _Read(found, guess, trainable, whole, seen, options)
 
 
 def _pinned(
     image: Float[np.ndarray, "rows columns"],
     segmenter: AbstractSegmenter,
     target_shape_factor: float,
-    rest_areas: str,
     pixel_size: float | None,
-    pixels: int,
-    background_width: float,
+    prepare: Callable[[float], np.ndarray],
 ) -> _Read:
     """The cells that lie whole in the image, as a free tissue whose outline does not move."""
     labels = np.asarray(segmenter(image))
@@ -288,7 +290,7 @@ def _pinned(
     tissue = Tissue(
         cluster.vertices, cluster.topology, cluster.boundary, cluster.softening, pinned=pinned
     )
-    seen = in_even_light(image, found.pixel_size, background_width, pixels)
+    seen = prepare(found.pixel_size)
     pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
     weight = away_from_outline(tissue, on_outline, labels > 0, pixel, seen.shape)
     # Straight edges cut off the corners of cells on the outline, of some nearly all of the cell.
@@ -301,4 +303,4 @@ def _pinned(
         "pixel_size": pixel,
     }
     found = eqx.tree_at(lambda f: f.tissue, found, tissue, is_leaf=lambda x: isinstance(x, Tissue))
-    return found, guess, eqx.is_inexact_array, inner, seen, options
+    return _Read(found, guess, eqx.is_inexact_array, inner, seen, options)

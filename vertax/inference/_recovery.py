@@ -10,10 +10,10 @@ from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import Record, member
 from vertax.mesh import Tissue
 
-Values = Float[Array | np.ndarray, "*batch parameters"]
+Values = Float[Array | np.ndarray, "..."]
 
 
-def pearson(true: Values, inferred: Values) -> Float[np.ndarray, "*batch"]:
+def pearson(true: Values, inferred: Values) -> Float[np.ndarray, "..."]:
     """Pearson's correlation of inferred with true parameters.
 
     **Arguments:**
@@ -34,7 +34,7 @@ def pearson(true: Values, inferred: Values) -> Float[np.ndarray, "*batch"]:
     return np.where(varied, np.sum(a * b, axis=-1) / np.where(varied, size, 1.0), np.nan)
 
 
-def relative_error(true: Values, inferred: Values) -> Float[np.ndarray, "*batch"]:
+def relative_error(true: Values, inferred: Values) -> Float[np.ndarray, "..."]:
     r"""Mean of $|\theta - \theta_\mathrm{true}| / |\theta_\mathrm{true}|$ over the parameters.
 
     **Arguments:**
