@@ -16,7 +16,6 @@ from jaxtyping import Array, PyTree
 from pydantic import Field
 
 from vertax.costs import AspectRatio, aspect_ratio
-from vertax.experiments import _design_figures as figures
 from vertax.experiments._design import (
     Gradient,
     Tensions,
@@ -27,6 +26,7 @@ from vertax.experiments._design import (
     member,
     tensions,
 )
+from vertax.experiments.convergent_extension import figures
 from vertax.fitting import Fit, InverseProblem
 from vertax.initialise import free_voronoi
 from vertax.mesh import Tissue

@@ -16,10 +16,9 @@ from pydantic import Field
 
 from vertax.costs import MeanShapeFactor
 from vertax.energies import ShapeFactorEnergy
-from vertax.experiments import _design_figures as figures
 from vertax.experiments._design import Gradient, design, limits
-from vertax.experiments._figures import convergence
 from vertax.experiments._scenes import ShapeFactors, TissueSection
+from vertax.experiments.design_mechanics import figures
 from vertax.fitting import InverseProblem
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
@@ -130,4 +129,4 @@ def _save(
     panels = {"initial": (initial, observed[0]), "designed": (outcome.tissue, observed[best])}
     figure = figures.mechanics(panels, observed, targets, config.target)
     folder.save_figure("design", figure)
-    folder.save_figure("convergence", convergence(outcome.history))
+    folder.save_figure("convergence", figures.convergence(outcome.history))

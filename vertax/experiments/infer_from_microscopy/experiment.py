@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vertax.costs import MeshImage
-from vertax.experiments import _figures
 from vertax.experiments._imaging import (
     Model,
     Preparation,
@@ -26,6 +25,7 @@ from vertax.experiments._imaging import (
     pixel_of,
     read,
 )
+from vertax.experiments.infer_from_microscopy import figures
 from vertax.fitting import Fit, FitError
 from vertax.initialise import Segmentation
 from vertax.io import read_image
@@ -189,9 +189,9 @@ def _draw(
     folder: RunFolder,
 ) -> None:
     overlays = {"segmented": found.tissue, "relaxed first guess": initial, "fitted": outcome.tissue}
-    folder.save_figure("overlay", _figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
-    folder.save_figure("convergence", _figures.convergence(outcome.history))
-    figure = _figures.cells_on_image(
+    folder.save_figure("overlay", figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
+    folder.save_figure("convergence", figures.convergence(outcome.history))
+    figure = figures.cells_on_image(
         pixels,
         outcome.tissue,
         parameters_of(outcome.energy)[0],

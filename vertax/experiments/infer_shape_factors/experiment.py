@@ -18,7 +18,6 @@ from pydantic import Field
 
 from vertax.costs import AbstractCost, MeshImage, VertexDistance, render
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
-from vertax.experiments import _figures
 from vertax.experiments._scenes import (
     Scene,
     ShapeFactors,
@@ -26,6 +25,7 @@ from vertax.experiments._scenes import (
     make_scene,
     same_neighbours,
 )
+from vertax.experiments.infer_shape_factors import figures
 from vertax.fitting import Fit, FitError, InverseProblem
 from vertax.mesh import Tissue
 from vertax.runs._config import ExperimentConfig, Section
@@ -179,7 +179,7 @@ def _save_scene(scene: Scene, image: _Image, folder: RunFolder) -> None:
     folder.save_tissue("target", scene.target)
     folder.save_tissue("initial", scene.initial)
     panels = {"target": (scene.target, _parameters(scene.truth))}
-    folder.save_figure("target", _figures.tissues(panels, label=f"true {_NAME}"))
+    folder.save_figure("target", figures.tissues(panels, label=f"true {_NAME}"))
     if image is not None:
         folder.save_array("image", image)
 
@@ -210,13 +210,13 @@ def _save_fit(
         "target": (scene.target, true),
     }
     label = f"target shape factor {_NAME}"
-    folder.save_figure(f"before_after{ending}", _figures.tissues(panels, label=label))
-    folder.save_figure(f"convergence{ending}", _figures.convergence(outcome.history))
-    folder.save_figure(f"recovery{ending}", _figures.recovery(true, inferred, initial, name=_NAME))
+    folder.save_figure(f"before_after{ending}", figures.tissues(panels, label=label))
+    folder.save_figure(f"convergence{ending}", figures.convergence(outcome.history))
+    folder.save_figure(f"recovery{ending}", figures.recovery(true, inferred, initial, name=_NAME))
     if source == "image" and image is not None:
         overlays = {"image": None, "initial guess": scene.initial, "fitted": outcome.tissue}
         pixel = _pixel_size(scene.target, config.image)
-        figure = _figures.overlays(image, overlays, pixel_size=pixel, upright=True)
+        figure = figures.overlays(image, overlays, pixel_size=pixel)
         folder.save_figure(f"overlay{ending}", figure)
 
 

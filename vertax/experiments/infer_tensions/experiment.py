@@ -31,6 +31,7 @@ from vertax.fitting import Fit, FitError, InverseProblem, uncertainty
 from vertax.initialise import Segmentation, free_voronoi, from_labels, labels_from_skeleton
 from vertax.io import read_image
 from vertax.mesh import Tissue
+from vertax.plotting import cell_polygons, label_colours
 from vertax.responses import equilibrate
 from vertax.runs._config import ExperimentConfig, Section
 from vertax.runs._folder import RunFolder
@@ -147,9 +148,10 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         image = np.asarray(read_image(config.image.path))
         skeleton = config.image.kind == "skeleton"
         labels = labels_from_skeleton(image) if skeleton else image
+        picture = np.asarray(image != 0, float) if skeleton else label_colours(labels)
     else:
         truth, labels = _synthetic(config)
-        image = labels
+        picture = label_colours(labels)
     found = from_labels(labels, boundary="free", inner_arcs=config.model.inner_arcs)
     folder.save_tissue("target", found.tissue)
     problem, balanced = problem_of(config, found)
@@ -169,7 +171,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     folder.save_figure(
         "tensions",
         figures.foam(
-            np.asarray(image != 0, float),
+            picture,
             found,
             outcome.tissue,
             result.tension,
@@ -274,8 +276,9 @@ def _synthetic(config: Config) -> tuple[tuple[LocalSum, Tissue], Int[np.ndarray,
     shape = tuple(np.ceil(extent[::-1] * scale + 0.1 * options.pixels).astype(int).tolist())
     labels = np.zeros(shape, np.int32)
     centres = np.indices(shape)[::-1].reshape(2, -1).T + 0.5
-    for number, outline in enumerate(figures.outlines(relaxed), start=1):
-        inside = Path(outline * scale + offset).contains_points(centres)
+    polygons, sides = cell_polygons(relaxed, points_per_arc=60)
+    for number, (outline, size) in enumerate(zip(polygons, sides, strict=True), start=1):
+        inside = Path(outline[:size] * scale + offset).contains_points(centres)
         labels[inside.reshape(shape)] = number
     return (energy, relaxed), labels
 

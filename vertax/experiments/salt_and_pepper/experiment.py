@@ -16,7 +16,6 @@ from jaxtyping import Array, PyTree
 from pydantic import Field
 
 from vertax.costs import HomotypicLength
-from vertax.experiments import _design_figures as figures
 from vertax.experiments._design import (
     Gradient,
     Tensions,
@@ -28,6 +27,7 @@ from vertax.experiments._design import (
     tensions,
 )
 from vertax.experiments._scenes import TissueSection
+from vertax.experiments.salt_and_pepper import figures
 from vertax.fitting import Fit, InverseProblem
 from vertax.initialise import free_voronoi, periodic_voronoi
 from vertax.mesh import Tissue
