@@ -130,7 +130,7 @@ def scale_bar(
     - `ax`: the axes, after all is drawn.
     - `unit`: what lengths are told in.
     - `unit_length`: how long that is, in the tissue's units of length.
-    - `length`: of the bar, in `unit`s; by default 1, 2 or 5 times a power of ten, about a fifth of the width.
+    - `length`: of the bar, in `unit`s; by default 1, 2 or 5 times a power of ten, at most a quarter of the width.
 
     **Raises:**
 
@@ -139,7 +139,7 @@ def scale_bar(
     unit_length = float(unit_length)
     left, right = sorted(ax.get_xlim())
     if length is None:
-        length = _round_length((right - left) / unit_length / 3.5)
+        length = _round_length((right - left) / unit_length / 4)
     length = float(length)
     for name, value in (("unit_length", unit_length), ("length", length)):
         if not (np.isfinite(value) and value > 0):

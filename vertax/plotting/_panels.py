@@ -126,7 +126,16 @@ def plot_tissues(
             bars
         ):  # a later bar goes between the axes and an earlier one
             assert values is not None
-            add_bar(list(axes), colours.scale(values), values, colours.label, shrink=0.8, aspect=25)
+            add_bar(
+                list(axes),
+                colours.scale(values),
+                values,
+                colours.label,
+                fraction=0.05,
+                pad=0.02,
+                shrink=0.8,
+                aspect=25,
+            )
     return list(axes)
 
 

@@ -169,6 +169,7 @@ def scaling(rows: list[dict[str, Any]]) -> Figure:
     **Returns:** the figure.
     """
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
+    sizes = sorted({row["cells"] for row in rows})
     titles = {"paper": "the paper's protocol", "equilibrium": "true equilibria"}
     figure, (axes,) = new_figure(1, 2 * len(protocols), width=2.2, height=2.4)
     for k, protocol in enumerate(protocols):
@@ -195,6 +196,8 @@ def scaling(rows: list[dict[str, Any]]) -> Figure:
             )
         for ax in (time, memory):
             ax.set(xscale="log", yscale="log", xlabel="cells", title=titles[protocol])
+            ax.set_xticks(sizes, list(map(str, sizes)))
+            ax.minorticks_off()
         time.set_ylabel("time of an epoch (ms)")
         memory.set_ylabel("working memory (kB)")
     same_limits(axes[::2])

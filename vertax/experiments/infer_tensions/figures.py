@@ -6,11 +6,16 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, Real
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from vertax.initialise import Segmentation
 from vertax.mesh import Tissue
 from vertax.plotting import house_style, new_figure, plot_recovery, plot_tissue, scale_bar
+
+# Without the palest end, which would look like no colour at all.
+_PRESSURES = ListedColormap(colormaps["Blues"](np.linspace(0.15, 1, 256)), "pressures")
 
 
 @house_style()
@@ -43,7 +48,7 @@ def foam(
         pressure,
         tension,
         ax=right,
-        cmap="Blues",
+        cmap=_PRESSURES,
         label=r"pressure $p\,\sqrt{\bar A}\,/\,\bar\gamma$",
         edge_label=r"tension $\gamma / \bar\gamma$",
     )
