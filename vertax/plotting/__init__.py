@@ -1,6 +1,6 @@
 """Pictures of tissues and of fits."""
 
-from vertax.mesh._outlines import cell_polygons as cell_polygons
+from vertax.mesh import cell_polygons as cell_polygons
 from vertax.plotting._animation import animate as animate, flipped_edges as flipped_edges
 from vertax.plotting._curves import plot_history as plot_history
 from vertax.plotting._image import (

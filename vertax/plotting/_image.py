@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, SupportsFloat
 
 import numpy as np
-from jaxtyping import Float, Integer, Real
+from jaxtyping import Array, Float, Real, Shaped
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
@@ -77,7 +77,7 @@ def extent_of(image: np.ndarray, pixel_size: float) -> np.ndarray:
 
 
 def label_colours(
-    labels: Integer[np.ndarray, "rows columns"],
+    labels: Shaped[np.ndarray | Array, " ..."],
 ) -> Float[np.ndarray, "rows columns 3"]:
     """A picture of a label image: a dark colour for each label, so that a mesh shows on top.
 
@@ -130,20 +130,19 @@ def scale_bar(
     - `ax`: the axes, after all is drawn.
     - `unit`: what lengths are told in.
     - `unit_length`: how long that is, in the tissue's units of length.
-    - `length`: of the bar, in `unit`s; by default 1, 2 or 5 times a power of ten, at most a quarter of the width.
+    - `length`: of the bar, in `unit`s; by default 1, 2 or 5 times a power of ten, and at most a quarter
+        of the width.
 
     **Raises:**
 
     - `ValueError` if a length is not positive.
     """
+    for name, value in (("unit_length", unit_length), ("length", length)):
+        if value is not None and not (np.isfinite(float(value)) and float(value) > 0):
+            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
     unit_length = float(unit_length)
     left, right = sorted(ax.get_xlim())
-    if length is None:
-        length = _round_length((right - left) / unit_length / 4)
-    length = float(length)
-    for name, value in (("unit_length", unit_length), ("length", length)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+    length = float(_round_length((right - left) / unit_length / 4) if length is None else length)
     over_image = bool(ax.images)
     colour = "w" if over_image else _style.INK
     end = right - 0.04 * (right - left)

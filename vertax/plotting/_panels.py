@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, SupportsFloat, TypeAlias
+from typing import Any, SupportsFloat, TypeAlias
 
 import numpy as np
 from jaxtyping import Array, Bool, Real
@@ -16,7 +16,7 @@ from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
 from vertax.plotting._colours import EDGES_ON_DARK, EDGES_ON_PALE, Colours, add_bar
 from vertax.plotting._image import extent_of, plot_image
-from vertax.plotting._tissue import draw, single, view_of
+from vertax.plotting._tissue import checked, draw, single, view_of
 
 Values: TypeAlias = (
     Callable[[Tissue], Real[Array | np.ndarray, " ..."]]
@@ -41,7 +41,7 @@ def plot_tissues(
     edge_vmin: SupportsFloat | None = None,
     edge_vmax: SupportsFloat | None = None,
     edge_label: str | None = None,
-    colorbar: bool | Literal["cells", "edges"] = True,
+    colorbar: bool | str = True,
     linewidth: SupportsFloat | None = None,
     image: Real[np.ndarray, " ..."] | None = None,
     pixel_size: SupportsFloat = 1.0,
@@ -63,8 +63,8 @@ def plot_tissues(
     - `image`, `pixel_size`: an image under all panels, as for [`plot_tissue`][vertax.plot_tissue].
     - `vmin`, `vmax`, `edge_vmin`, `edge_vmax`: limits of the colours; by default those of the finite values
         of all panels together.
-    - `colorbar`: whether to draw a bar for the cells of all panels and one for their edges; or the name
-        of the one to draw.
+    - `colorbar`: whether to draw a bar for the cells of all panels and one for their edges; or `"cells"` or
+        `"edges"` for one of them.
     - others as for [`plot_tissue`][vertax.plot_tissue].
 
     **Returns:** the axes of the panels.
@@ -75,7 +75,7 @@ def plot_tissues(
         panels, for None without an image, and as `plot_tissue`.
     """
     _style.one_of(axes, figure, "axes")
-    _check(tissues, axes, image)
+    _check(tissues, axes, image, colorbar)
     drawings = {name: None if t is None else Drawing(single(t)) for name, t in tissues.items()}
     cell_values = _values("cells", cells, tissues)
     edge_values = _values("edges", edges, tissues)
@@ -90,6 +90,14 @@ def plot_tissues(
         )
         if values is not None and colorbar in (True, name)
     ]
+    # Before there is a figure: one of pyplot would stay open.
+    for drawing, own_cells, own_edges in zip(
+        drawings.values(), cell_values, edge_values, strict=True
+    ):
+        if drawing is not None:
+            checked("cells", own_cells, drawing.n_cells)
+            checked("edges", own_edges, drawing.n_edges)
+            checked("mask", mask, drawing.n_cells)
     pixel = float(pixel_size)
     views = _views(drawings, mask) if image is None else [None] * len(drawings)
     with _style.house_style():
@@ -122,9 +130,8 @@ def plot_tissues(
                     pixel_size=pixel,
                 )
             ax.set_title(name)
-        for colours, values in reversed(
-            bars
-        ):  # a later bar goes between the axes and an earlier one
+        # A later bar goes between the axes and an earlier one.
+        for colours, values in reversed(bars):
             assert values is not None
             add_bar(
                 list(axes),
@@ -139,7 +146,13 @@ def plot_tissues(
     return list(axes)
 
 
-def _check(tissues: Mapping[str, Tissue | None], axes: Any, image: np.ndarray | None) -> None:
+def _check(
+    tissues: Mapping[str, Tissue | None], axes: Any, image: np.ndarray | None, colorbar: bool | str
+) -> None:
+    if colorbar not in (True, False, "cells", "edges"):
+        raise ValueError(
+            f'Argument `colorbar` must be true, false, "cells" or "edges", but is {colorbar!r}.'
+        )
     if not tissues:
         raise ValueError("Argument `tissues` must have at least one panel, but is empty.")
     if image is None and None in tissues.values():

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Real
@@ -14,10 +14,10 @@ from vertax.plotting import _style
 
 
 def plot_band(
-    curves: Real[Array | np.ndarray, "epochs replicates"],
-    x: Real[Array | np.ndarray, " epochs"] | None = None,
+    curves: Real[Array | np.ndarray, " ..."],
+    x: Real[Array | np.ndarray, " ..."] | Sequence[float] | None = None,
     *,
-    spread: Literal["deviation", "range"] = "deviation",
+    spread: str = "deviation",
     log: bool = False,
     ax: Axes | None = None,
     figure: Figure | None = None,
@@ -31,10 +31,11 @@ def plot_band(
 
     **Arguments:**
 
-    - `curves`: a curve in each column, such as `fit.history.cost` of a batch of fits.
+    - `curves`: shape `(epochs, replicates)`, a curve in each column, such as `fit.history.cost` of a batch
+        of fits.
     - `x`: where they are, by default 0, 1, 2, …
-    - `spread`: what the band shows: one standard deviation to either side, or all from the least to the
-        largest.
+    - `spread`: what the band shows: `"deviation"`, one standard deviation to either side, or `"range"`, all
+        from the least to the largest.
     - `log`: take mean and deviation of the logarithm, and draw on a logarithmic axis.
     - `ax`: the axes to draw in, also one after the other to compare; by default those of a new figure.
     - `figure`: an empty figure to draw in instead, which no window shows.
@@ -87,7 +88,7 @@ def plot_band(
 
 
 def plot_boxes(
-    groups: Mapping[str, Real[Array | np.ndarray, " ..."]],
+    groups: Mapping[str, Real[Array | np.ndarray, " ..."] | Sequence[float]],
     *,
     log: bool = False,
     ax: Axes | None = None,

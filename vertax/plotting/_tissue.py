@@ -145,11 +145,11 @@ def draw(
 ) -> Axes:
     """Draw what `plot_tissue` draws, with cells placed as in `drawing`; `view` is what to show."""
     _style.one_of(ax, figure)
-    cell_values = _values("cells", cells, drawing.n_cells)
-    edge_values = _values("edges", edges, drawing.n_edges)
-    shown = _values("mask", mask, drawing.n_cells)
+    cell_values = checked("cells", cells, drawing.n_cells)
+    edge_values = checked("edges", edges, drawing.n_edges)
+    shown = checked("mask", mask, drawing.n_cells)
     shown = np.ones(drawing.n_cells, bool) if shown is None else shown.astype(bool)
-    marked = _values("highlight", highlight, drawing.n_edges)
+    marked = checked("highlight", highlight, drawing.n_edges)
     opacity = 1.0 if alpha is None else float(alpha)
     if not 0 <= opacity <= 1:
         raise ValueError(f"Argument `alpha` must lie in 0 … 1, but is {opacity}.")
@@ -224,7 +224,7 @@ def draw(
     return ax
 
 
-def _values(name: str, values: Any, n: int) -> np.ndarray | None:
+def checked(name: str, values: Any, n: int) -> np.ndarray | None:
     if values is None:
         return None
     values = np.asarray(values)
