@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
-from vertax.experiments._scenes import Scene
 from vertax.fitting import Fit
 from vertax.plotting import (
     house_style,
@@ -67,12 +66,12 @@ def inference(curves: Mapping[str, Curves], metrics: Mapping[str, Any]) -> Figur
     return figure
 
 
-def tissues(scene: Scene, fits: Mapping[str, Fit]) -> Figure:
+def tissues(scene: Any, fits: Mapping[str, Fit]) -> Figure:
     """One replicate: the start, what each method made of it, and the target.
 
     **Arguments:**
 
-    - `scene`: the replicate.
+    - `scene`: the replicate: tissues `initial` and `target`, with energies `guess` and `truth`.
     - `fits`: of each method.
 
     **Returns:** the figure.
