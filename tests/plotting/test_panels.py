@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import rgb_to_hsv
+from matplotlib.colors import rgb_to_hsv, to_rgb
 from matplotlib.figure import Figure
 
 import vertax as vx
-from vertax.plotting import label_colours, new_figure, plot_image, plot_tissues, scale_bar
+from vertax.plotting import _style, label_colours, new_figure, plot_image, plot_tissues, scale_bar
 
 IMAGE = np.arange(60 * 80, dtype=np.uint16).reshape(60, 80)
 
@@ -192,6 +192,14 @@ class TestLabels:
         values = rgb_to_hsv(colours[labels > 0])[:, 2]
         assert values.min() > 0.3
         assert values.max() < 0.5
+
+    def test_a_mesh_shows_on_every_label(self):
+        # As texts on a web page should: contrast of relative luminances.
+        labels = np.arange(400).reshape(20, 20)
+        linear = lambda c: np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        luminance = lambda c: linear(c) @ np.array([0.2126, 0.7152, 0.0722])
+        mesh = luminance(np.array(to_rgb(_style.HIGHLIGHT)))
+        assert np.min((mesh + 0.05) / (luminance(label_colours(labels)) + 0.05)) > 2.5
 
     def test_labels_that_follow_each_other_differ(self):
         colours = label_colours(np.arange(1, 400).reshape(1, -1))[0]

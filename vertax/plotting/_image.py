@@ -174,13 +174,8 @@ def scale_bar(
             zorder=5,
         )
     if over_image:  # white on black can be read on anything
-        for artist in (line, text):
-            artist.set_path_effects([withStroke(linewidth=artist_width(artist), foreground="k")])
-
-
-def artist_width(artist: Any) -> float:
-    """Width of a dark rim around a line or a text."""
-    return artist.get_linewidth() + 1.6 if hasattr(artist, "get_linewidth") else 1.8
+        line.set_path_effects([withStroke(linewidth=line.get_linewidth() + 1.6, foreground="k")])
+        text.set_path_effects([withStroke(linewidth=1.8, foreground="k")])
 
 
 def _round_length(most: float) -> float:
