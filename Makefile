@@ -70,7 +70,7 @@ clean: ## remove the environment, caches and builds, but no results
 # is installed in place, so changes of its code need no new set-up.
 $(VENV)/.base: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV); this takes a minute or two and happens once."
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable '.[run]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(BIN)/python
@@ -81,7 +81,7 @@ $(VENV)/.dev: pyproject.toml | $(BIN)/python
 $(VENV)/.docs: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV) for the documentation; this takes a minute or two and happens once."
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'
-	@touch $@ $(VENV)/.base
+	@touch $@
 
 $(BIN)/python:
 	@command -v $(PYTHON) >/dev/null || { \

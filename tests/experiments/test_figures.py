@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PolyCollection
@@ -165,8 +166,8 @@ def test_methods_across_topologies(tissue):
     np.testing.assert_allclose(
         axes[0].lines[0].get_ydata(), np.exp(np.log(curves["alone"].relative_error).mean(axis=1))
     )
-    energy = lambda low: SimpleNamespace(target_shape_factor=np.linspace(low, 4, 9))
-    scene = SimpleNamespace(initial=tissue, guess=energy(3.6), target=tissue, truth=energy(3.7))
+    energy = lambda low: vx.energies.ShapeFactorEnergy(jnp.linspace(low, 4, 9))
+    scene = vx.inference.Scene(energy(3.7), tissue, energy(3.6), tissue, converged=jnp.array(True))
     fits = {"guided": fit_with(tissue=tissue, energy=energy(3.5))}
     axes = panels(topologies.tissues(scene, fits))
     assert [ax.get_title() for ax in axes] == ["start", "guided", "target"]

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
+from vertax._base.extras import needing
+
 _SMALLEST_SIDE = 16
 
 
@@ -77,10 +79,8 @@ class Watershed(AbstractSegmenter):
     def __call__(
         self, image: Shaped[np.ndarray | Array, " *shape"]
     ) -> Int[np.ndarray, "rows columns"]:
-        measure, morphology, segmentation = (
-            _import(f"skimage.{name}", "Watershed", "scikit-image", "image")
-            for name in ("measure", "morphology", "segmentation")
-        )
+        with needing("image", "Watershed"):
+            from skimage import measure, morphology, segmentation
         pixels = check_image(image)
         # The logarithm makes bright and faint membranes comparable; the mean sets where it bends.
         pixels = pixels - pixels.min()
@@ -140,7 +140,8 @@ class Cellpose(AbstractSegmenter):
     def __call__(
         self, image: Shaped[np.ndarray | Array, " *shape"]
     ) -> Int[np.ndarray, "rows columns"]:
-        models = _import("cellpose.models", "Cellpose", "cellpose", "cellpose")
+        with needing("cellpose", "Cellpose"):
+            models = importlib.import_module("cellpose.models")
         _check_version("cellpose", 4)
         pixels = check_image(image)
         network = models.CellposeModel(gpu=self.gpu, pretrained_model=self.model)
@@ -222,15 +223,6 @@ def _check_size(name: str, value: float | None, *, zero: bool) -> None:
         raise ValueError(
             f"Argument `{name}` must be {'at least 0' if zero else 'positive'}, but is {value}."
         )
-
-
-def _import(module: str, who: str, package: str, extra: str):
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f'{who} needs {package}: pip install "vertax[{extra}]" ({error}).'
-        ) from error
 
 
 def _check_version(package: str, least: int) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 
+from vertax._base.extras import needing
+
 _TIFF = (".tif", ".tiff")
 
 
@@ -30,7 +32,7 @@ def read_image(
     - `FileNotFoundError` if there is no such file.
     - `ValueError` if it is not an image, if it has channels or planes and none was chosen, or not
         the one that was.
-    - `ImportError` for a TIFF file if tifffile is not installed.
+    - `ImportError` if what reads the file is not installed: the extra `[image]`.
     """
     file = Path(path)
     if not file.exists():
@@ -66,16 +68,15 @@ def _read(file: Path) -> tuple[np.ndarray, str]:
 
 
 def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
-    try:
+    with needing("image", "Reading TIFF files"):
         import tifffile
-    except ImportError as error:
-        raise ImportError('TIFF files need tifffile: pip install "vertax[image]".') from error
     with tifffile.TiffFile(file) as tiff:
         return tiff.series[0].asarray(), tiff.series[0].axes
 
 
 def _read_picture(file: Path) -> tuple[np.ndarray, str]:
-    from PIL import Image  # comes with matplotlib
+    with needing("image", "Reading pictures"):
+        from PIL import Image
 
     with Image.open(file) as picture:
         # Palette indices are no intensities.

@@ -87,7 +87,7 @@ def label_colours(
 
     **Arguments:**
 
-    - `labels`: a number in each pixel of a cell, 0 in the background.
+    - `labels`: a number in each pixel of a cell, 0 or less in the background.
 
     **Returns:** red, green and blue of each pixel, from 0 to 1; the background is black.
 
@@ -106,7 +106,7 @@ def label_colours(
     number = np.arange(len(values))
     hue, value = np.modf(number * 0.618034)[0], 0.34 + 0.14 * np.modf(number * 0.381966)[0]
     colours = hsv_to_rgb(np.stack([hue, np.full(len(values), 0.45), value], axis=-1))
-    colours[values == 0] = 0
+    colours[values <= 0] = 0
     return colours[place.reshape(labels.shape)]
 
 

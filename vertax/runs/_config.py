@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import os
 import tomllib
 import types
@@ -10,13 +11,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
-import annotated_types
-import pydantic
-from pydantic.fields import FieldInfo
+from vertax._base.extras import needing
+from vertax.runs._errors import ConfigError
 
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message says where and what would be right."""
+with needing("run", "The configuration of experiments"):
+    import annotated_types
+    import pydantic
+    from pydantic.fields import FieldInfo
 
 
 class Section(pydantic.BaseModel):
@@ -53,13 +54,33 @@ class Section(pydantic.BaseModel):
 class ExperimentConfig(Section):
     """The keys that every experiment has.
 
-    Subclasses add a key `experiment`, a literal with the name of theirs.
+    Subclasses add their own.
     """
 
+    experiment: str = ""
+    """Which experiment this is: the name of its folder."""
     seed: int = pydantic.Field(default=0, ge=0)
     """Seed of everything random."""
     precision: Literal["float64", "float32"] = "float64"
     """Floating-point numbers of the whole run."""
+
+
+@functools.cache
+def named(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
+    """The configuration of the experiment of a name, which takes no other for its key `experiment`.
+
+    **Arguments:**
+
+    - `config`: the class with the keys of the experiment.
+    - `name`: of the experiment.
+
+    **Returns:** a subclass.
+    """
+    key = pydantic.Field(name, description=config.model_fields["experiment"].description)
+    fields: dict[str, Any] = {"experiment": (Literal[name], key)}
+    return pydantic.create_model(
+        config.__name__, __base__=config, __module__=config.__module__, **fields
+    )
 
 
 Model = TypeVar("Model", bound=Section)

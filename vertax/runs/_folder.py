@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import importlib.metadata
 import json
 import os
 import platform
@@ -14,31 +12,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
-from jaxtyping import Shaped
-from matplotlib.figure import Figure
+import optimistix as optx
+from jaxtyping import ArrayLike, Shaped
 
 from vertax._base.archive import read_archive, write_archive
-from vertax.fitting import Checkpoint
-from vertax.fitting import fit
-from vertax.fitting import Fit
-from vertax.fitting import InverseProblem
+from vertax._base.extras import needing
+from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
+from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
 from vertax.runs._config import ExperimentConfig, read_toml, validate
+from vertax.runs._errors import RunFolderError, UnfinishedRunError
+from vertax.runs._figures import FIGURE_FORMATS, checked_formats, write_figure
 from vertax.runs._summary import plain
-from vertax.io import atomic_write, save_tissue
+from vertax.runs._tables import histories, history_columns
+from vertax.runs._versions import installed_version
+
+with needing("run", "The folder of a run"):
+    import tomli_w
+    from matplotlib.figure import Figure
+
+Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 
 CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
+_FIGURES = tuple(f"figures/*.{ending}" for ending in FIGURE_FORMATS)
 # What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
-_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", "figures/*.png", f"{PARTS}/*.npz")
-
-
-class RunFolderError(ValueError):
-    """A folder that a run must not write to, or that holds none."""
-
-
-class UnfinishedRunError(RunFolderError):
-    """The folder of a run that did not come to its end."""
+_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", *_FIGURES, f"{PARTS}/*.npz")
 
 
 class RunFolder:
@@ -50,15 +48,24 @@ class RunFolder:
     **Arguments:**
 
     - `path`: an existing folder; `claim` finds or makes one.
+    - `figures`: formats of the pictures, of `"png"`, `"pdf"` and `"svg"`; each picture is written in all
+        of them.
+
+    **Raises:**
+
+    - `RunFolderError` for another format.
     """
 
     path: Path
+    figure_formats: tuple[str, ...]
     interrupted: bool
     """Whether an interrupt from the keyboard ended a fit of this run: no other one begins."""
 
-    def __init__(self, path: str | os.PathLike[str]):
+    def __init__(self, path: str | os.PathLike[str], *, figures: Sequence[str] = ("png",)):
         self.path = Path(path)
+        self.figure_formats = checked_formats(figures)
         self.interrupted = False
+        self._warnings: dict[str, list[str]] = {}
 
     @classmethod
     def claim(
@@ -68,6 +75,7 @@ class RunFolder:
         *,
         overwrite: bool = False,
         root: str | os.PathLike[str] = "runs",
+        figures: Sequence[str] = ("png",),
     ) -> RunFolder:
         """Make the folder of a new run, without touching an earlier one.
 
@@ -77,17 +85,19 @@ class RunFolder:
         - `output`: the folder itself, if the user chose one.
         - `overwrite`: clear a folder that holds an earlier run, and use it again.
         - `root`: folder of all runs.
+        - `figures`: formats of the pictures.
 
         **Returns:** the folder, which holds no results.
 
         **Raises:**
 
         - `RunFolderError` if `output` is not empty and `overwrite` is not set, if what is to be
-            overwritten is not the folder of a run, or if a file is in the way.
+            overwritten is not the folder of a run, if a file is in the way, or for another format.
         """
+        figures = checked_formats(figures)  # before anything is made or cleared
         try:
             if output is None and not overwrite:
-                return cls(_numbered(Path(root) / name))
+                return cls(_numbered(Path(root) / name), figures=figures)
             folder = Path(root) / name if output is None else Path(output)
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.iterdir()):
@@ -101,7 +111,7 @@ class RunFolder:
             raise RunFolderError(
                 f"Cannot use {error.filename} as a folder: there is a file of that name."
             ) from None
-        return cls(folder)
+        return cls(folder, figures=figures)
 
     @classmethod
     def existing(cls, path: str | os.PathLike[str]) -> RunFolder:
@@ -128,22 +138,29 @@ class RunFolder:
         return cls(folder)
 
     @classmethod
-    def unfinished(cls, path: str | os.PathLike[str], config: ExperimentConfig) -> RunFolder:
+    def unfinished(
+        cls,
+        path: str | os.PathLike[str],
+        config: ExperimentConfig,
+        *,
+        figures: Sequence[str] = ("png",),
+    ) -> RunFolder:
         """The folder of an earlier run that did not come to its end, to go on with it.
 
         **Arguments:**
 
         - `path`: the folder.
         - `config`: the configuration, which must be that of the run.
+        - `figures`: formats of the pictures; they may be others than before.
 
         **Returns:** the folder.
 
         **Raises:**
 
-        - `RunFolderError` if it is not the folder of a run, if the run is finished, or if its
-            configuration is another one.
+        - `RunFolderError` if it is not the folder of a run, if the run is finished, if its
+            configuration is another one, or for another format.
         """
-        run = cls.existing(path)
+        run = cls(cls.existing(path).path, figures=figures)
         if (run.path / METRICS).exists():
             raise RunFolderError(
                 f"The run in {run.path} is finished: there is nothing to resume. To see what it found: "
@@ -165,14 +182,26 @@ class RunFolder:
         return run
 
     def fit(
-        self, name: str, problem: InverseProblem[Any], optimiser: Any, epochs: int, **options: Any
+        self,
+        name: str,
+        problem: InverseProblem[Any],
+        optimiser: Any,
+        epochs: int,
+        *,
+        partial: bool = False,
+        callback: Callback | None = None,
+        **options: Any,
     ) -> Fit[Any]:
         """Solve an inverse problem, with a checkpoint in this folder that a resumed run goes on from.
+
+        A fit that is not at its end is one of `warnings`. One that cannot go on leaves the table of its
+        epochs and, if it is no batch, its best tissue, both named after it.
 
         **Arguments:**
 
         - `name`: of this fit; no other one of the run has it.
-        - `problem`, `optimiser`, `epochs`, `options`: as of [`fit`][vertax.fit].
+        - `problem`, `optimiser`, `epochs`, `callback`, `options`: as of [`fit`][vertax.fit].
+        - `partial`: take what there is of a fit that cannot go on, with a warning.
 
         **Returns:** the [`Fit`][vertax.Fit], also if it was interrupted; `interrupted` of the folder then
         tells so.
@@ -180,14 +209,70 @@ class RunFolder:
         **Raises:**
 
         - `KeyboardInterrupt` if an earlier fit was interrupted, or this one before it had anything.
+        - `FitError` if it cannot go on and `partial` is not set, or if there is nothing of it.
         - others as [`fit`][vertax.fit].
         """
+
+        def watch(epoch: int, record: Record) -> Mapping[str, ArrayLike] | None:
+            if self.interrupted:  # Ctrl-C reaches one thread only
+                raise KeyboardInterrupt
+            return None if callback is None else callback(epoch, record)
+
         if self.interrupted:
             raise KeyboardInterrupt
         checkpoint = Checkpoint(self._part(name))
-        outcome = fit(problem, optimiser, epochs, checkpoint=checkpoint, **options)
-        self.interrupted = outcome.interrupted
+        try:
+            outcome = fit(
+                problem, optimiser, epochs, checkpoint=checkpoint, callback=watch, **options
+            )
+        except FitError as error:
+            if error.fit is None:
+                raise
+            self._save_failed(name, error.fit)
+            if not partial:
+                raise
+            self.warn(str(error).rstrip("."), name)
+            return error.fit
+        # Several fits may go side by side: none takes back what another one says.
+        self.interrupted |= outcome.interrupted
+        if not outcome.interrupted:
+            self._judge(name, optimiser, epochs, outcome)
         return outcome
+
+    def _judge(self, name: str, optimiser: Any, epochs: int, outcome: Fit[Any]) -> None:
+        """Warn of a fit that is not at its end."""
+        for doubt in doubts(outcome):
+            self.warn(doubt, name)
+        solver = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
+        if solver and len(outcome.history.cost) >= epochs:
+            self.warn(
+                f"the least-squares solver did not end within {epochs} epochs (raise them)", name
+            )
+
+    def _save_failed(self, name: str, outcome: Fit[Any]) -> None:
+        ending = _safe(name)
+        if outcome.history.cost.ndim == 1:
+            self.save_table(f"history_{ending}", history_columns(outcome.history))
+            self.save_tissue(f"fitted_{ending}", outcome.tissue)
+        else:
+            members = range(outcome.history.cost.shape[1])
+            labels = [{"member": str(k)} for k in members]
+            self.save_table(f"history_{ending}", histories(outcome, labels))
+
+    def warn(self, text: str, who: str | None = None) -> None:
+        """Note something that whoever reads the results must know: it is in the metrics and on the screen.
+
+        **Arguments:**
+
+        - `text`: a sentence without a full stop.
+        - `who`: what it holds for, such as the name of a fit; equal texts are joined to one.
+        """
+        self._warnings.setdefault(text, []).extend([] if who is None else [who])
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was noted by `warn`, one sentence each."""
+        return [_sentence(text, sorted(whom)) for text, whom in self._warnings.items()]
 
     def part(
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
@@ -224,7 +309,7 @@ class RunFolder:
     def _part(self, name: str) -> Path:
         folder = self.path / PARTS
         folder.mkdir(exist_ok=True)
-        return folder / f"{re.sub('[^0-9A-Za-z.-]+', '_', name)}.npz"
+        return folder / f"{_safe(name)}.npz"
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Write the resolved configuration, with every default spelled out.
@@ -262,7 +347,7 @@ class RunFolder:
             np.save(file, array, allow_pickle=False)
 
     def save_table(self, name: str, columns: Mapping[str, Sequence[Any] | np.ndarray]) -> None:
-        """Write a table to `name.csv`.
+        """Write a table to `name.csv`, as [`write_csv`][vertax.io.write_csv]: NaN is an empty field.
 
         **Arguments:**
 
@@ -273,14 +358,10 @@ class RunFolder:
 
         - `ValueError` if the columns differ in length.
         """
-        rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
-        with atomic_write(self.path / f"{name}.csv", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(rows)
+        write_csv(self.path / f"{name}.csv", columns)
 
     def save_figure(self, name: str, figure: Figure) -> None:
-        """Write a picture to `figures/name.png`.
+        """Write a picture to `figures/name.png`, or in the other formats that were asked for.
 
         **Arguments:**
 
@@ -289,8 +370,8 @@ class RunFolder:
         """
         folder = self.path / "figures"
         folder.mkdir(exist_ok=True)
-        with atomic_write(folder / f"{name}.png", "wb") as file:
-            figure.savefig(file, format="png", dpi=200)
+        for ending in self.figure_formats:
+            write_figure(folder / f"{name}.{ending}", figure)
 
     def save_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write the metrics; the last thing a run does.
@@ -298,8 +379,10 @@ class RunFolder:
         **Arguments:**
 
         - `metrics`: numbers, texts, lists and mappings; NaN and infinity, which strict JSON does
-            not have, become null.
+            not have, become null. `warnings` of this folder are added, if there are any.
         """
+        if self.warnings:
+            metrics = {**metrics, "warnings": self.warnings}
         with atomic_write(self.path / METRICS) as file:
             json.dump(plain(metrics), file, indent=2, allow_nan=False)
             file.write("\n")
@@ -341,22 +424,17 @@ class RunFolder:
 
         **Returns:** their paths, sorted by name.
         """
-        return sorted(self.path.glob("figures/*.png"))
+        return sorted(file for pattern in _FIGURES for file in self.path.glob(pattern))
 
 
-def installed_version(name: str) -> str:
-    """Version of an installed package.
+def _safe(name: str) -> str:
+    """A name as a part of the name of a file."""
+    return re.sub("[^0-9A-Za-z.-]+", "_", name)
 
-    **Arguments:**
 
-    - `name`: of the package.
-
-    **Returns:** its version, or `"(not installed)"` for one that runs from its source folder.
-    """
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"
+def _sentence(text: str, whom: Sequence[str]) -> str:
+    shown = ", ".join(whom[:3]) + (f" and {len(whom) - 3} more" if len(whom) > 3 else "")
+    return f"{shown}: {text}." if whom else f"{text[:1].upper()}{text[1:]}."
 
 
 def _numbered(path: Path) -> Path:

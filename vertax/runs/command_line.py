@@ -25,11 +25,6 @@ app = typer.Typer(
 USAGE, FAILURE, INTERRUPTED = 2, 1, 130
 
 
-def main() -> None:
-    """Entry point of the program `vertax`."""
-    app()
-
-
 def _show_version(wanted: bool) -> bool:
     if wanted:
         from vertax.runs import installed_version
@@ -102,6 +97,22 @@ def run(
             "no fit begins again.",
         ),
     ] = None,
+    figures: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FORMAT",
+            help="png, pdf or svg; may be repeated. By default png.",
+            show_default=False,
+        ),
+    ] = None,
+    no_cache: Annotated[
+        bool,
+        typer.Option(
+            "--no-cache",
+            help="Compile everything anew, instead of keeping what was compiled in the user's cache folder "
+            "(the environment variable VERTAX_CACHE names another, or is off).",
+        ),
+    ] = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", help="Show no progress bar and no summary.")
     ] = False,
@@ -114,24 +125,34 @@ def run(
     import matplotlib
 
     from vertax import FitError
-    from vertax.runs import ConfigError, RunFolder, RunFolderError, load_config, summary
+    from vertax.runs import (
+        ConfigError,
+        RunFolder,
+        RunFolderError,
+        enable_cache,
+        load_config,
+        summary,
+    )
 
     folder: RunFolder | None = None
+    formats = tuple(figures or ("png",))
     # Figures go to files only, also where there is a screen.
     matplotlib.use("Agg")
     try:
         experiment, settings = load_config(config, overrides or ())
         # The library leaves the precision of JAX to the user; here the configuration decides.
         jax.config.update("jax_enable_x64", settings.precision == "float64")
+        if not no_cache:
+            enable_cache()
         if resume is None:
-            folder = RunFolder.claim(config.stem, output, overwrite=overwrite)
+            folder = RunFolder.claim(config.stem, output, overwrite=overwrite, figures=formats)
             folder.save_config(settings)
         elif output is not None or overwrite:
             raise RunFolderError(
                 "--resume goes with neither --output nor --overwrite: leave them out."
             )
         else:
-            folder = RunFolder.unfinished(resume, settings)
+            folder = RunFolder.unfinished(resume, settings, figures=formats)
         if not quiet:
             typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
         metrics = experiment.run(settings, folder, progress=not quiet)
@@ -151,8 +172,13 @@ def run(
         if debug:
             raise
         _stop(error, FAILURE)
+    except ImportError as error:
+        if debug or "pip install" not in str(error):
+            raise
+        _stop(error, FAILURE)
     if not quiet:
         typer.echo(summary(metrics))
+        _warn(folder.warnings)
         typer.echo(f"Results: {folder.path}")
         for figure in folder.figures():
             typer.echo(f"  {figure}")
@@ -176,11 +202,18 @@ def show(
     others = [file for file in run.files() if file not in figures]
     if table := summary(metrics):
         typer.echo(table)
+    _warn(metrics.get("warnings", ()))
     for title, files in (("Figures", figures), ("Files", others)):
         if files:
             typer.echo(f"{title}:")
         for file in files:
             typer.echo(f"  {file}")
+
+
+def _warn(warnings: Iterable[str]) -> None:
+    """What the numbers above do not tell."""
+    for warning in warnings:
+        typer.secho(f"Warning: {warning}", err=True, fg=typer.colors.YELLOW)
 
 
 def _found(folder: RunFolder) -> str:
@@ -202,7 +235,3 @@ def _interrupted(config: Path, overrides: Iterable[str], folder: RunFolder | Non
 def _stop(error: Exception, code: int) -> NoReturn:
     typer.echo(f"Error: {error}", err=True)
     raise typer.Exit(code)
-
-
-if __name__ == "__main__":
-    main()

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vertax.fitting import Fit
+from vertax.inference import pearson, relative_error
 from vertax.plotting import (
     INK,
     house_style,
@@ -49,7 +50,7 @@ def inference(
 
     **Returns:** the figure.
     """
-    figure, ((start, end, cost), (error, pearson, final)) = new_figure(2, 3)
+    figure, ((start, end, cost), (error, correlation, final)) = new_figure(2, 3)
     figure.suptitle(title, fontsize=9)
     guess = np.ravel(initial)
     plot_recovery(np.ravel(true), guess, ax=start, name="$p_0$", label="guess", colour="0.6")
@@ -68,10 +69,11 @@ def inference(
             plot_band(curves, ax=ax, log=True, label=method, colour=_COLOURS[method])
         ax.set(xlabel="epoch", ylabel=label)
     cost.legend(ncols=2, columnspacing=0.8)
-    missing = {m: _missing_correlation(true, p) for m, p in inferred.items()}
-    errors = {m: np.mean(np.abs(p - true) / np.abs(true), axis=1) for m, p in inferred.items()}
-    plot_boxes(missing, ax=pearson, colours=_COLOURS, log=True)
-    pearson.set_ylabel("1 − Pearson $r$ at the end")
+    # What is 0 up to rounding is not positive.
+    missing = {m: np.maximum(1 - pearson(true, p), 1e-16) for m, p in inferred.items()}
+    errors = {m: relative_error(true, p) for m, p in inferred.items()}
+    plot_boxes(missing, ax=correlation, colours=_COLOURS, log=True)
+    correlation.set_ylabel("1 − Pearson $r$ at the end")
     plot_boxes(errors, ax=final, colours=_COLOURS, log=True)
     final.set_ylabel("relative error at the end")
     return figure
@@ -202,12 +204,6 @@ def scaling(rows: list[dict[str, Any]]) -> Figure:
     same_limits(axes[1::2])
     axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="upper left", bbox_to_anchor=(1, 1))
     return figure
-
-
-def _missing_correlation(true: np.ndarray, inferred: np.ndarray) -> np.ndarray:
-    """One minus Pearson's correlation of each replicate; what is 0 up to rounding is not positive."""
-    r = [np.corrcoef(*replicate)[0, 1] for replicate in zip(true, inferred, strict=True)]
-    return np.maximum(1 - np.array(r), 1e-16)
 
 
 def _centre(values: np.ndarray) -> np.ndarray:

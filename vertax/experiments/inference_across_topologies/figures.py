@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
 from vertax.fitting import Fit
+from vertax.inference import Scene
 from vertax.plotting import (
     house_style,
     new_figure,
@@ -66,12 +67,12 @@ def inference(curves: Mapping[str, Curves], metrics: Mapping[str, Any]) -> Figur
     return figure
 
 
-def tissues(scene: Any, fits: Mapping[str, Fit]) -> Figure:
+def tissues(scene: Scene, fits: Mapping[str, Fit]) -> Figure:
     """One replicate: the start, what each method made of it, and the target.
 
     **Arguments:**
 
-    - `scene`: the replicate: tissues `initial` and `target`, with energies `guess` and `truth`.
+    - `scene`: the replicate.
     - `fits`: of each method.
 
     **Returns:** the figure.
