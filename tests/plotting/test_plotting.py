@@ -6,6 +6,7 @@ import jax
 import matplotlib
 import numpy as np
 import pytest
+from free_helpers import cluster
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
@@ -86,6 +87,20 @@ class TestPolygons:
             moved = tissue.with_configuration(jax.numpy.asarray(start + noise))
             places.add(tuple(np.round(cell_polygons(moved)[0].ravel(), 6) + 0.0))
         assert len(places) == 1
+
+    def test_arcs_are_as_fine_as_asked_for(self):
+        tissue = cluster(5)
+        off = []
+        for points in (1, 8, 64):
+            polygons, sides = cell_polygons(tissue, points_per_arc=points)
+            np.testing.assert_array_equal(sides, points * np.asarray(tissue.neighbour_counts))
+            areas = [shoelace(p[:n]) for p, n in zip(polygons, sides, strict=True)]
+            off.append(np.abs(areas - np.asarray(tissue.areas)).max())
+        # A polygon in an arc misses an area that falls with the square of the number of pieces.
+        assert off[0] > 10 * off[1]
+        assert off[1] == pytest.approx(64 * off[2], rel=0.1)
+        with pytest.raises(ValueError, match="`points_per_arc` must be a positive whole number"):
+            cell_polygons(tissue, points_per_arc=0)
 
 
 def centroid(polygon):
