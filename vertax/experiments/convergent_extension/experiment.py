@@ -16,7 +16,6 @@ from jaxtyping import Array
 from pydantic import Field
 
 from vertax.costs import AspectRatio, aspect_ratio
-from vertax.experiments import _design_figures as figures
 from vertax.fitting import Fit, InverseProblem, Record, limits, member
 from vertax.inference import foam_terms
 from vertax.initialise import free_voronoi
@@ -33,6 +32,8 @@ from vertax.runs import (
     replicate_keys,
     spread_of,
 )
+
+from . import figures
 
 
 class Config(ExperimentConfig):

@@ -15,8 +15,6 @@ from pydantic import Field
 
 from vertax.costs import MeanShapeFactor
 from vertax.energies import ShapeFactorEnergy
-from vertax.experiments import _design_figures as figures
-from vertax.experiments._figures import convergence
 from vertax.fitting import Fit, InverseProblem, Record, limits
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
@@ -31,6 +29,8 @@ from vertax.runs import (
     fit_metrics,
     history_columns,
 )
+
+from . import figures
 
 
 class Config(ExperimentConfig):
@@ -135,4 +135,4 @@ def _save(
     panels = {"initial": (initial, observed[0]), "designed": (outcome.tissue, observed[best])}
     figure = figures.mechanics(panels, observed, targets, config.target)
     folder.save_figure("design", figure)
-    folder.save_figure("convergence", convergence(outcome.history))
+    folder.save_figure("convergence", figures.convergence(outcome.history))

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vertax.experiments import _figures
 from vertax.fitting import Fit
 from vertax.inference import Micrograph
 from vertax.runs import (
@@ -31,6 +30,8 @@ from vertax.runs import (
     history_columns,
     read_micrograph,
 )
+
+from . import figures
 
 
 class ImageSection(Preparation, ImageFile):
@@ -143,9 +144,9 @@ def _draw(
 ) -> None:
     found, initial = micrograph.segmentation, micrograph.first.tissue
     overlays = {"segmented": found.tissue, "relaxed first guess": initial, "fitted": outcome.tissue}
-    folder.save_figure("overlay", _figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
-    folder.save_figure("convergence", _figures.convergence(outcome.history))
-    figure = _figures.cells_on_image(
+    folder.save_figure("overlay", figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
+    folder.save_figure("convergence", figures.convergence(outcome.history))
+    figure = figures.cells_on_image(
         pixels,
         outcome.tissue,
         micrograph.parameters(outcome.energy)[0],

@@ -17,7 +17,6 @@ from pydantic import Field
 
 from vertax.costs import AbstractCost, MeshImage, VertexDistance
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
-from vertax.experiments import _figures
 from vertax.fitting import Fit, InverseProblem
 from vertax.inference import Scene, pearson, relative_error, same_neighbours, shape_factor_scene
 from vertax.runs import (
@@ -32,6 +31,8 @@ from vertax.runs import (
     history_columns,
     joined,
 )
+
+from . import figures
 
 _NAME = r"$p_0$"
 _Image = Float[np.ndarray, "rows columns"] | None
@@ -143,7 +144,7 @@ def _save_scene(scene: Scene, image: _Image, folder: RunFolder) -> None:
     folder.save_tissue("target", scene.target)
     folder.save_tissue("initial", scene.initial)
     panels = {"target": (scene.target, _parameters(scene.truth))}
-    folder.save_figure("target", _figures.tissues(panels, label=f"true {_NAME}"))
+    folder.save_figure("target", figures.tissues(panels, label=f"true {_NAME}"))
     if image is not None:
         folder.save_array("image", image)
 
@@ -172,13 +173,13 @@ def _save_fit(
         "target": (scene.target, true),
     }
     label = f"target shape factor {_NAME}"
-    folder.save_figure(f"before_after{ending}", _figures.tissues(panels, label=label))
-    folder.save_figure(f"convergence{ending}", _figures.convergence(outcome.history))
-    folder.save_figure(f"recovery{ending}", _figures.recovery(true, inferred, initial, name=_NAME))
+    folder.save_figure(f"before_after{ending}", figures.tissues(panels, label=label))
+    folder.save_figure(f"convergence{ending}", figures.convergence(outcome.history))
+    folder.save_figure(f"recovery{ending}", figures.recovery(true, inferred, initial, name=_NAME))
     if source == "image" and image is not None:
         overlays = {"image": None, "initial guess": scene.initial, "fitted": outcome.tissue}
         pixel = _pixel_size(config, scene)
-        figure = _figures.overlays(image, overlays, pixel_size=pixel, upright=True)
+        figure = figures.overlays(image, overlays, pixel_size=pixel)
         folder.save_figure(f"overlay{ending}", figure)
 
 

@@ -32,6 +32,7 @@ from vertax.inference import (
 )
 from vertax.initialise import Segmentation, free_voronoi, from_labels, labels_from_skeleton
 from vertax.mesh import Tissue
+from vertax.plotting import label_colours
 from vertax.runs import (
     ExperimentConfig,
     ImageFile,
@@ -158,7 +159,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     edges, cells = _tables(found, outcome, result, truth)
     folder.save_table("edges", edges)
     folder.save_table("cells", cells)
-    picture = np.asarray(image != 0, float)
+    # Labels differ by their colours, and outlines are light on dark.
+    picture = label_colours(labels) if image is labels else np.asarray(image != 0, float)
     tensions, pressures = result.tension, result.pressure
     figure = figures.foam(picture, found, outcome.tissue, tensions, pressures)
     folder.save_figure("tensions", figure)

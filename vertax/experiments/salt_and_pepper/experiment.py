@@ -17,7 +17,6 @@ from jaxtyping import Array
 from pydantic import Field
 
 from vertax.costs import HomotypicLength
-from vertax.experiments import _design_figures as figures
 from vertax.fitting import Fit, InverseProblem, Record, limits, member
 from vertax.inference import foam_terms
 from vertax.initialise import free_voronoi, periodic_voronoi
@@ -36,6 +35,8 @@ from vertax.runs import (
     replicate_keys,
     spread_of,
 )
+
+from . import figures
 
 Boundary = Literal["periodic", "free"]
 
