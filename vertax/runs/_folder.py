@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,20 +21,16 @@ from vertax._base.extras import needing
 from vertax.fitting import Checkpoint, Fit, InverseProblem, fit
 from vertax.io import atomic_write, save_tissue
 from vertax.mesh import Tissue
+from vertax.runs._claim import CONFIG, FIGURES, METRICS, PARTS, claimed
 from vertax.runs._config import ExperimentConfig, read_toml, validate
 from vertax.runs._errors import RunFolderError, UnfinishedRunError
-from vertax.runs._figures import FIGURE_FORMATS, checked_formats, write_figure
+from vertax.runs._figures import checked_formats, write_figure
 from vertax.runs._summary import plain
 from vertax.runs._versions import installed_version
 
 with needing("run", "The folder of a run"):
     import tomli_w
     from matplotlib.figure import Figure
-
-CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
-_FIGURES = tuple(f"figures/*.{ending}" for ending in FIGURE_FORMATS)
-# What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
-_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", *_FIGURES, f"{PARTS}/*.npz")
 
 
 class RunFolder:
@@ -55,12 +52,15 @@ class RunFolder:
 
     path: Path
     figure_formats: tuple[str, ...]
+    talkative: bool
+    """Whether `say` says it."""
     interrupted: bool
     """Whether an interrupt from the keyboard ended a fit of this run: no other one begins."""
 
     def __init__(self, path: str | os.PathLike[str], *, figures: Sequence[str] = ("png",)):
         self.path = Path(path)
         self.figure_formats = checked_formats(figures)
+        self.talkative = False
         self.interrupted = False
 
     @classmethod
@@ -91,23 +91,7 @@ class RunFolder:
             overwritten is not the folder of a run, if a file is in the way, or for another format.
         """
         figures = checked_formats(figures)  # before anything is made or cleared
-        try:
-            if output is None and not overwrite:
-                return cls(_numbered(Path(root) / name), figures=figures)
-            folder = Path(root) / name if output is None else Path(output)
-            folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.iterdir()):
-                if not overwrite:
-                    raise RunFolderError(
-                        f"The folder {folder} is not empty. Choose another with --output, or pass "
-                        "--overwrite to replace the run in it."
-                    )
-                _clear(folder)
-        except (FileExistsError, NotADirectoryError) as error:
-            raise RunFolderError(
-                f"Cannot use {error.filename} as a folder: there is a file of that name."
-            ) from None
-        return cls(folder, figures=figures)
+        return cls(claimed(Path(root) / name, output, overwrite), figures=figures)
 
     @classmethod
     def existing(cls, path: str | os.PathLike[str]) -> RunFolder:
@@ -177,6 +161,16 @@ class RunFolder:
             )
         return run
 
+    def say(self, what: str) -> None:
+        """Tell on the terminal what the run is at, if it is to tell (`vertax run` without `--quiet`).
+
+        **Arguments:**
+
+        - `what`: a few words, said before what takes longer than a second or two.
+        """
+        if self.talkative:
+            print(f"  {what} …", file=sys.stderr, flush=True)
+
     def fit(
         self, name: str, problem: InverseProblem[Any], optimiser: Any, epochs: int, **options: Any
     ) -> Fit[Any]:
@@ -197,6 +191,7 @@ class RunFolder:
         """
         if self.interrupted:
             raise KeyboardInterrupt
+        self.say(f"fit: {name}")
         checkpoint = Checkpoint(self._part(name))
         outcome = fit(problem, optimiser, epochs, checkpoint=checkpoint, **options)
         self.interrupted = outcome.interrupted
@@ -216,6 +211,7 @@ class RunFolder:
         """
         file = self._part(name)
         if not file.exists():
+            self.say(name)
             write_archive(file, "part", 1, compute())
         arrays = read_archive(file, "part", 1)
         return {key: array for key, array in arrays.items() if key not in ("format", "version")}
@@ -354,35 +350,7 @@ class RunFolder:
 
         **Returns:** their paths, sorted by name.
         """
-        return sorted(file for pattern in _FIGURES for file in self.path.glob(pattern))
-
-
-def _numbered(path: Path) -> Path:
-    """The first of path, path-2, path-3, … that is free, made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    number = 1
-    while True:
-        folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-        try:
-            folder.mkdir()  # refuses an existing one: two runs at a time get two folders
-            return folder
-        except FileExistsError:
-            if folder.is_dir() and not any(folder.iterdir()):
-                return folder
-        number += 1
-
-
-def _clear(folder: Path) -> None:
-    """Remove the files of an earlier run, and nothing else."""
-    # Whoever points at the wrong folder must not lose it.
-    if not (folder / CONFIG).is_file():
-        raise RunFolderError(
-            f"The folder {folder} is not empty and holds no run (no {CONFIG}), so it is not "
-            "overwritten."
-        )
-    for pattern in _LEFTOVERS:
-        for file in folder.glob(pattern):
-            file.unlink()
+        return sorted(file for pattern in FIGURES for file in self.path.glob(pattern))
 
 
 def _changes(then: Any, now: Any, name: str = "") -> list[str]:
