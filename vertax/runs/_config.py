@@ -8,7 +8,7 @@ import tomllib
 import types
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from vertax._base.extras import needing
 from vertax.runs._errors import ConfigError
@@ -62,7 +62,7 @@ class ExperimentConfig(Section):
     """Floating-point numbers of the whole run."""
 
     @pydantic.model_validator(mode="after")
-    def _seed_that_is_kept(self) -> Self:
+    def _seed_that_is_kept(self) -> Any:
         # JAX takes the lower 32 bits and drops the others without a word.
         if self.precision == "float32" and self.seed >= 2**32:
             raise ValueError(
