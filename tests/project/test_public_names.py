@@ -5,8 +5,8 @@ NAMES = """
 AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractTransitions
 AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation Fit FitError Free GradientOutcome
 History ImplicitDifferentiation InverseProblem MINRES Periodic Record T1 Tissue Topology Uncertainty adjoints
-animate costs energies equilibrate fit fitting initialise io load_tissue mesh plot_history plot_recovery
-plot_tissue plotting responses runs save_tissue solvers transitions uncertainty
+animate costs energies equilibrate fit fitting inference initialise io load_tissue mesh plot_history
+plot_recovery plot_tissue plotting responses runs save_tissue solvers transitions uncertainty
 """
 
 FAMILIES = {
@@ -17,7 +17,11 @@ FAMILIES = {
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "
     "PerimeterElasticity ShapeFactorEnergy Sum",
-    "fitting": "Checkpoint Fit FitError History InverseProblem Record Uncertainty fit uncertainty",
+    "fitting": "Checkpoint Fit FitError History InverseProblem Record Uncertainty doubts fit limits "
+    "member stack stack_fits uncertainty",
+    "inference": "Micrograph Microscope PinnedEnergy RecoveryWatch RelativeTensions Scene TensionProblem "
+    "Tensions Transition fit_onset fit_transition foam_energy foam_terms force_balance label_image "
+    "micrograph_problem pearson relative_error same_neighbours shape_factor_scene tension_problem",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
     "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
     "io": "BoundedTables Tables Trajectory atomic_write cell_table edge_table from_tables "
@@ -26,7 +30,7 @@ FAMILIES = {
     "write_geojson write_vtk",
     "mesh": "AbstractBoundary Free Periodic Tissue Topology",
     "plotting": "animate cell_polygons flipped_edges plot_history plot_recovery plot_tissue",
-    "responses": "Equilibrium equilibrate",
+    "responses": "Equilibrium Relaxation equilibrate",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
     "transitions": "AbstractTransitions T1",
 }

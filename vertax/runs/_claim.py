@@ -1,10 +1,13 @@
-"""The folder of a new run, found or made without touching an earlier one."""
+"""Which folder a run gets: a new one, or that of an earlier run to go on with."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from vertax.runs._config import ExperimentConfig, read_toml, validate
 from vertax.runs._errors import RunFolderError
 from vertax.runs._figures import FIGURE_FORMATS
 
@@ -44,6 +47,53 @@ def claimed(default: Path, output: str | os.PathLike[str] | None, overwrite: boo
     return folder
 
 
+def existing(path: str | os.PathLike[str]) -> Path:
+    """The folder of an earlier run, see `RunFolder.existing`.
+
+    **Raises:**
+
+    - `RunFolderError` if it is none.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        what = "it is a file" if folder.exists() else "there is none"
+        raise RunFolderError(f"{folder} is not the folder of a run: {what}.")
+    if not (folder / CONFIG).is_file():
+        raise RunFolderError(
+            f"{folder} is not the folder of a run: there is no {CONFIG} in it, which a run writes first."
+        )
+    return folder
+
+
+def unfinished(path: str | os.PathLike[str], config: ExperimentConfig) -> Path:
+    """The folder of a run that can be resumed, see `RunFolder.unfinished`.
+
+    **Raises:**
+
+    - `RunFolderError` if it cannot.
+    """
+    folder = existing(path)
+    if (folder / METRICS).exists():
+        raise RunFolderError(
+            f"The run in {folder} is finished: there is nothing to resume. To see what it found: "
+            f"vertax show {folder}"
+        )
+    earlier = read_toml(folder / CONFIG)
+    if earlier.get("experiment") != (config.model_dump().get("experiment")):
+        raise RunFolderError(
+            f"The run in {folder} is one of the experiment {earlier.get('experiment')!r}. Give its "
+            f"own configuration: vertax run {folder / CONFIG} --resume {folder}"
+        )
+    then = validate(type(config), earlier, str(folder / CONFIG))
+    if then != config:
+        changed = _changes(then.model_dump(mode="json"), config.model_dump(mode="json"))
+        raise RunFolderError(
+            f"The run in {folder} has another configuration: {'; '.join(changed)}. Give its own, "
+            f"vertax run {folder / CONFIG} --resume {folder}, or begin a new run without --resume."
+        )
+    return folder
+
+
 def _numbered(path: Path) -> Path:
     """The first of path, path-2, path-3, … that is free, made."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,3 +120,12 @@ def _clear(folder: Path) -> None:
     for pattern in _LEFTOVERS:
         for file in folder.glob(pattern):
             file.unlink()
+
+
+def _changes(then: Any, now: Any, name: str = "") -> list[str]:
+    """What differs between two configurations, in words."""
+    if isinstance(then, Mapping) and isinstance(now, Mapping):
+        keys = dict.fromkeys([*then, *now])
+        inside = lambda key: f"{name}.{key}" if name else key
+        return [c for k in keys for c in _changes(then.get(k), now.get(k), inside(k))]
+    return [] if then == now else [f"`{name}` was {then!r} and is {now!r}"]

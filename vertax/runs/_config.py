@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import os
 import tomllib
 import types
@@ -53,9 +54,11 @@ class Section(pydantic.BaseModel):
 class ExperimentConfig(Section):
     """The keys that every experiment has.
 
-    Subclasses add a key `experiment`, a literal with the name of theirs.
+    Subclasses add their own.
     """
 
+    experiment: str = ""
+    """Which experiment this is: the name of its folder."""
     seed: int = pydantic.Field(default=0, ge=0)
     """Seed of everything random."""
     precision: Literal["float64", "float32"] = "float64"
@@ -69,6 +72,24 @@ class ExperimentConfig(Section):
                 f"with precision float32, `seed` must be below 2**32, but is {self.seed}"
             )
         return self
+
+
+@functools.cache
+def named(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
+    """The configuration of the experiment of a name, which takes no other for its key `experiment`.
+
+    **Arguments:**
+
+    - `config`: the class with the keys of the experiment.
+    - `name`: of the experiment.
+
+    **Returns:** a subclass.
+    """
+    key = pydantic.Field(name, description=config.model_fields["experiment"].description)
+    fields: dict[str, Any] = {"experiment": (Literal[name], key)}
+    return pydantic.create_model(
+        config.__name__, __base__=config, __module__=config.__module__, **fields
+    )
 
 
 Model = TypeVar("Model", bound=Section)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import ast
 import difflib
 import importlib
-import importlib.resources
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vertax.runs._errors import ConfigError
@@ -30,8 +30,10 @@ class Experiment(NamedTuple):
 
     @property
     def config(self) -> type[ExperimentConfig]:
-        """What configures it."""
-        return self._package.Config
+        """What configures it: the `Config` of the package, and the name of its folder as `experiment`."""
+        from vertax.runs._config import named
+
+        return named(self._package.Config, self.name)
 
     @property
     def run(self) -> Callable[..., Mapping[str, Any]]:
@@ -45,12 +47,13 @@ class Experiment(NamedTuple):
 
 def _found() -> dict[str, Experiment]:
     # Their docstrings are read and nothing is imported: lists and help come at once.
+    places = map(Path, importlib.import_module(_PACKAGE).__path__)
     experiments: dict[str, Experiment] = {}
-    for folder in sorted(importlib.resources.files(_PACKAGE).iterdir(), key=lambda f: f.name):
-        source = folder / "__init__.py"
-        if folder.is_dir() and source.is_file() and not folder.name.startswith("_"):
+    for source in sorted(file for place in places for file in place.glob("*/__init__.py")):
+        name = source.parent.name
+        if not name.startswith("_"):
             text = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
-            experiments[folder.name] = Experiment(folder.name, text.partition("\n")[0])
+            experiments[name] = Experiment(name, text.partition("\n")[0])
     return experiments
 
 

@@ -181,6 +181,7 @@ def run(
         _stop(f"The run is too large for this machine ({error}). Make it smaller.", FAILURE)
     if not quiet:
         typer.echo(summary(metrics))
+        _warn(folder.warnings)
         typer.echo(f"Results: {folder.path}")
         for figure in folder.figures():
             typer.echo(f"  {figure}")
@@ -204,11 +205,18 @@ def show(
     others = [file for file in run.files() if file not in figures]
     if table := summary(metrics):
         typer.echo(table)
+    _warn(metrics.get("warnings", ()))
     for title, files in (("Figures", figures), ("Files", others)):
         if files:
             typer.echo(f"{title}:")
         for file in files:
             typer.echo(f"  {file}")
+
+
+def _warn(warnings: Iterable[str]) -> None:
+    """What the numbers above do not tell."""
+    for warning in warnings:
+        typer.secho(f"Warning: {warning}", err=True, fg=typer.colors.YELLOW)
 
 
 def _found(folder: RunFolder) -> str:

@@ -9,6 +9,7 @@ the relaxation is cut short, which explains the differences, and as the nudge of
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
@@ -28,25 +29,31 @@ from vertax.adjoints import (
 )
 from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
-from vertax.experiments._scenes import (
-    Scene,
+from vertax.fitting import Fit, InverseProblem, stack
+from vertax.inference import Scene, pearson, relative_error, same_neighbours, shape_factor_scene
+from vertax.responses import Relaxation as Response
+from vertax.runs import (
+    ExperimentConfig,
+    Fitting,
+    Gradient,
+    Relaxation,
+    RunFolder,
+    Section,
     ShapeFactors,
     TissueSection,
-    make_scene,
-    pearson_of,
-    same_neighbours,
-    stack,
+    histories,
+    joined,
 )
-from vertax.experiments.benchmark_adjoints import figures
-from vertax.fitting import Fit, InverseProblem
-from vertax.responses import equilibrate
-from vertax.runs._config import ExperimentConfig, Section
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Fitting, Relaxation
-from vertax.runs._tables import histories, joined
+
+from . import figures
 
 Method = Literal["AD", "Adj-ID", "Sen-ID", "EP"]
-_METHODS: tuple[Method, ...] = ("AD", "Adj-ID", "Sen-ID", "EP")
+_GRADIENTS: dict[Method, str] = {
+    "AD": "unrolled",
+    "Adj-ID": "implicit",
+    "Sen-ID": "sensitivity",
+    "EP": "propagation",
+}
 
 
 class Protocol(Section):
@@ -60,14 +67,8 @@ class Protocol(Section):
     """The same for AD, which needs a solver of fixed steps."""
     fit: Fitting = Fitting()
     """How the parameters are fitted."""
-    nudge: Literal["linear", "cost"] = "linear"
-    """The nudge of EP."""
-    beta: float | None = Field(default=None, gt=0)
-    """Its strength; left out, it is chosen by the precision."""
-    nudged_rtol: float | None = Field(default=None, gt=0)
-    """Tolerance of nudged relaxations relative to the nudge; left out, chosen by the precision."""
-    strict: bool = True
-    """Whether a gradient that has not converged ends the fit."""
+    gradient: Gradient = Gradient(strict=True)
+    """How gradients are taken; the method is each in turn."""
 
 
 class Scaling(Section):
@@ -101,11 +102,9 @@ class Accuracy(Section):
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["benchmark_adjoints"] = "benchmark_adjoints"
-    """Which experiment this is."""
     replicates: int = Field(default=5, ge=2)
     """Independent tissues; they are fitted as one batch."""
-    methods: list[Method] = Field(default=list(_METHODS))
+    methods: list[Method] = Field(default=list(_GRADIENTS))
     """Ways to differentiate."""
     least_squares_steps: int = Field(default=25, ge=0)
     """Outer steps of Levenberg-Marquardt, at true equilibria; 0 leaves it out."""
@@ -199,11 +198,10 @@ def _inference(config: Config, name: str, folder: RunFolder, progress: bool) -> 
 
 def _recovery(true: np.ndarray, inferred: np.ndarray, outcome: Fit) -> dict[str, Any]:
     history = outcome.history
-    pearson = pearson_of(true, inferred)
-    error = np.mean(np.abs(inferred - true) / np.abs(true), axis=1)
+    correlation, error = pearson(true, inferred), relative_error(true, inferred)
     return {
-        "pearson_mean": pearson.mean(),
-        "pearson_min": pearson.min(),
+        "pearson_mean": correlation.mean(),
+        "pearson_min": correlation.min(),
         "relative_error_mean": error.mean(),
         "relative_error_max": error.max(),
         "cost_mean": np.mean(outcome.cost),
@@ -212,7 +210,7 @@ def _recovery(true: np.ndarray, inferred: np.ndarray, outcome: Fit) -> dict[str,
         "num_t1": history.num_t1.sum(),
         "epochs": len(history.cost),
         "ms_per_epoch_of_batch": 1e3 * np.median(history.seconds[1:]),
-        "pearson": pearson,
+        "pearson": correlation,
         "relative_error": error,
         "epochs_to_1e-6": _first_below(history.relative_error.max(axis=1), 1e-6),
     }
@@ -227,19 +225,22 @@ def _protocol(config: Config, name: str) -> Protocol:
     return {"paper": config.paper, "equilibrium": config.equilibrium}[name]
 
 
+def _scene(config: Config, key: jax.Array, response: Response, n_cells: int | None = None) -> Scene:
+    size = {} if n_cells is None else {"n_cells": n_cells}
+    tissue = config.tissue.model_dump() | size
+    return shape_factor_scene(key=key, response=response, **tissue, **config.truth.model_dump())
+
+
 def _scenes(config: Config, relaxation: Relaxation, n_cells: int | None = None) -> list[Scene]:
     """As many scenes as replicates, in each of which start and target have one topology."""
     # Vertices are compared by number, which means nothing across a T1 transition: as in the paper,
     # guesses that relax into other neighbours are not for this benchmark.
-    tissue = config.tissue
-    if n_cells is not None:
-        tissue = tissue.model_copy(update={"n_cells": n_cells})
+    response = relaxation.build()
     scenes: list[Scene] = []
     for key in jax.random.split(jax.random.key(config.seed), 20 * config.replicates):
-        scene = make_scene(jax.random.split(key, 3), tissue, config.truth, Relaxation())
+        scene = _scene(config, key, Response(), n_cells)
         if same_neighbours(scene.initial, scene.target):
-            options = relaxation.options()
-            initial = equilibrate(scene.target, scene.guess, **options, throw=False).tissue
+            initial = response(scene.target, scene.guess, throw=False).tissue
             scenes.append(eqx.tree_at(lambda s: s.initial, scene, initial))
         if len(scenes) == config.replicates:
             return scenes
@@ -249,29 +250,15 @@ def _scenes(config: Config, relaxation: Relaxation, n_cells: int | None = None) 
     )
 
 
-def _adjoint(protocol: Protocol, method: Method) -> AbstractAdjoint:
-    throw = protocol.strict
-    if method == "AD":
-        return AutomaticDifferentiation(throw=throw)
-    if method == "Adj-ID":
-        return ImplicitDifferentiation(throw=throw)
-    if method == "Sen-ID":
-        return ImplicitDifferentiation("sensitivity", throw=throw)
-    return EquilibriumPropagation(
-        protocol.beta, protocol.nudge, rtol=protocol.nudged_rtol, throw=throw
-    )
-
-
-def _problem(
-    scene: Scene, protocol: Protocol, method: Method, *, adjoint: AbstractAdjoint | None = None
-) -> InverseProblem[ShapeFactorEnergy]:
+def _problem(scene: Scene, protocol: Protocol, method: Method) -> InverseProblem[ShapeFactorEnergy]:
     relaxation = protocol.unrolled if method == "AD" else protocol.relaxation
+    gradient = protocol.gradient.model_copy(update={"method": _GRADIENTS[method]})
     return InverseProblem(
         scene.initial,
         scene.guess,
         VertexDistance(scene.target),
-        adjoint=_adjoint(protocol, method) if adjoint is None else adjoint,
-        **relaxation.options(),
+        adjoint=gradient.build(),
+        **vars(relaxation.build()),
     )
 
 
@@ -294,7 +281,8 @@ def _cases(config: Config) -> list[_Case]:
     cases = []
     for scene in _scenes(config, Relaxation(), config.accuracy.n_cells):
         # From the hidden tissue to that of the guess: the relaxation has some way to go.
-        settled = equilibrate(scene.target, scene.guess, transitions=None, tolerance=1e-12).tissue
+        exact = Response(transitions=None, tolerance=1e-12)
+        settled = exact(scene.target, scene.guess).tissue
         cases.append(_Case(scene, _dense(scene, settled), settled))
     return cases
 
@@ -314,19 +302,18 @@ def _dense(scene: Scene, settled: Any) -> jax.Array:
     return -mixed.T @ jnp.linalg.pinv(hessian, rtol=1e-10, hermitian=True) @ pull
 
 
-def _gradient_error(**options: Any) -> Callable[..., jax.Array]:
+def _gradient_error(response: Response) -> Callable[..., jax.Array]:
     """How far a gradient is from the reference, as a function of tolerance and adjoint."""
 
     @eqx.filter_jit
     def error(case: _Case, adjoint: AbstractAdjoint, start: Any, tolerance: Any) -> jax.Array:
+        settings = dataclasses.replace(response, transitions=None, tolerance=tolerance)
         problem = InverseProblem(
             start,
             case.scene.guess,
             VertexDistance(case.scene.target),
             adjoint=adjoint,
-            transitions=None,
-            tolerance=tolerance,
-            **options,
+            **vars(settings),
         )
         _, _, (gradient, _), _ = problem.value_and_gradient()
         assert gradient is not None
@@ -339,9 +326,8 @@ def _gradient_error(**options: Any) -> Callable[..., jax.Array]:
 def _accuracy(config: Config, folder: RunFolder) -> dict[str, Any]:
     """Error of each gradient against the force at which the relaxation stopped."""
     # A first-order solver ends just below the tolerance; Newton's method would overshoot it.
-    relaxation = config.equilibrium.unrolled.model_copy(update={"max_steps": 50_000})
-    options = relaxation.options()
-    solver, max_steps = options["solver"], options["max_steps"]
+    relaxation = config.equilibrium.unrolled.model_copy(update={"max_steps": 50_000, "patience": 1})
+    error = _gradient_error(relaxation.build())
     # "As it is usually done": no more steps than the tissue itself needs, and nudged tissues are
     # relaxed no better than the tissue.
     adjoints: dict[str, AbstractAdjoint] = {
@@ -355,7 +341,6 @@ def _accuracy(config: Config, folder: RunFolder) -> dict[str, Any]:
     cases = _cases(config)
     errors = {}
     for name, adjoint in adjoints.items():
-        error = _gradient_error(solver=solver, max_steps=max_steps)
         errors[name] = np.array(
             [
                 [float(error(c, adjoint, c.scene.target, jnp.asarray(t))) for c in cases]
@@ -383,7 +368,7 @@ def _beta_scan(config: Config, folder: RunFolder, progress: bool) -> dict[str, A
     columns: dict[str, list[Any]] = {"nudge": [], "estimator": [], "beta": [], "error": []}
     for nudge in ("linear", "cost"):
         for centred in (True, False):
-            error = _gradient_error()
+            error = _gradient_error(Response())
             adjoints = [
                 EquilibriumPropagation(jnp.asarray(b), nudge, centred=centred, throw=False)
                 for b in betas[nudge]
@@ -399,7 +384,8 @@ def _beta_scan(config: Config, folder: RunFolder, progress: bool) -> dict[str, A
     batch = stack(_scenes(config, config.paper.relaxation))
     fitted = {}
     for beta in config.accuracy.fitted_betas:
-        protocol = config.paper.model_copy(update={"beta": beta})
+        gradient = config.paper.gradient.model_copy(update={"beta": beta})
+        protocol = config.paper.model_copy(update={"gradient": gradient})
         outcome = folder.fit(
             f"beta {beta:g}",
             _problem(batch, protocol, "EP"),
@@ -433,9 +419,8 @@ def _scaling(config: Config, folder: RunFolder) -> dict[str, dict[str, Any]]:
     for name in ("equilibrium", "paper"):
         protocol = _protocol(config, name)
         for n_cells in config.scaling.sizes:
-            keys = jax.random.split(jax.random.key(config.seed), 3)
-            tissue = config.tissue.model_copy(update={"n_cells": n_cells})
-            scene = make_scene(keys, tissue, config.truth, protocol.relaxation)
+            key = jax.random.key(config.seed)
+            scene = _scene(config, key, protocol.relaxation.build(), n_cells)
             for method in _measurable(config, n_cells):
                 problem = _problem(scene, protocol, method)
                 rows.append(

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vertax.experiments._figures import band, boxes, new_figure
-from vertax.experiments._scenes import pearson_of
 from vertax.fitting import Fit
+from vertax.inference import pearson
 from vertax.plotting import _style
 
 # The colours of the paper, in shades that are told apart with any colour vision.
@@ -65,7 +65,7 @@ def inference(
             grid[key].set(xlabel="epoch", ylabel=label, yscale="log")
         grid["cost"].legend(ncols=2, columnspacing=0.8)
         error = {m: np.mean(np.abs(p - true) / np.abs(true), axis=1) for m, p in inferred.items()}
-        boxes(grid["pearson"], {m: 1 - pearson_of(true, p) for m, p in inferred.items()}, _COLOURS)
+        boxes(grid["pearson"], {m: 1 - pearson(true, p) for m, p in inferred.items()}, _COLOURS)
         grid["pearson"].set_ylabel("1 − Pearson $r$ at the end")
         boxes(grid["final"], error, _COLOURS)
         grid["final"].set_ylabel("relative error at the end")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -12,22 +12,7 @@ from matplotlib.figure import Figure
 from vertax.experiments._figures import new_figure
 from vertax.initialise import Segmentation
 from vertax.mesh import Tissue
-from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style, plot_tissue
-
-
-def outlines(tissue: Tissue) -> Iterator[Float[np.ndarray, "corners 2"]]:
-    """The outline of each cell, as a polygon fine enough for its arcs.
-
-    **Arguments:**
-
-    - `tissue`: the tissue.
-
-    **Returns:** the corners of one cell after the other.
-    """
-    polygons, sizes = Drawing(tissue, 60).polygons()
-    for polygon, size in zip(polygons, sizes, strict=True):
-        yield polygon[:size]
 
 
 def foam(

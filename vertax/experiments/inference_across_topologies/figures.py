@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vertax.experiments import _figures
-from vertax.experiments._scenes import Scene
 from vertax.fitting import Fit
+from vertax.inference import Scene
 from vertax.plotting import _style
 
 
