@@ -12,9 +12,11 @@ def main() -> None:
     try:
         with needing("run", "The command `vertax`"):
             from vertax.runs.command_line import app
+        app()
     except ImportError as error:
-        sys.exit(f"Error: {error}")
-    app()
+        if "pip install" not in str(error):
+            raise
+        sys.exit(f"Error: {error}")  # an extra is missing, here or in what a command imports
 
 
 if __name__ == "__main__":

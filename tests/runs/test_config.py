@@ -145,9 +145,21 @@ def test_a_missing_file_and_bad_toml_are_named(write, tmp_path):
     assert f"Cannot read {tmp_path}" in refusal(tmp_path)
     bad = write("fit = [", "bad.toml")
     assert f"{bad} is not valid TOML" in refusal(bad)
+    deep = write("x = " + "[" * 5000, "deep.toml")
+    assert refusal(deep) == f"{deep} is nested too deeply."
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe\x00")
     assert f"{binary} is not valid TOML" in refusal(binary)
+
+
+def test_a_byte_order_mark_is_no_mistake(tmp_path):
+    path = tmp_path / "windows.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + VALID.replace("\n", "\r\n").encode())
+    assert load_config(path)[1].fit.epochs == 7
+
+
+def test_a_long_value_is_quoted_in_part(write):
+    assert len(refusal(write(VALID), f"data={'a' * 10_000}")) < 500
 
 
 def test_the_experiment_must_be_named_and_exist(write):

@@ -6,7 +6,7 @@ import contextlib
 import json
 import os
 import platform
-import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,18 @@ from typing import Any
 import numpy as np
 import optimistix as optx
 from jaxtyping import ArrayLike, Shaped
+from tqdm import tqdm
 
 from vertax._base.archive import read_archive, write_archive
 from vertax._base.extras import needing
 from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
 from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
-from vertax.runs._config import ExperimentConfig, read_toml, validate
+from vertax.runs._claim import CONFIG, FIGURES, METRICS, PARTS, claimed, existing, unfinished
+from vertax.runs._config import ExperimentConfig
 from vertax.runs._errors import RunFolderError, UnfinishedRunError
-from vertax.runs._figures import FIGURE_FORMATS, checked_formats, write_figure
-from vertax.runs._summary import plain
+from vertax.runs._figures import checked_formats, write_figure
+from vertax.runs._summary import plain, safe, sentence
 from vertax.runs._tables import histories, history_columns
 from vertax.runs._versions import installed_version
 
@@ -32,11 +34,6 @@ with needing("run", "The folder of a run"):
     from matplotlib.figure import Figure
 
 Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
-
-CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
-_FIGURES = tuple(f"figures/*.{ending}" for ending in FIGURE_FORMATS)
-# What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
-_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", *_FIGURES, f"{PARTS}/*.npz")
 
 
 class RunFolder:
@@ -58,12 +55,15 @@ class RunFolder:
 
     path: Path
     figure_formats: tuple[str, ...]
+    talkative: bool
+    """Whether `say` says it."""
     interrupted: bool
     """Whether an interrupt from the keyboard ended a fit of this run: no other one begins."""
 
     def __init__(self, path: str | os.PathLike[str], *, figures: Sequence[str] = ("png",)):
         self.path = Path(path)
         self.figure_formats = checked_formats(figures)
+        self.talkative = False
         self.interrupted = False
         self._warnings: dict[str, list[str]] = {}
 
@@ -95,23 +95,7 @@ class RunFolder:
             overwritten is not the folder of a run, if a file is in the way, or for another format.
         """
         figures = checked_formats(figures)  # before anything is made or cleared
-        try:
-            if output is None and not overwrite:
-                return cls(_numbered(Path(root) / name), figures=figures)
-            folder = Path(root) / name if output is None else Path(output)
-            folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.iterdir()):
-                if not overwrite:
-                    raise RunFolderError(
-                        f"The folder {folder} is not empty. Choose another with --output, or pass "
-                        "--overwrite to replace the run in it."
-                    )
-                _clear(folder)
-        except (FileExistsError, NotADirectoryError) as error:
-            raise RunFolderError(
-                f"Cannot use {error.filename} as a folder: there is a file of that name."
-            ) from None
-        return cls(folder, figures=figures)
+        return cls(claimed(Path(root) / name, output, overwrite), figures=figures)
 
     @classmethod
     def existing(cls, path: str | os.PathLike[str]) -> RunFolder:
@@ -127,15 +111,7 @@ class RunFolder:
 
         - `RunFolderError` if there is no such folder, or if it is not that of a run.
         """
-        folder = Path(path)
-        if not folder.is_dir():
-            what = "it is a file" if folder.exists() else "there is none"
-            raise RunFolderError(f"{folder} is not the folder of a run: {what}.")
-        if not (folder / CONFIG).is_file():
-            raise RunFolderError(
-                f"{folder} is not the folder of a run: there is no {CONFIG} in it, which a run writes first."
-            )
-        return cls(folder)
+        return cls(existing(path))
 
     @classmethod
     def unfinished(
@@ -160,26 +136,17 @@ class RunFolder:
         - `RunFolderError` if it is not the folder of a run, if the run is finished, if its
             configuration is another one, or for another format.
         """
-        run = cls(cls.existing(path).path, figures=figures)
-        if (run.path / METRICS).exists():
-            raise RunFolderError(
-                f"The run in {run.path} is finished: there is nothing to resume. To see what it found: "
-                f"vertax show {run.path}"
-            )
-        earlier = read_toml(run.path / CONFIG)
-        if earlier.get("experiment") != (config.model_dump().get("experiment")):
-            raise RunFolderError(
-                f"The run in {run.path} is one of the experiment {earlier.get('experiment')!r}. Give its "
-                f"own configuration: vertax run {run.path / CONFIG} --resume {run.path}"
-            )
-        then = validate(type(config), earlier, str(run.path / CONFIG))
-        if then != config:
-            changed = _changes(then.model_dump(mode="json"), config.model_dump(mode="json"))
-            raise RunFolderError(
-                f"The run in {run.path} has another configuration: {'; '.join(changed)}. Give its own, "
-                f"vertax run {run.path / CONFIG} --resume {run.path}, or begin a new run without --resume."
-            )
-        return run
+        return cls(unfinished(path, config), figures=figures)
+
+    def say(self, what: str) -> None:
+        """Tell on the terminal what the run is at, if it is to tell (`vertax run` without `--quiet`).
+
+        **Arguments:**
+
+        - `what`: a few words, said before what takes longer than a second or two.
+        """
+        if self.talkative:
+            tqdm.write(f"  {what} …", file=sys.stderr)  # above the bars
 
     def fit(
         self,
@@ -220,6 +187,8 @@ class RunFolder:
 
         if self.interrupted:
             raise KeyboardInterrupt
+        if options.get("progress", True):  # fits side by side have a bar of their own
+            self.say(f"fit: {name}")
         checkpoint = Checkpoint(self._part(name))
         try:
             outcome = fit(
@@ -250,7 +219,7 @@ class RunFolder:
             )
 
     def _save_failed(self, name: str, outcome: Fit[Any]) -> None:
-        ending = _safe(name)
+        ending = safe(name)
         if outcome.history.cost.ndim == 1:
             self.save_table(f"history_{ending}", history_columns(outcome.history))
             self.save_tissue(f"fitted_{ending}", outcome.tissue)
@@ -272,7 +241,7 @@ class RunFolder:
     @property
     def warnings(self) -> list[str]:
         """What was noted by `warn`, one sentence each."""
-        return [_sentence(text, sorted(whom)) for text, whom in self._warnings.items()]
+        return [sentence(text, sorted(whom)) for text, whom in self._warnings.items()]
 
     def part(
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
@@ -288,6 +257,7 @@ class RunFolder:
         """
         file = self._part(name)
         if not file.exists():
+            self.say(name)
             write_archive(file, "part", 1, compute())
         arrays = read_archive(file, "part", 1)
         return {key: array for key, array in arrays.items() if key not in ("format", "version")}
@@ -309,7 +279,7 @@ class RunFolder:
     def _part(self, name: str) -> Path:
         folder = self.path / PARTS
         folder.mkdir(exist_ok=True)
-        return folder / f"{_safe(name)}.npz"
+        return folder / f"{safe(name)}.npz"
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Write the resolved configuration, with every default spelled out.
@@ -424,51 +394,4 @@ class RunFolder:
 
         **Returns:** their paths, sorted by name.
         """
-        return sorted(file for pattern in _FIGURES for file in self.path.glob(pattern))
-
-
-def _safe(name: str) -> str:
-    """A name as a part of the name of a file."""
-    return re.sub("[^0-9A-Za-z.-]+", "_", name)
-
-
-def _sentence(text: str, whom: Sequence[str]) -> str:
-    shown = ", ".join(whom[:3]) + (f" and {len(whom) - 3} more" if len(whom) > 3 else "")
-    return f"{shown}: {text}." if whom else f"{text[:1].upper()}{text[1:]}."
-
-
-def _numbered(path: Path) -> Path:
-    """The first of path, path-2, path-3, … that is free, made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    number = 1
-    while True:
-        folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-        try:
-            folder.mkdir()  # refuses an existing one: two runs at a time get two folders
-            return folder
-        except FileExistsError:
-            if folder.is_dir() and not any(folder.iterdir()):
-                return folder
-        number += 1
-
-
-def _clear(folder: Path) -> None:
-    """Remove the files of an earlier run, and nothing else."""
-    # Whoever points at the wrong folder must not lose it.
-    if not (folder / CONFIG).is_file():
-        raise RunFolderError(
-            f"The folder {folder} is not empty and holds no run (no {CONFIG}), so it is not "
-            "overwritten."
-        )
-    for pattern in _LEFTOVERS:
-        for file in folder.glob(pattern):
-            file.unlink()
-
-
-def _changes(then: Any, now: Any, name: str = "") -> list[str]:
-    """What differs between two configurations, in words."""
-    if isinstance(then, Mapping) and isinstance(now, Mapping):
-        keys = dict.fromkeys([*then, *now])
-        inside = lambda key: f"{name}.{key}" if name else key
-        return [c for k in keys for c in _changes(then.get(k), now.get(k), inside(k))]
-    return [] if then == now else [f"`{name}` was {then!r} and is {now!r}"]
+        return sorted(file for pattern in FIGURES for file in self.path.glob(pattern))

@@ -122,9 +122,9 @@ def run(
 ) -> None:
     """Run the experiment that a configuration file describes."""
     import jax
-    import matplotlib
 
     from vertax import FitError
+    from vertax._base.extras import needing
     from vertax.runs import (
         ConfigError,
         RunFolder,
@@ -136,6 +136,8 @@ def run(
 
     folder: RunFolder | None = None
     formats = tuple(figures or ("png",))
+    with needing("run", "A run"):
+        import matplotlib
     # Figures go to files only, also where there is a screen.
     matplotlib.use("Agg")
     try:
@@ -155,6 +157,7 @@ def run(
             folder = RunFolder.unfinished(resume, settings, figures=formats)
         if not quiet:
             typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
+        folder.talkative = not quiet
         metrics = experiment.run(settings, folder, progress=not quiet)
         if folder.interrupted:
             raise KeyboardInterrupt
@@ -172,10 +175,10 @@ def run(
         if debug:
             raise
         _stop(error, FAILURE)
-    except ImportError as error:
-        if debug or "pip install" not in str(error):
+    except (MemoryError, OverflowError) as error:
+        if debug:
             raise
-        _stop(error, FAILURE)
+        _stop(f"The run is too large for this machine ({error}). Make it smaller.", FAILURE)
     if not quiet:
         typer.echo(summary(metrics))
         _warn(folder.warnings)
@@ -232,6 +235,6 @@ def _interrupted(config: Path, overrides: Iterable[str], folder: RunFolder | Non
     return f"Interrupted. What there is lies in {folder.path}. To go on: {command}"
 
 
-def _stop(error: Exception, code: int) -> NoReturn:
+def _stop(error: Exception | str, code: int) -> NoReturn:
     typer.echo(f"Error: {error}", err=True)
     raise typer.Exit(code)
