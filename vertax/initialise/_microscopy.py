@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Array, Int, Shaped
 
+from vertax._base.checks import check_concrete
 from vertax.initialise._labels import Segmentation, check_options, from_labels
 from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
 
@@ -43,15 +44,21 @@ def from_microscopy(
         finds fewer than two cells; and as `from_labels` does.
     - `ImportError` if what the segmenter needs is not installed.
     """
+    check_concrete("from_microscopy", image, pixel_size)
     check_options(boundary, pixel_size)
     pixels = check_image(image)
     segmenter = Watershed() if segmenter is None else segmenter
+    if not callable(segmenter) or isinstance(segmenter, type):
+        raise TypeError(
+            "Argument `segmenter` must be a segmenter, such as Watershed(), or a function from an image to "
+            f"its labels, but is {segmenter!r}."
+        )
     segment = _segment_periodic if boundary == "periodic" else _segment
     labels = segment(pixels, segmenter)
     n_cells = len(np.unique(labels[labels > 0]))
     if n_cells < 2:
         raise ValueError(
-            f"Argument `image` must show at least two cells, but {type(segmenter).__name__} found "
+            f"Argument `image` must show at least two cells, but {_name(segmenter)} found "
             f"{n_cells}. Check that membranes are bright on dark cells, and that the segmenter "
             "knows the size of the cells."
         )
@@ -59,8 +66,13 @@ def from_microscopy(
         return from_labels(labels, boundary=boundary, pixel_size=pixel_size, softening=softening)
     except ValueError as error:
         raise ValueError(
-            f"The labels that {type(segmenter).__name__} found in `image` make no tissue. {error}"
+            f"The labels that {_name(segmenter)} found in `image` make no tissue. {error}"
         ) from error
+
+
+def _name(segmenter: AbstractSegmenter) -> str:
+    """What messages call it; a segmenter of one's own may be a function."""
+    return getattr(segmenter, "__name__", type(segmenter).__name__)
 
 
 def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray, "rows columns"]:
@@ -68,7 +80,7 @@ def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray,
     if labels.shape != image.shape or labels.dtype.kind not in "iu":
         raise ValueError(
             f"Argument `segmenter` must return an integer label for each pixel, shape "
-            f"{image.shape}, but {type(segmenter).__name__} returned {labels.dtype} of shape "
+            f"{image.shape}, but {_name(segmenter)} returned {labels.dtype} of shape "
             f"{labels.shape}."
         )
     return labels
