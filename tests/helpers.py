@@ -1,6 +1,8 @@
 """Shared by the tests: tissues, the list of solvers, finite differences."""
 
+import contextlib
 import functools
+import logging
 
 import equinox as eqx
 import jax
@@ -23,6 +25,24 @@ SOLVERS = [
     ("optimistix_bfgs", optx.BFGS(rtol=0.0, atol=0.0), 1e-6),
     ("optimistix_nonlinear_cg", optx.NonlinearCG(rtol=0.0, atol=0.0), 1e-5),
 ]
+
+
+@contextlib.contextmanager
+def counted_compilations(names: list[str]):
+    """Adds the name of each function that XLA compiles meanwhile."""
+    logger = logging.getLogger("jax._src.interpreters.pxla")
+    handler = logging.Handler()
+    handler.emit = lambda record: names.append(record.getMessage().split()[1])
+    level, propagates = logger.level, logger.propagate
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+        logger.propagate = propagates
 
 
 def random_tissue(n_cells: int, seed: int = 0, **options) -> vx.Tissue:

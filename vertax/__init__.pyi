@@ -26,6 +26,7 @@ from .energies import (
 )
 from .fitting import (
     Checkpoint as Checkpoint,
+    Evaluation as Evaluation,
     Fit as Fit,
     FitError as FitError,
     History as History,
@@ -49,6 +50,11 @@ from .plotting import (
     plot_recovery as plot_recovery,
     plot_tissue as plot_tissue,
 )
-from .responses import Equilibrium as Equilibrium, equilibrate as equilibrate
+from .responses import (
+    AbstractResponse as AbstractResponse,
+    Equilibrium as Equilibrium,
+    Relaxation as Relaxation,
+    equilibrate as equilibrate,
+)
 from .solvers import MINRES as MINRES
 from .transitions import T1 as T1, AbstractTransitions as AbstractTransitions

@@ -185,8 +185,11 @@ def test_a_gradient_through_the_equilibrium_free():
 
 
 def _check_hypergradient(tissue, start, cost):
-    problem = vx.InverseProblem(tissue, start, cost, transitions=None, tolerance=1e-11)
-    _, _, (gradient, _), outcome = eqx.filter_jit(lambda p: p.value_and_gradient())(problem)
+    problem = vx.InverseProblem(
+        tissue, start, cost, response=vx.Relaxation(transitions=None, tolerance=1e-11)
+    )
+    evaluation = eqx.filter_jit(lambda p: p.value_and_gradient())(problem)
+    gradient, outcome = evaluation.gradient, evaluation.outcome
     assert outcome.trusted
     parameters, constants = eqx.partition(start, eqx.is_inexact_array)
     direction = random_like(parameters)

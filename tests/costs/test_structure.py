@@ -180,11 +180,10 @@ def test_the_structural_cost_has_a_useful_derivative_for_all_adjoints(adjoint, a
     tissue, own = relaxed(12, 3)
     cost = IndexAwareStructural(random_tissue(12, 5))
     momentum = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
-    solver = momentum if adjoint.unrolls else None
-    problem = vx.InverseProblem(
-        tissue, own, cost, adjoint=adjoint, solver=solver, transitions=None, max_steps=20_000
-    )
-    _, _, (gradient, _), _ = eqx.filter_jit(problem.value_and_gradient)()
+    solver = momentum if adjoint.unrolls else vx.solvers.NewtonCG()
+    response = vx.Relaxation(solver, transitions=None, max_steps=20_000)
+    problem = vx.InverseProblem(tissue, own, cost, response=response, adjoint=adjoint)
+    gradient = eqx.filter_jit(problem.value_and_gradient)().gradient
     expected = dense_hypergradient(tissue, own, cost)
     error = np.linalg.norm(p0_of(gradient) - expected) / np.linalg.norm(expected)
     assert error < accuracy
@@ -295,7 +294,12 @@ def test_gradients_under_guidance(crossing, adjoint):
     tissue = vx.equilibrate(target, problem.energy, transitions=None).tissue
     cost = CentroidDistance(target)
     problem = vx.InverseProblem(
-        tissue, problem.energy, cost, adjoint=adjoint, transitions=None, guidance=3.0
+        tissue,
+        problem.energy,
+        cost,
+        response=vx.Relaxation(transitions=None),
+        adjoint=adjoint,
+        guidance=3.0,
     )
     value = eqx.filter_jit(lambda p0: problem(vx.energies.ShapeFactorEnergy(p0))[0])
     p0 = p0_of(problem.energy)
@@ -305,7 +309,8 @@ def test_gradients_under_guidance(crossing, adjoint):
     accuracy = 1e-5 if isinstance(adjoint, vx.ImplicitDifferentiation) else 1e-3
     assert slope == pytest.approx(expected, rel=accuracy)
     # Guided, the tissue comes closer than of itself.
-    free = vx.InverseProblem(tissue, problem.energy, cost, transitions=None)
+    still = vx.Relaxation(transitions=None)
+    free = vx.InverseProblem(tissue, problem.energy, cost, response=still)
     assert value(p0) < 0.9 * float(free()[0])
 
 

@@ -129,7 +129,9 @@ def test_a_short_fit_is_written_once(path, monkeypatch):
 
 OTHERS = {
     "with another optimiser": {"optimiser": optax.adam(2e-2)},
-    "sizes.*: the default and not max_steps=300": {"problem": problem_of(max_steps=300)[0]},
+    "sizes.*max_steps=2000 and not max_steps=300": {
+        "problem": problem_of(response=vx.Relaxation(max_steps=300))[0]
+    },
     "numbers in its arrays": {"problem": problem_of(2)[0]},
     "another `guidance`: nan and not 10.0 in epoch 0": {"guidance": kappa},
     "sizes, classes or settings": {"truth": None},

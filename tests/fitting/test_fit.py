@@ -288,11 +288,7 @@ def test_the_protocol_of_the_paper(hidden):
         start,
         guess,
         VertexDistance(target),
-        solver=vx.solvers.GradientDescent(1e-2),
-        transitions=vx.T1(5e-3),
-        tolerance=1e-3,
-        patience=10,
-        max_steps=1000,
+        response=vx.Relaxation(vx.solvers.GradientDescent(1e-2), vx.T1(5e-3), 1e-3, 10, 1000),
     )
     fit = vx.fit(problem, optax.nadam(1e-3), 60, truth=truth, progress=False)
     assert fit.history.relative_error[-1] < fit.history.relative_error[0]
@@ -330,7 +326,9 @@ def test_an_interrupt_ends_a_least_squares_fit_too(hidden):
 
 def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):
     target, _, guess, start = hidden
-    problem = vx.InverseProblem(start, guess, VertexDistance(target), max_steps=300)
+    problem = vx.InverseProblem(
+        start, guess, VertexDistance(target), response=vx.Relaxation(max_steps=300)
+    )
     with pytest.raises(vx.FitError, match=r"not finite|broke down") as error:
         vx.fit(problem, optax.sgd(1e300), 20, progress=False)
     assert error.value.fit is not None
@@ -340,7 +338,9 @@ def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):
 
 def test_a_fit_without_any_equilibrium_is_an_error(hidden):
     target, _, guess, _ = hidden
-    problem = vx.InverseProblem(random_tissue(10, 8), guess, VertexDistance(target), max_steps=1)
+    problem = vx.InverseProblem(
+        random_tissue(10, 8), guess, VertexDistance(target), response=vx.Relaxation(max_steps=1)
+    )
     with pytest.raises(vx.FitError, match="No epoch of the fit reached equilibrium"):
         vx.fit(problem, optax.adam(1e-9), 2, progress=False)
 

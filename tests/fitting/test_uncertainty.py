@@ -21,7 +21,9 @@ def hidden():
 
 
 def fitted(tissue, energy, cost, **options):
-    problem = vx.InverseProblem(tissue, energy, cost, transitions=None, **options)
+    problem = vx.InverseProblem(
+        tissue, energy, cost, response=vx.Relaxation(transitions=None), **options
+    )
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
     return problem, vx.fit(problem, solver, 15, progress=False)
 
@@ -41,7 +43,9 @@ def test_it_is_the_scatter_of_repeated_fits(hidden):
 
     keys = jax.random.split(jax.random.key(0), 60)
     problems = eqx.filter_vmap(
-        lambda key: vx.InverseProblem(tissue, truth, once(key), transitions=None),
+        lambda key: vx.InverseProblem(
+            tissue, truth, once(key), response=vx.Relaxation(transitions=None)
+        ),
         out_axes=eqx.if_array(0),
     )(keys)
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
@@ -93,7 +97,9 @@ class OneNumber(vx.costs.AbstractLeastSquaresCost):
 def test_it_names_what_the_data_do_not_determine(hidden, noise):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + noise * jax.random.normal(jax.random.key(0), (20,))
-    problem = vx.InverseProblem(tissue, truth, OneNumber(measured), transitions=None)
+    problem = vx.InverseProblem(
+        tissue, truth, OneNumber(measured), response=vx.Relaxation(transitions=None)
+    )
     fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
     alone = vx.uncertainty(problem, fit)
     assert int(jnp.sum(jnp.isinf(alone.deviations))) == 7
@@ -126,7 +132,9 @@ def _slope(problem, fit):
 def test_a_position_that_the_cost_does_not_see_makes_no_difference(hidden):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + 0.1 * jax.random.normal(jax.random.key(0), (20,))
-    problem = vx.InverseProblem(tissue, truth, OneNumber(measured), transitions=None)
+    problem = vx.InverseProblem(
+        tissue, truth, OneNumber(measured), response=vx.Relaxation(transitions=None)
+    )
     fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
     moving = dataclasses.replace(problem, fit_position=True)
     still, moved = (vx.uncertainty(p, fit, prior=0.3) for p in (problem, moving))
@@ -138,7 +146,9 @@ def test_a_position_that_the_cost_does_not_see_makes_no_difference(hidden):
 
 def test_data_without_noise_leave_nothing_open(hidden):
     tissue, truth = hidden
-    problem = vx.InverseProblem(tissue, truth, OneNumber(jnp.full(20, 3.6)), transitions=None)
+    problem = vx.InverseProblem(
+        tissue, truth, OneNumber(jnp.full(20, 3.6)), response=vx.Relaxation(transitions=None)
+    )
     fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
     exact = eqx.tree_at(
         lambda p: p.cost.wanted,
@@ -158,14 +168,17 @@ def test_a_fitted_position_adds_to_the_uncertainty(hidden):
     image = image + 0.05 * image.max() * np.random.default_rng(0).normal(size=image.shape)
     cost = MeshImage(image, width)
     fit = vx.fit(
-        vx.InverseProblem(tissue, truth, cost, transitions=None),
+        vx.InverseProblem(tissue, truth, cost, response=vx.Relaxation(transitions=None)),
         optax.adam(1e-3),
         2,
         progress=False,
     )
     known, unknown = (
         vx.uncertainty(
-            vx.InverseProblem(tissue, truth, cost, transitions=None, fit_position=moves), fit
+            vx.InverseProblem(
+                tissue, truth, cost, response=vx.Relaxation(transitions=None), fit_position=moves
+            ),
+            fit,
         )
         for moves in (False, True)
     )

@@ -46,8 +46,8 @@ def test_a_shape_that_no_tensions_hold_is_met_as_well_as_can_be(foam):
     )
     made = tension_problem(found)
     problem, guess = made.problem, made.balanced
-    value = eqx.filter_jit(lambda e: problem.value_and_gradient(e, seen, jnp.zeros(2))[0])
-    gradient = eqx.filter_jit(lambda e: problem.value_and_gradient(e, seen, jnp.zeros(2))[2][0])
+    value = eqx.filter_jit(lambda e: problem.value_and_gradient(e, seen, jnp.zeros(2)).cost)
+    gradient = eqx.filter_jit(lambda e: problem.value_and_gradient(e, seen, jnp.zeros(2)).gradient)
     slope = gradient(guess)
     size = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
     downhill = jax.tree.map(lambda x: -0.02 * x / size, slope)

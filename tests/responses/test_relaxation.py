@@ -5,7 +5,14 @@ import numpy as np
 import optimistix as optx
 import pytest
 from free_helpers import cluster
-from helpers import SOLVERS, dense_hessian, random_tissue, relaxed, shape_factors
+from helpers import (
+    SOLVERS,
+    counted_compilations,
+    dense_hessian,
+    random_tissue,
+    relaxed,
+    shape_factors,
+)
 
 import vertax as vx
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
@@ -92,19 +99,46 @@ def test_equilibrium_does_not_depend_on_where_the_box_is():
     np.testing.assert_allclose(a.tissue.areas, b.tissue.areas, atol=1e-7)
 
 
-def test_units_do_not_matter():
-    # The same physics in micrometres and with another unit of energy.
-    tissue = random_tissue(20, 3)
-    scale = 37.0
-    large = vx.initialise.periodic_voronoi(
-        20, key=jax.random.key(3), lattice=scale * tissue.boundary.lattice
-    )
-    p0 = shape_factors(20, 3.7, 0.1)
-    a = vx.equilibrate(tissue, ShapeFactorEnergy(p0))
-    b = vx.equilibrate(
-        large, ShapeFactorEnergy(p0, scale**2), transitions=vx.T1(0.02 * scale), tolerance=1e-10
-    )
-    np.testing.assert_allclose(b.tissue.areas, scale**2 * a.tissue.areas, rtol=1e-6)
+class Scaled(vx.AbstractEnergy):
+    """An energy in another unit."""
+
+    energy: vx.AbstractEnergy
+    unit: float
+
+    def __call__(self, tissue):
+        return self.unit * self.energy(tissue)
+
+
+@pytest.mark.parametrize(
+    "solver", [vx.solvers.NewtonCG(), vx.solvers.FIRE()], ids=["newton", "fire"]
+)
+def test_units_do_not_matter(solver):
+    # The same physics in cells, in micrometres and in pixels, with all defaults and any unit of energy.
+    tissue, p0 = random_tissue(20, 3), shape_factors(20, 3.7, 0.1)
+    relax = lambda tissue, energy: vx.equilibrate(tissue, energy, solver=solver)
+    a = relax(tissue, ShapeFactorEnergy(p0))
+    for scale, unit in ((37.0, 1.0), (0.01, 1e8), (1.0, 1e-9)):
+        lattice = scale * tissue.boundary.lattice
+        other = vx.initialise.periodic_voronoi(20, key=jax.random.key(3), lattice=lattice)
+        b = relax(other, Scaled(ShapeFactorEnergy(p0, scale**2), unit))
+        np.testing.assert_allclose(b.tissue.areas, scale**2 * a.tissue.areas, rtol=1e-6)
+        assert abs(int(b.num_steps) - int(a.num_steps)) <= 0.1 * a.num_steps + 1
+
+
+def test_what_is_a_number_compiles_once():
+    tissue = random_tissue(12, 0)
+
+    def relax(p0: float, tolerance: float, max_steps: int, threshold: float):
+        rule = vx.T1(threshold)
+        settings = {"tolerance": tolerance, "max_steps": max_steps, "transitions": rule}
+        return vx.equilibrate(tissue, ShapeFactorEnergy(p0), **settings)
+
+    compiled = []
+    relax(3.7, 1e-8, 1000, 0.02)
+    with counted_compilations(compiled):
+        assert relax(3.71, 1e-9, 1001, 0.03).converged
+        assert relax(3.72, 1e-7, 500, 0.01).converged
+    assert not compiled
 
 
 def test_patience_counts_consecutive_steps():
@@ -133,8 +167,10 @@ def test_the_protocol_of_the_paper_runs_and_says_that_it_did_not_converge():
 
 def test_no_convergence_is_an_error_by_default_and_a_result_otherwise():
     tissue, energy = random_tissue(12, 0), ShapeFactorEnergy(3.7)
-    with pytest.raises(Exception, match="maximum number of steps"):
-        vx.equilibrate(tissue, energy, max_steps=2).energy.block_until_ready()
+    with pytest.raises(Exception, match="no equilibrium in 2 steps"):
+        vx.equilibrate(tissue, energy, max_steps=2)
+    with pytest.raises(Exception, match="reached no equilibrium"):
+        jax.jit(lambda t: vx.equilibrate(t, energy, max_steps=2).energy)(tissue).block_until_ready()
     found = vx.equilibrate(tissue, energy, max_steps=2, throw=False)
     assert not found.converged
     assert found.num_steps == 2

@@ -1,13 +1,16 @@
-"""Small tools used in several rooms; the only place that reaches around other libraries' habits."""
+"""What makes modules pleasant to use: properties that compile as one, numbers that compile once."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.core
+import jax.numpy as jnp
+
+Tree = TypeVar("Tree", bound=Any)
 
 if TYPE_CHECKING:
     compiled_property = property  # so that type checkers see the type of each property
@@ -29,6 +32,23 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
-def without_addresses(text: str) -> str:
-    """A text in which no address of an object in memory is left, so that two processes write the same."""
-    return re.sub(r" at 0x[0-9a-f]+", "", text)
+def differs_between_devices(array: jax.Array) -> bool:
+    """Whether `jax.shard_map` keeps track of an array as one that differs from device to device."""
+    kind = jax.typeof(array)
+    newer = getattr(getattr(kind, "mat", None), "varying", None)  # as of JAX 0.10
+    return bool(newer or getattr(kind, "vma", None))
+
+
+def traced(tree: Tree, *, integers: bool = False) -> Tree:
+    """The same pytree with its Python floats (and integers) as arrays.
+
+    `equinox.filter_jit` takes numbers that are no arrays for a part of the program, and compiles another
+    one for each. These arrays keep the precision of what they are combined with, as Python numbers do.
+    """
+
+    def convert(x: Any) -> Any:
+        if isinstance(x, float) or (integers and isinstance(x, int) and not isinstance(x, bool)):
+            return jnp.asarray(x)
+        return x
+
+    return jax.tree.map(convert, tree)

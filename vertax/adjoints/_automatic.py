@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from vertax._base.optimistix import Minimisation
 from vertax.adjoints._adjoint import (
     AbstractAdjoint,
     GradientOutcome,
@@ -75,26 +74,17 @@ class AutomaticDifferentiation(AbstractAdjoint):
         inputs: PyTree,
         tags: frozenset[object],
     ) -> PyTree[Any]:
-        fn, _, _, args, options, *rest = inputs
-        if not {"relaxation", "start"} <= options.keys():
+        minimisation = Minimisation.of(primal_fn, inputs)
+        if not {"relaxation", "start", "max_steps"} <= minimisation.options.keys():
             raise TypeError(
                 "AutomaticDifferentiation differentiates the relaxations of vertax.equilibrate."
             )
-        loop = partial(eqxi.while_loop, kind="lax")
-        root, residual = frozen(primal_fn((*frozen(inputs), loop)))
-        loop = partial(eqxi.while_loop, kind="checkpointed", checkpoints=self.checkpoints)
-        minimise = partial(_minimise, primal_fn, loop)
-        vjp_arg = (fn, args, self.outcome)
-        others = frozen((options, rest))
-        return _unroll(vjp_arg, root, others, self.without_outcome(), minimise), residual
+        root, residual = frozen(frozen(minimisation).run())
+        vjp_arg = (minimisation.fn, minimisation.args, self.outcome)
+        others = frozen(minimisation.but(fn=None, args=None))
+        return _unroll(vjp_arg, root, others, self.without_outcome()), residual
 
-    def _rehearse(
-        self,
-        fn: Callable,
-        args: PyTree,
-        options: dict[str, Any],
-        max_steps: int,
-    ) -> GradientOutcome:
+    def _rehearse(self, fn: Callable, args: PyTree, options: dict[str, Any]) -> GradientOutcome:
         """How many steps it takes until the position and its derivative are at rest."""
         # The gradient that a solver keeps in its state is g(X_n, θ). Its derivative along a direction of
         # θ, H dX_n/dθ + ∂g/∂θ, is what is left of the linear system that the derivative solves.
@@ -126,7 +116,7 @@ class AutomaticDifferentiation(AbstractAdjoint):
             _, state = eqx.combine(floats, arrays, static)
             settled = relaxation.at_rest(state) & (residual(tangents) <= rtol * initial)
             finite = jnp.isfinite(state.force) & jnp.isfinite(residual(tangents))
-            return ~settled & finite & (state.num_steps < max_steps)
+            return ~settled & finite & (state.num_steps < options["max_steps"])
 
         def body(carry: tuple) -> tuple:
             floats, tangents, arrays = carry
@@ -158,25 +148,12 @@ def _random_direction(parameters: PyTree[Array]) -> PyTree[Array]:
     return jax.tree.unflatten(structure, [draw(*pair) for pair in zip(keys, leaves, strict=False)])
 
 
-def _minimise(
-    primal_fn: Callable,
-    loop: Callable,
-    fn: Any,
-    args: Any,
-    options: dict[str, Any],
-    rest: list[Any],
-) -> PyTree[Array]:
-    inputs = (fn, options["relaxation"], options["start"], args, options, *rest, loop)
-    return primal_fn(inputs)[0]
-
-
 @eqx.filter_custom_vjp
 def _unroll(
     vjp_arg: tuple[Any, Any, GradientOutcome | None],
     root: PyTree[Array],
-    others: tuple,
+    others: Minimisation,
     adjoint: AutomaticDifferentiation,
-    minimise: Callable,
 ) -> PyTree[Array]:
     # Who does not differentiate needs no second run.
     return root
@@ -187,16 +164,25 @@ def _(
     perturbed: Any,
     vjp_arg: Any,
     root: PyTree[Array],
-    others: tuple,
+    others: Minimisation,
     adjoint: AutomaticDifferentiation,
-    minimise: Callable,
 ) -> tuple:
     fn, args, _ = vjp_arg
-    options, rest = others
-    outcome = adjoint._rehearse(fn, args, options, rest[0])
-    options = options | {"num_steps": outcome.num_steps}
+    options = others.options
+    outcome = adjoint._rehearse(fn, args, options)
+    unrolled = others.but(
+        solver=options["relaxation"],
+        y0=options["start"],
+        options=options | {"num_steps": outcome.num_steps},
+    )
     moving, fixed = differentiable((fn, args))
-    root, pull = jax.vjp(lambda m: minimise(*eqx.combine(m, fixed), options, rest), moving)
+
+    def minimum(moving: PyTree) -> PyTree[Array]:
+        fn, args = eqx.combine(moving, fixed)
+        steps = unrolled.but(fn=fn, args=args)
+        return steps.run("checkpointed", checkpoints=adjoint.checkpoints)[0]
+
+    root, pull = jax.vjp(minimum, moving)
     return root, (pull, outcome)
 
 
@@ -207,9 +193,8 @@ def _(
     perturbed: Any,
     vjp_arg: Any,
     root: PyTree[Array],
-    others: tuple,
+    others: Minimisation,
     adjoint: AutomaticDifferentiation,
-    minimise: Callable,
 ) -> Any:
     *_, slot = vjp_arg
     pull, outcome = residuals

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Literal, cast
 
 import equinox as eqx
@@ -14,6 +13,7 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from vertax._base.optimistix import Minimisation
 from vertax.adjoints._adjoint import (
     AbstractAdjoint,
     GradientOutcome,
@@ -68,8 +68,7 @@ class ImplicitDifferentiation(AbstractAdjoint):
         inputs: PyTree,
         tags: frozenset[object],
     ) -> PyTree[Any]:
-        loop = partial(eqxi.while_loop, kind="lax")
-        root, residual = primal_fn((*frozen(inputs), loop))
+        root, residual = frozen(Minimisation.of(primal_fn, inputs)).run()
         root, residual = frozen(root), jax.tree.map(eqxi.nondifferentiable_backward, residual)
         adjoint = cast(ImplicitDifferentiation, self.without_outcome())
         system = _System(adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag})

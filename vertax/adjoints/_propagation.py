@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.optimistix import Minimisation, steps_of
 from vertax.adjoints._adjoint import (
     AbstractAdjoint,
     GradientOutcome,
@@ -79,14 +79,11 @@ class EquilibriumPropagation(AbstractAdjoint):
         inputs: PyTree,
         tags: frozenset[object],
     ) -> PyTree[Any]:
-        fn, solver, y0, args, options, *rest = inputs
-        loop = partial(eqxi.while_loop, kind="lax")
-        others = frozen((solver, y0, options, rest))
-        minimise = partial(_minimise, primal_fn, loop)
-        root, residual = minimise(frozen(fn), frozen(args), *others)
-        root, residual = frozen((root, residual))
-        vjp_arg = (fn, args, self.outcome)
-        return _propagate(vjp_arg, root, others, self.without_outcome(), minimise), residual
+        minimisation = Minimisation.of(primal_fn, inputs)
+        root, residual = frozen(frozen(minimisation).run())
+        vjp_arg = (minimisation.fn, minimisation.args, self.outcome)
+        others = frozen(minimisation.but(fn=None, args=None))
+        return _propagate(vjp_arg, root, others, self.without_outcome()), residual
 
     def strength(
         self, beta: float | Float[Array, ""] | None, options: dict[str, Any], dtype: Any
@@ -110,19 +107,6 @@ class EquilibriumPropagation(AbstractAdjoint):
         return (1.0, -1.0) if self.centred else (1.0, 0.0)
 
 
-def _minimise(
-    primal_fn: Callable,
-    loop: Callable,
-    fn: Any,
-    args: Any,
-    solver: Any,
-    y0: Any,
-    options: Any,
-    rest: Any,
-) -> tuple[PyTree[Array], PyTree]:
-    return primal_fn((fn, solver, y0, args, options, *rest, loop))
-
-
 class _Nudged(eqx.Module):
     """An objective with a constant force on every degree of freedom."""
 
@@ -139,9 +123,8 @@ class _Nudged(eqx.Module):
 def _propagate(
     vjp_arg: tuple[Any, Any, GradientOutcome | None],
     root: PyTree[Array],
-    others: tuple,
+    others: Minimisation,
     adjoint: EquilibriumPropagation,
-    minimise: Callable,
 ) -> PyTree[Array]:
     return root
 
@@ -158,21 +141,22 @@ def _(
     perturbed: Any,
     vjp_arg: Any,
     root: PyTree[Array],
-    others: tuple,
+    others: Minimisation,
     adjoint: EquilibriumPropagation,
-    minimise: Callable,
 ) -> Any:
     fn, args, slot = vjp_arg
-    solver, _, options, rest = others
+    options = others.options
     cotangent = materialise(cotangent, root)
     size = optx.max_norm(cotangent)
     force = optax.tree.scale(1 / jnp.where(size > 0, size, 1), cotangent)
     strength = adjoint.strength(adjoint.beta, options, size.dtype)
     # The solver of an equilibrium that is known takes no step; the relaxation that found it does.
-    solver = options.get("relaxation", solver)
+    solver = options.get("relaxation", others.solver)
     coarsest = options.get("tolerance", jnp.inf)
     tolerance = jnp.minimum(coarsest, adjoint.tolerance(strength))
-    options = options | {"tolerance": tolerance}
+    nudge = others.but(
+        solver=solver, y0=root, args=args, options=options | {"tolerance": tolerance}
+    )
 
     moving, fixed = differentiable((fn, args))
 
@@ -185,9 +169,9 @@ def _(
 
     def phase(sign: Array) -> tuple[PyTree[Array], Array, Array]:
         nudged = _Nudged(fn, force, sign * strength)
-        y, (num_steps, *_) = minimise(nudged, args, solver, root, options, rest)
+        y, residual = nudge.but(fn=nudged).run()
         left = optx.max_norm(jax.grad(lambda y: nudged(y, args)[0])(y))
-        return slope(y), left, num_steps
+        return slope(y), left, steps_of(residual)
 
     # One phase is a batch of the two signs. A one-sided difference needs no second relaxation.
     signs = jnp.asarray([s for s in adjoint.signs if s != 0], size.dtype)
@@ -197,19 +181,98 @@ def _(
     else:
         difference = jax.tree.map(lambda s, at_rest: s[0] - at_rest, slopes, slope(root))
     gradient = jax.tree.map(lambda d: size / strength * d, difference)
-    residual = jnp.max(left) / strength
-    outcome = GradientOutcome(
-        residual,
-        jnp.asarray(jnp.sum(num_steps), size.dtype),
-        jnp.nan,
-        jnp.asarray(~(residual < UNTRUSTED), size.dtype),
-    )
-    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, REASON)
+    outcome = _outcome(jnp.max(left) / strength, jnp.sum(num_steps))
+    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
     return d_fn, d_args, outcome
 
 
-UNTRUSTED = 0.01
-REASON = (
+class AbstractNudging(eqx.Module):
+    """A system at rest that its own cost can nudge, as the paper's form of the method needs it.
+
+    `parameters` are what the gradient is taken with respect to.
+    """
+
+    @abc.abstractmethod
+    def cost(self, parameters: PyTree) -> Float[Array, ""]:
+        """The cost where the system is at rest."""
+
+    @abc.abstractmethod
+    def sizes(self, parameters: PyTree) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The force that a nudge of strength 1 exerts, and the unit of force."""
+
+    @abc.abstractmethod
+    def relax(
+        self, parameters: PyTree, nudge: Float[Array, ""], tolerance: Float[Array, ""]
+    ) -> tuple[PyTree, Float[Array, ""], Float[Array, ""]]:
+        """Where the nudged system comes to rest, the largest force there, and the steps it took."""
+
+    @abc.abstractmethod
+    def energy(
+        self, parameters: PyTree, nudge: Float[Array, ""], state: PyTree
+    ) -> Float[Array, ""]:
+        """The energy of the nudged system, nudge included."""
+
+
+# Equilibrium propagation in the form of the paper: X± minimise E ± (β/2) C, with the whole cost and with
+# T1 transitions, and the gradient is the difference of the partial derivatives of these two energies
+# with respect to the parameters, over β.
+@eqx.filter_custom_vjp
+def cost_by_nudging(
+    vjp_arg: tuple[PyTree, GradientOutcome | None],
+    system: AbstractNudging,
+    adjoint: EquilibriumPropagation,
+) -> Float[Array, ""]:
+    """The cost of a system, with a gradient from the two sides that the cost pulls and pushes it to."""
+    parameters, _ = vjp_arg
+    return system.cost(parameters)
+
+
+@cost_by_nudging.def_fwd
+def _(
+    perturbed: Any, vjp_arg: Any, system: AbstractNudging, adjoint: EquilibriumPropagation
+) -> tuple[Float[Array, ""], None]:
+    parameters, _ = vjp_arg
+    return system.cost(parameters), None
+
+
+@cost_by_nudging.def_bwd
+def _(
+    residuals: None,
+    cotangent: Float[Array, ""],
+    perturbed: Any,
+    vjp_arg: Any,
+    system: AbstractNudging,
+    adjoint: EquilibriumPropagation,
+) -> Any:
+    parameters, slot = vjp_arg
+    pull, unit = system.sizes(parameters)
+    if adjoint.beta is None:
+        half_beta = adjoint.strength(None, {"stiffness": unit}, pull.dtype) / pull
+    else:
+        half_beta = jnp.asarray(adjoint.beta, pull.dtype) / 2
+    force = half_beta * pull
+    moving, fixed = differentiable(parameters)
+
+    def phase(sign: Array) -> tuple[PyTree[Array], Array, Array]:
+        nudge = sign * half_beta
+        state, left, num_steps = frozen(system.relax(parameters, nudge, adjoint.tolerance(force)))
+        energy = lambda m: system.energy(eqx.combine(m, fixed), nudge, state)
+        return jax.grad(energy)(moving), left, num_steps
+
+    signs = jnp.asarray(adjoint.signs, half_beta.dtype)
+    slopes, left, num_steps = jax.vmap(phase)(signs)
+    beta = half_beta * (signs[0] - signs[1])
+    gradient = jax.tree.map(lambda s: cotangent * (s[0] - s[1]) / beta, slopes)
+    outcome = _outcome(jnp.max(left) / force, jnp.sum(num_steps))
+    return settle(gradient, outcome, adjoint.throw, slot, _REASON)
+
+
+def _outcome(residual: Float[Array, ""], num_steps: Array) -> GradientOutcome:
+    return GradientOutcome(residual, num_steps, jnp.nan, ~(residual < _UNTRUSTED))
+
+
+_UNTRUSTED = 0.01
+_REASON = (
     "The gradient by equilibrium propagation cannot be trusted: a nudged relaxation did not come to "
     "rest. Raise `max_steps`, use the default solver or a larger `beta`, or allow it with "
     "EquilibriumPropagation(throw=False)."

@@ -9,6 +9,9 @@ from vertax.fitting._history import (
     History as History,
     Record as Record,
 )
-from vertax.fitting._inverse import InverseProblem as InverseProblem
+from vertax.fitting._inverse import (
+    Evaluation as Evaluation,
+    InverseProblem as InverseProblem,
+)
 from vertax.fitting._uncertainty import Uncertainty as Uncertainty, uncertainty as uncertainty
 from vertax.fitting._verdict import doubts as doubts, limits as limits

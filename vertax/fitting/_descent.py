@@ -13,8 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from vertax._base.modules import without_addresses
-from vertax.adjoints import GradientOutcome
+from vertax.fitting._checkpoint import without_addresses
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
@@ -25,10 +24,9 @@ from vertax.fitting._epoch import (
     relative_error,
     unbeaten,
 )
-from vertax.fitting._history import Record
-from vertax.fitting._inverse import InverseProblem
+from vertax.fitting._history import Facts, Record
+from vertax.fitting._inverse import Evaluation, InverseProblem
 from vertax.mesh import Tissue
-from vertax.responses import Equilibrium
 
 
 class State(eqx.Module):
@@ -135,17 +133,18 @@ def _epoch(
         if guidance is not None:
             problem = dataclasses.replace(problem, guidance=guidance)
         shift = no_shift(problem)
-        value, equilibrium, gradient, outcome = problem.value_and_gradient(
-            eqx.combine(state.parameters, constants), state.tissue, shift
-        )
-        record = _record(state.parameters, value, equilibrium, gradient, outcome, true, throw)
+        energy = eqx.combine(state.parameters, constants)
+        evaluation = problem.value_and_gradient(energy, state.tissue, shift, throw=False)
+        gradient = (evaluation.gradient, evaluation.shift_gradient)
+        equilibrium = evaluation.equilibrium
+        record = _record(state.parameters, evaluation, gradient, true, throw)
         going = state.going & record.sound
         fitted = (state.parameters, shift)
         updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
             cast(optax.Updates, gradient),
             state.optimiser,
             cast(optax.Params, fitted),
-            value=value,
+            value=evaluation.cost,
             grad=gradient,
         )
         parameters, shift = eqx.apply_updates(fitted, updates)
@@ -156,8 +155,7 @@ def _epoch(
             state.best,
             state.parameters,
             equilibrium.tissue,
-            value,
-            equilibrium.max_force,
+            Facts(**record.facts()),
             guidance_of(problem),
             epoch,
             going & equilibrium.converged,
@@ -172,25 +170,25 @@ def _epoch(
 
 def _record(
     parameters: PyTree[Array],
-    value: Array,
-    equilibrium: Equilibrium,
+    evaluation: Evaluation,
     gradient: PyTree[Array],
-    outcome: GradientOutcome,
     true: PyTree[Array] | None,
     throw: bool,
 ) -> Record:
+    equilibrium, outcome = evaluation.equilibrium, evaluation.outcome
     norm = optax.tree.norm(gradient)
-    finite = jnp.isfinite(value) & jnp.isfinite(norm)
+    finite = jnp.isfinite(evaluation.cost) & jnp.isfinite(norm)
     return Record(
         parameters=parameters,
         tissue=equilibrium.tissue,
-        cost=value,
+        cost=evaluation.cost,
         max_force=equilibrium.max_force,
         converged=equilibrium.converged,
         num_steps=equilibrium.num_steps,
         num_t1=equilibrium.num_t1,
         gradient_norm=norm,
-        outcome=outcome,
+        gradient_residual=outcome.residual,
+        gradient_steps=outcome.num_steps,
         relative_error=relative_error(parameters, true),
         sound=finite & outcome.trusted if throw else finite,
     )

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax.fitting._history import Record
+from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
 
@@ -20,8 +20,7 @@ class Best(eqx.Module):
 
     parameters: PyTree[Array]
     tissue: Tissue
-    cost: Float[Array, ""]
-    max_force: Float[Array, ""]
+    facts: Facts
     guidance: Float[Array, ""]
     epoch: Int[Array, ""]
 
@@ -52,24 +51,44 @@ def no_shift(problem: InverseProblem) -> Float[Array, "2"] | None:
     return jnp.zeros(2, problem.tissue.vertices.dtype) if problem.fit_position else None
 
 
+def nothing_known(problem: InverseProblem) -> Facts:
+    """The facts of an epoch that has not happened."""
+    dtype = problem.tissue.vertices.dtype
+    unknown, none = jnp.full((), jnp.nan, dtype), jnp.zeros((), int)
+    return Facts(
+        cost=jnp.full((), jnp.inf, dtype),
+        max_force=jnp.full((), jnp.inf, dtype),
+        converged=jnp.array(False),
+        num_steps=none,
+        num_t1=none,
+        gradient_norm=unknown,
+        gradient_residual=unknown,
+        gradient_steps=unknown,
+        relative_error=unknown,
+    )
+
+
 def unbeaten(problem: InverseProblem, parameters: PyTree[Array]) -> Best:
-    infinite = jnp.asarray(jnp.inf, problem.tissue.vertices.dtype)
-    return Best(parameters, problem.tissue, infinite, infinite, infinite, jnp.array(-1))
+    facts = nothing_known(problem)
+    return Best(
+        parameters, problem.tissue, facts, facts.cost, jnp.full((), -1, jnp.result_type(int))
+    )
 
 
 def better(
     best: Best,
     parameters: PyTree,
     tissue: Tissue,
-    cost: Array,
-    force: Array,
+    facts: Facts,
     guidance: Array,
     epoch: Array,
     ok: Array,
 ) -> Best:
-    new = Best(parameters, tissue, cost, force, guidance, epoch)
+    new = Best(parameters, tissue, facts, guidance, epoch)
     # Guidance makes any cost small: only costs at the same one can be compared.
-    lower = (guidance < best.guidance) | ((guidance == best.guidance) & (cost < best.cost))
+    lower = (guidance < best.guidance) | (
+        (guidance == best.guidance) & (facts.cost < best.facts.cost)
+    )
     return choose(ok & lower, new, best)
 
 
@@ -80,7 +99,8 @@ def guidance_of(problem: InverseProblem) -> Float[Array, ""]:
 
 
 def choose(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
-    pick = lambda a, b: jnp.where(condition, a, b) if eqx.is_array(a) else a
+    # With the type of the old one, lest the next epoch be compiled anew.
+    pick = lambda a, b: jnp.where(condition, a, b).astype(b.dtype) if eqx.is_array(a) else a
     return jax.tree.map(pick, new, old)
 
 

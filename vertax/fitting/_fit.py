@@ -10,12 +10,14 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Int, PyTree
 from tqdm import tqdm
 
+from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._arguments import check_arguments
 from vertax.fitting._checkpoint import Checkpoint, Keeper, Progress, Row, columns_of, identity_of
@@ -107,6 +109,8 @@ def fit(
     # of type would compile the epoch anew.
     parameters = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
     true = None if truth is None else eqx.filter(truth, problem.trainable)
+    given, problem = problem, _with_numbers_as_data(problem, parameters, batched)
+    constants = eqx.partition(problem.energy, problem.trainable)[1]
     method: AbstractMethod
     if isinstance(optimiser, optx.AbstractLeastSquaresSolver):
         if guidance is not None:
@@ -123,13 +127,13 @@ def fit(
         method = Descent(optimiser, problem, parameters, constants, true, batched, guidance)
     if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
         checkpoint = Checkpoint(checkpoint)
-    keeper = Keeper(checkpoint, lambda: identity_of(problem, true, method.description(), batched))
+    keeper = Keeper(checkpoint, lambda: identity_of(given, true, method.description(), batched))
     done, stopped, interrupted = _run(method, keeper, epochs, progress, callback)
     if not done.rows:
         raise FitError(f"The fit stopped: {stopped}.", None)
     best = done.state.best
     history = History(**columns_of(done.rows))
-    if not np.isfinite(best.cost).any():
+    if not np.isfinite(best.facts.cost).any():
         raise FitError(
             "No epoch of the fit reached equilibrium: raise `max_steps`, loosen `tolerance`, or use the "
             f"default solver (largest force: {history.max_force.min():.1e}). Stopped because "
@@ -139,8 +143,8 @@ def fit(
     outcome = Fit(
         eqx.combine(best.parameters, constants),
         best.tissue,
-        best.cost,
-        best.max_force,
+        best.facts.cost,
+        best.facts.max_force,
         np.asarray(best.epoch),
         history,
         columns_of(done.notes),
@@ -149,6 +153,27 @@ def fit(
     if stopped is not None:
         raise FitError(f"The fit stopped: {stopped}. Try a smaller step of the optimiser.", outcome)
     return outcome
+
+
+def _with_numbers_as_data(
+    problem: InverseProblem[Energy], parameters: PyTree, batched: bool
+) -> InverseProblem[Energy]:
+    """The same problem with arrays for its Python numbers, of which another one compiles nothing anew."""
+    # Which leaves are fitted is settled before: a number of the energy is a constant.
+    fitted = jax.tree.map(lambda x: x is not None, parameters, is_leaf=lambda x: x is None)
+    energy, cost, guidance = traced((problem.energy, problem.cost, problem.guidance))
+    response = problem.response.traced()
+    data = dataclasses.replace(
+        problem, energy=energy, cost=cost, guidance=guidance, response=response, trainable=fitted
+    )
+    if not batched:
+        return data
+    n = jax.tree.leaves(parameters)[0].shape[0]
+    spread = lambda new, old: (
+        new if eqx.is_array(old) or not eqx.is_array(new) else jnp.full(n, new)
+    )
+    old = dataclasses.replace(problem, trainable=fitted)
+    return jax.tree.map(spread, data, old)
 
 
 def _check_batch(tree: PyTree) -> None:
@@ -204,7 +229,7 @@ def _run(
             bar.update()
             keeper.note(done)
     except KeyboardInterrupt:
-        if not done.rows or not np.isfinite(done.state.best.cost).any():
+        if not done.rows or not np.isfinite(done.state.best.facts.cost).any():
             raise
         keeper.save(done)
         return done, None, True
@@ -247,18 +272,14 @@ def _noted(
 
 
 def _row(record: Record, seconds: float, guidance: float) -> Row:
-    names = [field.name for field in dataclasses.fields(History)]
-    known = {name: getattr(record, name) for name in names if hasattr(record, name)}
-    known["gradient_residual"] = record.outcome.residual
-    known["gradient_steps"] = record.outcome.num_steps
-    row = {name: np.asarray(value) for name, value in known.items()}
+    row = {name: np.asarray(value) for name, value in record.facts().items()}
     return row | {"seconds": seconds, "guidance": guidance}
 
 
 def _trouble(record: Record, epoch: int) -> str:
     cost, slope = np.asarray(record.cost), np.asarray(record.gradient_norm)
     if np.isfinite(cost).all() and np.isfinite(slope).all():
-        residual = np.max(record.outcome.residual)
+        residual = np.max(record.gradient_residual)
         return (
             f"the gradient of epoch {epoch} cannot be trusted (residual {residual:.1e}; an adjoint with "
             "throw=False goes on all the same)"

@@ -3,38 +3,50 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Generic
+from typing import Any, Generic
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
-from vertax.adjoints import GradientOutcome
 from vertax.fitting._inverse import Energy
 from vertax.mesh import Tissue
 
 
-class History(eqx.Module):
+class Facts(eqx.Module):
+    """What there is to know of an epoch, or of many along a first axis.
+
+    In a batch the last axis is that of its members.
+    """
+
+    cost: Float[Any, "*axes"]
+    """Cost at the parameters that the epoch began with; with a least-squares solver, at those of its last
+    accepted step."""
+    max_force: Float[Any, "*axes"]
+    """Largest force of the equilibrium."""
+    converged: Bool[Any, "*axes"]
+    """Whether the relaxation reached equilibrium."""
+    num_steps: Int[Any, "*axes"]
+    """Steps of the relaxation."""
+    num_t1: Int[Any, "*axes"]
+    """T1 transitions of the relaxation."""
+    gradient_norm: Float[Any, "*axes"]
+    """Norm of the hypergradient; NaN for a least-squares solver."""
+    gradient_residual: Float[Any, "*axes"]
+    """How far the adjoint came, see [`GradientOutcome`][vertax.GradientOutcome]; NaN if not known."""
+    gradient_steps: Float[Any, "*axes"]
+    """Steps of the adjoint; NaN if not known."""
+    relative_error: Float[Any, "*axes"]
+    """Mean of |inferred - true| / |true| over all parameters; NaN if the truth is not known."""
+
+    def facts(self) -> dict[str, Any]:
+        """These numbers by name."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(Facts)}
+
+
+class History(Facts):
     """What happened in each epoch of a fit; in a batch there is a second axis for its members."""
 
-    cost: Float[np.ndarray, "epochs *batch"]
-    """Cost at the parameters that the epoch began with."""
-    max_force: Float[np.ndarray, "epochs *batch"]
-    """Largest force of the equilibrium."""
-    converged: Bool[np.ndarray, "epochs *batch"]
-    """Whether the relaxation reached equilibrium."""
-    num_steps: Int[np.ndarray, "epochs *batch"]
-    """Steps of the relaxation."""
-    num_t1: Int[np.ndarray, "epochs *batch"]
-    """T1 transitions of the relaxation."""
-    gradient_norm: Float[np.ndarray, "epochs *batch"]
-    """Norm of the hypergradient."""
-    gradient_residual: Float[np.ndarray, "epochs *batch"]
-    """How far the adjoint came, see [`GradientOutcome`][vertax.GradientOutcome]; NaN if not known."""
-    gradient_steps: Float[np.ndarray, "epochs *batch"]
-    """Steps of the adjoint; NaN if not known."""
-    relative_error: Float[np.ndarray, "epochs *batch"]
-    """Mean of |inferred - true| / |true| over all parameters; NaN if the truth is not known."""
     seconds: Float[np.ndarray, " epochs"]
     """Wall-clock time of each epoch; the first one, and the first of a fit that is continued, includes
     compilation."""
@@ -76,7 +88,7 @@ class FitError(RuntimeError):
         self.fit = fit
 
 
-class Record(eqx.Module):
+class Record(Facts):
     """One epoch of a fit, as its callback sees it; in a batch each array has a leading axis for its members.
 
     ```python
@@ -93,21 +105,5 @@ class Record(eqx.Module):
     least-squares solver, those of its last accepted step."""
     tissue: Tissue
     """Their equilibrium."""
-    cost: Float[Array, "*batch"]
-    """Their cost."""
-    max_force: Float[Array, "*batch"]
-    """Largest force of the equilibrium."""
-    converged: Bool[Array, "*batch"]
-    """Whether the relaxation reached equilibrium."""
-    num_steps: Int[Array, "*batch"]
-    """Steps of the relaxation."""
-    num_t1: Int[Array, "*batch"]
-    """T1 transitions of the relaxation."""
-    gradient_norm: Float[Array, "*batch"]
-    """Norm of the hypergradient; NaN for a least-squares solver."""
-    outcome: GradientOutcome
-    """How the gradient came about; NaN for a least-squares solver."""
-    relative_error: Float[Array, "*batch"]
-    """Mean of |inferred - true| / |true| over all parameters; NaN if the truth is not known."""
     sound: Bool[Array, "*batch"]
     """Whether cost and gradient are finite and can be trusted."""

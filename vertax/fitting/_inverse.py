@@ -17,15 +17,28 @@ from vertax.adjoints import (
     GradientOutcome,
     ImplicitDifferentiation,
 )
-from vertax.adjoints._adjoint import differentiable, frozen, settle
-from vertax.adjoints._propagation import REASON, UNTRUSTED
+from vertax.adjoints._adjoint import frozen
+from vertax.adjoints._propagation import AbstractNudging, cost_by_nudging
 from vertax.costs import AbstractCost
 from vertax.energies import AbstractEnergy
+from vertax.energies._units import mean_stiffness, units_of
 from vertax.mesh import Tissue
-from vertax.responses._relaxation import Equilibrium, equilibrate, mean_stiffness
-from vertax.transitions import T1, AbstractTransitions
+from vertax.responses import AbstractResponse, Equilibrium, Relaxation
 
 Energy = TypeVar("Energy", bound=AbstractEnergy)
+
+
+class Evaluation(eqx.Module):
+    """A cost, its gradient, and how both came about."""
+
+    cost: Float[Array, ""]
+    equilibrium: Equilibrium
+    gradient: PyTree[Array]
+    """With respect to the trainable leaves of the energy; the others are None."""
+    shift_gradient: Float[Array, 2] | None
+    """With respect to the displacement of the whole; None if there is none."""
+    outcome: GradientOutcome
+    """How the gradient came about."""
 
 
 class InverseProblem(eqx.Module, Generic[Energy]):
@@ -44,11 +57,15 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         Python floats are constants.
     - `fit_position`: fit also where the whole tissue lies. No parameter of an energy moves the centroid
         of a tissue, so a cost that sees positions (an image) needs this unless they are known.
-    - `adjoint`, `solver`, `transitions`, `tolerance`, `patience`, `max_steps`: passed on to
-        [`equilibrate`][vertax.equilibrate].
+    - `response`: how the tissue answers to its energy, a [`Relaxation`][vertax.Relaxation].
+    - `adjoint`: how to differentiate, one of `vertax.adjoints`.
     - `guidance`: strength $\kappa$, energy per cost. If given, the tissue minimises $E + \kappa C$:
         the cost pulls it, through T1 transitions too, towards what it asks for, while the parameters
         are not yet such that it goes there by itself. See `guidance` of [`fit`][vertax.fit].
+
+    **Raises:**
+
+    - `TypeError` for a response or a cost that is none.
     """
 
     tissue: Tissue
@@ -56,19 +73,24 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     cost: AbstractCost
     trainable: PyTree[bool] | Callable[[Any], bool] = eqx.is_inexact_array
     fit_position: bool = False
+    response: AbstractResponse = eqx.field(default_factory=Relaxation)
     adjoint: AbstractAdjoint = eqx.field(default_factory=ImplicitDifferentiation)
-    solver: optx.AbstractMinimiser[Any, Any, Any] | None = None
-    transitions: AbstractTransitions | None = T1()
-    tolerance: float | Float[Array, ""] | None = None
-    patience: int = 1
-    max_steps: int = 2000
     guidance: float | Float[Array, ""] | None = None
+
+    def __check_init__(self):
+        if not isinstance(self.response, AbstractResponse):
+            raise TypeError(
+                f"Argument `response` must be a response such as vertax.Relaxation(), but is "
+                f"{self.response!r}."
+            )
 
     def __call__(
         self,
         energy: AbstractEnergy | None = None,
         tissue: Tissue | None = None,
         shift: Float[Array, 2] | None = None,
+        *,
+        throw: bool = True,
     ) -> tuple[Float[Array, ""], Equilibrium]:
         """Cost and equilibrium for some parameters.
 
@@ -77,27 +99,35 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         - `energy`: the energy, by default the problem's.
         - `tissue`: where the relaxation starts, by default the problem's tissue.
         - `shift`: a displacement of the relaxed tissue as a whole, by default none.
+        - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
 
         **Returns:** the cost, differentiable in `energy` and `shift`, and the equilibrium.
+
+        **Raises:**
+
+        - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge.
         """
         energy = self.energy if energy is None else energy
         tissue = self.tissue if tissue is None else tissue
         if isinstance(self.adjoint, EquilibriumPropagation) and self.adjoint.nudge == "cost":
-            settled = frozen(self._relax(*frozen((tissue, energy, shift)), adjoint=None))
+            start = frozen((tissue, energy, shift))
+            settled = frozen(self.relax(*start, adjoint=ImplicitDifferentiation(), throw=throw))
             problem = eqx.tree_at(
                 lambda p: (p.adjoint, p.energy), self, (self.adjoint.without_outcome(), None)
             )
-            vjp_arg = (energy, shift, self.adjoint.outcome)
-            cost = _cost_by_nudging(vjp_arg, frozen(problem), settled.tissue)
+            system = _Nudging(frozen(problem), settled.tissue)
+            vjp_arg = ((energy, shift), self.adjoint.outcome)
+            cost = cost_by_nudging(vjp_arg, system, problem.adjoint)
             return cost, _placed(settled, shift)
-        equilibrium = _placed(self._relax(tissue, energy, shift, adjoint=self.adjoint), shift)
+        relaxed = self.relax(tissue, energy, shift, adjoint=self.adjoint, throw=throw)
+        equilibrium = _placed(relaxed, shift)
         return self.cost(equilibrium.tissue, energy), equilibrium
 
     def residuals(
         self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
     ) -> tuple[Float[Array, " residuals"], Equilibrium, Tissue]:
         """Residuals of a least-squares cost, the equilibrium, and its tissue displaced by `shift`."""
-        equilibrium = self._relax(tissue, energy, shift, adjoint=self.adjoint)
+        equilibrium = self.relax(tissue, energy, shift, adjoint=self.adjoint)
         placed = _moved(equilibrium.tissue, shift)
         return self.cost.residuals(placed, energy), equilibrium, placed
 
@@ -106,25 +136,19 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         energy: AbstractEnergy | None = None,
         tissue: Tissue | None = None,
         shift: Float[Array, 2] | None = None,
-    ) -> tuple[
-        Float[Array, ""], Equilibrium, tuple[PyTree[Array], Float[Array, 2] | None], GradientOutcome
-    ]:
+        *,
+        throw: bool = True,
+    ) -> Evaluation:
         """Cost, equilibrium, gradient, and how the gradient came about.
 
         **Arguments:** as in a call of the problem.
 
-        **Returns:**
-
-        - the cost;
-        - the equilibrium;
-        - the gradient with respect to the trainable leaves of the energy (the others are None) and with
-            respect to `shift` (None if there is none);
-        - the [`GradientOutcome`][vertax.GradientOutcome] of the adjoint.
+        **Returns:** an [`Evaluation`][vertax.Evaluation].
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox) for a gradient that cannot be trusted, unless the adjoint is told
-            not to with `throw=False`.
+        - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge; and
+            for a gradient that cannot be trusted, unless the adjoint is told not to with `throw=False`.
         """
         energy = self.energy if energy is None else energy
         parameters, constants = eqx.partition(energy, self.trainable)
@@ -133,38 +157,34 @@ class InverseProblem(eqx.Module, Generic[Energy]):
             parameters, shift, outcome = arguments
             adjoint = self.adjoint.with_outcome(outcome)
             problem = eqx.tree_at(lambda p: p.adjoint, self, adjoint)
-            return problem(eqx.combine(parameters, constants), tissue, shift)
+            return problem(eqx.combine(parameters, constants), tissue, shift, throw=False)
 
         arguments = (parameters, shift, GradientOutcome())
-        (value, equilibrium), (*gradient, outcome) = jax.value_and_grad(cost, has_aux=True)(
-            arguments
-        )
-        return value, equilibrium, tuple(gradient), outcome
+        evaluate = jax.value_and_grad(cost, has_aux=True)
+        (value, equilibrium), (gradient, shift_gradient, outcome) = evaluate(arguments)
+        equilibrium = equilibrium.checked() if throw else equilibrium
+        return Evaluation(value, equilibrium, gradient, shift_gradient, outcome)
 
-    def _relax(
+    def relax(
         self,
         tissue: Tissue,
         energy: AbstractEnergy,
         shift: Float[Array, 2] | None,
         *,
-        adjoint: AbstractAdjoint | None,
+        adjoint: AbstractAdjoint,
         nudge: Float[Array, ""] | None = None,
-        **options: Any,
+        tolerance: Float[Array, ""] | None = None,
+        throw: bool = False,
     ) -> Equilibrium:
-        settings: dict[str, Any] = {
-            "solver": self.solver,
-            "transitions": self.transitions,
-            "tolerance": self.tolerance,
-            "patience": self.patience,
-            "max_steps": self.max_steps,
-        }
-        pulled = self._pulled(tissue, energy, shift, nudge)
-        found = equilibrate(tissue, pulled, adjoint=adjoint, throw=False, **settings | options)
+        """The equilibrium from `tissue`, not displaced; pulled by the cost where guided or nudged."""
+        pulled = self.pulled(tissue, energy, shift, nudge)
+        response = self.response if tolerance is None else self.response.finer(tolerance)
+        equilibrium = response(tissue, pulled, adjoint=adjoint, throw=throw)
         if pulled is energy:
-            return found
-        return eqx.tree_at(lambda e: e.energy, found, energy(found.tissue))
+            return equilibrium
+        return eqx.tree_at(lambda e: e.energy, equilibrium, energy(equilibrium.tissue))
 
-    def _pulled(
+    def pulled(
         self,
         tissue: Tissue,
         energy: AbstractEnergy,
@@ -205,90 +225,44 @@ class _Pulled(AbstractEnergy):
         return self.energy(tissue) + self.strength * self.cost(placed, self.energy)
 
 
-# Equilibrium propagation in the form of the paper: X± minimise E ± (β/2) C, with the whole cost and with
-# T1 transitions, and the gradient is the difference of the partial derivatives of these two energies
-# with respect to the parameters, over β.
-@eqx.filter_custom_vjp
-def _cost_by_nudging(
-    vjp_arg: tuple[AbstractEnergy, Float[Array, 2] | None, GradientOutcome | None],
-    problem: InverseProblem,
-    settled: Tissue,
-) -> Float[Array, ""]:
-    energy, shift, _ = vjp_arg
-    return problem.cost(_moved(settled, shift), energy)
+class _Nudging(AbstractNudging):
+    """An inverse problem at rest; its parameters are an energy and a displacement of the whole."""
 
+    problem: InverseProblem
+    settled: Tissue
 
-@_cost_by_nudging.def_fwd
-def _(perturbed: Any, vjp_arg: Any, problem: InverseProblem, settled: Tissue) -> tuple:
-    energy, shift, _ = vjp_arg
-    return problem.cost(_moved(settled, shift), energy), None
+    def cost(self, parameters: PyTree) -> Float[Array, ""]:
+        energy, shift = parameters
+        return self.problem.cost(_moved(self.settled, shift), energy)
 
+    def sizes(self, parameters: PyTree) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        energy, shift = parameters
+        cost = lambda tissue: self.problem.cost(_moved(tissue, shift), energy)
+        at = lambda y: cost(self.settled.with_configuration(y))
+        value, slope = jax.value_and_grad(at)(self.settled.configuration)
+        units = units_of(self.settled, energy)
+        # At the optimum of the cost its slope vanishes, and β has to stay so small that E - (β/2) C keeps
+        # its minimum. A cost that counts neighbours has neither slope nor curvature: only a size.
+        pull = jnp.maximum(optx.max_norm(slope), mean_stiffness(self.settled, cost) * units.length)
+        pull = jnp.maximum(pull, 1e-8 * jnp.abs(value) / units.length)
+        return jnp.where(pull > 0, pull, 1), units.force
 
-@_cost_by_nudging.def_bwd
-def _(
-    residuals: None,
-    cotangent: Float[Array, ""],
-    perturbed: Any,
-    vjp_arg: Any,
-    problem: InverseProblem,
-    settled: Tissue,
-) -> Any:
-    energy, shift, slot = vjp_arg
-    adjoint = problem.adjoint
-    assert isinstance(adjoint, EquilibriumPropagation)
-    half_beta, force = _nudge(problem, adjoint, settled, energy, shift)
-    moving, fixed = differentiable((energy, shift))
-
-    def phase(sign: Array) -> tuple[PyTree[Array], Equilibrium]:
-        nudge = sign * half_beta
-        tolerance = _tolerance(problem, adjoint, force)
-        found = frozen(
-            problem._relax(settled, energy, shift, adjoint=None, nudge=nudge, tolerance=tolerance)
+    def relax(
+        self, parameters: PyTree, nudge: Float[Array, ""], tolerance: Float[Array, ""]
+    ) -> tuple[Tissue, Float[Array, ""], Float[Array, ""]]:
+        energy, shift = parameters
+        at_rest = self.problem.relax(
+            self.settled,
+            energy,
+            shift,
+            adjoint=ImplicitDifferentiation(),
+            nudge=nudge,
+            tolerance=tolerance,
         )
+        return at_rest.tissue, at_rest.max_force, at_rest.num_steps.astype(nudge.dtype)
 
-        def nudged(m: PyTree[Array]) -> Float[Array, ""]:
-            energy, shift = eqx.combine(m, fixed)
-            return problem._pulled(settled, energy, shift, nudge)(found.tissue)
-
-        return jax.grad(nudged)(moving), found
-
-    signs = jnp.asarray(adjoint.signs, half_beta.dtype)
-    slopes, found = jax.vmap(phase)(signs)
-    beta = half_beta * (signs[0] - signs[1])
-    gradient = jax.tree.map(lambda s: cotangent * (s[0] - s[1]) / beta, slopes)
-    residual = jnp.max(found.max_force) / force
-    outcome = GradientOutcome(residual, jnp.sum(found.num_steps), jnp.nan, ~(residual < UNTRUSTED))
-    (d_energy, d_shift), outcome = settle(gradient, outcome, adjoint.throw, slot, REASON)
-    return d_energy, d_shift, outcome
-
-
-def _nudge(
-    problem: InverseProblem,
-    adjoint: EquilibriumPropagation,
-    settled: Tissue,
-    energy: AbstractEnergy,
-    shift: Float[Array, 2] | None,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Half of β, and a force that it exerts if not at the optimum."""
-    cost = lambda tissue: problem.cost(_moved(tissue, shift), energy)
-    at = lambda y: cost(settled.with_configuration(y))
-    value, slope = jax.value_and_grad(at)(settled.configuration)
-    length = jnp.sqrt(jnp.mean(jnp.abs(settled.areas)))
-    # At the optimum of the cost its slope vanishes, and β has to stay so small that E - (β/2) C keeps
-    # its minimum. A cost that counts neighbours has neither slope nor curvature: only a size.
-    pull = jnp.maximum(optx.max_norm(slope), mean_stiffness(settled, cost) * length)
-    pull = jnp.maximum(pull, 1e-8 * jnp.abs(value) / length)
-    pull = jnp.where(pull > 0, pull, 1)
-    if adjoint.beta is not None:
-        half_beta = jnp.asarray(adjoint.beta, value.dtype) / 2
-    else:
-        units = {"stiffness": mean_stiffness(settled, energy), "length_scale": length}
-        half_beta = adjoint.strength(None, units, value.dtype) / pull
-    return half_beta, half_beta * pull
-
-
-def _tolerance(
-    problem: InverseProblem, adjoint: EquilibriumPropagation, force: Float[Array, ""]
-) -> Float[Array, ""]:
-    tolerance = adjoint.tolerance(force)
-    return tolerance if problem.tolerance is None else jnp.minimum(tolerance, problem.tolerance)
+    def energy(
+        self, parameters: PyTree, nudge: Float[Array, ""], state: Tissue
+    ) -> Float[Array, ""]:
+        energy, shift = parameters
+        return self.problem.pulled(self.settled, energy, shift, nudge)(state)

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import without_addresses
-from vertax.adjoints import GradientOutcome, ImplicitDifferentiation
+from vertax.adjoints import ImplicitDifferentiation
+from vertax.fitting._checkpoint import without_addresses
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
@@ -20,10 +20,11 @@ from vertax.fitting._epoch import (
     choose,
     guidance_of,
     no_shift,
+    nothing_known,
     relative_error,
     unbeaten,
 )
-from vertax.fitting._history import Record
+from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
 
@@ -44,7 +45,7 @@ class State(eqx.Module):
     """Where the next relaxation starts."""
     placed: Tissue
     """The equilibrium of the accepted step, displaced as it says."""
-    facts: dict[str, Array]
+    facts: Facts
     """What there is to know of it."""
     scale: Float[Array, "*batch"]
     """Of the residuals that the solver sees."""
@@ -151,14 +152,18 @@ def _residuals(
         worst = jnp.asarray(jnp.finfo(residuals.dtype).max ** 0.25, residuals.dtype)
         ok = relaxed.converged & jnp.all(jnp.isfinite(residuals))
         residuals = jnp.where(ok, scale * residuals, worst)
-        facts = {
-            "cost": 0.5 * jnp.sum((residuals / scale) ** 2),
-            "max_force": relaxed.max_force,
-            "converged": ok,
-            "num_steps": relaxed.num_steps,
-            "num_t1": relaxed.num_t1,
-            "relative_error": relative_error(parameters, true),
-        }
+        unknown = jnp.full_like(scale, jnp.nan)
+        facts = Facts(
+            cost=0.5 * jnp.sum((residuals / scale) ** 2),
+            max_force=relaxed.max_force,
+            converged=ok,
+            num_steps=relaxed.num_steps,
+            num_t1=relaxed.num_t1,
+            gradient_norm=unknown,
+            gradient_residual=unknown,
+            gradient_steps=unknown,
+            relative_error=relative_error(parameters, true),
+        )
         return residuals, (eqx.filter((relaxed.tissue, placed), eqx.is_array), facts)
 
     return evaluate
@@ -183,8 +188,7 @@ def _start(
         scale = jax.lax.rsqrt(jnp.maximum(jnp.sum(first**2), jnp.finfo(first.dtype).tiny))
         machine = _Machine(solver, problem, constants, true, fitted, scale)
         leaves = jax.tree.leaves(eqx.filter(machine.blank, eqx.is_array))
-        facts = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), machine.aux[1])
-        facts["cost"] = facts["cost"] + jnp.nan
+        facts = nothing_known(problem)
         best = unbeaten(problem, parameters)
         tissues = (problem.tissue, problem.tissue)
         still, going = jnp.array(0), jnp.array(True)
@@ -213,9 +217,8 @@ def _epoch(
         y, solver_state, done = machine.step(state)
         arrays, facts = solver_state.aux  # those of the last accepted point, which is y
         tissue, placed = (eqx.combine(a, problem.tissue) for a in arrays)
-        reached = (facts["cost"], facts["max_force"], guidance_of(problem))
-        best = better(state.best, y[0], placed, *reached, epoch, facts["converged"])
-        n_still = jnp.where(facts["cost"] == state.facts["cost"], state.n_still + 1, 0)
+        best = better(state.best, y[0], placed, facts, guidance_of(problem), epoch, facts.converged)
+        n_still = jnp.where(facts.cost == state.facts.cost, state.n_still + 1, 0)
         leaves = jax.tree.leaves(eqx.filter(solver_state, eqx.is_array))
         going = ~done & (n_still < _PATIENCE)
         moved = State(y, leaves, tissue, placed, facts, state.scale, best, n_still, going)
@@ -228,12 +231,9 @@ def _epoch(
 
 
 def _record(state: State) -> Record:
-    unknown = jnp.full_like(state.scale, jnp.nan)
     return Record(
         parameters=state.fitted[0],
         tissue=state.placed,
-        gradient_norm=unknown,
-        outcome=GradientOutcome(unknown, unknown, unknown, unknown),
         sound=jnp.array(True),
-        **state.facts,
+        **state.facts.facts(),
     )

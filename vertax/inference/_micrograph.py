@@ -230,7 +230,7 @@ def micrograph_problem(
     first = response(tissue, guess, throw=False)
     # Mirror planes or pins hold the tissue in its place: there is no position to fit.
     problem = InverseProblem(
-        first.tissue, guess, MeshImage(psf_width=width, **options), trainable, **vars(response)
+        first.tissue, guess, MeshImage(psf_width=width, **options), trainable, response=response
     )
     return Micrograph(problem, found, whole, seen, width, first)
 

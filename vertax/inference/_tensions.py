@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -137,11 +136,7 @@ class TensionProblem(eqx.Module):
         return float(np.sqrt(squared / share)) / self.segmentation.pixel_size
 
     def _relaxed(self, tissue: Any, energy: AbstractEnergy) -> Any:
-        settings = {
-            field.name: getattr(self.problem, field.name)
-            for field in dataclasses.fields(Relaxation)
-        }
-        return Relaxation(**settings)(tissue, energy, throw=False).tissue
+        return self.problem.response(tissue, energy, throw=False).tissue
 
 
 def tension_problem(
@@ -201,5 +196,5 @@ def tension_problem(
     # As many independent positions as edges have ends: each is known to within the noise.
     n_positions = 2 * seen.n_vertices
     cost = EdgeDistance(seen) + width**2 / n_positions * RelativeTensions(prior)
-    problem = InverseProblem(seen, guess, cost, trainable, fit_position=True, **vars(response))
+    problem = InverseProblem(seen, guess, cost, trainable, fit_position=True, response=response)
     return TensionProblem(problem, segmentation, guess)

@@ -15,11 +15,9 @@ from vertax.io._module_file import (
     save_energy as save_energy,
     save_problem as save_problem,
 )
-from vertax.io._recording import record_relaxation as record_relaxation
 from vertax.io._tables import Tables as Tables, from_tables as from_tables, to_tables as to_tables
 from vertax.io._tissue_file import load_tissue as load_tissue, save_tissue as save_tissue
 from vertax.io._trajectory import (
-    Trajectory as Trajectory,
     load_trajectory as load_trajectory,
     save_trajectory as save_trajectory,
 )

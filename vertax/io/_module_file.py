@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from vertax import adjoints, costs, energies, solvers
+from vertax import adjoints, costs, energies, responses, solvers
 from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax._base.checks import named
 from vertax.energies import AbstractEnergy
@@ -108,8 +108,8 @@ def save_problem(path: str | os.PathLike[str], problem: InverseProblem[Any]) -> 
     Optimistix). So a solver such as [`Optax`][vertax.solvers.Optax] is left out and given again:
 
     ```python
-    vx.io.save_problem("problem.npz", dataclasses.replace(problem, solver=None))
-    problem = dataclasses.replace(vx.io.load_problem("problem.npz"), solver=solver)
+    vx.io.save_problem("problem.npz", dataclasses.replace(problem, response=vx.Relaxation()))
+    problem = dataclasses.replace(vx.io.load_problem("problem.npz"), response=problem.response)
     ```
 
     and a `trainable` of your own is written as booleans, `jax.tree.map(trainable, energy)`.
@@ -193,7 +193,7 @@ def _public_classes() -> dict[str, type[eqx.Module]]:
     """The classes of vertax by the name that a file knows them by."""
     single = (Free, InverseProblem, Periodic, T1, Tissue, Topology)
     classes: dict[str, type[eqx.Module]] = {cls.__name__: cls for cls in single}
-    for family in (adjoints, costs, energies, solvers):
+    for family in (adjoints, costs, energies, responses, solvers):
         for name, cls in vars(family).items():
             if (
                 isinstance(cls, type)
@@ -243,8 +243,11 @@ class _Writer:
     def remedy(self, path: str) -> str:
         if self.argument == "problem" and path.startswith(".trainable"):
             return "Give booleans: dataclasses.replace(problem, trainable=jax.tree.map(trainable, energy))."
-        if self.argument == "problem" and path.startswith(".solver"):
-            return "Save dataclasses.replace(problem, solver=None), and give the solver again after loading."
+        if self.argument == "problem" and path.startswith(".response"):
+            return (
+                "Save dataclasses.replace(problem, response=vx.Relaxation()), and give the response again "
+                "after loading."
+            )
         return "Take it out before saving (equinox.tree_at), and put it back after loading."
 
     def array(self, kind: str, value: Any, path: str) -> dict[str, Any]:

@@ -1,4 +1,9 @@
 """Responses: how a tissue answers to its energy."""
 
-from vertax.responses._relaxation import Equilibrium as Equilibrium, equilibrate as equilibrate
-from vertax.responses._settings import Relaxation as Relaxation
+from vertax.responses._recording import record_relaxation as record_relaxation
+from vertax.responses._relaxation import Relaxation as Relaxation, equilibrate as equilibrate
+from vertax.responses._response import (
+    AbstractResponse as AbstractResponse,
+    Equilibrium as Equilibrium,
+)
+from vertax.responses._trajectory import Trajectory as Trajectory

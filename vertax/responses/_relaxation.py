@@ -2,46 +2,141 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import is_concrete
+from vertax._base.modules import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
+from vertax.energies._units import Units, units_of
 from vertax.mesh import Tissue
+from vertax.responses._response import AbstractResponse, Equilibrium
+from vertax.responses._search import Search, SearchState, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
-from vertax.solvers._patience import AtRest, Relaxation, RelaxationState
+from vertax.solvers._patience import AtRest, Patient
 from vertax.transitions import T1, AbstractTransitions
 
 
-class Equilibrium(eqx.Module):
-    """A relaxed tissue and how it got there; under `jax.vmap` one entry for each of the batch."""
+class Relaxation(AbstractResponse):
+    r"""The tissue comes to rest, $X^* \in \arg\min_X E(X, \theta)$ (paper, Methods).
 
-    tissue: Tissue
-    """The relaxed tissue, differentiable with respect to the parameters of the energy."""
-    energy: Float[Array, "*batch"]
-    """Its energy."""
-    max_force: Float[Array, "*batch"]
-    r"""Largest component of $|\nabla_X E|$."""
-    num_steps: Int[Array, "*batch"]
-    """Steps of the minimiser."""
-    num_t1: Int[Array, "*batch"]
-    """T1 transitions on the way."""
-    result: optx.RESULTS
-    """Outcome; `optimistix.RESULTS[result]` is its message."""
+    Call it with a tissue and an energy, or give it to an
+    [`InverseProblem`][vertax.InverseProblem]; [`equilibrate`][vertax.equilibrate] does both in one line.
+
+    Defaults know the units of the tissue, so it relaxes alike in micrometres, in pixels and in cells of
+    area 1: lengths are measured in the root mean cell area $\ell$, forces in $k \ell$ with $k$ the mean
+    eigenvalue of the Hessian where the relaxation starts.
+
+    **Arguments:**
+
+    - `solver`: a minimiser of `vertax.solvers` or of Optimistix; [`NewtonCG`][vertax.solvers.NewtonCG]
+        by default, which reaches true equilibria.
+    - `transitions`: the rule for topology changes, or None to keep the topology.
+    - `tolerance`: largest force (component of $\nabla_X E$) that counts as equilibrium, in units of
+        energy per length; by default $10^{-10}\,k \ell$ in float64 and $10^{-5}\,k \ell$ in float32.
+    - `patience`: number of consecutive steps for which the force must stay below the tolerance.
+    - `max_steps`: most steps of the minimiser.
+
+    `tolerance`, `patience`, `max_steps` and the numbers of `transitions` and of an energy are data: another
+    number compiles nothing anew. The solver and the adjoint are parts of the program.
+
+    **Raises:**
+
+    - `TypeError` for a solver, or transitions, that are none.
+    - `ValueError` for a tolerance, patience or number of steps that is not positive.
+    """
+
+    solver: optx.AbstractMinimiser[Any, Any, Any] = eqx.field(default_factory=NewtonCG)
+    transitions: AbstractTransitions | None = T1()
+    tolerance: float | Float[Array, ""] | None = None
+    patience: int | Int[Array, ""] = 1
+    max_steps: int | Int[Array, ""] = 2000
+
+    def __check_init__(self):
+        if not isinstance(self.solver, optx.AbstractMinimiser):
+            raise TypeError(
+                "Argument `solver` must be a minimiser of vertax.solvers or of Optimistix, e.g. "
+                f"vertax.solvers.LBFGS(), but is {self.solver!r}."
+            )
+        if not isinstance(self.transitions, AbstractTransitions | None):
+            raise TypeError(
+                "Argument `transitions` must be a rule for topology changes, e.g. vertax.T1(), or None, "
+                f"but is {self.transitions!r}."
+            )
+        for name in ("tolerance", "patience", "max_steps"):
+            value = getattr(self, name)
+            if value is not None and is_concrete(value) and not np.all(np.asarray(value) > 0):
+                raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+
+    def __call__(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        *,
+        adjoint: AbstractAdjoint | None = None,
+        throw: bool = True,
+    ) -> Equilibrium:
+        """Relax a tissue.
+
+        **Arguments:**
+
+        - `tissue`: where the relaxation starts.
+        - `energy`: what to minimise.
+        - `adjoint`: how to differentiate, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
+            default.
+        - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
+
+        **Returns:** an [`Equilibrium`][vertax.Equilibrium].
+
+        **Raises:** as [`equilibrate`][vertax.equilibrate].
+        """
+        adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
+        _check_adjoint(adjoint, self.minimiser)
+        _check_sharding((tissue, energy))
+        equilibrium = _equilibrate(*traced((tissue, energy)), self.traced(), adjoint)
+        # An error that is raised within a compiled program calls back to the host, and JAX keeps no such
+        # program in its cache on disk.
+        return equilibrium.checked() if throw else equilibrium
+
+    def finer(self, tolerance: Float[Array, ""]) -> Relaxation:
+        """The same, at rest only where the largest force is below this tolerance too."""
+        if self.tolerance is not None:
+            tolerance = jnp.minimum(tolerance, self.tolerance)
+        return dataclasses.replace(self, tolerance=tolerance)
 
     @property
-    def converged(self) -> Bool[Array, "*batch"]:
-        """Whether the largest force fell below the tolerance."""
-        return self.result == optx.RESULTS.successful
+    def minimiser(self) -> AbstractSolver:
+        """The solver, judged by its largest force."""
+        return self.solver if isinstance(self.solver, AbstractSolver) else Wrapped(self.solver)
+
+    def traced(self) -> Relaxation:
+        """The same with its numbers as arrays, of which another one compiles nothing anew."""
+        names = ("transitions", "tolerance", "patience", "max_steps")
+        numbers = {name: traced(getattr(self, name), integers=True) for name in names}
+        return dataclasses.replace(self, **numbers)
+
+    def search(self, tissue: Tissue, energy: AbstractEnergy) -> Search:
+        """The way to equilibrium, step by step, in the units of a tissue."""
+        units = units_of(tissue, energy)
+        tolerance = self.tolerance
+        if tolerance is None:
+            precise = tissue.vertices.dtype == jnp.float64
+            tolerance = (1e-10 if precise else 1e-5) * units.force
+        options = {
+            "length_scale": units.length,
+            "stiffness": units.stiffness,
+            "tolerance": jnp.asarray(tolerance, tissue.vertices.dtype),
+        }
+        minimiser = Patient(solver=self.minimiser, patience=self.patience)
+        return Search(minimiser, self.transitions, frozen(options))
 
 
 def equilibrate(
@@ -52,8 +147,8 @@ def equilibrate(
     adjoint: AbstractAdjoint | None = None,
     transitions: AbstractTransitions | None = T1(),
     tolerance: float | Float[Array, ""] | None = None,
-    patience: int = 1,
-    max_steps: int = 2000,
+    patience: int | Int[Array, ""] = 1,
+    max_steps: int | Int[Array, ""] = 2000,
     throw: bool = True,
 ) -> Equilibrium:
     r"""Relax a tissue to mechanical equilibrium, $X^* \in \arg\min_X E(X, \theta)$ (paper, Methods).
@@ -67,15 +162,10 @@ def equilibrate(
 
     - `tissue`: where the relaxation starts.
     - `energy`: what to minimise.
-    - `solver`: a minimiser of `vertax.solvers` or of Optimistix; [`NewtonCG`][vertax.solvers.NewtonCG]
-        by default, which reaches true equilibria.
     - `adjoint`: how to differentiate, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
         default.
-    - `transitions`: the rule for topology changes, or None to keep the topology.
-    - `tolerance`: largest force (component of $\nabla_X E$) that counts as equilibrium; by default
-        1e-9 in float64 and 1e-4 in float32.
-    - `patience`: number of consecutive steps for which the force must stay below the tolerance.
-    - `max_steps`: most steps of the minimiser.
+    - `solver`, `transitions`, `tolerance`, `patience`, `max_steps`: see
+        [`Relaxation`][vertax.Relaxation], whose convenient form this is.
     - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
 
     **Returns:** an [`Equilibrium`][vertax.Equilibrium].
@@ -83,81 +173,69 @@ def equilibrate(
     **Raises:**
 
     - `ValueError` for a tolerance, patience or number of steps that is not positive.
-    - `TypeError` for an adjoint that is none of `vertax.adjoints`.
-    - `RuntimeError` (of Equinox, also inside `jax.jit`) if `throw` and the relaxation did not converge.
+    - `ValueError` within `jax.shard_map` that checks which values differ between devices: pass
+        `check_vma=False`.
+    - `TypeError` for an adjoint that is none of `vertax.adjoints`, or a solver that is no minimiser.
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge.
     """
-    if solver is None:
-        solver = NewtonCG()
-    if not isinstance(solver, AbstractSolver):
-        solver = Wrapped(solver)
-    adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
-    _check_adjoint(adjoint, solver)
-    if tolerance is None:
-        tolerance = 1e-9 if tissue.vertices.dtype == jnp.float64 else 1e-4
-    if is_concrete(tolerance) and not tolerance > 0:
-        raise ValueError(f"Argument `tolerance` must be positive, but is {tolerance}.")
-    if patience < 1 or max_steps < 1:
-        raise ValueError(
-            f"Arguments `patience` and `max_steps` must be at least 1, but are {patience} and {max_steps}."
-        )
-    return _equilibrate(
-        tissue, energy, solver, adjoint, transitions, tolerance, patience, max_steps, throw
-    )
+    solver = NewtonCG() if solver is None else solver
+    response = Relaxation(solver, transitions, tolerance, patience, max_steps)
+    return response(tissue, energy, adjoint=adjoint, throw=throw)
 
 
 @eqx.filter_jit
 def _equilibrate(
+    tissue: Tissue, energy: AbstractEnergy, response: Relaxation, adjoint: AbstractAdjoint
+) -> Equilibrium:
+    start, constant = frozen((tissue, energy))
+    search = response.search(start, constant)
+    end = search.advance(search.begin(start, constant), constant, response.max_steps)
+    return conclude(search, end, tissue, energy, adjoint, response.max_steps)
+
+
+def conclude(
+    search: Search,
+    state: SearchState,
     tissue: Tissue,
     energy: AbstractEnergy,
-    solver: AbstractSolver,
     adjoint: AbstractAdjoint,
-    transitions: AbstractTransitions | None,
-    tolerance: float | Float[Array, ""],
-    patience: int,
-    max_steps: int,
-    throw: bool,
+    max_steps: int | Int[Array, ""],
 ) -> Equilibrium:
-    # Solvers bound their steps in units of the cells, whatever unit of length the user chose.
-    scale = jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
-    tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
-    options = frozen({"length_scale": scale, "tolerance": tolerance})
-    relaxation = Relaxation(solver=solver, patience=patience)
-
-    found = _search(
-        relaxation, options, transitions, *frozen((tissue, energy)), max_steps=max_steps
-    )
-    # The second solve starts at rest and takes no step: it is there to be differentiated.
-    stiffness = mean_stiffness(found.tissue, frozen(energy))
-    stiffness = jnp.where(stiffness > 0, stiffness, 1)
-    free = free_motions(found.tissue, frozen(energy), scale, stiffness)
+    """The equilibrium that a search from `tissue` ended at, differentiable."""
+    relaxed = state.tissue
+    units = units_of(relaxed, frozen(energy))
+    free = free_motions(relaxed, frozen(energy), units)
     # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
     # unless the energy has something to say about where the tissue is.
-    settled = _choose(jnp.all(free), found.tissue.settled(frozen(tissue)), found.tissue)
-    moved = settled.held_as(_choose(jnp.all(free), tissue, found.tissue))
+    settled = _choose(jnp.all(free), relaxed.settled(frozen(tissue)), relaxed)
+    moved = settled.held_as(_choose(jnp.all(free), tissue, relaxed))
     springs = jnp.ones_like(moved.drift(settled.configuration)).at[: len(free)].set(free)
-    memory = {"stiffness": stiffness, "relaxation": relaxation, "start": found.start}
+    memory = {
+        "stiffness": units.stiffness,
+        "relaxation": search.minimiser,
+        "start": state.origin,
+        "max_steps": jnp.asarray(max_steps),
+    }
+    # This solve starts at rest and takes no step: it is there to be differentiated.
     solution = optx.minimise(
-        _potential,
+        _pinned_energy,
         AtRest(),
         settled.configuration,
-        (moved, energy, stiffness * springs),
-        options | memory,
-        max_steps=max_steps,
+        (moved, energy, units.stiffness * springs),
+        search.options | memory,
+        max_steps=None,
         adjoint=adjoint,
         throw=False,
     )
     final = moved.with_configuration(solution.value)
-    equilibrium = Equilibrium(
+    return Equilibrium(
         tissue=final,
         energy=energy(final),
-        max_force=found.max_force,
-        num_steps=found.num_steps,
-        num_t1=found.num_t1,
-        result=found.result,
+        max_force=state.minimiser.force,
+        num_steps=state.num_steps,
+        num_t1=state.num_t1,
+        result=search.result(state),
     )
-    if throw:
-        equilibrium = found.result.error_if(equilibrium, found.result != optx.RESULTS.successful)
-    return equilibrium
 
 
 def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
@@ -181,6 +259,16 @@ def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
         )
 
 
+def _check_sharding(tree: PyTree) -> None:
+    # Within `shard_map` JAX tells apart what differs from device to device and what does not, and a loop
+    # that begins with a plain 0 and counts is refused. The loops of Optimistix and Equinox do.
+    if any(differs_between_devices(x) for x in jax.tree.leaves(tree) if eqx.is_array(x)):
+        raise ValueError(
+            "A relaxation within jax.shard_map needs jax.shard_map(..., check_vma=False): its loops begin "
+            "with numbers that are the same on all devices."
+        )
+
+
 def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
     """The vertices of one tissue or another; pinned ones are where the first has them."""
     if one.pinned is not None:
@@ -188,112 +276,23 @@ def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
     return one.with_vertices(jnp.where(condition, one.vertices, other.vertices))
 
 
-def free_motions(
-    tissue: Tissue, energy: AbstractEnergy, scale: Float[Array, ""], stiffness: Float[Array, ""]
-) -> Bool[Array, " modes"]:
+def free_motions(tissue: Tissue, energy: AbstractEnergy, units: Units) -> Bool[Array, " modes"]:
     """Which motions of the whole cost nothing: all, unless the energy knows positions."""
-    there = tissue.boundary.motions(tissue.vertices, 0.3 * scale)
+    there = tissue.boundary.motions(tissue.vertices, 0.3 * units.length)
     energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(there)
     here = energy(tissue)
     rounding = jnp.finfo(here.dtype).eps ** 0.6
-    return jnp.abs(energies - here) <= rounding * (jnp.abs(here) + stiffness * scale**2)
+    return jnp.abs(energies - here) <= rounding * (
+        jnp.abs(here) + units.stiffness * units.length**2
+    )
 
 
-def _potential(configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Array]) -> Array:
+def _pinned_energy(
+    configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Array]
+) -> Array:
     """The energy, and a term that pins the motions which cost nothing."""
     # Motions of the whole are zero modes. They make the Hessian singular, and a nudged relaxation would
     # drift along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
     tissue, energy, gauge = args
     drift = tissue.drift(configuration)
-    return energy(tissue.with_configuration(configuration)) + 0.5 * jnp.sum(gauge * drift**2)
-
-
-def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:
-    """The size of a typical second derivative of an energy, or of any number that a tissue has."""
-    # The Rayleigh quotient of a random vector is the mean eigenvalue, near enough.
-    y, unravel = ravel_pytree(tissue.configuration)
-    slope = jax.grad(lambda x: energy(tissue.with_configuration(unravel(x))))
-    probe = jax.random.normal(jax.random.key(0), y.shape, y.dtype)
-    _, response = jax.jvp(slope, (y,), (probe,))
-    return jnp.abs(jnp.sum(probe * response)) / jnp.sum(probe**2)
-
-
-class _Found(eqx.Module):
-    tissue: Tissue
-    start: PyTree[Array]  # the configuration right after the last T1 transition, or the first one
-    max_force: Float[Array, ""]
-    num_steps: Int[Array, ""]
-    num_t1: Int[Array, ""]
-    result: optx.RESULTS
-
-
-def _search(
-    relaxation: Relaxation,
-    options: dict[str, Array],
-    transitions: AbstractTransitions | None,
-    tissue: Tissue,
-    energy: AbstractEnergy,
-    *,
-    max_steps: int,
-) -> _Found:
-    """Relax with topology changes; not differentiable."""
-    no_gauge = jnp.zeros((), tissue.vertices.dtype)
-    objective = lambda y, args: (_potential(y, args), None)
-    f_struct, tags = jax.ShapeDtypeStruct((), no_gauge.dtype), frozenset()
-
-    def begin(at: Tissue) -> RelaxationState:
-        args = (at, energy, no_gauge)
-        return relaxation.init(objective, at.configuration, args, options, f_struct, None, tags)
-
-    state = begin(tissue)
-    dynamic, static = eqx.partition(state, eqx.is_array)
-    counts = jnp.zeros(0, jnp.int32) if transitions is None else transitions.init(tissue)
-
-    def unfinished(carry: tuple) -> Bool[Array, ""]:
-        *_, num_steps, finished = carry
-        return ~finished & (num_steps < max_steps)
-
-    def iterate(carry: tuple) -> tuple:
-        tissue, origin, dynamic, counts, num_steps, _ = carry
-        if transitions is None:
-            flipped = jnp.array(False)
-        else:
-            tissue, new_counts = transitions.sweep(tissue, energy, counts)
-            flipped = jnp.any(new_counts != counts)
-            counts = new_counts
-            # What a minimiser remembers of the old topology misleads it in the new one.
-            dynamic = jax.lax.cond(
-                flipped, lambda: eqx.filter(begin(tissue), eqx.is_array), lambda: dynamic
-            )
-            origin = jax.tree.map(
-                lambda new, old: jnp.where(flipped, new, old), tissue.configuration, origin
-            )
-        state = eqx.combine(dynamic, static)
-        finished = (relaxation.at_rest(state) & ~flipped) | jnp.isnan(state.force)
-
-        def step() -> tuple[PyTree, PyTree]:
-            args = (tissue, energy, no_gauge)
-            y, new_state, _ = relaxation.step(
-                objective, tissue.configuration, args, options, state, tags
-            )
-            return y, eqx.filter(new_state, eqx.is_array)
-
-        y, dynamic = jax.lax.cond(finished, lambda: (tissue.configuration, dynamic), step)
-        return (
-            tissue.with_configuration(y),
-            origin,
-            dynamic,
-            counts,
-            num_steps + jnp.where(finished, 0, 1),
-            finished,
-        )
-
-    start = (tissue, tissue.configuration, dynamic, counts, jnp.array(0), jnp.array(False))
-    tissue, origin, dynamic, counts, num_steps, _ = jax.lax.while_loop(unfinished, iterate, start)
-    state = eqx.combine(dynamic, static)
-    result = optx.RESULTS.where(
-        relaxation.at_rest(state), optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
-    )
-    finite = jnp.isfinite(state.force) & jnp.all(jnp.isfinite(tissue.vertices))
-    result = optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
-    return _Found(tissue, origin, state.force, num_steps, jnp.sum(counts), result)
+    return objective(configuration, (tissue, energy))[0] + 0.5 * jnp.sum(gauge * drift**2)

@@ -173,8 +173,9 @@ class FIRE(AbstractSolver):
 
     **Arguments:**
 
-    - `time_step`: first and smallest useful time step, for unit mass.
-    - `max_time_step`: largest time step.
+    - `time_step`: first and smallest useful time step, for unit mass where the mean stiffness is 12 (that
+        of the paper's first energy); elsewhere in proportion to the period of oscillation.
+    - `max_time_step`: largest time step, likewise.
     - `max_displacement`: furthest that one vertex may move in a step, in units of the length scale (in
         [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
 
@@ -204,7 +205,13 @@ class FIRE(AbstractSolver):
         scalar = lambda x: jnp.asarray(x, value.dtype)
         rest = optax.tree.zeros_like(y)
         return _FIREState(
-            value, gradient, rest, scalar(self.time_step), scalar(_MIXING), scalar(0), aux
+            value,
+            gradient,
+            rest,
+            scalar(self.time_step * _unit_of_time(options)),
+            scalar(_MIXING),
+            scalar(0),
+            aux,
         )
 
     def step(
@@ -215,10 +222,11 @@ class FIRE(AbstractSolver):
         downhill = power > 0
         n_downhill = jnp.where(downhill, state.downhill + 1, 0)
         fast = n_downhill > _DELAY
+        unit = _unit_of_time(options)
         dt = jnp.where(downhill, state.time_step, 0.5 * state.time_step)
-        dt = jnp.where(fast, jnp.minimum(1.1 * dt, self.max_time_step), dt)
+        dt = jnp.where(fast, jnp.minimum(1.1 * dt, self.max_time_step * unit), dt)
         # Without a floor a long uphill passage could shrink the step to nothing.
-        dt = jnp.maximum(dt, 0.02 * self.time_step)
+        dt = jnp.maximum(dt, 0.02 * self.time_step * unit)
         mixing = jnp.where(downhill, jnp.where(fast, 0.99 * state.mixing, state.mixing), _MIXING)
 
         velocity = jax.tree.map(lambda v: jnp.where(downhill, v, 0), state.velocity)
@@ -235,6 +243,11 @@ class FIRE(AbstractSolver):
 
     def gradient(self, state: _FIREState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
+
+
+def _unit_of_time(options: dict[str, Any]) -> Any:
+    """The period of oscillation, relative to that of a stiffness of 12."""
+    return (12 / options.get("stiffness", 12.0)) ** 0.5
 
 
 # Bitzek et al.: α_start = 0.1, and acceleration begins after five steps downhill.

@@ -60,7 +60,9 @@ class NewtonCG(AbstractSolver):
         reach = self.max_displacement * options.get("length_scale", 1.0)
         g = state.gradient
         _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], y)
-        p, hp, products = self._truncated_cg(hessian, g, state.radius)
+        # Forces are measured in that which moves a vertex by the length scale.
+        force = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
+        p, hp, products = self._truncated_cg(hessian, g, state.radius, force)
         # The region bounds the 2-norm; no single vertex may jump far either.
         largest = tree.norm(p, ord=jnp.inf)
         shrink = jnp.minimum(1.0, reach / jnp.where(largest > 0, largest, 1))
@@ -94,14 +96,14 @@ class NewtonCG(AbstractSolver):
         return state.gradient
 
     def _truncated_cg(
-        self, hessian: Any, g: PyTree, radius: Float[Array, ""]
+        self, hessian: Any, g: PyTree, radius: Float[Array, ""], force: float | Float[Array, ""]
     ) -> tuple[PyTree, PyTree, Int[Array, ""]]:
         """A step `p` inside the trust region, and `H p`."""
         # Conjugate gradients on (H + λ) p = -g from p = 0; |p| grows from iterate to iterate, so the first
         # one to leave the region, or to meet negative curvature, ends on its edge.
         squared = _dot(g, g)
         size = jnp.sqrt(squared)
-        forcing = jnp.minimum(0.1, jnp.sqrt(size))
+        forcing = jnp.minimum(0.1, jnp.sqrt(size / force))
         damping = size / radius
         zero = tree.zeros_like(g)
         first = tree.scale(-1, g)

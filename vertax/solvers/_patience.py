@@ -1,4 +1,4 @@
-"""The minimisers that `equilibrate` runs: to come to rest, and to stay there."""
+"""The minimisers that a relaxation runs: to come to rest, and to stay there."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from vertax.solvers._solver import AbstractSolver
 
 
-class RelaxationState(eqx.Module):
-    """State of a `Relaxation`."""
+class PatientState(eqx.Module):
+    """State of a `Patient`."""
 
     inner: PyTree
     force: Float[Array, ""]
@@ -22,11 +22,12 @@ class RelaxationState(eqx.Module):
     num_steps: Int[Array, ""]
 
 
-class Relaxation(optx.AbstractMinimiser):
+class Patient(optx.AbstractMinimiser):
     """A solver that is at rest when the largest force has stayed below a tolerance for some steps.
 
-    Besides those of the solver it knows two options: `tolerance`, the largest force at rest; and
-    `num_steps`, after which it stops, at rest or not and neither sooner nor later.
+    Besides those of the solver it knows three options: `tolerance`, the largest force at rest;
+    `max_steps`, after which it stops, at rest or not; and `num_steps`, after which it stops, neither
+    sooner nor later.
 
     **Arguments:**
 
@@ -35,30 +36,31 @@ class Relaxation(optx.AbstractMinimiser):
     """
 
     solver: AbstractSolver
-    patience: int = eqx.field(static=True, default=1)
+    patience: int | Int[Array, ""] = 1
     rtol: float = 0.0
     atol: float = 0.0
     norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(default=optx.max_norm, static=True)
 
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
-    ) -> RelaxationState:
+    ) -> PatientState:
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
         return self._judge(inner, options, jnp.array(0), jnp.array(0))
 
     def step(
-        self, fn: Any, y: Any, args: Any, options: Any, state: RelaxationState, tags: Any
-    ) -> tuple[Any, RelaxationState, Any]:
+        self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any
+    ) -> tuple[Any, PatientState, Any]:
         y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
         return y, self._judge(inner, options, state.n_below, state.num_steps + 1), aux
 
     def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: RelaxationState, tags: Any
+        self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         if "num_steps" in options:
             done = state.num_steps >= options["num_steps"]
         else:
             done = self.at_rest(state) | jnp.isnan(state.force)
+            done |= state.num_steps >= options.get("max_steps", jnp.inf)
         return done, optx.RESULTS.successful
 
     def postprocess(
@@ -66,20 +68,20 @@ class Relaxation(optx.AbstractMinimiser):
     ) -> tuple[Any, Any, dict[str, Any]]:
         return y, aux, {}
 
-    def at_rest(self, state: RelaxationState) -> Bool[Array, ""]:
+    def at_rest(self, state: PatientState) -> Bool[Array, ""]:
         """Whether the force has been below the tolerance for long enough."""
         return state.n_below >= self.patience
 
-    def gradient(self, state: RelaxationState) -> PyTree[Float[Array, "..."]]:
+    def gradient(self, state: PatientState) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
         return self.solver.gradient(state.inner)
 
     def _judge(
         self, inner: Any, options: Any, n_below: Int[Array, ""], num_steps: Int[Array, ""]
-    ) -> RelaxationState:
+    ) -> PatientState:
         force = self.norm(self.solver.gradient(inner))
         below = force < options["tolerance"]
-        return RelaxationState(inner, force, jnp.where(below, n_below + 1, 0), num_steps)
+        return PatientState(inner, force, jnp.where(below, n_below + 1, 0), num_steps)
 
 
 class AtRest(optx.AbstractMinimiser):

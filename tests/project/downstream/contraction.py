@@ -53,7 +53,9 @@ def problem(tissue: vx.Tissue) -> vx.InverseProblem[vx.AbstractEnergy]:
     strength = 0.1 * (1 + number)
     energy = vx.energies.AreaElasticity(1.0, 1.0) + Contractility(strength)
     cost = Evenness() + 0.1 * vx.costs.CellAreas(jnp.mean(tissue.areas))
-    return vx.InverseProblem(tissue=tissue, energy=energy, cost=cost, tolerance=1e-6)
+    return vx.InverseProblem(
+        tissue=tissue, energy=energy, cost=cost, response=vx.Relaxation(tolerance=1e-6)
+    )
 
 
 def gradient(tissue: vx.Tissue, strength: Float[Array, " cells"]) -> Float[Array, " cells"]:
@@ -70,7 +72,7 @@ def fit(
     problem: vx.InverseProblem[vx.AbstractEnergy], folder: Path, epochs: int
 ) -> vx.Fit[vx.AbstractEnergy]:
     """Solve the problem, and leave everything in a folder."""
-    trajectory = vx.io.Trajectory()
+    trajectory = vx.responses.Trajectory()
     optimiser = optax.adam(1e-2)
     outcome = vx.fit(problem, optimiser, epochs, progress=False, callback=trajectory)
     vx.save_tissue(folder / "tissue.npz", outcome.tissue)

@@ -169,7 +169,7 @@ def problem_of(
         scene.guess,
         VertexDistance(scene.target),
         adjoint=gradient.build(),
-        **vars(relaxation.build()),
+        response=relaxation.build(),
     )
 
 

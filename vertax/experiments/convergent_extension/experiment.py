@@ -118,7 +118,7 @@ def _design(config: Config, n_cells: int, folder: RunFolder, progress: bool) -> 
                 config.tensions.draw(cluster, config.spread, key),
                 AspectRatio(jnp.array(config.start_ratio), config.measure),
                 adjoint=config.gradient.build(),
-                **vars(config.relaxation.build()),
+                response=config.relaxation.build(),
             )
         )
     options: dict[str, Any] = {"notes": _ratio, "progress": progress}

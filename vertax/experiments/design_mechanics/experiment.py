@@ -81,7 +81,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         energy,
         MeanShapeFactor(config.target),
         adjoint=config.gradient.build(),
-        **vars(response),
+        response=response,
     )
     optimiser, epochs = config.fit.build(), config.fit.epochs
     outcome = folder.fit("design", problem, optimiser, epochs, callback=_notes, progress=progress)

@@ -123,7 +123,7 @@ def _fit(
         cost,
         # Vertices keep their centroid while they relax; an image does not say where it was.
         fit_position=source == "image",
-        **vars(config.relaxation.build()),
+        response=config.relaxation.build(),
     )
     optimiser, epochs = config.fit.build(), config.fit.epochs
     return folder.fit(source, problem, optimiser, epochs, truth=scene.truth, progress=progress)

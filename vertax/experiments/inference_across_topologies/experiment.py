@@ -207,7 +207,7 @@ def _fit(config: Config, method: Method, batch: Scene, folder: RunFolder, progre
         batch.guess,
         cost,
         adjoint=config.gradient.build(),
-        **vars(config.relaxation.build()),
+        response=config.relaxation.build(),
     )
     guidance = config.guidance.schedule(config.tissue.n_cells) if method.guided else None
     return folder.fit(

@@ -125,7 +125,7 @@ def _problems(config: Config, boundary: Boundary, n_types: int) -> list[InverseP
                 config.tensions.draw(tissue, config.spread, keys[2]),
                 HomotypicLength(types, config.relative),
                 adjoint=config.gradient.build(),
-                **vars(config.relaxation.build()),
+                response=config.relaxation.build(),
             )
         )
     return problems

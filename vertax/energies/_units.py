@@ -1,0 +1,49 @@
+"""Typical sizes of a tissue and of its energy, in which solvers and adjoints measure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from vertax.mesh import Tissue
+
+
+class Units(eqx.Module):
+    """The units of a tissue: whatever unit of length and energy the user chose, it relaxes alike."""
+
+    length: Float[Array, ""]
+    """The size of a cell: the root mean cell area."""
+    stiffness: Float[Array, ""]
+    """A typical second derivative of the energy; 1 for one that has none."""
+
+    @property
+    def force(self) -> Float[Array, ""]:
+        """The force that moves a vertex by the size of a cell."""
+        return self.stiffness * self.length
+
+
+def units_of(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Units:
+    """The units of a tissue and of its energy."""
+    stiffness = mean_stiffness(tissue, energy)
+    sound = jnp.isfinite(stiffness) & (stiffness > 0)
+    return Units(cell_size(tissue), jnp.where(sound, stiffness, 1))
+
+
+def cell_size(tissue: Tissue) -> Float[Array, ""]:
+    """The root mean cell area."""
+    return jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
+
+
+def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:
+    """The size of a typical second derivative of an energy, or of any number that a tissue has."""
+    # The Rayleigh quotient of a random vector is the mean eigenvalue, near enough.
+    y, unravel = ravel_pytree(tissue.configuration)
+    slope = jax.grad(lambda x: energy(tissue.with_configuration(unravel(x))))
+    probe = jax.random.normal(jax.random.key(0), y.shape, y.dtype)
+    _, response = jax.jvp(slope, (y,), (probe,))
+    return jnp.abs(jnp.sum(probe * response)) / jnp.sum(probe**2)

@@ -1,0 +1,102 @@
+"""What every response of a tissue to its energy has in common."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax._base.modules import is_concrete
+from vertax.adjoints import AbstractAdjoint
+from vertax.energies import AbstractEnergy
+from vertax.mesh import Tissue
+
+
+class Equilibrium(eqx.Module):
+    """A relaxed tissue and how it got there; under `jax.vmap` one entry for each of the batch."""
+
+    tissue: Tissue
+    """The relaxed tissue, differentiable with respect to the parameters of the energy."""
+    energy: Float[Array, "*batch"]
+    """Its energy."""
+    max_force: Float[Array, "*batch"]
+    r"""Largest component of $|\nabla_X E|$."""
+    num_steps: Int[Array, "*batch"]
+    """Steps of the minimiser."""
+    num_t1: Int[Array, "*batch"]
+    """T1 transitions on the way."""
+    result: optx.RESULTS
+    """Outcome; `optimistix.RESULTS[result]` is its message."""
+
+    @property
+    def converged(self) -> Bool[Array, "*batch"]:
+        """Whether the largest force fell below the tolerance."""
+        return self.result == optx.RESULTS.successful
+
+    def checked(self) -> Equilibrium:
+        """The same, if it converged.
+
+        **Raises:**
+
+        - `RuntimeError` (of Equinox inside `jax.jit`) if it did not.
+        """
+        converged = self.converged
+        if not is_concrete(converged):
+            # The message of a compiled program cannot hold numbers.
+            reason = f"The relaxation reached no equilibrium. {_REMEDY}"
+            return eqx.error_if(self, ~converged, reason)
+        if np.all(converged):
+            return self
+        members = f" ({np.sum(~converged)} of {np.size(converged)})" if np.ndim(converged) else ""
+        forces = np.asarray(self.max_force)
+        if not np.isfinite(forces).all():
+            raise RuntimeError(
+                f"The relaxation broke down{members}: its forces are not finite. The parameters of the "
+                "energy may be NaN, or so extreme that the tissue collapses."
+            )
+        raise RuntimeError(
+            f"The relaxation reached no equilibrium{members} in {np.max(self.num_steps)} steps (largest "
+            f"force {np.max(forces):.1e}). {_REMEDY}"
+        )
+
+
+_REMEDY = (
+    "Raise `max_steps`, loosen `tolerance`, use the default solver, or pass throw=False and look at "
+    "`converged`."
+)
+
+
+class AbstractResponse(eqx.Module):
+    """How a tissue answers to its energy."""
+
+    @abc.abstractmethod
+    def __call__(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        *,
+        adjoint: AbstractAdjoint | None = None,
+        throw: bool = True,
+    ) -> Equilibrium:
+        """Let the tissue answer.
+
+        **Arguments:**
+
+        - `tissue`: where it starts.
+        - `energy`: what it answers to.
+        - `adjoint`: how to differentiate.
+        - `throw`: raise an error if it reaches no equilibrium.
+
+        **Returns:** where it ends.
+        """
+
+    @abc.abstractmethod
+    def traced(self) -> AbstractResponse:
+        """The same with its numbers as arrays, of which another one compiles nothing anew."""
+
+    @abc.abstractmethod
+    def finer(self, tolerance: Float[Array, ""]) -> AbstractResponse:
+        """The same, at rest only where the largest force is below this tolerance too."""
