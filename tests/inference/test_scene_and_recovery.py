@@ -65,15 +65,16 @@ def test_the_watch_counts_what_differs():
     tissues = stack([targets[0], random_tissue(8, 2)])
     watch = RecoveryWatch(truth, stack(targets))
     numbers, counts, yes = jnp.zeros(2), jnp.zeros(2, int), jnp.ones(2, bool)
+    names = ("cost", "max_force", "relative_error")
+    slopes = ("gradient_norm", "gradient_residual", "gradient_steps")
     record = vx.Record(
         parameters=eqx.filter(truth, eqx.is_array),
         tissue=tissues,
         converged=yes,
         num_steps=counts,
         num_t1=counts,
-        outcome=vx.GradientOutcome(),
         sound=yes,
-        **dict.fromkeys(("cost", "max_force", "gradient_norm", "relative_error"), numbers),
+        **dict.fromkeys((*names, *slopes), numbers),
     )
     notes = watch(0, record)
     np.testing.assert_allclose(notes["pearson"], 1)

@@ -18,8 +18,8 @@ FAMILIES = {
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "
     "PerimeterElasticity ShapeFactorEnergy Sum",
-    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts fit limits "
-    "member stack stack_fits uncertainty",
+    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts fit "
+    "limits member stack stack_fits uncertainty",
     "inference": "Micrograph Microscope PinnedEnergy RecoveryWatch RelativeTensions Scene TensionProblem "
     "Tensions Transition fit_onset fit_transition foam_energy foam_terms force_balance label_image "
     "micrograph_problem pearson relative_error same_neighbours shape_factor_scene tension_problem",

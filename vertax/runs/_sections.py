@@ -48,13 +48,13 @@ class Relaxation(Section):
     """Whether short edges may flip (T1 transitions)."""
     t1_threshold: float = Field(default=float(T1().threshold), gt=0)
     """Length below which an edge may flip, in units of the root of the mean cell area."""
-    max_flips: int = Field(default=T1().max_flips, ge=1)
+    max_flips: int = Field(default=int(T1().max_flips), ge=1)
     """How often one edge may flip in a relaxation."""
     tolerance: float | None = Field(default=None, gt=0)
     """Largest force that counts as equilibrium; left out, it is chosen by the precision."""
-    patience: int = Field(default=Response().patience, ge=1)
+    patience: int = Field(default=int(Response().patience), ge=1)
     """Number of consecutive steps for which the force must stay below the tolerance."""
-    max_steps: int = Field(default=Response().max_steps, ge=1)
+    max_steps: int = Field(default=int(Response().max_steps), ge=1)
     """Most steps of the minimiser."""
 
     def build(self) -> Response:
