@@ -4,11 +4,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Tests compile a lot: two processes are nearly twice as fast as one, more need more memory. A file of
-# tests stays in one process, so that what it shares is made once. The tests run in lots, because a
-# process that has compiled very much dies in the compiler.
+# Tests compile a lot: two processes are nearly twice as fast as one, more need more memory.
 WORKERS ?= 2
-LOTS := a-c d-e f-l m-z
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -23,12 +20,10 @@ demo: $(VENV)/.base ## infer hidden shape factors of a synthetic tissue and show
 	$(BIN)/vertax run configs/demo.toml $(DEMO_OPTIONS)
 
 test: $(VENV)/.dev ## the tests that run on every change
-	@for lot in $(LOTS); do \
-	    $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_OPTIONS) tests/test_[$$lot]*.py || exit 1; \
-	done
+	$(BIN)/python tests/run.py --workers $(WORKERS) $(PYTEST_OPTIONS)
 
 test-slow: $(VENV)/.dev ## the longer scientific checks
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m slow $(PYTEST_OPTIONS)
+	$(BIN)/python tests/run.py --workers $(WORKERS) -m slow $(PYTEST_OPTIONS)
 
 notebooks: $(VENV)/.dev ## execute the notebooks, shortened; their outputs stay as they are
 	$(BIN)/python notebooks/execute.py --light --jobs $(WORKERS)
@@ -70,7 +65,7 @@ clean: ## remove the environment, caches and builds, but no results
 # is installed in place, so changes of its code need no new set-up.
 $(VENV)/.base: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV); this takes a minute or two and happens once."
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable '.[run]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(BIN)/python
@@ -81,7 +76,7 @@ $(VENV)/.dev: pyproject.toml | $(BIN)/python
 $(VENV)/.docs: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV) for the documentation; this takes a minute or two and happens once."
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'
-	@touch $@ $(VENV)/.base
+	@touch $@
 
 $(BIN)/python:
 	@command -v $(PYTHON) >/dev/null || { \

@@ -8,6 +8,7 @@ from pathlib import Path
 FLAGS = ["--xla_backend_optimization_level=0"]
 if version("jaxlib").startswith("0.10."):
     FLAGS.append("--xla_cpu_use_fusion_emitters=false")  # XLA stops at flags that it does not know
+os.environ["VERTAX_CACHE"] = "off"  # nothing of the tests in the user's cache folder
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS])
 
 import equinox as eqx

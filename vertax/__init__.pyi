@@ -3,6 +3,7 @@ from . import (
     costs as costs,
     energies as energies,
     fitting as fitting,
+    inference as inference,
     initialise as initialise,
     io as io,
     mesh as mesh,

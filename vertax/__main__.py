@@ -1,5 +1,23 @@
-"""`python -m vertax` is the command `vertax`."""
+"""The command `vertax`, which is `python -m vertax` as well."""
 
-from vertax.runs.command_line import main
+from __future__ import annotations
 
-main()
+import sys
+
+from vertax._base.extras import needing
+
+
+def main() -> None:
+    """Entry point of the program `vertax`."""
+    try:
+        with needing("run", "The command `vertax`"):
+            from vertax.runs.command_line import app
+        app()
+    except ImportError as error:
+        if "pip install" not in str(error):
+            raise
+        sys.exit(f"Error: {error}")  # an extra is missing, here or in what a command imports
+
+
+if __name__ == "__main__":
+    main()

@@ -9,7 +9,7 @@ from run_helpers import run, table
 
 import vertax as vx
 from vertax.costs import HomotypicLength, aspect_ratio
-from vertax.experiments._design import Tensions, limits
+from vertax.runs import TensionRange
 
 MECHANICS = """
 experiment = "design_mechanics"
@@ -90,7 +90,7 @@ def test_cells_of_one_type_part(tmp_path, method):
     folder, metrics = run(
         tmp_path / "tiny.toml", tmp_path / "out", f"gradient.method={method}", *nudge
     )
-    (kind,) = metrics.values()
+    kind = metrics["free, 2 types"]
     assert kind["share_best"]["mean"] > kind["share_initial"]["mean"] + 0.1
     types = jnp.asarray(np.array(table(folder / "cell_types.csv")["type"], int))
     tissue = vx.load_tissue(folder / "designed.npz")
@@ -102,53 +102,17 @@ def test_cells_of_one_type_part(tmp_path, method):
 
 def test_bounds_of_tensions_are_ordered():
     with pytest.raises(ValueError, match="low must be below high"):
-        Tensions(low=0.3, high=0.2)
+        TensionRange(low=0.3, high=0.2)
 
 
 def test_tensions_are_drawn_about_the_middle_of_their_range():
     import jax
 
     tissue = vx.initialise.free_voronoi(8, key=jax.random.key(0))
-    equal = Tensions(low=0.1, high=0.3).draw(tissue, 0.0, jax.random.key(1)).terms[1]
+    equal = TensionRange(low=0.1, high=0.3).draw(tissue, 0.0, jax.random.key(1)).terms[1]
     assert isinstance(equal, vx.energies.BoundedTension)
     np.testing.assert_allclose(equal.tension, 0.2)
-    varied = Tensions(low=0.1, high=0.3).draw(tissue, 0.5, jax.random.key(1)).terms[1]
+    varied = TensionRange(low=0.1, high=0.3).draw(tissue, 0.5, jax.random.key(1)).terms[1]
     assert isinstance(varied, vx.energies.BoundedTension)
     assert np.ptp(varied.tension) > 0.05
     assert ((varied.tension > 0.15) & (varied.tension < 0.25)).all()
-
-
-def fitted(**curves):
-    """The parts of a fit that tell what limits it."""
-    n = 20
-    history = {
-        "converged": np.full(n, True),
-        "num_t1": np.zeros(n, int),
-        "gradient_norm": np.ones(n),
-    }
-    names = ("cost", "max_force", "num_steps", "gradient_residual", "gradient_steps")
-    history |= dict.fromkeys((*names, "relative_error"), np.ones(n)) | {
-        "seconds": np.ones(n),
-        "guidance": np.ones(n),
-    }
-    history["num_steps"] = np.ones(n, int)
-    best = curves.pop("best_epoch", 5)
-    tissue = vx.initialise.hexagonal(3, 4)
-    energy = vx.energies.LineTension(1.0)
-    record = vx.History(**history | curves)
-    return vx.Fit(energy, tissue, jnp.array(1.0), jnp.array(0.0), np.array(best), record)
-
-
-@pytest.mark.parametrize(
-    ("curves", "word"),
-    [
-        ({"converged": np.full(20, False)}, "relaxations"),
-        ({"best_epoch": 19}, "still falling"),
-        ({"num_t1": np.full(20, 3)}, "T1"),
-        ({"gradient_norm": np.logspace(0, -9, 20)}, "vanished"),
-        ({}, "stopped falling"),
-    ],
-)
-def test_what_limits_a_design_is_named(curves, word):
-    assert word in limits(fitted(**curves), np.array(False))
-    assert limits(fitted(**curves), np.array(True)) == "reached"

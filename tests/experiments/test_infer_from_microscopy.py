@@ -8,8 +8,7 @@ from helpers import relaxed
 from PIL import Image
 
 import vertax as vx
-from vertax.runs import RunFolder, load_config
-from vertax.runs._config import ConfigError
+from vertax.runs import ConfigError, RunFolder, load_config
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import pytest
 from run_helpers import run, table
 
 import vertax as vx
-from vertax.experiments.infer_shape_factors.experiment import ImageSection, synthetic_image
 from vertax.runs import (
     EXPERIMENTS,
     ConfigError,
@@ -96,11 +95,9 @@ def test_the_target_is_an_equilibrium_of_the_true_parameters(tiny):
     folder, _ = tiny
     true = np.array(table(folder / "shape_factors.csv")["true"], float)
     target = vx.load_tissue(folder / "target.npz")
-    # The options of the experiment: then nothing is compiled again.
-    options = load_config(folder / "config.toml")[1].relaxation.options()
-    found = vx.equilibrate(
-        target, vx.energies.ShapeFactorEnergy(jax.numpy.asarray(true)), **options, throw=False
-    )
+    # The settings of the experiment: then nothing is compiled again.
+    relaxation = load_config(folder / "config.toml")[1].relaxation.build()
+    found = relaxation(target, vx.energies.ShapeFactorEnergy(jax.numpy.asarray(true)), throw=False)
     assert bool(found.converged)
     assert int(found.num_steps) == 0
 
@@ -125,27 +122,13 @@ def test_the_resolved_configuration_repeats_the_run(tiny):
     assert not (again / "image.npy").exists()
     written = tomllib.loads((again / "config.toml").read_text())
     assert written["data"] == "vertices"
-    assert written["relaxation"]["t1_threshold"] == 5e-3
+    assert written["relaxation"]["t1_threshold"] == vx.T1().threshold
 
 
 def test_figures_are_pictures(tiny):
     folder, _ = tiny
     for path in (folder / "figures").iterdir():
         assert path.read_bytes().startswith(b"\x89PNG"), path
-
-
-def test_an_image_has_the_noise_and_background_asked_for():
-    tissue = vx.initialise.periodic_voronoi(6, key=jax.random.key(0))
-    take = lambda **options: synthetic_image(
-        tissue, ImageSection(pixels=64, **options), jax.random.key(1)
-    )
-    clean = take(noise=0.0, background=0.0)
-    assert clean.max() == pytest.approx(1)
-    np.testing.assert_allclose(take(noise=0.0, background=0.3), clean + 0.3)
-    assert np.std(take(noise=0.1, background=0.0) - clean) == pytest.approx(0.1, rel=0.05)
-    ratio = take(noise=0.0, background=0.3, uneven_gain=0.2) / (clean + 0.3)
-    assert ratio.max() == pytest.approx(1.2, rel=1e-3)
-    assert ratio.min() == pytest.approx(0.8, rel=1e-3)
 
 
 # --- run folders
@@ -200,7 +183,7 @@ def test_metrics_are_strict_json(tmp_path):
 
 
 def test_columns_of_a_table_have_one_length(tmp_path):
-    with pytest.raises(ValueError, match=r"shorter|longer"):
+    with pytest.raises(ValueError, match="columns of one length"):
         RunFolder(tmp_path).save_table("x", {"a": [1, 2], "b": [1]})
     assert not list(tmp_path.iterdir())
 

@@ -8,7 +8,6 @@ from run_helpers import run, table
 
 import vertax as vx
 from vertax.costs import mismatched_neighbours
-from vertax.experiments.rigidity_transition.experiment import fit_onset, fit_transition
 
 ACROSS = """
 experiment = "inference_across_topologies"
@@ -76,26 +75,3 @@ def test_tissues_turn_from_solid_to_fluid(tmp_path):
     assert rows["shape_factor"][1] == pytest.approx(4.1, abs=1e-4)
     assert 3.4 < metrics["quench"]["p0_star"] < 4.1
     assert metrics["run"]["converged_fraction"] == 1
-
-
-def test_the_curve_of_a_transition():
-    p0 = np.linspace(3.6, 4.0, 21)
-    share = 1 / (1 + np.exp(-(p0 - 3.83) / 0.03))
-    found = fit_transition(p0, 1e4 * share, 10_000)
-    assert found.centre == pytest.approx(3.83, abs=1e-4)
-    assert found.width == pytest.approx(0.03, rel=1e-2)
-    # A step between two values lies between them.
-    step = fit_transition(p0, 100.0 * (p0 > 3.81), 100)
-    assert 3.80 <= step.centre <= 3.82
-    assert np.isnan(fit_transition(p0, np.zeros(21), 100).centre)
-
-
-def test_the_onset_is_where_the_root_of_the_energy_ends():
-    p0 = np.linspace(3.6, 4.0, 21)
-    spread = 1 + 0.1 * np.random.default_rng(0).standard_normal((21, 40))
-    energies = np.maximum(3.85 - p0, 0)[:, None] ** 2 * spread**2
-    onset = fit_onset(p0, energies)
-    assert onset is not None
-    assert onset.centre == pytest.approx(3.85, abs=0.01)
-    assert onset.width == pytest.approx(1, rel=0.1)
-    assert fit_onset(p0, 0 * energies) is None

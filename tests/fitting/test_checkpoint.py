@@ -13,7 +13,7 @@ from helpers import random_like, relaxed, rewritten
 import vertax as vx
 from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
-from vertax.experiments._scenes import stack
+from vertax.fitting import stack
 
 ADAM = optax.adam(1e-2)
 LEAST_SQUARES = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 import vertax as vx
 from vertax.costs import MeshImage, VertexDistance, render
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
-from vertax.experiments._scenes import stack
+from vertax.fitting import stack
 
 
 @pytest.fixture(scope="module")

@@ -194,7 +194,9 @@ def test_unknown_boundary_is_refused(small):
 def test_missing_scikit_image_is_named(small, monkeypatch):
     for module in ("skimage", "skimage.measure", "skimage.morphology", "skimage.segmentation"):
         monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ImportError, match=re.escape('pip install "vertax[image]"')):
+    with pytest.raises(
+        ImportError, match=re.escape('needs scikit-image: pip install "vertax[image]"')
+    ):
         from_microscopy(small[0])
 
 

@@ -1,5 +1,7 @@
 """Tissues that move, and edges that are marked."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ from PIL import Image
 
 import vertax as vx
 from vertax.mesh._topology import flip_edges
-from vertax.plotting import _style, flipped_edges
+from vertax.plotting import _animation, _style, flipped_edges
 from vertax.plotting._animation import _marks, _placed
+from vertax.plotting._colours import add_bar
 from vertax.plotting._tissue import _repeated
 
 
@@ -67,6 +70,17 @@ def test_a_gif_has_a_picture_for_each_frame_and_marks_transitions(way, tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["way.gif"]
     corners = {tuple(frame[0, 0]) for frame in frames}
     assert corners == {(255, 255, 255)}
+
+
+def test_the_bar_says_what_it_cuts_off(way, tmp_path, monkeypatch):
+    bars = []
+    keep = lambda *args, **options: bars.append(add_bar(*args, **options))
+    monkeypatch.setattr(_animation, "add_bar", keep)
+    values = np.linspace(0, 1, 4 * 8).reshape(4, 8)
+    limits: dict[str, Any]
+    for limits in ({}, {"vmax": 0.5}, {"vmin": 0.1, "vmax": 0.5}):
+        vx.animate(way, tmp_path / "way.gif", values, dpi=60, **limits)
+    assert [bar.extend for bar in bars] == ["neither", "max", "both"]
 
 
 def test_values_may_be_a_function_and_clusters_have_arcs(tmp_path):

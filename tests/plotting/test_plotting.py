@@ -6,6 +6,7 @@ import jax
 import matplotlib
 import numpy as np
 import pytest
+from free_helpers import cluster
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
@@ -87,6 +88,20 @@ class TestPolygons:
             places.add(tuple(np.round(cell_polygons(moved)[0].ravel(), 6) + 0.0))
         assert len(places) == 1
 
+    def test_arcs_are_as_fine_as_asked_for(self):
+        tissue = cluster(5)
+        off = []
+        for points in (1, 8, 64):
+            polygons, sides = cell_polygons(tissue, points_per_arc=points)
+            np.testing.assert_array_equal(sides, points * np.asarray(tissue.neighbour_counts))
+            areas = [shoelace(p[:n]) for p, n in zip(polygons, sides, strict=True)]
+            off.append(np.abs(areas - np.asarray(tissue.areas)).max())
+        # A polygon in an arc misses an area that falls with the square of the number of pieces.
+        assert off[0] > 10 * off[1]
+        assert off[1] == pytest.approx(64 * off[2], rel=0.1)
+        with pytest.raises(ValueError, match="`points_per_arc` must be a positive whole number"):
+            cell_polygons(tissue, points_per_arc=0)
+
 
 def centroid(polygon):
     # In a frame of its own: the formula loses digits far from the origin.
@@ -160,6 +175,11 @@ class TestTissue:
         ):
             faces = faces_of(plot_tissue(tissue, areas, **limits))
             assert faces.colorbar.extend == extend
+            # The bar says how far the values go that it does not show.
+            beyond = {"min": [areas.min()], "max": [areas.max()], "neither": []}
+            beyond["both"] = beyond["min"] + beyond["max"]
+            texts = [text.get_text() for text in faces.colorbar.ax.texts]
+            assert texts == [f"{value:.3g}" for value in beyond[extend]]
 
     def test_cells_without_a_value_are_grey(self, tissue):
         values = np.arange(tissue.n_cells, dtype=float)
@@ -173,9 +193,17 @@ class TestTissue:
             np.testing.assert_allclose(colours[cell], to_rgba("0.85"), atol=1e-6)
         assert np.ptp(colours[3, :3]) > 0.1
 
-    def test_values_that_are_all_missing_or_all_equal_draw(self, tissue):
-        for values in (np.full(15, np.nan), np.full(15, 3.7), np.zeros(15, int)):
-            plot_tissue(tissue, values).figure.canvas.draw()
+    @pytest.mark.parametrize("values", [np.full(15, np.nan), np.full(15, 3.7), np.zeros(15, int)])
+    def test_values_that_are_all_missing_or_all_equal_have_one_colour(self, tissue, values):
+        ax = plot_tissue(tissue, values, label="value")
+        ax.figure.canvas.draw()
+        faces = faces_of(ax)
+        low, high = faces.get_clim()
+        missing = bool(np.isnan(values[0]))
+        colour = to_rgba("0.85") if missing else faces.cmap(faces.norm(float(values[0])))
+        np.testing.assert_allclose(faces.get_facecolor(), np.tile(colour, (15, 1)), atol=1e-6)
+        assert faces.colorbar.extend == "neither"
+        assert missing or low < values[0] < high
 
     def test_mask(self, tissue):
         mask = np.arange(tissue.n_cells) % 3 == 0
@@ -254,11 +282,20 @@ class TestOverlay:
         assert len(faces_of(ax).get_facecolor()) == 0
         np.testing.assert_allclose(lines_of(ax).get_color()[0], to_rgba("#ffb000"))
 
-    def test_faces_are_translucent(self, tissue):
+    def test_cells_have_the_colours_of_the_bar_and_leave_the_membranes_visible(self, tissue):
         ax = plot_tissue(tissue, tissue.areas, image=self.IMAGE, pixel_size=0.05)
-        assert faces_of(ax).get_alpha() == 0.5
-        ax = plot_tissue(tissue, tissue.areas, image=self.IMAGE, alpha=0.2)
-        assert faces_of(ax).get_alpha() == 0.2
+        ax.figure.canvas.draw()
+        faces = faces_of(ax)
+        values = faces.get_array()
+        np.testing.assert_array_equal(faces.get_facecolor(), faces.cmap(faces.norm(values)))
+        drawn = [abs(shoelace(path.vertices[:-1])) for path in faces.get_paths()]
+        np.testing.assert_allclose(drawn, 0.64 * values, rtol=1e-9)
+
+    def test_with_an_opacity_cells_are_whole(self, tissue):
+        faces = faces_of(plot_tissue(tissue, tissue.areas, image=self.IMAGE, alpha=0.2))
+        assert faces.get_alpha() == 0.2
+        drawn = [abs(shoelace(path.vertices[:-1])) for path in faces.get_paths()]
+        np.testing.assert_allclose(drawn, faces.get_array(), rtol=1e-9)
 
     def test_contrast_ignores_single_pixels(self, tissue):
         image = np.random.default_rng(0).normal(100, 10, (60, 80))
@@ -267,9 +304,15 @@ class TestOverlay:
         assert 60 < low < 90
         assert 110 < high < 140
 
-    def test_flat_and_colour_images(self, tissue):
-        for image in (np.zeros((4, 5)), np.zeros((4, 5, 3), np.uint8)):
-            plot_tissue(tissue, image=image).figure.canvas.draw()
+    def test_flat_images_are_black_and_colour_images_are_as_they_are(self, tissue):
+        colours = np.random.default_rng(0).integers(0, 256, (4, 5, 3)).astype(np.uint8)
+        for image, expected in (
+            (np.full((4, 5), 7.0), np.zeros((4, 5, 3))),
+            (colours, colours / 255),
+        ):
+            shown: Any = plot_tissue(tissue, image=image).images[0]
+            pixels = shown.to_rgba(shown.get_array(), norm=True)
+            np.testing.assert_allclose(pixels[..., :3], expected, atol=1e-6)
 
 
 class TestHistory:
@@ -325,8 +368,38 @@ class TestRecovery:
         offsets: Any = [c.get_offsets() for c in ax.collections]
         np.testing.assert_array_equal(offsets[-1][:, 1], inferred)
         np.testing.assert_array_equal(offsets[0][:, 1], 2.5)
-        x, y = ax.lines[0].get_data()
-        np.testing.assert_array_equal(x, y)
+        diagonal: Any = ax.lines[0]
+        assert diagonal.get_xy1() == (0, 0)
+        assert diagonal.get_slope() == 1
+
+    def test_several_in_one_figure_share_one_diagonal_and_all_are_seen(self):
+        ax = plot_recovery(self.TRUE, self.TRUE + 5, label="far", deviation=np.full(4, 0.5))
+        plot_recovery(self.TRUE - 3, self.TRUE - 3, ax=ax, label="near", colour="red", marker="^")
+        assert len([line for line in ax.lines if hasattr(line, "get_slope")]) == 1
+        assert ax.get_xlim() == ax.get_ylim()
+        assert ax.get_xlim()[0] < -2
+        assert ax.get_xlim()[1] > 9
+        assert len(ax.texts) == 0
+        assert ax.get_legend_handles_labels()[1] == ["far", "near"]
+        (bars,) = (c for c in ax.collections if isinstance(c, LineCollection))
+        np.testing.assert_allclose([np.ptp(s[:, 1]) for s in bars.get_segments()], 1.0)
+
+    def test_what_is_not_known_is_left_out(self):
+        true, inferred = np.append(self.TRUE, np.nan), np.append(self.TRUE, 100.0)
+        ax = plot_recovery(true, inferred)
+        points: Any = ax.collections[0].get_offsets()
+        np.testing.assert_array_equal(points[:, 0], self.TRUE)
+        assert "$r$ = 1.0000" in ax.texts[0].get_text()
+        assert ax.get_ylim()[1] < 5
+
+    def test_in_a_given_figure_that_no_window_shows(self):
+        figure = Figure()
+        assert plot_recovery(self.TRUE, self.TRUE, figure=figure).figure is figure
+        assert plt.get_fignums() == []
+        with pytest.raises(ValueError, match="`figure` must be empty"):
+            plot_recovery(self.TRUE, self.TRUE, figure=figure)
+        with pytest.raises(ValueError, match="`ax` and `figure` must not both be given"):
+            plot_recovery(self.TRUE, self.TRUE, ax=figure.axes[0], figure=Figure())
 
     def test_undefined_numbers_are_left_out(self):
         text = plot_recovery(np.full(3, 3.7), np.array([3.6, 3.7, 3.8])).texts[0].get_text()
@@ -346,5 +419,7 @@ class TestRecovery:
             plot_recovery(self.TRUE, np.ones(3))
         with pytest.raises(ValueError, match="`initial` must have the shape of `true`"):
             plot_recovery(self.TRUE, self.TRUE, np.ones(3))
+        with pytest.raises(ValueError, match="`deviation` must have the shape of `true`"):
+            plot_recovery(self.TRUE, self.TRUE, deviation=np.ones(3))
         with pytest.raises(ValueError, match="at least one parameter"):
             plot_recovery(np.ones(0), np.ones(0))

@@ -6,7 +6,7 @@ AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractRespons
 AbstractTransitions AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation
 Evaluation Fit FitError Free GradientOutcome History ImplicitDifferentiation InverseProblem MINRES
 Periodic Record Relaxation T1 Tissue Topology Uncertainty adjoints animate costs energies
-equilibrate fit fitting initialise io load_tissue mesh plot_history plot_recovery plot_tissue
+equilibrate fit fitting inference initialise io load_tissue mesh plot_history plot_recovery plot_tissue
 plotting responses runs save_tissue solvers transitions uncertainty
 """
 
@@ -18,15 +18,21 @@ FAMILIES = {
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "
     "PerimeterElasticity ShapeFactorEnergy Sum",
-    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty fit uncertainty",
+    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts fit "
+    "limits member stack stack_fits uncertainty",
+    "inference": "Micrograph Microscope PinnedEnergy RecoveryWatch RelativeTensions Scene TensionProblem "
+    "Tensions Transition fit_onset fit_transition foam_energy foam_terms force_balance label_image "
+    "micrograph_problem pearson relative_error same_neighbours shape_factor_scene tension_problem",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
     "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
     "io": "BoundedTables Tables atomic_write cell_table edge_table from_tables "
     "load_energy load_problem load_tissue load_trajectory read_image "
     "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
     "write_geojson write_vtk",
-    "mesh": "AbstractBoundary Free Periodic Tissue Topology",
-    "plotting": "animate cell_polygons flipped_edges plot_history plot_recovery plot_tissue",
+    "mesh": "AbstractBoundary Free Periodic Tissue Topology cell_polygons",
+    "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
+    "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "
+    "scale_bar series_colours",
     "responses": "AbstractResponse Equilibrium Relaxation Trajectory equilibrate record_relaxation",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
     "transitions": "AbstractTransitions T1",

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 import vertax as vx
-from vertax.runs import EXPERIMENTS, RunFolder
+from vertax.runs import EXPERIMENTS, RunFolder, RunFolderError
 from vertax.runs.command_line import app
 
 ROOT = Path(__file__).parents[2]
@@ -81,6 +83,19 @@ def test_a_chosen_folder_is_overwritten_only_if_told_to(tiny):
         (["tiny.toml", "--set", "fit.epoch=3"], "did you mean `fit.epochs`"),
         (["tiny.toml", "--set", "fit.epochs=x"], "`fit.epochs` must be an integer"),
         (["tiny.toml", "--set", "fit.epochs"], "must have the form key=value"),
+        (
+            ["tiny.toml", "--set", f"seed={2**63}"],
+            "`seed` is 9223372036854775808, which is no integer of 64",
+        ),
+        (["tiny.toml", "--set", f"seed={'9' * 5000}"], "`seed` must be an integer, at least 0"),
+        (
+            ["tiny.toml", "--set", "precision=float32", "--set", f"seed={2**32}"],
+            "with precision float32, `seed` must be below 2**32, but is 4294967296.",
+        ),
+        (["tiny.toml", "--set", f"seed={'[' * 5000}"], "is nested too deeply"),
+        (["tiny.toml", "--output", "/proc/run"], "Cannot use /proc/run as a folder"),
+        (["tiny.toml", "--output", "x" * 5000], "as a folder: File name too long. Choose another"),
+        (["tiny.toml", "--figures", "gif"], "Figures are written as png, pdf, svg"),
     ],
 )
 def test_a_wrong_configuration_is_a_message_and_exit_code_2(tiny, arguments, said):
@@ -115,6 +130,51 @@ def test_a_failed_run_is_a_message_and_exit_code_1(tiny, instead, error):
     # A folder without metrics is one of a run that did not end.
     assert [path.name for path in (tiny / "runs/tiny").iterdir()] == ["config.toml"]
     assert vertax("run", "tiny.toml", "--debug").exception is error
+
+
+def test_a_run_that_is_too_large_is_a_message_and_exit_code_1(tiny, instead):
+    instead(lambda config, folder, *, progress: np.empty((2**40, 2**10)))
+    outcome = vertax("run", "tiny.toml")
+    assert outcome.exit_code == 1
+    assert "Error: The run is too large for this machine" in outcome.stderr
+
+
+def test_the_formats_of_the_figures_are_chosen(tiny, instead):
+    def draw(config, folder, *, progress):
+        for name in ("a", "b"):
+            figure = Figure()
+            figure.subplots().plot([0, 1])
+            folder.save_figure(name, figure)
+        return {"cost": 1.0}
+
+    instead(draw)
+    outcome = vertax("run", "tiny.toml", "--figures", "pdf", "--figures", "svg", "--output", "out")
+    assert outcome.exit_code == 0, outcome.output
+    files = sorted(path.name for path in (tiny / "out/figures").iterdir())
+    assert files == ["a.pdf", "a.svg", "b.pdf", "b.svg"]
+    assert "out/figures/b.pdf" in outcome.output
+    first = [(tiny / "out/figures" / name).read_bytes() for name in files]
+    assert first[0].startswith(b"%PDF")
+    assert b"<svg" in first[1]
+    again = vertax("run", "tiny.toml", "--figures", "svg", "--output", "out", "--overwrite")
+    assert again.exit_code == 0, again.output
+    # What is no longer asked for is gone, and the same picture is the same file.
+    assert sorted(path.name for path in (tiny / "out/figures").iterdir()) == ["a.svg", "b.svg"]
+    assert (tiny / "out/figures/a.svg").read_bytes() == first[1]
+    assert vertax("run", "tiny.toml").exit_code == 0
+    assert (tiny / "runs/tiny/figures/a.png").is_file()
+    with pytest.raises(RunFolderError, match="one or more"):
+        RunFolder(tiny, figures=())
+
+
+def test_a_run_says_what_it_is_at_unless_it_is_to_be_quiet(tiny, instead):
+    def run(config, folder, *, progress):
+        folder.say("counting")
+        return {"n": folder.part("cells 1", lambda: {"n": np.arange(3)})["n"]}
+
+    instead(run)
+    assert vertax("run", "tiny.toml").stderr == "  counting …\n  cells 1 …\n"
+    assert vertax("run", "tiny.toml", "--quiet").stderr == ""
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(tiny, instead):

@@ -2,7 +2,6 @@
 
 import tomllib
 from pathlib import Path
-from typing import Literal
 
 import pytest
 from pydantic import Field
@@ -145,9 +144,21 @@ def test_a_missing_file_and_bad_toml_are_named(write, tmp_path):
     assert f"Cannot read {tmp_path}" in refusal(tmp_path)
     bad = write("fit = [", "bad.toml")
     assert f"{bad} is not valid TOML" in refusal(bad)
+    deep = write("x = " + "[" * 5000, "deep.toml")
+    assert refusal(deep) == f"{deep} is nested too deeply."
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe\x00")
     assert f"{binary} is not valid TOML" in refusal(binary)
+
+
+def test_a_byte_order_mark_is_no_mistake(tmp_path):
+    path = tmp_path / "windows.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + VALID.replace("\n", "\r\n").encode())
+    assert load_config(path)[1].fit.epochs == 7
+
+
+def test_a_long_value_is_quoted_in_part(write):
+    assert len(refusal(write(VALID), f"data={'a' * 10_000}")) < 500
 
 
 def test_the_experiment_must_be_named_and_exist(write):
@@ -184,8 +195,6 @@ class _Camera(Section):
 class _Config(ExperimentConfig):
     """A configuration."""
 
-    experiment: Literal["x"] = "x"
-    """Which."""
     camera: _Camera
     """A camera."""
 
@@ -193,8 +202,6 @@ class _Config(ExperimentConfig):
 class _Deep(ExperimentConfig):
     """A configuration with its own defaults for shared tables."""
 
-    experiment: Literal["x"] = "x"
-    """Which."""
     outer: "_Outer" = Field(default_factory=lambda: _Outer())
     """A table."""
     camera: _Camera = _Camera(path=Path("here.tif"), crop=[1, 2])

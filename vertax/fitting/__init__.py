@@ -1,5 +1,6 @@
 """Inverse problems: parameters whose equilibrium minimises a cost."""
 
+from vertax.fitting._batch import member as member, stack as stack, stack_fits as stack_fits
 from vertax.fitting._checkpoint import Checkpoint as Checkpoint
 from vertax.fitting._fit import fit as fit
 from vertax.fitting._history import (
@@ -13,3 +14,4 @@ from vertax.fitting._inverse import (
     InverseProblem as InverseProblem,
 )
 from vertax.fitting._uncertainty import Uncertainty as Uncertainty, uncertainty as uncertainty
+from vertax.fitting._verdict import doubts as doubts, limits as limits

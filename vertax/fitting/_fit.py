@@ -205,6 +205,7 @@ def _run(
             initial=len(done.rows),
             unit="epoch",
             disable=None if progress else True,
+            desc="compiling",  # while the first epoch stands at 0
         )
         while len(done.rows) < epochs and np.any(done.state.going):
             epoch, began = len(done.rows), time.perf_counter()
@@ -219,6 +220,7 @@ def _run(
                 )
             notes = None if callback is None else callback(epoch, record)
             done = Progress(state, (*done.rows, row), _noted(done.notes, notes, epoch))
+            bar.set_description(refresh=False)
             bar.set_postfix(
                 cost=f"{np.nanmean(row['cost']):.3e}",
                 force=f"{np.max(row['max_force']):.1e}",

@@ -1,1 +1,34 @@
-"""Inference: from images and masks to parameters."""
+"""From images, masks and synthetic data to parameters: what experiments and notebooks call."""
+
+from vertax.inference._foam import (
+    foam_energy as foam_energy,
+    foam_terms as foam_terms,
+    force_balance as force_balance,
+)
+from vertax.inference._micrograph import (
+    Micrograph as Micrograph,
+    PinnedEnergy as PinnedEnergy,
+    micrograph_problem as micrograph_problem,
+)
+from vertax.inference._microscope import Microscope as Microscope, label_image as label_image
+from vertax.inference._recovery import (
+    RecoveryWatch as RecoveryWatch,
+    pearson as pearson,
+    relative_error as relative_error,
+    same_neighbours as same_neighbours,
+)
+from vertax.inference._scene import (
+    Scene as Scene,
+    shape_factor_scene as shape_factor_scene,
+)
+from vertax.inference._tensions import (
+    RelativeTensions as RelativeTensions,
+    TensionProblem as TensionProblem,
+    Tensions as Tensions,
+    tension_problem as tension_problem,
+)
+from vertax.inference._transition import (
+    Transition as Transition,
+    fit_onset as fit_onset,
+    fit_transition as fit_transition,
+)

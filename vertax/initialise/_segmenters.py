@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from vertax._base.checks import check_number
+from vertax._base.extras import needing
 
 _SMALLEST_SIDE = 16
 
@@ -79,10 +80,8 @@ class Watershed(AbstractSegmenter):
     def __call__(
         self, image: Shaped[np.ndarray | Array, " *shape"]
     ) -> Int[np.ndarray, "rows columns"]:
-        measure, morphology, segmentation = (
-            _import(f"skimage.{name}", "Watershed", "scikit-image", "image")
-            for name in ("measure", "morphology", "segmentation")
-        )
+        with needing("image", "Watershed"):
+            from skimage import measure, morphology, segmentation
         pixels = check_image(image)
         for name in ("cell_size", "smoothing"):
             length = getattr(self, name)
@@ -149,7 +148,8 @@ class Cellpose(AbstractSegmenter):
     def __call__(
         self, image: Shaped[np.ndarray | Array, " *shape"]
     ) -> Int[np.ndarray, "rows columns"]:
-        models = _import("cellpose.models", "Cellpose", "cellpose", "cellpose")
+        with needing("cellpose", "Cellpose"):
+            models = importlib.import_module("cellpose.models")
         _check_version("cellpose", 4)
         pixels = check_image(image)
         network = models.CellposeModel(gpu=self.gpu, pretrained_model=self.model)
@@ -228,15 +228,6 @@ def _check_size(name: str, value: float | None, *, zero: bool) -> None:
     if value is None:
         return
     check_number(name, value, least=0) if zero else check_number(name, value, above=0)
-
-
-def _import(module: str, who: str, package: str, extra: str):
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f'{who} needs {package}: pip install "vertax[{extra}]" ({error}).'
-        ) from error
 
 
 def _check_version(package: str, least: int) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from vertax._base.checks import check_whole
+from vertax._base.extras import needing
 
 _TIFF = (".tif", ".tiff")
 
@@ -36,7 +37,7 @@ def read_image(
     - `ValueError` if it is not an image of real numbers, if it has channels or planes and none was chosen,
         or not the one that was.
     - `TypeError` for a channel or plane that is no whole number.
-    - `ImportError` for a TIFF file if tifffile is not installed.
+    - `ImportError` if what reads the file is not installed: the extra `[image]`.
     """
     file = Path(path)
     if not file.exists():
@@ -82,10 +83,8 @@ def _read(file: Path) -> tuple[np.ndarray, str]:
 
 
 def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
-    try:
+    with needing("image", "Reading TIFF files"):
         import tifffile
-    except ImportError as error:
-        raise ImportError('TIFF files need tifffile: pip install "vertax[image]".') from error
     with tifffile.TiffFile(file) as tiff:
         series = tiff.series[0]
         pixels, axes = series.asarray(), series.axes
@@ -96,7 +95,8 @@ def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
 
 
 def _read_picture(file: Path) -> tuple[np.ndarray, str]:
-    from PIL import Image  # comes with matplotlib
+    with needing("image", "Reading pictures"):
+        from PIL import Image
 
     with Image.open(file) as picture:
         # Palette indices are no intensities.

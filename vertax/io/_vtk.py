@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vertax._base.atomic import atomic_draft
+from vertax._base.extras import needing
 from vertax.io._data_tables import Column, cell_columns, edge_columns
 from vertax.io._geojson import checked_drawing, edge_path
 from vertax.mesh import Tissue
@@ -47,16 +48,12 @@ def write_vtk(
 
     **Raises:**
 
-    - `ImportError` if meshio is not installed: `pip install 'vertax[files]'`.
+    - `ImportError` if meshio is not installed: `pip install "vertax[files]"`.
     - `ValueError` for another ending, values that are no numbers, a batch of tissues, less than one
         point an arc, and as [`cell_table`][vertax.io.cell_table].
     """
-    try:
+    with needing("files", "Writing VTK files"):
         import meshio
-    except ImportError as error:
-        raise ImportError(
-            "VTK files are written through meshio, which is not installed: pip install 'vertax[files]'"
-        ) from error
     if Path(path).suffix not in _SUFFIXES:
         raise ValueError(
             f"Argument `path` must end in {' or '.join(_SUFFIXES)}, but is {os.fspath(path)!r}."

@@ -5,5 +5,6 @@ from vertax.mesh._boundary import (
     Free as Free,
     Periodic as Periodic,
 )
+from vertax.mesh._outlines import cell_polygons as cell_polygons
 from vertax.mesh._tissue import Tissue as Tissue
 from vertax.mesh._topology import Topology as Topology

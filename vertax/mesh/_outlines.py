@@ -116,21 +116,30 @@ class Drawing(eqx.Module):
 
 
 def cell_polygons(
-    tissue: Tissue,
+    tissue: Tissue, points_per_arc: int = _POINTS_PER_ARC
 ) -> tuple[Float[np.ndarray, "cells sides 2"], Int[np.ndarray, " cells"]]:
     """Corners of all cells, counter-clockwise, each cell whole.
 
     In a periodic tissue each cell is placed so that its centroid lies in the home box; its corners
-    may stick out. If there are arcs, each side is a line of 24 pieces.
+    may stick out. If there are arcs, each side is a line of so many pieces.
 
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
+    - `points_per_arc`: number of straight pieces that stand for an arc.
 
     **Returns:** the corners, in units of length, where rows of cells with fewer sides than others
     are filled up with their first corner; and the number of corners of each cell.
+
+    **Raises:**
+
+    - `ValueError` if `points_per_arc` is not positive.
     """
-    return Drawing(tissue).polygons()
+    if points_per_arc < 1:
+        raise ValueError(
+            f"Argument `points_per_arc` must be a positive whole number, but is {points_per_arc}."
+        )
+    return Drawing(tissue, points_per_arc).polygons()
 
 
 @eqx.filter_jit  # one compilation instead of one for each operation

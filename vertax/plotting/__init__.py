@@ -1,6 +1,25 @@
 """Pictures of tissues and of fits."""
 
-from vertax.mesh._outlines import cell_polygons as cell_polygons
-from vertax.plotting._animation import animate as animate, flipped_edges as flipped_edges
-from vertax.plotting._curves import plot_history as plot_history, plot_recovery as plot_recovery
-from vertax.plotting._tissue import plot_tissue as plot_tissue
+from vertax._base.extras import needing as _needing
+from vertax.mesh import cell_polygons as cell_polygons
+
+with _needing("plot", "Drawing"):
+    from vertax.plotting._animation import animate as animate, flipped_edges as flipped_edges
+    from vertax.plotting._curves import plot_history as plot_history
+    from vertax.plotting._image import (
+        label_colours as label_colours,
+        plot_image as plot_image,
+        scale_bar as scale_bar,
+    )
+    from vertax.plotting._panels import plot_tissues as plot_tissues
+    from vertax.plotting._recovery import plot_recovery as plot_recovery
+    from vertax.plotting._replicates import plot_band as plot_band, plot_boxes as plot_boxes
+    from vertax.plotting._style import (
+        INK as INK,
+        SERIES as SERIES,
+        house_style as house_style,
+        new_figure as new_figure,
+        same_limits as same_limits,
+        series_colours as series_colours,
+    )
+    from vertax.plotting._tissue import plot_tissue as plot_tissue

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Real
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, Normalize, to_rgb
+from matplotlib.colors import Colormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
@@ -21,7 +20,8 @@ from vertax._base.atomic import atomic_draft
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
-from vertax.plotting._tissue import Colours, colour_map, draw, line_width, size_of, view_of
+from vertax.plotting._colours import Colours, add_bar
+from vertax.plotting._tissue import draw, line_width, view_of
 
 CellValues: TypeAlias = (
     Callable[[Tissue], Real[Array | np.ndarray, " cells"]]
@@ -65,7 +65,8 @@ def animate(
     - `fps`: frames a second.
     - `mark_t1`: for how many frames edges that have flipped are marked; 0 is not at all.
     - `cmap`, `label`: colour map of the cells, and label of its bar.
-    - `vmin`, `vmax`: limits of the colours; by default those of all frames together.
+    - `vmin`, `vmax`: limits of the colours; by default those of all frames together. Where values of a frame
+        lie beyond, the bar has an arrow and says how far they go.
     - `captions`: a text above each frame.
     - `linger`: seconds that the last frame stays.
     - `dpi`: pixels an inch; the tissue is about three inches wide.
@@ -82,9 +83,7 @@ def animate(
     _check(frames, fps, mark_t1, captions, linger, dpi)
     write = _writer(path)
     values = _cell_values(cells, frames)
-    pictures = _pictures(
-        frames, values, _limits(values, vmin, vmax), cmap, label, captions, mark_t1, dpi
-    )
+    pictures = _pictures(frames, values, Colours(cmap, vmin, vmax, label), captions, mark_t1, dpi)
     with atomic_draft(path) as draft:
         write(draft, pictures, fps, linger)
 
@@ -161,14 +160,6 @@ def _cell_values(cells: CellValues | None, frames: list[Tissue]) -> np.ndarray |
     return values
 
 
-def _limits(
-    values: np.ndarray | None, vmin: SupportsFloat | None, vmax: SupportsFloat | None
-) -> tuple[float, float]:
-    finite = np.zeros(0) if values is None else values[np.isfinite(values)]
-    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-    return float(low if vmin is None else vmin), float(high if vmax is None else vmax)
-
-
 def _marks(frames: list[Tissue], duration: int) -> Iterator[np.ndarray]:
     """Edges to mark in each frame: those that flipped in the last few."""
     left = np.zeros(frames[0].n_edges, int)
@@ -180,9 +171,7 @@ def _marks(frames: list[Tissue], duration: int) -> Iterator[np.ndarray]:
 def _pictures(
     frames: list[Tissue],
     values: np.ndarray | None,
-    limits: tuple[float, float],
-    cmap: str | Colormap,
-    label: str | None,
+    colours: Colours,
     captions: Sequence[str] | None,
     mark_t1: int,
     dpi: int,
@@ -194,12 +183,11 @@ def _pictures(
     with _style.house_style():
         figure, ax = _figure(high - low, values is not None, captions is not None, dpi)
         if values is not None:
-            scale = ScalarMappable(Normalize(*limits), colour_map(cmap))
-            bar = figure.colorbar(scale, ax=ax, aspect=22, shrink=0.9, label=label or "")
-            bar.outline.set_linewidth(0.4)
+            low_colour, high_colour = colours.limits(values)  # of all frames together
+            colours = colours._replace(low=low_colour, high=high_colour)
+            add_bar(ax, colours.scale(values), values, colours.label, aspect=22, shrink=0.9)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         width = line_width(drawings[0], ax)
-    colours = Colours(cmap, *limits)
     for k, (drawing, marked) in enumerate(zip(drawings, _marks(frames, mark_t1), strict=True)):
         ax.clear()
         own = None if values is None else values[k]
@@ -229,7 +217,7 @@ def _placed(frames: list[Tissue]) -> list[Drawing]:
 
 
 def _figure(extent: np.ndarray, bar: bool, caption: bool, dpi: int) -> tuple[Figure, Axes]:
-    width, height = size_of(extent)
+    width, height = _style.size_of(extent)
     layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04)
     size = (width + 0.8 * bar + 0.1, height + 0.25 * caption + 0.1)
     figure = Figure(figsize=size, dpi=dpi, layout=layout)

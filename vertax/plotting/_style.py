@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -15,13 +17,13 @@ MISSING = "0.85"
 BLANK = "0.96"
 """Faces when cells are not coloured."""
 INK = "0.15"
-"""Cell outlines and text."""
+"""The dark grey of cell outlines, text and lines of reference."""
 HIGHLIGHT = "#ffb000"
 """Membranes over a grey image."""
 MARK = "#e8308a"
 """Marked edges: not in viridis, not in inferno, and no grey."""
-SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-"""Blue, vermilion, green, purple of Okabe and Ito, told apart with any colour vision."""
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
+"""Colours of curves: six of Okabe and Ito, told apart with any colour vision, and a grey."""
 
 _STYLE: Any = {
     "font.size": 8,
@@ -51,23 +53,137 @@ _STYLE: Any = {
 }
 
 
-def house_style() -> contextlib.AbstractContextManager[None]:
-    """Matplotlib settings while a picture is made; the user's own are back afterwards."""
-    return matplotlib.rc_context(_STYLE)
+@contextlib.contextmanager
+def house_style() -> Iterator[None]:
+    """Matplotlib settings of all pictures here, for pictures of one's own: a context, or a decorator.
+
+    ```python
+    @vx.plotting.house_style()
+    def my_figure(energies):
+        figure, ((ax,),) = vx.plotting.new_figure()
+        ax.plot(energies)
+        return figure
+    ```
+
+    The settings of the user are back afterwards.
+    """
+    with matplotlib.rc_context(_STYLE):
+        yield
 
 
-def new_axes(n: int = 1, *, width: float, height: float) -> list[Axes]:
-    """A new figure of `n` axes side by side, each `width` × `height` inches."""
-    import matplotlib.pyplot as plt  # here: it picks a window system
+def new_figure(
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    width: float | Sequence[float] = 2.4,
+    height: float | Sequence[float] = 2.3,
+    room: float = 0.0,
+) -> tuple[Figure, np.ndarray]:
+    """A figure of panels in rows and columns, for a file: no window shows it, and nothing has to close it.
 
-    _, axes = plt.subplots(
-        1,
-        n,
-        figsize=(n * width, height),
-        layout=ConstrainedLayoutEngine(w_pad=0.06),
-        squeeze=False,
-    )
-    return list(axes[0])
+    ```python
+    figure, ((left, right),) = vx.plotting.new_figure(1, 2, width=[3.0, 2.4])
+    vx.plot_tissue(tissue, ax=left)
+    figure.savefig("tissue.png")
+    ```
+
+    **Arguments:**
+
+    - `rows`, `columns`: of panels.
+    - `width`: of a panel in inches; or of the panels of each column.
+    - `height`: of a panel in inches; or of the panels of each row.
+    - `room`: more width on the right in inches, for a colour bar or a legend.
+
+    **Returns:** the figure, and its axes in an array of shape `(rows, columns)`.
+
+    **Raises:**
+
+    - `ValueError` if there are no panels, or if widths or heights do not go with them.
+    """
+    if rows < 1 or columns < 1:
+        raise ValueError(
+            f"Arguments `rows` and `columns` must be positive, but are {rows} and {columns}."
+        )
+    widths, heights = _sizes("width", width, columns), _sizes("height", height, rows)
+    # Not pyplot: it keeps every figure open, and on a screen would open windows.
+    layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06)
+    figure = Figure(figsize=(sum(widths) + room, sum(heights)), layout=layout)
+    with house_style():
+        axes = figure.subplots(
+            rows, columns, width_ratios=widths, height_ratios=heights, squeeze=False
+        )
+    return figure, axes
+
+
+def _sizes(name: str, size: float | Sequence[float], n: int) -> list[float]:
+    sizes = np.broadcast_to(np.asarray(size, float), n) if np.ndim(size) == 0 else np.asarray(size)
+    if sizes.shape != (n,) or not np.all(sizes > 0):
+        raise ValueError(
+            f"Argument `{name}` must be a positive number of inches, or {n} of them, but is {size}."
+        )
+    return [float(x) for x in sizes]
+
+
+def series_colours(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each name, always the same for the same list.
+
+    **Arguments:**
+
+    - `names`: of the curves or groups.
+
+    **Returns:** the colours of `SERIES` by name; after seven they begin anew.
+    """
+    return {name: SERIES[k % len(SERIES)] for k, name in enumerate(names)}
+
+
+def same_limits(axes: Iterable[Axes], *, x: bool = True, y: bool = True) -> None:
+    """Give panels the same limits, those that show all of them, so that they can be compared.
+
+    **Arguments:**
+
+    - `axes`: the panels, after all is drawn.
+    - `x`, `y`: which of the two axes.
+    """
+    panels = list(axes)
+    for wanted, limits, change in (
+        (x, [ax.get_xlim() for ax in panels], Axes.set_xlim),
+        (y, [ax.get_ylim() for ax in panels], Axes.set_ylim),
+    ):
+        if wanted:
+            for ax in panels:
+                change(ax, np.min(limits), np.max(limits))
+
+
+def new_axes(
+    n: int = 1, *, width: float, height: float, room: float = 0.0, figure: Figure | None = None
+) -> list[Axes]:
+    """Axes side by side, each `width` × `height` inches, in a new figure of pyplot or filling a given one."""
+    size = (n * width + room, height)
+    layout = ConstrainedLayoutEngine(w_pad=0.06)
+    if figure is None:
+        import matplotlib.pyplot as plt  # here: it picks a window system
+
+        figure = plt.figure(figsize=size, layout=layout)
+    else:
+        if figure.axes:
+            raise ValueError(
+                "Argument `figure` must be empty, but has axes; to draw in some, pass them instead."
+            )
+        figure.set_size_inches(size)
+        figure.set_layout_engine(layout)
+    return list(figure.subplots(1, n, squeeze=False)[0])
+
+
+def one_of(ax: Any, figure: Figure | None, name: str = "ax") -> None:
+    """Refuse a figure and axes at once."""
+    if ax is not None and figure is not None:
+        raise ValueError(f"Arguments `{name}` and `figure` must not both be given.")
+
+
+def size_of(extent: np.ndarray) -> tuple[float, float]:
+    """Width and height of a new picture in inches: of one area, whatever its shape."""
+    ratio = float(np.clip(extent[1] / extent[0], 0.25, 4))
+    return 3.0 / np.sqrt(ratio), 3.0 * np.sqrt(ratio)
 
 
 def figure_of(ax: Axes) -> Figure:

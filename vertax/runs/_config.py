@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import os
 import tomllib
 import types
@@ -10,13 +11,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
-import annotated_types
-import pydantic
-from pydantic.fields import FieldInfo
+from vertax._base.extras import needing
+from vertax.runs._errors import ConfigError
 
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message says where and what would be right."""
+with needing("run", "The configuration of experiments"):
+    import annotated_types
+    import pydantic
+    from pydantic.fields import FieldInfo
 
 
 class Section(pydantic.BaseModel):
@@ -53,13 +54,42 @@ class Section(pydantic.BaseModel):
 class ExperimentConfig(Section):
     """The keys that every experiment has.
 
-    Subclasses add a key `experiment`, a literal with the name of theirs.
+    Subclasses add their own.
     """
 
+    experiment: str = ""
+    """Which experiment this is: the name of its folder."""
     seed: int = pydantic.Field(default=0, ge=0)
     """Seed of everything random."""
     precision: Literal["float64", "float32"] = "float64"
     """Floating-point numbers of the whole run."""
+
+    @pydantic.model_validator(mode="after")
+    def _seed_that_is_kept(self) -> Any:
+        # JAX takes the lower 32 bits and drops the others without a word.
+        if self.precision == "float32" and self.seed >= 2**32:
+            raise ValueError(
+                f"with precision float32, `seed` must be below 2**32, but is {self.seed}"
+            )
+        return self
+
+
+@functools.cache
+def named(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
+    """The configuration of the experiment of a name, which takes no other for its key `experiment`.
+
+    **Arguments:**
+
+    - `config`: the class with the keys of the experiment.
+    - `name`: of the experiment.
+
+    **Returns:** a subclass.
+    """
+    key = pydantic.Field(name, description=config.model_fields["experiment"].description)
+    fields: dict[str, Any] = {"experiment": (Literal[name], key)}
+    return pydantic.create_model(
+        config.__name__, __base__=config, __module__=config.__module__, **fields
+    )
 
 
 Model = TypeVar("Model", bound=Section)
@@ -79,14 +109,16 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     - `ConfigError`, naming the file, if it cannot be read or is not valid TOML.
     """
     try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
+        # Editors on Windows put a mark before the text.
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise ConfigError(f"There is no configuration file {os.fspath(path)}.") from None
     except OSError as error:
         raise ConfigError(f"Cannot read {os.fspath(path)}: {error.strerror}.") from error
-    except ValueError as error:  # of TOML, or of text that is not UTF-8
+    except ValueError as error:  # of TOML, of text that is not UTF-8, or of a name that is no path
         raise ConfigError(f"{os.fspath(path)} is not valid TOML: {error}.") from error
+    except RecursionError:
+        raise ConfigError(f"{os.fspath(path)} is nested too deeply.") from None
 
 
 def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
@@ -144,6 +176,13 @@ def validate(
     - `ConfigError` that lists every unknown, missing or ill-typed key by its full dotted name, with
         what is allowed there and, for an unknown one, the nearest key that exists.
     """
+    too_large = [
+        f"`{key}` is {value}, which is no integer of 64 bits, as TOML has them."
+        for key, value in _flat(data)
+        if isinstance(value, int) and not -(2**63) <= value < 2**63
+    ]
+    if too_large:
+        raise ConfigError(f"In {where}: {' '.join(too_large)}")
     try:
         return model.model_validate(dict(data))
     except pydantic.ValidationError as error:
@@ -241,7 +280,8 @@ def _explain(known: Mapping[str, FieldInfo], mistake: Any) -> str:
     if mistake["type"] == "missing" and field is not None:
         return f"`{name}` is missing; it must be {allowed(field)}."
     if mistake["type"] == "value_error" or field is None:  # of a validator of ours
-        return f"`{name}`: {mistake['msg']}." if name else f"{mistake['msg']}."
+        what = str(mistake.get("ctx", {}).get("error", mistake["msg"])).removesuffix(".")
+        return f"`{name}`: {what}." if name else f"{what}."
     return f"`{name}` must be {allowed(field)}, but is {_in_toml(mistake['input'])}."
 
 
@@ -291,8 +331,10 @@ def _one_line(text: str | None) -> str:
 def _parse(text: str) -> Any:
     try:
         table = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except ValueError:  # no TOML, or a number of thousands of digits
         return text.strip()
+    except RecursionError:
+        raise ConfigError(f"The value {text[:20]}… is nested too deeply.") from None
     # A text with line breaks could smuggle in more keys.
     return table["value"] if table.keys() == {"value"} else text.strip()
 
@@ -305,6 +347,15 @@ def _merge(below: Mapping[str, Any], above: Any) -> Any:
         _merge(below[name], above[name]) if isinstance(below.get(name), Mapping) else above[name]
     )
     return {**below, **{name: merge(name) for name in above}}
+
+
+def _flat(data: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """All single values with their dotted names."""
+    if isinstance(data, Mapping | list):
+        for key, value in data.items() if isinstance(data, Mapping) else enumerate(data):
+            yield from _flat(value, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, data
 
 
 def _copy(data: Any) -> Any:
@@ -321,4 +372,7 @@ def _in_toml(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_in_toml, value))}]"
-    return f'"{value}"' if isinstance(value, str | Path) else str(value)
+    if isinstance(value, str | Path):
+        text = str(value)
+        return f'"{text if len(text) <= 80 else text[:80] + "…"}"'
+    return str(value)

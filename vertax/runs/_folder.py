@@ -3,39 +3,37 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import importlib.metadata
 import json
 import os
 import platform
-import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
-from jaxtyping import Shaped
-from matplotlib.figure import Figure
+import optimistix as optx
+from jaxtyping import ArrayLike, Shaped
+from tqdm import tqdm
 
 from vertax._base.archive import read_archive, write_archive
-from vertax.fitting import Checkpoint, Fit, InverseProblem, fit
-from vertax.io import atomic_write, save_tissue
+from vertax._base.extras import needing
+from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
+from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
-from vertax.runs._config import ExperimentConfig, read_toml, validate
-from vertax.runs._summary import plain
+from vertax.runs._claim import CONFIG, FIGURES, METRICS, PARTS, claimed, existing, unfinished
+from vertax.runs._config import ExperimentConfig
+from vertax.runs._errors import RunFolderError, UnfinishedRunError
+from vertax.runs._figures import checked_formats, write_figure
+from vertax.runs._summary import plain, safe, sentence
+from vertax.runs._tables import histories, history_columns
+from vertax.runs._versions import installed_version
 
-CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
-# What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
-_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", "figures/*.png", f"{PARTS}/*.npz")
+with needing("run", "The folder of a run"):
+    import tomli_w
+    from matplotlib.figure import Figure
 
-
-class RunFolderError(ValueError):
-    """A folder that a run must not write to, or that holds none."""
-
-
-class UnfinishedRunError(RunFolderError):
-    """The folder of a run that did not come to its end."""
+Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 
 
 class RunFolder:
@@ -47,15 +45,27 @@ class RunFolder:
     **Arguments:**
 
     - `path`: an existing folder; `claim` finds or makes one.
+    - `figures`: formats of the pictures, of `"png"`, `"pdf"` and `"svg"`; each picture is written in all
+        of them.
+
+    **Raises:**
+
+    - `RunFolderError` for another format.
     """
 
     path: Path
+    figure_formats: tuple[str, ...]
+    talkative: bool
+    """Whether `say` says it."""
     interrupted: bool
     """Whether an interrupt from the keyboard ended a fit of this run: no other one begins."""
 
-    def __init__(self, path: str | os.PathLike[str]):
+    def __init__(self, path: str | os.PathLike[str], *, figures: Sequence[str] = ("png",)):
         self.path = Path(path)
+        self.figure_formats = checked_formats(figures)
+        self.talkative = False
         self.interrupted = False
+        self._warnings: dict[str, list[str]] = {}
 
     @classmethod
     def claim(
@@ -65,6 +75,7 @@ class RunFolder:
         *,
         overwrite: bool = False,
         root: str | os.PathLike[str] = "runs",
+        figures: Sequence[str] = ("png",),
     ) -> RunFolder:
         """Make the folder of a new run, without touching an earlier one.
 
@@ -74,31 +85,17 @@ class RunFolder:
         - `output`: the folder itself, if the user chose one.
         - `overwrite`: clear a folder that holds an earlier run, and use it again.
         - `root`: folder of all runs.
+        - `figures`: formats of the pictures.
 
         **Returns:** the folder, which holds no results.
 
         **Raises:**
 
         - `RunFolderError` if `output` is not empty and `overwrite` is not set, if what is to be
-            overwritten is not the folder of a run, or if a file is in the way.
+            overwritten is not the folder of a run, if a file is in the way, or for another format.
         """
-        try:
-            if output is None and not overwrite:
-                return cls(_numbered(Path(root) / name))
-            folder = Path(root) / name if output is None else Path(output)
-            folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.iterdir()):
-                if not overwrite:
-                    raise RunFolderError(
-                        f"The folder {folder} is not empty. Choose another with --output, or pass "
-                        "--overwrite to replace the run in it."
-                    )
-                _clear(folder)
-        except (FileExistsError, NotADirectoryError) as error:
-            raise RunFolderError(
-                f"Cannot use {error.filename} as a folder: there is a file of that name."
-            ) from None
-        return cls(folder)
+        figures = checked_formats(figures)  # before anything is made or cleared
+        return cls(claimed(Path(root) / name, output, overwrite), figures=figures)
 
     @classmethod
     def existing(cls, path: str | os.PathLike[str]) -> RunFolder:
@@ -114,62 +111,64 @@ class RunFolder:
 
         - `RunFolderError` if there is no such folder, or if it is not that of a run.
         """
-        folder = Path(path)
-        if not folder.is_dir():
-            what = "it is a file" if folder.exists() else "there is none"
-            raise RunFolderError(f"{folder} is not the folder of a run: {what}.")
-        if not (folder / CONFIG).is_file():
-            raise RunFolderError(
-                f"{folder} is not the folder of a run: there is no {CONFIG} in it, which a run writes first."
-            )
-        return cls(folder)
+        return cls(existing(path))
 
     @classmethod
-    def unfinished(cls, path: str | os.PathLike[str], config: ExperimentConfig) -> RunFolder:
+    def unfinished(
+        cls,
+        path: str | os.PathLike[str],
+        config: ExperimentConfig,
+        *,
+        figures: Sequence[str] = ("png",),
+    ) -> RunFolder:
         """The folder of an earlier run that did not come to its end, to go on with it.
 
         **Arguments:**
 
         - `path`: the folder.
         - `config`: the configuration, which must be that of the run.
+        - `figures`: formats of the pictures; they may be others than before.
 
         **Returns:** the folder.
 
         **Raises:**
 
-        - `RunFolderError` if it is not the folder of a run, if the run is finished, or if its
-            configuration is another one.
+        - `RunFolderError` if it is not the folder of a run, if the run is finished, if its
+            configuration is another one, or for another format.
         """
-        run = cls.existing(path)
-        if (run.path / METRICS).exists():
-            raise RunFolderError(
-                f"The run in {run.path} is finished: there is nothing to resume. To see what it found: "
-                f"vertax show {run.path}"
-            )
-        earlier = read_toml(run.path / CONFIG)
-        if earlier.get("experiment") != (config.model_dump().get("experiment")):
-            raise RunFolderError(
-                f"The run in {run.path} is one of the experiment {earlier.get('experiment')!r}. Give its "
-                f"own configuration: vertax run {run.path / CONFIG} --resume {run.path}"
-            )
-        then = validate(type(config), earlier, str(run.path / CONFIG))
-        if then != config:
-            changed = _changes(then.model_dump(mode="json"), config.model_dump(mode="json"))
-            raise RunFolderError(
-                f"The run in {run.path} has another configuration: {'; '.join(changed)}. Give its own, "
-                f"vertax run {run.path / CONFIG} --resume {run.path}, or begin a new run without --resume."
-            )
-        return run
+        return cls(unfinished(path, config), figures=figures)
+
+    def say(self, what: str) -> None:
+        """Tell on the terminal what the run is at, if it is to tell (`vertax run` without `--quiet`).
+
+        **Arguments:**
+
+        - `what`: a few words, said before what takes longer than a second or two.
+        """
+        if self.talkative:
+            tqdm.write(f"  {what} …", file=sys.stderr)  # above the bars
 
     def fit(
-        self, name: str, problem: InverseProblem[Any], optimiser: Any, epochs: int, **options: Any
+        self,
+        name: str,
+        problem: InverseProblem[Any],
+        optimiser: Any,
+        epochs: int,
+        *,
+        partial: bool = False,
+        callback: Callback | None = None,
+        **options: Any,
     ) -> Fit[Any]:
         """Solve an inverse problem, with a checkpoint in this folder that a resumed run goes on from.
+
+        A fit that is not at its end is one of `warnings`. One that cannot go on leaves the table of its
+        epochs and, if it is no batch, its best tissue, both named after it.
 
         **Arguments:**
 
         - `name`: of this fit; no other one of the run has it.
-        - `problem`, `optimiser`, `epochs`, `options`: as of [`fit`][vertax.fit].
+        - `problem`, `optimiser`, `epochs`, `callback`, `options`: as of [`fit`][vertax.fit].
+        - `partial`: take what there is of a fit that cannot go on, with a warning.
 
         **Returns:** the [`Fit`][vertax.Fit], also if it was interrupted; `interrupted` of the folder then
         tells so.
@@ -177,14 +176,72 @@ class RunFolder:
         **Raises:**
 
         - `KeyboardInterrupt` if an earlier fit was interrupted, or this one before it had anything.
+        - `FitError` if it cannot go on and `partial` is not set, or if there is nothing of it.
         - others as [`fit`][vertax.fit].
         """
+
+        def watch(epoch: int, record: Record) -> Mapping[str, ArrayLike] | None:
+            if self.interrupted:  # Ctrl-C reaches one thread only
+                raise KeyboardInterrupt
+            return None if callback is None else callback(epoch, record)
+
         if self.interrupted:
             raise KeyboardInterrupt
+        if options.get("progress", True):  # fits side by side have a bar of their own
+            self.say(f"fit: {name}")
         checkpoint = Checkpoint(self._part(name))
-        outcome = fit(problem, optimiser, epochs, checkpoint=checkpoint, **options)
-        self.interrupted = outcome.interrupted
+        try:
+            outcome = fit(
+                problem, optimiser, epochs, checkpoint=checkpoint, callback=watch, **options
+            )
+        except FitError as error:
+            if error.fit is None:
+                raise
+            self._save_failed(name, error.fit)
+            if not partial:
+                raise
+            self.warn(str(error).rstrip("."), name)
+            return error.fit
+        # Several fits may go side by side: none takes back what another one says.
+        self.interrupted |= outcome.interrupted
+        if not outcome.interrupted:
+            self._judge(name, optimiser, epochs, outcome)
         return outcome
+
+    def _judge(self, name: str, optimiser: Any, epochs: int, outcome: Fit[Any]) -> None:
+        """Warn of a fit that is not at its end."""
+        for doubt in doubts(outcome):
+            self.warn(doubt, name)
+        solver = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
+        if solver and len(outcome.history.cost) >= epochs:
+            self.warn(
+                f"the least-squares solver did not end within {epochs} epochs (raise them)", name
+            )
+
+    def _save_failed(self, name: str, outcome: Fit[Any]) -> None:
+        ending = safe(name)
+        if outcome.history.cost.ndim == 1:
+            self.save_table(f"history_{ending}", history_columns(outcome.history))
+            self.save_tissue(f"fitted_{ending}", outcome.tissue)
+        else:
+            members = range(outcome.history.cost.shape[1])
+            labels = [{"member": str(k)} for k in members]
+            self.save_table(f"history_{ending}", histories(outcome, labels))
+
+    def warn(self, text: str, who: str | None = None) -> None:
+        """Note something that whoever reads the results must know: it is in the metrics and on the screen.
+
+        **Arguments:**
+
+        - `text`: a sentence without a full stop.
+        - `who`: what it holds for, such as the name of a fit; equal texts are joined to one.
+        """
+        self._warnings.setdefault(text, []).extend([] if who is None else [who])
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was noted by `warn`, one sentence each."""
+        return [sentence(text, sorted(whom)) for text, whom in self._warnings.items()]
 
     def part(
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
@@ -200,6 +257,7 @@ class RunFolder:
         """
         file = self._part(name)
         if not file.exists():
+            self.say(name)
             write_archive(file, "part", 1, compute())
         arrays = read_archive(file, "part", 1)
         return {key: array for key, array in arrays.items() if key not in ("format", "version")}
@@ -221,7 +279,7 @@ class RunFolder:
     def _part(self, name: str) -> Path:
         folder = self.path / PARTS
         folder.mkdir(exist_ok=True)
-        return folder / f"{re.sub('[^0-9A-Za-z.-]+', '_', name)}.npz"
+        return folder / f"{safe(name)}.npz"
 
     def save_config(self, config: ExperimentConfig) -> None:
         """Write the resolved configuration, with every default spelled out.
@@ -259,7 +317,7 @@ class RunFolder:
             np.save(file, array, allow_pickle=False)
 
     def save_table(self, name: str, columns: Mapping[str, Sequence[Any] | np.ndarray]) -> None:
-        """Write a table to `name.csv`.
+        """Write a table to `name.csv`, as [`write_csv`][vertax.io.write_csv]: NaN is an empty field.
 
         **Arguments:**
 
@@ -270,14 +328,10 @@ class RunFolder:
 
         - `ValueError` if the columns differ in length.
         """
-        rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
-        with atomic_write(self.path / f"{name}.csv", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(rows)
+        write_csv(self.path / f"{name}.csv", columns)
 
     def save_figure(self, name: str, figure: Figure) -> None:
-        """Write a picture to `figures/name.png`.
+        """Write a picture to `figures/name.png`, or in the other formats that were asked for.
 
         **Arguments:**
 
@@ -286,8 +340,8 @@ class RunFolder:
         """
         folder = self.path / "figures"
         folder.mkdir(exist_ok=True)
-        with atomic_write(folder / f"{name}.png", "wb") as file:
-            figure.savefig(file, format="png", dpi=200)
+        for ending in self.figure_formats:
+            write_figure(folder / f"{name}.{ending}", figure)
 
     def save_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write the metrics; the last thing a run does.
@@ -295,8 +349,10 @@ class RunFolder:
         **Arguments:**
 
         - `metrics`: numbers, texts, lists and mappings; NaN and infinity, which strict JSON does
-            not have, become null.
+            not have, become null. `warnings` of this folder are added, if there are any.
         """
+        if self.warnings:
+            metrics = {**metrics, "warnings": self.warnings}
         with atomic_write(self.path / METRICS) as file:
             json.dump(plain(metrics), file, indent=2, allow_nan=False)
             file.write("\n")
@@ -338,56 +394,4 @@ class RunFolder:
 
         **Returns:** their paths, sorted by name.
         """
-        return sorted(self.path.glob("figures/*.png"))
-
-
-def installed_version(name: str) -> str:
-    """Version of an installed package.
-
-    **Arguments:**
-
-    - `name`: of the package.
-
-    **Returns:** its version, or `"(not installed)"` for one that runs from its source folder.
-    """
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"
-
-
-def _numbered(path: Path) -> Path:
-    """The first of path, path-2, path-3, … that is free, made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    number = 1
-    while True:
-        folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-        try:
-            folder.mkdir()  # refuses an existing one: two runs at a time get two folders
-            return folder
-        except FileExistsError:
-            if folder.is_dir() and not any(folder.iterdir()):
-                return folder
-        number += 1
-
-
-def _clear(folder: Path) -> None:
-    """Remove the files of an earlier run, and nothing else."""
-    # Whoever points at the wrong folder must not lose it.
-    if not (folder / CONFIG).is_file():
-        raise RunFolderError(
-            f"The folder {folder} is not empty and holds no run (no {CONFIG}), so it is not "
-            "overwritten."
-        )
-    for pattern in _LEFTOVERS:
-        for file in folder.glob(pattern):
-            file.unlink()
-
-
-def _changes(then: Any, now: Any, name: str = "") -> list[str]:
-    """What differs between two configurations, in words."""
-    if isinstance(then, Mapping) and isinstance(now, Mapping):
-        keys = dict.fromkeys([*then, *now])
-        inside = lambda key: f"{name}.{key}" if name else key
-        return [c for k in keys for c in _changes(then.get(k), now.get(k), inside(k))]
-    return [] if then == now else [f"`{name}` was {then!r} and is {now!r}"]
+        return sorted(file for pattern in FIGURES for file in self.path.glob(pattern))

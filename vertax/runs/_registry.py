@@ -5,18 +5,14 @@ from __future__ import annotations
 import ast
 import difflib
 import importlib
-import importlib.resources
-import os
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from vertax.runs._config import (
-    ConfigError,
-    ExperimentConfig,
-    apply_overrides,
-    read_toml,
-    validate,
-)
+from vertax.runs._errors import ConfigError
+
+if TYPE_CHECKING:  # `vertax list` does without what configurations are made of
+    from vertax.runs._config import ExperimentConfig
 
 _PACKAGE = "vertax.experiments"
 
@@ -34,8 +30,10 @@ class Experiment(NamedTuple):
 
     @property
     def config(self) -> type[ExperimentConfig]:
-        """What configures it."""
-        return self._package.Config
+        """What configures it: the `Config` of the package, and the name of its folder as `experiment`."""
+        from vertax.runs._config import named
+
+        return named(self._package.Config, self.name)
 
     @property
     def run(self) -> Callable[..., Mapping[str, Any]]:
@@ -49,12 +47,13 @@ class Experiment(NamedTuple):
 
 def _found() -> dict[str, Experiment]:
     # Their docstrings are read and nothing is imported: lists and help come at once.
+    places = map(Path, importlib.import_module(_PACKAGE).__path__)
     experiments: dict[str, Experiment] = {}
-    for folder in sorted(importlib.resources.files(_PACKAGE).iterdir(), key=lambda f: f.name):
-        source = folder / "__init__.py"
-        if folder.is_dir() and source.is_file() and not folder.name.startswith("_"):
+    for source in sorted(file for place in places for file in place.glob("*/__init__.py")):
+        name = source.parent.name
+        if not name.startswith("_"):
             text = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
-            experiments[folder.name] = Experiment(folder.name, text.partition("\n")[0])
+            experiments[name] = Experiment(name, text.partition("\n")[0])
     return experiments
 
 
@@ -79,30 +78,3 @@ def find_experiment(name: Any) -> Experiment:
     near = difflib.get_close_matches(str(name), EXPERIMENTS, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(EXPERIMENTS)}."
     raise ConfigError(f"There is no experiment {name!r}; {hint}")
-
-
-def load_config(
-    path: str | os.PathLike[str], overrides: Iterable[str] = ()
-) -> tuple[Experiment, Any]:
-    """Read and check a configuration file.
-
-    **Arguments:**
-
-    - `path`: a TOML file; its key `experiment` says which experiment it configures.
-    - `overrides`: texts `key=value` that set single keys, see
-        `apply_overrides`.
-
-    **Returns:** the experiment and its configuration, an instance of `experiment.config`.
-
-    **Raises:**
-
-    - `ConfigError` if the file is missing or no TOML, or for an unknown or ill-typed key.
-    """
-    data = apply_overrides(read_toml(path), overrides)
-    if "experiment" not in data:
-        raise ConfigError(
-            f"In {os.fspath(path)}: `experiment` is missing; it names the experiment to run, one "
-            f"of {', '.join(EXPERIMENTS)}."
-        )
-    experiment = find_experiment(data["experiment"])
-    return experiment, validate(experiment.config, data, os.fspath(path))

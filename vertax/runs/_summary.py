@@ -1,9 +1,10 @@
-"""Metrics in text."""
+"""Metrics and names in text."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,17 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def safe(name: str) -> str:
+    """A name as a part of the name of a file."""
+    return re.sub("[^0-9A-Za-z.-]+", "_", name)
+
+
+def sentence(text: str, whom: Sequence[str]) -> str:
+    """A warning, and the first of those whom it concerns."""
+    shown = ", ".join(whom[:3]) + (f" and {len(whom) - 3} more" if len(whom) > 3 else "")
+    return f"{shown}: {text}." if whom else f"{text[:1].upper()}{text[1:]}."
 
 
 def _is_number(value: Any) -> bool:

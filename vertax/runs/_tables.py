@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vertax.fitting._history import Fit, History
+from vertax.fitting import Fit, History
 
 
 def history_columns(history: History, **labels: str) -> dict[str, Any]:

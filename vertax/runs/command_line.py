@@ -25,11 +25,6 @@ app = typer.Typer(
 USAGE, FAILURE, INTERRUPTED = 2, 1, 130
 
 
-def main() -> None:
-    """Entry point of the program `vertax`."""
-    app()
-
-
 def _show_version(wanted: bool) -> bool:
     if wanted:
         from vertax.runs import installed_version
@@ -102,6 +97,22 @@ def run(
             "no fit begins again.",
         ),
     ] = None,
+    figures: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FORMAT",
+            help="png, pdf or svg; may be repeated. By default png.",
+            show_default=False,
+        ),
+    ] = None,
+    no_cache: Annotated[
+        bool,
+        typer.Option(
+            "--no-cache",
+            help="Compile everything anew, instead of keeping what was compiled in the user's cache folder "
+            "(the environment variable VERTAX_CACHE names another, or is off).",
+        ),
+    ] = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", help="Show no progress bar and no summary.")
     ] = False,
@@ -111,29 +122,42 @@ def run(
 ) -> None:
     """Run the experiment that a configuration file describes."""
     import jax
-    import matplotlib
 
     from vertax import FitError
-    from vertax.runs import ConfigError, RunFolder, RunFolderError, load_config, summary
+    from vertax._base.extras import needing
+    from vertax.runs import (
+        ConfigError,
+        RunFolder,
+        RunFolderError,
+        enable_cache,
+        load_config,
+        summary,
+    )
 
     folder: RunFolder | None = None
+    formats = tuple(figures or ("png",))
+    with needing("run", "A run"):
+        import matplotlib
     # Figures go to files only, also where there is a screen.
     matplotlib.use("Agg")
     try:
         experiment, settings = load_config(config, overrides or ())
         # The library leaves the precision of JAX to the user; here the configuration decides.
         jax.config.update("jax_enable_x64", settings.precision == "float64")
+        if not no_cache:
+            enable_cache()
         if resume is None:
-            folder = RunFolder.claim(config.stem, output, overwrite=overwrite)
+            folder = RunFolder.claim(config.stem, output, overwrite=overwrite, figures=formats)
             folder.save_config(settings)
         elif output is not None or overwrite:
             raise RunFolderError(
                 "--resume goes with neither --output nor --overwrite: leave them out."
             )
         else:
-            folder = RunFolder.unfinished(resume, settings)
+            folder = RunFolder.unfinished(resume, settings, figures=formats)
         if not quiet:
             typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
+        folder.talkative = not quiet
         metrics = experiment.run(settings, folder, progress=not quiet)
         if folder.interrupted:
             raise KeyboardInterrupt
@@ -151,8 +175,13 @@ def run(
         if debug:
             raise
         _stop(error, FAILURE)
+    except (MemoryError, OverflowError) as error:
+        if debug:
+            raise
+        _stop(f"The run is too large for this machine ({error}). Make it smaller.", FAILURE)
     if not quiet:
         typer.echo(summary(metrics))
+        _warn(folder.warnings)
         typer.echo(f"Results: {folder.path}")
         for figure in folder.figures():
             typer.echo(f"  {figure}")
@@ -176,11 +205,18 @@ def show(
     others = [file for file in run.files() if file not in figures]
     if table := summary(metrics):
         typer.echo(table)
+    _warn(metrics.get("warnings", ()))
     for title, files in (("Figures", figures), ("Files", others)):
         if files:
             typer.echo(f"{title}:")
         for file in files:
             typer.echo(f"  {file}")
+
+
+def _warn(warnings: Iterable[str]) -> None:
+    """What the numbers above do not tell."""
+    for warning in warnings:
+        typer.secho(f"Warning: {warning}", err=True, fg=typer.colors.YELLOW)
 
 
 def _found(folder: RunFolder) -> str:
@@ -199,10 +235,6 @@ def _interrupted(config: Path, overrides: Iterable[str], folder: RunFolder | Non
     return f"Interrupted. What there is lies in {folder.path}. To go on: {command}"
 
 
-def _stop(error: Exception, code: int) -> NoReturn:
+def _stop(error: Exception | str, code: int) -> NoReturn:
     typer.echo(f"Error: {error}", err=True)
     raise typer.Exit(code)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,3 +1,4 @@
 """Compare automatic and implicit differentiation and equilibrium propagation."""
 
-from vertax.experiments.benchmark_adjoints.experiment import Config as Config, run as run
+from .experiment import run as run
+from .problems import Config as Config

@@ -6,14 +6,19 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from vertax.experiments._figures import band, boxes, new_figure
-from vertax.experiments._scenes import pearson_of
 from vertax.fitting import Fit
-from vertax.plotting import _style
+from vertax.inference import pearson, relative_error
+from vertax.plotting import (
+    INK,
+    house_style,
+    new_figure,
+    plot_band,
+    plot_boxes,
+    plot_recovery,
+    same_limits,
+)
 
 # The colours of the paper, in shades that are told apart with any colour vision.
 _COLOURS = {
@@ -26,6 +31,7 @@ _COLOURS = {
 _MARKERS = {"AD": "o", "EP": "s", "Adj-ID": "^", "Sen-ID": "v", "LM": "D"}
 
 
+@house_style()
 def inference(
     fits: Mapping[str, Fit],
     true: np.ndarray,
@@ -44,34 +50,36 @@ def inference(
 
     **Returns:** the figure.
     """
-    with _style.house_style():
-        layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06)
-        figure = Figure(figsize=(7.2, 4.6), layout=layout)
-        figure.suptitle(title, fontsize=9)
-        grid = figure.subplot_mosaic(
-            [["start", "end", "cost"], ["error", "pearson", "final"]], height_ratios=[1, 1]
-        )
-        methods = {name: fit for name, fit in fits.items() if name != "LM"}
-        _scatter(grid["start"], true, dict.fromkeys(methods, initial), "epoch 0")
-        last = {name: inferred[name] for name in methods}
-        epochs = max(len(f.history.cost) for f in methods.values())
-        _scatter(grid["end"], true, last, f"epoch {epochs}")
-        for key, name, label in (
-            ("cost", "cost", "cost (v2v)"),
-            ("error", "relative_error", "relative error"),
-        ):
-            for method, fit in fits.items():
-                band(grid[key], getattr(fit.history, name), method, _COLOURS[method])
-            grid[key].set(xlabel="epoch", ylabel=label, yscale="log")
-        grid["cost"].legend(ncols=2, columnspacing=0.8)
-        error = {m: np.mean(np.abs(p - true) / np.abs(true), axis=1) for m, p in inferred.items()}
-        boxes(grid["pearson"], {m: 1 - pearson_of(true, p) for m, p in inferred.items()}, _COLOURS)
-        grid["pearson"].set_ylabel("1 − Pearson $r$ at the end")
-        boxes(grid["final"], error, _COLOURS)
-        grid["final"].set_ylabel("relative error at the end")
+    figure, ((start, end, cost), (error, correlation, final)) = new_figure(2, 3)
+    figure.suptitle(title, fontsize=9)
+    guess = np.ravel(initial)
+    plot_recovery(np.ravel(true), guess, ax=start, name="$p_0$", label="guess", colour="0.6")
+    for method, values in inferred.items():
+        style: Any = {"label": method, "colour": _COLOURS[method], "marker": _MARKERS[method]}
+        plot_recovery(np.ravel(true), np.ravel(values), ax=end, name="$p_0$", **style)
+    same_limits((start, end))
+    start.set_title("epoch 0")
+    end.set_title("best epoch")
+    for ax, name, label in (
+        (cost, "cost", "cost (v2v)"),
+        (error, "relative_error", "relative error"),
+    ):
+        for method, fit in fits.items():
+            curves = getattr(fit.history, name)
+            plot_band(curves, ax=ax, log=True, label=method, colour=_COLOURS[method])
+        ax.set(xlabel="epoch", ylabel=label)
+    cost.legend(ncols=2, columnspacing=0.8)
+    # What is 0 up to rounding is not positive.
+    missing = {m: np.maximum(1 - pearson(true, p), 1e-16) for m, p in inferred.items()}
+    errors = {m: relative_error(true, p) for m, p in inferred.items()}
+    plot_boxes(missing, ax=correlation, colours=_COLOURS, log=True)
+    correlation.set_ylabel("1 − Pearson $r$ at the end")
+    plot_boxes(errors, ax=final, colours=_COLOURS, log=True)
+    final.set_ylabel("relative error at the end")
     return figure
 
 
+@house_style()
 def accuracy(tolerances: np.ndarray, errors: Mapping[str, np.ndarray]) -> Figure:
     """Error of each hypergradient against the tolerance of the relaxation.
 
@@ -82,32 +90,32 @@ def accuracy(tolerances: np.ndarray, errors: Mapping[str, np.ndarray]) -> Figure
 
     **Returns:** the figure.
     """
-    with _style.house_style():
-        figure, (ax,) = new_figure(1, width=4.8, height=2.8)
-        for name, values in errors.items():
-            method, _, variant = name.partition(",")
-            style: Any = {"ls": "--", "mfc": "white"} if variant else {}
-            # The two forms of ID agree to rounding: a larger marker lets both be seen.
-            size = 6 if method == "Sen-ID" else 3.5
-            ax.plot(
-                tolerances,
-                _centre(values),
-                marker=_MARKERS[method],
-                ms=size,
-                color=_COLOURS[method],
-                label=name,
-                **style,
-            )
-        ax.set(
-            xscale="log",
-            yscale="log",
-            xlabel="largest force at the end of the relaxation",
-            ylabel="relative error of the hypergradient",
+    figure, ((ax,),) = new_figure(width=4.8, height=2.8)
+    for name, values in errors.items():
+        method, _, variant = name.partition(",")
+        style: Any = {"ls": "--", "mfc": "white"} if variant else {}
+        # The two forms of ID agree to rounding: a larger marker lets both be seen.
+        size = 6 if method == "Sen-ID" else 3.5
+        ax.plot(
+            tolerances,
+            _centre(values),
+            marker=_MARKERS[method],
+            ms=size,
+            color=_COLOURS[method],
+            label=name,
+            **style,
         )
-        ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    ax.set(
+        xscale="log",
+        yscale="log",
+        xlabel="largest force at the end of the relaxation",
+        ylabel="relative error of the hypergradient",
+    )
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
+@house_style()
 def beta_scan(
     betas: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray],
@@ -123,32 +131,33 @@ def beta_scan(
 
     **Returns:** the figure.
     """
-    with _style.house_style():
-        figure, (linear, cost, right) = new_figure(3, width=2.4, height=2.5)
-        for ax, nudge, label in (
-            (linear, "linear", r"$\beta$, relative force"),
-            (cost, "cost", r"$\beta$, energy per cost"),
-        ):
-            for style, estimator in (("o-", "centred"), ("s--", "one-sided")):
-                values = _centre(errors[f"{nudge}, {estimator}"])
-                ax.plot(betas[nudge], values, style, ms=3, color=_COLOURS["EP"], label=estimator)
-            ax.set(xscale="log", yscale="log", xlabel=label, title=f"nudge: {nudge}")
-        linear.set_ylabel("relative error of the hypergradient")
-        linear.legend()
-        strengths = list(fitted)
-        for k, strength in enumerate(strengths):
-            points = fitted[strength]["relative_error"]
-            right.plot(np.full(len(points), k), points, "o", ms=3, color=_COLOURS["EP"])
-        right.set_xticks(range(len(strengths)), [f"{s:g}" for s in strengths])
-        right.set(
-            yscale="log",
-            xlabel=r"$\beta$, energy per cost",
-            ylabel="relative error of parameters",
-            title="fits, the paper's protocol",
-        )
+    figure, ((linear, cost, right),) = new_figure(1, 3, height=2.5)
+    for ax, nudge, label in (
+        (linear, "linear", r"$\beta$, relative force"),
+        (cost, "cost", r"$\beta$, energy per cost"),
+    ):
+        for style, estimator in (("o-", "centred"), ("s--", "one-sided")):
+            values = _centre(errors[f"{nudge}, {estimator}"])
+            ax.plot(betas[nudge], values, style, ms=3, color=_COLOURS["EP"], label=estimator)
+        ax.set(xscale="log", yscale="log", xlabel=label, title=f"nudge: {nudge}")
+    same_limits((linear, cost), x=False)
+    linear.set_ylabel("relative error of the hypergradient")
+    linear.legend()
+    strengths = list(fitted)
+    for k, strength in enumerate(strengths):
+        points = fitted[strength]["relative_error"]
+        right.plot(np.full(len(points), k), points, "o", ms=3, color=_COLOURS["EP"])
+    right.set_xticks(range(len(strengths)), [f"{s:g}" for s in strengths])
+    right.set(
+        yscale="log",
+        xlabel=r"$\beta$, energy per cost",
+        ylabel="relative error of parameters",
+        title="fits, the paper's protocol",
+    )
     return figure
 
 
+@house_style()
 def scaling(rows: list[dict[str, Any]]) -> Figure:
     """Time and memory of an epoch against the number of cells.
 
@@ -160,57 +169,41 @@ def scaling(rows: list[dict[str, Any]]) -> Figure:
     **Returns:** the figure.
     """
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
+    sizes = sorted({row["cells"] for row in rows})
     titles = {"paper": "the paper's protocol", "equilibrium": "true equilibria"}
-    with _style.house_style():
-        figure, axes = new_figure(2 * len(protocols), width=2.2, height=2.4)
-        for k, protocol in enumerate(protocols):
-            time, memory = axes[2 * k : 2 * k + 2]
-            for method in dict.fromkeys(row["method"] for row in rows):
-                own = [r for r in rows if (r["protocol"], r["method"]) == (protocol, method)]
-                style = {
-                    "marker": _MARKERS[method],
-                    "ms": 3.5,
-                    "color": _COLOURS[method],
-                    "label": method,
-                }
-                cells = [r["cells"] for r in own]
-                time.plot(cells, [r["ms_per_epoch"] for r in own], **style)
-                memory.plot(cells, [r["memory_kB"] for r in own], **style)
-            forward = [r for r in rows if (r["protocol"], r["method"]) == (protocol, "Adj-ID")]
-            if forward:
-                time.plot(
-                    [r["cells"] for r in forward],
-                    [r["ms_forward"] for r in forward],
-                    ls=":",
-                    color=_style.INK,
-                    label="relaxation alone",
-                )
-            for ax in (time, memory):
-                ax.set(xscale="log", yscale="log", xlabel="cells", title=titles[protocol])
-            time.set_ylabel("time of an epoch (ms)")
-            memory.set_ylabel("working memory (kB)")
-        axes[-1].legend(
-            *axes[0].get_legend_handles_labels(), loc="upper left", bbox_to_anchor=(1, 1)
-        )
+    figure, (axes,) = new_figure(1, 2 * len(protocols), width=2.2, height=2.4)
+    for k, protocol in enumerate(protocols):
+        time, memory = axes[2 * k : 2 * k + 2]
+        for method in dict.fromkeys(row["method"] for row in rows):
+            own = [r for r in rows if (r["protocol"], r["method"]) == (protocol, method)]
+            style = {
+                "marker": _MARKERS[method],
+                "ms": 3.5,
+                "color": _COLOURS[method],
+                "label": method,
+            }
+            cells = [r["cells"] for r in own]
+            time.plot(cells, [r["ms_per_epoch"] for r in own], **style)
+            memory.plot(cells, [r["memory_kB"] for r in own], **style)
+        forward = [r for r in rows if (r["protocol"], r["method"]) == (protocol, "Adj-ID")]
+        if forward:
+            time.plot(
+                [r["cells"] for r in forward],
+                [r["ms_forward"] for r in forward],
+                ls=":",
+                color=INK,
+                label="relaxation alone",
+            )
+        for ax in (time, memory):
+            ax.set(xscale="log", yscale="log", xlabel="cells", title=titles[protocol])
+            ax.set_xticks(sizes, list(map(str, sizes)))
+            ax.minorticks_off()
+        time.set_ylabel("time of an epoch (ms)")
+        memory.set_ylabel("working memory (kB)")
+    same_limits(axes[::2])
+    same_limits(axes[1::2])
+    axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="upper left", bbox_to_anchor=(1, 1))
     return figure
-
-
-def _scatter(ax: Axes, true: np.ndarray, found: Mapping[str, np.ndarray], title: str) -> None:
-    values = np.concatenate([true.ravel(), *(f.ravel() for f in found.values())])
-    ends = np.array([values.min(), values.max()]) + np.array([-0.05, 0.05]) * np.ptp(values)
-    ax.plot(ends, ends, color=_style.INK, lw=0.7, ls=(0, (4, 3)), zorder=1)
-    for method, points in found.items():
-        ax.scatter(
-            true.ravel(),
-            points.ravel(),
-            s=7,
-            lw=0,
-            alpha=0.6,
-            marker=_MARKERS[method],
-            color=_COLOURS[method],
-        )
-    ax.set(xlim=ends, ylim=ends, xlabel=r"true $p_0$", ylabel=r"inferred $p_0$", title=title)
-    ax.set_aspect("equal")
 
 
 def _centre(values: np.ndarray) -> np.ndarray:

@@ -9,9 +9,8 @@ that lie whole in it are compared with the truth, and one condition with the oth
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,41 +18,31 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from pydantic import Field
 from scipy.stats import mannwhitneyu
 
-from vertax.costs import MeshImage, render
 from vertax.energies import ShapeFactorEnergy
-from vertax.experiments._imaging import (
-    Model,
-    Preparation,
-    Reading,
-    SegmentationSection,
-    correlation,
-    pixel_of,
-    read,
-)
-from vertax.experiments._scenes import ShapeFactors, TissueSection
-from vertax.experiments.compare_conditions import figures
-from vertax.fitting import FitError, uncertainty
+from vertax.fitting import Fit, FitError
+from vertax.inference import Micrograph, pearson
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
-from vertax.responses import equilibrate
-from vertax.runs._config import ExperimentConfig, Section
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Fitting, Relaxation
+from vertax.runs import (
+    ExperimentConfig,
+    Fitting,
+    MicrographModel,
+    Microscope,
+    Preparation,
+    Relaxation,
+    RunFolder,
+    Segmenter,
+    ShapeFactors,
+    TissueSection,
+    read_micrograph,
+)
+
+from . import figures
 
 
-class Microscope(Section):
+class Views(Microscope):
     """How the tissues are seen; intensities are relative to the brightest membrane."""
 
-    pixels: int = Field(default=288, ge=64)
-    """Side of an image in pixels."""
-    psf_width: float = Field(default=2.0, ge=1)
-    """Standard deviation of the blur in pixels."""
-    background: float = Field(default=0.15, ge=0)
-    """Intensity where there is no membrane."""
-    uneven: float = Field(default=0.4, ge=0, lt=1)
-    """How much darker the image is at its corners than in its middle."""
-    faint: float = Field(default=0.05, ge=0, le=1)
-    """Share of the edges with a faint stretch."""
     snr: list[float] = Field(default=[20.0, 6.0, 3.0], min_length=1)
     """Signal-to-noise ratios: brightest membrane over standard deviation of the noise."""
 
@@ -61,8 +50,6 @@ class Microscope(Section):
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["compare_conditions"] = "compare_conditions"
-    """Which experiment this is."""
     stiff: ShapeFactors = ShapeFactors(mean=3.65, deviation=0.08)
     """Shape factors of the one condition."""
     fluid: ShapeFactors = ShapeFactors(mean=3.85, deviation=0.08)
@@ -71,13 +58,13 @@ class Config(ExperimentConfig):
     """Images of each condition; the same tissues are seen at all signal-to-noise ratios."""
     tissue: TissueSection = TissueSection(n_cells=64, lloyd_steps=1)
     """The tissue of an image."""
-    microscope: Microscope = Microscope()
+    microscope: Views = Views(pixels=288, background=0.15, vignetting=0.4, faint=0.05)
     """How it is seen."""
     preparation: Preparation = Preparation()
     """How images are prepared."""
-    segmentation: SegmentationSection = SegmentationSection()
+    segmentation: Segmenter = Segmenter()
     """How cells are found."""
-    model: Model = Model(border="pinned", rest_areas="equal")
+    model: MicrographModel = MicrographModel(border="pinned", rest_areas="equal")
     """The energy and the first guess, the same for both conditions. The scale of the images is known."""
     fit: Fitting = Fitting(learning_rate=2e-2, epochs=120)
     """How the parameters are fitted."""
@@ -129,14 +116,14 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
                 draw, noise = jax.random.split(own)
                 tissue, truth = _tissue(config, factors, draw)
                 noise = jax.random.fold_in(noise, snr_index)
-                pixels = _seen(tissue, config.microscope, snr, noise)
+                pixels = config.microscope.build(1 / snr)(tissue, key=noise)
                 name = f"{kind} {number} SNR {snr:g}"
                 result = _infer(config, pixels, folder, name, progress)
                 if isinstance(result, str):
                     failures.append(f"{kind} {number}, SNR {snr:g}: {result}")
                     continue
-                reading, outcome, deviation, n_undetermined = result
-                cells = _counterparts(config, reading, tissue)
+                micrograph, outcome, deviation, n_undetermined = result
+                cells = _counterparts(config, micrograph, tissue)
                 image = _Image(
                     kind,
                     number,
@@ -144,13 +131,17 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
                     np.asarray(truth.target_shape_factor)[cells[:, 1]],
                     np.asarray(outcome.energy.target_shape_factor)[cells[:, 0]],
                     deviation[cells[:, 0]],
-                    correlation(_mesh_cost(reading), outcome.tissue),
+                    micrograph.correlation(outcome.tissue),
                     n_undetermined,
                 )
                 found.append(image)
                 _save_table(found, folder)
                 if number == 0:
-                    pictures[f"{kind}, SNR {snr:g}"] = (pixels, reading.found, outcome)
+                    pictures[f"{kind}, SNR {snr:g}"] = (
+                        pixels,
+                        micrograph.segmentation,
+                        outcome,
+                    )
     if not found:
         raise ValueError(f"No image could be read: {'; '.join(failures)}")
     folder.save_figure("conditions", figures.conditions(found))
@@ -158,6 +149,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     metrics: dict[str, Any] = {
         f"SNR {snr:g}": _metrics(config, found, snr) for snr in config.microscope.snr
     }
+    if failures:
+        folder.warn(f"{len(failures)} images could not be read: see `failures` in the metrics")
     return metrics | {"failures": failures}
 
 
@@ -170,33 +163,7 @@ def _tissue(
     energy = ShapeFactorEnergy(p0)
     first = periodic_voronoi(n, key=keys[1], lloyd_steps=config.tissue.lloyd_steps)
     # Floppy tissues come to rest anywhere: converged or not, this is what the microscope sees.
-    return equilibrate(first, energy, **config.relaxation.options(), throw=False).tissue, energy
-
-
-def _seen(
-    tissue: Tissue, microscope: Microscope, snr: float, key: PRNGKeyArray
-) -> Float[np.ndarray, "rows columns"]:
-    """What the microscope sees of one period of the tissue, cells cut off at the border."""
-    side = microscope.pixels
-    pixel = float(np.sqrt(tissue.n_cells)) / side
-    membranes = np.asarray(render(tissue, (side, side), microscope.psf_width * pixel), float)
-    membranes = membranes / membranes.max()
-    keys = jax.random.split(key, 3)
-    # A faint stretch is as wide as the blur and half as long as its edge.
-    start, vector = (np.asarray(x, float) for x in tissue.edge_segments)
-    chosen = np.asarray(jax.random.uniform(keys[0], (len(start),))) < microscope.faint
-    y, x = (np.indices((side, side)) + 0.5) * pixel
-    for middle, length in zip(
-        (start + vector / 2)[chosen], np.linalg.norm(vector, axis=1)[chosen], strict=True
-    ):
-        away = np.asarray(
-            tissue.boundary.shortest(jnp.stack([x - middle[0], y - middle[1]], axis=-1))
-        )
-        membranes *= 1 - 0.9 * np.exp(-np.sum(away**2, axis=-1) / (2 * (length / 4) ** 2))
-    centre = (np.indices((side, side)) + 0.5) / side - 0.5
-    light = 1 - microscope.uneven * 2 * np.sum(centre**2, axis=0)
-    noise = np.asarray(jax.random.normal(keys[1], (side, side)), float) / snr
-    return light * (membranes + microscope.background) + noise
+    return config.relaxation.build()(first, energy, throw=False).tissue, energy
 
 
 def _infer(
@@ -205,45 +172,35 @@ def _infer(
     folder: RunFolder,
     name: str,
     progress: bool,
-) -> tuple[Reading, Any, Float[np.ndarray, " cells"], int] | str:
+) -> tuple[Micrograph, Fit, Float[np.ndarray, " cells"], int] | str:
     """From pixels to shape factors and their uncertainty; or what was in the way."""
     model = config.model
     if model.pixel_size is None:
         side = float(np.sqrt(config.tissue.n_cells))
         model = model.model_copy(update={"pixel_size": side / config.microscope.pixels})
+    optimiser, epochs = config.fit.build(), config.fit.epochs
     try:
-        reading = read(pixels, config.preparation, config.segmentation, model, config.relaxation)
-    except ValueError as error:
+        micrograph = read_micrograph(
+            pixels, config.preparation, config.segmentation, model, config.relaxation
+        )
+        outcome = folder.fit(
+            name, micrograph.problem, optimiser, epochs, partial=True, progress=progress
+        )
+    except (ValueError, FitError) as error:
         return str(error)
-    try:
-        outcome = reading.fit(folder, name, config.fit, progress=progress)
-    except FitError as error:
-        if error.fit is None:
-            return str(error)
-        outcome = error.fit
-    # What is left of the misfit is correlated over the blur: so many pixels say one thing.
-    rows, columns = reading.seen.shape
-    width = reading.psf_width / pixel_of(reading.found, reading.seen)
-    area = max(1.0, 4 * np.pi * width**2)
-    fitted = eqx.filter(outcome.energy, reading.problem.trainable)
-    n_fitted = sum(x.size for x in jax.tree.leaves(fitted))
-    independent = max(rows * columns / area, 2.0 * n_fitted)
-    said = uncertainty(reading.problem, outcome, prior=config.prior, n_independent=independent)
-    deviation = np.asarray(said.deviation.target_shape_factor)  # pyright: ignore
-    undetermined = int(np.sum(np.asarray(said.deviations) > 0.9 * config.prior))
-    return reading, outcome, deviation, undetermined
+    known = micrograph.uncertainty(outcome, prior=config.prior)
+    deviation = np.asarray(known.deviation.target_shape_factor)  # pyright: ignore
+    undetermined = int(np.sum(np.asarray(known.deviations) > 0.9 * config.prior))
+    return micrograph, outcome, deviation, undetermined
 
 
-def _mesh_cost(reading: Reading) -> MeshImage:
-    assert isinstance(reading.problem.cost, MeshImage)
-    return reading.problem.cost
-
-
-def _counterparts(config: Config, reading: Reading, tissue: Tissue) -> Int[np.ndarray, "pairs 2"]:
+def _counterparts(
+    config: Config, micrograph: Micrograph, tissue: Tissue
+) -> Int[np.ndarray, "pairs 2"]:
     """Whole cells of the segmented mesh, and the true cells whose centre is in the same place."""
-    whole = np.flatnonzero(reading.whole)
+    whole, found = np.flatnonzero(micrograph.whole), micrograph.segmentation
     pixel = float(np.sqrt(tissue.n_cells)) / config.microscope.pixels
-    ours = np.asarray(reading.found.tissue.centroids)[whole] / reading.found.pixel_size * pixel
+    ours = np.asarray(found.tissue.centroids)[whole] / found.pixel_size * pixel
     away = tissue.boundary.shortest(jnp.asarray(ours)[:, None] - tissue.centroids[None])
     distance = np.asarray(jnp.linalg.norm(away, axis=-1))
     nearest = distance.argmin(axis=1)
@@ -271,14 +228,14 @@ def _metrics(config: Config, found: list[_Image], snr: float) -> dict[str, Any]:
         for name in ("true", "inferred", "deviation")
     )
     within = {
-        f"pearson_within_{kind}": np.corrcoef(
+        f"pearson_within_{kind}": pearson(
             np.concatenate([i.true for i in own if i.condition == kind]), cells[kind]
-        )[0, 1]
+        )
         for kind in cells
     }
     test = mannwhitneyu(cells["fluid"], cells["stiff"], alternative="greater")
     return metrics | {
-        "pearson": np.corrcoef(true, inferred)[0, 1],
+        "pearson": pearson(true, inferred),
         **within,
         "error_rms": np.sqrt(np.mean((inferred - true) ** 2)),
         "error_mean": np.mean(inferred - true),

@@ -7,15 +7,23 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from vertax.experiments import _figures
-from vertax.plotting import _style, plot_tissue
-from vertax.plotting._tissue import draw_image
+from vertax.plotting import (
+    SERIES,
+    house_style,
+    new_figure,
+    plot_boxes,
+    plot_image,
+    plot_recovery,
+    plot_tissue,
+    same_limits,
+    scale_bar,
+)
 
-_COLOURS = {"stiff": _style.SERIES[0], "fluid": _style.SERIES[1]}
+_COLOURS = {"stiff": SERIES[0], "fluid": SERIES[1]}
 
 
+@house_style()
 def conditions(found: Sequence[Any]) -> Figure:
     """Inferred against true shape factors, and both conditions, at each signal-to-noise ratio.
 
@@ -26,37 +34,30 @@ def conditions(found: Sequence[Any]) -> Figure:
     **Returns:** the figure.
     """
     ratios = list(dict.fromkeys(image.snr for image in found))
-    values = np.concatenate([x for image in found for x in (image.true, image.inferred)])
-    ends = np.percentile(values, [0.5, 99.5]) + np.array([-0.05, 0.05])
-    with _style.house_style():
-        layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06)
-        figure = Figure(figsize=(2.4 * len(ratios), 4.6), layout=layout)
-        axes = figure.subplots(2, len(ratios), squeeze=False)
-        for (scatter, box), snr in zip(axes.T, ratios, strict=True):
-            own = [image for image in found if image.snr == snr]
-            scatter.plot(ends, ends, color=_style.INK, lw=0.7, ls=(0, (4, 3)), zorder=1)
-            cells = {}
-            for kind, colour in _COLOURS.items():
-                images = [image for image in own if image.condition == kind]
-                if not images:
-                    continue
-                true, inferred, deviation = (
-                    np.concatenate([getattr(i, name) for i in images])
-                    for name in ("true", "inferred", "deviation")
-                )
-                scatter.errorbar(
-                    true, inferred, deviation, fmt="o", ms=2.5, lw=0.4, color=colour, label=kind
-                )
-                cells[kind] = inferred
-            scatter.set(xlim=ends, ylim=ends, title=f"SNR {snr:g}")
-            scatter.set(xlabel="true $p_0$", ylabel="inferred $p_0$")
-            scatter.set_aspect("equal")
-            _figures.boxes(box, cells, _COLOURS, log=False)
-            box.set(ylabel="inferred $p_0$", ylim=ends)
-        axes[0, 0].legend(loc="upper left")
+    figure, axes = new_figure(2, len(ratios))
+    for (scatter, box), snr in zip(axes.T, ratios, strict=True):
+        cells = {}
+        for kind, colour in _COLOURS.items():
+            images = [image for image in found if (image.snr, image.condition) == (snr, kind)]
+            if not images:
+                continue
+            true, inferred, deviation = (
+                np.concatenate([getattr(i, name) for i in images])
+                for name in ("true", "inferred", "deviation")
+            )
+            options: dict[str, Any] = {"deviation": deviation, "name": "$p_0$", "colour": colour}
+            plot_recovery(true, inferred, ax=scatter, label=kind, **options)
+            cells[kind] = inferred
+        scatter.set_title(f"SNR {snr:g}")
+        plot_boxes(cells, ax=box, colours=_COLOURS)
+        box.set_ylabel("inferred $p_0$")
+    same_limits(axes[0])
+    same_limits(axes[1], x=False)
+    axes[0, 0].legend(loc="upper left")
     return figure
 
 
+@house_style()
 def images(pictures: Mapping[str, tuple[np.ndarray, Any, Any]]) -> Figure:
     """The first image of each kind, with the fitted mesh over it.
 
@@ -67,18 +68,15 @@ def images(pictures: Mapping[str, tuple[np.ndarray, Any, Any]]) -> Figure:
     **Returns:** the figure.
     """
     columns = max(1, (len(pictures) + 1) // 2)
-    with _style.house_style():
-        layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03)
-        figure = Figure(figsize=(2.3 * columns * 2, 4.9), layout=layout)
-        axes = figure.subplots(2, 2 * columns, squeeze=False)
-        for ax in axes.ravel():
-            ax.set_axis_off()
-        for k, (title, (pixels, found, outcome)) in enumerate(pictures.items()):
-            raw, fitted = axes[k % 2, 2 * (k // 2) : 2 * (k // 2) + 2]
-            draw_image(raw, pixels, found.pixel_size)
-            plot_tissue(
-                outcome.tissue, ax=fitted, image=pixels, pixel_size=found.pixel_size, linewidth=0.9
-            )
-            raw.set_title(title)
-            fitted.set_title("fitted mesh")
+    figure, axes = new_figure(2, 2 * columns, width=2.3, height=2.45)
+    for ax in axes.ravel():
+        ax.set_axis_off()
+    for k, (title, (pixels, found, outcome)) in enumerate(pictures.items()):
+        raw, fitted = axes[k % 2, 2 * (k // 2) : 2 * (k // 2) + 2]
+        size: dict[str, Any] = {"pixel_size": found.pixel_size}
+        plot_image(pixels, ax=raw, **size)
+        plot_tissue(outcome.tissue, ax=fitted, image=pixels, linewidth=0.9, **size)
+        scale_bar(raw, "pixels", unit_length=found.pixel_size)
+        raw.set_title(title)
+        fitted.set_title("fitted mesh")
     return figure

@@ -12,35 +12,33 @@ from typing import Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 from pydantic import Field
 
 from vertax.costs import AspectRatio, aspect_ratio
-from vertax.experiments import _design_figures as figures
-from vertax.experiments._design import (
-    Gradient,
-    Tensions,
-    designs,
-    keys_of,
-    limits,
-    mean_and_deviation,
-    member,
-    tensions,
-)
-from vertax.fitting import Fit, InverseProblem
+from vertax.fitting import Fit, InverseProblem, Record, limits, member
+from vertax.inference import foam_terms
 from vertax.initialise import free_voronoi
-from vertax.mesh import Tissue
-from vertax.runs._config import ExperimentConfig
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Fitting, Relaxation
-from vertax.runs._tables import histories, joined
+from vertax.runs import (
+    ExperimentConfig,
+    Fitting,
+    Gradient,
+    Relaxation,
+    RunFolder,
+    TensionRange,
+    fit_side_by_side,
+    histories,
+    joined,
+    replicate_keys,
+    spread_of,
+)
+
+from . import figures
 
 
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["convergent_extension"] = "convergent_extension"
-    """Which experiment this is."""
     n_cells: list[int] = Field(default=[6, 12, 18], min_length=1)
     """Sizes of the clusters."""
     targets: list[float] = Field(default=[1.75, 2.0, 2.25, 2.5, 2.75, 3.0], min_length=1)
@@ -57,7 +55,7 @@ class Config(ExperimentConfig):
     """Size of the cluster in the figure."""
     shown_target: float = Field(default=2.75, gt=1)
     """Its target; the nearest one is taken, of sizes too."""
-    tensions: Tensions = Tensions()
+    tensions: TensionRange = TensionRange()
     """Tensions of the edges and stiffness of the cells."""
     spread: float = Field(default=0.5, ge=0, lt=1)
     """Share of the range of tensions that the first ones are drawn from."""
@@ -67,7 +65,7 @@ class Config(ExperimentConfig):
     """How the aspect ratio to start at is reached."""
     fit: Fitting = Fitting(learning_rate=0.1, epochs=200)
     """How the tensions (their logits) are fitted."""
-    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=300)
+    relaxation: Relaxation = Relaxation(max_steps=300)
     """How the tissue is relaxed."""
 
 
@@ -88,16 +86,16 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     - `FitError` if a fit cannot go on.
     """
     metrics: dict[str, Any] = {}
-    designs: dict[int, tuple[Fit, Fit, np.ndarray]] = {}
+    designs: dict[int, tuple[Fit, Fit]] = {}
     tables: list[dict[str, Any]] = []
     for n_cells in config.n_cells:
-        designs[n_cells] = started, outcome, curves = _design(config, n_cells, folder, progress)
+        designs[n_cells] = started, outcome = _design(config, n_cells, folder, progress)
         labels = [
             {"n_cells": str(n_cells), "target": str(target), "replicate": str(k)}
             for target, k in _members(config)
         ]
         table = histories(outcome, labels)
-        tables.append(table | {"aspect_ratio": curves.T.ravel()})
+        tables.append(table | {"aspect_ratio": outcome.notes["ratio"].T.ravel()})
         metrics[f"{n_cells} cells"] = _metrics(config, started, outcome)
         folder.save_table("history", joined(tables))
     _save(config, designs, folder)
@@ -109,12 +107,10 @@ def _members(config: Config) -> list[tuple[float, int]]:
     return [(target, k) for target in config.targets for k in range(config.replicates)]
 
 
-def _design(
-    config: Config, n_cells: int, folder: RunFolder, progress: bool
-) -> tuple[Fit, Fit, np.ndarray]:
-    """The fits to the ratio at which designs start and to the targets; the ratios over epochs."""
+def _design(config: Config, n_cells: int, folder: RunFolder, progress: bool) -> tuple[Fit, Fit]:
+    """The fits to the ratio at which designs start, and to the targets."""
     problems = []
-    for key in keys_of(config.seed, config.replicates):
+    for key in replicate_keys(config.seed, config.replicates):
         cluster = free_voronoi(n_cells, key=key, lloyd_steps=2)
         problems.append(
             InverseProblem(
@@ -122,24 +118,26 @@ def _design(
                 config.tensions.draw(cluster, config.spread, key),
                 AspectRatio(jnp.array(config.start_ratio), config.measure),
                 adjoint=config.gradient.build(),
-                **config.relaxation.options(),
+                response=config.relaxation.build(),
             )
         )
-    options: dict[str, Any] = {"progress": progress}
+    options: dict[str, Any] = {"notes": _ratio, "progress": progress}
     name = f"{n_cells} cells"
-    started, *_ = designs(folder, f"{name} first", problems, config.start, _measure, **options)
+    started = fit_side_by_side(folder, f"{name} first", problems, config.start, **options)
     bound = []
     for target, k in _members(config):
         tissue, energy = member((started.tissue, started.energy), k)
         replaced = (tissue, energy, AspectRatio(jnp.array(target), config.measure))
         bound.append(eqx.tree_at(lambda p: (p.tissue, p.energy, p.cost), problems[k], replaced))
-    outcome, _, curves = designs(folder, name, bound, config.fit, _measure, **options)
-    return started, outcome, curves
+    return started, fit_side_by_side(folder, name, bound, config.fit, **options)
 
 
-def _measure(problem: InverseProblem, tissue: Tissue, parameters: PyTree) -> Array:
+_aspect_ratio = eqx.filter_jit(aspect_ratio)
+
+
+def _ratio(problem: InverseProblem, record: Record) -> dict[str, Array]:
     assert isinstance(problem.cost, AspectRatio)
-    return aspect_ratio(tissue, problem.cost.measure)
+    return {"ratio": _aspect_ratio(record.tissue, problem.cost.measure)}
 
 
 def _ratios(config: Config, outcome: Fit) -> np.ndarray:
@@ -156,7 +154,7 @@ def _metrics(config: Config, started: Fit, outcome: Fit) -> dict[str, Any]:
     verdicts = by_target(limits(outcome, (squared <= config.accuracy**2).ravel()))
     history = outcome.history
     return {
-        "start_ratio": mean_and_deviation(_ratios(config, started)),
+        "start_ratio": spread_of(_ratios(config, started)),
         "squared_error_mean": squared.mean(),
         "squared_error_max": squared.max(),
         "reached_fraction": np.mean(verdicts == "reached"),
@@ -168,7 +166,7 @@ def _metrics(config: Config, started: Fit, outcome: Fit) -> dict[str, Any]:
         "seconds_per_epoch": np.median(history.seconds),
         "targets": {
             str(target): {
-                "squared_error": mean_and_deviation(squared[k]),
+                "squared_error": spread_of(squared[k]),
                 "ratios": ratios[k],
                 "num_t1": by_target(history.num_t1.sum(axis=0))[k],
                 "best_epoch": by_target(outcome.best_epoch)[k],
@@ -179,10 +177,8 @@ def _metrics(config: Config, started: Fit, outcome: Fit) -> dict[str, Any]:
     }
 
 
-def _save(
-    config: Config, designs: dict[int, tuple[Fit, Fit, np.ndarray]], folder: RunFolder
-) -> None:
-    ratios = {n_cells: _ratios(config, outcome) for n_cells, (_, outcome, _) in designs.items()}
+def _save(config: Config, designs: dict[int, tuple[Fit, Fit]], folder: RunFolder) -> None:
+    ratios = {n_cells: _ratios(config, outcome) for n_cells, (_, outcome) in designs.items()}
     rows = [
         (n_cells, target, k, values[i, k])
         for n_cells, values in ratios.items()
@@ -195,13 +191,13 @@ def _save(
     folder.save_table("aspect_ratios", columns | {"squared_error": error})
     n_cells = min(designs, key=lambda n: abs(n - config.shown))
     index = int(np.argmin(np.abs(np.array(config.targets) - config.shown_target)))
-    started, outcome, _ = designs[n_cells]
+    started, outcome = designs[n_cells]
     panels = {}
     for name, fitted, row in (("initial", started, 0), ("designed", outcome, index)):
         # The first replicate.
         own = member((fitted.tissue, fitted.energy), row * config.replicates)
         ratio = _ratios(config, fitted)[row, 0]
-        panels[f"{name}: $r$ = {ratio:.2f}"] = (own[0], tensions(own[1]))
+        panels[f"{name}: $r$ = {ratio:.2f}"] = (own[0], np.asarray(foam_terms(own[1])[1].tension))
         folder.save_tissue(name, own[0])
     bounds = (config.tensions.low, config.tensions.high)
     figure = figures.elongation(panels, bounds, np.array(config.targets), ratios)

@@ -6,34 +6,36 @@ mean of the shape factors that the cells have in equilibrium is the one asked fo
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
 from pydantic import Field
 
 from vertax.costs import MeanShapeFactor
 from vertax.energies import ShapeFactorEnergy
-from vertax.experiments import _design_figures as figures
-from vertax.experiments._design import Gradient, design, limits
-from vertax.experiments._figures import convergence
-from vertax.experiments._scenes import ShapeFactors, TissueSection
-from vertax.fitting import InverseProblem
+from vertax.fitting import Fit, InverseProblem, Record, limits
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
-from vertax.runs._config import ExperimentConfig
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Fitting, Relaxation
-from vertax.runs._tables import fit_metrics, history_columns
+from vertax.runs import (
+    ExperimentConfig,
+    Fitting,
+    Gradient,
+    Relaxation,
+    RunFolder,
+    ShapeFactors,
+    TissueSection,
+    fit_metrics,
+    history_columns,
+)
+
+from . import figures
 
 
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["design_mechanics"] = "design_mechanics"
-    """Which experiment this is."""
     target: float = Field(default=4.10, gt=0)
     """The mean shape factor to reach."""
     accuracy: float = Field(default=1e-3, gt=0)
@@ -73,16 +75,18 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     noise = noise - jnp.mean(noise)
     energy = ShapeFactorEnergy(config.start.mean + config.start.deviation * noise)
     drawn = periodic_voronoi(n_cells, key=keys[1], lloyd_steps=config.tissue.lloyd_steps)
+    response = config.relaxation.build()
     problem = InverseProblem(
         drawn,
         energy,
         MeanShapeFactor(config.target),
         adjoint=config.gradient.build(),
-        **config.relaxation.options(),
+        response=response,
     )
-    outcome, initial, (observed, targets) = design(
-        folder, "design", problem, config.fit, _measure, progress=progress
-    )
+    optimiser, epochs = config.fit.build(), config.fit.epochs
+    outcome = folder.fit("design", problem, optimiser, epochs, callback=_notes, progress=progress)
+    initial = response(drawn, energy, throw=False).tissue
+    observed, targets = outcome.notes["observed"], outcome.notes["targets"]
     _save(initial, outcome, observed, targets, config, folder)
     mean, of_parameters = observed.mean(axis=1), targets.mean(axis=1)
     off = np.abs(mean - config.target)
@@ -103,13 +107,14 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     }
 
 
-def _measure(problem: InverseProblem, tissue: Tissue, parameters: PyTree) -> tuple[Array, Array]:
-    return tissue.shape_factors, jnp.asarray(parameters.target_shape_factor)
+def _notes(epoch: int, record: Record) -> dict[str, jax.Array]:
+    targets = record.parameters.target_shape_factor
+    return {"observed": record.tissue.shape_factors, "targets": targets}
 
 
 def _save(
     initial: Tissue,
-    outcome: Any,
+    outcome: Fit,
     observed: np.ndarray,
     targets: np.ndarray,
     config: Config,
@@ -130,4 +135,4 @@ def _save(
     panels = {"initial": (initial, observed[0]), "designed": (outcome.tissue, observed[best])}
     figure = figures.mechanics(panels, observed, targets, config.target)
     folder.save_figure("design", figure)
-    folder.save_figure("convergence", convergence(outcome.history))
+    folder.save_figure("convergence", figures.convergence(outcome.history))

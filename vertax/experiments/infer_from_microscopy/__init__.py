@@ -1,3 +1,3 @@
 """Infer the target shape factors of the cells in a microscopy image."""
 
-from vertax.experiments.infer_from_microscopy.experiment import Config as Config, run as run
+from .experiment import Config as Config, run as run

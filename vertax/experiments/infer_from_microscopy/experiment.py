@@ -9,55 +9,43 @@ original are reported; or the outline of its whole cells is pinned (`model.borde
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from vertax.costs import MeshImage
-from vertax.experiments import _figures
-from vertax.experiments._imaging import (
-    Model,
+from vertax.fitting import Fit
+from vertax.inference import Micrograph
+from vertax.runs import (
+    ExperimentConfig,
+    Fitting,
+    ImageFile,
+    MicrographModel,
     Preparation,
-    SegmentationSection,
-    correlation,
-    parameters_of,
-    pixel_of,
-    read,
+    Relaxation,
+    RunFolder,
+    Segmenter,
+    fit_metrics,
+    history_columns,
+    read_micrograph,
 )
-from vertax.fitting import Fit, FitError
-from vertax.initialise import Segmentation
-from vertax.io import read_image
-from vertax.mesh import Tissue
-from vertax.responses import Equilibrium
-from vertax.runs._config import ConfigError, ExperimentConfig
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Fitting, Relaxation
-from vertax.runs._tables import fit_metrics, history_columns
+
+from . import figures
 
 
-class ImageSection(Preparation):
-    """The image, and how it is prepared for the comparison with the model."""
-
-    path: str = ""
-    """File of a membrane image, bright membranes on dark cells."""
-    channel: int | None = None
-    """Which channel, if there are several."""
-    plane: int | None = None
-    """Which plane, if it is a stack."""
+class ImageSection(Preparation, ImageFile):
+    """The image, bright membranes on dark cells, and how it is prepared for the comparison."""
 
 
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["infer_from_microscopy"] = "infer_from_microscopy"
-    """Which experiment this is."""
     image: ImageSection = ImageSection()
     """The image."""
-    segmentation: SegmentationSection = SegmentationSection()
+    segmentation: Segmenter = Segmenter()
     """How the cells are found."""
-    model: Model = Model()
+    model: MicrographModel = MicrographModel()
     """The energy and the first guess."""
     fit: Fitting = Fitting(learning_rate=2e-2, epochs=150)
     """How the parameters are fitted."""
@@ -84,89 +72,57 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     - `ConfigError` if no image is named; `FileNotFoundError` and `ValueError` for one that cannot be
         used; `FitError` if the fit cannot go on.
     """
-    if not config.image.path:
-        raise ConfigError(
-            "`image.path` is missing: name a membrane image, as in --set image.path=IMAGE.tif."
-        )
-    pixels = read_image(config.image.path, channel=config.image.channel, plane=config.image.plane)
-    reading = read(
-        np.asarray(pixels, float),
-        config.image,
-        config.segmentation,
-        config.model,
-        config.relaxation,
+    pixels = np.asarray(config.image.read(), float)
+    micrograph = read_micrograph(
+        pixels, config.image, config.segmentation, config.model, config.relaxation
     )
-    found, whole, seen, width, first, problem = reading
-    folder.save_tissue("target", found.tissue)
-    folder.save_tissue("initial", first.tissue)
-    folder.save_array("image", seen)
-    try:
-        outcome = reading.fit(folder, "fit", config.fit, progress=progress)
-    except FitError as error:
-        if error.fit is not None:
-            folder.save_table("history", history_columns(error.fit.history))
-            folder.save_tissue("fitted", error.fit.tissue)
-        raise
+    folder.save_tissue("target", micrograph.segmentation.tissue)
+    folder.save_tissue("initial", micrograph.first.tissue)
+    folder.save_array("image", micrograph.image)
+    optimiser, epochs = config.fit.build(), config.fit.epochs
+    outcome = folder.fit("fit", micrograph.problem, optimiser, epochs, progress=progress)
     folder.save_tissue("fitted", outcome.tissue)
     folder.save_table("history", history_columns(outcome.history))
-    folder.save_table("cells", _cell_table(found, whole, outcome))
-    _draw(found, whole, np.asarray(pixels, float), first.tissue, outcome, folder)
-    assert isinstance(problem.cost, MeshImage)
-    return _metrics(found, whole, seen, problem.cost, first, outcome, width)
+    folder.save_table("cells", _cell_table(micrograph, outcome))
+    _draw(micrograph, pixels, outcome, folder)
+    metrics = _metrics(micrograph, outcome)
+    if metrics["correlation_fitted"] < 0.5:
+        folder.warn(
+            "the fitted mesh explains less than a quarter of the variance of the image (correlation "
+            f"{metrics['correlation_fitted']:.2f}): look at figures/overlay, and at the segmentation"
+        )
+    return metrics
 
 
-def _membrane_contrast(
-    tissue: Tissue, found: Segmentation, seen: Float[np.ndarray, "rows columns"]
-) -> float:
-    """Mean of the standardised image along the edges, weighted by length."""
-    start, vector = (np.asarray(x, float) for x in tissue.edge_segments)
-    steps = (np.arange(32) + 0.5) / 32
-    points = (start[:, None] + steps[:, None] * vector[:, None]).reshape(-1, 2)
-    length = np.repeat(np.linalg.norm(vector, axis=1), 32)
-    pixel = pixel_of(found, seen)
-    column, row = np.floor(points / pixel).astype(int).T
-    inside = (row >= 0) & (row < seen.shape[0]) & (column >= 0) & (column < seen.shape[1])
-    values = (seen - seen.mean()) / seen.std()
-    return float(np.average(values[row[inside], column[inside]], weights=length[inside]))
-
-
-def _metrics(
-    found: Segmentation,
-    whole: Bool[np.ndarray, " cells"],
-    seen: Float[np.ndarray, "rows columns"],
-    cost: MeshImage,
-    first: Equilibrium,
-    outcome: Fit,
-    width: float,
-) -> dict[str, Any]:
+def _metrics(micrograph: Micrograph, outcome: Fit) -> dict[str, Any]:
+    found, first = micrograph.segmentation, micrograph.first
     meshes = {"segmented": found.tissue, "initial": first.tissue, "fitted": outcome.tissue}
-    factors = parameters_of(outcome.energy)[0][whole]
+    factors = micrograph.parameters(outcome.energy)[0][micrograph.whole]
     metrics: dict[str, Any] = {}
     for name, tissue in meshes.items():
-        metrics[f"correlation_{name}"] = correlation(cost, tissue)
-        metrics[f"membrane_contrast_{name}"] = _membrane_contrast(tissue, found, seen)
+        metrics[f"correlation_{name}"] = micrograph.correlation(tissue)
+        metrics[f"membrane_contrast_{name}"] = micrograph.membrane_contrast(tissue)
     corners = outcome.tissue.boundary.shortest(outcome.tissue.vertices - found.tissue.vertices)
+    observed = np.asarray(outcome.tissue.shape_factors)[micrograph.whole]
     return metrics | {
         "n_cells": found.tissue.n_cells,
-        "n_whole_cells": int(whole.sum()),
+        "n_whole_cells": int(micrograph.whole.sum()),
         "shape_factor_mean": factors.mean(),
         "shape_factor_std": factors.std(),
         "shape_factor_median": np.median(factors),
-        "observed_shape_factor_mean": np.asarray(outcome.tissue.shape_factors)[whole].mean(),
+        "observed_shape_factor_mean": observed.mean(),
         "vertex_displacement_from_segmentation": float(jnp.mean(jnp.linalg.norm(corners, axis=-1))),
-        "psf_width_pixels": width / found.pixel_size,
+        "psf_width_pixels": micrograph.psf_width / found.pixel_size,
         "pixel_size": found.pixel_size,
         **fit_metrics(outcome),
         "num_t1_first_guess": first.num_t1,
     }
 
 
-def _cell_table(
-    found: Segmentation, whole: Bool[np.ndarray, " cells"], outcome: Fit
-) -> dict[str, np.ndarray]:
+def _cell_table(micrograph: Micrograph, outcome: Fit) -> dict[str, np.ndarray]:
     """One row a whole cell of the original image."""
-    tissue = outcome.tissue
-    shape_factors, rest_areas = parameters_of(outcome.energy)
+    tissue, found = outcome.tissue, micrograph.segmentation
+    shape_factors, rest_areas = micrograph.parameters(outcome.energy)
     columns = {
         "label": found.labels,
         "target_shape_factor": shape_factors,
@@ -177,25 +133,24 @@ def _cell_table(
         "x_pixels": tissue.centroids[:, 0] / found.pixel_size,
         "y_pixels": tissue.centroids[:, 1] / found.pixel_size,
     }
-    return {name: np.asarray(column)[whole] for name, column in columns.items()}
+    return {name: np.asarray(column)[micrograph.whole] for name, column in columns.items()}
 
 
 def _draw(
-    found: Segmentation,
-    whole: Bool[np.ndarray, " cells"],
+    micrograph: Micrograph,
     pixels: Float[np.ndarray, "rows columns"],
-    initial: Tissue,
     outcome: Fit,
     folder: RunFolder,
 ) -> None:
+    found, initial = micrograph.segmentation, micrograph.first.tissue
     overlays = {"segmented": found.tissue, "relaxed first guess": initial, "fitted": outcome.tissue}
-    folder.save_figure("overlay", _figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
-    folder.save_figure("convergence", _figures.convergence(outcome.history))
-    figure = _figures.cells_on_image(
+    folder.save_figure("overlay", figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
+    folder.save_figure("convergence", figures.convergence(outcome.history))
+    figure = figures.cells_on_image(
         pixels,
         outcome.tissue,
-        parameters_of(outcome.energy)[0],
-        whole,
+        micrograph.parameters(outcome.energy)[0],
+        micrograph.whole,
         pixel_size=found.pixel_size,
         label="target shape factor $p_0$",
     )

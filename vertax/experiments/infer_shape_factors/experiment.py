@@ -10,53 +10,44 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 from pydantic import Field
 
-from vertax.costs import AbstractCost, MeshImage, VertexDistance, render
+from vertax.costs import AbstractCost, MeshImage, VertexDistance
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
-from vertax.experiments import _figures
-from vertax.experiments._scenes import (
-    Scene,
+from vertax.fitting import Fit, InverseProblem
+from vertax.inference import Scene, pearson, relative_error, same_neighbours, shape_factor_scene
+from vertax.runs import (
+    ExperimentConfig,
+    Fitting,
+    Microscope,
+    Relaxation,
+    RunFolder,
     ShapeFactors,
     TissueSection,
-    make_scene,
-    same_neighbours,
+    fit_metrics,
+    history_columns,
+    joined,
 )
-from vertax.fitting import Fit, FitError, InverseProblem
-from vertax.mesh import Tissue
-from vertax.runs._config import ExperimentConfig, Section
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Fitting, Relaxation
-from vertax.runs._tables import fit_metrics, history_columns
+
+from . import figures
 
 _NAME = r"$p_0$"
 _Image = Float[np.ndarray, "rows columns"] | None
 
 
-class ImageSection(Section):
+class ImageSection(Microscope):
     """The synthetic microscopy image; intensities are relative to the brightest membrane."""
 
-    pixels: int = Field(default=128, ge=16)
-    """Side of the image in pixels."""
-    psf_width: float = Field(default=2.0, ge=1)
-    """Standard deviation of the point spread function in pixels."""
     noise: float = Field(default=0.05, ge=0)
     """Standard deviation of the noise of a pixel."""
-    background: float = Field(default=0.1, ge=0)
-    """Intensity where there is no membrane."""
-    uneven_gain: float = Field(default=0.0, ge=0, lt=1)
-    """Amplitude of a slow variation of brightness over the image."""
 
 
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["infer_shape_factors"] = "infer_shape_factors"
-    """Which experiment this is."""
     data: Literal["vertices", "image", "both"] = "vertices"
     """What the fit is given; both makes one fit from each."""
     guess: Literal["redrawn", "mean"] = "redrawn"
@@ -88,7 +79,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
 
     **Raises:**
 
-    - `FitError` if a fit cannot go on; the folder then holds what came before.
+    - `FitError` if a fit cannot go on.
     """
     scene, image = _make_scene(config)
     _save_scene(scene, image, folder)
@@ -96,12 +87,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     metrics: dict[str, dict[str, Any]] = {}
     fits: dict[str, Fit] = {}
     for source in ("vertices", "image") if both else (config.data,):
-        try:
-            fits[source] = _fit(config, scene, image, source, folder, progress)
-        except FitError as error:
-            if error.fit is not None:
-                _save_tables(scene, fits | {source: error.fit}, folder)
-            raise
+        fits[source] = _fit(config, scene, image, source, folder, progress)
         _save_tables(scene, fits, folder)
         _save_fit(config, scene, image, source, fits[source], folder)
         metrics[source] = _metrics(scene, fits[source])
@@ -109,35 +95,17 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     return metrics["vertices"] | metrics if both else metrics[config.data]
 
 
-def synthetic_image(
-    tissue: Tissue, options: ImageSection, key: PRNGKeyArray
-) -> Float[np.ndarray, "rows columns"]:
-    """What a microscope might see of a tissue: blurred membranes on a background, uneven and noisy.
-
-    **Arguments:**
-
-    - `tissue`: a tissue in a square periodic box.
-    - `options`: the microscope.
-    - `key`: of the noise.
-
-    **Returns:** the image of one period, rows along y.
-    """
-    shape = (options.pixels, options.pixels)
-    width = options.psf_width * _pixel_size(tissue, options)
-    membranes = np.asarray(eqx.filter_jit(render)(tissue, shape, width), float)
-    # Brightest off the centre, and periodic as the tissue is.
-    phase = 2 * np.pi * (np.arange(options.pixels) + 0.5) / options.pixels
-    gain = 1 + 0.5 * options.uneven_gain * (np.sin(phase)[:, None] + np.cos(phase)[None, :])
-    noise = np.asarray(jax.random.normal(key, shape), float)
-    return gain * (membranes / membranes.max() + options.background) + options.noise * noise
-
-
 def _make_scene(config: Config) -> tuple[Scene, _Image]:
     keys = jax.random.split(jax.random.key(config.seed), 4)
-    redrawn = config.guess == "redrawn"
-    scene = make_scene(keys[:3], config.tissue, config.truth, config.relaxation, redrawn=redrawn)
-    needs_image = config.data != "vertices"
-    return scene, synthetic_image(scene.target, config.image, keys[3]) if needs_image else None
+    scene = shape_factor_scene(
+        key=keys[:3],
+        guess=config.guess,
+        response=config.relaxation.build(),
+        **config.tissue.model_dump(),
+        **config.truth.model_dump(),
+    )
+    microscope = config.image.build(config.image.noise)
+    return scene, None if config.data == "vertices" else microscope(scene.target, key=keys[3])
 
 
 def _fit(
@@ -146,8 +114,7 @@ def _fit(
     cost: AbstractCost
     if source == "image":
         assert image is not None
-        width = config.image.psf_width * _pixel_size(scene.target, config.image)
-        cost = MeshImage(image, width)
+        cost = MeshImage(image, config.image.psf_width * _pixel_size(config, scene))
     else:
         cost = VertexDistance(scene.target)
     problem = InverseProblem(
@@ -156,7 +123,7 @@ def _fit(
         cost,
         # Vertices keep their centroid while they relax; an image does not say where it was.
         fit_position=source == "image",
-        **config.relaxation.options(),
+        response=config.relaxation.build(),
     )
     optimiser, epochs = config.fit.build(), config.fit.epochs
     return folder.fit(source, problem, optimiser, epochs, truth=scene.truth, progress=progress)
@@ -164,12 +131,10 @@ def _fit(
 
 def _metrics(scene: Scene, outcome: Fit) -> dict[str, Any]:
     true, inferred = _parameters(scene.truth), _parameters(outcome.energy)
-    history = outcome.history
-    varied = np.ptp(true) > 0 and np.ptp(inferred) > 0
     return {
-        "pearson": np.corrcoef(true, inferred)[0, 1] if varied else np.nan,
-        "relative_error": np.mean(np.abs(inferred - true) / np.abs(true)),
-        "relative_error_initial": history.relative_error[0],
+        "pearson": pearson(true, inferred),
+        "relative_error": relative_error(true, inferred),
+        "relative_error_initial": outcome.history.relative_error[0],
         **fit_metrics(outcome),
         "same_neighbours": same_neighbours(outcome.tissue, scene.target),
     }
@@ -179,7 +144,7 @@ def _save_scene(scene: Scene, image: _Image, folder: RunFolder) -> None:
     folder.save_tissue("target", scene.target)
     folder.save_tissue("initial", scene.initial)
     panels = {"target": (scene.target, _parameters(scene.truth))}
-    folder.save_figure("target", _figures.tissues(panels, label=f"true {_NAME}"))
+    folder.save_figure("target", figures.tissues(panels, label=f"true {_NAME}"))
     if image is not None:
         folder.save_array("image", image)
 
@@ -192,10 +157,8 @@ def _save_tables(scene: Scene, fits: dict[str, Fit], folder: RunFolder) -> None:
     true, initial = _parameters(scene.truth), _parameters(scene.guess)
     cells = {"cell": np.arange(len(true)), "true": true, "initial": initial} | inferred
     folder.save_table("shape_factors", cells)
-    epochs = [history_columns(outcome.history, data=source) for source, outcome in fits.items()]
-    folder.save_table(
-        "history", {name: np.concatenate([e[name] for e in epochs]) for name in epochs[0]}
-    )
+    tables = [history_columns(outcome.history, data=source) for source, outcome in fits.items()]
+    folder.save_table("history", joined(tables))
 
 
 def _save_fit(
@@ -210,13 +173,13 @@ def _save_fit(
         "target": (scene.target, true),
     }
     label = f"target shape factor {_NAME}"
-    folder.save_figure(f"before_after{ending}", _figures.tissues(panels, label=label))
-    folder.save_figure(f"convergence{ending}", _figures.convergence(outcome.history))
-    folder.save_figure(f"recovery{ending}", _figures.recovery(true, inferred, initial, name=_NAME))
+    folder.save_figure(f"before_after{ending}", figures.tissues(panels, label=label))
+    folder.save_figure(f"convergence{ending}", figures.convergence(outcome.history))
+    folder.save_figure(f"recovery{ending}", figures.recovery(true, inferred, initial, name=_NAME))
     if source == "image" and image is not None:
         overlays = {"image": None, "initial guess": scene.initial, "fitted": outcome.tissue}
-        pixel = _pixel_size(scene.target, config.image)
-        figure = _figures.overlays(image, overlays, pixel_size=pixel, upright=True)
+        pixel = _pixel_size(config, scene)
+        figure = figures.overlays(image, overlays, pixel_size=pixel)
         folder.save_figure(f"overlay{ending}", figure)
 
 
@@ -225,5 +188,5 @@ def _parameters(energy: AbstractEnergy) -> Float[np.ndarray, " cells"]:
     return np.asarray(energy.target_shape_factor, float)
 
 
-def _pixel_size(tissue: Tissue, options: ImageSection) -> float:
-    return float(np.sqrt(tissue.n_cells)) / options.pixels
+def _pixel_size(config: Config, scene: Scene) -> float:
+    return config.image.build(config.image.noise).pixel_size(scene.target)

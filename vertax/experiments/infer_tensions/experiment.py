@@ -9,40 +9,46 @@ segmented, to see how well they are found.
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
-from matplotlib.path import Path
+from jaxtyping import Int
 from pydantic import Field, model_validator
-from scipy.optimize import lsq_linear
 
-from vertax.costs import AbstractLeastSquaresCost, EdgeDistance
-from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
-from vertax.experiments._design import terms_of
-from vertax.experiments._scenes import pearson_of
-from vertax.experiments.infer_tensions import figures
-from vertax.fitting import Fit, FitError, InverseProblem, uncertainty
+from vertax.energies import LocalSum
+from vertax.fitting import Fit
+from vertax.inference import (
+    TensionProblem,
+    Tensions,
+    foam_energy,
+    foam_terms,
+    force_balance,
+    label_image,
+    pearson,
+    tension_problem,
+)
 from vertax.initialise import Segmentation, free_voronoi, from_labels, labels_from_skeleton
-from vertax.io import read_image
 from vertax.mesh import Tissue
-from vertax.responses import equilibrate
-from vertax.runs._config import ExperimentConfig, Section
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Relaxation
-from vertax.runs._tables import fit_metrics, history_columns
+from vertax.plotting import label_colours
+from vertax.runs import (
+    ExperimentConfig,
+    ImageFile,
+    Relaxation,
+    RunFolder,
+    Section,
+    fit_metrics,
+    history_columns,
+)
+
+from . import figures
 
 
-class ImageSection(Section):
-    """The segmented image."""
+class ImageSection(ImageFile):
+    """The segmented image; without a file, one of a synthetic cluster."""
 
-    path: str = ""
-    """Its file; left out, an image of a synthetic cluster."""
     kind: Literal["skeleton", "labels"] = "skeleton"
     """Whether it shows the outlines of cells, or a number in each pixel of a cell."""
 
@@ -58,29 +64,36 @@ class Cluster(Section):
     """Longer side of the image, in pixels."""
 
 
-class Model(Section):
-    """The foam model."""
+class Foam(Section):
+    """The foam model, relative to the mean tension."""
 
-    inner_arcs: bool = True
-    """Whether edges between two cells are arcs too, whose curvature tells differences of pressure."""
     stiffness: float = Field(default=20.0, gt=0)
-    """Stiffness of the areas, relative to the mean tension."""
+    """Stiffness of the areas."""
     low: float = Field(default=0.05, ge=0, lt=1)
     """Least relative tension."""
     high: float = Field(default=4.0, gt=1)
     """Largest relative tension."""
+
+
+class Model(Foam):
+    """The foam model, and how much the image counts."""
+
+    inner_arcs: bool = True
+    """Whether edges between two cells are arcs too, whose curvature tells differences of pressure."""
     prior: float = Field(default=0.5, gt=0)
     """Standard deviation of relative tensions before the image was seen; it decides what the geometry
     leaves open."""
     noise: float = Field(default=1.0, gt=0)
     """Standard deviation of the position of an edge, in pixels: how much the image counts against that."""
 
+    def foam(self) -> dict[str, float]:
+        """Stiffness and bounds of the tensions, by name."""
+        return {name: getattr(self, name) for name in Foam.model_fields}
+
 
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["infer_tensions"] = "infer_tensions"
-    """Which experiment this is."""
     image: ImageSection = ImageSection()
     """The segmented image."""
     cluster: Cluster = Cluster()
@@ -102,28 +115,6 @@ class Config(ExperimentConfig):
         return self
 
 
-class RelativeTensions(AbstractLeastSquaresCost):
-    r"""Penalty for tensions that differ from 1: $\tfrac12\sum_e ((\gamma_e - 1)/\sigma)^2$."""
-
-    deviation: float
-
-    def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """Differences over the standard deviation."""
-        return (tension_of(energy) - 1) / self.deviation
-
-
-def tension_of(energy: AbstractEnergy) -> Float[Array, " edges"]:
-    """Tensions of the edges.
-
-    **Arguments:**
-
-    - `energy`: of this experiment.
-
-    **Returns:** the tensions.
-    """
-    return terms_of(energy)[1].tension
-
-
 def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """Run the experiment.
 
@@ -136,6 +127,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     **Returns:** the metrics: distances of the edges from those of the image in pixels (for tensions that
     are all equal, those that balance forces best in the shape as it was seen, and the fitted ones),
     spread and uncertainty of tensions and pressures; for a synthetic cluster how well they were found.
+    Edges that are further from those of the image than the noise allows are a warning.
 
     **Raises:**
 
@@ -144,112 +136,56 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     """
     truth = None
     if config.image.path:
-        image = np.asarray(read_image(config.image.path))
-        skeleton = config.image.kind == "skeleton"
-        labels = labels_from_skeleton(image) if skeleton else image
+        image = config.image.read()
+        labels = labels_from_skeleton(image) if config.image.kind == "skeleton" else image
     else:
         truth, labels = _synthetic(config)
         image = labels
-    found = from_labels(labels, boundary="free", inner_arcs=config.model.inner_arcs)
+    model = config.model
+    found = from_labels(labels, boundary="free", inner_arcs=model.inner_arcs)
     folder.save_tissue("target", found.tissue)
-    problem, balanced = problem_of(config, found)
-    try:
-        solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-        outcome = folder.fit("tensions", problem, solver, config.epochs, progress=progress)
-    except FitError as error:
-        if error.fit is not None:
-            folder.save_table("history", history_columns(error.fit.history))
-        raise
+    foam = tension_problem(
+        found,
+        prior=model.prior,
+        noise=model.noise,
+        response=config.relaxation.build(),
+        **model.foam(),
+    )
+    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    outcome = folder.fit("tensions", foam.problem, solver, config.epochs, progress=progress)
     folder.save_tissue("fitted", outcome.tissue)
     folder.save_table("history", history_columns(outcome.history))
-    result = _result(config, problem, outcome)
+    result = foam.tensions(outcome)
     edges, cells = _tables(found, outcome, result, truth)
     folder.save_table("edges", edges)
     folder.save_table("cells", cells)
-    folder.save_figure(
-        "tensions",
-        figures.foam(
-            np.asarray(image != 0, float),
-            found,
-            outcome.tissue,
-            result.tension,
-            result.pressure,
-        ),
-    )
+    # Labels differ by their colours, and outlines are light on dark.
+    picture = label_colours(labels) if image is labels else np.asarray(image != 0, float)
+    tensions, pressures = result.tension, result.pressure
+    figure = figures.foam(picture, found, outcome.tissue, tensions, pressures)
+    folder.save_figure("tensions", figure)
     if truth is not None:
         folder.save_figure("recovery", figures.recovery(edges, cells))
-    return _metrics(config, found, balanced, outcome, result, edges, cells)
+    metrics = _metrics(config, foam, outcome, result, edges, cells)
+    _check(config, metrics, folder)
+    return metrics
 
 
-def problem_of(config: Config, found: Segmentation) -> tuple[InverseProblem, LocalSum]:
-    """The inverse problem of a segmented cluster.
-
-    **Arguments:**
-
-    - `config`: the configuration.
-    - `found`: the cluster.
-
-    **Returns:** the problem, and the energy that it starts from.
-    """
-    model = config.model
-    guess = balance(found.tissue, model)
-    trainable = jax.tree.map(lambda _: False, guess)
-    trainable = eqx.tree_at(
-        lambda e: (e.terms[0].target_area, e.terms[1].logits), trainable, (True, True)
-    )
-    width = model.noise * found.pixel_size
-    cost = EdgeDistance(found.tissue)
-    # As many independent positions as edges have ends: each is known to within the noise.
-    n_positions = 2 * found.tissue.n_vertices
-    total = cost + width**2 / n_positions * RelativeTensions(model.prior)
-    problem = InverseProblem(
-        found.tissue, guess, total, trainable, fit_position=True, **config.relaxation.options()
-    )
-    return problem, guess
-
-
-def balance(tissue: Tissue, model: Model) -> LocalSum:
-    r"""Tensions and pressures that come closest to a balance of forces in a given shape.
-
-    Forces on vertices and angles are linear in both, so this is a linear least-squares problem, with the
-    mean tension 1 and the prior of the model.
-
-    **Arguments:**
-
-    - `tissue`: the shape.
-    - `model`: bounds, stiffness and prior.
-
-    **Returns:** the energy E2 with these tensions and with target areas that make these pressures.
-    """
-    position, unravel = ravel_pytree(tissue.configuration)
-
-    def measures(x: Float[Array, " n"]) -> Float[Array, " edges_and_cells"]:
-        at = tissue.with_configuration(unravel(x))
-        return jnp.concatenate([at.edge_lengths, -at.areas])
-
-    forces = np.asarray(jax.jit(jax.jacrev(measures))(position)).T
-    n_edges, n_cells = tissue.n_edges, tissue.n_cells
-    # A typical force is one tension; the prior counts as much as a hundredth of one.
-    prior = 0.01 / model.prior * np.eye(n_edges, n_edges + n_cells)
-    mean = np.concatenate([np.full(n_edges, 1e3 / n_edges), np.zeros(n_cells)])
-    matrix = np.vstack([forces, prior, mean])
-    right = np.concatenate([np.zeros(len(forces)), prior.sum(axis=1), [1e3]])
-    margin = 1e-3 * (model.high - model.low)
-    low = np.concatenate([np.full(n_edges, model.low + margin), np.full(n_cells, -np.inf)])
-    high = np.concatenate([np.full(n_edges, model.high - margin), np.full(n_cells, np.inf)])
-    solution = lsq_linear(matrix, right, (low, high)).x
-    tension, pressure = np.split(np.asarray(solution), [n_edges])
-    areas = tissue.areas + jnp.asarray(pressure / model.stiffness)
-    return _foam(model, jnp.asarray(tension), areas)
-
-
-def _foam(model: Model, tension: Float[Array, " edges"], areas: Float[Array, " cells"]) -> LocalSum:
-    return LocalSum(
-        (
-            AreaElasticity(model.stiffness, areas),
-            BoundedTension(tension, model.low, model.high),
+def _check(config: Config, metrics: dict[str, Any], folder: RunFolder) -> None:
+    """Say so if the model does not have the edges of the image."""
+    noise, inner = config.model.noise, metrics["rms_distance_pixels_inner"]
+    everywhere = metrics["rms_distance_pixels_fitted"]
+    if inner > 2 * noise:
+        folder.warn(
+            f"the fitted edges do not explain the image: those between cells are {inner:.1f} pixels off, "
+            f"root mean square, where model.noise is {noise:g}; the tensions are not to be trusted"
         )
-    )
+    elif everywhere > 2 * noise:
+        folder.warn(
+            f"the outline of the fitted cluster is not that of the image: all edges are {everywhere:.1f} "
+            f"pixels off, root mean square, those between cells {inner:.1f}; tensions of the outline are "
+            "not to be trusted"
+        )
 
 
 def _synthetic(config: Config) -> tuple[tuple[LocalSum, Tissue], Int[np.ndarray, "rows columns"]]:
@@ -264,58 +200,13 @@ def _synthetic(config: Config) -> tuple[tuple[LocalSum, Tissue], Int[np.ndarray,
         tension_key, -0.5 / options.deviation, 0.5 / options.deviation, (cluster.n_edges,)
     )
     areas = jax.random.uniform(area_key, (options.n_cells,), minval=0.9, maxval=1.3)
-    energy = _foam(model, tension / jnp.mean(tension), areas)
-    free = Relaxation(t1_threshold=0.02).options()
-    relaxed = equilibrate(cluster, energy, **free).tissue
-    corners = np.asarray(relaxed.edge_points(jnp.linspace(0, 1, 40)), float).reshape(-1, 2)
-    low, extent = corners.min(axis=0), np.ptp(corners, axis=0)
-    scale = 0.9 * options.pixels / extent.max()
-    offset = 0.05 * options.pixels - low * scale
-    shape = tuple(np.ceil(extent[::-1] * scale + 0.1 * options.pixels).astype(int).tolist())
-    labels = np.zeros(shape, np.int32)
-    centres = np.indices(shape)[::-1].reshape(2, -1).T + 0.5
-    for number, outline in enumerate(figures.outlines(relaxed), start=1):
-        inside = Path(outline * scale + offset).contains_points(centres)
-        labels[inside.reshape(shape)] = number
-    return (energy, relaxed), labels
-
-
-class Result(NamedTuple):
-    """What was inferred, relative to the mean tension, where the mean area of a cell is 1."""
-
-    tension: Float[np.ndarray, " edges"]
-    tension_deviation: Float[np.ndarray, " edges"]
-    pressure: Float[np.ndarray, " cells"]
-    pressure_deviation: Float[np.ndarray, " cells"]
-
-
-def _result(config: Config, problem: InverseProblem, outcome: Fit) -> Result:
-    """Tensions and pressures with their standard deviations (Laplace approximation)."""
-    parameters, constants = eqx.partition(outcome.energy, problem.trainable)
-    flat, unravel = ravel_pytree(parameters)
-    options = config.relaxation.options()
-
-    # Areas follow their targets, so a pressure changes with the equilibrium.
-    def relative(x: Float[Array, " parameters"]) -> Float[Array, " edges_and_cells"]:
-        energy = eqx.combine(unravel(x), constants)
-        area, tension = terms_of(energy)
-        relaxed = equilibrate(outcome.tissue, energy, **options, throw=False).tissue
-        values = jnp.concatenate([tension.tension, area.pressures(relaxed)])
-        return values / jnp.mean(tension.tension)
-
-    slopes = jax.jit(jax.jacfwd(relative))(flat)
-    # Points of one edge move together: a mesh has no more independent positions than vertices and angles.
-    # The prior adds one residual an edge.
-    n_edges, n_vertices = outcome.tissue.n_edges, outcome.tissue.n_vertices
-    angles = int(outcome.tissue.is_arc.sum())
-    known = uncertainty(problem, outcome, n_independent=2 * n_vertices + angles + n_edges)
-    covariance = slopes @ known.covariance @ slopes.T
-    values, deviations = np.asarray(relative(flat)), np.sqrt(np.diag(np.asarray(covariance)))
-    return Result(values[:n_edges], deviations[:n_edges], values[n_edges:], deviations[n_edges:])
+    energy = foam_energy(tension / jnp.mean(tension), areas, **model.foam())
+    relaxed = Relaxation().build()(cluster, energy).tissue
+    return (energy, relaxed), label_image(relaxed, options.pixels)
 
 
 def _tables(
-    found: Segmentation, outcome: Fit, result: Result, truth: tuple[LocalSum, Tissue] | None
+    found: Segmentation, outcome: Fit, result: Tensions, truth: tuple[LocalSum, Tissue] | None
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """A row an edge, and a row a cell; the exterior is label 0."""
     tissue = outcome.tissue
@@ -336,7 +227,7 @@ def _tables(
     }
     if truth is not None:
         energy, relaxed = truth
-        area, tension = terms_of(energy)
+        area, tension = foam_terms(energy)
         # Labels are the numbers of the true cells, from 1.
         number = np.append(np.arange(1, relaxed.n_cells + 1), 0)
         true_between = np.sort(number[np.asarray(relaxed.topology.edge_cells)], axis=1)
@@ -355,38 +246,21 @@ def _tables(
 
 def _metrics(
     config: Config,
-    found: Segmentation,
-    balanced: LocalSum,
+    foam: TensionProblem,
     outcome: Fit,
-    result: Result,
+    result: Tensions,
     edges: dict[str, np.ndarray],
     cells: dict[str, np.ndarray],
 ) -> dict[str, Any]:
-    equal = balance(found.tissue, config.model.model_copy(update={"prior": 1e-3}))
-    cost = EdgeDistance(found.tissue)
-    options = config.relaxation.options()
-
-    @eqx.filter_jit
-    def distance(energy: LocalSum) -> Float[Array, ""]:
-        relaxed = equilibrate(found.tissue, energy, **options, throw=False).tissue
-        away = jnp.mean(relaxed.vertices - found.tissue.vertices, axis=0)
-        return cost(relaxed.with_vertices(relaxed.vertices - away), energy)
-
-    energies = {"equal": equal, "balanced": balanced, "fitted": outcome.energy}
+    found = foam.segmentation
+    equal = force_balance(found.tissue, prior=1e-3, **config.model.foam())
+    distances = foam.distances(equal, foam.balanced, outcome.energy)
+    names = ("equal", "balanced", "fitted")
     metrics: dict[str, Any] = {
-        f"rms_distance_pixels_{name}": float(jnp.sqrt(2 * distance(energy))) / found.pixel_size
-        for name, energy in energies.items()
+        f"rms_distance_pixels_{name}": x for name, x in zip(names, distances, strict=True)
     }
-    # The outline of a cluster that was cut out of a tissue has corners where cells beyond it met, which no
-    # arc has.
-    inner = ~np.asarray(found.tissue.topology.on_outline)
-    squared = np.sum(
-        np.square(cost.residuals(outcome.tissue, balanced)).reshape(len(inner), -1), axis=1
-    )
-    lengths = np.asarray(found.tissue.edge_lengths)
-    squared_inner = squared[inner].sum() * lengths.sum() / lengths[inner].sum()
     metrics |= {
-        "rms_distance_pixels_inner": np.sqrt(squared_inner) / found.pixel_size,
+        "rms_distance_pixels_inner": foam.inner_distance(outcome),
         "n_cells": found.tissue.n_cells,
         "n_edges": found.tissue.n_edges,
         "pixel_size": found.pixel_size,
@@ -399,6 +273,6 @@ def _metrics(
         if f"true_{name}" in values:
             true = values[f"true_{name}"]
             known = np.isfinite(true)
-            metrics[f"pearson_{name}"] = pearson_of(true[known][None], values[name][known][None])[0]
+            metrics[f"pearson_{name}"] = pearson(true[known], values[name][known])
             metrics[f"rms_error_{name}"] = np.sqrt(np.mean((values[name] - true)[known] ** 2))
     return metrics | fit_metrics(outcome)

@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
-from matplotlib.axes import Axes
+from jaxtyping import Float, Real
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from vertax.experiments._figures import new_figure
 from vertax.initialise import Segmentation
 from vertax.mesh import Tissue
-from vertax.mesh._outlines import Drawing
-from vertax.plotting import _style, plot_tissue
+from vertax.plotting import house_style, new_figure, plot_recovery, plot_tissue, scale_bar
+
+# Without the palest end, which would look like no colour at all.
+_PRESSURES = ListedColormap(colormaps["Blues"](np.linspace(0.15, 1, 256)), "pressures")
 
 
-def outlines(tissue: Tissue) -> Iterator[Float[np.ndarray, "corners 2"]]:
-    """The outline of each cell, as a polygon fine enough for its arcs.
-
-    **Arguments:**
-
-    - `tissue`: the tissue.
-
-    **Returns:** the corners of one cell after the other.
-    """
-    polygons, sizes = Drawing(tissue, 60).polygons()
-    for polygon, size in zip(polygons, sizes, strict=True):
-        yield polygon[:size]
-
-
+@house_style()
 def foam(
-    image: Float[np.ndarray, "rows columns"],
+    image: Real[np.ndarray, "rows columns *colours"],
     found: Segmentation,
     fitted: Tissue,
     tension: Float[np.ndarray, " edges"],
@@ -41,35 +30,35 @@ def foam(
 
     **Arguments:**
 
-    - `image`: the segmented image.
+    - `image`: a picture of what was segmented: grey outlines, or a colour for each label.
     - `found`: the cells found in it.
     - `fitted`: the equilibrium that comes closest.
     - `tension`, `pressure`: its tensions and pressures, relative to the mean tension.
 
     **Returns:** the figure.
     """
-    with _style.house_style():
-        rows, columns = image.shape
-        height = 3.4 * rows / columns + 0.5
-        figure, (left, right) = new_figure(2, width=3.6, height=height, room=1.2)
-        plot_tissue(fitted, ax=left, image=image, pixel_size=found.pixel_size)
-        left.set_title("edges of the equilibrium, over the image")
-        plot_tissue(
-            fitted,
-            pressure,
-            tension,
-            ax=right,
-            cmap="cividis",
-            edge_cmap="magma_r",
-            label=r"pressure $p\,\sqrt{\bar A}\,/\,\bar\gamma$",
-            edge_label=r"tension $\gamma / \bar\gamma$",
-        )
-        # As in the image, y points down.
-        right.set(xlim=left.get_xlim(), ylim=left.get_ylim())
-        right.set_title("tensions and pressures")
+    rows, columns = image.shape[:2]
+    height = 3.4 * rows / columns + 0.5
+    figure, ((left, right),) = new_figure(1, 2, width=3.6, height=height, room=1.2)
+    plot_tissue(fitted, ax=left, image=image, pixel_size=found.pixel_size)
+    left.set_title("edges of the equilibrium, over the image")
+    scale_bar(left, "pixels", unit_length=found.pixel_size)
+    plot_tissue(
+        fitted,
+        pressure,
+        tension,
+        ax=right,
+        cmap=_PRESSURES,
+        label=r"pressure $p\,\sqrt{\bar A}\,/\,\bar\gamma$",
+        edge_label=r"tension $\gamma / \bar\gamma$",
+    )
+    # As in the image, y points down.
+    right.set(xlim=left.get_xlim(), ylim=left.get_ylim())
+    right.set_title("tensions and pressures")
     return figure
 
 
+@house_style()
 def recovery(edges: Mapping[str, np.ndarray], cells: Mapping[str, np.ndarray]) -> Figure:
     """Inferred against true tensions and pressures.
 
@@ -79,28 +68,11 @@ def recovery(edges: Mapping[str, np.ndarray], cells: Mapping[str, np.ndarray]) -
 
     **Returns:** the figure.
     """
-    with _style.house_style():
-        figure, (left, right) = new_figure(2, width=2.9, height=2.7)
-        _against(left, edges, "tension", r"tension $\gamma / \bar\gamma$")
-        _against(right, cells, "pressure", r"pressure $p\,\sqrt{\bar A}\,/\,\bar\gamma$")
+    figure, ((left, right),) = new_figure(1, 2, width=2.9, height=2.7)
+    for ax, table, key, name in (
+        (left, edges, "tension", r"tension $\gamma / \bar\gamma$"),
+        (right, cells, "pressure", r"pressure $p\,\sqrt{\bar A}\,/\,\bar\gamma$"),
+    ):
+        deviation = table[f"{key}_deviation"]
+        plot_recovery(table[f"true_{key}"], table[key], deviation=deviation, ax=ax, name=name)
     return figure
-
-
-def _against(ax: Axes, table: Mapping[str, np.ndarray], name: str, label: str) -> None:
-    true, inferred = table[f"true_{name}"], table[name]
-    ax.errorbar(
-        true,
-        inferred,
-        yerr=table[f"{name}_deviation"],
-        fmt="o",
-        ms=3,
-        lw=0.6,
-        color=_style.SERIES[0],
-        ecolor="0.7",
-    )
-    known = np.isfinite(true)
-    both = np.concatenate([true[known], inferred[known]])
-    ends = [both.min(), both.max()]
-    ax.plot(ends, ends, color=_style.INK, lw=0.8, ls=":")
-    r = np.corrcoef(true[known], inferred[known])[0, 1]
-    ax.set(xlabel=f"true {label}", ylabel=f"inferred {label}", title=f"Pearson $r$ = {r:.3f}")

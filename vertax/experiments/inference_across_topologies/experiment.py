@@ -24,18 +24,23 @@ from vertax.costs import (
     VertexDistance,
     mismatched_neighbours,
 )
-from vertax.energies import ShapeFactorEnergy
-from vertax.experiments._design import Gradient, member
-from vertax.experiments._scenes import Scene, ShapeFactors, TissueSection, pearson_of, stack
-from vertax.experiments.inference_across_topologies import figures
-from vertax.fitting import Fit, FitError, InverseProblem, Record
-from vertax.initialise import periodic_voronoi
+from vertax.fitting import Fit, InverseProblem, member, stack
+from vertax.inference import RecoveryWatch, Scene, pearson, relative_error, shape_factor_scene
 from vertax.mesh import Tissue
-from vertax.responses import equilibrate
-from vertax.runs._config import ExperimentConfig, Section
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Fitting, Relaxation
-from vertax.runs._tables import histories, joined
+from vertax.runs import (
+    ExperimentConfig,
+    Fitting,
+    Gradient,
+    Relaxation,
+    RunFolder,
+    Section,
+    ShapeFactors,
+    TissueSection,
+    histories,
+    joined,
+)
+
+from . import figures
 
 
 class Guidance(Section):
@@ -89,8 +94,6 @@ _METHODS = [
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["inference_across_topologies"] = "inference_across_topologies"
-    """Which experiment this is."""
     replicates: int = Field(default=5, ge=1)
     """Independent tissues; they are fitted as one batch."""
     least_mismatch: int = Field(default=4, ge=1)
@@ -107,7 +110,7 @@ class Config(ExperimentConfig):
     """How the gradient is taken."""
     fit: Fitting = Fitting(epochs=350)
     """How the parameters are fitted."""
-    relaxation: Relaxation = Relaxation(tolerance=1e-8, t1_threshold=0.02)
+    relaxation: Relaxation = Relaxation(tolerance=1e-8)
     """How the tissues are relaxed."""
 
 
@@ -159,22 +162,23 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
 
 def _scenes(config: Config) -> list[Scene]:
     """Draws of which start and target relax, from one first tissue, into different topologies."""
-    n, truth = config.tissue.n_cells, config.truth
-    options = config.relaxation.options()
+    response = config.relaxation.build()
     scenes: list[Scene] = []
     for key in jax.random.split(jax.random.key(config.seed), 20 * config.replicates):
-        keys = jax.random.split(key, 3)
-        hidden, guess = (
-            ShapeFactorEnergy(truth.mean + truth.deviation * jax.random.normal(k, (n,)))
-            for k in keys[:2]
-        )
-        first = periodic_voronoi(n, key=keys[2], lloyd_steps=config.tissue.lloyd_steps)
-        target, initial = (
-            equilibrate(first, energy, **options, throw=False) for energy in (hidden, guess)
-        )
-        apart = mismatched_neighbours(initial.tissue, target.tissue)
-        if target.converged and initial.converged and apart >= config.least_mismatch:
-            scenes.append(Scene(hidden, target.tissue, guess, initial.tissue))
+        try:
+            scene = shape_factor_scene(
+                key=key,
+                start="first",
+                response=response,
+                target_response=response,
+                **config.tissue.model_dump(),
+                **config.truth.model_dump(),
+            )
+        except ValueError:  # the hidden tissue does not come to rest
+            continue
+        apart = mismatched_neighbours(scene.initial, scene.target)
+        if scene.converged and apart >= config.least_mismatch:
+            scenes.append(scene)
         if len(scenes) == config.replicates:
             return scenes
     raise ValueError(
@@ -196,29 +200,6 @@ def _cost(method: Method, target: Tissue) -> AbstractCost:
     return (1 - method.structure) * distance + method.structure * structure
 
 
-class _Watcher:
-    """Notes, after each epoch, what the history of a fit does not hold."""
-
-    def __init__(self, batch: Scene):
-        self._true = np.asarray(batch.truth.target_shape_factor)
-        self._targets = [member(batch.target, k) for k in range(len(self._true))]
-        self._topology: list[tuple[np.ndarray, int] | None] = [None] * len(self._true)
-
-    def __call__(self, epoch: int, record: Record) -> dict[str, np.ndarray]:
-        inferred = np.asarray(record.parameters.target_shape_factor)
-        cells = np.asarray(record.tissue.topology.cell)
-        mismatched = [self._count(k, record, row) for k, row in enumerate(cells)]
-        return {"pearson": pearson_of(self._true, inferred), "mismatched": np.asarray(mismatched)}
-
-    def _count(self, k: int, record: Record, cells: np.ndarray) -> int:
-        # Most epochs have no T1 transition, and the assignment of cells takes a while.
-        known = self._topology[k]
-        if known is None or not np.array_equal(known[0], cells):
-            count = mismatched_neighbours(member(record.tissue, k), self._targets[k])
-            self._topology[k] = known = (cells, count)
-        return known[1]
-
-
 def _fit(config: Config, method: Method, batch: Scene, folder: RunFolder, progress: bool) -> Fit:
     cost = eqx.filter_vmap(lambda target: _cost(method, target))(batch.target)
     problem = InverseProblem(
@@ -226,25 +207,21 @@ def _fit(config: Config, method: Method, batch: Scene, folder: RunFolder, progre
         batch.guess,
         cost,
         adjoint=config.gradient.build(),
-        **config.relaxation.options(),
+        response=config.relaxation.build(),
     )
     guidance = config.guidance.schedule(config.tissue.n_cells) if method.guided else None
-    try:
-        return folder.fit(
-            method.name,
-            problem,
-            config.fit.build(),
-            config.fit.epochs,
-            truth=batch.truth,
-            guidance=guidance,
-            batched=True,
-            progress=progress,
-            callback=_Watcher(batch),
-        )
-    except FitError as error:
-        if error.fit is None:
-            raise
-        return error.fit
+    return folder.fit(
+        method.name,
+        problem,
+        config.fit.build(),
+        config.fit.epochs,
+        partial=True,
+        truth=batch.truth,
+        guidance=guidance,
+        batched=True,
+        progress=progress,
+        callback=RecoveryWatch(batch.truth, batch.target),
+    )
 
 
 def _summary_of_mismatch(counts: list[int], interfaces: int) -> dict[str, Any]:
@@ -259,15 +236,14 @@ def _summary_of_mismatch(counts: list[int], interfaces: int) -> dict[str, Any]:
 def _metrics(batch: Scene, outcome: Fit, final: list[int], interfaces: int) -> dict[str, Any]:
     true = np.asarray(batch.truth.target_shape_factor)
     inferred = np.asarray(outcome.energy.target_shape_factor)
-    pearson = pearson_of(true, inferred)
-    error = np.mean(np.abs(inferred - true) / np.abs(true), axis=1)
-    succeeded = (np.asarray(final) == 0) & (pearson > 0.999) & (error < 1e-3)
+    correlation, error = pearson(true, inferred), relative_error(true, inferred)
+    succeeded = (np.asarray(final) == 0) & (correlation > 0.999) & (error < 1e-3)
     history = outcome.history
     return {
         **_summary_of_mismatch(final, interfaces),
-        "pearson": pearson,
-        "pearson_mean": pearson.mean(),
-        "pearson_least": pearson.min(),
+        "pearson": correlation,
+        "pearson_mean": correlation.mean(),
+        "pearson_least": correlation.min(),
         "relative_error": error,
         "relative_error_mean": error.mean(),
         "relative_error_most": error.max(),

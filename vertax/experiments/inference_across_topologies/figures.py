@@ -8,12 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from vertax.experiments import _figures
-from vertax.experiments._scenes import Scene
 from vertax.fitting import Fit
-from vertax.plotting import _style
+from vertax.inference import Scene
+from vertax.plotting import (
+    house_style,
+    new_figure,
+    plot_band,
+    plot_boxes,
+    plot_tissues,
+    series_colours,
+)
 
 
 class Curves(NamedTuple):
@@ -24,6 +29,7 @@ class Curves(NamedTuple):
     mismatched: Int[np.ndarray, "epochs replicates"]
 
 
+@house_style()
 def inference(curves: Mapping[str, Curves], metrics: Mapping[str, Any]) -> Figure:
     """How well parameters and topology were found, by epoch and at the end.
 
@@ -34,36 +40,30 @@ def inference(curves: Mapping[str, Curves], metrics: Mapping[str, Any]) -> Figur
 
     **Returns:** the figure.
     """
-    colours = dict(zip(curves, (*_style.SERIES, "0.4", "0.6"), strict=False))
-    with _style.house_style():
-        layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06)
-        figure = Figure(figsize=(7.4, 4.6), layout=layout)
-        grid = figure.subplot_mosaic(
-            [["error", "pearson", "topology"], ["last_error", "last_pearson", "last_topology"]]
-        )
-        for name, curve in curves.items():
-            _figures.band(grid["error"], curve.relative_error, name, colours[name])
-            for key, values in (("pearson", curve.pearson), ("topology", curve.mismatched)):
-                epochs, ax = np.arange(len(values)), grid[key]
-                ax.plot(epochs, values.mean(axis=1), color=colours[name], label=name, lw=1)
-                low, high = values.min(axis=1), values.max(axis=1)
-                ax.fill_between(epochs, low, high, color=colours[name], alpha=0.12, lw=0)
-        grid["error"].set(yscale="log", ylabel="relative error")
-        grid["error"].legend()
-        grid["pearson"].set(ylabel="Pearson $r$")
-        grid["topology"].set(ylabel="mismatched neighbours")
-        for key in ("error", "pearson", "topology"):
-            grid[key].set(xlabel="epoch")
-        last = lambda key: {name: np.asarray(metrics[name][key]) for name in curves}
-        _figures.boxes(grid["last_error"], last("relative_error"), colours)
-        missing = {name: 1 - r for name, r in last("pearson").items()}
-        _figures.boxes(grid["last_pearson"], missing, colours)
-        _figures.boxes(grid["last_topology"], last("mismatched_neighbours"), colours, log=False)
-        grid["last_error"].set(ylabel="relative error at the end")
-        grid["last_pearson"].set(ylabel="1 − Pearson $r$ at the end")
-        grid["last_topology"].set(ylabel="mismatched at the end", ylim=(-0.5, None))
-        for key in ("last_error", "last_pearson", "last_topology"):
-            grid[key].tick_params(axis="x", labelrotation=25)
+    colours = series_colours(curves)
+    figure, ((error, pearson, topology), last) = new_figure(2, 3, width=2.5)
+    for name, curve in curves.items():
+        style: Any = {"label": name, "colour": colours[name]}
+        plot_band(curve.relative_error, ax=error, log=True, **style)
+        plot_band(curve.pearson, ax=pearson, spread="range", **style)
+        plot_band(curve.mismatched, ax=topology, spread="range", **style)
+    error.set(ylabel="relative error")
+    error.legend()
+    pearson.set(ylabel="Pearson $r$")
+    topology.set(ylabel="mismatched neighbours")
+    for ax in (error, pearson, topology):
+        ax.set_xlabel("epoch")
+    final = lambda key: {name: np.asarray(metrics[name][key]) for name in curves}
+    # What is 0 up to rounding is not positive.
+    missing = {name: np.maximum(1 - r, 1e-16) for name, r in final("pearson").items()}
+    plot_boxes(final("relative_error"), ax=last[0], colours=colours, log=True)
+    plot_boxes(missing, ax=last[1], colours=colours, log=True)
+    plot_boxes(final("mismatched_neighbours"), ax=last[2], colours=colours)
+    last[0].set(ylabel="relative error at the end")
+    last[1].set(ylabel="1 − Pearson $r$ at the end")
+    last[2].set(ylabel="mismatched at the end", ylim=(-0.5, None))
+    for ax in last:
+        ax.tick_params(axis="x", labelrotation=25)
     return figure
 
 
@@ -77,7 +77,14 @@ def tissues(scene: Scene, fits: Mapping[str, Fit]) -> Figure:
 
     **Returns:** the figure.
     """
-    panels: dict[str, Any] = {"start": (scene.initial, scene.guess.target_shape_factor)}
+    panels = {"start": (scene.initial, scene.guess.target_shape_factor)}
     panels |= {name: (f.tissue, f.energy.target_shape_factor) for name, f in fits.items()}
     panels |= {"target": (scene.target, scene.truth.target_shape_factor)}
-    return _figures.tissues(panels, label="target shape factor $p_0$")
+    figure = Figure()
+    plot_tissues(
+        {title: tissue for title, (tissue, _) in panels.items()},
+        [np.asarray(values) for _, values in panels.values()],
+        figure=figure,
+        label="target shape factor $p_0$",
+    )
+    return figure

@@ -11,10 +11,8 @@ relaxes again, and keeps the new state if that has less energy.
 
 from __future__ import annotations
 
-import concurrent.futures
-import os
 import time
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,19 +20,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field
-from scipy.optimize import minimize
-from tqdm import tqdm
 
 from vertax.energies import ShapeFactorEnergy
-from vertax.experiments._scenes import TissueSection, stack
-from vertax.experiments.rigidity_transition import figures
+from vertax.fitting import stack
+from vertax.inference import Transition, fit_onset, fit_transition
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
-from vertax.responses import equilibrate
-from vertax.runs._config import ExperimentConfig, Section
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Relaxation
-from vertax.transitions import AbstractTransitions
+from vertax.responses import Relaxation as Response
+from vertax.runs import (
+    ExperimentConfig,
+    Relaxation,
+    RunFolder,
+    Section,
+    TissueSection,
+    side_by_side,
+)
+
+from . import figures
 
 
 class Driving(Section):
@@ -49,8 +51,6 @@ class Driving(Section):
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["rigidity_transition"] = "rigidity_transition"
-    """Which experiment this is."""
     shape_factors: list[float] = Field(
         default_factory=lambda: [round(3.6 + 0.02 * k, 2) for k in range(21)], min_length=2
     )
@@ -69,7 +69,7 @@ class Config(ExperimentConfig):
     """Tissues that are relaxed as one batch: 1 is best on CPUs, all of them on a GPU."""
     resamples: int = Field(default=500, ge=10)
     """Bootstrap samples of the interval of the transition."""
-    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=500)
+    relaxation: Relaxation = Relaxation(max_steps=500)
     """How the tissues are relaxed."""
 
 
@@ -96,8 +96,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     transition; and, likewise, the onset: where the energy of rigid tissues would vanish.
     """
     began = time.perf_counter()
-    options = config.relaxation.options()
-    transitions = options.pop("transitions")
+    response = config.relaxation.build()
     shape_factors = np.asarray(config.shape_factors)
 
     def one(index: int) -> dict[str, np.ndarray]:
@@ -110,7 +109,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         first = stack([periodic_voronoi(n, key=k, lloyd_steps=steps) for k in keys[1:]])
         p0 = jnp.asarray(shape_factors[index])
         outcome = jax.block_until_ready(
-            _relax(first, p0, keys[0], transitions, options, config.driving, config.at_once)
+            _relax(first, p0, keys[0], response, config.driving, config.at_once)
         )
         shapes = np.asarray(jax.vmap(lambda t: t.shape_factors)(outcome.tissue)).mean(axis=1)
         some = jax.tree.map(lambda x: x[: config.modes], outcome.tissue)
@@ -118,22 +117,9 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         outcomes = {name: np.asarray(getattr(outcome, name)) for name in _Outcome._fields[:-1]}
         return outcomes | {"shapes": shapes, "modes": modes}
 
-    # One thread a core: what is compiled runs outside of Python's lock. The first one compiles.
-    indices = range(len(shape_factors))
-    bar = tqdm(total=len(shape_factors), unit="value", disable=None if progress else True)
-    results = {0: one(0)}
-    bar.update()
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        waiting = {pool.submit(one, index): index for index in indices[1:]}
-        try:
-            for done in concurrent.futures.as_completed(waiting):
-                results[waiting[done]] = done.result()
-                bar.update()
-        except KeyboardInterrupt:  # what is being computed is finished and kept, the rest not begun
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    bar.close()
-    found = {name: np.stack([results[i][name] for i in indices]) for name in results[0]}
+    n_values = len(shape_factors)
+    results = side_by_side(one, n_values, folder, progress=progress, unit="value")
+    found = {name: np.stack([result[name] for result in results]) for name in results[0]}
     return _report(
         config,
         folder,
@@ -153,8 +139,7 @@ def _relax(
     first: Tissue,
     p0: Float[Array, ""],
     key: PRNGKeyArray,
-    transitions: AbstractTransitions | None,
-    options: dict[str, Any],
+    response: Response,
     driving: Driving,
     at_once: int,
 ) -> _Outcome:
@@ -162,7 +147,7 @@ def _relax(
     energy = ShapeFactorEnergy(p0)
 
     def relax(tissue: Tissue, energy: ShapeFactorEnergy) -> Any:
-        return equilibrate(tissue, energy, transitions=transitions, throw=False, **options)
+        return response(tissue, energy, throw=False)
 
     def cycle(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, Array]:
         def shake() -> tuple:
@@ -204,43 +189,6 @@ def _zero_modes(tissues: Tissue, p0: Float[Array, ""]) -> Int[Array, " tissues"]
     return jax.lax.map(one, tissues)
 
 
-class Transition(NamedTuple):
-    """A logistic curve $1 / (1 + e^{-(p - p^*) / w})$."""
-
-    centre: float
-    width: float
-
-
-def fit_transition(
-    shape_factors: Float[np.ndarray, " values"],
-    successes: Float[np.ndarray, " values"],
-    trials: int,
-) -> Transition:
-    """The logistic curve that explains counts best (maximum likelihood).
-
-    **Arguments:**
-
-    - `shape_factors`: where the counts were taken.
-    - `successes`: how many of the trials there succeeded.
-    - `trials`: number of trials at each.
-
-    **Returns:** the curve; NaN if all trials succeeded, or none. It is no steeper than the spacing of
-    the shape factors can tell.
-    """
-    if successes.sum() == 0 or successes.sum() == trials * len(successes):
-        return Transition(np.nan, np.nan)
-    least = 0.1 * np.min(np.diff(np.sort(shape_factors)))
-
-    def loss(x: np.ndarray) -> float:
-        z = (shape_factors - x[0]) / (least + np.exp(x[1]))
-        likelihood = successes * -np.logaddexp(0, -z) + (trials - successes) * -np.logaddexp(0, z)
-        return -float(likelihood.sum())
-
-    middle = shape_factors[np.argmin(np.abs(successes / trials - 0.5))]
-    found = minimize(loss, [middle, np.log(0.02)], method="Nelder-Mead", options={"maxiter": 2000})
-    return Transition(float(found.x[0]), float(least + np.exp(found.x[1])))
-
-
 def _interval(
     shape_factors: np.ndarray, zero: Bool[np.ndarray, "values tissues"], config: Config
 ) -> tuple[Transition, tuple[float, float]]:
@@ -255,32 +203,6 @@ def _interval(
         centres.append(fit_transition(shape_factors, drawn, trials).centre)
     low, high = np.nanpercentile(centres, [2.5, 97.5])
     return best, (float(low), float(high))
-
-
-def fit_onset(
-    shape_factors: Float[np.ndarray, " values"], energies: Float[np.ndarray, "values tissues"]
-) -> Transition | None:
-    r"""Where rigid tissues would lose their energy: $\sqrt{E} \propto p^* - p^0$, extrapolated.
-
-    A rigid tissue keeps the perimeters that it can get, so its energy grows like the square of what is
-    missing. Unlike the count of tissues at zero energy this does not ask that the last cell of a tissue
-    be content.
-
-    **Arguments:**
-
-    - `shape_factors`: target shape factors, ascending.
-    - `energies`: per cell, of tissues at each.
-
-    **Returns:** the line through the lower half of the values that have energy: where it ends, and its
-    slope as the width; None if there are fewer than three.
-    """
-    roots = np.sqrt(np.maximum(energies, 0)).mean(axis=1)
-    rigid = np.flatnonzero(roots > 0.1 * roots.max())
-    if len(rigid) < 3:
-        return None
-    lower = rigid[: max(3, (len(rigid) + 1) // 2)]
-    slope, offset = np.polyfit(shape_factors[lower], roots[lower], 1)
-    return Transition(float(-offset / slope), float(-1 / slope))
 
 
 def _onset(

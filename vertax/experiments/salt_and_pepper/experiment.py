@@ -9,32 +9,34 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 from pydantic import Field
 
 from vertax.costs import HomotypicLength
-from vertax.experiments import _design_figures as figures
-from vertax.experiments._design import (
-    Gradient,
-    Tensions,
-    designs,
-    keys_of,
-    limits,
-    mean_and_deviation,
-    member,
-    tensions,
-)
-from vertax.experiments._scenes import TissueSection
-from vertax.fitting import Fit, InverseProblem
+from vertax.fitting import Fit, InverseProblem, Record, limits, member
+from vertax.inference import foam_terms
 from vertax.initialise import free_voronoi, periodic_voronoi
 from vertax.mesh import Tissue
-from vertax.runs._config import ExperimentConfig
-from vertax.runs._folder import RunFolder
-from vertax.runs._sections import Fitting, Relaxation
-from vertax.runs._tables import histories, joined
+from vertax.runs import (
+    ExperimentConfig,
+    Fitting,
+    Gradient,
+    Relaxation,
+    RunFolder,
+    TensionRange,
+    TissueSection,
+    fit_side_by_side,
+    histories,
+    joined,
+    replicate_keys,
+    spread_of,
+)
+
+from . import figures
 
 Boundary = Literal["periodic", "free"]
 
@@ -42,8 +44,6 @@ Boundary = Literal["periodic", "free"]
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    experiment: Literal["salt_and_pepper"] = "salt_and_pepper"
-    """Which experiment this is."""
     boundaries: list[Boundary] = Field(default=["free", "periodic"], min_length=1)
     """Kinds of tissues; the figure shows the first."""
     n_types: list[int] = Field(default=[2, 3], min_length=1)
@@ -56,7 +56,7 @@ class Config(ExperimentConfig):
     """Whether the cost is the share of these interfaces, and not their length as in the paper."""
     tissue: TissueSection = TissueSection(lloyd_steps=3)
     """The tissues."""
-    tensions: Tensions = Tensions(low=0.05, high=0.2)
+    tensions: TensionRange = TensionRange(low=0.05, high=0.2)
     """Tensions of the edges and stiffness of the cells."""
     spread: float = Field(default=0.0, ge=0, lt=1)
     """Share of the range of tensions that the first ones are drawn from; 0: all are equal."""
@@ -64,7 +64,7 @@ class Config(ExperimentConfig):
     """How gradients are taken."""
     fit: Fitting = Fitting(learning_rate=0.1, epochs=150)
     """How the tensions (their logits) are fitted."""
-    relaxation: Relaxation = Relaxation(t1_threshold=0.02, max_steps=300)
+    relaxation: Relaxation = Relaxation(max_steps=300)
     """How the tissue is relaxed."""
 
 
@@ -92,10 +92,10 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         for n_types in config.n_types:
             name = f"{boundary}, {n_types} types"
             problems = _problems(config, boundary, n_types)
-            outcome, first, curves = designs(
-                folder, name, problems, config.fit, _measure, progress=progress
+            outcome = fit_side_by_side(
+                folder, name, problems, config.fit, notes=_share, progress=progress
             )
-            shares[name] = curves
+            shares[name] = curves = outcome.notes["share"]
             labels = [
                 {"boundary": boundary, "n_types": str(n_types), "replicate": str(k)}
                 for k in range(config.replicates)
@@ -103,7 +103,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
             tables.append(histories(outcome, labels) | {"heterotypic_share": curves.T.ravel()})
             folder.save_table("history", joined(tables))
             metrics[name] = _metrics(config, outcome, curves)
-            panels = panels or _panels(problems[0], first, outcome, curves, folder)
+            panels = panels or _panels(config, problems[0], outcome, curves, folder)
     bounds = (config.tensions.low, config.tensions.high)
     folder.save_figure("design", figures.patterns(panels, bounds, shares))
     return metrics
@@ -114,7 +114,7 @@ def _problems(config: Config, boundary: Boundary, n_types: int) -> list[InverseP
     make = {"free": free_voronoi, "periodic": periodic_voronoi}[boundary]
     n_cells = config.tissue.n_cells
     problems = []
-    for key in keys_of(config.seed, config.replicates):
+    for key in replicate_keys(config.seed, config.replicates):
         keys = jax.random.split(key, 3)
         tissue = make(n_cells, key=keys[0], lloyd_steps=config.tissue.lloyd_steps)
         # As many cells of each type as can be.
@@ -125,17 +125,22 @@ def _problems(config: Config, boundary: Boundary, n_types: int) -> list[InverseP
                 config.tensions.draw(tissue, config.spread, keys[2]),
                 HomotypicLength(types, config.relative),
                 adjoint=config.gradient.build(),
-                **config.relaxation.options(),
+                response=config.relaxation.build(),
             )
         )
     return problems
 
 
-def _measure(problem: InverseProblem, tissue: Tissue, parameters: PyTree) -> Array:
-    """The heterotypic share."""
+@eqx.filter_jit
+def _heterotypic(problem: InverseProblem, tissue: Tissue) -> Array:
     assert isinstance(problem.cost, HomotypicLength)
     relative = HomotypicLength(problem.cost.cell_types, relative=True)
     return 1 - relative(tissue, problem.energy)
+
+
+def _share(problem: InverseProblem, record: Record) -> dict[str, Array]:
+    """The heterotypic share."""
+    return {"share": _heterotypic(problem, record.tissue)}
 
 
 def _best(outcome: Fit, curves: np.ndarray) -> np.ndarray:
@@ -149,9 +154,9 @@ def _metrics(config: Config, outcome: Fit, curves: np.ndarray) -> dict[str, Any]
     reached = best >= 1 - config.accuracy
     near = curves.mean(axis=1) >= 1 - 2 * config.accuracy
     return {
-        "share_initial": mean_and_deviation(curves[0]),
-        "share_best": mean_and_deviation(best),
-        "share_last": mean_and_deviation(curves[-1]),
+        "share_initial": spread_of(curves[0]),
+        "share_best": spread_of(best),
+        "share_last": spread_of(curves[-1]),
         "share_best_mean": best.mean(),
         "share_best_min": best.min(),
         "epochs_to_twice_the_accuracy": int(np.argmax(near)) if near.any() else None,
@@ -168,17 +173,19 @@ def _metrics(config: Config, outcome: Fit, curves: np.ndarray) -> dict[str, Any]
 
 
 def _panels(
-    problem: InverseProblem, first: Tissue, outcome: Fit, curves: np.ndarray, folder: RunFolder
+    config: Config, problem: InverseProblem, outcome: Fit, curves: np.ndarray, folder: RunFolder
 ) -> dict[str, tuple[Tissue, np.ndarray, np.ndarray]]:
     """The first replicate before and after."""
     assert isinstance(problem.cost, HomotypicLength)
     types = np.asarray(problem.cost.cell_types)
     folder.save_table("cell_types", {"cell": np.arange(len(types)), "type": types})
+    first = config.relaxation.build()(problem.tissue, problem.energy, throw=False).tissue
     panels = {}
     for name, tissue, energy, share in (
-        ("initial", member(first, 0), problem.energy, curves[0, 0]),
+        ("initial", first, problem.energy, curves[0, 0]),
         ("designed", *member((outcome.tissue, outcome.energy), 0), _best(outcome, curves)[0]),
     ):
-        panels[f"{name}: {share:.1%} heterotypic"] = (tissue, types, tensions(energy))
+        tensions = np.asarray(foam_terms(energy)[1].tension)
+        panels[f"{name}: {share:.1%} heterotypic"] = (tissue, types, tensions)
         folder.save_tissue(name, tissue)
     return panels

@@ -1,0 +1,94 @@
+"""Each configuration of the repository runs: here with everything as small as can be."""
+
+from pathlib import Path
+
+import pytest
+from run_helpers import run
+
+from vertax.inference import Microscope
+from vertax.initialise import periodic_voronoi
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+ONE_METHOD = '[{name = "guided", distance = "centroids", guided = true}]'
+
+SHORT = {
+    "benchmark_adjoints": [
+        "replicates=2",
+        "tissue.n_cells=8",
+        "methods=['Adj-ID', 'EP']",
+        "least_squares_steps=2",
+        "paper.fit.epochs=2",
+        "equilibrium.fit.epochs=2",
+        "accuracy.tolerances=[]",
+        "scaling.sizes=[8]",
+        "scaling.epochs=1",
+    ],
+    "compare_conditions": [
+        "images=1",
+        "tissue.n_cells=49",
+        "microscope.pixels=240",
+        "microscope.snr=[20]",
+        "preparation.pixels=96",
+        "fit.epochs=2",
+    ],
+    "convergent_extension": [
+        "n_cells=[6]",
+        "targets=[1.75]",
+        "replicates=1",
+        "start.epochs=2",
+        "fit.epochs=2",
+    ],
+    "demo": ["tissue.n_cells=6", "image.pixels=48", "fit.epochs=2"],
+    "design_mechanics": ["tissue.n_cells=6", "fit.epochs=2"],
+    "infer_from_microscopy": ["image.pixels=96", "fit.epochs=2"],
+    "infer_shape_factors": ["tissue.n_cells=6", "fit.epochs=2"],
+    "infer_tensions": ["cluster.n_cells=4", "cluster.pixels=200", "epochs=2"],
+    "inference_across_topologies": [
+        "replicates=1",
+        "least_mismatch=2",
+        "tissue.n_cells=12",
+        "fit.epochs=2",
+        f"methods={ONE_METHOD}",
+    ],
+    "paper_benchmark": ["tissue.n_cells=6", "fit.epochs=2"],
+    "rigidity_transition": [
+        "shape_factors=[3.4, 4.1]",
+        "replicates=2",
+        "tissue.n_cells=12",
+        "driving.cycles=1",
+        "resamples=10",
+    ],
+    "salt_and_pepper": [
+        "boundaries=['free']",
+        "n_types=[2]",
+        "replicates=1",
+        "tissue.n_cells=7",
+        "fit.epochs=2",
+    ],
+}
+
+
+def test_every_configuration_is_here():
+    assert sorted(SHORT) == sorted(path.stem for path in CONFIGS.glob("*.toml"))
+
+
+@pytest.fixture(scope="module")
+def micrograph(tmp_path_factory):
+    """An image in a file."""
+    import jax
+    import numpy as np
+    from PIL import Image
+
+    tissue = periodic_voronoi(25, key=jax.random.key(0), lloyd_steps=2)
+    image = Microscope(pixels=160, psf_width=2.5, background=0.1)(tissue, key=jax.random.key(1))
+    path = tmp_path_factory.mktemp("micrograph") / "membranes.png"
+    Image.fromarray((200 * image / image.max()).astype(np.uint8)).save(path)
+    return path
+
+
+@pytest.mark.slow  # other tests run every experiment; these run its file
+@pytest.mark.parametrize("name", SHORT)
+def test_a_configuration_runs(name, tmp_path, micrograph):
+    changes = [f"image.path={micrograph}"] if name == "infer_from_microscopy" else []
+    _, metrics = run(CONFIGS / f"{name}.toml", tmp_path / "run", *SHORT[name], *changes)
+    assert metrics

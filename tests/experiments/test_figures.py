@@ -1,0 +1,230 @@
+"""The figures of experiments, from numbers made up: one scale for what is compared, and nothing left out."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+
+import vertax as vx
+from vertax.experiments.benchmark_adjoints import figures as benchmark
+from vertax.experiments.compare_conditions import figures as conditions
+from vertax.experiments.convergent_extension import figures as extension
+from vertax.experiments.design_mechanics import figures as mechanics
+from vertax.experiments.infer_from_microscopy import figures as microscopy
+from vertax.experiments.infer_tensions import figures as tensions
+from vertax.experiments.inference_across_topologies import figures as topologies
+from vertax.experiments.rigidity_transition import figures as rigidity
+from vertax.experiments.salt_and_pepper import figures as patterns
+from vertax.plotting import label_colours
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def tissue():
+    return vx.initialise.periodic_voronoi(9, key=jax.random.key(0), lloyd_steps=1)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    return vx.initialise.free_voronoi(6, key=jax.random.key(0), lloyd_steps=1)
+
+
+def panels(figure: Figure) -> list[Any]:
+    """The axes, without bars."""
+    figure.canvas.draw()  # all can be drawn
+    return [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+
+
+def fit_with(**fields: Any) -> vx.Fit:
+    """A fit that has nothing but some fields."""
+    fit = object.__new__(vx.Fit)
+    for name, value in fields.items():
+        object.__setattr__(fit, name, value)
+    return fit
+
+
+def bars(figure: Figure) -> list[str]:
+    return [ax.get_ylabel() for ax in figure.axes if ax.get_label() == "<colorbar>"]
+
+
+def limits(axes, kind) -> set[tuple[float, float]]:
+    return {c.get_clim() for ax in axes for c in ax.collections if type(c) is kind}
+
+
+def test_designs_before_and_after_have_one_scale(tissue, cluster):
+    observed = 3.9 + 0.1 * RNG.normal(size=(5, 9))
+    shown = {"initial": (tissue, observed[0]), "designed": (tissue, observed[-1])}
+    figure = mechanics.mechanics(shown, observed, observed + 0.01, 4.1)
+    first, second, curves = panels(figure)
+    ends = observed[[0, -1]]
+    assert limits((first, second), PolyCollection) == {(ends.min(), ends.max())}
+    assert len(curves.lines) == 9 + 3
+    assert bars(figure) == [r"shape factor $P/\sqrt{A}$"]
+
+    tension = [1 + RNG.uniform(size=cluster.n_edges) for _ in range(2)]
+    both = {"initial": (cluster, tension[0]), "designed": (cluster, tension[1])}
+    targets = np.array([1.75, 2.0])
+    ratios = {n: targets[:, None] + 0.01 * RNG.normal(size=(2, 3)) for n in (6, 12)}
+    first, second, reached, _ = panels(extension.elongation(both, (1.0, 2.0), targets, ratios))
+    assert (1.0, 2.0) in limits((first, second), LineCollection)
+    assert reached.get_legend_handles_labels()[1] == ["6 cells", "12 cells"]
+
+    types = np.arange(6) % 2
+    three = {name: (tissue, types, values) for name, (tissue, values) in both.items()}
+    shares = {"free, 2 types": RNG.uniform(0.5, 1, (4, 3))}
+    figure = patterns.patterns(three, (1.0, 2.0), shares)
+    first, second, share = panels(figure)
+    assert limits((first, second), PolyCollection) == {(-0.5, 3.5)}
+    assert bars(figure) == [r"tension $\gamma$"]
+    np.testing.assert_allclose(share.lines[0].get_ydata(), shares["free, 2 types"].mean(axis=1))
+
+
+def test_a_label_image_shows_its_labels_under_the_edges(cluster):
+    labels = np.repeat(np.arange(7), 10).reshape(7, 10)
+    nothing = np.zeros(0, int)
+    whole = np.ones(6, bool)
+    found = vx.initialise.Segmentation(
+        cluster, np.arange(1, 7), whole, nothing, nothing, 0.4, labels.shape
+    )
+    picture = label_colours(labels)
+    values = np.ones(cluster.n_edges), np.ones(cluster.n_cells)
+    left, right = panels(tensions.foam(picture, found, cluster, *values))
+    np.testing.assert_allclose(left.images[0].get_array(), picture)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 7
+    assert (left.get_xlim(), left.get_ylim()) == (right.get_xlim(), right.get_ylim())
+    assert [text.get_text() for text in left.texts] == ["2 pixels"]
+
+
+def test_cells_over_a_micrograph_are_those_asked_for(tissue):
+    image = RNG.normal(size=(30, 30))
+    whole = np.arange(9) < 4
+    options: dict[str, Any] = {"pixel_size": 0.1, "label": "p"}
+    figure = microscopy.cells_on_image(image, tissue, np.arange(9.0), whole, **options)
+    (ax,) = panels(figure)
+    (faces,) = (c for c in ax.collections if isinstance(c, PolyCollection))
+    assert set(np.asarray(faces.get_array()).tolist()) == {0, 1, 2, 3}
+    assert bars(figure) == ["p"]
+    shown = {"segmented": tissue, "fitted": tissue}
+    axes = panels(microscopy.overlays(image, shown, pixel_size=0.1))
+    assert [ax.get_title() for ax in axes] == ["segmented", "fitted"]
+    assert all(len(ax.images) == 1 for ax in axes)
+
+
+def test_conditions_have_one_scale_for_all_ratios(tissue):
+    found = [
+        SimpleNamespace(
+            condition=kind,
+            snr=snr,
+            true=(true := mean + 0.1 * RNG.normal(size=8)),
+            inferred=true + RNG.normal(size=8) / snr,
+            deviation=np.full(8, 1 / snr),
+        )
+        for kind, mean in (("stiff", 3.6), ("fluid", 3.9))
+        for snr in (20.0, 3.0)
+    ]
+    axes = panels(conditions.conditions(found))
+    scatter, boxes = axes[:2], axes[2:]
+    assert len({ax.get_xlim() for ax in scatter} | {ax.get_ylim() for ax in scatter}) == 1
+    assert len({ax.get_ylim() for ax in boxes}) == 1
+    every = np.concatenate([x for i in found for x in (i.true, i.inferred)])
+    low, high = scatter[0].get_xlim()
+    assert low < every.min()
+    assert every.max() < high
+
+    seen: Any = SimpleNamespace(pixel_size=0.1)
+    outcome: Any = SimpleNamespace(tissue=tissue)
+    pictures = {f"SNR {k}": (RNG.normal(size=(30, 30)), seen, outcome) for k in range(3)}
+    with_image = [ax for ax in panels(conditions.images(pictures)) if ax.images]
+    assert len(with_image) == 6
+
+
+def test_methods_across_topologies(tissue):
+    methods = ("alone", "guided")
+    curves = {
+        name: topologies.Curves(
+            RNG.uniform(size=(6, 3)), RNG.uniform(size=(6, 3)), RNG.integers(0, 5, (6, 3))
+        )
+        for name in methods
+    }
+    metrics = {
+        name: {
+            "relative_error": c.relative_error[-1],
+            "pearson": np.array([0.5, 0.9, 1.0]),
+            "mismatched_neighbours": c.mismatched[-1],
+        }
+        for name, c in curves.items()
+    }
+    axes = panels(topologies.inference(curves, metrics))
+    assert len(axes) == 6
+    assert axes[0].get_legend_handles_labels()[1] == list(methods)
+    np.testing.assert_allclose(
+        axes[0].lines[0].get_ydata(), np.exp(np.log(curves["alone"].relative_error).mean(axis=1))
+    )
+    energy = lambda low: vx.energies.ShapeFactorEnergy(jnp.linspace(low, 4, 9))
+    scene = vx.inference.Scene(energy(3.7), tissue, energy(3.6), tissue, converged=jnp.array(True))
+    fits = {"guided": fit_with(tissue=tissue, energy=energy(3.5))}
+    axes = panels(topologies.tissues(scene, fits))
+    assert [ax.get_title() for ax in axes] == ["start", "guided", "target"]
+    assert limits(axes, PolyCollection) == {(3.5, 4.0)}
+
+
+def test_the_benchmark_compares_on_one_scale():
+    rows = [
+        {
+            "protocol": protocol,
+            "cells": n,
+            "method": method,
+            "ms_per_epoch": n * (10 if protocol == "paper" else 1),
+            "ms_forward": 0.5 * n,
+            "memory_kB": 3 * n,
+        }
+        for protocol in ("paper", "equilibrium")
+        for n in (20, 50)
+        for method in ("Adj-ID", "EP")
+    ]
+    time, memory, time_too, memory_too = panels(benchmark.scaling(rows))
+    assert time.get_ylim() == time_too.get_ylim()
+    assert memory.get_ylim() == memory_too.get_ylim()
+    assert [label.get_text() for label in time.get_xticklabels()] == ["20", "50"]
+
+    true, initial = 3.7 + 0.1 * RNG.normal(size=(2, 2, 5))
+    history = SimpleNamespace(
+        cost=RNG.uniform(size=(6, 2)), relative_error=RNG.uniform(size=(6, 2))
+    )
+    fits = {name: fit_with(history=history) for name in ("AD", "LM")}
+    inferred = {"AD": true + 0.01 * RNG.normal(size=true.shape), "LM": true}
+    figure = benchmark.inference(fits, true, initial, inferred, title="here")
+    start, end, *_ = panels(figure)
+    assert start.get_xlim() == end.get_xlim() == start.get_ylim() == end.get_ylim()
+
+    errors = {
+        f"{n}, {e}": RNG.uniform(size=(4, 2)) for n in ("linear", "cost") for e in _ESTIMATORS
+    }
+    betas = {"linear": np.logspace(-6, -3, 4), "cost": np.logspace(-3, 0, 4)}
+    linear, cost, _ = panels(
+        benchmark.beta_scan(betas, errors, {1.0: {"relative_error": [1e-3, 2e-3]}})
+    )
+    assert linear.get_ylim() == cost.get_ylim()
+    (ax,) = panels(benchmark.accuracy(np.logspace(-6, -3, 4), {"AD": RNG.uniform(size=(4, 2))}))
+    assert ax.get_xscale() == ax.get_yscale() == "log"
+
+
+_ESTIMATORS = ("centred", "one-sided")
+
+
+def test_more_cycles_than_colours_are_all_drawn():
+    p0 = np.linspace(3.7, 3.9, 5)
+    curves = [
+        rigidity.Curve(f"{k} cycles", np.linspace(0, 1, 5), 3.8, 0.01, np.linspace(1, 0, 5), None)
+        for k in range(9)
+    ]
+    axes = panels(rigidity.transition(p0, curves, RNG.uniform(size=(5, 2)), np.zeros((5, 0))))
+    assert len(axes) == 3
+    # Before, the sixth curve and those after it were left out without a word.
+    assert len(axes[0].get_legend_handles_labels()[1]) == 9

@@ -1,0 +1,52 @@
+"""Batches of tissues, energies and problems, and their members."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_tissue
+
+import vertax as vx
+from vertax.fitting import member, stack
+
+
+def problem(seed, **options):
+    tissue = random_tissue(6, seed)
+    cost = vx.costs.VertexDistance(tissue)
+    return vx.InverseProblem(
+        tissue, vx.energies.ShapeFactorEnergy(jnp.full(6, 3.7)), cost, **options
+    )
+
+
+def test_a_member_of_a_batch_is_what_was_put_there():
+    # Problems hold functions (`trainable`) and settings beside arrays.
+    problems = [problem(seed) for seed in range(3)]
+    batch = stack(problems)
+    assert batch.tissue.vertices.shape == (3, 12, 2)
+    for index in (0, 2, -1):
+        assert eqx.tree_equal(member(batch, index), problems[index])
+    assert member(batch, 1).trainable is problems[1].trainable
+
+
+def test_numpy_arrays_are_stacked_too():
+    batch = stack([{"x": np.arange(2), "n": 1}, {"x": np.arange(2) + 5, "n": 1}])
+    np.testing.assert_array_equal(batch["x"], [[0, 1], [5, 6]])
+    assert member(batch, 1)["n"] == 1
+
+
+def test_what_cannot_be_a_batch_is_refused():
+    with pytest.raises(ValueError, match="at least one"):
+        stack([])
+    with pytest.raises(ValueError, match="one structure"):
+        stack([random_tissue(6), vx.initialise.free_voronoi(6, key=jax.random.key(0))])
+    with pytest.raises(ValueError, match="equal shapes"):
+        stack([jnp.zeros(2), jnp.zeros(3)])
+    # JAX would have kept the first one for all.
+    with pytest.raises(ValueError, match=r"one holds 1\.0 where another holds 2\.0"):
+        stack([{"a": 1.0}, {"a": 2.0}])
+
+
+def test_a_member_that_is_not_there_is_refused():
+    with pytest.raises(IndexError, match="0 … 1"):
+        member(stack([jnp.zeros(2), jnp.ones(2)]), 2)

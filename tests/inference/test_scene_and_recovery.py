@@ -1,0 +1,90 @@
+"""Synthetic inverse problems, and how well they are solved."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_tissue
+
+import vertax as vx
+from vertax.costs import mismatched_neighbours
+from vertax.fitting import stack
+from vertax.inference import (
+    RecoveryWatch,
+    pearson,
+    relative_error,
+    same_neighbours,
+    shape_factor_scene,
+)
+
+
+def force(tissue, energy):
+    slope = jax.jit(jax.grad(lambda x: energy(tissue.with_configuration(x))))
+    return float(jnp.abs(slope(tissue.configuration)).max())
+
+
+def test_target_and_start_are_equilibria():
+    scene = shape_factor_scene(8, key=jax.random.key(0), mean=3.7, deviation=0.05)
+    assert scene.converged
+    assert force(scene.target, scene.truth) < 1e-8
+    assert force(scene.initial, scene.guess) < 1e-8
+    assert not np.allclose(scene.truth.target_shape_factor, scene.guess.target_shape_factor)
+
+
+def test_the_guess_may_be_the_mean_and_relax_from_the_first_tissue():
+    scene = shape_factor_scene(
+        8, key=jax.random.key(0), mean=3.7, deviation=0.05, guess="mean", start="first"
+    )
+    np.testing.assert_allclose(scene.guess.target_shape_factor, 3.7)
+    assert force(scene.initial, scene.guess) < 1e-8
+
+
+def test_unknown_choices_are_refused():
+    with pytest.raises(ValueError, match="`guess` must be 'redrawn' or 'mean'"):
+        shape_factor_scene(8, key=jax.random.key(0), guess="median")
+
+
+def test_correlation_and_error_of_batches():
+    rng = np.random.default_rng(0)
+    true = 3.7 + 0.1 * rng.standard_normal((3, 20))
+    inferred = true + 0.02 * rng.standard_normal((3, 20))
+    expected = [np.corrcoef(a, b)[0, 1] for a, b in zip(true, inferred, strict=True)]
+    np.testing.assert_allclose(pearson(true, inferred), expected)
+    np.testing.assert_allclose(pearson(true[0], inferred[0]), expected[0])
+    np.testing.assert_allclose(relative_error(true, 1.1 * true), 0.1)
+    # Of equal values there is no correlation.
+    assert np.isnan(pearson(true, np.full_like(true, 3.7))).all()
+    with pytest.raises(ValueError, match="one shape"):
+        pearson(true, inferred[0])
+
+
+def test_the_watch_counts_what_differs():
+    targets = [random_tissue(8, 0), random_tissue(8, 1)]
+    truth = vx.energies.ShapeFactorEnergy(3.7 + 0.1 * jnp.arange(16.0).reshape(2, 8))
+    tissues = stack([targets[0], random_tissue(8, 2)])
+    watch = RecoveryWatch(truth, stack(targets))
+    numbers, counts, yes = jnp.zeros(2), jnp.zeros(2, int), jnp.ones(2, bool)
+    names = ("cost", "max_force", "relative_error")
+    slopes = ("gradient_norm", "gradient_residual", "gradient_steps")
+    record = vx.Record(
+        parameters=eqx.filter(truth, eqx.is_array),
+        tissue=tissues,
+        converged=yes,
+        num_steps=counts,
+        num_t1=counts,
+        sound=yes,
+        **dict.fromkeys((*names, *slopes), numbers),
+    )
+    notes = watch(0, record)
+    np.testing.assert_allclose(notes["pearson"], 1)
+    expected = mismatched_neighbours(random_tissue(8, 2), targets[1])
+    np.testing.assert_array_equal(notes["mismatched"], [0, expected])
+    assert expected > 0
+    np.testing.assert_array_equal(watch(1, record)["mismatched"], notes["mismatched"])
+
+
+def test_neighbours_are_compared_whatever_the_edges_are_called():
+    tissue = random_tissue(8, 0)
+    assert same_neighbours(tissue, random_tissue(8, 0))
+    assert not same_neighbours(tissue, random_tissue(8, 1))

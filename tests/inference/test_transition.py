@@ -1,0 +1,36 @@
+"""Where tissues turn from solid to fluid, from counts and from energies."""
+
+import numpy as np
+import pytest
+
+from vertax.inference import fit_onset, fit_transition
+
+
+def test_the_curve_of_a_transition():
+    p0 = np.linspace(3.6, 4.0, 21)
+    share = 1 / (1 + np.exp(-(p0 - 3.83) / 0.03))
+    found = fit_transition(p0, 1e4 * share, 10_000)
+    assert found.centre == pytest.approx(3.83, abs=1e-4)
+    assert found.width == pytest.approx(0.03, rel=1e-2)
+    # A step between two values lies between them.
+    step = fit_transition(p0, 100.0 * (p0 > 3.81), 100)
+    assert 3.80 <= step.centre <= 3.82
+    assert np.isnan(fit_transition(p0, np.zeros(21), 100).centre)
+
+
+def test_the_onset_is_where_the_root_of_the_energy_ends():
+    p0 = np.linspace(3.6, 4.0, 21)
+    spread = 1 + 0.1 * np.random.default_rng(0).standard_normal((21, 40))
+    energies = np.maximum(3.85 - p0, 0)[:, None] ** 2 * spread**2
+    onset = fit_onset(p0, energies)
+    assert onset is not None
+    assert onset.centre == pytest.approx(3.85, abs=0.01)
+    assert onset.width == pytest.approx(1, rel=0.1)
+    assert fit_onset(p0, 0 * energies) is None
+
+
+def test_bad_counts_are_refused():
+    with pytest.raises(ValueError, match="`successes` must lie in 0 … 10"):
+        fit_transition(np.linspace(3.6, 4.0, 3), np.array([0.0, 5.0, 11.0]), 10)
+    with pytest.raises(ValueError, match="equally many entries, at least 2"):
+        fit_transition(np.array([3.8]), np.array([1.0]), 10)

@@ -1,0 +1,70 @@
+"""Run the tests, one process a folder: `python tests/run.py [--workers 2] [options of pytest]`.
+
+Tests compile a lot, and a process that has compiled very much dies in the compiler. So each folder of tests
+has a process of its own, and `--workers` of them run at a time. What they print comes in one piece, when they
+are done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+FOLDER = Path(__file__).resolve().parent
+# What takes longest begins first, and the others fill up the end.
+LONGEST = ("fitting", "adjoints", "solvers", "responses", "experiments")
+NOTHING_SELECTED = 5
+
+
+def groups() -> list[list[Path]]:
+    """The files of tests that share a process."""
+    folders = sorted({path.parent for path in FOLDER.rglob("test_*.py")})
+    parts = [sorted(folder.glob("test_*.py")) for folder in folders]
+    # Those that compile most have one process a file.
+    single = [[file] for files in parts if files[0].parent.name in LONGEST for file in files]
+    shared = [files for files in parts if files[0].parent.name not in LONGEST]
+    single.sort(key=lambda files: LONGEST.index(files[0].parent.name))
+    return single + shared
+
+
+def run(files: list[Path], options: list[str]) -> tuple[int, str]:
+    """The exit code of pytest, and the line that counts its tests."""
+    names = [str(file.relative_to(FOLDER.parent)) for file in files]
+    command = [sys.executable, "-m", "pytest", "-p", "no:xdist", *options, *names]
+    outcome = subprocess.run(
+        command, cwd=FOLDER.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    what = names[0] if len(names) == 1 else f"{Path(names[0]).parent} ({len(names)} files)"
+    print(f"\n--- {what}\n{outcome.stdout.rstrip()}", flush=True)
+    return outcome.returncode, (outcome.stdout.rstrip().splitlines() or [""])[-1]
+
+
+def main() -> int:
+    """Run all tests; the exit code is 0 if all passed."""
+    parser = argparse.ArgumentParser(description="Run the tests.", allow_abbrev=False)
+    parser.add_argument("--workers", type=int, default=2, help="processes at a time")
+    chosen, options = parser.parse_known_args()
+    began = time.perf_counter()
+    with ThreadPoolExecutor(chosen.workers) as pool:
+        outcomes = list(pool.map(lambda files: run(files, options), groups()))
+    count: Counter[str] = Counter()
+    for _, line in outcomes:
+        for number, what in re.findall(
+            r"(\d+) (passed|failed|skipped|xfailed|deselected|errors?)", line
+        ):
+            count[what] += int(number)
+    failed = [code for code, _ in outcomes if code not in (0, NOTHING_SELECTED)]
+    total = ", ".join(f"{number} {what}" for what, number in count.items())
+    broken = f"; {len(failed)} of {len(outcomes)} processes failed" if failed else ""
+    print(f"\n{total} in {time.perf_counter() - began:.0f} s{broken}")
+    return 1 if failed or not count["passed"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,205 @@
+"""Tissues side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, SupportsFloat, TypeAlias
+
+import numpy as np
+from jaxtyping import Array, Bool, Real
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap
+from matplotlib.figure import Figure
+
+from vertax.mesh import Tissue
+from vertax.mesh._outlines import Drawing
+from vertax.plotting import _style
+from vertax.plotting._colours import EDGES_ON_DARK, EDGES_ON_PALE, Colours, add_bar
+from vertax.plotting._image import extent_of, plot_image
+from vertax.plotting._tissue import checked, draw, single, view_of
+
+Values: TypeAlias = (
+    Callable[[Tissue], Real[Array | np.ndarray, " ..."]]
+    | Sequence[Real[Array | np.ndarray, " ..."] | None]
+    | Real[Array | np.ndarray, "panels _"]
+)
+
+
+def plot_tissues(
+    tissues: Mapping[str, Tissue | None],
+    cells: Values | None = None,
+    edges: Values | None = None,
+    *,
+    axes: Sequence[Axes] | np.ndarray | None = None,
+    figure: Figure | None = None,
+    mask: Bool[Array | np.ndarray, " ..."] | None = None,
+    cmap: str | Colormap = "viridis",
+    vmin: SupportsFloat | None = None,
+    vmax: SupportsFloat | None = None,
+    label: str | None = None,
+    edge_cmap: str | Colormap | None = None,
+    edge_vmin: SupportsFloat | None = None,
+    edge_vmax: SupportsFloat | None = None,
+    edge_label: str | None = None,
+    colorbar: bool | str = True,
+    linewidth: SupportsFloat | None = None,
+    image: Real[np.ndarray, " ..."] | None = None,
+    pixel_size: SupportsFloat = 1.0,
+) -> list[Axes]:
+    """Draw tissues side by side, to compare them: on one scale of colours and one scale of lengths.
+
+    ```python
+    vx.plotting.plot_tissues({"start": start, "fitted": fit.tissue}, lambda t: t.shape_factors)
+    vx.plotting.plot_tissues({"image": None, "fitted": fit.tissue}, image=membranes, pixel_size=0.2)
+    ```
+
+    **Arguments:**
+
+    - `tissues`: the tissue of each panel by its title; over an image None for the image alone.
+    - `cells`, `edges`: the values of the cells and of the edges, in the order of the panels; or a function
+        of the tissue. None of a panel: not coloured.
+    - `axes`: where to draw, one for each panel; by default a new figure.
+    - `figure`: an empty figure to draw in instead, which no window shows.
+    - `image`, `pixel_size`: an image under all panels, as for [`plot_tissue`][vertax.plot_tissue].
+    - `vmin`, `vmax`, `edge_vmin`, `edge_vmax`: limits of the colours; by default those of the finite values
+        of all panels together.
+    - `colorbar`: whether to draw a bar for the cells of all panels and one for their edges; or `"cells"` or
+        `"edges"` for one of them.
+    - others as for [`plot_tissue`][vertax.plot_tissue].
+
+    **Returns:** the axes of the panels.
+
+    **Raises:**
+
+    - `ValueError`, naming the argument, if there is no panel, for values or axes that do not go with the
+        panels, for None without an image, and as `plot_tissue`.
+    """
+    _style.one_of(axes, figure, "axes")
+    _check(tissues, axes, image, colorbar)
+    drawings = {name: None if t is None else Drawing(single(t)) for name, t in tissues.items()}
+    cell_values = _values("cells", cells, tissues)
+    edge_values = _values("edges", edges, tissues)
+    cell_colours, all_cells = _common(Colours(cmap, vmin, vmax, label), cell_values)
+    own = edge_cmap or (EDGES_ON_PALE if image is None else EDGES_ON_DARK)
+    edge_colours, all_edges = _common(Colours(own, edge_vmin, edge_vmax, edge_label), edge_values)
+    bars = [
+        (colours, values)
+        for name, colours, values in (
+            ("cells", cell_colours, all_cells),
+            ("edges", edge_colours, all_edges),
+        )
+        if values is not None and colorbar in (True, name)
+    ]
+    # Before there is a figure: one of pyplot would stay open.
+    for drawing, own_cells, own_edges in zip(
+        drawings.values(), cell_values, edge_values, strict=True
+    ):
+        if drawing is not None:
+            checked("cells", own_cells, drawing.n_cells)
+            checked("edges", own_edges, drawing.n_edges)
+            checked("mask", mask, drawing.n_cells)
+    pixel = float(pixel_size)
+    views = _views(drawings, mask) if image is None else [None] * len(drawings)
+    with _style.house_style():
+        if axes is None:
+            view = views[0]
+            extent = view[1] - view[0] if view is not None else extent_of(np.asarray(image), pixel)
+            height = 2.4 * float(np.clip(extent[1] / extent[0], 0.25, 2))
+            room = 0.75 * len(bars)
+            axes = _style.new_axes(
+                len(tissues), width=2.4, height=height + 0.25, room=room, figure=figure
+            )
+        for k, (ax, name) in enumerate(zip(axes, tissues, strict=True)):
+            drawing = drawings[name]
+            if drawing is None:
+                assert image is not None
+                plot_image(image, pixel_size=pixel, ax=ax)
+            else:
+                draw(
+                    drawing,
+                    cell_values[k],
+                    edge_values[k],
+                    ax=ax,
+                    view=views[k],
+                    mask=mask,
+                    cell_colours=cell_colours,
+                    edge_colours=edge_colours,
+                    colorbar=False,
+                    linewidth=linewidth,
+                    image=image,
+                    pixel_size=pixel,
+                )
+            ax.set_title(name)
+        # A later bar goes between the axes and an earlier one.
+        for colours, values in reversed(bars):
+            assert values is not None
+            add_bar(
+                list(axes),
+                colours.scale(values),
+                values,
+                colours.label,
+                fraction=0.05,
+                pad=0.02,
+                shrink=0.8,
+                aspect=25,
+            )
+    return list(axes)
+
+
+def _check(
+    tissues: Mapping[str, Tissue | None], axes: Any, image: np.ndarray | None, colorbar: bool | str
+) -> None:
+    if colorbar not in (True, False, "cells", "edges"):
+        raise ValueError(
+            f'Argument `colorbar` must be true, false, "cells" or "edges", but is {colorbar!r}.'
+        )
+    if not tissues:
+        raise ValueError("Argument `tissues` must have at least one panel, but is empty.")
+    if image is None and None in tissues.values():
+        raise ValueError(
+            "Argument `tissues` must have a tissue in each panel, unless there is an `image` to show alone."
+        )
+    if axes is not None and len(axes) != len(tissues):
+        raise ValueError(
+            f"Argument `axes` must have one entry for each of the {len(tissues)} panels, but has "
+            f"{len(axes)}."
+        )
+
+
+def _values(
+    name: str, values: Values | None, tissues: Mapping[str, Tissue | None]
+) -> list[np.ndarray | None]:
+    if values is None:
+        return [None] * len(tissues)
+    if callable(values):
+        return [None if t is None else np.asarray(values(t)) for t in tissues.values()]
+    if len(values) != len(tissues):
+        raise ValueError(
+            f"Argument `{name}` must have values for each of the {len(tissues)} panels, but has "
+            f"{len(values)}."
+        )
+    return [None if own is None else np.asarray(own) for own in values]
+
+
+def _common(colours: Colours, values: list[np.ndarray | None]) -> tuple[Colours, np.ndarray | None]:
+    """Colours with the same limits for all panels, and all values."""
+    some = [np.asarray(own, float).ravel() for own in values if own is not None]
+    if not some:
+        return colours, None
+    together = np.concatenate(some)
+    low, high = colours.limits(together)
+    return colours._replace(low=low, high=high), together
+
+
+def _views(
+    drawings: Mapping[str, Drawing | None], mask: Any
+) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """A part of the plane for each panel: of one size, with the tissue in its middle."""
+    views = []
+    for drawing in drawings.values():
+        assert drawing is not None
+        polygons = drawing.polygons()[0]
+        shown = polygons if mask is None else polygons[np.asarray(mask, bool)]
+        views.append(view_of(shown, drawing.box))
+    half = np.max([high - low for low, high in views], axis=0) / 2
+    return [((low + high) / 2 - half, (low + high) / 2 + half) for low, high in views]

@@ -1,0 +1,38 @@
+"""From a configuration file to an experiment and its configuration."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import Any
+
+from vertax.runs._config import apply_overrides, read_toml, validate
+from vertax.runs._errors import ConfigError
+from vertax.runs._registry import EXPERIMENTS, Experiment, find_experiment
+
+
+def load_config(
+    path: str | os.PathLike[str], overrides: Iterable[str] = ()
+) -> tuple[Experiment, Any]:
+    """Read and check a configuration file.
+
+    **Arguments:**
+
+    - `path`: a TOML file; its key `experiment` says which experiment it configures.
+    - `overrides`: texts `key=value` that set single keys, see
+        `apply_overrides`.
+
+    **Returns:** the experiment and its configuration, an instance of `experiment.config`.
+
+    **Raises:**
+
+    - `ConfigError` if the file is missing or no TOML, or for an unknown or ill-typed key.
+    """
+    data = apply_overrides(read_toml(path), overrides)
+    if "experiment" not in data:
+        raise ConfigError(
+            f"In {os.fspath(path)}: `experiment` is missing; it names the experiment to run, one "
+            f"of {', '.join(EXPERIMENTS)}."
+        )
+    experiment = find_experiment(data["experiment"])
+    return experiment, validate(experiment.config, data, os.fspath(path))

@@ -1,0 +1,122 @@
+"""Independent runs side by side, one thread a core."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from jaxtyping import ArrayLike
+from tqdm import tqdm
+
+from vertax.fitting import Fit, InverseProblem, Record, stack_fits
+from vertax.runs._folder import RunFolder
+from vertax.runs._sections import Fitting
+
+Result = TypeVar("Result")
+
+
+def side_by_side(
+    function: Callable[[int], Result],
+    n: int,
+    folder: RunFolder,
+    *,
+    progress: bool = True,
+    unit: str = "run",
+) -> list[Result]:
+    """Call a function for each of 0 … n - 1, one thread a core.
+
+    What JAX has compiled runs outside of Python's lock, so threads are enough. The first call goes alone,
+    because it compiles. An interrupt from the keyboard reaches one thread only: here it ends the others
+    too. Fits of the folder stop after their epoch and keep what they have, what is no fit is finished, and
+    nothing else begins.
+
+    **Arguments:**
+
+    - `function`: what to call, with results of its own.
+    - `n`: how often.
+    - `folder`: of the run, which knows of interrupts.
+    - `progress`: show a progress bar (only on a terminal).
+    - `unit`: what is counted.
+
+    **Returns:** what was returned, in the order of the numbers.
+
+    **Raises:**
+
+    - `KeyboardInterrupt` if the run was interrupted before all of them began.
+    - what a call raises; those that go on are waited for, and nothing else begins.
+    """
+
+    def one(index: int) -> Result:
+        if folder.interrupted:
+            raise KeyboardInterrupt
+        return function(index)
+
+    results: dict[int, Result] = {}
+    with tqdm(total=n, unit=unit, disable=None if progress else True) as bar:
+        for index in range(min(n, 1)):
+            results[index] = one(index)
+            bar.update()
+        with concurrent.futures.ThreadPoolExecutor(n_threads()) as pool:
+            waiting = {pool.submit(one, index): index for index in range(1, n)}
+            try:
+                for done in concurrent.futures.as_completed(waiting):
+                    results[waiting[done]] = done.result()
+                    bar.update()
+            except BaseException as error:
+                folder.interrupted |= isinstance(error, KeyboardInterrupt)
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+    return [results[index] for index in range(n)]
+
+
+def fit_side_by_side(
+    folder: RunFolder,
+    name: str,
+    problems: Sequence[InverseProblem[Any]],
+    fitting: Fitting,
+    *,
+    notes: Callable[[InverseProblem[Any], Record], Mapping[str, ArrayLike]] | None = None,
+    progress: bool = True,
+) -> Fit[Any]:
+    """Fit problems of one shape side by side.
+
+    As a batch they would all wait, in each epoch, for the one that takes the most steps to relax; with
+    T1 transitions that is many times as many as the others take.
+
+    **Arguments:**
+
+    - `folder`: of the run.
+    - `name`: of these fits; they are numbered from 0.
+    - `problems`: the inverse problems.
+    - `fitting`: how they are fitted.
+    - `notes`: what is kept of each epoch, from its problem and its [`Record`][vertax.Record].
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** the fit of all as of a batch, with notes; seconds are those of all, over the number of
+    threads.
+
+    **Raises:**
+
+    - `FitError` if a fit cannot go on.
+    """
+
+    def one(index: int) -> Fit[Any]:
+        problem = problems[index]
+
+        def noted(epoch: int, record: Record) -> Mapping[str, ArrayLike] | None:
+            return None if notes is None else notes(problem, record)
+
+        optimiser, epochs = fitting.build(), fitting.epochs
+        return folder.fit(
+            f"{name} {index}", problem, optimiser, epochs, callback=noted, progress=False
+        )
+
+    fits = side_by_side(one, len(problems), folder, progress=progress, unit="fit")
+    return stack_fits(fits, at_once=n_threads())
+
+
+def n_threads() -> int:
+    """How many run at once."""
+    return os.cpu_count() or 1
