@@ -2,7 +2,6 @@
 
 import tomllib
 from pathlib import Path
-from typing import Literal
 
 import pytest
 from pydantic import Field
@@ -196,8 +195,6 @@ class _Camera(Section):
 class _Config(ExperimentConfig):
     """A configuration."""
 
-    experiment: Literal["x"] = "x"
-    """Which."""
     camera: _Camera
     """A camera."""
 
@@ -205,8 +202,6 @@ class _Config(ExperimentConfig):
 class _Deep(ExperimentConfig):
     """A configuration with its own defaults for shared tables."""
 
-    experiment: Literal["x"] = "x"
-    """Which."""
     outer: "_Outer" = Field(default_factory=lambda: _Outer())
     """A table."""
     camera: _Camera = _Camera(path=Path("here.tif"), crop=[1, 2])
