@@ -58,7 +58,7 @@ build: $(VENV)/.dev ## wheel and source archive in dist
 	$(BIN)/python -m build
 
 clean: ## remove the environment, caches and builds, but no results
-	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site *.egg-info .cache .pytest_cache .ruff_cache .hypothesis
 	find . -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is newer than pyproject.toml when the environment holds what that asks for. The package itself

@@ -1,3 +1,6 @@
+import io
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,6 +16,9 @@ from vertax.costs import MeshImage, VertexDistance, render
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 from vertax.fitting import stack
 
+# JAX knows an optimiser by identity: fits of one kind of problem with this one share what is compiled.
+ADAM = optax.adam(1e-2)
+
 
 @pytest.fixture(scope="module")
 def hidden():
@@ -25,7 +31,7 @@ def hidden():
 def test_shape_factors_are_recovered_from_vertices(hidden):
     target, truth, guess, start = hidden
     problem = vx.InverseProblem(start, guess, VertexDistance(target))
-    fit = vx.fit(problem, optax.adam(1e-2), 200, truth=truth, progress=False)
+    fit = vx.fit(problem, ADAM, 200, truth=truth, progress=False)
     np.testing.assert_allclose(fit.energy.target_shape_factor, truth.target_shape_factor, rtol=1e-4)
     h = fit.history
     assert h.converged.all()
@@ -43,11 +49,11 @@ def test_shape_factors_are_recovered_from_an_image_of_a_displaced_tissue(hidden)
     image = render(target, (96, 96), 0.07)
     displaced = start.with_configuration(start.vertices + jnp.array([0.02, -0.03]))
     problem = vx.InverseProblem(displaced, guess, MeshImage(image, 0.07), fit_position=True)
-    fit = vx.fit(problem, optax.adam(1e-2), 250, truth=truth, progress=False)
+    fit = vx.fit(problem, ADAM, 250, truth=truth, progress=False)
     np.testing.assert_allclose(fit.energy.target_shape_factor, truth.target_shape_factor, rtol=1e-3)
     # Without fitting the position the parameters have to make up for it, and cannot.
     fixed = vx.InverseProblem(displaced, guess, MeshImage(image, 0.07))
-    biased = vx.fit(fixed, optax.adam(1e-2), 250, truth=truth, progress=False)
+    biased = vx.fit(fixed, ADAM, 250, truth=truth, progress=False)
     assert biased.history.relative_error[-1] > 10 * fit.history.relative_error[-1]
 
 
@@ -78,7 +84,7 @@ def test_only_chosen_leaves_are_fitted(hidden):
     which = jax.tree.map(lambda _: False, energy)
     which = eqx.tree_at(lambda e: e.terms[0].target_shape_factor, which, True)
     problem = vx.InverseProblem(start, energy, VertexDistance(target), which)
-    fit = vx.fit(problem, optax.adam(1e-2), 3, progress=False)
+    fit = vx.fit(problem, ADAM, 3, progress=False)
     np.testing.assert_array_equal(fit.energy.terms[1].tension, 0.01)
     assert not np.allclose(fit.energy.terms[0].target_shape_factor, 3.7)
 
@@ -98,7 +104,7 @@ def test_the_users_own_energy_is_fitted_like_any_other():
     start = vx.equilibrate(target, guess).tissue
     fit = vx.fit(
         vx.InverseProblem(start, guess, VertexDistance(target)),
-        optax.adam(1e-2),
+        ADAM,
         150,
         truth=truth,
         progress=False,
@@ -108,18 +114,17 @@ def test_the_users_own_energy_is_fitted_like_any_other():
 
 def test_the_optimiser_keeps_its_momentum_over_epochs(hidden):
     # Three epochs of Adam by hand, with one state throughout.
-    target, _, guess, start = hidden
+    target, truth, guess, start = hidden
     cost = VertexDistance(target)
-    optimiser = optax.adam(1e-2)
-    energy, state, tissue = guess, optimiser.init(eqx.filter(guess, eqx.is_inexact_array)), start
+    energy, state, tissue = guess, ADAM.init(eqx.filter(guess, eqx.is_inexact_array)), start
     for _ in range(3):
         problem = vx.InverseProblem(tissue, energy, cost)
         (_, found), gradient = eqx.filter_value_and_grad(lambda e, p=problem: p(e), has_aux=True)(
             energy
         )
-        updates, state = optimiser.update(gradient, state)
+        updates, state = ADAM.update(gradient, state)
         energy, tissue = eqx.apply_updates(energy, updates), found.tissue
-    fit = vx.fit(vx.InverseProblem(start, guess, cost), optimiser, 4, progress=False)
+    fit = vx.fit(vx.InverseProblem(start, guess, cost), ADAM, 4, truth=truth, progress=False)
     # The parameters of lowest cost are those of the last epoch, after three updates.
     assert fit.best_epoch == 3
     np.testing.assert_allclose(
@@ -212,7 +217,7 @@ def batch(hidden):
 @pytest.mark.parametrize(
     "optimiser",
     [
-        pytest.param(optax.adam(1e-2), id="adam"),
+        pytest.param(ADAM, id="adam"),
         pytest.param(LEAST_SQUARES, id="lm", marks=pytest.mark.slow),
     ],
 )
@@ -241,7 +246,7 @@ def test_a_member_that_breaks_down_leaves_the_others_alone(batch):
         stacked,
         stacked.cost.target.vertices.at[1].set(jnp.nan),
     )
-    fit = vx.fit(broken, optax.adam(1e-2), 30, truth=truths, batched=True, progress=False)
+    fit = vx.fit(broken, ADAM, 30, truth=truths, batched=True, progress=False)
     error = fit.history.relative_error
     assert (error[-1, [0, 2]] < 0.9 * error[0, [0, 2]]).all()
     assert (error[:, 1] == error[0, 1]).all()
@@ -254,18 +259,39 @@ def test_a_batch_has_one_leading_axis(hidden):
     with pytest.raises(ValueError, match="one leading axis"):
         vx.fit(
             vx.InverseProblem(start, guess, VertexDistance(target)),
-            optax.adam(1e-2),
+            ADAM,
             3,
             batched=True,
         )
 
 
 def test_the_history_knows_how_gradients_came_about(hidden):
-    target, _, guess, start = hidden
+    target, truth, guess, start = hidden
     problem = vx.InverseProblem(start, guess, VertexDistance(target))
-    history = vx.fit(problem, optax.adam(1e-2), 3, progress=False).history
+    history = vx.fit(problem, ADAM, 3, truth=truth, progress=False).history
     assert (history.gradient_residual < 1e-9).all()
     assert (history.gradient_steps > 5).all()
+
+
+class Terminal(io.StringIO):
+    """A stream that takes itself for a screen."""
+
+    def isatty(self):
+        return True
+
+
+def test_the_bar_says_that_it_compiles_until_the_first_epoch_is_done(hidden, monkeypatch):
+    target, truth, guess, start = hidden
+    problem = vx.InverseProblem(start, guess, VertexDistance(target))
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stderr", screen)
+    shown = []
+    watch = lambda *_: shown.append(screen.getvalue())
+    vx.fit(problem, ADAM, 2, truth=truth, callback=watch)
+    assert "compiling:   0%" in shown[0]
+    after = screen.getvalue()[len(shown[0]) :]
+    assert "2/2" in after
+    assert "compiling" not in after
 
 
 def test_a_gradient_that_cannot_be_trusted_ends_a_fit(hidden):
@@ -295,14 +321,14 @@ def test_the_protocol_of_the_paper(hidden):
 
 
 def test_an_interrupt_keeps_what_there_is(hidden):
-    target, _, guess, start = hidden
+    target, truth, guess, start = hidden
 
     def interrupt(epoch, _):
         if epoch == 4:
             raise KeyboardInterrupt
 
     problem = vx.InverseProblem(start, guess, VertexDistance(target))
-    fit = vx.fit(problem, optax.adam(1e-2), 100, progress=False, callback=interrupt)
+    fit = vx.fit(problem, ADAM, 100, truth=truth, progress=False, callback=interrupt)
     # Epoch 4 was not done.
     assert len(fit.history.cost) == 4
     assert fit.interrupted
@@ -342,16 +368,16 @@ def test_a_fit_without_any_equilibrium_is_an_error(hidden):
         random_tissue(10, 8), guess, VertexDistance(target), response=vx.Relaxation(max_steps=1)
     )
     with pytest.raises(vx.FitError, match="No epoch of the fit reached equilibrium"):
-        vx.fit(problem, optax.adam(1e-9), 2, progress=False)
+        vx.fit(problem, ADAM, 2, progress=False)
 
 
 def test_bad_problems_are_refused(hidden):
     target, _, guess, start = hidden
     cost = VertexDistance(target)
     with pytest.raises(ValueError, match="nothing to fit"):
-        vx.fit(vx.InverseProblem(start, ShapeFactorEnergy(3.7), cost), optax.adam(1e-2), 3)
+        vx.fit(vx.InverseProblem(start, ShapeFactorEnergy(3.7), cost), ADAM, 3)
     with pytest.raises(ValueError, match="`epochs`"):
-        vx.fit(vx.InverseProblem(start, guess, cost), optax.adam(1e-2), 0)
+        vx.fit(vx.InverseProblem(start, guess, cost), ADAM, 0)
 
 
 @pytest.mark.slow
@@ -359,7 +385,7 @@ def test_shape_factors_in_float32(hidden):
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     target, truth, guess, start = jax.tree.map(to32, hidden)
     problem = vx.InverseProblem(start, guess, VertexDistance(target))
-    fit = vx.fit(problem, optax.adam(1e-2), 80, truth=truth, progress=False)
+    fit = vx.fit(problem, ADAM, 80, truth=truth, progress=False)
     assert fit.energy.target_shape_factor.dtype == jnp.float32
     assert fit.history.relative_error[-1] < 0.1 * fit.history.relative_error[0]
 
@@ -389,7 +415,7 @@ def test_arguments_of_another_kind_are_answered(changes, error, message, as_a_us
     energy = ShapeFactorEnergy(jnp.full(6, 3.7))
     given = {
         "problem": vx.InverseProblem(tissue, energy, VertexDistance(tissue)),
-        "optimiser": optax.adam(1e-2),
+        "optimiser": ADAM,
         "epochs": 2,
     }
     with pytest.raises(error, match=message):

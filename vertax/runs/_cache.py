@@ -42,7 +42,7 @@ def enable_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     asked = os.environ.get(VARIABLE, "") if folder is None else os.fspath(folder)
     if folder is None and asked.lower() in _OFF:
         return None
-    if folder is None and (earlier := jax.config.jax_compilation_cache_dir) is not None:
+    if folder is None and (earlier := jax.config.values["jax_compilation_cache_dir"]) is not None:
         return Path(earlier)
     path = Path(asked).expanduser() if asked else _user_folder() / "vertax"
     try:
