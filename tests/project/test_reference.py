@@ -2,6 +2,7 @@
 
 import importlib
 import re
+from functools import reduce
 from pathlib import Path
 
 import pytest
@@ -28,11 +29,17 @@ def public(package: str) -> set[str]:
     return {name for name in names if not hasattr(getattr(module, name), "__path__")}
 
 
+def named(path: str) -> object:
+    """What a name of the reference stands for."""
+    return reduce(getattr, path.split("."), vx)
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_every_public_name_is_documented(package):
-    # A name that is also at the top may be documented as that.
-    documented = {name.removeprefix(f"{package}.") for name in DOCUMENTED}
-    assert not public(package) - documented
+    # Some stand in two packages, or at the top as well: once is enough.
+    documented = {id(named(name)) for name in DOCUMENTED}
+    module = importlib.import_module(f"vertax.{package}")
+    assert not [n for n in public(package) if id(getattr(module, n)) not in documented]
 
 
 def test_no_name_is_documented_twice():
