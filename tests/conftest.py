@@ -12,6 +12,7 @@ os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS])
 
 import equinox as eqx
 import jax
+import jaxtyping
 import matplotlib
 import pytest
 
@@ -28,3 +29,11 @@ def _few_compiled_functions():
     yield
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 15_000:
         eqx.clear_caches()
+
+
+@pytest.fixture
+def as_a_user():
+    """Without the type checks that the tests add to every function: what a user sees of a wrong type."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

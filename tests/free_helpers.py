@@ -38,7 +38,7 @@ def angles_of(tissue: vx.Tissue) -> jax.Array:
 
 
 def with_angles(tissue: vx.Tissue, angles: jax.Array) -> vx.Tissue:
-    return eqx.tree_at(lambda t: t.angles, tissue, angles)
+    return tissue.with_angles(angles)
 
 
 def rotated(tissue: vx.Tissue, angle: float, shift=(0.0, 0.0)) -> vx.Tissue:

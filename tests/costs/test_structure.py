@@ -199,7 +199,7 @@ def test_a_t1_changes_two_neighbourships():
 
 @pytest.mark.parametrize("name", ["interface_length", "epsilon", "softening"])
 def test_settings_must_be_positive(name):
-    with pytest.raises(ValueError, match=rf"`{name}` of IndexAwareStructural must be positive"):
+    with pytest.raises(ValueError, match=rf"`{name}` must be positive"):
         IndexAwareStructural(random_tissue(5), **{name: 0.0})
 
 

@@ -8,7 +8,12 @@ from hypothesis import given, settings
 from jaxtyping import Array, Float
 
 import vertax as vx
-from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity, ShapeFactorEnergy
+from vertax.energies import (
+    AreaElasticity,
+    LineTension,
+    PerimeterElasticity,
+    ShapeFactorEnergy,
+)
 
 tissue = random_tissue(12, 1, lloyd_steps=5)  # no edge so short that its length bends over a step
 per_cell = lambda seed: 1 + 0.3 * jax.random.uniform(jax.random.key(seed), (12,))

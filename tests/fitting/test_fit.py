@@ -362,3 +362,35 @@ def test_shape_factors_in_float32(hidden):
     fit = vx.fit(problem, optax.adam(1e-2), 80, truth=truth, progress=False)
     assert fit.energy.target_shape_factor.dtype == jnp.float32
     assert fit.history.relative_error[-1] < 0.1 * fit.history.relative_error[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"optimiser": "adam"}, TypeError, r"but is 'adam'. Write optax.adam\(learning_rate\)"),
+        ({"optimiser": "best"}, TypeError, r"but is 'best'. Pass an Optax optimiser"),
+        ({"optimiser": optax.adam}, TypeError, r"Call it: adam\("),
+        ({"optimiser": None}, TypeError, "but is None. Pass an Optax optimiser"),
+        (
+            {"optimiser": optx.BFGS(rtol=1e-3, atol=1e-3)},
+            TypeError,
+            "Minimisers relax tissues.*For the parameters pass an Optax",
+        ),
+        ({"optimiser": vx.solvers.LBFGS()}, TypeError, "Minimisers relax tissues"),
+        ({"problem": "problem"}, TypeError, "`problem` must be a vertax.InverseProblem"),
+        ({"epochs": 2.5}, TypeError, "`epochs` must be at least 1"),
+        ({"epochs": 0}, ValueError, "`epochs` must be at least 1"),
+        ({"guidance": 3.0}, TypeError, "`guidance` must be a function of the epoch.*3.0"),
+        ({"callback": "print"}, TypeError, "`callback` must be a function"),
+    ],
+)
+def test_arguments_of_another_kind_are_answered(changes, error, message, as_a_user):
+    tissue = random_tissue(6)
+    energy = ShapeFactorEnergy(jnp.full(6, 3.7))
+    given = {
+        "problem": vx.InverseProblem(tissue, energy, VertexDistance(tissue)),
+        "optimiser": optax.adam(1e-2),
+        "epochs": 2,
+    }
+    with pytest.raises(error, match=message):
+        vx.fit(**given | changes)

@@ -1,5 +1,8 @@
 """The Laplace approximation: how well data determine parameters."""
 
+import dataclasses
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +13,7 @@ import pytest
 from helpers import p0_of, relaxed
 
 import vertax as vx
-from vertax.costs import CentroidDistance, MeanShapeFactor, MeshImage, VertexDistance, render
+from vertax.costs import MeshImage, VertexDistance, render
 
 
 @pytest.fixture(scope="module")
@@ -82,25 +85,80 @@ def test_it_follows_its_formula(hidden):
     assert (p0_of(fewer.deviation) > p0_of(said.deviation)).all()
 
 
-def test_it_names_what_the_data_do_not_determine(hidden):
+class OneNumber(vx.costs.AbstractLeastSquaresCost):
+    """Twenty measurements of the perimeter of one cell."""
+
+    wanted: jax.Array
+
+    def residuals(self, tissue, energy):
+        return tissue.perimeters[0] - self.wanted
+
+
+@pytest.mark.parametrize("noise", [1e-1, 1e-7])
+def test_it_names_what_the_data_do_not_determine(hidden, noise):
     tissue, truth = hidden
-    cost = MeanShapeFactor(3.8) + CentroidDistance(tissue)
-
-    class OneNumber(vx.costs.AbstractLeastSquaresCost):
-        def residuals(self, tissue, energy):
-            return jnp.ones(20) * (tissue.perimeters[0] - 3.6)
-
+    measured = tissue.perimeters[0] + noise * jax.random.normal(jax.random.key(0), (20,))
     problem = vx.InverseProblem(
-        tissue, truth, OneNumber(), response=vx.Relaxation(transitions=None)
+        tissue, truth, OneNumber(measured), response=vx.Relaxation(transitions=None)
     )
-    fit = vx.fit(problem, optax.adam(1e-3), 3, progress=False)
-    said = vx.uncertainty(problem, fit)
-    assert int(jnp.sum(jnp.isinf(said.deviations))) == 7
-    assert np.isinf(p0_of(said.deviation)).any()
-    with_prior = vx.uncertainty(problem, fit, prior=0.3)
-    assert np.isfinite(p0_of(with_prior.deviation)).all()
-    assert float(jnp.max(with_prior.deviations)) == pytest.approx(0.3, rel=1e-3)
-    assert cost(tissue, truth) > 0
+    fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
+    alone = vx.uncertainty(problem, fit)
+    assert int(jnp.sum(jnp.isinf(alone.deviations))) == 7
+    assert np.isinf(p0_of(alone.deviation)).any()
+    # Where the data say nothing the prior is all there is, however precise they are elsewhere.
+    prior = 0.3
+    both = vx.uncertainty(problem, fit, prior=prior)
+    # The data see one direction, of which they have twenty measurements (Sherman-Morrison).
+    slope = _slope(problem, fit)
+    less = np.outer(slope, slope) / (slope @ slope + (float(alone.noise) / prior) ** 2 / 20)
+    by_hand = prior**2 * (np.eye(8) - less)
+    np.testing.assert_allclose(np.sort(both.deviations)[1:], prior, rtol=1e-9)
+    np.testing.assert_allclose(both.covariance, by_hand, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(p0_of(both.deviation), np.sqrt(np.diag(by_hand)), rtol=1e-4)
+    best = 1 / np.sqrt(1 / float(alone.deviations[-1]) ** 2 + 1 / prior**2)
+    assert float(both.deviations[-1]) == pytest.approx(best, rel=1e-6)
+
+
+def _slope(problem, fit):
+    """How the residuals, all alike, depend on the target shape factors, by finite differences."""
+
+    def residual(p0):
+        return problem.residuals(vx.energies.ShapeFactorEnergy(p0), fit.tissue, None)[0][0]
+
+    p0 = p0_of(fit.energy)
+    step = 1e-5 * np.eye(len(p0))
+    return np.array([float(residual(p0 + e) - residual(p0 - e)) / 2e-5 for e in step])
+
+
+def test_a_position_that_the_cost_does_not_see_makes_no_difference(hidden):
+    tissue, truth = hidden
+    measured = tissue.perimeters[0] + 0.1 * jax.random.normal(jax.random.key(0), (20,))
+    problem = vx.InverseProblem(
+        tissue, truth, OneNumber(measured), response=vx.Relaxation(transitions=None)
+    )
+    fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
+    moving = dataclasses.replace(problem, fit_position=True)
+    still, moved = (vx.uncertainty(p, fit, prior=0.3) for p in (problem, moving))
+    # Two parameters more leave a little more to the noise.
+    ratio = float(moved.noise / still.noise)
+    np.testing.assert_allclose(p0_of(moved.deviation), p0_of(still.deviation), rtol=ratio - 1)
+    assert 1 < ratio < 1.2
+
+
+def test_data_without_noise_leave_nothing_open(hidden):
+    tissue, truth = hidden
+    problem = vx.InverseProblem(
+        tissue, truth, OneNumber(jnp.full(20, 3.6)), response=vx.Relaxation(transitions=None)
+    )
+    fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
+    exact = eqx.tree_at(
+        lambda p: p.cost.wanted,
+        problem,
+        jnp.full(20, problem(fit.energy, fit.tissue)[1].tissue.perimeters[0]),
+    )
+    sure = vx.uncertainty(exact, fit, prior=0.3)
+    assert float(sure.deviations[-1]) < 1e-9
+    np.testing.assert_allclose(sure.deviations[:-1], 0.3)
 
 
 @pytest.mark.slow
@@ -129,10 +187,18 @@ def test_a_fitted_position_adds_to_the_uncertainty(hidden):
     assert float(jnp.max(p0_of(unknown.deviation) / p0_of(known.deviation))) < 3
 
 
-def test_bad_arguments_are_refused(hidden):
+def test_bad_arguments_are_refused(hidden, as_a_user):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, VertexDistance(tissue))
+    every: Any = "all"
     with pytest.raises(ValueError, match="`prior` must be positive"):
         vx.uncertainty(problem, fit, prior=0.0)
+    with pytest.raises(ValueError, match="`prior` must be positive and finite"):
+        vx.uncertainty(problem, fit, prior=float("inf"))
+    with pytest.raises(TypeError, match="`n_independent` must be one real number"):
+        vx.uncertainty(problem, fit, n_independent=every)
+    stack = lambda tree: jax.tree.map(lambda x: jnp.stack([x, x]) if eqx.is_array(x) else x, tree)
+    with pytest.raises(ValueError, match="must be single ones"):
+        vx.uncertainty(stack(problem), stack(fit))
     with pytest.raises(ValueError, match="more independent residuals than parameters"):
         vx.uncertainty(problem, fit, n_independent=8)

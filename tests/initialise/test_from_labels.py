@@ -192,11 +192,92 @@ def test_cell_spanning_the_image_is_refused_by_name():
             from_labels(mask, boundary=boundary)
 
 
-def test_background_label_around_everything_is_refused_by_name():
-    mask = np.full((40, 40), 5)
-    mask[10:30, 10:30] = np.kron([[1, 2], [3, 4]], np.ones((10, 10), int))
-    with pytest.raises(ValueError, match=r"the labels 5 do"):
-        from_labels(mask, boundary="periodic")
+@pytest.mark.parametrize("boundary", ["mirrored", "periodic", "free"])
+def test_a_label_around_all_others_is_the_background(boundary):
+    mask = np.pad(honeycomb(), 12)
+    plain = from_labels(mask, boundary=boundary)
+    assert plain.background is None
+    labelled = from_labels(np.where(mask == 0, 77, mask), boundary=boundary)
+    assert labelled.background == 77
+    assert 77 not in labelled.labels
+    assert 77 not in labelled.absorbed
+    np.testing.assert_array_equal(labelled.labels, plain.labels)
+    np.testing.assert_array_equal(labelled.tissue.vertices, plain.tissue.vertices)
+
+
+def test_a_background_that_cells_cross_is_named():
+    mask = np.pad(honeycomb(), 12)
+    mask[:, :20] = mask[:, 20:40]  # the outermost cells are at the border
+    cut = np.where(mask == 0, 77, mask)
+    assert 77 in from_labels(cut, boundary="free").labels
+    plain, named = (
+        from_labels(mask, boundary="free"),
+        from_labels(cut, boundary="free", background=77),
+    )
+    assert named.background == 77
+    np.testing.assert_array_equal(named.tissue.vertices, plain.tissue.vertices)
+    ring = np.pad(honeycomb(), 12, constant_values=77)
+    ring[0, 0] = 1
+    with pytest.raises(ValueError, match=r"labels 77 do.*name it by the argument `background`"):
+        from_labels(ring, boundary="periodic")
+    with pytest.raises(ValueError, match=r"too few remain.*name it by the argument `background`"):
+        from_labels(ring, boundary="free")
+
+
+@pytest.mark.parametrize(
+    ("background", "error", "message"),
+    [
+        (99, ValueError, "`background` must be a label of the mask, but no pixel has 99"),
+        (1.0, TypeError, "`background` must be a whole number"),
+        ("1", TypeError, "`background` must be a whole number"),
+    ],
+)
+def test_a_wrong_background_is_refused(background, error, message, as_a_user):
+    with pytest.raises(error, match=message):
+        from_labels(honeycomb(), background=background)
+
+
+def test_one_cell_besides_the_background_is_too_few():
+    mask = np.pad(np.full((10, 10), 2), 5, constant_values=1)
+    with pytest.raises(ValueError, match="but holds 1 besides the background, 1"):
+        from_labels(mask, boundary="free")
+
+
+def test_what_is_masked_is_no_cell():
+    mask = np.pad(honeycomb(), 12, constant_values=3)
+    hidden = np.zeros(mask.shape, bool)
+    hidden[:12], hidden[-12:], hidden[:, :12], hidden[:, -12:] = True, True, True, True
+    plain = from_labels(np.where(hidden, 0, mask), boundary="free")
+    masked = from_labels(np.ma.masked_array(mask, hidden), boundary="free")
+    np.testing.assert_array_equal(masked.tissue.vertices, plain.tissue.vertices)
+
+
+def test_labels_beyond_63_bits_are_refused():
+    mask = honeycomb().astype(np.uint64)
+    mask[mask == 7] = 2**64 - 1
+    with pytest.raises(ValueError, match="labels of at most 63 bits"):
+        from_labels(mask)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"gap_width": 1e9, "boundary": "free"}, ValueError, "at most as many pixels .*, 60, but"),
+        ({"gap_width": "wide"}, TypeError, "`gap_width` must be one real number, but is 'wide'"),
+        ({"gap_width": np.nan}, ValueError, "`gap_width` must be at least 0, but is nan"),
+        ({"pixel_size": "0.5"}, TypeError, "`pixel_size` must be one real number, but is '0.5'"),
+        ({"pixel_size": [1.0, 2.0]}, ValueError, "`pixel_size` must be one number"),
+        ({"pixel_size": 1j}, TypeError, "`pixel_size` must be one real number"),
+    ],
+)
+def test_wrong_sizes_are_named(options, error, message, as_a_user):
+    with pytest.raises(error, match=message):
+        from_labels(honeycomb(), **options)
+
+
+def test_under_vmap_the_remedy_is_told():
+    with pytest.raises(TypeError, match=r"from_labels needs arrays.*Call it outside"):
+        jax.vmap(lambda mask: from_labels(mask).tissue.areas)(honeycomb()[None])
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+import dataclasses
 import importlib.metadata
 import re
 import sys
@@ -7,6 +8,7 @@ from types import ModuleType, SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
@@ -17,6 +19,7 @@ from vertax.initialise import (
     Watershed,
     from_labels,
     from_microscopy,
+    labels_from_skeleton,
     periodic_voronoi,
 )
 from vertax.initialise._segmenters import estimate_cell_size
@@ -290,6 +293,62 @@ def test_read_image_takes_a_channel_of_a_colour_image(tmp_path, suffix):
     np.testing.assert_array_equal(read_image(path, channel=1), image[..., 1])
 
 
+@pytest.mark.parametrize("suffix", [".tif", ".png"])
+@pytest.mark.parametrize("n_channels", [2, 3, 4])
+def test_read_image_takes_grey_in_colours_as_it_is(tmp_path, suffix, n_channels):
+    grey = np.random.default_rng(0).integers(0, 255, (20, 30)).astype(np.uint8)
+    image = np.stack([grey] * n_channels, axis=-1)
+    if n_channels in (2, 4):
+        image[..., -1] = 255
+    path = tmp_path / f"grey{suffix}"
+    if suffix == ".png":
+        Image.fromarray(image).save(path)
+    else:
+        photometric = "minisblack" if n_channels == 2 else "rgb"
+        extra = ["unassalpha"] if n_channels in (2, 4) else []
+        tifffile.imwrite(
+            path, image, photometric=photometric, planarconfig="contig", extrasamples=extra
+        )
+    np.testing.assert_array_equal(read_image(path), grey)
+    # Transparency that differs from place to place is a channel.
+    if n_channels == 4 and suffix == ".png":
+        image[3, 4, -1] = 0
+        Image.fromarray(image).save(path)
+        with pytest.raises(ValueError, match="holds 4 channels"):
+            read_image(path)
+        np.testing.assert_array_equal(read_image(path, channel=3), image[..., 3])
+
+
+def test_read_image_refuses_complex_numbers(tmp_path):
+    path = tmp_path / "complex.tif"
+    tifffile.imwrite(path, np.full((20, 30), 1 + 2j, np.complex64))
+    with pytest.raises(ValueError, match=r"image of real numbers, but .* holds complex64"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("name", ["channel", "plane"])
+@pytest.mark.parametrize("index", ["red", 1.5, True])
+def test_read_image_refuses_an_index_that_is_none(tmp_path, small, name, index, as_a_user):
+    path = tmp_path / "image.png"
+    skimage_io.imsave(path, small[0], check_contrast=False)
+    with pytest.raises(TypeError, match=f"`{name}` must be a whole number"):
+        read_image(path, **{name: index})
+
+
+@pytest.mark.parametrize("segmenter", ["watershed", Watershed])
+def test_what_is_no_segmenter_is_refused(small, segmenter, as_a_user):
+    with pytest.raises(TypeError, match=r"`segmenter` must be a segmenter, such as Watershed\(\)"):
+        from_microscopy(small[0], segmenter=segmenter)
+
+
+def test_the_smoothing_by_default_is_what_its_documentation_says(small):
+    said = re.search(r"by default `cell_size / (\d+)`.\n    - `depth`", Watershed.__doc__ or "")
+    assert said is not None
+    size = 20.0
+    explicit = Watershed(cell_size=size, smoothing=size / int(said[1]))
+    np.testing.assert_array_equal(Watershed(cell_size=size)(small[0]), explicit(small[0]))
+
+
 def test_read_image_names_a_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere\.tif does not exist"):
         read_image(tmp_path / "nowhere.tif")
@@ -342,3 +401,32 @@ def test_real_image_edges_lie_on_membranes(real):
     centres = np.asarray(real.tissue.centroids)[cell][inside] / real.pixel_size
     at = lambda points: image[tuple(points[:, ::-1].astype(int).T)]
     assert np.mean(at(middles) > at(centres)) > 0.97
+
+
+@pytest.mark.parametrize("name", ["cell_size", "smoothing"])
+def test_lengths_beyond_the_image_are_refused(small, name):
+    with pytest.raises(
+        ValueError, match=f"`{name}` of Watershed is in pixels .* 200, but is 1000000000"
+    ):
+        dataclasses.replace(Watershed(), **{name: 1e9})(small[0])
+
+
+def test_a_segmenter_that_is_a_function_is_called_by_its_name(small):
+    def nothing(image):
+        return np.zeros(image.shape, int)
+
+    with pytest.raises(ValueError, match="but nothing found 0"):
+        from_microscopy(small[0], segmenter=nothing)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.eye(9) * 1j, "must hold real numbers, but its dtype is complex128"),
+        (np.full((9, 9), np.nan), "must be finite"),
+        (np.full((9, 9), "a"), "must hold real numbers"),
+    ],
+)
+def test_what_is_no_skeleton_is_refused(image, message):
+    with pytest.raises(ValueError, match=f"Argument `image` {message}"):
+        labels_from_skeleton(image)

@@ -1,3 +1,6 @@
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,6 +9,7 @@ from helpers import lattices, random_tissue
 from hypothesis import given, settings, strategies as st
 
 import vertax as vx
+from vertax.initialise import free_voronoi, hexagonal, periodic_voronoi
 
 voronoi = vx.initialise.periodic_voronoi
 
@@ -75,7 +79,7 @@ def test_memory_order_follows_space():
         ({}, "either `n_cells`"),
         ({"n_cells": 3, "seeds": np.zeros((3, 2))}, "either `n_cells`"),
         ({"n_cells": 3}, "`key` is needed"),
-        ({"n_cells": 0, "key": jax.random.key(0)}, "at least one cell"),
+        ({"n_cells": 0, "key": jax.random.key(0)}, "`n_cells` must be at least 1"),
         ({"seeds": np.zeros((0, 2))}, "at least one cell"),
         ({"seeds": np.zeros(4)}, "`seeds` must have shape"),
         ({"seeds": np.array([[0.1, 0.2], [np.nan, 0.3]])}, "`seeds` must be finite"),
@@ -96,3 +100,85 @@ def test_bad_arguments_are_named(options, message):
 def test_bad_hexagonal_lattices_are_refused(nx, ny, area):
     with pytest.raises(ValueError, match="must be"):
         vx.initialise.hexagonal(nx, ny, area=area)
+
+
+def test_a_seed_is_a_key(as_a_user):
+    for make in (periodic_voronoi, free_voronoi):
+        by_seed, by_key = (make(5, key=key) for key in (3, jax.random.key(3)))
+        np.testing.assert_array_equal(by_seed.vertices, by_key.vertices)
+    seed: Any = np.int64(3)
+    old, new = (periodic_voronoi(5, key=key) for key in (jax.random.PRNGKey(3), seed))
+    np.testing.assert_array_equal(old.vertices, new.vertices)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"key": "seed"}, TypeError, "`key` must be a key from jax.random.key"),
+        ({"key": 1.5}, TypeError, "`key` must be a key .* but is 1.5"),
+        ({"key": True}, TypeError, "`key` must be a key"),
+        ({"key": jnp.ones(2)}, TypeError, "`key` must be a key .* an array of type float"),
+        ({"key": 2**64}, ValueError, "`key` must be a seed of at most 64 bits"),
+        ({"key": jax.random.split(jax.random.key(0), 3)}, ValueError, r"must be one key.*\(3,\)"),
+        (
+            {"n_cells": 5.5},
+            TypeError,
+            "`n_cells` must be at least .*a Python integer.* but is 5.5",
+        ),
+        ({"n_cells": "5"}, TypeError, "`n_cells` must be at least"),
+        ({"n_cells": True}, TypeError, "`n_cells` must be at least"),
+        ({"n_cells": 0}, ValueError, "`n_cells` must be at least"),
+        ({"lloyd_steps": 1.0}, TypeError, "`lloyd_steps` must be at least 0"),
+        ({"lloyd_steps": -1}, ValueError, "`lloyd_steps` must be at least 0"),
+    ],
+)
+@pytest.mark.parametrize("make", [periodic_voronoi, free_voronoi])
+def test_wrong_arguments_are_named(make, options, error, message, as_a_user):
+    with pytest.raises(error, match=message):
+        make(**{"n_cells": 5, "key": jax.random.key(0)} | options)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"seeds": np.ones((4, 2)) * 1j}, TypeError, "`seeds` must hold real numbers"),
+        ({"seeds": [["a", "b"]]}, TypeError, "`seeds` must hold real numbers"),
+        ({"seeds": [[1, 2], [3]]}, TypeError, "`seeds` must hold real numbers"),
+        ({"n_cells": 5, "key": 0, "lattice": "square"}, TypeError, "`lattice` must hold real"),
+        ({"n_cells": 5, "key": 0, "lattice": np.nan * np.eye(2)}, ValueError, "`lattice` must be"),
+        ({"n_cells": 5, "key": 0, "lattice": 5.0}, ValueError, r"`lattice` must .* shape \(2, 2\)"),
+    ],
+)
+def test_wrong_seeds_and_boxes_are_named(options, error, message, as_a_user):
+    with pytest.raises(error, match=message):
+        periodic_voronoi(**options)
+
+
+@pytest.mark.parametrize("arguments", [(2.5, 4), (4, "4"), (True, 2)])
+def test_a_lattice_has_whole_numbers_of_cells(arguments, as_a_user):
+    with pytest.raises(TypeError, match="a Python integer"):
+        hexagonal(*arguments)
+
+
+def test_inside_transformations_the_remedy_is_told(as_a_user):
+    keys = jax.random.split(jax.random.key(0), 2)
+    for make in (lambda key: periodic_voronoi(5, key=key), lambda key: free_voronoi(5, key=key)):
+        for transformed in (eqx.filter_vmap(make), lambda keys, f=make: eqx.filter_jit(f)(keys[0])):
+            with pytest.raises(TypeError, match=r"does not work inside jax.jit.*jax.numpy.stack"):
+                transformed(keys)
+    with pytest.raises(TypeError, match="hexagonal needs arrays whose numbers"):
+        jax.vmap(lambda area: hexagonal(4, 4, area=area))(jnp.ones(2))
+    # What the message says.
+    tissues = [periodic_voronoi(5, key=key) for key in keys]
+    batch = jax.tree.map(lambda *x: jax.numpy.stack(x), *tissues)
+    assert eqx.filter_vmap(lambda tissue: tissue.areas)(batch).shape == (2, 5)
+
+
+def test_seeds_out_of_reach_are_refused():
+    seeds = np.random.default_rng(0).random((5, 2))
+    with pytest.raises(ValueError, match=r"`seeds` must lie within 1e.08 boxes of the origin"):
+        periodic_voronoi(seeds=seeds * 1e300)
+    shifted = periodic_voronoi(seeds=seeds + 1e5 * np.sqrt(5))
+    np.testing.assert_allclose(
+        np.sort(shifted.areas), np.sort(periodic_voronoi(seeds=seeds).areas), rtol=1e-6
+    )

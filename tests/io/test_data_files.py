@@ -233,3 +233,119 @@ class TestVTK:
         monkeypatch.setitem(sys.modules, "meshio", None)
         with pytest.raises(ImportError, match=r"pip install 'vertax\[files\]'"):
             write_vtk(tmp_path / "a.vtu", periodic)
+
+
+def test_what_is_not_known_is_an_empty_field(tmp_path):
+    path = tmp_path / "table.csv"
+    nan = float("nan")
+    table = {
+        "float": [1.5, nan, np.inf],
+        "none": [1.5, None, "text"],
+        "masked": np.ma.masked_array([1, 2, 3], [False, True, False]),
+        "date": np.array(["2020-01-01", "NaT", "2020-01-02"], "datetime64[D]"),
+        "half": np.array([1.5, nan, 2.0], np.float16),
+        "brain": jnp.array([1.5, nan, 2.0], jnp.bfloat16),
+    }
+    vx.io.write_csv(path, table)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert lines == [
+        "float,none,masked,date,half,brain",
+        "1.5,1.5,1,2020-01-01,1.5,1.5",
+        ",,,,,",
+        "Inf,text,3,2020-01-02,2.0,2.0",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("table", "error", "message"),
+    [
+        ([1, 2], TypeError, "`table` must hold columns by name, .* type list"),
+        ({"a": [1j]}, TypeError, "Column `a` must hold numbers, booleans or text, but holds"),
+        ({"a": [b"x"]}, TypeError, "Column `a` must hold numbers, booleans or text, but holds"),
+        ({"a": [{}]}, TypeError, "Column `a` must hold numbers, booleans or text, but holds"),
+        ({"a": [[1], [2, 3]]}, ValueError, "Column `a` must hold one entry a row"),
+    ],
+)
+def test_what_is_no_table_is_refused(tmp_path, table, error, message, as_a_user):
+    path = tmp_path / "table.csv"
+    with pytest.raises(error, match=message):
+        vx.io.write_csv(path, table)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("read", [vx.io.cell_table, vx.io.edge_table])
+def test_tables_are_of_one_tissue(read, as_a_user):
+    tissue = random_tissue(5)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
+    with pytest.raises(ValueError, match=r"one by one: jax.tree.map\(lambda x: x\[0\], tissue\)"):
+        read(batch)
+    member = jax.tree.map(lambda x: x[0], batch)  # what the message says
+    np.testing.assert_array_equal(read(member)["on_outline"], read(tissue)["on_outline"])
+    with pytest.raises(TypeError, match=r"`tissue` must be a vertax.Tissue, but is None"):
+        read(None)
+    with pytest.raises(TypeError, match=r"does not work inside jax.jit.*Call it outside"):
+        jax.jit(lambda tissue: read(tissue)["on_outline"])(tissue)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"cells": {"a": np.full(5, 1j)}}, TypeError, "Column `a` must hold .* which is what JSON"),
+        (
+            {"cells": {"a": np.full(5, b"x")}},
+            TypeError,
+            "Column `a` must hold .* which is what JSON",
+        ),
+        ({"cells": np.ones(5)}, TypeError, "Columns of the cells must be given by name"),
+        ({"edges": [1]}, TypeError, "Columns of the edges must be given by name"),
+        ({"points_per_arc": 1.5}, TypeError, "`points_per_arc` must be at least 1"),
+    ],
+)
+def test_what_has_no_place_in_geojson(tmp_path, options, error, message, as_a_user):
+    path = tmp_path / "cells.geojson"
+    with pytest.raises(error, match=message):
+        vx.io.write_geojson(path, random_tissue(5), **options)
+    assert not path.exists()
+
+
+def test_dates_are_text_in_geojson(tmp_path):
+    path = tmp_path / "cells.geojson"
+    dates = np.full(5, "2020-01-02", "datetime64[D]")
+    vx.io.write_geojson(path, random_tissue(5), cells={"seen": dates})
+    features = json.loads(path.read_text(encoding="utf-8"))["features"]
+    assert [feature["properties"]["seen"] for feature in features] == ["2020-01-02"] * 5
+
+
+@pytest.mark.parametrize("write", [vx.io.save_tissue, lambda path, tissue: vx.io.to_tables(tissue)])
+def test_what_is_no_tissue_is_not_written(tmp_path, write, as_a_user):
+    with pytest.raises(TypeError, match=r"`tissue` must be a vertax.Tissue, but is 'tissue'"):
+        write(tmp_path / "tissue.npz", "tissue")
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (
+            lambda t: None,
+            TypeError,
+            "`tables` must be vertax.io.Tables or BoundedTables, but is None",
+        ),
+        (tuple, TypeError, r"type tuple. Write Tables\(vert_table"),
+        (lambda t: t._replace(width="a"), TypeError, "`width` must be one real number, but is 'a'"),
+        (lambda t: t._replace(width=np.ones(2)), ValueError, "`width` must be one number"),
+        (lambda t: t._replace(height=np.nan), ValueError, "`height` must be positive"),
+    ],
+)
+def test_what_are_no_tables_is_named(change, error, message, as_a_user):
+    with pytest.raises(error, match=message):
+        vx.io.from_tables(change(vx.io.to_tables(random_tissue(5))))
+
+
+@pytest.mark.parametrize(
+    "classes", [["a"], vx.energies.LineTension, [vx.energies.LineTension(1.0)]]
+)
+def test_what_are_no_classes_is_named(tmp_path, classes, as_a_user):
+    path = tmp_path / "energy.npz"
+    vx.io.save_energy(path, vx.energies.LineTension(1.0))
+    with pytest.raises(TypeError, match="`classes` must"):
+        vx.io.load_energy(path, classes=classes)

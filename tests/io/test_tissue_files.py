@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import rewritten
+from helpers import random_tissue, rewritten
 
 import vertax as vx
 from vertax.io import atomic_write, load_tissue, save_tissue
@@ -270,3 +270,15 @@ class TestAtomicWrite:
         with pytest.raises(IsADirectoryError, match="is a folder"), atomic_write(tmp_path):
             pass
         assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["twin", "cell", "frame", "edge", "half_edge"])
+@pytest.mark.parametrize("value", [-1, 10**6, 2**31, 2**32, 2**62])
+def test_a_number_that_numbers_nothing_is_named(tmp_path, name, value):
+    path = tmp_path / "tissue.npz"
+    vx.io.save_tissue(path, random_tissue(5))
+    with np.load(path) as archive:
+        array = archive[name].astype(np.int64)
+    array.flat[7] += value
+    with pytest.raises(ValueError, match=r"tissue.npz is broken: .*(half-edge|twin|edge|tissue)"):
+        vx.io.load_tissue(rewritten(path, **{name: array}))

@@ -1,5 +1,7 @@
+import copy
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,7 +62,7 @@ def _swap_twins(twin):
 
 def _set(index, value):
     def change(array):
-        array = array.copy()
+        array = array.astype(np.int64)
         array[index] = value
         return array
 
@@ -78,6 +80,19 @@ def _set(index, value):
         ({"cell": lambda c: np.where(c == 4, 3, c)}, "broken"),
         ({"cell": lambda c: np.where(c == 4, 40, c)}, "every cell must have half-edges"),
         ({"cell": lambda c: c[:-1]}, "`cell` must have one entry"),
+        (
+            {"cell": _set(0, 2**40)},
+            "fewer than half-edges, but goes from 0 to",
+        ),
+        ({"cell": lambda c: c - 1}, "but goes from -1 to"),
+        ({"cell": lambda c: c + 0.0}, "`cell` must hold integers, but its type is float64"),
+        ({"twin": lambda t: t + 0.0}, "`twin` must hold integers"),
+        ({"twin": _set(0, 2**40)}, "involution"),
+        ({"twin": _set(0, -1)}, "involution"),
+        ({"frame": lambda f: f + 0.5}, "`frame` must hold integers"),
+        ({"frame": _set((0, 1), 2**40)}, "`frame` must hold lattice images that 32 bits"),
+        ({"edge": _set(0, 2**40)}, "`edge` must give each half-edge a number"),
+        ({"edge": lambda e: e + 0.0}, "`edge` must give each half-edge a number"),
         ({"frame": _set((0, 1), 7)}, "opposite lattice offsets"),
         ({"frame": lambda f: f[:, :1]}, "two entries"),
         ({"edge": _set(0, 3)}, "`edge`|edge number"),
@@ -161,3 +176,59 @@ def test_flipping_nothing_changes_nothing():
     m = random_tissue(16, 3).topology
     same = flip(m, jnp.zeros(m.n_edges, bool))
     assert all(jax.tree.leaves(jax.tree.map(lambda a, b: bool((a == b).all()), m, same)))
+
+
+def _same(one, other):
+    assert (one.n_cells, one.exterior) == (other.n_cells, other.exterior)
+    for name in ("twin", "cell", "frame", "edge", "half_edge"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+@pytest.mark.parametrize("numbered", [False, True])
+@pytest.mark.parametrize("free", [False, True])
+def test_inside_jit_and_vmap_it_is_the_same(free, numbered):
+    make = vx.initialise.free_voronoi if free else vx.initialise.periodic_voronoi
+    topologies = [make(9, key=jax.random.key(seed)).topology for seed in (1, 2)]
+    # (Free clusters of as many cells need not have as many vertices.)
+    topologies = topologies if not free else topologies[:1] * 2
+    arrays = lambda m: (m.twin, m.cell, m.frame) + ((m.edge,) if numbered else ())
+    build = lambda *arrays: vx.Topology(*arrays, exterior=free)
+    plain = [build(*arrays(m)) for m in topologies]
+    _same(jax.jit(build)(*arrays(topologies[0])), plain[0])
+    many = jax.vmap(build)(
+        *(jnp.stack(pair) for pair in zip(*map(arrays, topologies), strict=True))
+    )
+    for k in range(2):
+        _same(jax.tree.map(lambda x, k=k: x[k], many), plain[k])
+
+
+def test_inside_jit_shapes_and_types_are_checked():
+    m = random_tissue(8).topology
+    build = jax.jit(vx.Topology)
+    with pytest.raises(ValueError, match="`twin` must list three half-edges"):
+        build(m.twin[:-1], m.cell, m.frame)
+    with pytest.raises(ValueError, match="`cell` must have one entry"):
+        build(m.twin, m.cell[:-1], m.frame)
+    with pytest.raises(ValueError, match="`frame` must have two entries"):
+        build(m.twin, m.cell, m.frame[:, :1])
+    with pytest.raises(ValueError, match="`cell` must hold integers"):
+        build(m.twin, m.cell + 0.5, m.frame)
+    with pytest.raises(ValueError, match="`edge` must give each half-edge"):
+        build(m.twin, m.cell, m.frame, m.edge[:-1])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("half_edge", 2**30), ("half_edge", -1), ("twin", 2**30), ("edge", -7)]
+)
+def test_numbers_out_of_range_are_found(field, value):
+    m = random_tissue(8).topology
+    broken = eqx.tree_at(lambda m: getattr(m, field), m, getattr(m, field).at[3].set(value))
+    with pytest.raises(ValueError, match=f"`{field}` must lie in 0 … "):
+        broken.validate()
+
+
+def test_a_number_of_cells_out_of_range_is_found():
+    m = copy.copy(random_tissue(8).topology)
+    object.__setattr__(m, "n_cells", 10**12)  # as a file may have it
+    with pytest.raises(ValueError, match="no more than half-edges"):
+        m.validate()

@@ -96,7 +96,9 @@ def instead(monkeypatch):
     """Puts another function in the place of the experiment: nothing to compile."""
 
     def instead(run):
-        monkeypatch.setattr(importlib.import_module("vertax.experiments.infer_shape_factors"), "run", run)
+        monkeypatch.setattr(
+            importlib.import_module("vertax.experiments.infer_shape_factors"), "run", run
+        )
 
     return instead
 

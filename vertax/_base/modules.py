@@ -32,6 +32,13 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
+def differs_between_devices(array: jax.Array) -> bool:
+    """Whether `jax.shard_map` keeps track of an array as one that differs from device to device."""
+    kind = jax.typeof(array)
+    newer = getattr(getattr(kind, "mat", None), "varying", None)  # as of JAX 0.10
+    return bool(newer or getattr(kind, "vma", None))
+
+
 def traced(tree: Tree, *, integers: bool = False) -> Tree:
     """The same pytree with its Python floats (and integers) as arrays.
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from functools import partial
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from vertax._base.checks import as_real, check_number
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Free, Tissue
@@ -47,8 +49,7 @@ def aspect_ratio(tissue: Tissue, measure: Measure = "moments") -> Float[Array, "
             "The aspect ratio is that of an outline, which only a free tissue has, but the boundary is "
             f"{type(tissue.boundary).__name__}."
         )
-    if measure not in ("moments", "farthest"):
-        raise ValueError(f"Argument `measure` must be 'moments' or 'farthest', but is {measure!r}.")
+    _check_measure(measure)
     return _from_moments(tissue) if measure == "moments" else _from_farthest(tissue)
 
 
@@ -59,20 +60,32 @@ class AspectRatio(AbstractLeastSquaresCost):
 
     **Arguments:**
 
-    - `target`: the ratio to reach, above 1.
+    - `target`: the ratio to reach, at least 1.
     - `measure`: how the ratio is measured, see [`aspect_ratio`][vertax.costs.aspect_ratio].
 
     **Raises:**
 
-    - `ValueError` for a periodic tissue or another measure.
+    - `ValueError` for a target below 1, a periodic tissue or another measure.
     """
 
-    target: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
     measure: Measure = eqx.field(static=True, default="moments")
+
+    def __check_init__(self):
+        check_number("target", self.target, least=1, many=True)
+        _check_measure(self.measure)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The distance, times the root of 2: the paper's cost is the square, not half of it."""
+        check_number("target", self.target)
         return jnp.sqrt(2.0) * (aspect_ratio(tissue, self.measure) - self.target)[None]
+
+
+def _check_measure(measure: str) -> None:
+    if measure not in get_args(Measure):
+        raise ValueError(
+            f"Argument `measure` must be one of {get_args(Measure)}, but is {measure!r}."
+        )
 
 
 def _from_moments(tissue: Tissue) -> Float[Array, ""]:

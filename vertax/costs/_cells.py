@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vertax._base.checks import as_real, check_number
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -25,10 +28,11 @@ class MeanShapeFactor(AbstractLeastSquaresCost):
     - `target`: the mean shape factor to reach, dimensionless.
     """
 
-    target: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The distance, times the root of 2: the paper's cost is the square, not half of it."""
+        check_number("target", self.target)
         return jnp.sqrt(2.0) * (jnp.mean(tissue.shape_factors) - self.target)[None]
 
 
@@ -41,10 +45,13 @@ class CellAreas(AbstractLeastSquaresCost):
 
     **Raises:**
 
-    - `ValueError` if the number of areas is not that of the cells.
+    - `ValueError` if the number of areas is not that of the cells, or one is not positive.
     """
 
-    target: Float[Array, "*cells"] = eqx.field(converter=jnp.asarray)
+    target: Float[Array, "*cells"] = eqx.field(converter=partial(as_real, "target"))
+
+    def __check_init__(self):
+        check_number("target", self.target, above=0, many=True)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """Differences of areas over the root of the number of cells."""

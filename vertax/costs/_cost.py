@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from vertax._base.checks import check_number
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 
@@ -47,10 +48,17 @@ class AbstractCost(eqx.Module):
         """The cost times a number."""
         if isinstance(weight, AbstractCost):
             return NotImplemented
+        check_number("weight (of a cost)", weight)
         weights, costs = _parts(self)
         return WeightedSum(jnp.asarray(weight) * weights, costs)
 
     __rmul__ = __mul__
+    # A NumPy array on the left would make an array of costs.
+    __array_ufunc__ = None
+
+    def __radd__(self, other: int) -> AbstractCost:
+        """What `sum` of some costs begins with: 0 and the first one."""
+        return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
 class AbstractLeastSquaresCost(AbstractCost):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from vertax._base.checks import as_doubles, as_real, check_number, check_whole
 from vertax._base.modules import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
@@ -50,11 +51,24 @@ def render(
 
     **Raises:**
 
-    - `TypeError` for a boundary of another kind; `ValueError` for too small an image, and if
-        `pixel_size` is missing or too much.
+    - `TypeError` for a boundary of another kind; `ValueError` for too small an image, a width, number of
+        points or pixel size that is not positive, a batch, and if `pixel_size` is missing or too much.
     """
+    if len(np.shape(shape)) != 1 or len(shape) != 2:
+        raise ValueError(f"Argument `shape` must be (rows, columns), but is {shape}.")
+    for side in shape:
+        check_whole("shape", side)
     if min(shape) < _SPLINE_POINTS:
         raise ValueError(f"Argument `shape` must be at least 6 × 6 pixels, but is {shape}.")
+    check_number("psf_width", psf_width, above=0)
+    check_whole("points_per_edge", points_per_edge, least=1)
+    if pixel_size is not None:
+        check_number("pixel_size", pixel_size, above=0)
+    if tissue.vertices.ndim != 2:
+        raise ValueError(
+            f"Argument `tissue` must be a single tissue, but its vertices have shape "
+            f"{tissue.vertices.shape}. Take a batch through equinox.filter_vmap."
+        )
     lattice, (rows, columns) = _canvas(tissue.boundary, shape, pixel_size)
     dtype = tissue.vertices.dtype
     nodes, weights = np.polynomial.legendre.leggauss(points_per_edge)
@@ -169,35 +183,32 @@ class MeshImage(AbstractLeastSquaresCost):
         fit_intensity: bool = True,
         pixel_size: float | Float[Array, ""] | None = None,
     ):
-        pixels = np.asarray(image, float)
+        # Inside jax.vmap the numbers of an image are not there to be looked at.
+        known = is_concrete(image) and is_concrete(weight)
+        xp, convert = (np, as_doubles) if known else (jnp, as_real)
+        pixels = convert("image", image)
         if pixels.ndim != 2 or min(pixels.shape) < _SPLINE_POINTS:
             raise ValueError(
                 "Argument `image` must be two-dimensional and at least 6 × 6 pixels, but its shape is "
                 f"{pixels.shape}."
             )
-        if not np.isfinite(pixels).all():
-            raise ValueError("Argument `image` must be finite, but holds NaN or infinity.")
-        weights = np.ones_like(pixels) if weight is None else np.asarray(weight, float)
+        weights = xp.ones_like(pixels) if weight is None else convert("weight", weight)
         if weights.shape != pixels.shape:
             raise ValueError(
                 f"Argument `weight` must have the shape of the image, {pixels.shape}, but has "
                 f"{weights.shape}."
             )
-        if not (weights >= 0).all() or not weights.sum() > 0:
+        if known and (not (weights >= 0).all() or not weights.sum() > 0):
             raise ValueError(
                 "Argument `weight` must be at least 0 everywhere and positive somewhere."
             )
-        if is_concrete(psf_width) and not psf_width > 0:
-            raise ValueError(f"Argument `psf_width` must be positive, but is {psf_width}.")
-        if points_per_edge < 1:
-            raise ValueError(
-                f"Argument `points_per_edge` must be at least 1, but is {points_per_edge}."
-            )
+        check_number("psf_width", psf_width, above=0)
+        check_whole("points_per_edge", points_per_edge, least=1)
         weights = weights / weights.sum()
         if fit_intensity:
             mean = (weights * pixels).sum()
-            deviation = np.sqrt((weights * (pixels - mean) ** 2).sum())
-            if not deviation > 1e-12 * np.abs(pixels).max():
+            deviation = xp.sqrt((weights * (pixels - mean) ** 2).sum())
+            if known and not deviation > 1e-12 * np.abs(pixels).max():
                 raise ValueError("Argument `image` must show something, but is constant.")
             pixels = (pixels - mean) / deviation
         self.image = jnp.asarray(pixels)
@@ -205,8 +216,8 @@ class MeshImage(AbstractLeastSquaresCost):
         self.weight = jnp.asarray(weights)
         self.points_per_edge = points_per_edge
         self.fit_intensity = fit_intensity
-        if pixel_size is not None and is_concrete(pixel_size) and not pixel_size > 0:
-            raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
+        if pixel_size is not None:
+            check_number("pixel_size", pixel_size, above=0)
         self.pixel_size = None if pixel_size is None else jnp.asarray(pixel_size, self.image.dtype)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
@@ -232,6 +243,20 @@ def mirror(image: np.ndarray) -> np.ndarray:
 
     The way of the paper to make a micrograph periodic; goes with
     `vertax.initialise.from_labels(…, boundary="mirrored")`.
+
+    **Arguments:**
+
+    - `image`: shape (rows, columns).
+
+    **Returns:** the image, the original at the top left.
+
+    **Raises:**
+
+    - `ValueError` for an image that is not two-dimensional.
     """
+    if np.ndim(image) != 2:
+        raise ValueError(
+            f"Argument `image` must have shape (rows, columns), but its shape is {np.shape(image)}."
+        )
     image = np.concatenate([image, image[:, ::-1]], axis=1)
     return np.concatenate([image, image[::-1]], axis=0)

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
+from vertax._base.checks import as_real
+from vertax._base.modules import is_concrete
 from vertax.costs._cost import AbstractCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._topology import take
+
+
+def _as_types(value: ArrayLike | Sequence[int]) -> Int[Array, "..."]:
+    """Whole numbers as integers."""
+    types = as_real("cell_types", value)
+    if is_concrete(types) and not bool(jnp.all(types == jnp.round(types))):
+        raise ValueError(
+            "Argument `cell_types` must hold whole numbers, one for each type, but holds fractions. "
+            "numpy.unique(types, return_inverse=True)[1] numbers what is anything else."
+        )
+    return types.astype(int)
 
 
 class HomotypicLength(AbstractCost):
@@ -32,10 +47,11 @@ class HomotypicLength(AbstractCost):
 
     **Raises:**
 
-    - `ValueError` if the number of types is not that of the cells.
+    - `ValueError` if the number of types is not that of the cells, or for types that are no whole numbers.
+    - `TypeError` for types that are no numbers.
     """
 
-    cell_types: Int[Array, " cells"] = eqx.field(converter=jnp.asarray)
+    cell_types: Int[Array, " cells"] = eqx.field(converter=_as_types)
     relative: bool = eqx.field(static=True, default=False)
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.checks import check_whole, named
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -44,6 +45,7 @@ class VertexDistance(AbstractLeastSquaresCost):
     match: Matching = eqx.field(static=True, default="number")
 
     def __check_init__(self):
+        check_target("VertexDistance", self.target)
         if self.match not in get_args(Matching):
             raise ValueError(
                 f"Argument `match` of VertexDistance must be one of {get_args(Matching)}, but is "
@@ -52,12 +54,12 @@ class VertexDistance(AbstractLeastSquaresCost):
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """Displacements from the target over the root of the number of vertices."""
-        check_equal(type(self).__name__, tissue, self.target, "vertices")
+        check_equal(type(self).__name__, tissue, self.target, "vertices", place=True)
         goal = self.target.vertices
         if self.match == "cells":
             check_equal(type(self).__name__, tissue, self.target, "cells")
-            counterpart, found = matching_vertices(tissue, self.target)
-            goal = jnp.where(found[:, None], take(goal, counterpart), tissue.vertices)
+            counterpart, matched = matching_vertices(tissue, self.target)
+            goal = jnp.where(matched[:, None], take(goal, counterpart), tissue.vertices)
         displacement = tissue.boundary.shortest(tissue.vertices - goal)
         return displacement.ravel() / jnp.sqrt(1.0 * tissue.n_vertices)
 
@@ -88,15 +90,12 @@ class EdgeDistance(AbstractLeastSquaresCost):
     points_per_edge: int = eqx.field(static=True, default=5)
 
     def __check_init__(self):
-        if self.points_per_edge < 2:
-            raise ValueError(
-                "Argument `points_per_edge` of EdgeDistance must be at least 2, but is "
-                f"{self.points_per_edge}."
-            )
+        check_target("EdgeDistance", self.target)
+        check_whole("points_per_edge", self.points_per_edge, least=2)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """Displacements of points on edges, times the root of the share of length they stand for."""
-        check_equal(type(self).__name__, tissue, self.target, "edges")
+        check_equal(type(self).__name__, tissue, self.target, "edges", place=True)
         fractions = (jnp.arange(self.points_per_edge) + 0.5) / self.points_per_edge
         fractions = fractions.astype(tissue.vertices.dtype)
         goal = self.target.edge_points(fractions)
@@ -126,9 +125,12 @@ class CentroidDistance(AbstractLeastSquaresCost):
 
     target: Tissue
 
+    def __check_init__(self):
+        check_target("CentroidDistance", self.target)
+
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """Displacements from the target over the root of the number of cells."""
-        check_equal(type(self).__name__, tissue, self.target, "cells")
+        check_equal(type(self).__name__, tissue, self.target, "cells", place=True)
         displacement = tissue.boundary.shortest(tissue.centroids - self.target.centroids)
         return displacement.ravel() / jnp.sqrt(1.0 * tissue.n_cells)
 
@@ -157,8 +159,8 @@ def matching_vertices(
     # Rows that are no pair write to a place past the end, which is dropped.
     place = jnp.where(pair, first, n)
     counterpart = jnp.zeros(n, order.dtype).at[place].set(second - n, mode="drop")
-    found = jnp.zeros(n, bool).at[place].set(True, mode="drop")
-    return counterpart, found
+    matched = jnp.zeros(n, bool).at[place].set(True, mode="drop")
+    return counterpart, matched
 
 
 def _meeting_cells(tissue: Tissue) -> Int[Array, "vertices 3"]:
@@ -169,19 +171,41 @@ def _meeting_cells(tissue: Tissue) -> Int[Array, "vertices 3"]:
     return jnp.take_along_axis(turns, first[:, None, None], axis=1)[:, 0]
 
 
-def check_equal(who: str, tissue: Tissue, target: Tissue, name: str) -> None:
-    """Refuse a target with another number of something.
+def check_target(who: str, target: Tissue) -> None:
+    """Refuse a target that is no tissue with a `TypeError`."""
+    if not isinstance(target, Tissue):
+        raise TypeError(f"The target of {who} must be a Tissue, but is {named(target)}.")
+
+
+def check_equal(
+    who: str, tissue: Tissue, target: Tissue, name: str, *, place: bool = False
+) -> None:
+    """Refuse a target with another number of something, or a batch.
 
     **Arguments:**
 
     - `who`: what compares them.
     - `tissue`, `target`: the tissues.
     - `name`: what there must be equally many of, e.g. `"cells"`.
+    - `place`: whether both must also lie in the same kind of space.
 
     **Raises:**
 
-    - `ValueError` if there are not.
+    - `TypeError` if the target is no tissue.
+    - `ValueError` if there are not equally many.
     """
+    check_target(who, target)
+    for each in (tissue, target):
+        if each.vertices.ndim != 2:
+            raise ValueError(
+                f"{who} compares a single tissue with a single target, but vertices have shape "
+                f"{each.vertices.shape}. Take a batch through equinox.filter_vmap, costs included."
+            )
+    ours, theirs = (type(t.boundary).__name__ for t in (tissue, target))
+    if place and ours != theirs:
+        raise ValueError(
+            f"The target of {who} must have the boundary of the tissue, {ours}, but has {theirs}."
+        )
     ours, theirs = (getattr(t, f"n_{name}") for t in (tissue, target))
     if ours != theirs:
         raise ValueError(

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
-from vertax._base.modules import is_concrete
+from vertax._base.checks import check_number
 from vertax.costs._cost import AbstractCost
-from vertax.costs._positions import check_equal
+from vertax.costs._positions import check_equal, check_target
 from vertax.costs._transport import entropic_transport
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -60,12 +60,11 @@ class IndexAwareStructural(AbstractCost):
     softening: Float[Array, ""] | float = 0.1
 
     def __check_init__(self):
+        check_target("IndexAwareStructural", self.target)
         for name in ("interface_length", "epsilon", "softening"):
             value = getattr(self, name)
-            if value is not None and is_concrete(value) and not np.all(np.asarray(value) > 0):
-                raise ValueError(
-                    f"Argument `{name}` of IndexAwareStructural must be positive, but is {value}."
-                )
+            if value is not None:
+                check_number(name, value, above=0, many=True)
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Cost of the optimal transport between the structures."""
@@ -95,7 +94,13 @@ def adjacency(
         left out, cells that touch count 1, however often they do.
 
     **Returns:** the matrix; the exterior of a free tissue is left out.
+
+    **Raises:**
+
+    - `ValueError` for an interface length that is not positive.
     """
+    if interface_length is not None:
+        check_number("interface_length", interface_length, above=0)
     m = tissue.topology
     left, right = m.edge_cells.T
     weights = jnp.ones(tissue.n_edges, tissue.vertices.dtype)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from vertax._base.checks import check_number
 from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_cell
 from vertax.mesh import Tissue
 
@@ -22,10 +25,21 @@ class ShapeFactorEnergy(AbstractLocalEnergy):
 
     - `target_shape_factor`: $p^0$, dimensionless; scalar or one a cell.
     - `mean_area`: $A_0$, in units of length squared; scalar or one a cell.
+
+    **Raises:**
+
+    - `ValueError` for a mean area that is not positive.
     """
 
-    target_shape_factor: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
-    mean_area: float | Float[Array, "*cells"] = eqx.field(default=1.0, converter=as_parameter)
+    target_shape_factor: float | Float[Array, "*cells"] = eqx.field(
+        converter=partial(as_parameter, "target_shape_factor")
+    )
+    mean_area: float | Float[Array, "*cells"] = eqx.field(
+        default=1.0, converter=partial(as_parameter, "mean_area")
+    )
+
+    def __check_init__(self):
+        check_number("mean_area", self.mean_area, above=0, many=True)
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""
@@ -45,8 +59,12 @@ class AreaElasticity(AbstractLocalEnergy):
     - `target_area`: $A^0$; scalar or one a cell.
     """
 
-    stiffness: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
-    target_area: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
+    stiffness: float | Float[Array, "*cells"] = eqx.field(
+        converter=partial(as_parameter, "stiffness")
+    )
+    target_area: float | Float[Array, "*cells"] = eqx.field(
+        converter=partial(as_parameter, "target_area")
+    )
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""
@@ -71,8 +89,12 @@ class PerimeterElasticity(AbstractLocalEnergy):
     - `target_perimeter`: $P^0$; scalar or one a cell.
     """
 
-    stiffness: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
-    target_perimeter: float | Float[Array, "*cells"] = eqx.field(converter=as_parameter)
+    stiffness: float | Float[Array, "*cells"] = eqx.field(
+        converter=partial(as_parameter, "stiffness")
+    )
+    target_perimeter: float | Float[Array, "*cells"] = eqx.field(
+        converter=partial(as_parameter, "target_perimeter")
+    )
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from vertax._base.checks import as_real
 from vertax.mesh import Tissue
 
 
@@ -45,6 +46,10 @@ class AbstractEnergy(eqx.Module):
         terms = (*_terms(self), *_terms(other))
         local = tuple(term for term in terms if isinstance(term, AbstractLocalEnergy))
         return LocalSum(local) if len(local) == len(terms) else Sum(terms)
+
+    def __radd__(self, other: int) -> AbstractEnergy:
+        """What `sum` of some energies begins with: 0 and the first one."""
+        return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
 class AbstractLocalEnergy(AbstractEnergy):
@@ -101,22 +106,41 @@ Parameter: TypeAlias = float | Float[Array, "*shape"]
 """A parameter of an energy: an array, which is what a fit adjusts by default, or a constant float."""
 
 
-def as_parameter(value: ArrayLike) -> Parameter:
-    """A Python number stays one, a constant; anything else becomes an array."""
-    return float(value) if isinstance(value, int | float) else jnp.asarray(value)
+def as_parameter(name: str, value: ArrayLike) -> Parameter:
+    """A Python number stays one, a constant; anything else becomes an array of floating-point numbers.
+
+    **Arguments:**
+
+    - `name`: of the parameter.
+    - `value`: the parameter.
+
+    **Returns:** a float or an array.
+
+    **Raises:**
+
+    - `TypeError` for what are no real numbers.
+    - `ValueError` for NaN and infinity.
+    """
+    array = as_real(name, value)
+    return float(value) if isinstance(value, int | float) else array
 
 
 def per_cell(values: Parameter, tissue: Tissue, name: str) -> Parameter:
     """Check that a parameter is a scalar or has one entry a cell."""
-    return _check(values, tissue.n_cells, name, "cell")
+    return _check(values, tissue, tissue.n_cells, name, "cell")
 
 
 def per_edge(values: Parameter, tissue: Tissue, name: str) -> Parameter:
     """Check that a parameter is a scalar or has one entry an edge."""
-    return _check(values, tissue.n_edges, name, "edge")
+    return _check(values, tissue, tissue.n_edges, name, "edge")
 
 
-def _check(values: Parameter, size: int, name: str, what: str) -> Parameter:
+def _check(values: Parameter, tissue: Tissue, size: int, name: str, what: str) -> Parameter:
+    if tissue.vertices.ndim != 2:
+        raise ValueError(
+            "An energy is that of a single tissue, but the vertices have shape "
+            f"{tissue.vertices.shape}. Take a batch through equinox.filter_vmap."
+        )
     if jnp.shape(values) not in ((), (size,)):
         raise ValueError(
             f"Parameter `{name}` must be a scalar or have one entry a {what}, shape ({size},), but its "

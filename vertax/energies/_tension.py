@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from vertax._base.checks import as_real, check_number
 from vertax._base.modules import is_concrete
 from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_edge
 from vertax.mesh import Tissue
@@ -23,7 +26,7 @@ class LineTension(AbstractLocalEnergy):
     - `tension`: line tension $\gamma$, energy per length; scalar or one an edge.
     """
 
-    tension: float | Float[Array, "*edges"] = eqx.field(converter=as_parameter)
+    tension: float | Float[Array, "*edges"] = eqx.field(converter=partial(as_parameter, "tension"))
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
         """Energy of each edge."""
@@ -55,9 +58,11 @@ class BoundedTension(AbstractLocalEnergy):
     high: float
 
     def __init__(self, tension: ArrayLike, low: float, high: float):
+        check_number("low", low)
+        check_number("high", high)
         if not low < high:
             raise ValueError(f"Argument `low` must be below `high`, but they are {low} and {high}.")
-        tension = jnp.asarray(tension, jnp.result_type(float))
+        tension = as_real("tension", tension).astype(jnp.result_type(float))
         if is_concrete(tension) and not jnp.all((tension > low) & (tension < high)):
             raise ValueError(
                 f"Argument `tension` must lie between {low} and {high}, but goes from {tension.min()} "

@@ -170,28 +170,28 @@ _REMEDY = "Delete the file to start this fit anew."
 
 def _check_identity(name: str, text: str, wanted: Mapping[str, str]) -> None:
     try:
-        found = json.loads(text)
+        stored = json.loads(text)
     except json.JSONDecodeError:
-        found = {}
+        stored = {}
     for part, value in wanted.items():
-        if found.get(part) != value:
+        if stored.get(part) != value:
             raise ValueError(
-                f"{name} is the checkpoint of a fit with another {part}{_difference(found, part, value)}. "
+                f"{name} is the checkpoint of a fit with another {part}{_difference(stored, part, value)}. "
                 f"Give the same one again, or choose another file as `checkpoint`. {_REMEDY}"
             )
 
 
-def _difference(found: Mapping[str, str], part: str, value: str) -> str:
+def _difference(stored: Mapping[str, str], part: str, value: str) -> str:
     """What stands in one description and not in the other."""
     then, now = (
-        [line.strip(" ,") for line in text.splitlines()] for text in (found.get(part, ""), value)
+        [line.strip(" ,") for line in text.splitlines()] for text in (stored.get(part, ""), value)
     )
     lines = (
         [line for line in then if line not in now][:1],
         [line for line in now if line not in then][:1],
     )
     # What a description leaves out has its default.
-    texts = [next(iter(own), "the default") for own in lines]
+    texts = [next(iter(only), "the default") for only in lines]
     return "" if max(map(len, texts)) > 60 or not any(lines) else f": {texts[0]} and not {texts[1]}"
 
 

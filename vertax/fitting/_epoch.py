@@ -70,7 +70,9 @@ def nothing_known(problem: InverseProblem) -> Facts:
 
 def unbeaten(problem: InverseProblem, parameters: PyTree[Array]) -> Best:
     facts = nothing_known(problem)
-    return Best(parameters, problem.tissue, facts, facts.cost, jnp.full((), -1))
+    return Best(
+        parameters, problem.tissue, facts, facts.cost, jnp.full((), -1, jnp.result_type(int))
+    )
 
 
 def better(

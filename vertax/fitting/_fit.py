@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
+from vertax.fitting._arguments import check_arguments
 from vertax.fitting._checkpoint import Checkpoint, Keeper, Progress, Row, columns_of, identity_of
 from vertax.fitting._descent import Descent
 from vertax.fitting._epoch import AbstractMethod
@@ -90,12 +91,12 @@ def fit(
         differ in their leading axis, for `guidance` of a least-squares solver, for a `callback` whose
         notes change their names, and for a checkpoint that is broken or that of another fit.
     - `FileNotFoundError` if there is no folder for the checkpoint.
-    - `TypeError` for a least-squares solver with a cost that is no sum of squares.
+    - `TypeError` for a least-squares solver with a cost that is no sum of squares, and for arguments of
+        another kind, such as an optimiser that is none.
     - [`FitError`][vertax.FitError] if cost or gradient are not finite or cannot be trusted, or if no
         epoch reached equilibrium; it carries the fit so far.
     """
-    if epochs < 1:
-        raise ValueError(f"Argument `epochs` must be at least 1, but is {epochs}.")
+    check_arguments(problem, optimiser, epochs, guidance, callback)
     parameters, constants = eqx.partition(problem.energy, problem.trainable)
     if not jax.tree.leaves(parameters):
         raise ValueError(

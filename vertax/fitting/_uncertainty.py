@@ -10,6 +10,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.checks import check_number
 from vertax.energies import AbstractEnergy
 from vertax.fitting._history import Fit
 from vertax.fitting._inverse import InverseProblem
@@ -22,12 +23,13 @@ class Uncertainty(eqx.Module):
     deviation: AbstractEnergy
     """Standard deviation of each fitted parameter, in its place in the energy; others are None."""
     covariance: Float[Array, "parameters parameters"]
-    """Covariance of all fitted parameters, flattened in the order of `jax.tree.leaves`; what the data do
-    not determine at all is left out of it."""
+    """Covariance of all fitted parameters, flattened in the order of `jax.tree.leaves`; what neither the
+    data nor a prior determine is left out of it."""
     directions: Float[Array, "combinations parameters"]
     """Combinations of parameters (orthonormal rows), from the worst determined to the best."""
     deviations: Float[Array, " combinations"]
-    """Standard deviation along each combination; infinite where the data say nothing."""
+    """Standard deviation along each combination; where the data say nothing that of the prior, infinite
+    without one."""
     noise: Float[Array, ""]
     """Standard deviation of the noise of a residual, estimated from what the fit left over."""
 
@@ -64,11 +66,18 @@ def uncertainty(
     **Raises:**
 
     - `TypeError` if the cost is no sum of squares.
-    - `ValueError` for a prior that is not positive, or if there are not more independent residuals than
-        parameters.
+    - `ValueError` for a prior that is not positive, for a batch, or if there are not more independent
+        residuals than parameters.
     """
-    if prior is not None and not prior > 0:
-        raise ValueError(f"Argument `prior` must be positive, but is {prior}.")
+    if prior is not None:
+        check_number("prior", prior, above=0)
+    if n_independent is not None:
+        check_number("n_independent", n_independent, above=0)
+    if problem.tissue.vertices.ndim != 2 or fit.tissue.vertices.ndim != 2:
+        raise ValueError(
+            "Arguments `problem` and `fit` must be single ones, but are a batch. Take a member of each: "
+            "jax.tree.map(lambda x: x[0] if equinox.is_array(x) else x, fit)."
+        )
     parameters, constants = eqx.partition(fit.energy, problem.trainable)
     flat, unravel = jfu.ravel_pytree(parameters)
     shift = jnp.zeros(2, flat.dtype) if problem.fit_position else None
@@ -81,26 +90,30 @@ def uncertainty(
             f"them and {n_fitted} parameters. Fit fewer, or raise `n_independent`."
         )
     variance = squares / (n_residuals * (1 - n_fitted / n_free))
-    # So many residuals speak for themselves; the others repeat what they say.
-    information = gram / variance * (n_free / n_residuals)
-    # Where the tissue lies is fitted too, and known only so well.
-    known, crossed, own = (
-        information[: len(flat), : len(flat)],
-        information[: len(flat), len(flat) :],
-        information[len(flat) :, len(flat) :],
+    # Where the tissue lies is fitted too, and known only so well. (A cost that does not see it leaves
+    # zeros, which the pseudo-inverse passes by.)
+    known, crossed, position = (
+        gram[: len(flat), : len(flat)],
+        gram[: len(flat), len(flat) :],
+        gram[len(flat) :, len(flat) :],
     )
     if shift is not None:
-        known = known - crossed @ jnp.linalg.solve(own, crossed.T)
-    if prior is not None:
-        known = known + prior**-2 * jnp.eye(len(flat), dtype=flat.dtype)
+        known = known - crossed @ jnp.linalg.pinv(position, hermitian=True) @ crossed.T
     values, vectors = jnp.linalg.eigh((known + known.T) / 2)
+    # What the data do not see is asked of the data alone: a prior adds the same to all directions.
     # Slopes through the equilibrium are known to about 1e-6, their squares to the square of that.
-    unknown = values <= 1e-10 * values[-1]
-    inverse = jnp.where(unknown, 0, 1 / jnp.where(unknown, 1, values))
+    unknown = (values <= 1e-10 * values[-1]) | (values <= 0)
+    # So many residuals speak for themselves; the others repeat what they say.
+    spread = variance * n_residuals / n_free
+    rest = 0.0 if prior is None else spread * prior**-2
+    seen = jnp.where(unknown, 0, spread / (jnp.where(unknown, 1, values) + rest))
+    unseen = jnp.where(unknown, jnp.inf if prior is None else prior**2, 0)
+    # The covariance has no place for infinity.
+    inverse = seen + jnp.where(jnp.isfinite(unseen), unseen, 0)
     covariance = (vectors * inverse) @ vectors.T
-    lost = jnp.sum(jnp.where(unknown, vectors**2, 0), axis=1) > 1e-9
+    lost = jnp.sum(jnp.where(jnp.isinf(unseen), vectors**2, 0), axis=1) > 1e-9
     deviation = jnp.where(lost, jnp.inf, jnp.sqrt(jnp.diag(covariance)))
-    along = jnp.where(unknown, jnp.inf, jnp.sqrt(inverse))
+    along = jnp.sqrt(seen + unseen)
     return Uncertainty(unravel(deviation), covariance, vectors.T, along, jnp.sqrt(variance))
 
 

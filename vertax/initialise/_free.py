@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from vertax._base.checks import as_key, check_concrete, check_whole
 from vertax.initialise._order import spatial_order
 from vertax.initialise._voronoi import tessellate
 from vertax.mesh import Free, Tissue, Topology
@@ -16,7 +17,7 @@ from vertax.mesh._arcs import angle_of_area
 def free_voronoi(
     n_cells: int,
     *,
-    key: PRNGKeyArray,
+    key: PRNGKeyArray | int,
     lloyd_steps: int = 0,
     random_angles: bool = False,
     inner_arcs: bool = False,
@@ -31,7 +32,7 @@ def free_voronoi(
     **Arguments:**
 
     - `n_cells`: number of cells, at least two.
-    - `key`: a key from `jax.random.key`.
+    - `key`: a key from `jax.random.key`, or a whole number as its seed.
     - `lloyd_steps`: number of Lloyd iterations, which make the cells more regular.
     - `random_angles`: draw the angles of the arcs uniformly from 0 to $\pi/2$, as in the paper.
     - `inner_arcs`, `softening`: passed on to [`Tissue`][vertax.Tissue].
@@ -41,16 +42,17 @@ def free_voronoi(
     **Raises:**
 
     - `ValueError` for fewer than two cells, or a negative number of Lloyd iterations.
+    - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`: how a tissue is
+        connected depends on numbers, which are not known there.
     """
-    if n_cells < 2:
-        raise ValueError(f"Argument `n_cells` must be at least 2, but is {n_cells}.")
-    if lloyd_steps < 0:
-        raise ValueError(f"Argument `lloyd_steps` must be at least 0, but is {lloyd_steps}.")
+    check_concrete("free_voronoi", key)
+    check_whole("n_cells", n_cells, least=2)
+    check_whole("lloyd_steps", lloyd_steps, least=0)
     dtype = jnp.result_type(float)
     # A periodic box of seeds, so that no cell is unbounded, with a margin of three cells.
     n_seeds = int(np.ceil((2 * np.sqrt(n_cells / np.pi) + 6) ** 2))
     box = np.sqrt(n_seeds) * np.eye(2)
-    seed_key, angle_key = jax.random.split(key)
+    seed_key, angle_key = jax.random.split(as_key(key))
     fractions = np.asarray(jax.random.uniform(seed_key, (n_seeds, 2), dtype), float)
     seeds = (fractions[spatial_order(fractions)] - 0.5) @ box
     seeds, vertices, topology = tessellate(seeds, box, lloyd_steps)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Shaped
+from jaxtyping import Array, Bool, Int, Integer, Shaped
 
+from vertax._base.checks import check_concrete, check_number, check_whole
 from vertax.initialise._cracks import Mesh, crack_graph
 from vertax.initialise._repairs import (
     fill_gaps,
@@ -47,6 +50,8 @@ class Segmentation(eqx.Module):
     """Length of a pixel side, in the tissue's unit of length."""
     image_shape: tuple[int, int] = eqx.field(static=True)
     """Rows and columns of the given mask."""
+    background: int | None = eqx.field(static=True, default=None)
+    """The positive label in the mask that was taken for the background, if there is one."""
 
 
 def from_labels(
@@ -55,6 +60,7 @@ def from_labels(
     boundary: str = "mirrored",
     pixel_size: float | None = None,
     gap_width: float = 3.0,
+    background: int | None = None,
     softening: float | None = None,
     inner_arcs: bool = False,
 ) -> Segmentation:
@@ -67,7 +73,8 @@ def from_labels(
 
     Not every label image is a trivalent mesh. First it is repaired:
 
-    - pixels with label 0 or less are gaps, and go to the nearest label;
+    - pixels with label 0 or less, and of the background, are gaps, and go to the nearest label. One
+        label all along the border of the image, which so surrounds all others, is the background;
     - of a label in several pieces the largest stays (pixels hang together by their sides, not by
         their corners); each other piece goes to the neighbour with the longest common interface;
     - a label inside another (alone or in a group) goes to the one around it;
@@ -96,6 +103,8 @@ def from_labels(
     - `pixel_size`: length of a pixel side; by default such that the mean cell area is 1.
     - `gap_width`: how wide lines between cells may be, in pixels, not to be taken for a part of the
         exterior of a free tissue.
+    - `background`: a positive label that stands for no cell, where cells touch the border of the image too;
+        otherwise it is found.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
     - `inner_arcs`: make every edge an arc, with the area that its cells have over its chord in the image,
         and not only those on the outline of a free tissue. Of edges a few pixels long, the angle is
@@ -108,14 +117,24 @@ def from_labels(
 
     - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
         labels, or has a cell that reaches around the (mirrored) image or around all other cells;
-        for an unknown `boundary`, a `pixel_size` that is not positive or a negative `gap_width`.
+        for an unknown `boundary`, a `pixel_size` that is not positive, a `gap_width` that is negative or
+        larger than the image, or a `background` that no pixel has.
+    - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`.
     """
+    check_concrete("from_labels", mask, pixel_size)
     check_options(boundary, pixel_size)
-    if not (np.isfinite(gap_width) and gap_width >= 0):
-        raise ValueError(f"Argument `gap_width` must be at least 0, but is {gap_width}.")
-    values, image = _checked(np.asarray(mask))
+    check_number("gap_width", gap_width, least=0)
+    values, image, background = _checked(mask, background)
     if boundary == "free":
-        return _free_from_labels(values, image, pixel_size, gap_width, softening, inner_arcs)
+        if gap_width > max(image.shape):
+            raise ValueError(
+                "Argument `gap_width` must be at most as many pixels as the image has, "
+                f"{max(image.shape)}, but is {gap_width}."
+            )
+        segmentation = _free_from_labels(
+            values, image, pixel_size, gap_width, softening, inner_arcs
+        )
+        return dataclasses.replace(segmentation, background=background)
     periodic = boundary == "periodic"
     image = fill_gaps(image, periodic)
     image = join_pieces(image, periodic)
@@ -159,6 +178,7 @@ def from_labels(
         inflated=np.unique(values[label[moved]]),
         pixel_size=float(pixel_size),
         image_shape=(int(image.shape[0]), int(image.shape[1])),
+        background=background,
     )
 
 
@@ -251,14 +271,19 @@ def check_options(boundary: str, pixel_size: float | None) -> None:
             f"Argument `boundary` must be one of {', '.join(map(repr, _BOUNDARIES))}, but is "
             f"{boundary!r}."
         )
-    if pixel_size is not None and not (np.isfinite(pixel_size) and pixel_size > 0):
-        raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
+    if pixel_size is not None:
+        check_number("pixel_size", pixel_size, above=0)
 
 
 def _checked(
-    mask: np.ndarray,
-) -> tuple[Int[np.ndarray, " labels"], Int[np.ndarray, "rows columns"]]:
-    """The labels in ascending order, and the mask with each replaced by its rank; gaps are -1."""
+    mask: Shaped[np.ndarray | Array, " *shape"], background: int | None
+) -> tuple[Int[np.ndarray, " labels"], Int[np.ndarray, "rows columns"], int | None]:
+    """The labels in ascending order, the mask with each replaced by its rank, and the background.
+
+    Gaps are -1.
+    """
+    # Of a masked array, what is masked is no cell.
+    mask = np.ma.filled(mask, 0) if isinstance(mask, np.ma.MaskedArray) else np.asarray(mask)
     if mask.ndim != 2 or mask.size == 0:
         raise ValueError(
             "Argument `mask` must have shape (rows, columns), one label a pixel, but its shape is "
@@ -270,16 +295,43 @@ def _checked(
             "cells (scipy.ndimage.label does it for a binary mask) or convert the labels with "
             "mask.astype(int)."
         )
+    if mask.max() > np.iinfo(np.int64).max:
+        raise ValueError(
+            "Argument `mask` must hold labels of at most 63 bits, but its largest is "
+            f"{mask.max()}. Number the cells anew: numpy.unique(mask, return_inverse=True)[1]."
+        )
+    background = _background(mask, background)
+    if background is not None:
+        mask = np.where(mask == background, 0, mask)
     values, image = np.unique(mask, return_inverse=True)
     n_gaps = int(np.count_nonzero(values <= 0))
     values = values[n_gaps:]
     if len(values) < 2:
+        but = f"holds {len(values)}"
+        if background is not None:
+            but += f" besides the background, {background}"
         raise ValueError(
             "Argument `mask` must hold at least two cells, labelled by positive integers, but "
-            f"holds {len(values)}: every cell needs its own label."
+            f"{but}: every cell needs its own label."
         )
     image = image.reshape(mask.shape).astype(np.int32) - n_gaps
-    return values.astype(np.int64), np.maximum(image, -1)
+    return values.astype(np.int64), np.maximum(image, -1), background
+
+
+def _background(mask: Integer[np.ndarray, "rows columns"], given: int | None) -> int | None:
+    """The positive label of what is no cell."""
+    if given is not None:
+        check_whole("background", given)
+        if not np.any(mask == given):
+            raise ValueError(
+                f"Argument `background` must be a label of the mask, but no pixel has {given}."
+            )
+        return int(given) if given > 0 else None
+    # All others lie within a label that has the whole border, and a cell around all others is none.
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    around = int(border[0])
+    alone = around <= 0 or np.any(border != around) or np.all((mask == around) | (mask <= 0))
+    return None if alone else around
 
 
 def _touching(

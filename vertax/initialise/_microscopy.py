@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 from jaxtyping import Array, Int, Shaped
 
+from vertax._base.checks import check_concrete
 from vertax.initialise._labels import Segmentation, check_options, from_labels
 from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
+
+Segmenter: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 
 def from_microscopy(
     image: Shaped[np.ndarray | Array, " *shape"],
     *,
-    segmenter: AbstractSegmenter | None = None,
+    segmenter: AbstractSegmenter | Segmenter | None = None,
     boundary: str = "mirrored",
     pixel_size: float | None = None,
     softening: float | None = None,
@@ -30,7 +36,7 @@ def from_microscopy(
     - `image`: intensities of shape (rows, columns), e.g. from
         [`vertax.io.read_image`][vertax.io.read_image].
     - `segmenter`: [`Watershed`][vertax.initialise.Watershed] by default, or
-        [`Cellpose`][vertax.initialise.Cellpose], or one of your own.
+        [`Cellpose`][vertax.initialise.Cellpose], or one of your own: a function from pixels to labels.
     - `boundary`, `pixel_size`, `softening`: as for `from_labels`. With `boundary="periodic"` cells
         are found across the border of the image.
 
@@ -43,15 +49,21 @@ def from_microscopy(
         finds fewer than two cells; and as `from_labels` does.
     - `ImportError` if what the segmenter needs is not installed.
     """
+    check_concrete("from_microscopy", image, pixel_size)
     check_options(boundary, pixel_size)
     pixels = check_image(image)
     segmenter = Watershed() if segmenter is None else segmenter
+    if not callable(segmenter) or isinstance(segmenter, type):
+        raise TypeError(
+            "Argument `segmenter` must be a segmenter, such as Watershed(), or a function from an image to "
+            f"its labels, but is {segmenter!r}."
+        )
     segment = _segment_periodic if boundary == "periodic" else _segment
     labels = segment(pixels, segmenter)
     n_cells = len(np.unique(labels[labels > 0]))
     if n_cells < 2:
         raise ValueError(
-            f"Argument `image` must show at least two cells, but {type(segmenter).__name__} found "
+            f"Argument `image` must show at least two cells, but {_name(segmenter)} found "
             f"{n_cells}. Check that membranes are bright on dark cells, and that the segmenter "
             "knows the size of the cells."
         )
@@ -59,24 +71,27 @@ def from_microscopy(
         return from_labels(labels, boundary=boundary, pixel_size=pixel_size, softening=softening)
     except ValueError as error:
         raise ValueError(
-            f"The labels that {type(segmenter).__name__} found in `image` make no tissue. {error}"
+            f"The labels that {_name(segmenter)} found in `image` make no tissue. {error}"
         ) from error
 
 
-def _segment(image: np.ndarray, segmenter: AbstractSegmenter) -> Int[np.ndarray, "rows columns"]:
+def _name(segmenter: Segmenter) -> str:
+    """What messages call it; a segmenter of one's own may be a function."""
+    return getattr(segmenter, "__name__", type(segmenter).__name__)
+
+
+def _segment(image: np.ndarray, segmenter: Segmenter) -> Int[np.ndarray, "rows columns"]:
     labels = np.asarray(segmenter(image))
     if labels.shape != image.shape or labels.dtype.kind not in "iu":
         raise ValueError(
             f"Argument `segmenter` must return an integer label for each pixel, shape "
-            f"{image.shape}, but {type(segmenter).__name__} returned {labels.dtype} of shape "
+            f"{image.shape}, but {_name(segmenter)} returned {labels.dtype} of shape "
             f"{labels.shape}."
         )
     return labels
 
 
-def _segment_periodic(
-    image: np.ndarray, segmenter: AbstractSegmenter
-) -> Int[np.ndarray, "rows columns"]:
+def _segment_periodic(image: np.ndarray, segmenter: Segmenter) -> Int[np.ndarray, "rows columns"]:
     """Labels of a periodic image, with cells that cross its border whole.
 
     Every cell lies whole somewhere in the image continued by half of itself on all sides. There it

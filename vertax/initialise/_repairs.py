@@ -65,9 +65,9 @@ def join_pieces(image: Int[np.ndarray, "rows columns"], periodic: bool) -> np.nd
     a, b = np.concatenate([a, b]), np.concatenate([b, a])
     while not kept.all():  # pieces among pieces wait until a neighbour has found its label
         use = ~kept[a] & kept[b]
-        found, into = _longest_interface(a[use], label_of[b[use]])
-        label_of[found] = into
-        kept[found] = True
+        joining, into = _longest_interface(a[use], label_of[b[use]])
+        label_of[joining] = into
+        kept[joining] = True
     return label_of.astype(image.dtype)[piece]
 
 
@@ -111,7 +111,8 @@ def mesh_or_repairs(
     too_few = (
         "Argument `mask` must hold enough cells for a mesh of cells with three sides and more, but "
         f"of its {n - (exterior is not None)} labels too few remain after those inside others or with "
-        "two sides are absorbed. Give a larger image, or a finer segmentation."
+        "two sides are absorbed. Give a larger image, or a finer segmentation; if a label stands for the "
+        "background, name it by the argument `background`."
     )
     if len(np.unique(left)) < (2 if exterior is None else 3):
         raise ValueError(too_few)
@@ -122,7 +123,8 @@ def mesh_or_repairs(
             "Argument `mask` must hold cells that do not surround the others or reach from one "
             "border of the image to the opposite one (where they would meet themselves across the "
             f"mirrored or periodic boundary), but the labels {listed(values[error.cells % n])} "
-            "do. Crop the image, split them, or take a larger image."
+            "do. Crop the image, split them, or take a larger image; if one of them is the background, "
+            "name it by the argument `background`."
         ) from None
     if inside:
         into = label.copy()
@@ -138,14 +140,14 @@ def mesh_or_repairs(
         return mesh
     small = np.zeros(n, bool)
     small[mesh.cells[too_small] % n] = True
-    found, host = _longest_interface(left[small[left]], right[small[left]])
+    guest, host = _longest_interface(left[small[left]], right[small[left]])
     # Two small cells must not go to each other: between them, the one with the shorter outline goes
     # first. Then every chain of cells that are absorbed one into the other has an end.
     outline = np.bincount(left, minlength=n)
-    first = ~small[host] | (outline[found] < outline[host])
-    first |= small[host] & (outline[found] == outline[host]) & (found > host)
+    first = ~small[host] | (outline[guest] < outline[host])
+    first |= small[host] & (outline[guest] == outline[host]) & (guest > host)
     into = label.copy()
-    into[found[first]] = host[first]
+    into[guest[first]] = host[first]
     while not np.array_equal(into[into], into):
         into = into[into]
     return into
@@ -153,7 +155,7 @@ def mesh_or_repairs(
 
 def _longest_interface(
     a: Int[np.ndarray, " sides"], b: Int[np.ndarray, " sides"]
-) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, " found"]]:
+) -> tuple[Int[np.ndarray, " distinct"], Int[np.ndarray, " distinct"]]:
     """For each number in `a`, the number in `b` paired with it most often (or the smallest)."""
     pairs, counts = np.unique(np.stack([a, b]), axis=1, return_counts=True)
     order = np.lexsort((pairs[1], -counts, pairs[0]))

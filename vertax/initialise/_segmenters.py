@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
+from vertax._base.checks import check_number
+
 _SMALLEST_SIDE = 16
 
 
@@ -50,7 +52,7 @@ class Watershed(AbstractSegmenter):
 
     - `cell_size`: typical diameter of a cell; by default the wavelength at which the spectrum of
         the image peaks.
-    - `smoothing`: standard deviation of the Gaussian filter; by default `cell_size / 20`.
+    - `smoothing`: standard deviation of the Gaussian filter; by default `cell_size / 15`.
     - `depth`: how much darker than its membranes a cell must be, in local standard deviations of
         the image.
     - `min_area`: smallest area of a cell, in square pixels; by default `cell_size**2 / 20`.
@@ -82,6 +84,13 @@ class Watershed(AbstractSegmenter):
             for name in ("measure", "morphology", "segmentation")
         )
         pixels = check_image(image)
+        for name in ("cell_size", "smoothing"):
+            length = getattr(self, name)
+            if length is not None and length > max(pixels.shape):
+                raise ValueError(
+                    f"Argument `{name}` of Watershed is in pixels and must be at most the side of the image, "
+                    f"{max(pixels.shape)}, but is {length}."
+                )
         # The logarithm makes bright and faint membranes comparable; the mean sets where it bends.
         pixels = pixels - pixels.min()
         pixels = np.log1p(pixels / pixels.mean())
@@ -218,10 +227,7 @@ def estimate_cell_size(image: Float[np.ndarray, "rows columns"]) -> float:
 def _check_size(name: str, value: float | None, *, zero: bool) -> None:
     if value is None:
         return
-    if not np.isfinite(value) or value < 0 or (value == 0 and not zero):
-        raise ValueError(
-            f"Argument `{name}` must be {'at least 0' if zero else 'positive'}, but is {value}."
-        )
+    check_number(name, value, least=0) if zero else check_number(name, value, above=0)
 
 
 def _import(module: str, who: str, package: str, extra: str):

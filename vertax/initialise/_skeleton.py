@@ -24,9 +24,17 @@ def labels_from_skeleton(
 
     **Raises:**
 
-    - `ValueError` for an image that is not two-dimensional or too small, or whose lines enclose nothing.
+    - `ValueError` for an image that is not two-dimensional or too small, holds no finite real numbers, or
+        whose lines enclose nothing.
     """
-    lines = np.asarray(image) != 0
+    pixels = np.asarray(image)
+    if pixels.dtype.kind not in "buif":
+        raise ValueError(
+            f"Argument `image` must hold real numbers, but its dtype is {pixels.dtype}."
+        )
+    if not np.isfinite(pixels).all():
+        raise ValueError("Argument `image` must be finite, but holds NaN or infinity.")
+    lines = pixels != 0
     if lines.ndim != 2 or min(lines.shape) < 3:
         raise ValueError(
             "Argument `image` must have shape (rows, columns), at least 3 × 3, but its shape is "

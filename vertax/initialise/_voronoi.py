@@ -8,15 +8,19 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray
 from scipy.spatial import Delaunay, KDTree
 
+from vertax._base.checks import as_doubles, as_key, check_concrete, check_number, check_whole
 from vertax.initialise._order import spatial_order
 from vertax.mesh import Periodic, Tissue, Topology
+
+# Beyond, what is left of the digits of a position tells little of where in the box it is.
+_FARTHEST = 1e8
 
 
 def periodic_voronoi(
     n_cells: int | None = None,
     *,
     seeds: ArrayLike | None = None,
-    key: PRNGKeyArray | None = None,
+    key: PRNGKeyArray | int | None = None,
     lattice: ArrayLike | None = None,
     lloyd_steps: int = 0,
     softening: float | None = None,
@@ -29,7 +33,7 @@ def periodic_voronoi(
 
     - `n_cells`: number of random seeds, uniform in the box; needs `key`. Or
     - `seeds`, shape `(cells, 2)`: the seeds themselves; they may lie outside the box.
-    - `key`: a key from `jax.random.key`, for random seeds.
+    - `key`: a key from `jax.random.key`, or a whole number as its seed, for random seeds.
     - `lattice`, shape `(2, 2)`: the two lattice vectors of the box as rows; by default a square of side
         $\sqrt N$, so that the mean cell area is 1. Sheared boxes are fine.
     - `lloyd_steps`: number of Lloyd iterations (each seed moves to the mean of its cell's corners),
@@ -42,32 +46,36 @@ def periodic_voronoi(
 
     - `ValueError` if both or neither of `n_cells` and `seeds` are given, if seeds are not finite, of
         the wrong shape, fewer than one, or coincide (also across the periodic boundary).
+    - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`: how a tissue is
+        connected depends on numbers, which are not known there.
     """
+    check_concrete("periodic_voronoi", seeds, key, lattice)
     if (n_cells is None) == (seeds is None):
         raise ValueError("Give either `n_cells` (with `key`) or `seeds`, and not both.")
-    if lloyd_steps < 0:
-        raise ValueError(f"Argument `lloyd_steps` must be at least 0, but is {lloyd_steps}.")
+    if n_cells is not None:
+        check_whole("n_cells", n_cells, least=1)
+    check_whole("lloyd_steps", lloyd_steps, least=0)
     dtype = jnp.result_type(float)
     points = np.zeros((0, 2))
     if seeds is not None:
-        points = np.asarray(seeds, float)
+        points = as_doubles("seeds", seeds)
         if points.ndim != 2 or points.shape[1] != 2:
             raise ValueError(
                 f"Argument `seeds` must have shape (cells, 2), but has {points.shape}."
             )
-        if not np.isfinite(points).all():
-            raise ValueError("Argument `seeds` must be finite, but holds NaN or infinity.")
         n_cells = len(points)
     if n_cells is None or n_cells < 1:
         raise ValueError(f"A tissue needs at least one cell, but got {n_cells} seeds.")
-    box = np.sqrt(n_cells) * np.eye(2) if lattice is None else np.asarray(lattice, float)
+    box = np.sqrt(n_cells) * np.eye(2)
+    if lattice is not None:
+        box = as_doubles("lattice", lattice)
     boundary = Periodic(jnp.asarray(box, dtype))
     if seeds is None:
         if key is None:
             raise ValueError(
                 "Argument `key` is needed for random seeds: pass jax.random.key(seed)."
             )
-        fractions = np.asarray(jax.random.uniform(key, (n_cells, 2), dtype), float)
+        fractions = np.asarray(jax.random.uniform(as_key(key), (n_cells, 2), dtype), float)
         points = fractions[spatial_order(fractions)] @ box
 
     _, vertices, topology = tessellate(points, box, lloyd_steps)
@@ -91,10 +99,10 @@ def hexagonal(nx: int, ny: int, *, area: float = 1.0, softening: float | None = 
 
     - `ValueError` for fewer than one cell or row, or an area that is not positive.
     """
-    if nx < 1 or ny < 1:
-        raise ValueError(f"Arguments `nx` and `ny` must be at least 1, but are {nx} and {ny}.")
-    if not (np.isfinite(area) and area > 0):
-        raise ValueError(f"Argument `area` must be positive, but is {area}.")
+    check_concrete("hexagonal", area)
+    check_whole("nx", nx, least=1)
+    check_whole("ny", ny, least=1)
+    check_number("area", area, above=0)
     spacing = np.sqrt(2 * area / np.sqrt(3))
     column, row = np.meshgrid(np.arange(nx), np.arange(ny))
     x = column + 0.5 * (row % 2)
@@ -148,6 +156,11 @@ def _periodic_delaunay(
     # A reduced basis (Lagrange-Gauss) keeps the images that matter few, also in sheared boxes.
     basis, change = _reduce(lattice)
     fractions = seeds @ np.linalg.inv(basis)
+    if np.abs(fractions).max() > _FARTHEST:
+        raise ValueError(
+            f"Argument `seeds` must lie within {_FARTHEST:.0e} boxes of the origin, but the farthest is "
+            f"{np.abs(fractions).max():.0e} boxes away."
+        )
     home = np.floor(fractions).astype(int)
     fractions = fractions - home
     spacing = 1 / np.sqrt(n)

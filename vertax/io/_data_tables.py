@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import csv
+import datetime
 import math
+import numbers
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Shaped
 
 from vertax._base.atomic import atomic_write
+from vertax._base.checks import check_concrete, named
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
 
@@ -39,6 +43,7 @@ def cell_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray
 
     - `ValueError` for a batch of tissues, and for a column of another length or with a name that is
         taken.
+    - `TypeError` for what is no tissue, and inside `jax.jit` or `jax.vmap`.
     """
     check_single(tissue)
     return cell_columns(tissue, Drawing(tissue), columns)
@@ -70,8 +75,9 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
     vx.io.write_csv("cells.csv", vx.io.cell_table(tissue))
     ```
 
-    Numbers are written such that reading them gives the same bits. NaN is an empty field, which
-    pandas and R take for a missing value. The file is written atomically.
+    Numbers are written such that reading them gives the same bits. What is not known (NaN, NaT, None, and
+    what is masked) is an empty field, which pandas and R take for a missing value; an infinite number is
+    `Inf` or `-Inf`, a boolean `True` or `False`. The file is written atomically.
 
     **Arguments:**
 
@@ -81,8 +87,13 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
     **Raises:**
 
     - `ValueError` for columns of different lengths, or of more than one dimension.
+    - `TypeError` for what is no table, or holds something else than numbers, booleans, text and dates.
     """
-    columns = {name: np.asarray(column) for name, column in table.items()}
+    if not isinstance(table, Mapping):
+        raise TypeError(
+            f"Argument `table` must hold columns by name, as a dictionary does, but is {named(table)}."
+        )
+    columns = {name: _as_column(name, column) for name, column in table.items()}
     for name, column in columns.items():
         if column.ndim != 1:
             raise ValueError(
@@ -94,7 +105,8 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
         raise ValueError(
             f"Argument `table` must hold columns of one length, but they have {lengths}."
         )
-    rows = zip(*(map(_text, column) for column in columns.values()), strict=True)
+    texts = [[_text(name, value) for value in column] for name, column in columns.items()]
+    rows = zip(*texts, strict=True)
     with atomic_write(path, newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
@@ -146,25 +158,33 @@ def edge_columns(
 
 
 def check_single(tissue: Tissue) -> None:
-    """Refuse a batch."""
+    """Refuse a batch, what is no tissue, and one that is traced."""
+    if not isinstance(tissue, Tissue):
+        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {named(tissue)}.")
     if tissue.vertices.ndim != 2:
         raise ValueError(
             "Argument `tissue` must be a single tissue, but its vertices have shape "
-            f"{tissue.vertices.shape}. Write the members of a batch one by one."
+            f"{tissue.vertices.shape}. Write the members of a batch one by one: "
+            "jax.tree.map(lambda x: x[0], tissue) is the first."
         )
+    check_concrete("What writes a tissue", tissue)
 
 
 def _joined(
     table: Mapping[str, Any], columns: Mapping[str, Column], what: str, size: int
 ) -> dict[str, np.ndarray]:
     joined = {name: np.asarray(column) for name, column in table.items()}
+    if not isinstance(columns, Mapping):
+        raise TypeError(
+            f"Columns of the {what}s must be given by name, as in a dictionary, but are {named(columns)}."
+        )
     for name, column in columns.items():
         if name in joined:
             raise ValueError(
                 f"There is a column `{name}` already; the columns of the table are: {', '.join(table)}. "
                 "Choose another name."
             )
-        joined[name] = np.asarray(column)
+        joined[name] = _as_column(name, column)
         if joined[name].shape != (size,):
             raise ValueError(
                 f"Column `{name}` must have one entry for each {what}, shape ({size},), but has shape "
@@ -173,10 +193,33 @@ def _joined(
     return joined
 
 
-def _text(value: Any) -> str:
+def _as_column(name: str, column: Column) -> np.ndarray:
+    check_concrete(f"Column `{name}`", column)
+    try:
+        array = np.ma.asarray(column) if np.ma.isMaskedArray(column) else np.asarray(column)
+    except ValueError as error:
+        raise ValueError(
+            f"Column `{name}` must hold one entry a row, but its entries have different lengths."
+        ) from error
+    # bfloat16 and the like are no numbers to other programs.
+    foreign = array.dtype.kind == "V" and jnp.issubdtype(array.dtype, jnp.floating)
+    return array.astype(np.float32) if foreign else array
+
+
+def _text(name: str, value: Any) -> str:
+    if value is None or value is np.ma.masked:
+        return ""
+    if isinstance(value, np.datetime64 | np.timedelta64) and np.isnat(value):
+        return ""
     if isinstance(value, float | np.floating):
         if math.isnan(value):
             return ""
         if math.isinf(value):
             return "Inf" if value > 0 else "-Inf"
+    known = str | bool | np.bool_ | numbers.Real | np.datetime64 | datetime.date | datetime.time
+    if not isinstance(value, known) and not isinstance(value, os.PathLike):
+        raise TypeError(
+            f"Column `{name}` must hold numbers, booleans or text, but holds {named(value)}. Write the parts "
+            "of what is more (the real and the imaginary one, say) as columns of their own."
+        )
     return str(value)

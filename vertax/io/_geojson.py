@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 import os
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vertax._base.atomic import atomic_write
+from vertax._base.checks import check_whole, named
 from vertax.io._data_tables import Column, cell_columns, check_single, edge_columns
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
@@ -62,7 +64,13 @@ def write_geojson(
         [[*polygon[:n].tolist(), polygon[0].tolist()]]
         for polygon, n in zip(polygons, counts, strict=True)
     ]
-    files = {Path(path): ("Polygon", rings, cell_columns(tissue, drawing, cells or {}))}
+    files = {
+        Path(path): (
+            "Polygon",
+            rings,
+            cell_columns(tissue, drawing, {} if cells is None else cells),
+        )
+    }
     if edges is not None:
         lines = drawing.lines[drawing.half_edge].tolist()
         files[edge_path(path)] = ("LineString", lines, edge_columns(tissue, drawing, edges))
@@ -76,8 +84,7 @@ def write_geojson(
 def checked_drawing(tissue: Tissue, points_per_arc: int) -> Drawing:
     """The geometry that files need, arguments checked."""
     check_single(tissue)
-    if points_per_arc < 1:
-        raise ValueError(f"Argument `points_per_arc` must be at least 1, but is {points_per_arc}.")
+    check_whole("points_per_arc", points_per_arc, least=1)
     return Drawing(tissue, points_per_arc)
 
 
@@ -88,7 +95,7 @@ def edge_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _features(kind: str, shapes: list[Any], table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    columns = [[_strict(x) for x in column.tolist()] for column in table.values()]
+    columns = [[_strict(name, x) for x in column.tolist()] for name, column in table.items()]
     return [
         {
             "type": "Feature",
@@ -99,5 +106,12 @@ def _features(kind: str, shapes: list[Any], table: dict[str, np.ndarray]) -> lis
     ]
 
 
-def _strict(value: Any) -> Any:
+def _strict(name: str, value: Any) -> Any:
+    if isinstance(value, datetime.date):
+        return value.isoformat()
+    if not (value is None or isinstance(value, str | bool | int | float)):
+        raise TypeError(
+            f"Column `{name}` must hold numbers, booleans or text, which is what JSON has, but holds "
+            f"{named(value)}."
+        )
     return None if isinstance(value, float) and not math.isfinite(value) else value

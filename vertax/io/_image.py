@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 
+from vertax._base.checks import check_whole
+
 _TIFF = (".tif", ".tiff")
 
 
@@ -15,6 +17,9 @@ def read_image(
     path: str | os.PathLike[str], *, channel: int | None = None, plane: int | None = None
 ) -> Shaped[np.ndarray, "rows columns"]:
     """One two-dimensional image from a TIFF, PNG, JPEG, … file, in the numbers it is stored in.
+
+    A grey image that is stored in colours, with three channels alike, is read without a choice of the
+    channel; and a channel of transparency that is the same everywhere does not count.
 
     **Arguments:**
 
@@ -28,8 +33,9 @@ def read_image(
     **Raises:**
 
     - `FileNotFoundError` if there is no such file.
-    - `ValueError` if it is not an image, if it has channels or planes and none was chosen, or not
-        the one that was.
+    - `ValueError` if it is not an image of real numbers, if it has channels or planes and none was chosen,
+        or not the one that was.
+    - `TypeError` for a channel or plane that is no whole number.
     - `ImportError` for a TIFF file if tifffile is not installed.
     """
     file = Path(path)
@@ -37,7 +43,15 @@ def read_image(
         raise FileNotFoundError(
             f"Argument `path` must name an image file, but {file} does not exist."
         )
+    for name, index in (("channel", channel), ("plane", plane)):
+        if index is not None:
+            check_whole(name, index)
     pixels, axes = _read(file)
+    if pixels.dtype.kind not in "biuf":
+        raise ValueError(
+            f"Argument `path` must name an image of real numbers, but {file} holds {pixels.dtype}. Save "
+            "what you need of it, such as numpy.abs of complex numbers, as another file."
+        )
     rows, columns = axes.index("Y"), axes.index("X")
     channels = [i for i, axis in enumerate(axes) if axis in "CS"]
     planes = [i for i in range(len(axes)) if i not in (rows, columns, *channels)]
@@ -46,8 +60,10 @@ def read_image(
     n_planes = int(np.prod(pixels.shape[: len(planes)], dtype=int))
     pixels = pixels.reshape(n_planes, -1, *image)
     chosen_plane = _choose("plane", plane, n_planes, file)
-    chosen_channel = _choose("channel", channel, pixels.shape[1], file)
-    return pixels[chosen_plane, chosen_channel]
+    planes_read = pixels[chosen_plane]
+    if channel is None and all(np.array_equal(other, planes_read[0]) for other in planes_read[1:]):
+        return planes_read[0]
+    return planes_read[_choose("channel", channel, len(planes_read), file)]
 
 
 def _read(file: Path) -> tuple[np.ndarray, str]:
@@ -71,7 +87,12 @@ def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
     except ImportError as error:
         raise ImportError('TIFF files need tifffile: pip install "vertax[image]".') from error
     with tifffile.TiffFile(file) as tiff:
-        return tiff.series[0].asarray(), tiff.series[0].axes
+        series = tiff.series[0]
+        pixels, axes = series.asarray(), series.axes
+        extra = len(getattr(series.keyframe, "extrasamples", ()))
+    if axes.endswith("S") and extra == 1:
+        pixels = _without_transparency(pixels)
+    return pixels, axes
 
 
 def _read_picture(file: Path) -> tuple[np.ndarray, str]:
@@ -80,7 +101,18 @@ def _read_picture(file: Path) -> tuple[np.ndarray, str]:
     with Image.open(file) as picture:
         # Palette indices are no intensities.
         pixels = np.asarray(picture.convert("RGB") if picture.mode == "P" else picture)
+        transparent = pixels.ndim == 3 and picture.mode.endswith(("A", "a"))
+    if transparent:
+        pixels = _without_transparency(pixels)
     return pixels, "YX" if pixels.ndim == 2 else "YXS"
+
+
+def _without_transparency(
+    pixels: Shaped[np.ndarray, "*shape samples"],
+) -> Shaped[np.ndarray, "*shape fewer_samples"]:
+    """Without the last channel, if it says nothing."""
+    alpha = pixels[..., -1]
+    return pixels[..., :-1] if np.all(alpha == alpha.flat[0]) else pixels
 
 
 def _choose(name: str, index: int | None, n: int, file: Path) -> int:

@@ -19,6 +19,7 @@ import optimistix as optx
 
 from vertax import adjoints, costs, energies, responses, solvers
 from vertax._base.archive import as_jax, read_archive, write_archive
+from vertax._base.checks import named
 from vertax.energies import AbstractEnergy
 from vertax.fitting import InverseProblem
 from vertax.mesh import Free, Periodic, Tissue, Topology
@@ -160,9 +161,16 @@ def _load(
     classes: Iterable[type[eqx.Module]],
 ) -> _Module:
     name = os.fspath(path)
-    own: dict[str, type[eqx.Module]] = {}
+    user_classes: dict[str, type[eqx.Module]] = {}
+    if isinstance(classes, type) or not isinstance(classes, Iterable):
+        raise TypeError(f"Argument `classes` must be a list of classes, but is {named(classes)}.")
     for cls in classes:
-        if own.setdefault(cls.__name__, cls) is not cls:
+        if not (isinstance(cls, type) and issubclass(cls, eqx.Module)):
+            raise TypeError(
+                "Argument `classes` must hold classes, subclasses of equinox.Module, but holds "
+                f"{named(cls)}."
+            )
+        if user_classes.setdefault(cls.__name__, cls) is not cls:
             raise ValueError(
                 f"Argument `classes` holds two classes of the name {cls.__name__}, which a file cannot "
                 "tell apart. Rename one."
@@ -170,7 +178,7 @@ def _load(
     arrays = read_archive(path, what, _VERSION)
     try:
         tree = json.loads(str(arrays.get("tree", "")))
-        module = _Reader(name, arrays, own).node(tree, what)
+        module = _Reader(name, arrays, user_classes).node(tree, what)
     except (json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"{name} is broken: its `tree` cannot be read ({error}).") from error
     if not isinstance(module, kind):
@@ -272,10 +280,15 @@ class _Writer:
 class _Reader:
     """The way back from what `_Writer` wrote; nothing in a file is taken for granted."""
 
-    def __init__(self, file: str, arrays: dict[str, np.ndarray], own: dict[str, type[eqx.Module]]):
+    def __init__(
+        self,
+        file: str,
+        arrays: dict[str, np.ndarray],
+        user_classes: dict[str, type[eqx.Module]],
+    ):
         self.file = file
         self.arrays = arrays
-        self.own = own
+        self.user_classes = user_classes
 
     def node(self, node: Any, path: str) -> Any:
         if node is None or isinstance(node, bool | int | float | str):
@@ -319,12 +332,12 @@ class _Reader:
                     "Update vertax."
                 )
             return _public_classes()[name]
-        if name not in self.own:
+        if name not in self.user_classes:
             raise ValueError(
                 f"{self.file} holds an object of the class {name} (at `{path}`), which is not one of "
                 f"vertax. Pass the class: classes=[{name}]."
             )
-        return self.own[name]
+        return self.user_classes[name]
 
     def module(self, cls: type[eqx.Module], nodes: dict[str, Any], path: str) -> eqx.Module:
         known = {field.name: field for field in dataclasses.fields(cls)}

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from vertax._base.checks import check_number, named
 from vertax.io._bounded_tables import BoundedTables, checked, with_exterior, without_exterior
+from vertax.io._data_tables import check_single
 from vertax.mesh import Free, Periodic, Tissue, Topology
 
 
@@ -95,6 +97,11 @@ def from_tables(tables: Tables | BoundedTables, *, softening: float | None = Non
     """
     if isinstance(tables, BoundedTables):
         return _from_bounded_tables(tables, softening)
+    if not isinstance(tables, Tables):
+        raise TypeError(
+            "Argument `tables` must be vertax.io.Tables or BoundedTables, but is "
+            f"{named(tables)}. Write Tables(vert_table, he_table, face_table, width, height)."
+        )
     tables = _checked(tables)
     vert_table, he_table, face_table, width, height = tables
     _check_rows(tables)
@@ -179,11 +186,7 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
     - `ValueError` for a batch of tissues, for arcs that tables cannot hold, if the box is sheared or
         its first vector is not along x, or an edge reaches beyond the neighbouring box.
     """
-    if tissue.vertices.ndim != 2:
-        raise ValueError(
-            "Argument `tissue` must be a single tissue, but its vertices have shape "
-            f"{tissue.vertices.shape}."
-        )
+    check_single(tissue)
     if tissue.inner_arcs:
         raise ValueError(
             "Tables hold arcs on the outline only. Use `save_tissue`, which keeps all."
@@ -238,6 +241,8 @@ def _rows(m: Topology, offset: Int[np.ndarray, "halfedges 2"]) -> Int[np.ndarray
 def _checked(tables: Tables) -> Tables:
     """The tables as arrays of the right shapes and types."""
     v, he, f = (np.asarray(table) for table in tables[:3])
+    check_number("width", _number(tables.width), above=0)
+    check_number("height", _number(tables.height), above=0)
     width, height = float(tables.width), float(tables.height)
     if v.ndim != 2 or v.shape[1] != 2 or v.dtype.kind not in "fi" or not np.isfinite(v).all():
         raise ValueError(
@@ -254,9 +259,13 @@ def _checked(tables: Tables) -> Tables:
             f"Table `face_table` must hold integers, shape (faces,), but has shape {f.shape} and "
             f"type {f.dtype}. (For bounded tissues pass `BoundedTables`.)"
         )
-    if not (np.isfinite([width, height]).all() and width > 0 and height > 0):
-        raise ValueError(f"The width and height must be positive, but are {width} and {height}.")
     return Tables(v, he.astype(int), f.astype(int), width, height)
+
+
+def _number(value: Any) -> Any:
+    """A number that a file may hold as an array with one entry."""
+    array = isinstance(value, np.ndarray) and value.size == 1
+    return value.reshape(()) if array else value
 
 
 def _check_rows(tables: Tables) -> None:

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertax._base.archive import as_jax, read_archive, write_archive
+from vertax._base.checks import named
 from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue, Topology
 
 _VERSION = 1
+_INT32 = np.iinfo(np.int32)
 
 
 class _BoundaryRecord(NamedTuple):
@@ -49,6 +51,7 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
 
     - `ValueError` for a batch of tissues, for a precision NumPy does not know, or for a boundary
         that has no place in the format.
+    - `TypeError` for what is no tissue.
     - `OSError` if the file cannot be written.
     """
     write_archive(path, "tissue", _VERSION, tissue_arrays(tissue))
@@ -75,6 +78,8 @@ def load_tissue(path: str | os.PathLike[str]) -> Tissue:
 
 def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
     """All that a tissue consists of by name, see `save_tissue`; the way back is `tissue_from`."""
+    if not isinstance(tissue, Tissue):
+        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {named(tissue)}.")
     topology = tissue.topology
     kind, record = _record_of(tissue.boundary)
     arrays: dict[str, Any] = {
@@ -149,6 +154,11 @@ def tissue_from(
             )
         if array.dtype.kind == "f":
             as_jax(array, name)
+        elif array.size and not (_INT32.min <= array.min() and array.max() <= _INT32.max):
+            raise ValueError(
+                f"{name} is broken: `{key}` holds numbers from {array.min()} to {array.max()}, which "
+                "number nothing in a tissue."
+            )
         return array
 
     twin = get("twin", "i", None)

@@ -91,10 +91,10 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     trajectory = Trajectory()
     once = {key: arrays[key] for key in _ONCE if key in arrays}
     for i, k in enumerate(number.tolist()):
-        own = {
+        frame = {
             key: np.asarray(array[k if key in _TOPOLOGY else i]) for key, array in framed.items()
         }
-        tissue = tissue_from(once | own, name, topologies.get(k))
+        tissue = tissue_from(once | frame, name, topologies.get(k))
         topologies.setdefault(k, tissue.topology)
         trajectory.append(
             tissue, **{key.removeprefix("value_"): column[i] for key, column in values.items()}

@@ -64,7 +64,13 @@ def write_vtk(
     drawing = checked_drawing(tissue, points_per_arc)
     polygons, counts = drawing.polygons()
     corners = [polygon[:n] for polygon, n in zip(polygons, counts, strict=True)]
-    meshes = {Path(path): ("polygon", corners, cell_columns(tissue, drawing, cells or {}))}
+    meshes = {
+        Path(path): (
+            "polygon",
+            corners,
+            cell_columns(tissue, drawing, {} if cells is None else cells),
+        )
+    }
     if edges is not None:
         lines, shown = drawing.sides(np.ones(tissue.n_cells, bool))
         table = edge_columns(tissue, drawing, edges)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -29,6 +30,26 @@ _AREA = _TERMS * _ZETA  # times α
 _MOMENT = -0.5 * np.convolve(_AREA, np.concatenate([[1.0], -2 * _ZETA]))[: len(_TERMS)]
 _MOMENT[0] = 0.0  # 1/12 cancels exactly
 _SERIES_BELOW = 0.5
+
+
+class Arcs(eqx.Module):
+    """The angles of the edges of a tissue.
+
+    **Arguments:**
+
+    - `angles`: of each edge, in radians; only those of arcs count.
+    - `length`: what makes an angle a degree of freedom like a position.
+    - `inner`: whether edges between two cells are arcs, or only those on the outline.
+    """
+
+    angles: Float[Array, " edges"]
+    length: Float[Array, ""]
+    inner: bool = eqx.field(static=True, kw_only=True)
+
+    @property
+    def scaled(self) -> Float[Array, " edges"]:
+        """The angles as degrees of freedom."""
+        return self.angles * self.length
 
 
 class _Function(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from vertax._base.modules import compiled_property, is_concrete
-from vertax.mesh._arcs import arc_points, area_factor, bounded, length_factor, moment_factor
+from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
 
@@ -17,8 +17,8 @@ from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, sourc
 class Tissue(eqx.Module):
     r"""A planar tissue: vertices, their connectivity and the space they live in.
 
-    Geometry is differentiable in `vertices`, in `angles` and in the boundary (the lattice of a periodic
-    box).
+    Geometry is differentiable in `vertices`, in the angles of `arcs` and in the boundary (the lattice of
+    a periodic box).
 
     Edges are straight, or circular arcs (paper, Methods, "Bounded mode"): an arc with the angle
     $\alpha$ between its chord $c$ and its tangents has the radius $R = c / (2 \sin\alpha)$ and the length
@@ -58,10 +58,9 @@ class Tissue(eqx.Module):
     topology: Topology
     boundary: AbstractBoundary
     softening: Float[Array, ""]
-    angles: Float[Array, " edges"] | None
+    arcs: Arcs | None
+    """The angles of edges and what belongs to them; None if all edges are straight."""
     pinned: Bool[Array, " vertices"] | None
-    angle_length: Float[Array, ""] | None
-    inner_arcs: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -91,13 +90,15 @@ class Tissue(eqx.Module):
         self.vertices = vertices
         self.topology = topology
         self.boundary = boundary
-        self.angles = None if angles is None else _checked_angles(angles, vertices.dtype, topology)
         if angles is not None and not (topology.exterior or inner_arcs):
             raise ValueError(
                 "Argument `angles` is for arcs, but a periodic tissue has none: pass `inner_arcs=True`, "
                 "or no angles."
             )
-        self.inner_arcs = inner_arcs
+        self.arcs = None
+        if angles is not None:
+            angles = _checked_angles(angles, vertices.dtype, topology)
+            self.arcs = Arcs(angles, jnp.ones((), vertices.dtype), inner=inner_arcs)
         self.pinned = None if pinned is None else jnp.asarray(pinned, bool)
         if self.pinned is not None and self.pinned.shape != (topology.n_vertices,):
             raise ValueError(
@@ -105,7 +106,6 @@ class Tissue(eqx.Module):
                 f"{self.pinned.shape}."
             )
         self.softening = jnp.zeros((), vertices.dtype)
-        self.angle_length = None
         if softening is None or (angles is not None and angle_length is None):
             size = jnp.sqrt(jax.lax.stop_gradient(_mean_area(self)))
             softening = 1e-3 * size if softening is None else softening
@@ -114,12 +114,26 @@ class Tissue(eqx.Module):
         if is_concrete(softening) and not softening >= 0:
             raise ValueError(f"Argument `softening` must be at least 0, but is {softening}.")
         self.softening = softening
-        if angles is not None:
-            self.angle_length = jnp.asarray(angle_length, vertices.dtype)
-            if is_concrete(self.angle_length) and not self.angle_length > 0:
-                raise ValueError(
-                    f"Argument `angle_length` must be positive, but is {self.angle_length}."
-                )
+        if self.arcs is not None:
+            length = jnp.asarray(angle_length, vertices.dtype)
+            if is_concrete(length) and not length > 0:
+                raise ValueError(f"Argument `angle_length` must be positive, but is {length}.")
+            self.arcs = Arcs(self.arcs.angles, length, inner=inner_arcs)
+
+    @property
+    def angles(self) -> Float[Array, " edges"] | None:
+        """The angle of each edge, of which only those of arcs count; None if all edges are straight."""
+        return None if self.arcs is None else self.arcs.angles
+
+    @property
+    def angle_length(self) -> Float[Array, ""] | None:
+        """The length that makes an angle a degree of freedom; None if all edges are straight."""
+        return None if self.arcs is None else self.arcs.length
+
+    @property
+    def inner_arcs(self) -> bool:
+        """Whether edges between two cells are arcs too."""
+        return self.arcs is not None and self.arcs.inner
 
     @property
     def n_cells(self) -> int:
@@ -162,16 +176,16 @@ class Tissue(eqx.Module):
         Edges across a periodic boundary go on beyond the box.
         """
         first, vector = self.edge_segments
-        if self.angles is None:
+        if self.arcs is None:
             return first[:, None] + fractions[:, None] * vector[:, None]
         return arc_points(first, vector, self.edge_angles, fractions)
 
     @property
     def is_arc(self) -> Bool[Array, " edges"]:
         """Which edges are arcs; the angles of the others do not count."""
-        if self.angles is None:
+        if self.arcs is None:
             return jnp.zeros(self.n_edges, bool)
-        return jnp.ones(self.n_edges, bool) if self.inner_arcs else self.topology.on_outline
+        return jnp.ones(self.n_edges, bool) if self.arcs.inner else self.topology.on_outline
 
     @compiled_property
     def edge_angles(self) -> Float[Array, " edges"]:
@@ -180,9 +194,9 @@ class Tissue(eqx.Module):
         That is out of the cell on its left; 0 for straight edges. Always between -π and π, where an
         edge is an arc: a minimiser may overstep that in `angles`, but not here.
         """
-        if self.angles is None:
+        if self.arcs is None:
             return jnp.zeros(self.n_edges, self.vertices.dtype)
-        return jnp.where(self.is_arc, bounded(self.angles), 0)
+        return jnp.where(self.is_arc, bounded(self.arcs.angles), 0)
 
     @compiled_property
     def edge_curvatures(self) -> Float[Array, " edges"]:
@@ -208,7 +222,7 @@ class Tissue(eqx.Module):
     def edge_lengths(self) -> Float[Array, " edges"]:
         """Length of each edge (softened, see the class)."""
         lengths = self._lengths(self.edge_vectors)
-        return lengths if self.angles is None else lengths * length_factor(self.edge_angles)
+        return lengths if self.arcs is None else lengths * length_factor(self.edge_angles)
 
     @compiled_property
     def areas(self) -> Float[Array, " cells"]:
@@ -245,7 +259,7 @@ class Tissue(eqx.Module):
         q = take(p, m.next)
         area = _cross(p, q) / 2
         moment = (p + q) * area[:, None] / 3
-        if self.angles is not None:
+        if self.arcs is not None:
             angle = take(self.edge_angles, m.edge)
             angle = jnp.where(m.forward, angle, -angle)
             chord = q - p
@@ -263,7 +277,7 @@ class Tissue(eqx.Module):
 
         With arcs a pair, `(vertices, angles * angle_length)`.
         """
-        return self.vertices if self.angles is None else (self.vertices, self._scaled_angles())
+        return self.vertices if self.arcs is None else (self.vertices, self.arcs.scaled)
 
     def with_configuration(self, configuration: PyTree[Float[Array, "..."]]) -> Tissue:
         """The same tissue with its degrees of freedom replaced.
@@ -274,14 +288,18 @@ class Tissue(eqx.Module):
         if self.pinned is not None:
             vertices = jnp.where(self.pinned[:, None], self.vertices, vertices)
         moved = self.with_vertices(vertices)
-        if scaled is None or self.angles is None or self.angle_length is None:
+        if scaled is None or self.arcs is None:
             return moved
-        angles = jnp.where(self.is_arc, scaled / self.angle_length, self.angles)
-        return eqx.tree_at(lambda t: t.angles, moved, angles)
+        angles = jnp.where(self.is_arc, scaled / self.arcs.length, self.arcs.angles)
+        return moved.with_angles(angles)
 
     def with_vertices(self, vertices: Float[Array, "vertices 2"]) -> Tissue:
         """The same tissue with its vertices, also pinned ones, elsewhere."""
         return eqx.tree_at(lambda t: t.vertices, self, vertices)
+
+    def with_angles(self, angles: Float[Array, " edges"]) -> Tissue:
+        """The same tissue, which has arcs, with other angles."""
+        return eqx.tree_at(lambda t: t.arcs.angles, self, angles)
 
     def drift(self, configuration: PyTree[Float[Array, "..."]]) -> Float[Array, " modes"]:
         """How far a configuration strayed from that of this tissue in ways that have no energy.
@@ -294,9 +312,8 @@ class Tissue(eqx.Module):
         if self.pinned is not None:
             held = jnp.where(self.pinned[:, None], vertices - self.vertices, 0)
             drift.append(held.ravel())
-        here = self._scaled_angles()
-        if scaled is not None and here is not None:
-            drift.append(jnp.where(self.is_arc, 0, scaled - here))
+        if scaled is not None and self.arcs is not None:
+            drift.append(jnp.where(self.is_arc, 0, scaled - self.arcs.scaled))
         return jnp.concatenate(drift)
 
     def settled(self, start: Tissue) -> Tissue:
@@ -320,15 +337,10 @@ class Tissue(eqx.Module):
         """The same vertices, connected in another way."""
         return eqx.tree_at(lambda t: t.topology, self, topology)
 
-    def _scaled_angles(self) -> Float[Array, " edges"] | None:
-        if self.angles is None or self.angle_length is None:
-            return None
-        return self.angles * self.angle_length
-
     def _split(
         self, configuration: PyTree[Float[Array, "..."]]
     ) -> tuple[Float[Array, "vertices 2"], Float[Array, " edges"] | None]:
-        return (configuration, None) if self.angles is None else configuration
+        return (configuration, None) if self.arcs is None else configuration
 
     def _lengths(self, vectors: Float[Array, "edges 2"]) -> Float[Array, " edges"]:
         squared = vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + self.softening**2
@@ -345,7 +357,7 @@ class Tissue(eqx.Module):
         # The right cell's corner at the first vertex is one slot clockwise.
         right = first + self.boundary.translation(take(m.frame, clockwise(m.half_edge)))
         area_left, area_right = 0.5 * _cross(left, vector), -0.5 * _cross(right, vector)
-        if self.angles is None:
+        if self.arcs is None:
             return area_left, area_right
         bulge = (vector[:, 0] ** 2 + vector[:, 1] ** 2) * area_factor(self.edge_angles)
         return area_left + bulge, area_right - bulge

@@ -10,7 +10,8 @@ from jaxtyping import Array, ArrayLike, Bool, Int, Shaped
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vertax._base.modules import compiled_property
+from vertax._base.modules import compiled_property, is_concrete
+from vertax.mesh._half_edges import check_arrays
 
 
 # Every vertex joins exactly three edges, so half-edge h = 3 v + k is the k-th edge leaving vertex v in
@@ -53,7 +54,7 @@ class Topology(eqx.Module):
     **Raises:**
 
     - `ValueError` naming the broken invariant (see [`Topology.validate`][vertax.Topology.validate]),
-        for concrete arrays; inside `jax.jit` only shapes are checked.
+        for concrete arrays; inside `jax.jit` and `jax.vmap` only shapes and types are checked.
     """
 
     twin: Int[Array, " halfedges"]
@@ -76,32 +77,29 @@ class Topology(eqx.Module):
         *,
         exterior: bool = False,
     ):
-        twin, cell, frame = (np.asarray(x) for x in (twin, cell, frame))
-        if twin.ndim != 1 or twin.size == 0 or twin.size % 6 != 0:
-            raise ValueError(
-                "Argument `twin` must list three half-edges for each of an even number of vertices, "
-                f"but its shape is {twin.shape}."
-            )
-        h = np.arange(twin.size)
-        if twin.min() < 0 or twin.max() >= twin.size or np.any(twin[twin] != h):
-            raise ValueError("Argument `twin` must be an involution: twin[twin[h]] == h.")
-        if np.any(twin == h):
-            raise ValueError(
-                f"Argument `twin` must not have fixed points, but half-edge {np.argmax(twin == h)} is "
-                "its own twin."
-            )
+        known = all(is_concrete(x) for x in (twin, cell, frame, edge))
+        xp = np if known else jnp
+        twin, cell, frame = (xp.asarray(x) for x in (twin, cell, frame))
+        check_arrays(twin, cell, frame, known=known)
+        h = xp.arange(twin.size)
         if edge is None:
-            first = np.minimum(h, twin)
-            edge = np.unique(first, return_inverse=True)[1]
-        edge = np.asarray(edge)
-        half_edge = np.full(twin.size // 2, -1)
-        if edge.shape != twin.shape or edge.min() < 0 or edge.max() >= half_edge.size:
+            edge = (xp.cumsum(h < twin) - 1)[xp.minimum(h, twin)]
+        edge = xp.asarray(edge)
+        n_edges = twin.size // 2
+        outside = edge.min() < 0 or edge.max() >= n_edges if known and edge.size else False
+        if edge.shape != twin.shape or edge.dtype.kind not in "iu" or outside:
             raise ValueError(
                 "Argument `edge` must give each half-edge a number in 0 … n_edges - 1."
             )
-        half_edge[edge[::-1]] = h[::-1]  # reversed: the first half-edge of each edge wins
-        n_cells = int(cell.max()) + (not exterior)
-        half_edge = np.where(cell[half_edge] == n_cells, twin[half_edge], half_edge)
+        # The first half-edge of each edge gives it its direction.
+        half_edge = xp.zeros(n_edges, int)
+        if known:
+            half_edge[edge[::-1]] = h[::-1]
+        else:
+            half_edge = jnp.full(n_edges, twin.size).at[edge].min(h)
+        # A trivalent mesh of a torus has half as many faces as vertices, one of a sphere two more.
+        n_cells = int(cell.max()) + (not exterior) if known else twin.size // 6 + exterior
+        half_edge = xp.where(cell[half_edge] == n_cells, twin[half_edge], half_edge)
         to_int32 = lambda x: jnp.asarray(x, jnp.int32)
         self.twin = to_int32(twin)
         self.cell = to_int32(cell)
@@ -110,7 +108,8 @@ class Topology(eqx.Module):
         self.half_edge = to_int32(half_edge)
         self.n_cells = n_cells
         self.exterior = exterior
-        self.validate()
+        if known:
+            self.validate()
 
     @property
     def n_half_edges(self) -> int:
@@ -208,6 +207,17 @@ class Topology(eqx.Module):
 
         require(cell.shape == (n_half,), "`cell` must have one entry a half-edge")
         require(frame.shape == (n_half, 2), "`frame` must have two entries a half-edge")
+        require(edge.shape == (n_half,), "`edge` must have one entry a half-edge")
+        require(half_edge.shape == (n_half // 2,), "`half_edge` must have one entry an edge")
+        require(0 < n_faces <= n_half, "there must be cells, and no more than half-edges")
+        for name, index, bound, at in (
+            ("twin", twin, n_half, "half-edges"),
+            ("edge", edge, n_half // 2, "half-edges"),
+            ("half_edge", half_edge, n_half, "edges"),
+        ):
+            require(
+                (index >= 0) & (index < bound), f"`{name}` must lie in 0 … {bound - 1}, at {at}"
+            )
         require(twin[twin] == h, "`twin` must be an involution, twin[twin[h]] == h, at half-edges")
         require(twin != h, "no half-edge may be its own twin, at half-edges")
         require(

@@ -8,10 +8,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import is_concrete, traced
+from vertax._base.modules import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
@@ -20,6 +21,7 @@ from vertax.mesh import Tissue
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._search import Search, SearchState, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
+from vertax.solvers._optimistix import check_solver
 from vertax.solvers._patience import AtRest, Patient
 from vertax.transitions import T1, AbstractTransitions
 
@@ -60,11 +62,7 @@ class Relaxation(AbstractResponse):
     max_steps: int | Int[Array, ""] = 2000
 
     def __check_init__(self):
-        if not isinstance(self.solver, optx.AbstractMinimiser):
-            raise TypeError(
-                "Argument `solver` must be a minimiser of vertax.solvers or of Optimistix, e.g. "
-                f"vertax.solvers.LBFGS(), but is {self.solver!r}."
-            )
+        check_solver(self.solver)
         if not isinstance(self.transitions, AbstractTransitions | None):
             raise TypeError(
                 "Argument `transitions` must be a rule for topology changes, e.g. vertax.T1(), or None, "
@@ -72,7 +70,7 @@ class Relaxation(AbstractResponse):
             )
         for name in ("tolerance", "patience", "max_steps"):
             value = getattr(self, name)
-            if value is not None and is_concrete(value) and not jnp.all(jnp.asarray(value) > 0):
+            if value is not None and is_concrete(value) and not np.all(np.asarray(value) > 0):
                 raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
 
     def __call__(
@@ -99,6 +97,7 @@ class Relaxation(AbstractResponse):
         """
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         _check_adjoint(adjoint, self.minimiser)
+        _check_sharding((tissue, energy))
         equilibrium = _equilibrate(*traced((tissue, energy)), self.traced(), adjoint)
         # An error that is raised within a compiled program calls back to the host, and JAX keeps no such
         # program in its cache on disk.
@@ -171,6 +170,8 @@ def equilibrate(
     **Raises:**
 
     - `ValueError` for a tolerance, patience or number of steps that is not positive.
+    - `ValueError` within `jax.shard_map` that checks which values differ between devices: pass
+        `check_vma=False`.
     - `TypeError` for an adjoint that is none of `vertax.adjoints`, or a solver that is no minimiser.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge.
     """
@@ -185,8 +186,8 @@ def _equilibrate(
 ) -> Equilibrium:
     start, constant = frozen((tissue, energy))
     search = response.search(start, constant)
-    found = search.advance(search.begin(start, constant), constant, response.max_steps)
-    return conclude(search, found, tissue, energy, adjoint, response.max_steps)
+    end = search.advance(search.begin(start, constant), constant, response.max_steps)
+    return conclude(search, end, tissue, energy, adjoint, response.max_steps)
 
 
 def conclude(
@@ -252,6 +253,16 @@ def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
         raise ValueError(
             "EquilibriumPropagation(nudge='cost') needs to know the cost: use it in an InverseProblem, "
             "or nudge='linear' here."
+        )
+
+
+def _check_sharding(tree: PyTree) -> None:
+    # Within `shard_map` JAX tells apart what differs from device to device and what does not, and a loop
+    # that begins with a plain 0 and counts is refused. The loops of Optimistix and Equinox do.
+    if any(differs_between_devices(x) for x in jax.tree.leaves(tree) if eqx.is_array(x)):
+        raise ValueError(
+            "A relaxation within jax.shard_map needs jax.shard_map(..., check_vma=False): its loops begin "
+            "with numbers that are the same on all devices."
         )
 
 

@@ -19,14 +19,11 @@ from jaxtyping import Shaped
 from matplotlib.figure import Figure
 
 from vertax._base.archive import read_archive, write_archive
-from vertax.fitting import Checkpoint
-from vertax.fitting import fit
-from vertax.fitting import Fit
-from vertax.fitting import InverseProblem
+from vertax.fitting import Checkpoint, Fit, InverseProblem, fit
+from vertax.io import atomic_write, save_tissue
 from vertax.mesh import Tissue
 from vertax.runs._config import ExperimentConfig, read_toml, validate
 from vertax.runs._summary import plain
-from vertax.io import atomic_write, save_tissue
 
 CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
 # What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.

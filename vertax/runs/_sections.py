@@ -10,8 +10,8 @@ import optimistix as optx
 from pydantic import Field
 
 from vertax import solvers
-from vertax.transitions import T1
 from vertax.runs._config import Section
+from vertax.transitions import T1
 
 
 class Relaxation(Section):

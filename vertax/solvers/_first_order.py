@@ -7,9 +7,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.checks import check_number, check_whole, named
+from vertax._base.modules import is_concrete
 from vertax.solvers._solver import AbstractSolver, value_and_gradient
 
 
@@ -29,9 +32,16 @@ class GradientDescent(AbstractSolver):
     **Arguments:**
 
     - `learning_rate`: step $\eta$, length squared per energy.
+
+    **Raises:**
+
+    - `ValueError` for a step that is not positive.
     """
 
     learning_rate: float | Float[Array, ""] = 1e-2
+
+    def __check_init__(self):
+        check_number("learning_rate", self.learning_rate, above=0, many=True)
 
     @property
     def unrollable(self) -> bool:
@@ -61,9 +71,20 @@ class Optax(AbstractSolver):
 
     - `optimiser`: e.g. `optax.adam(1e-2)`; schedules work, and so do optimisers with a line search
         (`optax.lbfgs()`), which are passed the value, gradient and value function.
+
+    **Raises:**
+
+    - `TypeError` for what is no Optax optimiser.
     """
 
     optimiser: optax.GradientTransformation = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not isinstance(self.optimiser, optax.GradientTransformation):
+            raise TypeError(
+                "Argument `optimiser` must be an Optax optimiser, such as optax.adam(1e-2), but is "
+                f"{named(self.optimiser)}."
+            )
 
     @property
     def unrollable(self) -> bool:
@@ -125,7 +146,12 @@ def LBFGS(history: int = 10) -> Optax:
     **Arguments:**
 
     - `history`: number of past steps that shape the metric.
+
+    **Raises:**
+
+    - `ValueError` for less than one.
     """
+    check_whole("history", history, least=1)
     return Optax(optax.lbfgs(memory_size=history))
 
 
@@ -152,11 +178,25 @@ class FIRE(AbstractSolver):
     - `max_time_step`: largest time step, likewise.
     - `max_displacement`: furthest that one vertex may move in a step, in units of the length scale (in
         [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
+
+    **Raises:**
+
+    - `ValueError` for a setting that is not positive, or a first time step above the largest.
     """
 
     time_step: float = 0.02
     max_time_step: float = 0.2
     max_displacement: float = 0.1
+
+    def __check_init__(self):
+        for name in ("time_step", "max_time_step", "max_displacement"):
+            check_number(name, getattr(self, name), above=0, many=True)
+        steps = (self.time_step, self.max_time_step)
+        if all(is_concrete(step) for step in steps) and not np.all(steps[0] <= steps[1]):
+            raise ValueError(
+                "Argument `time_step` must be at most `max_time_step`, but they are "
+                f"{steps[0]} and {steps[1]}."
+            )
 
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.checks import named
 from vertax.solvers._first_order import has_line_search
 from vertax.solvers._solver import AbstractSolver, value_and_gradient
 
@@ -15,6 +17,20 @@ from vertax.solvers._solver import AbstractSolver, value_and_gradient
 class _WrappedState(eqx.Module):
     inner: PyTree
     gradient: PyTree[Float[Array, "..."]]
+
+
+def check_solver(solver: Any) -> None:
+    """Refuse what is no minimiser with a `TypeError` that says what to write."""
+    if isinstance(solver, optx.AbstractMinimiser):
+        return
+    remedy = "Pass one of vertax.solvers, such as LBFGS(), or a minimiser of Optimistix."
+    if isinstance(solver, type) and issubclass(solver, optx.AbstractMinimiser):
+        remedy = f"Call it: {solver.__name__}(…)."
+    elif isinstance(solver, optax.GradientTransformation):
+        remedy = "Wrap the Optax optimiser: vertax.solvers.Optax(optimiser)."
+    elif isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractRootFinder):
+        remedy = f"{type(solver).__name__} solves another kind of problem. {remedy}"
+    raise TypeError(f"Argument `solver` must be a minimiser, but is {named(solver)}. {remedy}")
 
 
 class Wrapped(AbstractSolver):
@@ -27,9 +43,16 @@ class Wrapped(AbstractSolver):
     **Arguments:**
 
     - `solver`: any `optimistix.AbstractMinimiser`, e.g. `optimistix.BFGS(rtol=0.0, atol=0.0)`.
+
+    **Raises:**
+
+    - `TypeError` for anything else.
     """
 
     solver: optx.AbstractMinimiser
+
+    def __check_init__(self):
+        check_solver(self.solver)
 
     @property
     def unrollable(self) -> bool:

@@ -211,7 +211,7 @@ def _spare_sides(tissue: Tissue) -> Int[Array, "edges 2"]:
 def _straightened(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
     if tissue.angles is None:
         return tissue
-    return eqx.tree_at(lambda t: t.angles, tissue, jnp.where(which, 0, tissue.angles))
+    return tissue.with_angles(jnp.where(which, 0, tissue.angles))
 
 
 def _independent(

@@ -1,0 +1,74 @@
+# pyright: reportArgumentType=false
+"""What energies refuse, and how."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_tissue
+
+from vertax.energies import (
+    AreaElasticity,
+    BoundedTension,
+    LineTension,
+    PerimeterElasticity,
+    ShapeFactorEnergy,
+)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (
+            lambda: ShapeFactorEnergy("3.7"),
+            TypeError,
+            "`target_shape_factor` must hold real .* '3.7'",
+        ),
+        (
+            lambda: ShapeFactorEnergy(None),
+            TypeError,
+            "`target_shape_factor` must hold real numbers",
+        ),
+        (lambda: ShapeFactorEnergy([[1], [2, 3]]), TypeError, "must hold real numbers"),
+        (lambda: ShapeFactorEnergy(jnp.full(6, 1j)), TypeError, "an array of type complex128"),
+        (lambda: ShapeFactorEnergy(np.nan), ValueError, "`target_shape_factor` must be finite"),
+        (
+            lambda: ShapeFactorEnergy(3.7, 0.0),
+            ValueError,
+            "`mean_area` must be positive, but is 0.0",
+        ),
+        (lambda: ShapeFactorEnergy(3.7, jnp.array([1.0, -1])), ValueError, "from -1.0 to 1.0"),
+        (lambda: AreaElasticity(np.inf, 1.0), ValueError, "`stiffness` must be finite"),
+        (lambda: AreaElasticity(1.0, np.nan), ValueError, "`target_area` must be finite"),
+        (lambda: PerimeterElasticity("a", 1.0), TypeError, "`stiffness` must hold real numbers"),
+        (lambda: LineTension("a"), TypeError, "`tension` must hold real numbers, but is 'a'"),
+        (lambda: BoundedTension(np.ones(3), -np.inf, 2.0), ValueError, "`low` must be finite"),
+        (lambda: BoundedTension(np.ones(3), 0.0, "2"), TypeError, "`high` must be one real number"),
+        (lambda: BoundedTension(None, 0.0, 2.0), TypeError, "`tension` must hold real numbers"),
+        (lambda: BoundedTension("a", 0.0, 2.0), TypeError, "`tension` must hold real numbers"),
+        (
+            lambda: BoundedTension(np.full(3, np.nan), 0.0, 2.0),
+            ValueError,
+            "`tension` must be finite",
+        ),
+    ],
+)
+def test_what_is_no_parameter_is_named(make, error, message, as_a_user):
+    with pytest.raises(error, match=message):
+        make()
+
+
+def test_whole_numbers_in_an_array_are_parameters_too():
+    energy = ShapeFactorEnergy(np.full(6, 4))
+    assert eqx.is_inexact_array(energy.target_shape_factor)
+    assert isinstance(ShapeFactorEnergy(4).target_shape_factor, float)  # and one number a constant
+
+
+def test_a_batch_of_tissues_wants_vmap():
+    tissue = random_tissue(6)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
+    energy = ShapeFactorEnergy(3.7) + LineTension(0.1)
+    with pytest.raises(ValueError, match=r"single tissue, but .*filter_vmap"):
+        energy(batch)
+    np.testing.assert_allclose(eqx.filter_vmap(energy)(batch), energy(tissue), rtol=1e-12)

@@ -1,0 +1,62 @@
+"""What the arguments of a fit must be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import optax
+import optimistix as optx
+
+from vertax._base.checks import check_whole, named
+from vertax.fitting._inverse import InverseProblem
+
+
+def check_arguments(
+    problem: Any, optimiser: Any, epochs: Any, guidance: Any, callback: Any
+) -> None:
+    """Refuse what [`fit`][vertax.fit] cannot work with, with what to write instead.
+
+    **Raises:**
+
+    - `TypeError` for an argument of another kind.
+    - `ValueError` for less than one epoch.
+    """
+    if not isinstance(problem, InverseProblem):
+        raise TypeError(
+            f"Argument `problem` must be a vertax.InverseProblem, but is {named(problem)}."
+        )
+    _check_optimiser(optimiser)
+    check_whole("epochs", epochs, least=1)
+    if guidance is not None and not callable(guidance):
+        raise TypeError(
+            "Argument `guidance` must be a function of the epoch, such as "
+            f"optax.linear_schedule(1.0, 0.0, 100), but is {named(guidance)}. A constant strength is set "
+            "in the problem: InverseProblem(..., guidance=...)."
+        )
+    if callback is not None and not callable(callback):
+        raise TypeError(
+            f"Argument `callback` must be a function of epoch and record, but is {named(callback)}."
+        )
+
+
+def _check_optimiser(optimiser: Any) -> None:
+    known = optax.GradientTransformation | optx.AbstractLeastSquaresSolver
+    if isinstance(optimiser, known):
+        return
+    remedy = (
+        "Pass an Optax optimiser, such as optax.adam(1e-2), or a least-squares solver, such as "
+        "optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)."
+    )
+    if isinstance(optimiser, str) and callable(getattr(optax, optimiser, None)):
+        remedy = f"Write optax.{optimiser}(learning_rate)."
+    elif isinstance(optimiser, optx.AbstractMinimiser):
+        remedy = (
+            "Minimisers relax tissues: they are for the `solver` of a relaxation. For the parameters "
+            f"p{remedy[1:]}"
+        )
+    elif callable(optimiser):
+        remedy = f"Call it: {getattr(optimiser, '__name__', 'optimiser')}(…)."
+    raise TypeError(
+        "Argument `optimiser` must be an optimiser of parameters, but is "
+        f"{named(optimiser)}. {remedy}"
+    )
