@@ -1,0 +1,101 @@
+"""The code in the README and in the documentation runs as it stands there.
+
+The blocks marked as `python` of a page run from top to bottom, in one namespace and an empty folder, and
+they bring their imports. A block whose last line is a comment `# raises NAME` must raise that. What is not to
+be run is marked otherwise: `text`, `sh`, `toml`.
+"""
+
+import re
+import textwrap
+from contextlib import nullcontext
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import pytest
+
+import vertax as vx
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"^([ ]*)```python\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
+
+
+def blocks(page: Path) -> list[tuple[int, str]]:
+    """The Python of a page, with the lines that it begins in."""
+    text = page.read_text(encoding="utf-8")
+    return [(text[: m.start(2)].count("\n"), textwrap.dedent(m[2])) for m in BLOCK.finditer(text)]
+
+
+PAGES = [
+    page.relative_to(ROOT).as_posix()
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    if blocks(page)
+]
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Runs a page, and returns its names."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(page: str) -> dict:
+        names = {"__name__": "__main__"}
+        for line, source in blocks(ROOT / page):
+            # Empty lines before it, so that a traceback shows the line of the page.
+            code = compile("\n" * line + source, str(ROOT / page), "exec")
+            raises = re.search(r"^# raises ([\w.]+)\s*\Z", source, re.MULTILINE)
+            with pytest.raises(eval(raises[1], names)) if raises else nullcontext():
+                exec(code, names)
+        return names
+
+    yield run
+    plt.close("all")
+
+
+# Those that compile much: for `make test-slow`.
+SLOW = {
+    "docs/extending.md",
+    "docs/index.md",
+    "docs/masks.md",
+    "docs/pictures.md",
+    "docs/topologies.md",
+}
+
+# What a page promises beside its code.
+PROMISES = {
+    "README.md": lambda names: (
+        names["fit"].history.relative_error[-1] < 1e-5
+        and jnp.all(jnp.isfinite(names["gradient"].terms[1].strength))
+    ),
+    "docs/extending.md": lambda names: abs(names["slope"] / names["difference"] - 1) < 1e-5,
+    "docs/index.md": lambda names: names["fit"].history.relative_error[-1] < 1e-5,
+    "docs/masks.md": lambda names: (
+        names["foam"].inner_distance(names["fit"]) < 0.5 and not vx.fitting.doubts(names["fit"])
+    ),
+    "docs/performance.md": lambda names: jnp.allclose(
+        *(names[f](names["factors"]) for f in ("one_by_one", "side_by_side"))
+    ),
+    "docs/topologies.md": lambda names: (
+        vx.costs.mismatched_neighbours(names["fit"].tissue, names["target"]) == 0
+        and names["fit"].history.relative_error[-1] < 1e-3
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else []) for page in PAGES],
+)
+def test_its_code_runs_as_printed(page, run):
+    names = run(page)
+    assert PROMISES.get(page, lambda names: True)(names)
+
+
+def test_what_is_said_of_pages_is_said_of_pages():
+    assert SLOW | PROMISES.keys() <= set(PAGES)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_fences_name_their_language(page):
+    opened = re.findall(r"^ *```(\w*)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    assert set(opened[::2]) <= {"python", "sh", "text", "toml"}
