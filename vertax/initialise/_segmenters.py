@@ -105,7 +105,7 @@ class Watershed(AbstractSegmenter):
         flat = gaussian_filter(flat / np.maximum(spread, 0.1 * np.std(flat)), smoothing)
         markers = measure.label(morphology.h_minima(flat, self.depth))
         while True:
-            labels = segmentation.watershed(flat, markers)
+            labels = np.asarray(segmentation.watershed(flat, markers))
             areas = np.bincount(labels.ravel())
             small = (areas > 0) & (areas < min_area)
             if not small.any() or np.count_nonzero(areas) < 2:
