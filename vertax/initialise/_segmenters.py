@@ -103,7 +103,7 @@ class Watershed(AbstractSegmenter):
         spread = np.sqrt(gaussian_filter(flat**2, cell_size))
         # A tenth of the overall spread at least: where there is no membrane, noise stays noise.
         flat = gaussian_filter(flat / np.maximum(spread, 0.1 * np.std(flat)), smoothing)
-        markers = measure.label(morphology.h_minima(flat, self.depth))
+        markers = np.asarray(measure.label(morphology.h_minima(flat, self.depth)))
         while True:
             labels = np.asarray(segmentation.watershed(flat, markers))
             areas = np.bincount(labels.ravel())
