@@ -15,7 +15,9 @@ from helpers import (
 )
 
 import vertax as vx
+from vertax._base.modules import traced
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
+from vertax.responses._relaxation import _equilibrate
 
 solvers = pytest.mark.parametrize(
     ("solver", "force"), [row[1:] for row in SOLVERS], ids=[row[0] for row in SOLVERS]
@@ -139,6 +141,14 @@ def test_what_is_a_number_compiles_once():
         assert relax(3.71, 1e-9, 1001, 0.03).converged
         assert relax(3.72, 1e-7, 500, 0.01).converged
     assert not compiled
+
+
+def test_what_is_compiled_can_be_kept_on_disk():
+    # JAX keeps no program that calls back to the host, as an error raised within it does.
+    tissue, energy = traced((random_tissue(6, 0), ShapeFactorEnergy(3.7)))
+    response, adjoint = vx.Relaxation().traced(), vx.ImplicitDifferentiation()
+    program = _equilibrate.lower(tissue, energy, response, adjoint).as_text()
+    assert "callback" not in program
 
 
 def test_patience_counts_consecutive_steps():
