@@ -129,7 +129,7 @@ def test_a_short_fit_is_written_once(path, monkeypatch):
 
 OTHERS = {
     "with another optimiser": {"optimiser": optax.adam(2e-2)},
-    "sizes.*max_steps=2000 and not max_steps=300": {
+    "sizes.*: .*NewtonCG.* and not .*max_steps=300": {
         "problem": problem_of(response=vx.Relaxation(max_steps=300))[0]
     },
     "numbers in its arrays": {"problem": problem_of(2)[0]},
