@@ -97,7 +97,7 @@ def fit(
         epoch reached equilibrium; it carries the fit so far.
     """
     check_arguments(problem, optimiser, epochs, guidance, callback)
-    parameters, constants = eqx.partition(problem.energy, problem.trainable)
+    parameters, fixed = eqx.partition(problem.energy, problem.trainable)
     if not jax.tree.leaves(parameters):
         raise ValueError(
             "There is nothing to fit: no leaf of the energy is selected by `trainable`. Parameters are "
@@ -141,7 +141,7 @@ def fit(
             None,
         )
     outcome = Fit(
-        eqx.combine(best.parameters, constants),
+        eqx.combine(best.parameters, fixed),  # its Python numbers are none that are fitted
         best.tissue,
         best.facts.cost,
         best.facts.max_force,
