@@ -240,7 +240,7 @@ def test_broken_tables_are_refused_by_name(tissue):
         r"he_table.*shape \(half-edges, 8\)": good._replace(he_table=good.he_table[:, :7]),
         r"he_table.*integers": good._replace(he_table=good.he_table.astype(float)),
         r"face_table.*BoundedTables": good._replace(face_table=np.stack([good.face_table] * 2, 1)),
-        r"width and height": good._replace(height=0.0),
+        r"`height` must be positive": good._replace(height=0.0),
         r"three edges.*vertices": rows_of_one_vertex,
         r"`next` must lie in": with_he(5, 1, 10**6),
         r"`twin` must pair": with_he(4, 2, good.he_table[9, 2]),
