@@ -42,9 +42,7 @@ class TestEdgeDistance:
         assert jax.grad(cost)(y) @ way == pytest.approx(float(difference), rel=1e-7)
 
     def test_bad_input_is_refused(self):
-        with pytest.raises(
-            ValueError, match="`points_per_edge` of EdgeDistance must be at least 2"
-        ):
+        with pytest.raises(ValueError, match="`points_per_edge` must be at least 2"):
             EdgeDistance(random_tissue(6), 1)
         with pytest.raises(ValueError, match="must have 15 edges"):
             EdgeDistance(random_tissue(6))(random_tissue(5), ShapeFactorEnergy(3.8))

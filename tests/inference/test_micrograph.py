@@ -53,7 +53,9 @@ def test_correlation_and_contrast_fall_when_the_mesh_is_moved(pinned):
 
 
 def test_the_rest_area_of_an_inner_cell_is_one():
-    energy = PinnedEnergy(jnp.full(2, 3.7), jnp.log(jnp.array([0.5, 0.5])), np.array([True, False]))
+    energy = PinnedEnergy(
+        jnp.full(2, 3.7), jnp.log(jnp.array([0.5, 0.5])), jnp.array([True, False])
+    )
     np.testing.assert_allclose(energy.mean_area, [1.0, 0.5])
 
 

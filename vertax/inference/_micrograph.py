@@ -39,7 +39,7 @@ class PinnedEnergy(AbstractEnergy):
     """Target shape factor of each cell."""
     log_border_area: Float[Array, " cells"]
     """Logarithm of the rest area; it counts for cells that are not inner ones."""
-    inner: Bool[np.ndarray, " cells"]
+    inner: Bool[Array, " cells"]
     """Which cells do not touch the border."""
 
     @property
@@ -295,7 +295,7 @@ def _pinned(
     weight = away_from_outline(tissue, on_outline, labels > 0, pixel, seen.shape)
     # Straight edges cut off the corners of cells on the outline, of some nearly all of the cell.
     areas = jnp.log(jnp.maximum(tissue.areas, 0.2))
-    guess = PinnedEnergy(jnp.full(cluster.n_cells, target_shape_factor), areas, inner)
+    guess = PinnedEnergy(jnp.full(cluster.n_cells, target_shape_factor), areas, jnp.asarray(inner))
     options = {
         "image": seen,
         "points_per_edge": _POINTS_PER_EDGE,
