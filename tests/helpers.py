@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
+import pytest
 from hypothesis import strategies as st
 from jax import Array
 
@@ -25,6 +26,15 @@ SOLVERS = [
     ("optimistix_bfgs", optx.BFGS(rtol=0.0, atol=0.0), 1e-6),
     ("optimistix_nonlinear_cg", optx.NonlinearCG(rtol=0.0, atol=0.0), 1e-5),
 ]
+
+
+def each_solver(*quick: str) -> pytest.MarkDecorator:
+    """All solvers, of which those named are tried on every change and all of them by `test-slow`."""
+    rows = [
+        pytest.param(solver, force, marks=() if name in quick else (pytest.mark.slow,), id=name)
+        for name, solver, force in SOLVERS
+    ]
+    return pytest.mark.parametrize(("solver", "force"), rows)
 
 
 @contextlib.contextmanager

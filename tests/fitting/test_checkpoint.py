@@ -74,7 +74,7 @@ def path(tmp_path):
     return tmp_path / "fit.npz"
 
 
-COMPILES_LONG = ("least squares, batch", "batch")
+COMPILES_LONG = ("least squares, batch", "batch", "guided", "noisy")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 from free_helpers import angles_of, cluster, doublet, forces, rotated, with_angles
-from helpers import SOLVERS, central_difference, random_like
+from helpers import central_difference, each_solver, random_like
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import brentq
 
@@ -108,7 +108,7 @@ def test_triplets(seed):
     assert max(imbalance(tissue, tension, target)) < 1e-8
 
 
-@pytest.mark.parametrize("inner_arcs", [False, True])
+@pytest.mark.parametrize("inner_arcs", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_young_laplace_and_force_balance_in_random_clusters(inner_arcs):
     n, target = 20, jnp.linspace(0.7, 1.3, 20)
     batch = [cluster(n, s, inner_arcs=inner_arcs, softening=1e-6) for s in range(3)]
@@ -128,16 +128,16 @@ def test_young_laplace_and_force_balance_in_random_clusters(inner_arcs):
         assert max(jnp.abs(force).max(), jnp.abs(torque).max()) < 1e-9
 
 
-@pytest.mark.parametrize(("name", "solver", "reached"), SOLVERS, ids=[row[0] for row in SOLVERS])
-def test_all_solvers_reach_the_same_drop(name, solver, reached):
+@each_solver("newton_cg", "fire")
+def test_all_solvers_reach_the_same_drop(solver, force):
     tension, target = jnp.array([0.9, 0.7, 1.2]), jnp.array([0.7, 1.4])
     energy = AreaElasticity(0.2 * K, target) + LineTension(0.2 * tension)
     start = relax(doublet(inner_arcs=True), drops(tension, 0.9 * target), transitions=None)
-    options = {"solver": solver, "tolerance": 10 * reached, "max_steps": 3000, "transitions": None}
+    options = {"solver": solver, "tolerance": 10 * force, "max_steps": 3000, "transitions": None}
     found = vx.equilibrate(start, energy, throw=False, **options)
     assert found.converged, (found.max_force, found.num_steps)
     exact = relax(start, energy, transitions=None)
-    np.testing.assert_allclose(found.tissue.areas, exact.areas, atol=100 * reached)
+    np.testing.assert_allclose(found.tissue.areas, exact.areas, atol=100 * force)
 
 
 def test_units_of_length_do_not_matter_to_the_solver():
@@ -173,7 +173,7 @@ def hypergradient_problem(tissue, seed=0):
     return loss, 0.7 + 0.2 * jax.random.uniform(jax.random.key(seed), (tissue.n_edges,))
 
 
-@pytest.mark.parametrize("inner_arcs", [False, True])
+@pytest.mark.parametrize("inner_arcs", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_hypergradient_from_far_away_against_central_differences(inner_arcs):
     # The relaxation starts out of equilibrium, with T1s on the way: the orientation in which it ends
     # must not depend on the solver's way there, or the gradient would miss that.
@@ -186,7 +186,7 @@ def test_hypergradient_from_far_away_against_central_differences(inner_arcs):
 
 
 # Clusters that are not about to undergo a T1 transition, where positions jump.
-@pytest.mark.parametrize(("n_pinned", "seed"), [(1, 1), (3, 6)])
+@pytest.mark.parametrize(("n_pinned", "seed"), [pytest.param(1, 1, marks=pytest.mark.slow), (3, 6)])
 def test_pinned_vertices_stay_and_are_differentiable(n_pinned, seed):
     free = cluster(7, seed)
     pinned = jnp.zeros(free.n_vertices, bool).at[jnp.arange(n_pinned) * 3].set(True)

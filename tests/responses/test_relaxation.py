@@ -9,6 +9,7 @@ from helpers import (
     SOLVERS,
     counted_compilations,
     dense_hessian,
+    each_solver,
     random_tissue,
     relaxed,
     shape_factors,
@@ -19,10 +20,6 @@ from vertax._base.modules import traced
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 from vertax.responses._relaxation import _equilibrate
 
-solvers = pytest.mark.parametrize(
-    ("solver", "force"), [row[1:] for row in SOLVERS], ids=[row[0] for row in SOLVERS]
-)
-
 
 @pytest.fixture(scope="module")
 def disturbed():
@@ -32,7 +29,7 @@ def disturbed():
     return tissue.with_configuration(tissue.vertices + nudge), energy, tissue
 
 
-@solvers
+@each_solver(*(name for name, *_ in SOLVERS))
 def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
     start, energy, reference = disturbed
     found = vx.equilibrate(
@@ -45,7 +42,7 @@ def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
     assert found.energy == pytest.approx(float(energy(reference)), abs=10 * force**2 + 1e-9)
 
 
-@solvers
+@each_solver("newton_cg", "lbfgs")
 def test_every_solver_works_in_float32(solver, force, disturbed):
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     start, energy, reference = disturbed
@@ -147,7 +144,7 @@ def test_what_is_compiled_can_be_kept_on_disk():
     # JAX keeps no program that calls back to the host, as an error raised within it does.
     tissue, energy = traced((random_tissue(6, 0), ShapeFactorEnergy(3.7)))
     response, adjoint = vx.Relaxation().traced(), vx.ImplicitDifferentiation()
-    program = _equilibrate.lower(tissue, energy, response, adjoint).as_text()
+    program = _equilibrate.lower(tissue, energy, response, adjoint).as_text()  # pyright: ignore[reportFunctionMemberAccess]
     assert "callback" not in program
 
 
