@@ -110,6 +110,9 @@ def test_the_users_own_energy_is_fitted_like_any_other():
         progress=False,
     )
     assert fit.history.relative_error[-1] < 0.1 * fit.history.relative_error[0]
+    # What is no array is no parameter, in the fit that goes on from this one neither.
+    assert isinstance(fit.energy.terms[0].stiffness, float)
+    assert len(jax.tree.leaves(eqx.filter(fit.energy, eqx.is_inexact_array))) == 1
 
 
 def test_the_optimiser_keeps_its_momentum_over_epochs(hidden):

@@ -32,7 +32,7 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
-def differs_between_devices(array: jax.Array) -> bool:
+def differs_between_devices(array: jax.typing.ArrayLike) -> bool:
     """Whether `jax.shard_map` keeps track of an array as one that differs from device to device."""
     kind = jax.typeof(array)
     newer = getattr(getattr(kind, "mat", None), "varying", None)  # as of JAX 0.10
