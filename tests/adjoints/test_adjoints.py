@@ -329,6 +329,7 @@ def test_adjoint_ignores_translations():
     assert jnp.abs(gradient).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_order_of_the_estimators_of_equilibrium_propagation():
     tissue, energy, cost = start_and_cost(8)
 
