@@ -180,10 +180,10 @@ class TestRoundTrip:
     @pytest.mark.parametrize(
         "options",
         [
-            {"solver": None, "transitions": None, "tolerance": None, "guidance": None},
+            {"response": vx.Relaxation(transitions=None), "guidance": None},
             {"fit_position": True, "adjoint": vx.EquilibriumPropagation(1e-4, nudge="cost")},
             {"adjoint": vx.AutomaticDifferentiation(throw=False, outcome=vx.GradientOutcome())},
-            {"solver": vx.solvers.GradientDescent(jnp.array(1e-3))},
+            {"response": vx.Relaxation(vx.solvers.GradientDescent(jnp.array(1e-3)))},
             {"trainable": eqx.is_array},
         ],
     )
@@ -231,7 +231,7 @@ class TestRoundTrip:
             energy=Contractility(jnp.ones(N)),
             cost=Nearest(tissue) + vx.costs.MeanShapeFactor(3.8),
             adjoint=vx.ImplicitDifferentiation(linear_solver=lx.LU()),
-            solver=vx.solvers.Wrapped(Steepest(jnp.array(0.1), rate=2.0)),
+            response=vx.Relaxation(vx.solvers.Wrapped(Steepest(jnp.array(0.1), rate=2.0))),
         )
         save_problem(path, problem)
         loaded = load_problem(path, classes=[Contractility, Nearest, lx.LU, Steepest])

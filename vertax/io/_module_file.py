@@ -23,6 +23,7 @@ from vertax._base.checks import named
 from vertax.energies import AbstractEnergy
 from vertax.fitting import InverseProblem
 from vertax.mesh import Free, Periodic, Tissue, Topology
+from vertax.mesh._arcs import Arcs
 from vertax.transitions import T1
 
 _VERSION = 1
@@ -191,7 +192,7 @@ def _load(
 @functools.cache
 def _public_classes() -> dict[str, type[eqx.Module]]:
     """The classes of vertax by the name that a file knows them by."""
-    single = (Free, InverseProblem, Periodic, T1, Tissue, Topology)
+    single = (Arcs, Free, InverseProblem, Periodic, T1, Tissue, Topology)
     classes: dict[str, type[eqx.Module]] = {cls.__name__: cls for cls in single}
     for family in (adjoints, costs, energies, responses, solvers):
         for name, cls in vars(family).items():
