@@ -184,7 +184,7 @@ def _check_batch(tree: PyTree) -> None:
             "Argument `problem` (and `truth`) must be a batch if `batched` is set: all arrays need one "
             "leading axis of one size, but there are "
             f"{sorted('none' if s is None else str(s) for s in sizes)}. Make it with "
-            "equinox.filter_vmap, or stack problems with jax.tree.map."
+            "equinox.filter_vmap, or of single problems with vertax.fitting.stack."
         )
 
 
