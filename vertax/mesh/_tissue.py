@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from vertax._base.modules import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free
+from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
 
 
@@ -270,6 +271,11 @@ class Tissue(eqx.Module):
             moment += (p + q) * bulge[:, None] / 2
             moment += right * (squared * moment_factor(angle))[:, None]
         return (centre + face_sums(moment) / face_sums(area)[:, None])[: self.n_cells]
+
+    @compiled_property
+    def overlaps(self) -> Overlaps:
+        """Where cells overlap: whether the tissue tiles the plane, as every tissue should."""
+        return find_overlaps(self)
 
     @property
     def configuration(self) -> PyTree[Float[Array, "..."]]:

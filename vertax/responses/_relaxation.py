@@ -18,6 +18,7 @@ from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units, units_of
 from vertax.mesh import Tissue
+from vertax.responses._contact import Contacts
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._search import Search, SearchState, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
@@ -60,6 +61,7 @@ class Relaxation(AbstractResponse):
     tolerance: float | Float[Array, ""] | None = None
     patience: int | Int[Array, ""] = 1
     max_steps: int | Int[Array, ""] = 2000
+    contact_range: float | Float[Array, ""] | None = 0.01
 
     def __check_init__(self):
         check_solver(self.solver)
@@ -116,7 +118,7 @@ class Relaxation(AbstractResponse):
 
     def traced(self) -> Relaxation:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""
-        names = ("transitions", "tolerance", "patience", "max_steps")
+        names = ("transitions", "tolerance", "patience", "max_steps", "contact_range")
         numbers = {name: traced(getattr(self, name), integers=True) for name in names}
         return dataclasses.replace(self, **numbers)
 
@@ -133,7 +135,7 @@ class Relaxation(AbstractResponse):
             "tolerance": jnp.asarray(tolerance, tissue.vertices.dtype),
         }
         minimiser = Patient(solver=self.minimiser, patience=self.patience)
-        return Search(minimiser, self.transitions, frozen(options))
+        return Search(minimiser, self.transitions, frozen(options), self.contact_range)
 
 
 def equilibrate(
@@ -200,7 +202,7 @@ def conclude(
 ) -> Equilibrium:
     """The equilibrium that a search from `tissue` ended at, differentiable."""
     relaxed = state.tissue
-    units = units_of(relaxed, frozen(energy))
+    units = Units(search.options["length_scale"], search.options["stiffness"])
     free = free_motions(relaxed, frozen(energy), units)
     # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
     # unless the energy has something to say about where the tissue is.
@@ -218,7 +220,7 @@ def conclude(
         _pinned_energy,
         AtRest(),
         settled.configuration,
-        (moved, energy, units.stiffness * springs),
+        (moved, energy, frozen(state.contacts), units.stiffness * springs),
         search.options | memory,
         max_steps=None,
         adjoint=adjoint,
@@ -285,11 +287,11 @@ def free_motions(tissue: Tissue, energy: AbstractEnergy, units: Units) -> Bool[A
 
 
 def _pinned_energy(
-    configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Array]
+    configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Contacts | None, Array]
 ) -> Array:
     """The energy, and a term that pins the motions which cost nothing."""
     # Motions of the whole are zero modes. They make the Hessian singular, and a nudged relaxation would
     # drift along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
-    tissue, energy, gauge = args
+    tissue, energy, contacts, gauge = args
     drift = tissue.drift(configuration)
-    return objective(configuration, (tissue, energy))[0] + 0.5 * jnp.sum(gauge * drift**2)
+    return objective(configuration, (tissue, energy, contacts))[0] + 0.5 * jnp.sum(gauge * drift**2)

@@ -7,11 +7,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
+from vertax.mesh._overlaps import find_overlaps
+from vertax.responses._contact import Contacts, contacts_of
 from vertax.solvers._patience import Patient, PatientState
 from vertax.transitions import AbstractTransitions
 
@@ -23,9 +26,13 @@ class SearchState(eqx.Module):
     origin: PyTree[Array]
     """The configuration right after the last transition, or the first one."""
     minimiser: PatientState
+    contacts: Contacts | None
+    overlaps: Bool[Array, ""]
+    """Whether the tissue overlaps, and always has."""
     counts: Int[Array, " edges"]
     """How often each edge took part in a transition."""
     num_steps: Int[Array, ""]
+    started: Bool[Array, ""]
     finished: Bool[Array, ""]
 
     @property
@@ -42,19 +49,33 @@ class Search(eqx.Module):
     - `minimiser`: takes the steps and knows when the tissue is at rest.
     - `transitions`: the rule for topology changes, or None.
     - `options`: of the minimiser: typical sizes and the tolerance.
+    - `contact_range`: of contacts; None to let cells overlap.
     """
 
     minimiser: Patient
     transitions: AbstractTransitions | None
     options: dict[str, Array]
+    contact_range: float | Float[Array, ""] | None
 
     def begin(self, tissue: Tissue, energy: AbstractEnergy) -> SearchState:
         """The state before the first step."""
         rule = self.transitions
         counts = jnp.zeros(0, jnp.int32) if rule is None else rule.init(tissue)
-        minimiser = self._restarted(tissue, energy)
+        # The first step only makes it what it is, lest all of that be compiled twice.
+        empty = lambda function, *args: _empty(eqx.filter_eval_shape(function, *args))
+        contacts, overlaps = empty(self._near, tissue)
+        minimiser = empty(self._restarted, tissue, energy, contacts)
+        no = jnp.array(False)
         return SearchState(
-            tissue, tissue.configuration, minimiser, counts, jnp.array(0), jnp.array(False)
+            tissue,
+            tissue.configuration,
+            minimiser,
+            contacts,
+            overlaps,
+            counts,
+            jnp.array(0),
+            started=no,
+            finished=no,
         )
 
     def advance(
@@ -83,39 +104,72 @@ class Search(eqx.Module):
         return optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
 
     def _step(self, state: SearchState, energy: AbstractEnergy) -> SearchState:
-        tissue, counts, minimiser, origin = (
-            state.tissue,
-            state.counts,
-            state.minimiser,
-            state.origin,
-        )
-        flipped = jnp.array(False)
-        if self.transitions is not None:
-            tissue, counts = self.transitions.sweep(tissue, energy, state.counts)
-            flipped = jnp.any(counts != state.counts)
-            # What a minimiser remembers of the old topology misleads it in the new one.
-            restart = lambda: self._restarted(tissue, energy)
-            minimiser = _either(flipped, restart, lambda: state.minimiser, state.minimiser)
-            moved = lambda new, old: jnp.where(flipped, new, old)
-            origin = jax.tree.map(moved, tissue.configuration, origin)
-        at_rest = self.minimiser.at_rest(minimiser) & ~flipped
-        finished = at_rest | jnp.isnan(minimiser.force)
+        """A step of the minimiser (not the first time), then transitions; what would overlap is undone."""
+        before = state.tissue
+        args = (before, energy, state.contacts)
 
         def step() -> tuple[PyTree, PatientState]:
             y, new, _ = self.minimiser.step(
-                objective, tissue.configuration, (tissue, energy), self.options, minimiser, _TAGS
+                objective, before.configuration, args, self.options, state.minimiser, _TAGS
             )
             return y, new
 
-        here = (tissue.configuration, minimiser)
-        y, minimiser = _either(finished, lambda: here, step, here)
-        num_steps = state.num_steps + jnp.where(finished, 0, 1)
-        moved = tissue.with_configuration(y)
-        return SearchState(moved, origin, minimiser, counts, num_steps, finished)
+        here = (before.configuration, state.minimiser)
+        trial, minimiser = _either(state.started, step, lambda: here, here)
+        tissue, counts = before.with_configuration(trial), state.counts
+        if self.transitions is not None:
+            tissue, counts = self.transitions.sweep(tissue, energy, state.counts)
+        swept = jnp.any(tissue.vertices != before.with_configuration(trial).vertices) | jnp.any(counts != state.counts)
+        contacts, overlaps = self._near(tissue)
+        refused = state.started & ~state.overlaps & overlaps
+        kept = (before, state.contacts, state.overlaps, state.counts)
+        tissue, contacts, overlaps, counts = jax.tree.map(
+            lambda old, new: jnp.where(refused, old, new), kept, (tissue, contacts, overlaps, counts)
+        )
+        flipped = swept & ~refused
 
-    def _restarted(self, tissue: Tissue, energy: AbstractEnergy) -> PatientState:
+        def restart() -> tuple[PyTree, PatientState]:
+            # What a minimiser remembers of the old topology misleads it in the new one.
+            return tissue.configuration, self._restarted(tissue, energy, contacts)
+
+        def retreat() -> tuple[PyTree, PatientState]:
+            inside = lambda y: ~find_overlaps(before.with_configuration(y)).any
+            way = optax.tree.sub(trial, before.configuration)
+            return self.minimiser.retreat(
+                objective, before.configuration, way, args, self.options, state.minimiser, _TAGS, inside
+            )
+
+        here = (tissue.configuration, minimiser)
+        y, minimiser = _either(flipped | ~state.started, restart, lambda: here, here)
+        if self.contact_range is not None:
+            here = (y, minimiser)
+            y, minimiser = _either(refused, retreat, lambda: here, here)
+        moved = lambda new, old: jnp.where(flipped, new, old)
+        return SearchState(
+            tissue=tissue.with_configuration(y),
+            origin=jax.tree.map(moved, tissue.configuration, state.origin),
+            minimiser=minimiser,
+            contacts=contacts,
+            overlaps=overlaps,
+            counts=counts,
+            num_steps=state.num_steps + jnp.where(state.started, 1, 0),
+            started=jnp.array(True),
+            finished=(self.minimiser.at_rest(minimiser) & ~flipped & ~refused)
+            | jnp.isnan(minimiser.force),
+        )
+
+    def _near(self, tissue: Tissue) -> tuple[Contacts | None, Bool[Array, ""]]:
+        """The contacts of a tissue, and whether it overlaps, if that matters."""
+        if self.contact_range is None:
+            return None, jnp.array(False)
+        contacts, overlaps = contacts_of(self.contact_range, self.options, tissue)
+        return contacts, overlaps.any
+
+    def _restarted(
+        self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
+    ) -> PatientState:
         struct = jax.ShapeDtypeStruct((), tissue.vertices.dtype)
-        args = (tissue, energy)
+        args = (tissue, energy, contacts)
         return self.minimiser.init(
             objective, tissue.configuration, args, self.options, struct, None, _TAGS
         )
@@ -125,11 +179,19 @@ _TAGS: frozenset[object] = frozenset()
 
 
 def objective(
-    configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy]
+    configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Contacts | None]
 ) -> tuple[Float[Array, ""], None]:
-    """The energy of a configuration, as Optimistix wants it."""
-    tissue, energy = args
-    return energy(tissue.with_configuration(configuration)), None
+    """The energy of a configuration and of its contacts, as Optimistix wants it."""
+    tissue, energy, contacts = args
+    there = tissue.with_configuration(configuration)
+    value = energy(there)
+    return value if contacts is None else value + contacts(there), None
+
+
+def _empty(tree: PyTree) -> PyTree:
+    """Zeros for the arrays of a pytree of which only their shapes are known."""
+    is_shape = lambda x: isinstance(x, jax.ShapeDtypeStruct)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_shape(x) else x, tree)
 
 
 def _either(condition: Bool[Array, ""], yes: Any, no: Any, like: Any) -> Any:

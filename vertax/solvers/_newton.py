@@ -92,6 +92,19 @@ class NewtonCG(AbstractSolver):
         y, value, g, aux = tree.where(accept, (trial, value, gradient, aux), kept)
         return y, _NewtonState(value, g, radius, state.num_products + products, aux), aux
 
+    def retreat(
+        self,
+        fn: Any,
+        y: Any,
+        way: Any,
+        args: Any,
+        options: Any,
+        state: _NewtonState,
+        tags: Any,
+        inside: Any,
+    ) -> tuple[Any, _NewtonState]:
+        return y, eqx.tree_at(lambda s: s.radius, state, 0.25 * jnp.sqrt(_dot(way, way)))
+
     def gradient(self, state: _NewtonState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 

@@ -53,6 +53,21 @@ class Patient(optx.AbstractMinimiser):
         y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
         return y, self._judge(inner, options, state.n_below, state.num_steps + 1), aux
 
+    def retreat(
+        self,
+        fn: Any,
+        y: Any,
+        way: Any,
+        args: Any,
+        options: Any,
+        state: PatientState,
+        tags: Any,
+        inside: Callable[[PyTree], Bool[Array, ""]],
+    ) -> tuple[Any, PatientState]:
+        """Where to go on after a step that must not be taken, see `AbstractSolver`."""
+        y, inner = self.solver.retreat(fn, y, way, args, options, state.inner, tags, inside)
+        return y, self._judge(inner, options, jnp.array(0), state.num_steps + 1)
+
     def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:

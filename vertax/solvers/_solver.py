@@ -8,6 +8,8 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -38,6 +40,32 @@ class AbstractSolver(optx.AbstractMinimiser):
     @abc.abstractmethod
     def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
+
+    def retreat(
+        self,
+        fn: Any,
+        y: Any,
+        way: Any,
+        args: Any,
+        options: Any,
+        state: Any,
+        tags: Any,
+        inside: Callable[[PyTree], Bool[Array, ""]],
+    ) -> tuple[Any, Any]:
+        """Where to go on, and in what state, after a step that must not be taken.
+
+        **Arguments:**
+
+        - `y`, `state`: those before the step.
+        - `way`: the step, to `y + way`.
+        - `inside`: which points are allowed, as `y` is.
+        """
+        halved = lambda share: 0.5 * share
+        outside = lambda share: ~inside(optax.tree.add_scale(y, share, way)) & (share > 1e-9)
+        share = jax.lax.while_loop(outside, halved, jnp.asarray(0.5, optx.max_norm(way).dtype))
+        y = optax.tree.where(inside(optax.tree.add_scale(y, share, way)), optax.tree.add_scale(y, share, way), y)
+        struct = jax.eval_shape(fn, y, args)
+        return y, self.init(fn, y, args, options, struct[0], struct[1], tags)
 
     def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any

@@ -7,13 +7,14 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import is_concrete
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
+from vertax.mesh._overlaps import Overlaps
 from vertax.mesh._topology import edge_neighbourhood, flip_edges, source, take
 from vertax.transitions._transitions import AbstractTransitions
 
@@ -89,35 +90,67 @@ class T1(AbstractTransitions):
             todo &= corner.can_flip & (counts < self.max_flips)
             chosen = _independent(todo, corner, tissue.n_cells)
 
-            def judge() -> tuple[Tissue, Bool[Array, " edges"]]:
+            def flip_where_it_helps() -> tuple[Tissue, Bool[Array, " edges"]]:
                 length = jnp.maximum(corner.length, threshold)
                 chord = length / corner.stretch
                 stretch = lambda which: corner.place(tissue, which, corner.along, chord)
 
-                def flip(which: Bool[Array, " edges"], share: float = 1.0) -> Tissue:
+                def flip(
+                    which: Bool[Array, " edges"], share: float | Float[Array, " edges"] = 1.0
+                ) -> Tissue:
                     placed = corner.place(tissue, which, corner.across, share * length)
                     flipped = flip_edges(tissue.topology, which)
                     return _straightened(placed, which).with_topology(flipped)
 
-                def lowers(which: Bool[Array, " edges"], other: _Trial) -> Bool[Array, " edges"]:
-                    if isinstance(energy, AbstractLocalEnergy):
-                        return _judge_local(energy, which, corner, other, flip)
-                    return _judge_total(energy, which, corner, other, flip)
+                trials = lambda which: (stretch(which), flip(which), flip(which, 0.5))
+                local = isinstance(energy, AbstractLocalEnergy)
+                judge = _judge_local if local else _judge_total
+                stretched, flipped, shorter = judge(energy, chosen, corner, trials)
+                grows = flipped < shorter
+                accepted = chosen & (flipped < stretched) & (grows | (counts == 0))
+                before = _faces(tissue.overlaps)
 
-                accepted = lowers(chosen, stretch)
-                again = accepted & (counts > 0)
-                grows = lowers(again, lambda which: flip(which, 0.5))
-                accepted &= ~again | grows
-                return flip(accepted), accepted
+                # Where there is no room for the new edge it is made shorter; then it is refused.
+                def make_room(i: Array, carry: tuple) -> tuple:
+                    accepted, share = carry
+                    made = _faces(flip(accepted, share).overlaps) & ~before
+                    blamed = accepted & jnp.any(take(made, corner.cells), axis=-1)
+                    refused = blamed & (i == _SHORTENED)
+                    return accepted & ~refused, jnp.where(blamed, 0.25 * share, share)
+
+                whole = jnp.ones_like(length)
+                accepted, share = jax.lax.fori_loop(0, _SHORTENED + 1, make_room, (accepted, whole))
+                return flip(accepted, share), accepted
 
             new, accepted = jax.lax.cond(
-                jnp.any(chosen), judge, lambda: (tissue, jnp.zeros_like(chosen))
+                jnp.any(chosen), flip_where_it_helps, lambda: (tissue, jnp.zeros_like(chosen))
             )
             return new, counts + accepted, todo & ~chosen
 
         start = (tissue, counts, jnp.ones(tissue.n_edges, bool))
         tissue, counts, _ = jax.lax.while_loop(unfinished, one_round, start)
+        corner = _EdgeFrames(tissue)
+        back = corner.inside_out & (corner.length < threshold) & _free_edges(tissue, corner)
+        chord = corner.length / corner.stretch
+        tissue = jax.lax.cond(
+            jnp.any(back), lambda: corner.place(tissue, back, corner.along, chord), lambda: tissue
+        )
         return tissue, counts
+
+
+_SHORTENED = 2
+
+
+def _faces(overlaps: Overlaps) -> Bool[Array, " faces"]:
+    """Which faces overlap, the exterior last."""
+    return jnp.append(overlaps.cells, overlaps.exterior)
+
+
+def _free_edges(tissue: Tissue, corner: _EdgeFrames) -> Bool[Array, " edges"]:
+    """Which edges have no pinned end."""
+    if tissue.pinned is None:
+        return jnp.ones(tissue.n_edges, bool)
+    return ~take(tissue.pinned, corner.start) & ~take(tissue.pinned, corner.end)
 
 
 class _EdgeFrames(eqx.Module):
@@ -177,8 +210,7 @@ class _EdgeFrames(eqx.Module):
         spare = jnp.min(_spare_sides(tissue), axis=-1)
         losses = jnp.where(left == right, 2, 1)
         self.can_flip = (spare >= losses) & (at_start != at_end) & (self.start != self.end)
-        if tissue.pinned is not None:
-            self.can_flip &= ~take(tissue.pinned, self.start) & ~take(tissue.pinned, self.end)
+        self.can_flip &= _free_edges(tissue, self)
 
     def place(
         self,
@@ -230,44 +262,42 @@ def _independent(
     return candidates & jnp.all(first | (corner.cells == n_cells), axis=-1)
 
 
-_Trial = Callable[[Bool[Array, " edges"]], Tissue]
+# The tissue with the marked edges stretched, flipped, and flipped with half the length.
+_Trials = Callable[[Bool[Array, " edges"]], tuple[Tissue, Tissue, Tissue]]
 
 
 def _judge_local(
-    energy: AbstractLocalEnergy,
-    chosen: Bool[Array, " edges"],
-    corner: _EdgeFrames,
-    stretch: _Trial,
-    flip: _Trial,
-) -> Bool[Array, " edges"]:
-    """Which flips lower a local energy: all at once, each by the terms of its own cells and edges."""
-    stretched, flipped = stretch(chosen), flip(chosen)
-    by_cell = energy.cell_terms(flipped) - energy.cell_terms(stretched)
-    by_edge = energy.edge_terms(flipped) - energy.edge_terms(stretched)
+    energy: AbstractLocalEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
+) -> Float[Array, "3 edges"]:
+    """What the trials of each chosen edge cost: all at once, each by the terms of its own cells and edges."""
+    by_cell, by_edge = _of_each(lambda t: (energy.cell_terms(t), energy.edge_terms(t)), trials(chosen))
     # In a very small tissue one cell can be two of the four: count it once.
     cells = corner.cells
     repeated = [jnp.zeros(cells.shape[0], bool)]
     for k in range(1, 4):
         repeated.append(jnp.any(cells[:, :k] == cells[:, k : k + 1], axis=-1))
-    by_cell = by_cell.at[cells].get(mode="fill", fill_value=0)  # the exterior has no energy
-    change = jnp.where(jnp.stack(repeated, axis=-1), 0, by_cell)
-    return chosen & (jnp.sum(change, axis=-1) + jnp.sum(take(by_edge, corner.edges), axis=-1) < 0)
+    by_cell = by_cell.at[:, cells].get(mode="fill", fill_value=0)  # the exterior has no energy
+    by_cell = jnp.where(jnp.stack(repeated, axis=-1), 0, by_cell)
+    return jnp.sum(by_cell, axis=-1) + jnp.sum(by_edge[:, corner.edges], axis=-1)
 
 
 def _judge_total(
-    energy: AbstractEnergy,
-    chosen: Bool[Array, " edges"],
-    corner: _EdgeFrames,
-    stretch: _Trial,
-    flip: _Trial,
-) -> Bool[Array, " edges"]:
-    """Which flips lower an arbitrary energy: one candidate after the other, by the total."""
+    energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
+) -> Float[Array, "3 edges"]:
+    """What the trials of each chosen edge cost by an arbitrary energy: one edge after the other."""
     edges = jnp.arange(chosen.shape[0])
     order = jnp.argsort(jnp.where(chosen, corner.length, jnp.inf))
 
-    def body(i: Array, accepted: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
-        # The candidates share no cell, so settled ones need not be flipped to judge the next.
-        this = edges == order[i]
-        return accepted | (this & (energy(flip(this)) < energy(stretch(this))))
+    def body(i: Array, costs: Float[Array, "3 edges"]) -> Float[Array, "3 edges"]:
+        # Chosen edges share no cell, so others need not be flipped to judge one.
+        return costs.at[:, order[i]].set(_of_each(energy, trials(edges == order[i])))
 
-    return jax.lax.fori_loop(0, jnp.sum(chosen), body, jnp.zeros_like(chosen))
+    nothing = jnp.zeros((3, chosen.shape[0]), corner.length.dtype)
+    return jax.lax.fori_loop(0, jnp.sum(chosen), body, nothing)
+
+
+def _of_each(function: Callable[[Tissue], PyTree], tissues: tuple[Tissue, ...]) -> PyTree:
+    """What a function returns for each of some tissues; it is compiled once."""
+    arrays, static = eqx.partition(tissues, eqx.is_array)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *arrays)
+    return jax.vmap(lambda x: function(eqx.combine(x, static[0])))(stacked)
