@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax.mesh._sides import Sides, sides_cross, sides_of
 from vertax.mesh._topology import Topology, take
 
 if TYPE_CHECKING:
@@ -68,55 +69,59 @@ class Overlaps(eqx.Module):
 
 def find_overlaps(tissue: Tissue) -> Overlaps:
     """Compare each side with all others of its face."""
-    here = _numbers(tissue.topology)
-    crossed = around(tissue.topology, _comparing(tissue), here)
+    sides = sides_of(tissue)
+
+    def compare(k: Int[Array, ""], other: Int[Array, " halfedges"], crossed: Array) -> Array:
+        return jnp.where(_crosses(k, other, sides, take(sides, other)), other, crossed)
+
+    crossed = around(tissue.topology, compare, _numbers(tissue.topology))
     return _overlaps(tissue, crossed)
 
 
 def overlaps_and_nearest(
-    tissue: Tissue, measure: Callable[[Array, Array, Array, Array], Float[Array, " halfedges"]]
-) -> tuple[Overlaps, Int[Array, "halfedges 2"], Float[Array, "halfedges 2"]]:
+    tissue: Tissue, measure: Callable[[Sides, Sides, Array, Array], Float[Array, " halfedges"]]
+) -> tuple[Overlaps, Int[Array, "halfedges 2"], Float[Array, "halfedges 2"], Float[Array, ""]]:
     """Overlaps; and of each corner the two nearest sides of its face that it does not end.
 
     **Arguments:**
 
-    - `measure`: how near each corner is to a side, given by its start, its vector and its number.
+    - `measure`: how near the starts of sides are to other sides; given also whether each of those is the
+        next side, and whether it is the last but one.
 
-    **Returns:** the overlaps; the two sides, as half-edges; how near they are.
+    **Returns:** the overlaps; the two sides, as half-edges; how near they are; and how near the nearest side
+    of all is that is not next to a corner's own.
     """
-    m, corners = tissue.topology, tissue.corners
-    chords = take(corners, m.next) - corners
+    m = tissue.topology
+    sides = sides_of(tissue)
     here = _numbers(m)
-    compare = _comparing(tissue)
+    before_last = take(m.previous, m.previous)
 
     def both(k: Int[Array, ""], other: Int[Array, " halfedges"], carry: tuple) -> tuple:
-        crossed, sides, gaps = carry
-        gap = measure(corners, take(corners, other), take(chords, other), other)
-        gap = jnp.where(other == here, jnp.inf, gap)
+        crossed, nearest, gaps, least = carry
+        theirs = take(sides, other)
+        after, before = jnp.broadcast_to(k == 1, here.shape), other == before_last
+        gap = jnp.where(other == here, jnp.inf, measure(sides, theirs, after, before))
         closest = gap < gaps[0]
         second = ~closest & (gap < gaps[1])
         insert = lambda x, best: (
             jnp.where(closest, x, best[0]),
             jnp.where(closest, best[0], jnp.where(second, x, best[1])),
         )
-        return compare(k, other, crossed), insert(other, sides), insert(gap, gaps)
+        crossed = jnp.where(_crosses(k, other, sides, theirs), other, crossed)
+        least = jnp.minimum(least, jnp.where(after | before, jnp.inf, gap))
+        return crossed, insert(other, nearest), insert(gap, gaps), least
 
-    none = jnp.full(here.size, jnp.inf, corners.dtype)
-    crossed, sides, gaps = around(m, both, (here, (here, here), (none, none)))
-    return _overlaps(tissue, crossed), jnp.stack(sides, axis=-1), jnp.stack(gaps, axis=-1)
+    none = jnp.full(here.size, jnp.inf, sides.dtype)
+    start = (here, (here, here), (none, none), none)
+    crossed, nearest, gaps, least = around(m, both, start)
+    nearest, gaps = jnp.stack(nearest, axis=-1), jnp.stack(gaps, axis=-1)
+    return _overlaps(tissue, crossed), nearest, gaps, jnp.min(least)
 
 
-def _comparing(
-    tissue: Tissue,
-) -> Callable[[Int[Array, ""], Int[Array, " halfedges"], Array], Array]:
-    m, corners = tissue.topology, tissue.corners
-    chords = take(corners, m.next) - corners
-
-    def compare(k: Int[Array, ""], other: Int[Array, " halfedges"], crossed: Array) -> Array:
-        crosses = _segments_cross(corners, chords, take(corners, other), take(chords, other))
-        return jnp.where(crosses & (k > 1), other, crossed)
-
-    return compare
+def _crosses(
+    k: Int[Array, ""], other: Int[Array, " halfedges"], sides: Sides, theirs: Sides
+) -> Bool[Array, " halfedges"]:
+    return sides_cross(sides, theirs, k == 1) & (other != jnp.arange(other.size))
 
 
 def _overlaps(tissue: Tissue, crossed: Int[Array, " halfedges"]) -> Overlaps:
@@ -153,19 +158,3 @@ def around(
 
     _, end = jax.lax.fori_loop(1, jnp.max(last) + 1, one, (here, start))
     return end
-
-
-def _segments_cross(
-    p: Float[Array, "n 2"], u: Float[Array, "n 2"], q: Float[Array, "n 2"], v: Float[Array, "n 2"]
-) -> Bool[Array, " n"]:
-    """Whether the segments p … p + u and q … q + v have a point in common that ends neither."""
-    w = q - p
-    apart = (cross(u, w) * cross(u, w + v) >= 0) | (cross(v, w) * cross(v, w - u) >= 0)
-    # Rounding may let sides in one line, like those of a row of bricks, look crossed.
-    low, high = jnp.minimum(p, p + u), jnp.maximum(p, p + u)
-    below, above = jnp.minimum(q, q + v), jnp.maximum(q, q + v)
-    return ~apart & jnp.all((low <= above) & (below <= high), axis=-1)
-
-
-def cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
-    return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax.mesh import Tissue
-from vertax.mesh._overlaps import Overlaps, overlaps_and_nearest
+from vertax.mesh._overlaps import overlaps_and_nearest
+from vertax.mesh._sides import Sides, bulge_gap, cross, dot, sides_of, squared_distance, wedge
 from vertax.mesh._topology import take
 
 # A face comes to overlap itself where a corner reaches a side that it does not end. A barrier holds it off
@@ -26,59 +28,102 @@ class Contacts(eqx.Module):
 
     **Arguments:**
 
-    - `distance`: the range far from the ends of a side, a length.
-    - `slope`: the range over the distance to the end near the ends.
+    - `distance`: the range, a length.
+    - `slope`: the range over the distance to the common end, between sides that are next to each other.
     - `strength`: energy per length squared.
     - `pairs`: half-edges whose source is near another side of their face, and that side; the same twice
         where there are fewer pairs.
+    - `slack`: how far the vertices may move until something else may come into range.
     """
 
     distance: Float[Array, ""]
     slope: Float[Array, ""]
     strength: Float[Array, ""]
     pairs: Int[Array, "contacts 2"]
+    slack: Float[Array, ""]
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The energy of the barrier."""
-        corners, following = tissue.corners, tissue.topology.next
+        nothing = lambda: jnp.zeros((), tissue.vertices.dtype)
+        some = jnp.any(self.pairs[:, 0] != self.pairs[:, 1])
+        return jax.lax.cond(some, lambda: self._energy(tissue), nothing)
+
+    def _energy(self, tissue: Tissue) -> Float[Array, ""]:
+        following, sides = tissue.topology.next, sides_of(tissue)
         corner, side = self.pairs[:, 0], self.pairs[:, 1]
-        start = take(corners, side)
-        chord = take(corners, take(following, side)) - start
-        adjacent = next_to(corner, side, following)
-        near, squared = self.nearness(take(corners, corner), start, chord, adjacent)
-        near = jnp.where((near < 1) & (corner != side), near, 1)
-        return self.strength * jnp.sum(-squared * (1 - near) ** 2 * jnp.log(near))
+        after = take(following, corner) == side
+        before = take(following, take(following, side)) == corner
+        values = jnp.zeros(corner.shape, sides.dtype)
+        for near, squared in self._nearness(take(sides, corner), take(sides, side), after, before):
+            near = jnp.where((near < 1) & (corner != side), near, 1)
+            values -= squared * (1 - near) ** 2 * jnp.log(near)
+        return self.strength * jnp.sum(values)
 
-    def nearness(
-        self,
-        point: Float[Array, "n 2"],
-        start: Float[Array, "n 2"],
-        chord: Float[Array, "n 2"],
-        adjacent: Bool[Array, " n"],
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """Squared distance of points from sides over the squared range; the squared range."""
-        first = point - start
-        squared = jnp.sum(chord**2, axis=-1)
-        share = jnp.sum(first * chord, axis=-1) / jnp.where(squared > 0, squared, 1)
-        way = first - jnp.clip(share, 0, 1)[:, None] * chord
-        to_end = jnp.minimum(jnp.sum(first**2, axis=-1), jnp.sum((first - chord) ** 2, axis=-1))
-        range_ = jnp.broadcast_to(self.distance**2, squared.shape)
-        short = self.slope**2 * to_end
-        range_ = jnp.where(adjacent, range_ * short / (range_ + short), range_)
-        return jnp.sum(way**2, axis=-1) / jnp.where(range_ > 0, range_, 1), range_
+    def _nearness(
+        self, one: Sides, other: Sides, after: Bool[Array, " n"], before: Bool[Array, " n"]
+    ) -> list[tuple[Float[Array, " n"], Float[Array, " n"]]]:
+        """Squared distance over squared range, and the squared range.
+
+        The distance is that of the start of one side from the other; of arcs also that between the two, or
+        the angle if one follows on the other.
+        """
+        adjacent = after | before
+        range_ = jnp.broadcast_to(self.distance**2, adjacent.shape)
+
+        def limited(arm: Float[Array, " n"]) -> Float[Array, " n"]:
+            short = self.slope**2 * arm
+            short = range_ * short / (range_ + short)
+            return jnp.where(adjacent, jnp.where(short > 0, short, 1), range_)
+
+        first = one[:, :2] - other[:, :2]
+        last = first - other[:, 2:4]
+        limit = limited(jnp.minimum(dot(first, first), dot(last, last)))
+        near = [(squared_distance(one[:, :2], other) / limit, limit)]
+        if one.shape[-1] == 5:
+            sine, cosine = wedge(one, other)
+            acute = after & (cosine > 0) & (sine > 0)
+            limit = limited(jnp.minimum(dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])))
+            angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
+            gap = bulge_gap(one, other)
+            gap = jnp.where(jnp.isfinite(gap), gap, 1) ** 2 / limit + jnp.where(jnp.isfinite(gap), 0, jnp.inf)
+            near.append((jnp.where(adjacent, angle, gap), limit))
+        return near
+
+    def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
+        """The contacts in a tissue, and whether it overlaps."""
+
+        def measure(one: Sides, other: Sides, after: Array, before: Array) -> Array:
+            near = [near for near, _ in self._nearness(one, other, after, before)]
+            return near[0] if len(near) == 1 else jnp.minimum(*near)
+
+        overlaps, sides, near, least = overlaps_and_nearest(tissue, measure)
+        near = near < _MARGIN**2
+        corner, rank = jnp.nonzero(near, size=len(self.pairs), fill_value=0)
+        pairs = jnp.stack([corner.astype(sides.dtype), sides[corner, rank]], axis=-1)
+        # (`nonzero` fills up with the first one, which may be a pair.)
+        there = jnp.arange(len(pairs)) < jnp.sum(near)
+        pairs = jnp.where(there[:, None], pairs, 0)
+        slack = 0.5 * (jnp.sqrt(least) - _MARGIN) * self.distance
+        return eqx.tree_at(lambda c: (c.pairs, c.slack), self, (pairs, slack)), overlaps.any
+
+    def moved(self, before: Tissue, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
+        """The contacts after vertices moved, if there are none, and whether that is certain."""
+        steps = jnp.sum((tissue.vertices - before.vertices) ** 2, axis=-1)
+        slack = self.slack - jnp.sqrt(jnp.max(steps))
+        # (Arcs bend as well, and their angles are not those of the chords.)
+        straight = jnp.array(tissue.arcs is None)
+        clear = straight & (slack > 0) & _angles_are_open(tissue, _MARGIN * self.slope)
+        return eqx.tree_at(lambda c: (c.pairs, c.slack), self, (0 * self.pairs, slack)), clear
 
 
-def next_to(
-    corner: Int[Array, " n"], side: Int[Array, " n"], following: Int[Array, " halfedges"]
-) -> Bool[Array, " n"]:
-    """Whether a side is next to one of the two that meet at a corner."""
-    return (take(following, corner) == side) | (take(following, take(following, side)) == corner)
+# What is less than so many ranges away may come into range in the next step.
+_MARGIN = 2
 
 
-def contacts_of(
+def no_contacts(
     reach: float | Float[Array, ""], options: dict[str, Array], tissue: Tissue
-) -> tuple[Contacts, Overlaps]:
-    """The contacts of a tissue, and where it overlaps.
+) -> Contacts:
+    """Contacts that are not found yet.
 
     **Arguments:**
 
@@ -90,21 +135,19 @@ def contacts_of(
     # The barrier must not depend on the parameters of the energy, not even through its strength: that would be
     # one more derivative. So it is a power of 16.
     strength = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0)) / slope
-    none = jnp.zeros((tissue.n_vertices, 2), tissue.topology.twin.dtype)
-    contacts = Contacts(reach * length, slope, strength, none)
-    here, following = jnp.arange(tissue.topology.n_half_edges), tissue.topology.next
-
-    def measure(point: Array, start: Array, chord: Array, side: Array) -> Array:
-        return contacts.nearness(point, start, chord, next_to(here, side, following))[0]
-
-    overlaps, sides, near = overlaps_and_nearest(tissue, measure)
-    # What is as near as this may come into range in the next step.
-    which, rank = jnp.nonzero(near < _MARGIN**2, size=len(none), fill_value=0)
-    pairs = jnp.stack([which.astype(none.dtype), sides[which, rank]], axis=-1)
-    # (What fills up the list is pair 0, which may be one.)
-    there = jnp.arange(len(none)) < jnp.sum(near < _MARGIN**2)
-    pairs = jnp.where(there[:, None], pairs, none)
-    return eqx.tree_at(lambda c: c.pairs, contacts, pairs), overlaps
+    nothing = jnp.zeros((tissue.n_vertices, 2), tissue.topology.twin.dtype)
+    slack = jnp.zeros_like(length)
+    return Contacts(reach * length, slope, strength, nothing, slack)
 
 
-_MARGIN = 4
+def _angles_are_open(tissue: Tissue, least: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether edges leave all vertices in order, at angles whose sine is not below a limit."""
+    m = tissue.topology
+    forward = take(tissue.edge_vectors, m.edge)
+    u = jnp.where(m.forward[:, None], forward, -forward).reshape(-1, 3, 2)
+    v = jnp.roll(u, -1, axis=1)
+    sine, cosine = cross(u, v), jnp.sum(u * v, axis=-1)
+    squared = jnp.sum(u**2, axis=-1)
+    narrow = (cosine > 0) & (sine**2 < least**2 * squared * jnp.roll(squared, -1, axis=1))
+    # In order at least two of the three angles are less than π.
+    return ~jnp.any(narrow) & jnp.all(jnp.sum(sine > 0, axis=1) >= 2)

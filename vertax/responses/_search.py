@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import find_overlaps
-from vertax.responses._contact import Contacts, contacts_of
+from vertax.responses._contact import Contacts, no_contacts
 from vertax.solvers._patience import Patient, PatientState
 from vertax.transitions import AbstractTransitions
 
@@ -63,7 +63,9 @@ class Search(eqx.Module):
         counts = jnp.zeros(0, jnp.int32) if rule is None else rule.init(tissue)
         # The first step only makes it what it is, lest all of that be compiled twice.
         empty = lambda function, *args: _empty(eqx.filter_eval_shape(function, *args))
-        contacts, overlaps = empty(self._near, tissue)
+        contacts = None
+        if self.contact_range is not None:
+            contacts = no_contacts(self.contact_range, self.options, tissue)
         minimiser = empty(self._restarted, tissue, energy, contacts)
         no = jnp.array(False)
         return SearchState(
@@ -71,7 +73,7 @@ class Search(eqx.Module):
             tissue.configuration,
             minimiser,
             contacts,
-            overlaps,
+            no,
             counts,
             jnp.array(0),
             started=no,
@@ -120,7 +122,7 @@ class Search(eqx.Module):
         if self.transitions is not None:
             tissue, counts = self.transitions.sweep(tissue, energy, state.counts)
         swept = jnp.any(tissue.vertices != before.with_configuration(trial).vertices) | jnp.any(counts != state.counts)
-        contacts, overlaps = self._near(tissue)
+        contacts, overlaps = self._near(tissue, state, swept | ~state.started)
         refused = state.started & ~state.overlaps & overlaps
         kept = (before, state.contacts, state.overlaps, state.counts)
         tissue, contacts, overlaps, counts = jax.tree.map(
@@ -158,12 +160,16 @@ class Search(eqx.Module):
             | jnp.isnan(minimiser.force),
         )
 
-    def _near(self, tissue: Tissue) -> tuple[Contacts | None, Bool[Array, ""]]:
+    def _near(
+        self, tissue: Tissue, last: SearchState, anew: Bool[Array, ""]
+    ) -> tuple[Contacts | None, Bool[Array, ""]]:
         """The contacts of a tissue, and whether it overlaps, if that matters."""
-        if self.contact_range is None:
+        if last.contacts is None:
             return None, jnp.array(False)
-        contacts, overlaps = contacts_of(self.contact_range, self.options, tissue)
-        return contacts, overlaps.any
+        contacts, clear = last.contacts.moved(last.tissue, tissue)
+        clear &= ~anew & ~last.overlaps
+        same = lambda: (contacts, jnp.array(False))
+        return jax.lax.cond(clear, same, lambda: contacts.found(tissue))
 
     def _restarted(
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None

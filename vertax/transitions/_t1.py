@@ -86,8 +86,10 @@ class T1(AbstractTransitions):
         def one_round(carry: tuple) -> tuple:
             tissue, counts, todo = carry
             corner = _EdgeFrames(tissue)
-            todo &= (corner.length < threshold) | corner.inside_out
-            todo &= corner.can_flip & (counts < self.max_flips)
+            short = corner.length < threshold
+            may_flip = corner.can_flip & (counts < self.max_flips)
+            may_turn = corner.inside_out & short & corner.free
+            todo &= may_turn | (may_flip & (short | corner.inside_out))
             chosen = _independent(todo, corner, tissue.n_cells)
 
             def flip_where_it_helps() -> tuple[Tissue, Bool[Array, " edges"]]:
@@ -107,7 +109,7 @@ class T1(AbstractTransitions):
                 judge = _judge_local if local else _judge_total
                 stretched, flipped, shorter = judge(energy, chosen, corner, trials)
                 grows = flipped < shorter
-                accepted = chosen & (flipped < stretched) & (grows | (counts == 0))
+                accepted = chosen & may_flip & (flipped < stretched) & (grows | (counts == 0))
                 before = _faces(tissue.overlaps)
 
                 # Where there is no room for the new edge it is made shorter; then it is refused.
@@ -120,7 +122,10 @@ class T1(AbstractTransitions):
 
                 whole = jnp.ones_like(length)
                 accepted, share = jax.lax.fori_loop(0, _SHORTENED + 1, make_room, (accepted, whole))
-                return flip(accepted, share), accepted
+                # What is inside out and stays so little that nobody would notice is put right.
+                back = chosen & ~accepted & may_turn
+                upright = corner.length / corner.stretch
+                return corner.place(flip(accepted, share), back, corner.along, upright), accepted
 
             new, accepted = jax.lax.cond(
                 jnp.any(chosen), flip_where_it_helps, lambda: (tissue, jnp.zeros_like(chosen))
@@ -129,12 +134,6 @@ class T1(AbstractTransitions):
 
         start = (tissue, counts, jnp.ones(tissue.n_edges, bool))
         tissue, counts, _ = jax.lax.while_loop(unfinished, one_round, start)
-        corner = _EdgeFrames(tissue)
-        back = corner.inside_out & (corner.length < threshold) & _free_edges(tissue, corner)
-        chord = corner.length / corner.stretch
-        tissue = jax.lax.cond(
-            jnp.any(back), lambda: corner.place(tissue, back, corner.along, chord), lambda: tissue
-        )
         return tissue, counts
 
 
@@ -144,13 +143,6 @@ _SHORTENED = 2
 def _faces(overlaps: Overlaps) -> Bool[Array, " faces"]:
     """Which faces overlap, the exterior last."""
     return jnp.append(overlaps.cells, overlaps.exterior)
-
-
-def _free_edges(tissue: Tissue, corner: _EdgeFrames) -> Bool[Array, " edges"]:
-    """Which edges have no pinned end."""
-    if tissue.pinned is None:
-        return jnp.ones(tissue.n_edges, bool)
-    return ~take(tissue.pinned, corner.start) & ~take(tissue.pinned, corner.end)
 
 
 class _EdgeFrames(eqx.Module):
@@ -166,6 +158,7 @@ class _EdgeFrames(eqx.Module):
     along: Float[Array, "edges 2"]
     across: Float[Array, "edges 2"]
     inside_out: Bool[Array, " edges"]
+    free: Bool[Array, " edges"]  # neither end is pinned
     can_flip: Bool[Array, " edges"]
 
     def __init__(self, tissue: Tissue):
@@ -210,7 +203,10 @@ class _EdgeFrames(eqx.Module):
         spare = jnp.min(_spare_sides(tissue), axis=-1)
         losses = jnp.where(left == right, 2, 1)
         self.can_flip = (spare >= losses) & (at_start != at_end) & (self.start != self.end)
-        self.can_flip &= _free_edges(tissue, self)
+        self.free = jnp.ones_like(upright)
+        if tissue.pinned is not None:
+            self.free = ~take(tissue.pinned, self.start) & ~take(tissue.pinned, self.end)
+        self.can_flip &= self.free
 
     def place(
         self,

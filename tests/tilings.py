@@ -1,0 +1,56 @@
+"""Whether a tissue tiles the plane, by brute force: a check that shares nothing with the library's."""
+
+import numpy as np
+
+import vertax as vx
+
+
+def faces_that_overlap(tissue: vx.Tissue, points: int = 48) -> list[int]:
+    """The faces (the exterior last) whose outline, drawn with straight pieces, crosses itself or is inside out."""
+    m = tissue.topology
+    following, cell = np.asarray(m.next), np.asarray(m.cell)
+    vertices, lattice = np.asarray(tissue.vertices), np.zeros((2, 2))
+    if isinstance(tissue.boundary, vx.Periodic):
+        lattice = np.asarray(tissue.boundary.lattice)
+    start = np.repeat(vertices, 3, axis=0) + np.asarray(m.frame) @ lattice
+    angles = np.where(m.forward, 1, -1) * np.asarray(tissue.edge_angles)[np.asarray(m.edge)]
+    bad = []
+    for face in range(m.n_faces):
+        first = h = int(np.flatnonzero(cell == face)[0])
+        outline = []
+        while True:
+            outline.append(_piece(start[h], start[following[h]], angles[h], points))
+            h = int(following[h])
+            if h == first:
+                break
+        polygon = np.concatenate(outline)
+        x, y = polygon.T
+        area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+        if (area > 0) == (face == m.n_cells) or _crosses_itself(polygon):
+            bad.append(face)
+    return bad
+
+
+def _piece(p: np.ndarray, q: np.ndarray, angle: float, points: int) -> np.ndarray:
+    """Points from p on, without q, on an arc that bulges to the right of the way."""
+    if abs(angle) < 1e-9:
+        return p[None]
+    chord = q - p
+    right = np.array([chord[1], -chord[0]])
+    centre = 0.5 * (p + q) - right * 0.5 / np.tan(angle)
+    turn = np.linspace(0, 2 * angle, points, endpoint=False)
+    x, y = (p - centre).T
+    return centre + np.stack(
+        [x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], axis=-1
+    )
+
+
+def _crosses_itself(polygon: np.ndarray) -> bool:
+    p, u = polygon, np.roll(polygon, -1, axis=0) - polygon
+    side = lambda a, b: np.sign(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+    w = p[None] - p[:, None]
+    ends = side(u[:, None], w) * side(u[:, None], w + u[None])
+    crossed = (ends < 0) & (ends.T < 0)
+    n = len(p)
+    apart = np.abs(np.arange(n)[:, None] - np.arange(n)) % (n - 1) > 1
+    return bool(np.any(crossed & apart))

@@ -1,0 +1,171 @@
+"""Sides of a face by pairs: whether they cross, and how far one is from the other."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vertax.mesh._topology import take
+
+if TYPE_CHECKING:
+    from vertax.mesh._tissue import Tissue
+
+# A side is a row of a table: where it begins, its chord and, if there are arcs, its angle α, positive if it
+# bulges to the right, which is out of the face. With the unit vector e along the chord c and n to its left,
+# points x of its circle, as seen from its start, obey
+#
+#     F(x) = κ/2 |x|² - g·x = 0,    κ = 2 sin(α) / c,    g = sin(α) e + cos(α) n,
+#
+# which is the line of the chord for α = 0, without any large radius. The signed distance from the circle is
+# 2 F / (1 + √(1 + 2 κ F)).
+Sides = Float[Array, "sides parts"]
+
+
+def sides_of(tissue: Tissue) -> Sides:
+    """The sides of all faces, each in the frame of the face on its left."""
+    m, corners = tissue.topology, tissue.corners
+    parts = [corners, take(corners, m.next) - corners]
+    if tissue.arcs is not None:
+        angles = take(tissue.edge_angles, m.edge)
+        parts.append(jnp.where(m.forward, angles, -angles)[:, None])
+    return jnp.concatenate(parts, axis=-1)
+
+
+def cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
+    """Cross product."""
+    return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+
+
+def dot(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
+    """Scalar product."""
+    return p[..., 0] * q[..., 0] + p[..., 1] * q[..., 1]
+
+
+def sides_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array, " sides"]:
+    """Whether two sides have a point in common, other than where both end.
+
+    **Arguments:**
+
+    - `joined`: whether the other one begins where the first one ends.
+    """
+    straight = _segments_cross(one, other) & ~joined
+    if one.shape[-1] == 4:
+        return straight
+    bent = jnp.maximum(jnp.abs(one[:, 4]), jnp.abs(other[:, 4])) > 1e-6
+    return jnp.where(bent, _arcs_cross(one, other, joined), straight)
+
+
+def _segments_cross(one: Sides, other: Sides) -> Bool[Array, " sides"]:
+    p, u, q, v = one[:, :2], one[:, 2:4], other[:, :2], other[:, 2:4]
+    w = q - p
+    apart = (cross(u, w) * cross(u, w + v) >= 0) | (cross(v, w) * cross(v, w - u) >= 0)
+    # Rounding may let sides in one line, like those of a row of bricks, look crossed.
+    low, high = jnp.minimum(p, p + u), jnp.maximum(p, p + u)
+    below, above = jnp.minimum(q, q + v), jnp.maximum(q, q + v)
+    return ~apart & jnp.all((low <= above) & (below <= high), axis=-1)
+
+
+def _arcs_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array, " sides"]:
+    """The same for circles: they meet on the line where κ' F = κ F'."""
+    first = jnp.abs(_circle(one)[0]) >= jnp.abs(_circle(other)[0])
+    a = jnp.where(first[:, None], one, other)
+    b = jnp.where(first[:, None], other, one)
+    (k1, g1), (k2, g2) = _circle(a), _circle(b)
+    w = b[:, :2] - a[:, :2]
+    normal = (k2 / jnp.where(k1 == 0, 1, k1))[:, None] * g1 - k2[:, None] * w - g2
+    level = -(0.5 * k2 * dot(w, w) + dot(w, g2))
+    size = jnp.maximum(dot(normal, normal), jnp.finfo(w.dtype).tiny)
+    foot = normal * (level / size)[:, None]
+    along = jnp.stack([-normal[:, 1], normal[:, 0]], axis=-1) / jnp.sqrt(size)[:, None]
+    half, rest = dot(along, g1), 0.5 * k1 * dot(foot, foot) - dot(foot, g1)
+    squared = half**2 - 2 * k1 * rest
+    root = half + jnp.where(half < 0, -1, 1) * jnp.sqrt(jnp.maximum(squared, 0))
+    nonzero = lambda x: jnp.where(x == 0, jnp.finfo(w.dtype).tiny, x)
+    # Where sides are joined they have one point in common.
+    joint = other[:, :2] - a[:, :2]
+    nearby = 4 * jnp.finfo(w.dtype).eps ** 0.5 * jnp.sqrt(dot(a[:, 2:4], a[:, 2:4]))
+    crosses = jnp.zeros(squared.shape, bool)
+    for share in (root / nonzero(k1), 2 * rest / nonzero(root)):
+        x = foot + share[:, None] * along
+        away = ~joined | (jnp.sqrt(dot(x - joint, x - joint)) > nearby)
+        crosses |= away & _on_arc(a, x) & _on_arc(b, x - w)
+    return crosses & (squared > 0)
+
+
+def _circle(side: Sides) -> tuple[Float[Array, " sides"], Float[Array, "sides 2"]]:
+    """Curvature κ and vector g of the circle of each side."""
+    chord, angle = side[:, 2:4], side[:, 4]
+    squared = dot(chord, chord)
+    length = jnp.sqrt(jnp.where(squared > 0, squared, 1))
+    unit = chord / length[:, None]
+    left = jnp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    return 2 * sine / length, sine[:, None] * unit + cosine[:, None] * left
+
+
+def _on_arc(side: Sides, x: Float[Array, "sides 2"]) -> Bool[Array, " sides"]:
+    """Whether a point of the circle, as seen from the start, is one of the arc."""
+    chord, angle = side[:, 2:4], side[:, 4]
+    squared, along, aside = dot(chord, chord), dot(chord, x), cross(chord, x)
+    # An arc is what its circle has on one side of the chord. A flat one hardly leaves the chord.
+    flat = (along > 0) & (along < squared) & (jnp.abs(aside) < squared)
+    return jnp.where(jnp.abs(angle) < 0.5, flat, aside * angle < 0)
+
+
+def squared_distance(point: Float[Array, "sides 2"], side: Sides) -> Float[Array, " sides"]:
+    """Squared distance of a point from each side."""
+    first, chord = point - side[:, :2], side[:, 2:4]
+    if side.shape[-1] == 4:
+        squared = dot(chord, chord)
+        share = dot(first, chord) / jnp.where(squared > 0, squared, 1)
+        way = first - jnp.clip(share, 0, 1)[:, None] * chord
+        return dot(way, way)
+    curvature, g = _circle(side)
+    value = 0.5 * curvature * dot(first, first) - dot(g, first)
+    # At the centre of its circle a point is as far from all of the arc.
+    centred = 1 + 2 * curvature * value
+    distance = 2 * value / (1 + jnp.sqrt(jnp.where(centred > 0, centred, 1)))
+    last = first - chord
+    past_start = -cross(g, first) >= 0
+    before_end = curvature * cross(first, chord) + cross(g, last) >= 0
+    wide = jnp.abs(side[:, 4]) > 0.5 * jnp.pi
+    faces = jnp.where(wide, past_start | before_end, past_start & before_end) & (centred > 0)
+    ends = jnp.minimum(dot(first, first), dot(last, last))
+    return jnp.where(faces, distance**2, ends)
+
+
+def bulge_gap(one: Sides, other: Sides) -> Float[Array, " sides"]:
+    """Distance between two arcs where both bulge into the face, towards each other; otherwise infinite."""
+    (k1, g1), (k2, g2) = _circle(one), _circle(other)
+    bulging = (one[:, 4] < -_FLAT) & (other[:, 4] < -_FLAT)
+    r1, r2 = (1 / jnp.where(bulging, -k, 1) for k in (k1, k2))
+    c1 = one[:, :2] - r1[:, None] * g1
+    c2 = other[:, :2] - r2[:, None] * g2
+    way = c2 - c1
+    squared = dot(way, way)
+    distance = jnp.sqrt(jnp.where(squared > 0, squared, 1))
+    unit = way / distance[:, None]
+    x = c1 + r1[:, None] * unit - one[:, :2]
+    y = c2 - r2[:, None] * unit - other[:, :2]
+    facing = bulging & (squared > 0) & _on_arc(one, x) & _on_arc(other, y)
+    return jnp.where(facing, distance - r1 - r2, jnp.inf)
+
+
+# (Flatter arcs are nearest to each other at the end of one.)
+_FLAT = 0.02
+
+
+def wedge(one: Sides, other: Sides) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
+    """Sine and cosine of the angle of the face between a side and the one that begins where it ends."""
+
+    def tangent(side: Sides, sign: int) -> Float[Array, "sides 2"]:
+        chord, angle = side[:, 2:4], side[:, 4]
+        squared = dot(chord, chord)
+        unit = chord / jnp.sqrt(jnp.where(squared > 0, squared, 1))[:, None]
+        left = jnp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
+        return jnp.cos(angle)[:, None] * unit + sign * jnp.sin(angle)[:, None] * left
+
+    back, leaving = -tangent(one, 1), tangent(other, -1)
+    return cross(leaving, back), dot(leaving, back)
