@@ -130,9 +130,16 @@ class Search(eqx.Module):
         )
         flipped = swept & ~refused
 
+        anew = flipped | ~state.started
+        other = jnp.array(False)
+        if contacts is not None:
+            other = jnp.any(contacts.pairs != state.contacts.pairs)
+
         def restart() -> tuple[PyTree, PatientState]:
+            fresh = self._restarted(tissue, energy, contacts)
             # What a minimiser remembers of the old topology misleads it in the new one.
-            return tissue.configuration, self._restarted(tissue, energy, contacts)
+            resumed = self.minimiser.resumed(fresh, minimiser)
+            return tissue.configuration, _where(anew, fresh, resumed)
 
         def retreat() -> tuple[PyTree, PatientState]:
             inside = lambda y: ~find_overlaps(before.with_configuration(y)).any
@@ -142,7 +149,7 @@ class Search(eqx.Module):
             )
 
         here = (tissue.configuration, minimiser)
-        y, minimiser = _either(flipped | ~state.started, restart, lambda: here, here)
+        y, minimiser = _either(anew | other, restart, lambda: here, here)
         if self.contact_range is not None:
             here = (y, minimiser)
             y, minimiser = _either(refused, retreat, lambda: here, here)
@@ -198,6 +205,12 @@ def _empty(tree: PyTree) -> PyTree:
     """Zeros for the arrays of a pytree of which only their shapes are known."""
     is_shape = lambda x: isinstance(x, jax.ShapeDtypeStruct)
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_shape(x) else x, tree)
+
+
+def _where(condition: Bool[Array, ""], one: Any, other: Any) -> Any:
+    """`jnp.where` of two pytrees that may hold more than arrays."""
+    choose = lambda x, y: jnp.where(condition, x, y) if eqx.is_array(x) else x
+    return jax.tree.map(choose, one, other)
 
 
 def _either(condition: Bool[Array, ""], yes: Any, no: Any, like: Any) -> Any:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax._base.checks import check_number, check_whole, named
 from vertax._base.modules import is_concrete
-from vertax.solvers._solver import AbstractSolver, value_and_gradient
+from vertax.solvers._solver import AbstractSolver, evaluated_anew, value_and_gradient
 
 
 class _State(eqx.Module):
@@ -62,6 +62,9 @@ class GradientDescent(AbstractSolver):
 
     def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
+
+    def resumed(self, fresh: _State, old: _State) -> _State:
+        return evaluated_anew(fresh, old)
 
 
 class Optax(AbstractSolver):
@@ -119,6 +122,9 @@ class Optax(AbstractSolver):
 
     def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
+
+    def resumed(self, fresh: _State, old: _State) -> _State:
+        return evaluated_anew(fresh, old)
 
 
 def has_line_search(optimiser: optax.GradientTransformation) -> bool:
@@ -243,6 +249,9 @@ class FIRE(AbstractSolver):
 
     def gradient(self, state: _FIREState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
+
+    def resumed(self, fresh: _FIREState, old: _FIREState) -> _FIREState:
+        return evaluated_anew(fresh, old)
 
 
 def _unit_of_time(options: dict[str, Any]) -> Any:

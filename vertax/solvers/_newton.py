@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
-from vertax.solvers._solver import AbstractSolver, value_and_gradient
+from vertax.solvers._solver import AbstractSolver, evaluated_anew, value_and_gradient
 
 
 class _NewtonState(eqx.Module):
@@ -91,6 +91,9 @@ class NewtonCG(AbstractSolver):
         kept = (y, state.value, g, state.aux)
         y, value, g, aux = tree.where(accept, (trial, value, gradient, aux), kept)
         return y, _NewtonState(value, g, radius, state.num_products + products, aux), aux
+
+    def resumed(self, fresh: _NewtonState, old: _NewtonState) -> _NewtonState:
+        return evaluated_anew(fresh, old)
 
     def retreat(
         self,

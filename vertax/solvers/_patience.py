@@ -53,6 +53,11 @@ class Patient(optx.AbstractMinimiser):
         y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
         return y, self._judge(inner, options, state.n_below, state.num_steps + 1), aux
 
+    def resumed(self, fresh: PatientState, old: PatientState) -> PatientState:
+        """The state of `init` where the solver is, with what else it remembers, see `AbstractSolver`."""
+        inner = self.solver.resumed(fresh.inner, old.inner)
+        return eqx.tree_at(lambda s: (s.inner, s.num_steps), fresh, (inner, old.num_steps))
+
     def retreat(
         self,
         fn: Any,

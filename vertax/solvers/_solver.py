@@ -41,6 +41,14 @@ class AbstractSolver(optx.AbstractMinimiser):
     def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
 
+    def resumed(self, fresh: Any, old: Any) -> Any:
+        """The state of `init` at the point where the solver is, with what else it remembers.
+
+        This is asked for when the objective has changed a little: the solver needs its value and its
+        gradient anew, but no more.
+        """
+        return fresh
+
     def retreat(
         self,
         fn: Any,
@@ -60,10 +68,11 @@ class AbstractSolver(optx.AbstractMinimiser):
         - `way`: the step, to `y + way`.
         - `inside`: which points are allowed, as `y` is.
         """
-        halved = lambda share: 0.5 * share
-        outside = lambda share: ~inside(optax.tree.add_scale(y, share, way)) & (share > 1e-9)
-        share = jax.lax.while_loop(outside, halved, jnp.asarray(0.5, optx.max_norm(way).dtype))
-        y = optax.tree.where(inside(optax.tree.add_scale(y, share, way)), optax.tree.add_scale(y, share, way), y)
+        at = lambda share: optax.tree.add_scale(y, share, way)
+        too_far = lambda share: ~inside(at(share)) & (share > _LEAST_SHARE)
+        share = jnp.asarray(0.5, optx.max_norm(way).dtype)
+        share = jax.lax.while_loop(too_far, lambda share: 0.5 * share, share)
+        y = at(jnp.where(share > _LEAST_SHARE, share, 0))
         struct = jax.eval_shape(fn, y, args)
         return y, self.init(fn, y, args, options, struct[0], struct[1], tags)
 
@@ -78,7 +87,15 @@ class AbstractSolver(optx.AbstractMinimiser):
         return y, aux, {}
 
 
+_LEAST_SHARE = 1e-6
+
+
 def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, PyTree, PyTree]:
     """Value, gradient and auxiliary output of an Optimistix objective `fn(y, args) -> (value, aux)`."""
     (value, aux), gradient = jax.value_and_grad(fn, has_aux=True)(y, args)
     return value, gradient, aux
+
+
+def evaluated_anew(fresh: Any, old: Any) -> Any:
+    """A state with the value and the gradient of another one."""
+    return eqx.tree_at(lambda s: (s.value, s.gradient), old, (fresh.value, fresh.gradient))
