@@ -131,7 +131,8 @@ def no_contacts(
     - `options`: of a minimiser: typical sizes.
     """
     length, stiffness = options["length_scale"], options["stiffness"]
-    slope = jnp.asarray(SLOPE * reach, length.dtype)
+    reach = jnp.maximum(jnp.asarray(reach, length.dtype), 1e-9)
+    slope = SLOPE * reach
     # The barrier must not depend on the parameters of the energy, not even through its strength: that would be
     # one more derivative. So it is a power of 16.
     strength = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0)) / slope

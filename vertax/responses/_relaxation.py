@@ -12,6 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.checks import check_number
 from vertax._base.modules import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
@@ -46,14 +47,18 @@ class Relaxation(AbstractResponse):
         energy per length; by default $10^{-10}\,k \ell$ in float64 and $10^{-5}\,k \ell$ in float32.
     - `patience`: number of consecutive steps for which the force must stay below the tolerance.
     - `max_steps`: most steps of the minimiser.
+    - `contact_range`: how near a corner comes to a side of the same cell (or of the outline) before a
+        barrier holds it off, in units of the size of a cell; see [Contact](concepts.md#contact). 0 leaves
+        the barrier out, and steps that would make cells overlap are still refused; None lets them overlap.
 
-    `tolerance`, `patience`, `max_steps` and the numbers of `transitions` and of an energy are data: another
+    `tolerance`, `patience`, `max_steps`, `contact_range` and the numbers of `transitions` and of an energy are data: another
     number compiles nothing anew. The solver and the adjoint are parts of the program.
 
     **Raises:**
 
     - `TypeError` for a solver, or transitions, that are none.
-    - `ValueError` for a tolerance, patience or number of steps that is not positive.
+    - `ValueError` for a tolerance, patience or number of steps that is not positive, or a negative
+        contact range.
     """
 
     solver: optx.AbstractMinimiser[Any, Any, Any] = eqx.field(default_factory=NewtonCG)
@@ -74,6 +79,8 @@ class Relaxation(AbstractResponse):
             value = getattr(self, name)
             if value is not None and is_concrete(value) and not np.all(np.asarray(value) > 0):
                 raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+        if self.contact_range is not None:
+            check_number("contact_range", self.contact_range, least=0, many=True)
 
     def __call__(
         self,
@@ -148,6 +155,7 @@ def equilibrate(
     tolerance: float | Float[Array, ""] | None = None,
     patience: int | Int[Array, ""] = 1,
     max_steps: int | Int[Array, ""] = 2000,
+    contact_range: float | Float[Array, ""] | None = 0.01,
     throw: bool = True,
 ) -> Equilibrium:
     r"""Relax a tissue to mechanical equilibrium, $X^* \in \arg\min_X E(X, \theta)$ (paper, Methods).
@@ -163,7 +171,7 @@ def equilibrate(
     - `energy`: what to minimise.
     - `adjoint`: how to differentiate, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
         default.
-    - `solver`, `transitions`, `tolerance`, `patience`, `max_steps`: see
+    - `solver`, `transitions`, `tolerance`, `patience`, `max_steps`, `contact_range`: see
         [`Relaxation`][vertax.Relaxation], whose convenient form this is.
     - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
 
@@ -175,10 +183,11 @@ def equilibrate(
     - `ValueError` within `jax.shard_map` that checks which values differ between devices: pass
         `check_vma=False`.
     - `TypeError` for an adjoint that is none of `vertax.adjoints`, or a solver that is no minimiser.
-    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge.
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge, or
+        its cells overlap, as they already did in `tissue`.
     """
     solver = NewtonCG() if solver is None else solver
-    response = Relaxation(solver, transitions, tolerance, patience, max_steps)
+    response = Relaxation(solver, transitions, tolerance, patience, max_steps, contact_range)
     return response(tissue, energy, adjoint=adjoint, throw=throw)
 
 
@@ -233,6 +242,7 @@ def conclude(
         max_force=state.minimiser.force,
         num_steps=state.num_steps,
         num_t1=state.num_t1,
+        valid=~state.overlaps if state.contacts is not None else ~final.overlaps.any,
         result=search.result(state),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 
 import equinox as eqx
+import jax
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
@@ -28,25 +29,27 @@ class Equilibrium(eqx.Module):
     """Steps of the minimiser."""
     num_t1: Int[Array, "*batch"]
     """T1 transitions on the way."""
+    valid: Bool[Array, "*batch"]
+    """Whether its cells tile the plane; `tissue.overlaps` says where they do not."""
     result: optx.RESULTS
-    """Outcome; `optimistix.RESULTS[result]` is its message."""
+    """Outcome of the minimiser; `optimistix.RESULTS[result]` is its message."""
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:
-        """Whether the largest force fell below the tolerance."""
-        return self.result == optx.RESULTS.successful
+        """Whether the largest force fell below the tolerance, in a tissue without overlaps."""
+        return (self.result == optx.RESULTS.successful) & self.valid
 
     def checked(self) -> Equilibrium:
         """The same, if it converged.
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox inside `jax.jit`) if it did not.
+        - `RuntimeError` (of Equinox inside `jax.jit`) if it did not, or if cells overlap.
         """
         converged = self.converged
         if not is_concrete(converged):
             # The message of a compiled program cannot hold numbers.
-            reason = f"The relaxation reached no equilibrium. {_REMEDY}"
+            reason = f"The relaxation reached no equilibrium, or its cells overlap. {_REMEDY}"
             return eqx.error_if(self, ~converged, reason)
         if np.all(converged):
             return self
@@ -57,12 +60,26 @@ class Equilibrium(eqx.Module):
                 f"The relaxation broke down{members}: its forces are not finite. The parameters of the "
                 "energy may be NaN, or so extreme that the tissue collapses."
             )
+        if not np.all(self.valid):
+            raise RuntimeError(
+                f"Cells of the relaxed tissue overlap{members}: {self._first_overlap()}. {_UNTANGLE}"
+            )
         raise RuntimeError(
             f"The relaxation reached no equilibrium{members} in {np.max(self.num_steps)} steps (largest "
             f"force {np.max(forces):.1e}). {_REMEDY}"
         )
 
+    def _first_overlap(self) -> str:
+        """Where the first tissue of a batch overlaps that does."""
+        ndim, number = np.ndim(self.valid), int(np.argmin(np.ravel(self.valid)))
+        one = lambda x: x.reshape(-1, *x.shape[ndim:])[number] if eqx.is_array(x) else x
+        return jax.tree.map(one, self.tissue).overlaps.describe()
 
+
+_UNTANGLE = (
+    "A relaxation never makes cells overlap unless `contact_range` is None, but it may start from a tissue "
+    "in which they do: look at its `overlaps`."
+)
 _REMEDY = (
     "Raise `max_steps`, loosen `tolerance`, use the default solver, or pass throw=False and look at "
     "`converged`."
