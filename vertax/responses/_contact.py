@@ -82,10 +82,14 @@ class Contacts(eqx.Module):
         if one.shape[-1] == 5:
             sine, cosine = wedge(one, other)
             acute = after & (cosine > 0) & (sine > 0)
-            limit = limited(jnp.minimum(dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])))
+            limit = limited(
+                jnp.minimum(dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4]))
+            )
             angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
             gap = bulge_gap(one, other)
-            gap = jnp.where(jnp.isfinite(gap), gap, 1) ** 2 / limit + jnp.where(jnp.isfinite(gap), 0, jnp.inf)
+            gap = jnp.where(jnp.isfinite(gap), gap, 1) ** 2 / limit + jnp.where(
+                jnp.isfinite(gap), 0, jnp.inf
+            )
             near.append((jnp.where(adjacent, angle, gap), limit))
         return near
 

@@ -121,12 +121,16 @@ class Search(eqx.Module):
         tissue, counts = before.with_configuration(trial), state.counts
         if self.transitions is not None:
             tissue, counts = self.transitions.sweep(tissue, energy, state.counts)
-        swept = jnp.any(tissue.vertices != before.with_configuration(trial).vertices) | jnp.any(counts != state.counts)
+        swept = jnp.any(tissue.vertices != before.with_configuration(trial).vertices) | jnp.any(
+            counts != state.counts
+        )
         contacts, overlaps = self._near(tissue, state, swept | ~state.started)
         refused = state.started & ~state.overlaps & overlaps
         kept = (before, state.contacts, state.overlaps, state.counts)
         tissue, contacts, overlaps, counts = jax.tree.map(
-            lambda old, new: jnp.where(refused, old, new), kept, (tissue, contacts, overlaps, counts)
+            lambda old, new: jnp.where(refused, old, new),
+            kept,
+            (tissue, contacts, overlaps, counts),
         )
         flipped = swept & ~refused
 
@@ -145,7 +149,14 @@ class Search(eqx.Module):
             inside = lambda y: ~find_overlaps(before.with_configuration(y)).any
             way = optax.tree.sub(trial, before.configuration)
             return self.minimiser.retreat(
-                objective, before.configuration, way, args, self.options, state.minimiser, _TAGS, inside
+                objective,
+                before.configuration,
+                way,
+                args,
+                self.options,
+                state.minimiser,
+                _TAGS,
+                inside,
             )
 
         here = (tissue.configuration, minimiser)

@@ -266,7 +266,9 @@ def _judge_local(
     energy: AbstractLocalEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
 ) -> Float[Array, "3 edges"]:
     """What the trials of each chosen edge cost: all at once, each by the terms of its own cells and edges."""
-    by_cell, by_edge = _of_each(lambda t: (energy.cell_terms(t), energy.edge_terms(t)), trials(chosen))
+    by_cell, by_edge = _of_each(
+        lambda t: (energy.cell_terms(t), energy.edge_terms(t)), trials(chosen)
+    )
     # In a very small tissue one cell can be two of the four: count it once.
     cells = corner.cells
     repeated = [jnp.zeros(cells.shape[0], bool)]

@@ -1,0 +1,98 @@
+"""Where tissues overlap, against brute force."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+from hypothesis import given, settings, strategies as st
+from tilings import faces_that_overlap
+
+import vertax as vx
+
+overlaps_of = eqx.filter_jit(lambda tissue: tissue.overlaps)
+PERIODIC = vx.initialise.periodic_voronoi(n_cells=12, key=1)
+FREE = cluster(8, 1)
+
+
+def faces(overlaps) -> list[int]:
+    cells = np.flatnonzero(overlaps.cells).tolist()
+    return cells + [len(overlaps.cells)] * bool(overlaps.exterior)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), size=st.floats(0, 0.6), sheared=st.booleans())
+def test_periodic_tissues_against_brute_force(seed, size, sheared):
+    lattice = np.asarray(PERIODIC.boundary.lattice) @ np.array([[1.0, 0.0], [0.4 * sheared, 1.0]])
+    vertices = np.asarray(PERIODIC.vertices) @ np.array([[1.0, 0.0], [0.4 * sheared, 1.0]])
+    moves = size * np.random.default_rng(seed).normal(size=vertices.shape)
+    tissue = eqx.tree_at(
+        lambda t: (t.vertices, t.boundary.lattice),
+        PERIODIC,
+        (jnp.asarray(vertices + moves), jnp.asarray(lattice)),
+    )
+    assert faces(overlaps_of(tissue)) == faces_that_overlap(tissue)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), size=st.floats(0, 0.5), bend=st.floats(0, 1.2))
+def test_free_tissues_with_arcs_against_brute_force(seed, size, bend):
+    rng = np.random.default_rng(seed)
+    moves = size * rng.normal(size=FREE.vertices.shape)
+    angles = np.clip(np.asarray(FREE.angles) + bend * rng.normal(size=FREE.n_edges), -2.8, 2.8)
+    tissue = FREE.with_vertices(FREE.vertices + moves).with_angles(jnp.asarray(angles))
+    assert faces(overlaps_of(tissue)) == faces_that_overlap(tissue, points=160)
+
+
+def test_a_corner_that_moved_through_the_opposite_side():
+    tissue = vx.initialise.hexagonal(2, 2)
+    assert not overlaps_of(tissue).any
+    assert overlaps_of(tissue).describe() == ""
+    m = tissue.topology
+    cell = np.flatnonzero(np.asarray(m.cell) == 0)
+    corner, opposite = np.asarray(tissue.corners)[cell[0]], np.asarray(tissue.centroids)[0]
+    moved = tissue.with_vertices(tissue.vertices.at[cell[0] // 3].add(2.4 * (opposite - corner)))
+    overlaps = overlaps_of(moved)
+    assert overlaps.any and overlaps.cells[0] and not np.all(overlaps.cells)
+    assert overlaps.sides[overlaps.crossed[jnp.argmax(overlaps.sides)]]
+    assert "cell 0" in overlaps.describe() and f"{cell[0] // 3}" in overlaps.describe()
+
+
+def test_sides_in_one_line_do_not_cross():
+    # Every other edge of a row of bricks lies in one line with the next, up to rounding.
+    tissue = vx.initialise.hexagonal(4, 4)
+    lines = np.round(np.asarray(tissue.vertices)[:, 1] / 0.31) * 0.31
+    bricks = tissue.with_vertices(tissue.vertices.at[:, 1].set(lines))
+    assert faces(overlaps_of(bricks)) == faces_that_overlap(bricks)
+
+
+def test_a_tissue_inside_out_is_seen():
+    tissue = PERIODIC
+    mirrored = eqx.tree_at(
+        lambda t: (t.vertices, t.boundary.lattice),
+        tissue,
+        (
+            tissue.vertices * jnp.array([-1.0, 1.0]),
+            tissue.boundary.lattice * jnp.array([-1.0, 1.0]),
+        ),
+    )
+    overlaps = overlaps_of(mirrored)
+    assert np.all(overlaps.cells) and not np.any(overlaps.sides)
+
+
+def test_a_batch_has_overlaps_of_its_own():
+    moved = PERIODIC.with_vertices(PERIODIC.vertices.at[3].add(2.0))
+    both = jax.tree.map(lambda *x: jnp.stack(x), PERIODIC, moved)
+    overlaps = eqx.filter_vmap(lambda t: t.overlaps)(both)
+    assert overlaps.any.tolist() == [False, True]
+    one = overlaps_of(moved)
+    assert overlaps.describe() == one.describe() != ""
+    np.testing.assert_array_equal(overlaps.crossed[1], one.crossed)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_first_tissues_do_not_overlap(dtype):
+    for tissue in (PERIODIC, FREE):
+        cast = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tissue)
+        assert not overlaps_of(cast).any

@@ -1,0 +1,121 @@
+"""Cells never overlap on the way to equilibrium, and rest against each other smoothly."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+from hypothesis import given, settings, strategies as st
+from tilings import faces_that_overlap
+
+import vertax as vx
+
+N = 20
+relaxed = eqx.filter_jit(vx.Relaxation(max_steps=300).__call__)
+
+
+def tissue_of(seed: int) -> vx.Tissue:
+    return vx.initialise.periodic_voronoi(n_cells=N, key=seed)
+
+
+def shape_factors(seed: int, low: float = 3.3, high: float = 4.9) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(low, high, N)
+
+
+def shapes(targets) -> vx.AbstractEnergy:
+    return vx.energies.ShapeFactorEnergy(jnp.asarray(targets))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6), low=st.floats(3.0, 4.5), spread=st.floats(0, 0.5))
+def test_a_random_tissue_stays_valid(seed, low, spread):
+    energy = shapes(shape_factors(seed, low, low + spread + 1e-9))
+    equilibrium = relaxed(tissue_of(seed % 100), energy, throw=False)
+    assert equilibrium.valid
+    assert faces_that_overlap(equilibrium.tissue) == []
+
+
+@pytest.mark.slow
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), inner_arcs=st.booleans())
+def test_a_random_cluster_stays_valid(seed, inner_arcs):
+    tissue = cluster(12, seed % 100, inner_arcs=inner_arcs)
+    tension = np.random.default_rng(seed).uniform(0.06, 0.6, tissue.n_edges)
+    energy = vx.energies.AreaElasticity(2.0, 1.0) + vx.energies.LineTension(jnp.asarray(tension))
+    equilibrium = relaxed(tissue, energy, throw=False)
+    assert equilibrium.valid
+    assert faces_that_overlap(equilibrium.tissue, 200) == []
+
+
+@pytest.mark.parametrize("solver", [vx.solvers.FIRE(), vx.solvers.LBFGS()], ids=["FIRE", "LBFGS"])
+def test_steps_of_any_solver_are_undone_where_cells_would_overlap(solver):
+    response = vx.Relaxation(solver, tolerance=1e-6, max_steps=400)
+    for seed in range(3):
+        equilibrium = response(tissue_of(seed), shapes(np.full(N, 4.5)), throw=False)
+        assert faces_that_overlap(equilibrium.tissue) == []
+
+
+def test_without_contact_cells_overlap_and_that_is_refused():
+    response = vx.Relaxation(contact_range=None)
+    energy = shapes(np.full(N, 4.7))
+    equilibrium = response(tissue_of(1), energy, throw=False)
+    bad = faces_that_overlap(equilibrium.tissue)
+    assert bad and not equilibrium.valid and not equilibrium.converged
+    with pytest.raises(RuntimeError, match=rf"overlap: cell {bad[0]}\b.*contact_range"):
+        response(tissue_of(1), energy)
+
+
+def test_a_tissue_that_overlaps_from_the_start_is_named():
+    tissue = vx.initialise.hexagonal(2, 2)
+    overlapping = tissue.with_vertices(tissue.vertices.at[0].add(2.5))
+    with pytest.raises(RuntimeError, match="vertices"):
+        vx.equilibrate(
+            overlapping, vx.energies.ShapeFactorEnergy(3.7), transitions=None, max_steps=1
+        )
+
+
+def test_nothing_changes_where_nothing_touches():
+    energy = shapes(np.full(N, 3.6))
+    start = vx.equilibrate(tissue_of(2), energy).tissue
+    pushed = shapes(np.linspace(3.55, 3.65, N))
+    held, free = (vx.Relaxation(contact_range=r)(start, pushed) for r in (0.01, None))
+    assert held.num_steps == free.num_steps
+    np.testing.assert_allclose(held.tissue.vertices, free.tissue.vertices, rtol=0, atol=1e-13)
+
+
+def test_a_negative_range_is_refused():
+    with pytest.raises(ValueError, match="contact_range"):
+        vx.Relaxation(contact_range=-0.1)
+
+
+# In this tissue cells of very different target shape factors press corners against sides.
+TOUCHING = 17
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "rtol"),
+    [
+        (vx.ImplicitDifferentiation(), 1e-6),
+        (vx.EquilibriumPropagation(beta=1e-6), 1e-5),
+    ],
+    ids=["implicit", "propagation"],
+)
+def test_hypergradients_of_a_tissue_in_contact(adjoint, rtol):
+    targets, rng = shape_factors(TOUCHING), np.random.default_rng(TOUCHING)
+    start = relaxed(tissue_of(TOUCHING), shapes(targets)).tissue
+    force = jax.grad(lambda v: shapes(targets)(start.with_vertices(v)))(start.vertices)
+    assert np.max(np.abs(force)) > 1e-3  # what the energy exerts and contacts bear
+    direction = jnp.asarray(rng.normal(size=N))
+
+    @eqx.filter_jit
+    def cost(targets, adjoint):
+        energy = vx.energies.ShapeFactorEnergy(targets)
+        found = vx.equilibrate(start, energy, adjoint=adjoint, tolerance=1e-11)
+        return jnp.sum(jnp.sin(3 * found.tissue.edge_lengths))
+
+    targets, step = jnp.asarray(targets), 1e-5
+    there = [cost(targets + s * step * direction, vx.ImplicitDifferentiation()) for s in (1, -1)]
+    expected = (there[0] - there[1]) / (2 * step)
+    slope = jax.grad(cost)(targets, adjoint)
+    np.testing.assert_allclose(slope @ direction, expected, rtol=rtol)
