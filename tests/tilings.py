@@ -6,7 +6,7 @@ import vertax as vx
 
 
 def faces_that_overlap(tissue: vx.Tissue, points: int = 48) -> list[int]:
-    """The faces (the exterior last) whose outline, drawn with straight pieces, crosses itself or is inside out."""
+    """The faces (the exterior last) whose outline, drawn by pieces, crosses itself or is inside out."""
     m = tissue.topology
     following, cell = np.asarray(m.next), np.asarray(m.cell)
     vertices, lattice = np.asarray(tissue.vertices), np.zeros((2, 2))

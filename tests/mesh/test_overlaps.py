@@ -54,9 +54,12 @@ def test_a_corner_that_moved_through_the_opposite_side():
     corner, opposite = np.asarray(tissue.corners)[cell[0]], np.asarray(tissue.centroids)[0]
     moved = tissue.with_vertices(tissue.vertices.at[cell[0] // 3].add(2.4 * (opposite - corner)))
     overlaps = overlaps_of(moved)
-    assert overlaps.any and overlaps.cells[0] and not np.all(overlaps.cells)
+    assert overlaps.any
+    assert overlaps.cells[0]
+    assert not np.all(overlaps.cells)
     assert overlaps.sides[overlaps.crossed[jnp.argmax(overlaps.sides)]]
-    assert "cell 0" in overlaps.describe() and f"{cell[0] // 3}" in overlaps.describe()
+    assert "cell 0" in overlaps.describe()
+    assert f"{cell[0] // 3}" in overlaps.describe()
 
 
 def test_sides_in_one_line_do_not_cross():
@@ -78,7 +81,8 @@ def test_a_tissue_inside_out_is_seen():
         ),
     )
     overlaps = overlaps_of(mirrored)
-    assert np.all(overlaps.cells) and not np.any(overlaps.sides)
+    assert np.all(overlaps.cells)
+    assert not np.any(overlaps.sides)
 
 
 def test_a_batch_has_overlaps_of_its_own():

@@ -29,7 +29,7 @@ FAMILIES = {
     "load_energy load_problem load_tissue load_trajectory read_image "
     "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
     "write_geojson write_vtk",
-    "mesh": "AbstractBoundary Free Periodic Tissue Topology cell_polygons",
+    "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
     "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "
     "scale_bar series_colours",

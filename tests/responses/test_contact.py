@@ -61,7 +61,9 @@ def test_without_contact_cells_overlap_and_that_is_refused():
     energy = shapes(np.full(N, 4.7))
     equilibrium = response(tissue_of(1), energy, throw=False)
     bad = faces_that_overlap(equilibrium.tissue)
-    assert bad and not equilibrium.valid and not equilibrium.converged
+    assert bad
+    assert not equilibrium.valid
+    assert not equilibrium.converged
     with pytest.raises(RuntimeError, match=rf"overlap: cell {bad[0]}\b.*contact_range"):
         response(tissue_of(1), energy)
 

@@ -6,5 +6,6 @@ from vertax.mesh._boundary import (
     Periodic as Periodic,
 )
 from vertax.mesh._outlines import cell_polygons as cell_polygons
+from vertax.mesh._overlaps import Overlaps as Overlaps
 from vertax.mesh._tissue import Tissue as Tissue
 from vertax.mesh._topology import Topology as Topology

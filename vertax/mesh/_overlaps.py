@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 Carry = TypeVar("Carry")
 
 
-# If every face is a simple polygon (of arcs) that runs counter-clockwise, and the exterior clockwise, then the
-# tissue tiles the plane: by their turning numbers the angles of all faces add up to one full turn for each
-# vertex, and no vertex has less, so its three faces surround it once. Nothing has to be compared across
+# If every face is a simple polygon (of arcs) that runs counter-clockwise, and the exterior clockwise, then
+# the tissue tiles the plane: by their turning numbers the angles of all faces add up to one full turn for
+# each vertex, and no vertex has less, so its three faces surround it once. Nothing has to be compared across
 # faces.
 class Overlaps(eqx.Module):
     """Where the faces of a tissue overlap; under `jax.vmap` one entry for each of the batch.

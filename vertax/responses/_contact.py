@@ -137,8 +137,8 @@ def no_contacts(
     length, stiffness = options["length_scale"], options["stiffness"]
     reach = jnp.maximum(jnp.asarray(reach, length.dtype), 1e-9)
     slope = SLOPE * reach
-    # The barrier must not depend on the parameters of the energy, not even through its strength: that would be
-    # one more derivative. So it is a power of 16.
+    # The barrier must not depend on the parameters of the energy, not even through its strength: that would
+    # be one more derivative. So it is a power of 16.
     strength = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0)) / slope
     nothing = jnp.zeros((tissue.n_vertices, 2), tissue.topology.twin.dtype)
     slack = jnp.zeros_like(length)

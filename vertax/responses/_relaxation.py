@@ -51,8 +51,8 @@ class Relaxation(AbstractResponse):
         barrier holds it off, in units of the size of a cell; see [Contact](concepts.md#contact). 0 leaves
         the barrier out, and steps that would make cells overlap are still refused; None lets them overlap.
 
-    `tolerance`, `patience`, `max_steps`, `contact_range` and the numbers of `transitions` and of an energy are data: another
-    number compiles nothing anew. The solver and the adjoint are parts of the program.
+    `tolerance`, `patience`, `max_steps`, `contact_range` and the numbers of `transitions` and of an energy
+    are data: another number compiles nothing anew. The solver and the adjoint are parts of the program.
 
     **Raises:**
 

@@ -37,6 +37,9 @@ class T1(AbstractTransitions):
     four cells meet in one point because its tension is too high for either configuration, it would
     otherwise flip to and fro for ever.
 
+    Where a flipped edge would make cells overlap it is made shorter, and if that does not help it does not
+    flip. An edge below the threshold that is inside out, and does not flip, is put upright.
+
     Lengths are those of arcs where edges are arcs; an edge that flips becomes straight, or an arc of
     angle 0.
 
