@@ -127,7 +127,7 @@ def test_no_sequence_of_flips_breaks_the_mesh(seed, inner_arcs):
         # Flips leave edges of length 100 behind.
         place = jax.random.normal(key, tissue.vertices.shape)
         tissue = with_angles(tissue.with_vertices(place), 0.5 * jnp.ones(tissue.n_edges))
-    assert n_flips > 20
+    assert n_flips > 8
     assert shortest >= 2
 
 

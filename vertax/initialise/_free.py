@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 
 from vertax._base.checks import as_key, check_concrete, check_whole
 from vertax.initialise._order import spatial_order
+from vertax.initialise._tidy import without_overlaps
 from vertax.initialise._voronoi import tessellate
 from vertax.mesh import Free, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
@@ -65,7 +66,7 @@ def free_voronoi(
     vertices, topology, angles = _cut_out(corners, topology, chosen)
     if random_angles:
         angles = jax.random.uniform(angle_key, angles.shape, dtype, maxval=np.pi / 2)
-    return Tissue(
+    tissue = Tissue(
         jnp.asarray(vertices, dtype),
         topology,
         Free(),
@@ -73,6 +74,7 @@ def free_voronoi(
         angles=jnp.asarray(angles, dtype),
         inner_arcs=inner_arcs,
     )
+    return without_overlaps(tissue)
 
 
 def _cut_out(

@@ -20,6 +20,7 @@ from vertax.initialise._repairs import (
     untangle,
     with_exterior,
 )
+from vertax.initialise._tidy import without_overlaps
 from vertax.mesh import Free, Periodic, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
 
@@ -171,7 +172,7 @@ def from_labels(
         top_bottom, left_right = _touching(image, n)
         whole = (mesh.cells < n) & ~(top_bottom | left_right)[label]
     return Segmentation(
-        tissue=tissue,
+        tissue=without_overlaps(tissue),
         labels=values[label],
         whole=whole,
         absorbed=np.setdiff1d(values, values[label]),
@@ -224,7 +225,9 @@ def _free_from_labels(
     home = image[margin : margin + rows, margin : margin + columns]
     top_bottom, left_right = _touching(home, exterior + 1)
     return Segmentation(
-        tissue=_with_arcs(straight, mesh, curved, pixel_size, inner_arcs=inner_arcs),
+        tissue=without_overlaps(
+            _with_arcs(straight, mesh, curved, pixel_size, inner_arcs=inner_arcs)
+        ),
         labels=values[label],
         whole=~(top_bottom | left_right)[label],
         absorbed=np.setdiff1d(values, values[label]),

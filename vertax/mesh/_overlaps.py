@@ -69,13 +69,25 @@ class Overlaps(eqx.Module):
 
 def find_overlaps(tissue: Tissue) -> Overlaps:
     """Compare each side with all others of its face."""
-    sides = sides_of(tissue)
+    m = tissue.topology
+    return _overlaps(tissue, crossed_sides(sides_of(tissue), m.next, _last(m)))
+
+
+def crossed_sides(
+    sides: Sides, following: Int[Array, " halfedges"], last: Int[Array, " halfedges"]
+) -> Int[Array, " halfedges"]:
+    """For each side another one of its face that it crosses, or itself.
+
+    **Arguments:**
+
+    - `following`: the next side of the face.
+    - `last`: two less than the number of its sides.
+    """
 
     def compare(k: Int[Array, ""], other: Int[Array, " halfedges"], crossed: Array) -> Array:
         return jnp.where(_crosses(k, other, sides, take(sides, other)), other, crossed)
 
-    crossed = around(tissue.topology, compare, _numbers(tissue.topology))
-    return _overlaps(tissue, crossed)
+    return around(following, last, compare, jnp.arange(len(sides), dtype=following.dtype))
 
 
 def overlaps_and_nearest(
@@ -113,7 +125,7 @@ def overlaps_and_nearest(
 
     none = jnp.full(here.size, jnp.inf, sides.dtype)
     start = (here, (here, here), (none, none), none)
-    crossed, nearest, gaps, least = around(m, both, start)
+    crossed, nearest, gaps, least = around(m.next, _last(m), both, start)
     nearest, gaps = jnp.stack(nearest, axis=-1), jnp.stack(gaps, axis=-1)
     return _overlaps(tissue, crossed), nearest, gaps, jnp.min(least)
 
@@ -136,20 +148,23 @@ def _numbers(topology: Topology) -> Int[Array, " halfedges"]:
     return jnp.arange(topology.n_half_edges, dtype=topology.twin.dtype)
 
 
+def _last(topology: Topology) -> Int[Array, " halfedges"]:
+    n_sides = jax.ops.segment_sum(jnp.ones_like(topology.cell), topology.cell, topology.n_faces)
+    return take(n_sides, topology.cell) - 2
+
+
 def around(
-    topology: Topology,
+    following: Int[Array, " halfedges"],
+    last: Int[Array, " halfedges"],
     body: Callable[[Int[Array, ""], Int[Array, " halfedges"], Carry], Carry],
     start: Carry,
 ) -> Carry:
     """Walk around all faces at once: `body` sees each half-edge with the one k sides further.
 
-    k goes from 1 to two less than the sides of the largest face; half-edges that are through are paired
-    with themselves. So each corner meets all sides of its face that it does not end.
+    k goes from 1 to `last`, which may differ from face to face; half-edges that are through are paired with
+    themselves. With two less than the number of sides each corner meets all sides that it does not end.
     """
-    following = topology.next
-    n_sides = jax.ops.segment_sum(jnp.ones_like(topology.cell), topology.cell, topology.n_faces)
-    last = take(n_sides, topology.cell) - 2
-    here = _numbers(topology)
+    here = jnp.arange(following.size, dtype=following.dtype)
 
     def one(k: Int[Array, ""], carry: tuple) -> tuple:
         other, inner = carry

@@ -1,0 +1,81 @@
+"""First tissues that tile the plane."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int
+
+from vertax.mesh import Periodic, Tissue
+from vertax.mesh._overlaps import crossed_sides
+
+_ROUNDS = 60
+
+
+def without_overlaps(tissue: Tissue) -> Tissue:
+    """The same tissue, mended where its cells overlap, and only there.
+
+    Arcs are made flatter; and where straight edges cross, corners move towards their neighbours.
+
+    **Raises:**
+
+    - `ValueError` if that does not help.
+    """
+    m = tissue.topology
+    cell, twin = np.asarray(m.cell), np.asarray(m.twin)
+    following = np.where(twin % 3 == 0, twin + 2, twin - 1)
+    for attempt in range(_ROUNDS):
+        crossed = _crossed(tissue, following, cell)
+        bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
+        if not crossed.any():
+            return tissue
+        ends, faces = np.asarray(m.edge_vertices), np.asarray(m.edge_cells)
+        touched = np.any(np.append(bad, False)[faces], axis=1)
+        touched[np.asarray(m.edge)[crossed]] = True
+        if tissue.arcs is not None:
+            tissue = tissue.with_angles(jnp.where(touched, 0.7, 1) * tissue.arcs.angles)
+        if tissue.arcs is None or attempt >= _ROUNDS // 4:
+            moving = np.zeros(m.n_vertices, bool)
+            moving[ends[touched]] = True
+            step = np.zeros((m.n_vertices, 2))
+            vectors = np.asarray(tissue.edge_vectors)
+            np.add.at(step, ends[:, 0], vectors / 3)
+            np.add.at(step, ends[:, 1], -vectors / 3)
+            tissue = tissue.with_vertices(
+                tissue.vertices + 0.5 * jnp.asarray(np.where(moving[:, None], step, 0))
+            )
+    raise ValueError(
+        f"Cells of the first tissue overlap: {tissue.overlaps.describe()}. Smooth the outlines that it is made "
+        "from, or leave these cells out."
+    )
+
+
+def _crossed(
+    tissue: Tissue, following: Int[np.ndarray, " halfedges"], cell: Int[np.ndarray, " halfedges"]
+) -> Bool[np.ndarray, " halfedges"]:
+    """Which half-edges cross another side of their face."""
+    # Tissues come in all sizes. Filled up to a power of two, they share what is compiled.
+    n = following.size
+    more = max(64, 1 << (n - 1).bit_length()) - n
+    start = np.repeat(np.asarray(tissue.vertices), 3, axis=0)
+    if isinstance(tissue.boundary, Periodic):
+        start = start + np.asarray(tissue.topology.frame) @ np.asarray(tissue.boundary.lattice)
+    sides = np.concatenate([start, start[following] - start], axis=1)
+    if tissue.arcs is not None:
+        edge, half_edge = (np.asarray(x) for x in (tissue.topology.edge, tissue.topology.half_edge))
+        angles = np.asarray(tissue.arcs.angles)
+        if not tissue.inner_arcs:
+            angles = np.where(cell[np.asarray(tissue.topology.twin)[half_edge]] == tissue.n_cells, angles, 0)
+        forward = half_edge[edge] == np.arange(n)
+        sides = np.column_stack([sides, np.where(forward, 1, -1) * angles[edge]])
+    last = np.bincount(cell)[cell] - 2
+    padded = (
+        np.pad(sides, ((0, more), (0, 0))),
+        np.concatenate([following, np.arange(n, n + more)]).astype(np.int32),
+        np.pad(last, (0, more)).astype(np.int32),
+    )
+    return np.asarray(_compiled(*map(jnp.asarray, padded)))[:n] != np.arange(n)
+
+
+_compiled = eqx.filter_jit(crossed_sides)
