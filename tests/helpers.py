@@ -27,6 +27,10 @@ SOLVERS = [
     ("optimistix_nonlinear_cg", optx.NonlinearCG(rtol=0.0, atol=0.0), 1e-5),
 ]
 
+# JAX knows an optimiser by identity: fits of one kind of problem with this one share what is compiled.
+ADAM = optax.adam(1e-2)
+LEAST_SQUARES = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+
 
 def each_solver(*quick: str) -> pytest.MarkDecorator:
     """All solvers, of which those named are tried on every change and all of them by `test-slow`."""
