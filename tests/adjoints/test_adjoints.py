@@ -111,7 +111,7 @@ def test_hypergradient_against_a_dense_reference(adjoint, response, rtol, n_cell
     assert distance(found.gradient, reference) < rtol
 
 
-@adjoints("propagation", "automatic")
+@adjoints("automatic")
 def test_topology_changes_on_the_way(adjoint, response, rtol):
     _, _, cost = start_and_cost()
     tissue = random_tissue(CELLS, 5)
@@ -354,7 +354,7 @@ RASH = eqx.tree_at(lambda r: r.max_steps, MOMENTUM, jnp.asarray(5))
 class TestOutcome:
     """How a gradient came about is told, and a bad one is refused."""
 
-    @adjoints("implicit", "propagation")
+    @adjoints("propagation")
     def test_it_is_the_gradient_with_respect_to_an_empty_one(self, adjoint, response, rtol):
         found = evaluate(*start_and_cost(), adjoint, response)
         assert found.outcome.trusted

@@ -165,6 +165,7 @@ def test_slopes_of_the_costs(name):
     assert slope == pytest.approx(float(difference), rel=1e-5)
 
 
+@pytest.mark.slow  # their slopes are checked above, and other costs through the equilibrium
 def test_a_gradient_through_the_equilibrium_periodic():
     tissue, start = relaxed(12, 1)
     weights = (0.5, 0.3, 0.2)

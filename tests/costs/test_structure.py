@@ -175,12 +175,13 @@ def test_derivatives_of_the_structural_cost(dtype):
     np.testing.assert_allclose(second, expected, atol=10 * close * float(jnp.abs(expected).max()))
 
 
+@pytest.mark.slow  # its slope is checked above, and gradients of other costs with the adjoints
 @pytest.mark.parametrize(
     ("adjoint", "accuracy"),
     [
         (vx.ImplicitDifferentiation(), 1e-7),
-        pytest.param(vx.EquilibriumPropagation(), 1e-5, marks=pytest.mark.slow),
-        pytest.param(vx.AutomaticDifferentiation(), 1e-4, marks=pytest.mark.slow),
+        (vx.EquilibriumPropagation(), 1e-5),
+        (vx.AutomaticDifferentiation(), 1e-4),
     ],
     ids=["ID", "EP", "AD"],
 )

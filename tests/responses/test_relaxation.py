@@ -65,7 +65,15 @@ def relaxed_one_by_one(tissues, targets):
     return jax.lax.map(relax, (tissues, targets))
 
 
-@pytest.mark.parametrize("p0", [3.5, 3.7, 3.8, 3.9])
+@pytest.mark.parametrize(
+    "p0",
+    [
+        3.5,
+        pytest.param(3.7, marks=pytest.mark.slow),
+        pytest.param(3.8, marks=pytest.mark.slow),
+        3.9,
+    ],
+)
 def test_random_tissues_reach_true_equilibria(p0):
     batch = [random_tissue(64, s) for s in range(6)]
     tissues = jax.tree.map(lambda *x: jnp.stack(x), *batch)
