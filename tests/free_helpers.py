@@ -42,8 +42,8 @@ def with_angles(tissue: vx.Tissue, angles: jax.Array) -> vx.Tissue:
 
 
 def rotated(tissue: vx.Tissue, angle: float, shift=(0.0, 0.0)) -> vx.Tissue:
-    turn = jnp.array([[jnp.cos(angle), jnp.sin(angle)], [-jnp.sin(angle), jnp.cos(angle)]])
-    return tissue.with_vertices(tissue.vertices @ turn + jnp.array(shift))
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return tissue.with_vertices(jnp.asarray(np.asarray(tissue.vertices) @ turn + np.array(shift)))
 
 
 def relabelled(tissue: vx.Tissue, seed: int) -> tuple[vx.Tissue, np.ndarray, np.ndarray]:
@@ -75,10 +75,11 @@ def relabelled(tissue: vx.Tissue, seed: int) -> tuple[vx.Tissue, np.ndarray, np.
     return new, cell, edge
 
 
+@eqx.filter_jit
 def forces(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> tuple[jax.Array, jax.Array]:
     """Derivatives of the energy by vertices and by angles."""
     at = lambda v, a: energy(with_angles(tissue.with_vertices(v), a))
-    return eqx.filter_jit(jax.grad(at, argnums=(0, 1)))(tissue.vertices, tissue.angles)
+    return jax.grad(at, argnums=(0, 1))(tissue.vertices, tissue.angles)
 
 
 def outline_length(tissue: vx.Tissue) -> int:

@@ -27,6 +27,10 @@ SOLVERS = [
     ("optimistix_nonlinear_cg", optx.NonlinearCG(rtol=0.0, atol=0.0), 1e-5),
 ]
 
+# JAX knows an optimiser by identity: fits of one kind of problem with this one share what is compiled.
+ADAM = optax.adam(1e-2)
+LEAST_SQUARES = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+
 
 def each_solver(*quick: str) -> pytest.MarkDecorator:
     """All solvers, of which those named are tried on every change and all of them by `test-slow`."""
@@ -70,17 +74,25 @@ def relaxed(n_cells: int, seed: int = 0, mean: float = 3.7) -> tuple[vx.Tissue, 
 
 def central_difference(f, x, direction, step=1e-5):
     """Derivative of `f` at the pytree `x` along `direction`."""
-    at = lambda s: f(jax.tree.map(lambda a, b: a + s * b, x, direction))
+    # By NumPy, for which nothing is compiled.
+    moved = lambda a, b, s: jnp.asarray(np.asarray(a) + s * np.asarray(b))
+    at = lambda s: np.asarray(f(jax.tree.map(lambda a, b: moved(a, b, s), x, direction)))
     return (at(step) - at(-step)) / (2 * step)
 
 
-def random_like(x, seed=0):
+@eqx.filter_jit
+def _random_like(x, seed):
     leaves, structure = jax.tree.flatten(x)
     keys = jax.random.split(jax.random.key(seed), len(leaves))
     return jax.tree.unflatten(
         structure,
         [jax.random.normal(k, a.shape, a.dtype) for k, a in zip(keys, leaves, strict=True)],
     )
+
+
+def random_like(x, seed: int = 0):
+    """A pytree of normal random numbers."""
+    return _random_like(x, np.asarray(seed))
 
 
 @st.composite
@@ -95,7 +107,7 @@ def lattices(draw, n_cells: int):
 @st.composite
 def tissues(draw, min_cells: int = 1, max_cells: int = 30):
     """Recipes of random Voronoi tissues in boxes of all kinds: call one to make its tissue."""
-    n = draw(st.sampled_from([n for n in (1, 2, 3, 5, 12, 30) if min_cells <= n <= max_cells]))
+    n = draw(st.sampled_from([n for n in (1, 3, 12) if min_cells <= n <= max_cells]))
     seed, lattice = draw(st.integers(0, 2**16)), draw(lattices(n))
     return functools.partial(random_tissue, n, seed, lattice=lattice)
 
@@ -112,23 +124,43 @@ def p0_of(energy: vx.AbstractEnergy) -> jax.Array:
     return jnp.asarray(energy.target_shape_factor)
 
 
-def dense_hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> np.ndarray:
+# Compiled once for all tissues of a size, and energies and costs of a kind.
+@eqx.filter_jit
+def _hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> Array:
     f = lambda y: energy(tissue.with_configuration(y.reshape(tissue.vertices.shape)))
-    return np.asarray(eqx.filter_jit(jax.hessian(f))(tissue.vertices.ravel()))
+    return jax.hessian(f)(tissue.vertices.ravel())
 
 
-def dense_hypergradient(
+@eqx.filter_jit
+def _pull_and_slope(
     tissue: vx.Tissue, energy: vx.AbstractEnergy, cost: vx.AbstractCost
-) -> Array:
-    """Gradient with respect to the target shape factors of E1 at an equilibrium, by a pseudo-inverse."""
-    pull = jax.grad(lambda x: cost(tissue.with_configuration(x), energy))(tissue.vertices).ravel()
+) -> tuple[Array, Array]:
+    pull = jax.grad(lambda x: cost(tissue.with_configuration(x), energy))(tissue.vertices)
 
     def force(p: Array) -> Array:
         e = vx.energies.ShapeFactorEnergy(p)
         return jax.grad(lambda x: e(tissue.with_configuration(x)))(tissue.vertices).ravel()
 
+    return pull.ravel(), jax.jacobian(force)(p0_of(energy))
+
+
+def dense_hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> np.ndarray:
+    return np.asarray(_hessian(tissue, energy))
+
+
+def dense_hypergradient(
+    tissue: vx.Tissue, energy: vx.AbstractEnergy, cost: vx.AbstractCost
+) -> np.ndarray:
+    """Gradient with respect to the target shape factors of E1 at an equilibrium, by a pseudo-inverse."""
+    pull, slope = map(np.asarray, _pull_and_slope(tissue, energy, cost))
     inverse = np.linalg.pinv(dense_hessian(tissue, energy), rcond=1e-10)
-    return -jax.jacobian(force)(p0_of(energy)).T @ inverse @ pull
+    return -slope.T @ inverse @ pull
+
+
+@eqx.filter_jit
+def value_of(cost: vx.AbstractCost, tissue: vx.Tissue, energy: vx.AbstractEnergy) -> Array:
+    """A cost, compiled once for all of a kind."""
+    return cost(tissue, energy)
 
 
 def edge_cell_sets(tissue: vx.Tissue) -> list[tuple[int, int]]:

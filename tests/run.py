@@ -1,8 +1,8 @@
 """Run the tests, one process a folder: `python tests/run.py [--workers 2] [options of pytest]`.
 
 Tests compile a lot, and a process that has compiled very much dies in the compiler. So each folder of tests
-has a process of its own, and `--workers` of them run at a time. What they print comes in one piece, when they
-are done.
+has a process of its own, and so have the files that compile most; `--workers` of them run at a time. What
+they print comes in one piece, when they are done.
 """
 
 from __future__ import annotations
@@ -26,19 +26,34 @@ CACHE = {
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
 }
 # What takes longest begins first, and the others fill up the end.
-LONGEST = ("fitting", "adjoints", "solvers", "responses", "experiments")
+LONGEST = (
+    "adjoints",
+    "project",
+    "fitting",
+    "responses/test_free_equilibrium.py",
+    "responses/test_relaxation.py",
+    "costs",
+    "responses",
+    "experiments/test_topologies_and_rigidity.py",
+    "runs",
+    "experiments/test_designs.py",
+    "transitions",
+    "mesh",
+    "solvers",
+    "experiments",
+)
 NOTHING_SELECTED = 5
 
 
 def groups() -> list[list[Path]]:
     """The files of tests that share a process."""
-    folders = sorted({path.parent for path in FOLDER.rglob("test_*.py")})
-    parts = [sorted(folder.glob("test_*.py")) for folder in folders]
-    # Those that compile most have one process a file.
-    single = [[file] for files in parts if files[0].parent.name in LONGEST for file in files]
-    shared = [files for files in parts if files[0].parent.name not in LONGEST]
-    single.sort(key=lambda files: LONGEST.index(files[0].parent.name))
-    return single + shared
+    shared: dict[str, list[Path]] = {}
+    for file in sorted(FOLDER.rglob("test_*.py")):
+        name = file.relative_to(FOLDER).as_posix()
+        group = name if name in LONGEST else file.parent.name
+        shared.setdefault(group, []).append(file)
+    place = lambda name: LONGEST.index(name) if name in LONGEST else len(LONGEST)
+    return [shared[name] for name in sorted(shared, key=place)]
 
 
 def run(files: list[Path], options: list[str]) -> tuple[int, str]:

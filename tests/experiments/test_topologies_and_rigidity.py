@@ -13,9 +13,9 @@ ACROSS = """
 experiment = "inference_across_topologies"
 replicates = 2
 least_mismatch = 2
-tissue = { n_cells = 12 }
-guidance = { epochs = 80 }
-fit = { learning_rate = 2e-2, epochs = 130 }
+tissue = { n_cells = 8 }
+guidance = { epochs = 50 }
+fit = { learning_rate = 2e-2, epochs = 90 }
 
 [[methods]]
 name = "guided"
@@ -45,8 +45,8 @@ def test_guidance_crosses_topologies(tmp_path):
     assert mismatched_neighbours(fitted, target) == 0
     rows = table(folder / "shape_factors.csv")
     error = np.abs(np.array(rows["guided"], float) / np.array(rows["true"], float) - 1)
-    assert np.mean(error.reshape(2, 12), axis=1) == pytest.approx(found["relative_error"])
-    assert len(table(folder / "history.csv")["cost"]) == 2 * 130
+    assert np.mean(error.reshape(2, 8), axis=1) == pytest.approx(found["relative_error"])
+    assert len(table(folder / "history.csv")["cost"]) == 2 * 90
     assert json.loads((folder / "metrics.json").read_text()) == metrics
     for name in ("inference", "tissues"):
         assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000

@@ -6,23 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import optimistix as optx
 import pytest
-from helpers import random_like, relaxed, rewritten
+from helpers import ADAM, LEAST_SQUARES, random_like, relaxed, rewritten
 
 import vertax as vx
 from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import stack
 
-ADAM = optax.adam(1e-2)
-LEAST_SQUARES = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
 EPOCHS = 6
 
 
 def problem_of(seed=0, **options):
-    target, truth = relaxed(6, 1)
-    guess = ShapeFactorEnergy(jnp.full(6, 3.7) + 0.05 * random_like(jnp.zeros(6), seed))
+    target, truth = relaxed(10, 1)
+    guess = ShapeFactorEnergy(jnp.full(10, 3.7) + 0.05 * random_like(jnp.zeros(10), seed))
     return vx.InverseProblem(target, guess, VertexDistance(target), **options), truth
 
 

@@ -21,12 +21,13 @@ def hidden():
     return relaxed(8, 3)
 
 
-def fitted(tissue, energy, cost, **options):
-    problem = vx.InverseProblem(
-        tissue, energy, cost, response=vx.Relaxation(transitions=None), **options
-    )
-    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
-    return problem, vx.fit(problem, solver, 15, progress=False)
+AT_REST = optax.adam(1e-12)
+
+
+def fitted(tissue, energy, cost):
+    """A problem, and a fit that leaves the energy as it is."""
+    problem = vx.InverseProblem(tissue, energy, cost, response=vx.Relaxation(transitions=None))
+    return problem, vx.fit(problem, AT_REST, 1, progress=False)
 
 
 @pytest.mark.slow  # sixty fits
@@ -68,6 +69,7 @@ def test_it_follows_its_formula(hidden):
     problem, fit = fitted(tissue, truth, VertexDistance(target))
     said = vx.uncertainty(problem, fit)
 
+    @jax.jit
     def residuals(p0):
         return problem.residuals(vx.energies.ShapeFactorEnergy(p0), fit.tissue, None)[0]
 
@@ -98,10 +100,7 @@ class OneNumber(vx.costs.AbstractLeastSquaresCost):
 def test_it_names_what_the_data_do_not_determine(hidden, noise):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + noise * jax.random.normal(jax.random.key(0), (20,))
-    problem = vx.InverseProblem(
-        tissue, truth, OneNumber(measured), response=vx.Relaxation(transitions=None)
-    )
-    fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
+    problem, fit = fitted(tissue, truth, OneNumber(measured))
     alone = vx.uncertainty(problem, fit)
     assert int(jnp.sum(jnp.isinf(alone.deviations))) == 7
     assert np.isinf(p0_of(alone.deviation)).any()
@@ -122,6 +121,7 @@ def test_it_names_what_the_data_do_not_determine(hidden, noise):
 def _slope(problem, fit):
     """How the residuals, all alike, depend on the target shape factors, by finite differences."""
 
+    @jax.jit
     def residual(p0):
         return problem.residuals(vx.energies.ShapeFactorEnergy(p0), fit.tissue, None)[0][0]
 
@@ -133,10 +133,7 @@ def _slope(problem, fit):
 def test_a_position_that_the_cost_does_not_see_makes_no_difference(hidden):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + 0.1 * jax.random.normal(jax.random.key(0), (20,))
-    problem = vx.InverseProblem(
-        tissue, truth, OneNumber(measured), response=vx.Relaxation(transitions=None)
-    )
-    fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
+    problem, fit = fitted(tissue, truth, OneNumber(measured))
     moving = dataclasses.replace(problem, fit_position=True)
     still, moved = (vx.uncertainty(p, fit, prior=0.3) for p in (problem, moving))
     # Two parameters more leave a little more to the noise.
@@ -147,10 +144,7 @@ def test_a_position_that_the_cost_does_not_see_makes_no_difference(hidden):
 
 def test_data_without_noise_leave_nothing_open(hidden):
     tissue, truth = hidden
-    problem = vx.InverseProblem(
-        tissue, truth, OneNumber(jnp.full(20, 3.6)), response=vx.Relaxation(transitions=None)
-    )
-    fit = vx.fit(problem, optax.adam(1e-12), 1, progress=False)
+    problem, fit = fitted(tissue, truth, OneNumber(jnp.full(20, 3.6, float)))
     exact = eqx.tree_at(
         lambda p: p.cost.wanted,
         problem,

@@ -24,36 +24,35 @@ from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity, Sh
 few = settings(max_examples=10, deadline=None)
 clusters = st.builds(  # recipes: call one to make its tissue
     lambda n, seed, curved: lambda: cluster(n, seed, random_angles=True, inner_arcs=curved),
-    st.sampled_from([2, 3, 7, 20]),
+    st.sampled_from([2, 9]),
     st.integers(0, 2**16),
     st.booleans(),
 )
 
 
+PER_CELL = ("areas", "perimeters", "shape_factors", "centroids")
+PER_EDGE = ("edge_lengths", "edge_curvatures")
+
+
 @eqx.filter_jit
-def shape(tissue):
-    """Everything that does not depend on where the tissue lies."""
-    return {
-        "areas": tissue.areas,
-        "perimeters": tissue.perimeters,
-        "shape_factors": tissue.shape_factors,
-        "edge_lengths": tissue.edge_lengths,
-        "edge_curvatures": tissue.edge_curvatures,
-    }
+def compiled_geometry(tissue):
+    return {name: getattr(tissue, name) for name in (*PER_CELL, *PER_EDGE)}
+
+
+def geometry(tissue):
+    return {name: np.asarray(value) for name, value in compiled_geometry(tissue).items()}
 
 
 @few
 @given(clusters, st.floats(0, 6.3), st.floats(-30, 30))
 def test_rigid_motions_change_no_shape(recipe, angle, x):
     tissue = recipe()
-    moved = rotated(tissue, angle, (x, -0.3 * x))
-    for name, values in shape(tissue).items():
-        np.testing.assert_allclose(shape(moved)[name], values, rtol=1e-9, atol=1e-9)
-    turned = rotated(
-        tissue.with_vertices(jnp.tile(tissue.centroids[:1], (tissue.n_vertices, 1))), angle
-    )
-    expected = turned.vertices[0] + jnp.array([x, -0.3 * x])
-    np.testing.assert_allclose(moved.centroids[0], expected, atol=1e-8)
+    before, after = geometry(tissue), geometry(rotated(tissue, angle, (x, -0.3 * x)))
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    expected = before.pop("centroids") @ turn + [x, -0.3 * x]
+    np.testing.assert_allclose(after.pop("centroids"), expected, atol=1e-8)
+    for name, values in before.items():
+        np.testing.assert_allclose(after[name], values, rtol=1e-9, atol=1e-9)
 
 
 @few
@@ -61,25 +60,26 @@ def test_rigid_motions_change_no_shape(recipe, angle, x):
 def test_relabelling_changes_no_shape(recipe, seed):
     tissue = recipe()
     new, cell, edge = relabelled(tissue, seed)
-    for name in ("areas", "perimeters", "shape_factors", "centroids"):
+    before, after = geometry(tissue), geometry(new)
+    for name in PER_CELL:
         # Not to rounding: sums are in another order, and small cells are differences of large numbers.
-        expected = np.asarray(getattr(tissue, name))
-        np.testing.assert_allclose(
-            np.asarray(getattr(new, name))[cell], expected, rtol=1e-8, atol=1e-9
-        )
-    np.testing.assert_allclose(np.asarray(new.edge_lengths)[edge], tissue.edge_lengths, rtol=1e-12)
+        np.testing.assert_allclose(after[name][cell], before[name], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(after["edge_lengths"][edge], before["edge_lengths"], rtol=1e-12)
 
 
 @few
 @given(clusters, st.floats(0.01, 100))
 def test_units_of_length_change_no_shape(recipe, unit):
     tissue = recipe()
-    vertices = unit * tissue.vertices
+    vertices = jnp.asarray(unit * np.asarray(tissue.vertices))
     scaled = vx.Tissue(
         vertices, tissue.topology, vx.Free(), angles=tissue.angles, inner_arcs=tissue.inner_arcs
     )
-    np.testing.assert_allclose(scaled.areas, unit**2 * tissue.areas, rtol=1e-9, atol=1e-9 * unit**2)
-    np.testing.assert_allclose(scaled.edge_lengths, unit * tissue.edge_lengths, rtol=1e-9)
+    before, after = geometry(tissue), geometry(scaled)
+    np.testing.assert_allclose(
+        after["areas"], unit**2 * before["areas"], rtol=1e-9, atol=1e-9 * unit**2
+    )
+    np.testing.assert_allclose(after["edge_lengths"], unit * before["edge_lengths"], rtol=1e-9)
     assert scaled.angle_length == pytest.approx(float(unit * tissue.angle_length))
 
 
@@ -147,6 +147,14 @@ def test_inactive_angles_do_not_count_and_do_not_move():
     np.testing.assert_allclose(drift, inner)
 
 
+@eqx.filter_jit
+def derivatives(tissue, energy, y, direction):
+    """The energy, its gradient, and its second derivative along a direction."""
+    f = lambda y: energy(tissue.with_configuration(y))
+    gradient, product = jax.jvp(jax.grad(f), (y,), (direction,))
+    return f(y), gradient, product
+
+
 @pytest.mark.parametrize("inner_arcs", [False, True])
 @pytest.mark.parametrize("angle", [None, 0.0, -0.7, 2.0])
 def test_forces_and_second_derivatives_against_finite_differences(inner_arcs, angle):
@@ -159,15 +167,14 @@ def test_forces_and_second_derivatives_against_finite_differences(inner_arcs, an
         + LineTension(jnp.linspace(1, 2, 12))
     )
     y = tissue.configuration
-    f = jax.jit(lambda y: energy(tissue.with_configuration(y)))
     direction, probe = random_like(y), random_like(y, 1)
-    dot = lambda a, b: float(sum(jnp.sum(p * q) for p, q in zip(a, b, strict=True)))
-    gradient = jax.jit(jax.grad(f))
-    assert dot(gradient(y), direction) == pytest.approx(
-        float(central_difference(f, y, direction)), rel=1e-7, abs=1e-8
+    dot = lambda a, b: sum(np.sum(np.asarray(p) * np.asarray(q)) for p, q in zip(a, b, strict=True))
+    at = lambda y: derivatives(tissue, energy, y, direction)
+    _, gradient, product = at(y)
+    assert dot(gradient, direction) == pytest.approx(
+        float(central_difference(lambda y: at(y)[0], y, direction)), rel=1e-7, abs=1e-8
     )
-    along = lambda y: dot(gradient(y), probe)
-    product = jax.jit(lambda: jax.jvp(jax.grad(f), (y,), (direction,))[1])()
+    along = lambda y: dot(at(y)[1], probe)
     assert dot(product, probe) == pytest.approx(
         central_difference(along, y, direction), rel=1e-6, abs=1e-7
     )
@@ -258,7 +265,7 @@ def test_arguments_are_checked():
 
 
 @few
-@given(st.integers(2, 60), st.integers(0, 2**16), st.integers(0, 2))
+@given(st.sampled_from([2, 9, 60]), st.integers(0, 2**16), st.integers(0, 2))
 def test_free_voronoi_clusters_are_whole_and_keep_their_areas(n, seed, lloyd_steps):
     tissue = cluster(n, seed, lloyd_steps=lloyd_steps)
     tissue.topology.validate()

@@ -54,11 +54,15 @@ def run(tmp_path, monkeypatch):
 
 # Those that compile much: for `make test-slow`.
 SLOW = {
+    "docs/concepts.md",
+    "docs/errors.md",
     "docs/extending.md",
     "docs/index.md",
     "docs/masks.md",
+    "docs/performance.md",
     "docs/pictures.md",
     "docs/topologies.md",
+    "docs/tyssue.md",
 }
 
 # What a page promises beside its code.

@@ -29,6 +29,11 @@ def disturbed():
     return tissue.with_configuration(tissue.vertices + nudge), energy, tissue
 
 
+@eqx.filter_jit
+def force_of(tissue, energy):
+    return jax.grad(lambda x: energy(tissue.with_configuration(x)))(tissue.vertices)
+
+
 @each_solver(*(name for name, *_ in SOLVERS))
 def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
     start, energy, reference = disturbed
@@ -37,8 +42,7 @@ def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
     )
     assert found.converged
     assert found.max_force < force
-    actual = jax.grad(lambda x: energy(found.tissue.with_configuration(x)))(found.tissue.vertices)
-    assert jnp.abs(actual).max() < force
+    assert np.abs(force_of(found.tissue, energy)).max() < force
     assert found.energy == pytest.approx(float(energy(reference)), abs=10 * force**2 + 1e-9)
 
 
@@ -61,7 +65,15 @@ def relaxed_one_by_one(tissues, targets):
     return jax.lax.map(relax, (tissues, targets))
 
 
-@pytest.mark.parametrize("p0", [3.5, 3.7, 3.8, 3.9])
+@pytest.mark.parametrize(
+    "p0",
+    [
+        3.5,
+        pytest.param(3.7, marks=pytest.mark.slow),
+        pytest.param(3.8, marks=pytest.mark.slow),
+        3.9,
+    ],
+)
 def test_random_tissues_reach_true_equilibria(p0):
     batch = [random_tissue(64, s) for s in range(6)]
     tissues = jax.tree.map(lambda *x: jnp.stack(x), *batch)
@@ -79,8 +91,8 @@ def test_random_tissues_reach_true_equilibria(p0):
 
 
 def test_vmap_and_single_runs_agree():
-    batch = [random_tissue(16, s) for s in range(3)]
-    energy = AreaElasticity(20.0, 1.0) + LineTension(jnp.full(48, 0.5))
+    batch = [random_tissue(12, s) for s in range(3)]
+    energy = AreaElasticity(20.0, 1.0) + LineTension(jnp.full(36, 0.5))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *batch)
     together = eqx.filter_vmap(lambda t: vx.equilibrate(t, energy))(stacked)
     for k, tissue in enumerate(batch):
@@ -90,15 +102,15 @@ def test_vmap_and_single_runs_agree():
 
 
 def test_relaxation_does_not_drift():
-    tissue = random_tissue(20, 3)
+    tissue = random_tissue(12, 3)
     found = vx.equilibrate(tissue, ShapeFactorEnergy(3.7))
     np.testing.assert_allclose(found.tissue.vertices.mean(0), tissue.vertices.mean(0), atol=1e-12)
 
 
 def test_equilibrium_does_not_depend_on_where_the_box_is():
-    tissue = random_tissue(20, 3)
+    tissue = random_tissue(12, 3)
     moved = tissue.with_configuration(tissue.vertices + jnp.array([3.3, -7.1]))
-    energy = ShapeFactorEnergy(shape_factors(20, 3.7, 0.1))
+    energy = ShapeFactorEnergy(shape_factors(12, 3.7, 0.1))
     a, b = vx.equilibrate(tissue, energy), vx.equilibrate(moved, energy)
     np.testing.assert_allclose(a.tissue.areas, b.tissue.areas, atol=1e-7)
 
@@ -118,12 +130,12 @@ class Scaled(vx.AbstractEnergy):
 )
 def test_units_do_not_matter(solver):
     # The same physics in cells, in micrometres and in pixels, with all defaults and any unit of energy.
-    tissue, p0 = random_tissue(20, 3), shape_factors(20, 3.7, 0.1)
+    tissue, p0 = random_tissue(12, 3), shape_factors(12, 3.7, 0.1)
     relax = lambda tissue, energy: vx.equilibrate(tissue, energy, solver=solver)
     a = relax(tissue, ShapeFactorEnergy(p0))
     for scale, unit in ((37.0, 1.0), (0.01, 1e8), (1.0, 1e-9)):
         lattice = scale * tissue.boundary.lattice
-        other = vx.initialise.periodic_voronoi(20, key=jax.random.key(3), lattice=lattice)
+        other = vx.initialise.periodic_voronoi(12, key=jax.random.key(3), lattice=lattice)
         b = relax(other, Scaled(ShapeFactorEnergy(p0, scale**2), unit))
         np.testing.assert_allclose(b.tissue.areas, scale**2 * a.tissue.areas, rtol=1e-6)
         assert abs(int(b.num_steps) - int(a.num_steps)) <= 0.1 * a.num_steps + 1
@@ -164,8 +176,8 @@ def test_patience_counts_consecutive_steps():
 
 def test_the_protocol_of_the_paper_runs_and_says_that_it_did_not_converge():
     found = vx.equilibrate(
-        random_tissue(20, 0),
-        ShapeFactorEnergy(shape_factors(20, 3.7, 0.1)),
+        random_tissue(12, 0),
+        ShapeFactorEnergy(shape_factors(12, 3.7, 0.1)),
         solver=vx.solvers.GradientDescent(1e-2),
         tolerance=1e-3,
         patience=10,
