@@ -54,7 +54,6 @@ def run(tmp_path, monkeypatch):
 
 # Those that compile much: for `make test-slow`.
 SLOW = {
-    "docs/concepts.md",
     "docs/errors.md",
     "docs/extending.md",
     "docs/index.md",

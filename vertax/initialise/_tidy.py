@@ -66,7 +66,9 @@ def _crossed(
         edge, half_edge = (np.asarray(x) for x in (tissue.topology.edge, tissue.topology.half_edge))
         angles = np.asarray(tissue.arcs.angles)
         if not tissue.inner_arcs:
-            angles = np.where(cell[np.asarray(tissue.topology.twin)[half_edge]] == tissue.n_cells, angles, 0)
+            angles = np.where(
+                cell[np.asarray(tissue.topology.twin)[half_edge]] == tissue.n_cells, angles, 0
+            )
         forward = half_edge[edge] == np.arange(n)
         sides = np.column_stack([sides, np.where(forward, 1, -1) * angles[edge]])
     last = np.bincount(cell)[cell] - 2
