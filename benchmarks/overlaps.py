@@ -19,7 +19,7 @@ import optimistix as optx
 import vertax as vx
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from tilings import faces_that_overlap
+from tilings import faces_that_overlap  # pyright: ignore[reportMissingImports]
 
 jax.config.update("jax_enable_x64", True)
 

@@ -204,8 +204,10 @@ def test_float32(adjoint, response, rtol):
     tissue, _, cost = start_and_cost()
     energy = ShapeFactorEnergy(shape_factors(CELLS, 3.7, 0.1, 4))
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
-    small = jax.tree.map(to32, (tissue, energy, cost))
-    gradient = evaluate(*small, adjoint, response).gradient.target_shape_factor
+    tissue_32, energy_32, cost_32 = jax.tree.map(to32, (tissue, energy, cost))
+    gradient = evaluate(
+        tissue_32, energy_32, cost_32, adjoint, response
+    ).gradient.target_shape_factor
     assert gradient.dtype == jnp.float32
     reference = evaluate(tissue, energy, cost, vx.ImplicitDifferentiation(), STILL).gradient
     assert distance(gradient.astype(jnp.float64), reference) < 0.03

@@ -37,7 +37,7 @@ energy = vx.energies.ShapeFactorEnergy(3.7)
 
 
 @eqx.filter_jit
-def flipped(tissue, length=1e-9):
+def flipped(tissue, length: float | jax.Array = 1e-9):
     """The tissue with its shortest edge shrunk to a length, and the same after a T1 of that edge."""
     edge = jnp.argmin(tissue.edge_lengths)
     half = tissue.topology.half_edge[edge]

@@ -46,8 +46,8 @@ def without_overlaps(tissue: Tissue) -> Tissue:
                 tissue.vertices + 0.5 * jnp.asarray(np.where(moving[:, None], step, 0))
             )
     raise ValueError(
-        f"Cells of the first tissue overlap: {tissue.overlaps.describe()}. Smooth the outlines that it is made "
-        "from, or leave these cells out."
+        f"Cells of the first tissue overlap: {tissue.overlaps.describe()}. Smooth the outlines that it "
+        "is made from, or leave these cells out."
     )
 
 

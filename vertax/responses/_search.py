@@ -133,11 +133,10 @@ class Search(eqx.Module):
             (tissue, contacts, overlaps, counts),
         )
         flipped = swept & ~refused
-
         anew = flipped | ~state.started
-        other = jnp.array(False)
-        if contacts is not None:
-            other = jnp.any(contacts.pairs != state.contacts.pairs)
+        others = jnp.array(False)
+        if contacts is not None and state.contacts is not None:
+            others = jnp.any(contacts.pairs != state.contacts.pairs)
 
         def restart() -> tuple[PyTree, PatientState]:
             fresh = self._restarted(tissue, energy, contacts)
@@ -160,7 +159,7 @@ class Search(eqx.Module):
             )
 
         here = (tissue.configuration, minimiser)
-        y, minimiser = _either(anew | other, restart, lambda: here, here)
+        y, minimiser = _either(anew | others, restart, lambda: here, here)
         if self.contact_range is not None:
             here = (y, minimiser)
             y, minimiser = _either(refused, retreat, lambda: here, here)

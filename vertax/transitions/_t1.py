@@ -108,9 +108,7 @@ class T1(AbstractTransitions):
                     return _straightened(placed, which).with_topology(flipped)
 
                 trials = lambda which: (stretch(which), flip(which), flip(which, 0.5))
-                local = isinstance(energy, AbstractLocalEnergy)
-                judge = _judge_local if local else _judge_total
-                stretched, flipped, shorter = judge(energy, chosen, corner, trials)
+                stretched, flipped, shorter = _judge(energy, chosen, corner, trials)
                 grows = flipped < shorter
                 accepted = chosen & may_flip & (flipped < stretched) & (grows | (counts == 0))
                 before = _faces(tissue.overlaps)
@@ -265,10 +263,19 @@ def _independent(
 _Trials = Callable[[Bool[Array, " edges"]], tuple[Tissue, Tissue, Tissue]]
 
 
+def _judge(
+    energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
+) -> Float[Array, "3 edges"]:
+    """What the trials of each chosen edge cost."""
+    if isinstance(energy, AbstractLocalEnergy):
+        return _judge_local(energy, chosen, corner, trials)
+    return _judge_total(energy, chosen, corner, trials)
+
+
 def _judge_local(
     energy: AbstractLocalEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
 ) -> Float[Array, "3 edges"]:
-    """What the trials of each chosen edge cost: all at once, each by the terms of its own cells and edges."""
+    """The same for a local energy: all at once, each by the terms of its own cells and edges."""
     by_cell, by_edge = _of_each(
         lambda t: (energy.cell_terms(t), energy.edge_terms(t)), trials(chosen)
     )
@@ -285,7 +292,7 @@ def _judge_local(
 def _judge_total(
     energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
 ) -> Float[Array, "3 edges"]:
-    """What the trials of each chosen edge cost by an arbitrary energy: one edge after the other."""
+    """The same for an arbitrary energy: one edge after the other."""
     edges = jnp.arange(chosen.shape[0])
     order = jnp.argsort(jnp.where(chosen, corner.length, jnp.inf))
 
