@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -11,11 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax.mesh._sides import Sides, sides_cross, sides_of
+from vertax.mesh._sides import Sides, sides_cross
 from vertax.mesh._topology import Topology, take
-
-if TYPE_CHECKING:
-    from vertax.mesh._tissue import Tissue
 
 Carry = TypeVar("Carry")
 
@@ -67,10 +64,9 @@ class Overlaps(eqx.Module):
         return ", ".join(where)
 
 
-def find_overlaps(tissue: Tissue) -> Overlaps:
+def find_overlaps(topology: Topology, sides: Sides, areas: Float[Array, " cells"]) -> Overlaps:
     """Compare each side with all others of its face."""
-    m = tissue.topology
-    return _overlaps(tissue, crossed_sides(sides_of(tissue), m.next, _last(m)))
+    return _overlaps(topology, areas, crossed_sides(sides, topology.next, _last(topology)))
 
 
 def crossed_sides(
@@ -91,7 +87,10 @@ def crossed_sides(
 
 
 def overlaps_and_nearest(
-    tissue: Tissue, measure: Callable[[Sides, Sides, Array, Array], Float[Array, " halfedges"]]
+    m: Topology,
+    sides: Sides,
+    areas: Float[Array, " cells"],
+    measure: Callable[[Sides, Sides, Array, Array], Float[Array, " halfedges"]],
 ) -> tuple[Overlaps, Int[Array, "halfedges 2"], Float[Array, "halfedges 2"], Float[Array, ""]]:
     """Overlaps; and of each corner the two nearest sides of its face that it does not end.
 
@@ -103,8 +102,6 @@ def overlaps_and_nearest(
     **Returns:** the overlaps; the two sides, as half-edges; how near they are; and how near the nearest side
     of all is that is not next to a corner's own.
     """
-    m = tissue.topology
-    sides = sides_of(tissue)
     here = _numbers(m)
     before_last = take(m.previous, m.previous)
 
@@ -127,7 +124,7 @@ def overlaps_and_nearest(
     start = (here, (here, here), (none, none), none)
     crossed, nearest, gaps, least = around(m.next, _last(m), both, start)
     nearest, gaps = jnp.stack(nearest, axis=-1), jnp.stack(gaps, axis=-1)
-    return _overlaps(tissue, crossed), nearest, gaps, jnp.min(least)
+    return _overlaps(m, areas, crossed), nearest, gaps, jnp.min(least)
 
 
 def _crosses(
@@ -136,12 +133,13 @@ def _crosses(
     return sides_cross(sides, theirs, k == 1) & (other != jnp.arange(other.size))
 
 
-def _overlaps(tissue: Tissue, crossed: Int[Array, " halfedges"]) -> Overlaps:
-    m = tissue.topology
+def _overlaps(
+    m: Topology, areas: Float[Array, " cells"], crossed: Int[Array, " halfedges"]
+) -> Overlaps:
     crosses = (crossed != _numbers(m)).astype(jnp.int32)
     faces = jax.ops.segment_max(crosses, m.cell, m.n_faces) > 0
     exterior = faces[-1] if m.exterior else jnp.array(False)
-    return Overlaps(crossed, faces[: m.n_cells] | ~(tissue.areas > 0), exterior)
+    return Overlaps(crossed, faces[: m.n_cells] | ~(areas > 0), exterior)
 
 
 def _numbers(topology: Topology) -> Int[Array, " halfedges"]:

@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-
-from vertax.mesh._topology import take
-
-if TYPE_CHECKING:
-    from vertax.mesh._tissue import Tissue
 
 # A side is a row of a table: where it begins, its chord and, if there are arcs, its angle α, positive if it
 # bulges to the right, which is out of the face. With the unit vector e along the chord c and n to its left,
@@ -21,16 +14,6 @@ if TYPE_CHECKING:
 # which is the line of the chord for α = 0, without any large radius. The signed distance from the circle is
 # 2 F / (1 + √(1 + 2 κ F)).
 Sides = Float[Array, "sides parts"]
-
-
-def sides_of(tissue: Tissue) -> Sides:
-    """The sides of all faces, each in the frame of the face on its left."""
-    m, corners = tissue.topology, tissue.corners
-    parts = [corners, take(corners, m.next) - corners]
-    if tissue.arcs is not None:
-        angles = take(tissue.edge_angles, m.edge)
-        parts.append(jnp.where(m.forward, angles, -angles)[:, None])
-    return jnp.concatenate(parts, axis=-1)
 
 
 def cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:

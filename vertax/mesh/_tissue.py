@@ -273,9 +273,22 @@ class Tissue(eqx.Module):
         return (centre + face_sums(moment) / face_sums(area)[:, None])[: self.n_cells]
 
     @compiled_property
+    def sides(self) -> Float[Array, "halfedges parts"]:
+        """Where each half-edge begins, in the frame of the cell on its left, and its vector.
+
+        If there are arcs, followed by its angle: positive where it bulges to its right, out of that cell.
+        """
+        m, corners = self.topology, self.corners
+        parts = [corners, take(corners, m.next) - corners]
+        if self.arcs is not None:
+            angles = take(self.edge_angles, m.edge)
+            parts.append(jnp.where(m.forward, angles, -angles)[:, None])
+        return jnp.concatenate(parts, axis=-1)
+
+    @compiled_property
     def overlaps(self) -> Overlaps:
         """Where cells overlap: whether the tissue tiles the plane, as every tissue should."""
-        return find_overlaps(self)
+        return find_overlaps(self.topology, self.sides, self.areas)
 
     @property
     def configuration(self) -> PyTree[Float[Array, "..."]]:

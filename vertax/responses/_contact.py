@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
-from vertax.mesh._sides import Sides, bulge_gap, cross, dot, sides_of, squared_distance, wedge
+from vertax.mesh._sides import Sides, bulge_gap, cross, dot, squared_distance, wedge
 from vertax.mesh._topology import take
 
 # A face comes to overlap itself where a corner reaches a side that it does not end. A barrier holds it off
@@ -49,7 +49,7 @@ class Contacts(eqx.Module):
         return jax.lax.cond(some, lambda: self._energy(tissue), nothing)
 
     def _energy(self, tissue: Tissue) -> Float[Array, ""]:
-        following, sides = tissue.topology.next, sides_of(tissue)
+        following, sides = tissue.topology.next, tissue.sides
         corner, side = self.pairs[:, 0], self.pairs[:, 1]
         after = take(following, corner) == side
         before = take(following, take(following, side)) == corner
@@ -100,7 +100,9 @@ class Contacts(eqx.Module):
             near = [near for near, _ in self._nearness(one, other, after, before)]
             return near[0] if len(near) == 1 else jnp.minimum(*near)
 
-        overlaps, sides, near, least = overlaps_and_nearest(tissue, measure)
+        overlaps, sides, near, least = overlaps_and_nearest(
+            tissue.topology, tissue.sides, tissue.areas, measure
+        )
         near = near < _MARGIN**2
         corner, rank = jnp.nonzero(near, size=len(self.pairs), fill_value=0)
         pairs = jnp.stack([corner.astype(sides.dtype), sides[corner, rank]], axis=-1)

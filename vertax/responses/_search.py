@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._overlaps import find_overlaps
 from vertax.responses._contact import Contacts, no_contacts
 from vertax.solvers._patience import Patient, PatientState
 from vertax.transitions import AbstractTransitions
@@ -145,7 +144,7 @@ class Search(eqx.Module):
             return tissue.configuration, _where(anew, fresh, resumed)
 
         def retreat() -> tuple[PyTree, PatientState]:
-            inside = lambda y: ~find_overlaps(before.with_configuration(y)).any
+            inside = lambda y: ~before.with_configuration(y).overlaps.any
             way = optax.tree.sub(trial, before.configuration)
             return self.minimiser.retreat(
                 objective,
