@@ -48,7 +48,7 @@ class Relaxation(AbstractResponse):
     - `patience`: number of consecutive steps for which the force must stay below the tolerance.
     - `max_steps`: most steps of the minimiser.
     - `contact_range`: how near a corner comes to a side of the same cell (or of the outline) before a
-        barrier holds it off, in units of the size of a cell; see [Contact](concepts.md#contact). 0 leaves
+        barrier holds it off, in units of the size of a cell; see [Contact](../concepts.md#contact). 0 leaves
         the barrier out, and steps that would make cells overlap are still refused; None lets them overlap.
 
     `tolerance`, `patience`, `max_steps`, `contact_range` and the numbers of `transitions` and of an energy
