@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -52,10 +54,13 @@ def _segments_cross(one: Sides, other: Sides) -> Bool[Array, " sides"]:
 
 def _arcs_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array, " sides"]:
     """The same for circles: they meet on the line where κ' F = κ F'."""
-    first = jnp.abs(_circle(one)[0]) >= jnp.abs(_circle(other)[0])
-    a = jnp.where(first[:, None], one, other)
-    b = jnp.where(first[:, None], other, one)
-    (k1, g1), (k2, g2) = _circle(a), _circle(b)
+    circles = jnp.column_stack(circle_of(one)), jnp.column_stack(circle_of(other))
+    first = (jnp.abs(circles[0][:, 0]) >= jnp.abs(circles[1][:, 0]))[:, None]
+    a, b = jnp.where(first, one, other), jnp.where(first, other, one)
+    (k1, g1), (k2, g2) = (
+        (rows[:, 0], rows[:, 1:])
+        for rows in (jnp.where(first, *circles), jnp.where(first, *reversed(circles)))
+    )
     w = b[:, :2] - a[:, :2]
     normal = (k2 / jnp.where(k1 == 0, 1, k1))[:, None] * g1 - k2[:, None] * w - g2
     level = -(0.5 * k2 * dot(w, w) + dot(w, g2))
@@ -77,17 +82,6 @@ def _arcs_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array
     return crosses & (squared > 0)
 
 
-def _circle(side: Sides) -> tuple[Float[Array, " sides"], Float[Array, "sides 2"]]:
-    """Curvature κ and vector g of the circle of each side."""
-    chord, angle = side[:, 2:4], side[:, 4]
-    squared = dot(chord, chord)
-    length = jnp.sqrt(jnp.where(squared > 0, squared, 1))
-    unit = chord / length[:, None]
-    left = jnp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
-    sine, cosine = jnp.sin(angle), jnp.cos(angle)
-    return 2 * sine / length, sine[:, None] * unit + cosine[:, None] * left
-
-
 def _on_arc(side: Sides, x: Float[Array, "sides 2"]) -> Bool[Array, " sides"]:
     """Whether a point of the circle, as seen from the start, is one of the arc."""
     chord, angle = side[:, 2:4], side[:, 4]
@@ -97,20 +91,46 @@ def _on_arc(side: Sides, x: Float[Array, "sides 2"]) -> Bool[Array, " sides"]:
     return jnp.where(jnp.abs(angle) < 0.5, flat, aside * angle < 0)
 
 
-def squared_distance(point: Float[Array, "sides 2"], side: Sides) -> Float[Array, " sides"]:
-    """Squared distance of a point from each side."""
+class Circle(NamedTuple):
+    """Curvature κ and vector g of the circle of each side."""
+
+    curvature: Float[Array, " sides"]
+    normal: Float[Array, "sides 2"]
+
+
+def circle_of(side: Sides) -> Circle:
+    """The circles of sides that may be arcs."""
+    chord, angle = side[:, 2:4], side[:, 4:]
+    squared = jnp.sum(chord**2, axis=-1, keepdims=True)
+    unit = chord / jnp.sqrt(jnp.where(squared > 0, squared, 1))
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    left = jnp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
+    curvature = 2 * sine / jnp.sqrt(jnp.where(squared > 0, squared, 1))
+    return Circle(curvature[:, 0], sine * unit + cosine * left)
+
+
+def squared_distance_to_segment(
+    point: Float[Array, "sides 2"], side: Sides
+) -> Float[Array, " sides"]:
+    """Squared distance of a point from each straight side."""
     first, chord = point - side[:, :2], side[:, 2:4]
-    if side.shape[-1] == 4:
-        squared = dot(chord, chord)
-        share = dot(first, chord) / jnp.where(squared > 0, squared, 1)
-        way = first - jnp.clip(share, 0, 1)[:, None] * chord
-        return dot(way, way)
-    curvature, g = _circle(side)
+    squared = dot(chord, chord)
+    share = dot(first, chord) / jnp.where(squared > 0, squared, 1)
+    way = first - jnp.clip(share, 0, 1)[:, None] * chord
+    return dot(way, way)
+
+
+def squared_distance_to_arc(
+    point: Float[Array, "sides 2"], side: Sides, circle: Circle
+) -> Float[Array, " sides"]:
+    """Squared distance of a point from each arc."""
+    curvature, g = circle
+    first, chord = point - side[:, :2], side[:, 2:4]
+    last = first - chord
     value = 0.5 * curvature * dot(first, first) - dot(g, first)
     # At the centre of its circle a point is as far from all of the arc.
     centred = 1 + 2 * curvature * value
     distance = 2 * value / (1 + jnp.sqrt(jnp.where(centred > 0, centred, 1)))
-    last = first - chord
     past_start = -cross(g, first) >= 0
     before_end = curvature * cross(first, chord) + cross(g, last) >= 0
     wide = jnp.abs(side[:, 4]) > 0.5 * jnp.pi
@@ -119,36 +139,34 @@ def squared_distance(point: Float[Array, "sides 2"], side: Sides) -> Float[Array
     return jnp.where(faces, distance**2, ends)
 
 
-def bulge_gap(one: Sides, other: Sides) -> Float[Array, " sides"]:
-    """Distance between two arcs where both bulge into the face, towards each other; otherwise infinite."""
-    (k1, g1), (k2, g2) = _circle(one), _circle(other)
-    bulging = (one[:, 4] < -_FLAT) & (other[:, 4] < -_FLAT)
-    r1, r2 = (1 / jnp.where(bulging, -k, 1) for k in (k1, k2))
-    c1 = one[:, :2] - r1[:, None] * g1
-    c2 = other[:, :2] - r2[:, None] * g2
-    way = c2 - c1
+def bulge_gap(one: Sides, other: Sides, circles: tuple[Circle, Circle]) -> Float[Array, " sides"]:
+    """Distance from an arc that bulges into the face to the middle of another one; infinite for others.
+
+    That one bulges in as well, towards the first, or out, around it.
+    """
+    bulging = (one[:, 4] < -_FLAT) & (jnp.abs(other[:, 4]) > _FLAT)
+    r1, r2 = (1 / jnp.where(bulging, c.curvature, 1) for c in circles)  # negative: bulging in
+    inward = jnp.where(other[:, 4] < 0, 1, -1)
+    to_centre = tuple(r[:, None] * c.normal for r, c in zip((r1, r2), circles, strict=True))
+    way = other[:, :2] + to_centre[1] - one[:, :2] - to_centre[0]
     squared = dot(way, way)
     distance = jnp.sqrt(jnp.where(squared > 0, squared, 1))
     unit = way / distance[:, None]
-    x = c1 + r1[:, None] * unit - one[:, :2]
-    y = c2 - r2[:, None] * unit - other[:, :2]
-    facing = bulging & (squared > 0) & _on_arc(one, x) & _on_arc(other, y)
-    return jnp.where(facing, distance - r1 - r2, jnp.inf)
+    x = to_centre[0] - (inward * r1)[:, None] * unit
+    y = to_centre[1] - jnp.abs(r2)[:, None] * unit
+    gap = inward * distance + r1 + r2
+    facing = bulging & (squared > 0) & (gap > 0) & _on_arc(one, x) & _on_arc(other, y)
+    return jnp.where(facing, gap, jnp.inf)
 
 
 # (Flatter arcs are nearest to each other at the end of one.)
 _FLAT = 0.02
 
 
-def wedge(one: Sides, other: Sides) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
+def wedge(
+    one: Sides, circles: tuple[Circle, Circle]
+) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
     """Sine and cosine of the angle of the face between a side and the one that begins where it ends."""
-
-    def tangent(side: Sides, sign: int) -> Float[Array, "sides 2"]:
-        chord, angle = side[:, 2:4], side[:, 4]
-        squared = dot(chord, chord)
-        unit = chord / jnp.sqrt(jnp.where(squared > 0, squared, 1))[:, None]
-        left = jnp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
-        return jnp.cos(angle)[:, None] * unit + sign * jnp.sin(angle)[:, None] * left
-
-    back, leaving = -tangent(one, 1), tangent(other, -1)
-    return cross(leaving, back), dot(leaving, back)
+    (curvature, g), (_, leaving) = circles
+    arriving = g - curvature[:, None] * one[:, 2:4]  # normals to the two tangents there
+    return -cross(leaving, arriving), -dot(leaving, arriving)

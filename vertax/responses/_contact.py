@@ -9,7 +9,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
-from vertax.mesh._sides import Sides, bulge_gap, cross, dot, squared_distance, wedge
+from vertax.mesh._sides import (
+    Sides,
+    bulge_gap,
+    circle_of,
+    cross,
+    dot,
+    squared_distance_to_arc,
+    squared_distance_to_segment,
+    wedge,
+)
 from vertax.mesh._topology import take
 
 # A face comes to overlap itself where a corner reaches a side that it does not end. A barrier holds it off
@@ -45,6 +54,8 @@ class Contacts(eqx.Module):
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The energy of the barrier."""
         nothing = lambda: jnp.zeros((), tissue.vertices.dtype)
+        if tissue.arcs is not None:
+            return self._energy(tissue)  # which takes less than to compile this twice
         some = jnp.any(self.pairs[:, 0] != self.pairs[:, 1])
         return jax.lax.cond(some, lambda: self._energy(tissue), nothing)
 
@@ -78,19 +89,19 @@ class Contacts(eqx.Module):
         first = one[:, :2] - other[:, :2]
         last = first - other[:, 2:4]
         limit = limited(jnp.minimum(dot(first, first), dot(last, last)))
-        near = [(squared_distance(one[:, :2], other) / limit, limit)]
-        if one.shape[-1] == 5:
-            sine, cosine = wedge(one, other)
-            acute = after & (cosine > 0) & (sine > 0)
-            limit = limited(
-                jnp.minimum(dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4]))
-            )
-            angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
-            gap = bulge_gap(one, other)
-            gap = jnp.where(jnp.isfinite(gap), gap, 1) ** 2 / limit + jnp.where(
-                jnp.isfinite(gap), 0, jnp.inf
-            )
-            near.append((jnp.where(adjacent, angle, gap), limit))
+        if one.shape[-1] == 4:
+            return [(squared_distance_to_segment(one[:, :2], other) / limit, limit)]
+        circles = circle_of(one), circle_of(other)
+        near = [(squared_distance_to_arc(one[:, :2], other, circles[1]) / limit, limit)]
+        sine, cosine = wedge(one, circles)
+        acute = after & (cosine > 0) & (sine > 0)
+        arms = dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])
+        limit = limited(jnp.minimum(*arms))
+        angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
+        gap = bulge_gap(one, other, circles)
+        far = jnp.isinf(gap)
+        gap = jnp.where(far, jnp.inf, jnp.where(far, 1, gap) ** 2 / limit)
+        near.append((jnp.where(adjacent, angle, gap), limit))
         return near
 
     def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
