@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import ArrayLike, Bool, Float, PRNGKeyArray
 
 from vertax._base.checks import as_key, check_concrete, check_whole
 from vertax.initialise._order import spatial_order
@@ -66,15 +66,15 @@ def free_voronoi(
     vertices, topology, angles = _cut_out(corners, topology, chosen)
     if random_angles:
         angles = jax.random.uniform(angle_key, angles.shape, dtype, maxval=np.pi / 2)
-    tissue = Tissue(
-        jnp.asarray(vertices, dtype),
-        topology,
-        Free(),
-        softening,
-        angles=jnp.asarray(angles, dtype),
-        inner_arcs=inner_arcs,
-    )
-    return without_overlaps(tissue)
+
+    def made(vertices: ArrayLike, angles: ArrayLike) -> Tissue:
+        # The default softening follows from the areas, and these from the angles.
+        positions, bends = (jnp.asarray(x, dtype) for x in (vertices, angles))
+        return Tissue(positions, topology, Free(), softening, angles=bends, inner_arcs=inner_arcs)
+
+    tissue = made(vertices, angles)
+    tidy = without_overlaps(tissue)
+    return tissue if tidy is tissue else made(tidy.vertices, tidy.edge_angles)
 
 
 def _cut_out(
