@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from vertax._base.checks import as_key, check_concrete, check_whole
 from vertax.initialise._order import spatial_order
@@ -67,14 +67,13 @@ def free_voronoi(
     if random_angles:
         angles = jax.random.uniform(angle_key, angles.shape, dtype, maxval=np.pi / 2)
 
-    def made(vertices: ArrayLike, angles: ArrayLike) -> Tissue:
+    def made(vertices: Float[Array, "vertices 2"], angles: Float[Array, " edges"] | None) -> Tissue:
         # The default softening follows from the areas, and these from the angles.
-        positions, bends = (jnp.asarray(x, dtype) for x in (vertices, angles))
-        return Tissue(positions, topology, Free(), softening, angles=bends, inner_arcs=inner_arcs)
+        return Tissue(vertices, topology, Free(), softening, angles=angles, inner_arcs=inner_arcs)
 
-    tissue = made(vertices, angles)
+    tissue = made(jnp.asarray(vertices, dtype), jnp.asarray(angles, dtype))
     tidy = without_overlaps(tissue)
-    return tissue if tidy is tissue else made(tidy.vertices, tidy.edge_angles)
+    return tissue if tidy is tissue else made(tidy.vertices, tidy.angles)
 
 
 def _cut_out(
