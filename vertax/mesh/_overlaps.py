@@ -45,6 +45,15 @@ class Overlaps(eqx.Module):
         """Which half-edges cross another side of the face on their left."""
         return self.crossed != jnp.arange(self.crossed.shape[-1])
 
+    def vertices(self, topology: Topology) -> Bool[Array, " vertices"]:
+        """The corners of cells that overlap, and the ends of sides of the outline that cross."""
+        crosses, after = self.sides, topology.next
+        other = jnp.where(crosses, self.crossed, jnp.arange(after.size))
+        bad = take(jnp.append(self.cells, False), topology.cell) | crosses
+        for half_edge in (after, other, take(after, other)):
+            bad = bad.at[half_edge].max(crosses)
+        return jnp.any(bad.reshape(-1, 3), axis=1)
+
     def describe(self) -> str:
         """Where the tissue (of a batch: the first one that does) overlaps, in words; empty if nowhere."""
         bad = np.flatnonzero(np.atleast_1d(self.any))

@@ -312,6 +312,12 @@ class Tissue(eqx.Module):
         angles = jnp.where(self.is_arc, scaled / self.arcs.length, self.arcs.angles)
         return moved.with_angles(angles)
 
+    def by_row(self, values: Float[Array, " vertices"]) -> PyTree[Float[Array, " rows"]]:
+        """A number a vertex for each row of the `configuration`: of an arc, the lesser of its ends."""
+        if self.arcs is None:
+            return values
+        return values, jnp.min(take(values, self.topology.edge_vertices), axis=-1)
+
     def with_vertices(self, vertices: Float[Array, "vertices 2"]) -> Tissue:
         """The same tissue with its vertices, also pinned ones, elsewhere."""
         return eqx.tree_at(lambda t: t.vertices, self, vertices)

@@ -104,8 +104,8 @@ class Contacts(eqx.Module):
         near.append((jnp.where(adjacent, angle, gap), limit))
         return near
 
-    def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
-        """The contacts in a tissue, and whether it overlaps."""
+    def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, " vertices"]]:
+        """The contacts in a tissue, and the vertices of what overlaps."""
 
         def measure(one: Sides, other: Sides, after: Array, before: Array) -> Array:
             near = [near for near, _ in self._nearness(one, other, after, before)]
@@ -121,7 +121,9 @@ class Contacts(eqx.Module):
         there = jnp.arange(len(pairs)) < jnp.sum(near)
         pairs = jnp.where(there[:, None], pairs, 0)
         slack = 0.5 * (jnp.sqrt(least) - _MARGIN) * self.distance
-        return eqx.tree_at(lambda c: (c.pairs, c.slack), self, (pairs, slack)), overlaps.any
+        return eqx.tree_at(lambda c: (c.pairs, c.slack), self, (pairs, slack)), overlaps.vertices(
+            tissue.topology
+        )
 
     def moved(self, before: Tissue, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
         """The contacts after vertices moved, if there are none, and whether that is certain."""

@@ -7,7 +7,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -38,6 +37,18 @@ class SearchState(eqx.Module):
     def num_t1(self) -> Int[Array, ""]:
         """Transitions so far."""
         return jnp.sum(self.counts)
+
+
+class _Arrival(eqx.Module):
+    """Where a step has led."""
+
+    tissue: Tissue
+    contacts: Contacts | None
+    counts: Int[Array, " edges"]
+    share: Float[Array, " vertices"]
+    """Which share of the step each vertex has taken."""
+    overlapping: Bool[Array, " vertices"]
+    tries: Int[Array, ""]
 
 
 class Search(eqx.Module):
@@ -105,7 +116,7 @@ class Search(eqx.Module):
         return optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
 
     def _step(self, state: SearchState, energy: AbstractEnergy) -> SearchState:
-        """A step of the minimiser (not the first time), then transitions; what would overlap is undone."""
+        """A step of the minimiser (not the first time), then transitions."""
         before = state.tissue
         args = (before, energy, state.contacts)
 
@@ -116,76 +127,88 @@ class Search(eqx.Module):
             return y, new
 
         here = (before.configuration, state.minimiser)
-        trial, minimiser = _either(state.started, step, lambda: here, here)
-        tissue, counts = before.with_configuration(trial), state.counts
-        if self.transitions is not None:
-            tissue, counts = self.transitions.sweep(tissue, energy, state.counts)
-        swept = jnp.any(tissue.vertices != before.with_configuration(trial).vertices) | jnp.any(
-            counts != state.counts
+        goal, minimiser = _either(state.started, step, lambda: here, here)
+        arrived = self._arrive(state, before.with_configuration(goal), energy)
+        tissue, contacts = arrived.tissue, arrived.contacts
+        flipped = jnp.any(arrived.counts != state.counts)
+        elsewhere = jax.tree.map(
+            lambda a, b: jnp.any(a != b),
+            tissue.configuration,
+            tissue.with_configuration(goal).configuration,
         )
-        contacts, overlaps = self._near(tissue, state, swept | ~state.started)
-        refused = state.started & ~state.overlaps & overlaps
-        kept = (before, state.contacts, state.overlaps, state.counts)
-        tissue, contacts, overlaps, counts = jax.tree.map(
-            lambda old, new: jnp.where(refused, old, new),
-            kept,
-            (tissue, contacts, overlaps, counts),
-        )
-        flipped = swept & ~refused
-        anew = flipped | ~state.started
-        others = jnp.array(False)
+        changed = flipped | jnp.any(jnp.stack(jax.tree.leaves(elsewhere)))
         if contacts is not None and state.contacts is not None:
-            others = jnp.any(contacts.pairs != state.contacts.pairs)
+            changed |= jnp.any(contacts.pairs != state.contacts.pairs)
 
-        def restart() -> tuple[PyTree, PatientState]:
+        def restart() -> PatientState:
             fresh = self._restarted(tissue, energy, contacts)
-            # What a minimiser remembers of the old topology misleads it in the new one.
-            resumed = self.minimiser.resumed(fresh, minimiser)
-            return tissue.configuration, _where(anew, fresh, resumed)
+            share = before.by_row(arrived.share)
+            resumed = self.minimiser.resumed(fresh, minimiser, share, flipped)
+            return _where(state.started, resumed, fresh)
 
-        def retreat() -> tuple[PyTree, PatientState]:
-            inside = lambda y: ~before.with_configuration(y).overlaps.any
-            way = optax.tree.sub(trial, before.configuration)
-            return self.minimiser.retreat(
-                objective,
-                before.configuration,
-                way,
-                args,
-                self.options,
-                state.minimiser,
-                _TAGS,
-                inside,
-            )
-
-        here = (tissue.configuration, minimiser)
-        y, minimiser = _either(anew | others, restart, lambda: here, here)
-        if self.contact_range is not None:
-            here = (y, minimiser)
-            y, minimiser = _either(refused, retreat, lambda: here, here)
-        moved = lambda new, old: jnp.where(flipped, new, old)
+        minimiser = _either(changed | ~state.started, restart, lambda: minimiser, minimiser)
         return SearchState(
-            tissue=tissue.with_configuration(y),
-            origin=jax.tree.map(moved, tissue.configuration, state.origin),
+            tissue=tissue,
+            origin=_where(flipped, tissue.configuration, state.origin),
             minimiser=minimiser,
             contacts=contacts,
-            overlaps=overlaps,
-            counts=counts,
+            overlaps=jnp.any(arrived.overlapping),
+            counts=arrived.counts,
             num_steps=state.num_steps + jnp.where(state.started, 1, 0),
             started=jnp.array(True),
-            finished=(self.minimiser.at_rest(minimiser) & ~flipped & ~refused)
+            finished=(self.minimiser.at_rest(minimiser) & ~flipped & jnp.all(arrived.share == 1))
             | jnp.isnan(minimiser.force),
         )
 
+    def _arrive(self, state: SearchState, goal: Tissue, energy: AbstractEnergy) -> _Arrival:
+        """Transitions where a step leads; vertices of what would overlap go less far."""
+        before = state.tissue
+
+        def attempt(last: _Arrival) -> _Arrival:
+            less = jnp.where(last.tries < _TRIES - 2, 0.25, 0) * last.share
+            share = jnp.where(last.overlapping | (last.tries == _TRIES - 1), less, last.share)
+            part = lambda a, b, rows: jnp.where(rows < 1, a + rows * (b - a), b)
+            there = before.with_configuration(
+                jax.tree.map(
+                    lambda a, b, rows: part(a, b, rows.reshape(rows.shape + (1,) * (a.ndim - 1))),
+                    before.configuration,
+                    goal.configuration,
+                    before.by_row(share),
+                )
+            )
+            tissue, counts = there, state.counts
+            if self.transitions is not None:
+                tissue, counts = self.transitions.sweep(there, energy, state.counts)
+            swept = jnp.any(tissue.vertices != there.vertices) | jnp.any(counts != state.counts)
+            contacts, overlapping = self._near(tissue, state, swept | ~state.started)
+            return _Arrival(tissue, contacts, counts, share, overlapping, last.tries + 1)
+
+        everywhere = jnp.ones(goal.n_vertices, goal.vertices.dtype)
+        nowhere = jnp.zeros(goal.n_vertices, bool)
+        start = _Arrival(goal, state.contacts, state.counts, everywhere, nowhere, jnp.array(0))
+        arrays, static = eqx.partition(start, eqx.is_array)
+        # What overlapped from the start is not mended in this way.
+        guarded = state.started & ~state.overlaps
+
+        def unfinished(arrays: _Arrival) -> Bool[Array, ""]:
+            again = guarded & jnp.any(arrays.overlapping) & (arrays.tries < _TRIES)
+            return (arrays.tries == 0) | again
+
+        def iterate(arrays: _Arrival) -> _Arrival:
+            return eqx.filter(attempt(eqx.combine(arrays, static)), eqx.is_array)
+
+        return eqx.combine(jax.lax.while_loop(unfinished, iterate, arrays), static)
+
     def _near(
         self, tissue: Tissue, last: SearchState, anew: Bool[Array, ""]
-    ) -> tuple[Contacts | None, Bool[Array, ""]]:
-        """The contacts of a tissue, and whether it overlaps, if that matters."""
+    ) -> tuple[Contacts | None, Bool[Array, " vertices"]]:
+        """The contacts of a tissue, and the vertices of what overlaps, if that matters."""
+        nowhere = jnp.zeros(tissue.n_vertices, bool)
         if last.contacts is None:
-            return None, jnp.array(False)
+            return None, nowhere
         contacts, clear = last.contacts.moved(last.tissue, tissue)
         clear &= ~anew & ~last.overlaps
-        same = lambda: (contacts, jnp.array(False))
-        return jax.lax.cond(clear, same, lambda: contacts.found(tissue))
+        return jax.lax.cond(clear, lambda: (contacts, nowhere), lambda: contacts.found(tissue))
 
     def _restarted(
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
@@ -198,6 +221,8 @@ class Search(eqx.Module):
 
 
 _TAGS: frozenset[object] = frozenset()
+# After so many attempts nothing moves.
+_TRIES = 6
 
 
 def objective(

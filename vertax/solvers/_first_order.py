@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax._base.checks import check_number, check_whole, named
 from vertax._base.modules import is_concrete
-from vertax.solvers._solver import AbstractSolver, evaluated_anew, value_and_gradient
+from vertax.solvers._solver import AbstractSolver, value_and_gradient, with_value_and_gradient
 
 
 class _State(eqx.Module):
@@ -63,8 +63,8 @@ class GradientDescent(AbstractSolver):
     def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
-    def resumed(self, fresh: _State, old: _State) -> _State:
-        return evaluated_anew(fresh, old)
+    def evaluated_anew(self, fresh: _State, old: _State) -> _State:
+        return with_value_and_gradient(fresh, old)
 
 
 class Optax(AbstractSolver):
@@ -123,8 +123,8 @@ class Optax(AbstractSolver):
     def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
-    def resumed(self, fresh: _State, old: _State) -> _State:
-        return evaluated_anew(fresh, old)
+    def evaluated_anew(self, fresh: _State, old: _State) -> _State:
+        return with_value_and_gradient(fresh, old)
 
 
 def has_line_search(optimiser: optax.GradientTransformation) -> bool:
@@ -250,8 +250,8 @@ class FIRE(AbstractSolver):
     def gradient(self, state: _FIREState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
-    def resumed(self, fresh: _FIREState, old: _FIREState) -> _FIREState:
-        return evaluated_anew(fresh, old)
+    def evaluated_anew(self, fresh: _FIREState, old: _FIREState) -> _FIREState:
+        return with_value_and_gradient(fresh, old)
 
 
 def _unit_of_time(options: dict[str, Any]) -> Any:

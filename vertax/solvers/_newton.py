@@ -1,4 +1,4 @@
-"""Trust-region Newton minimisation with truncated conjugate gradients."""
+"""Newton minimisation by conjugate gradients, with a trust region for each vertex."""
 
 from __future__ import annotations
 
@@ -10,35 +10,34 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
-from vertax.solvers._solver import AbstractSolver, evaluated_anew, value_and_gradient
+from vertax.solvers._solver import AbstractSolver, Rows, value_and_gradient
 
 
 class _NewtonState(eqx.Module):
     value: Float[Array, ""]
     gradient: PyTree[Float[Array, "..."]]
-    radius: Float[Array, ""]
+    radii: Rows
     num_products: Int[Array, ""]
     aux: PyTree
 
 
 class NewtonCG(AbstractSolver):
-    r"""Newton's method in a trust region, each step by truncated conjugate gradients (Steihaug).
+    r"""Newton's method, each step by conjugate gradients, with a trust region for each vertex.
 
-    A step minimises the quadratic model $g \cdot p + \tfrac12 p \cdot (H + \lambda) p$ over
-    $|p| \le \Delta$ with Hessian-vector products only. Directions of negative curvature are followed to
-    the edge of the region, so the Hessian may be indefinite far from equilibrium. Converges
-    quadratically: the way to a *true* equilibrium. (Steihaug 1983, doi:10.1137/0720042; Nocedal & Wright
-    2006, alg. 4.1 and 7.2, doi:10.1007/978-0-387-40065-5.)
+    A step minimises the quadratic model $g \cdot p + \tfrac12 p \cdot (H + \Lambda) p$ with
+    Hessian-vector products only. $\Lambda$ is diagonal, one number for each vertex: $|g_v| / \Delta_v$,
+    so that no vertex means to leave its region of radius $\Delta_v$ (and more where one still does), and
+    more where the Hessian has negative curvature, so that the model is convex. Near equilibrium it
+    vanishes with the force, and convergence is quadratic: the way to a *true* equilibrium. (Steihaug 1983,
+    doi:10.1137/0720042; Nocedal & Wright 2006, alg. 4.1 and 7.2, doi:10.1007/978-0-387-40065-5.)
 
-    The damping $\lambda = |g| / \Delta$ is what holds a step in a small region. Conjugate gradients that
-    are merely cut off at its edge go down the steepest slope there, to and fro across a narrow valley: a
-    four-fold vertex is one, a thousand times stiffer against opening than against being moved. Damped,
-    they go along it. Near equilibrium $\lambda$ vanishes with the force.
+    Where a step gains less energy than the model promised, the regions shrink of those vertices whose
+    forces it did not foresee, and of no others: so one difficult place does not hold back a large tissue.
 
     **Arguments:**
 
-    - `max_displacement`: the furthest one vertex may move in a step, in units of the length scale (in
-        [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
+    - `max_displacement`: about the furthest that one vertex moves in a step, in units of the length scale
+        (in [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
     - `max_products`: most Hessian-vector products in one step.
     """
 
@@ -49,10 +48,9 @@ class NewtonCG(AbstractSolver):
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _NewtonState:
         value, gradient, aux = value_and_gradient(fn, y, args)
-        # The 2-norm of a step in which every coordinate moves as far as it may.
         reach = self.max_displacement * options.get("length_scale", 1.0)
-        radius = reach * jnp.sqrt(jnp.asarray(tree.size(y), value.dtype))
-        return _NewtonState(value, gradient, radius, jnp.array(0), aux)
+        radii = jax.tree.map(lambda x: jnp.full_like(_size(x), reach), y)
+        return _NewtonState(value, gradient, radii, jnp.array(0), aux)
 
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
@@ -60,14 +58,13 @@ class NewtonCG(AbstractSolver):
         reach = self.max_displacement * options.get("length_scale", 1.0)
         g = state.gradient
         _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], y)
-        # Forces are measured in that which moves a vertex by the length scale.
-        force = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
-        p, hp, products = self._truncated_cg(hessian, g, state.radius, force)
-        # The region bounds the 2-norm; no single vertex may jump far either.
-        largest = tree.norm(p, ord=jnp.inf)
-        shrink = jnp.minimum(1.0, reach / jnp.where(largest > 0, largest, 1))
-        p = tree.scale(shrink, p)
-        predicted = -(_dot(g, p) + 0.5 * shrink * _dot(p, hp))
+        bounds = jax.tree.map(lambda radius: jnp.minimum(radius, reach), state.radii)
+        p, hp, products = self._conjugate_gradients(hessian, g, state.radii, bounds, options)
+        # Vertices may go somewhat further than they should, but none by much.
+        furthest = _largest(jax.tree.map(lambda p, b: _size(p) / b, p, bounds))
+        shrink = jnp.minimum(1.0, 2 / jnp.where(furthest > 0, furthest, 1))
+        p, hp = tree.scale(shrink, p), tree.scale(shrink, hp)
+        predicted = -(_dot(g, p) + 0.5 * _dot(p, hp))
 
         trial = tree.add(y, p)
         value, gradient, aux = value_and_gradient(fn, trial, args)
@@ -81,78 +78,126 @@ class NewtonCG(AbstractSolver):
         finite = jnp.isfinite(value) & jnp.isfinite(_dot(gradient, gradient))
         accept = finite & jnp.where(lost, lower_force, ratio > 1e-4)
 
-        length = jnp.sqrt(_dot(p, p))
-        far = length > 0.3 * state.radius
-        radius = jnp.where(
-            accept & (lost | (ratio > 0.25)),
-            jnp.where(far & (ratio > 0.75), 2 * state.radius, state.radius),
-            0.25 * length,
-        )
+        fine = accept & (lost | (ratio > 0.75))
+
+        def adapted(
+            radius: Array, step: Array, old: Array, change: Array, new: Array
+        ) -> Float[Array, " rows"]:
+            length, scale = _size(step), jnp.maximum(_size(old), _size(change))
+            error = _size(new - old - change) / jnp.where(scale > 0, scale, 1)
+            shrunk = jnp.maximum(0.25 * radius, jnp.minimum(0.5 * length, radius))
+            # Of a refused step those that were foreseen are to blame as well, if less.
+            blamed = ~fine & (error > 0.75) | ~accept & ~(error < 0.25)
+            kept = jnp.where(blamed, shrunk, jnp.where(accept, radius, 0.5 * radius))
+            grows = accept & (fine | (error < 0.25)) & (length > 0.3 * radius)
+            return jnp.where(grows, 2 * radius, kept)
+
+        radii = jax.tree.map(adapted, state.radii, p, g, hp, gradient)
         kept = (y, state.value, g, state.aux)
         y, value, g, aux = tree.where(accept, (trial, value, gradient, aux), kept)
-        return y, _NewtonState(value, g, radius, state.num_products + products, aux), aux
+        return y, _NewtonState(value, g, radii, state.num_products + products, aux), aux
 
-    def resumed(self, fresh: _NewtonState, old: _NewtonState) -> _NewtonState:
-        return evaluated_anew(fresh, old)
-
-    def retreat(
-        self,
-        fn: Any,
-        y: Any,
-        way: Any,
-        args: Any,
-        options: Any,
-        state: _NewtonState,
-        tags: Any,
-        inside: Any,
-    ) -> tuple[Any, _NewtonState]:
-        return y, eqx.tree_at(lambda s: s.radius, state, 0.25 * jnp.sqrt(_dot(way, way)))
+    def resumed(
+        self, fresh: _NewtonState, old: _NewtonState, share: Rows, flipped: Bool[Array, ""]
+    ) -> _NewtonState:
+        # Elsewhere the regions are as good as they were.
+        radii = jax.tree.map(lambda r, s: jnp.where(s < 1, 0.25 * r, r), old.radii, share)
+        return eqx.tree_at(lambda s: (s.radii, s.num_products), fresh, (radii, old.num_products))
 
     def gradient(self, state: _NewtonState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
-    def _truncated_cg(
-        self, hessian: Any, g: PyTree, radius: Float[Array, ""], force: float | Float[Array, ""]
+    def _conjugate_gradients(
+        self, hessian: Any, g: PyTree, radii: Rows, bounds: Rows, options: dict[str, Any]
     ) -> tuple[PyTree, PyTree, Int[Array, ""]]:
-        """A step `p` inside the trust region, and `H p`."""
-        # Conjugate gradients on (H + λ) p = -g from p = 0; |p| grows from iterate to iterate, so the first
-        # one to leave the region, or to meet negative curvature, ends on its edge.
-        squared = _dot(g, g)
-        size = jnp.sqrt(squared)
-        forcing = jnp.minimum(0.1, jnp.sqrt(size / force))
-        damping = size / radius
+        """A step `p`, and `H p`."""
+        stiffness = options.get("stiffness", 1.0)
+        # Forces are measured in that which moves a vertex by the length scale.
+        force = stiffness * options.get("length_scale", 1.0)
+        forcing = jnp.minimum(0.1, jnp.sqrt(tree.norm(g) / force))
         zero = tree.zeros_like(g)
-        first = tree.scale(-1, g)
+
+        def residual(p: PyTree, hp: PyTree, shift: Rows) -> tuple[PyTree, PyTree]:
+            """What is left of the gradient, and the same preconditioned."""
+            r = jax.tree.map(lambda g, h, s, p: g + h + _times(s, p), g, hp, shift, p)
+            return r, _preconditioned(r, shift)
+
+        def _preconditioned(r: PyTree, shift: Rows) -> PyTree:
+            return jax.tree.map(lambda r, s: _times(1 / (stiffness + s), r), r, shift)
+
+        first = jax.tree.map(lambda g, radius: _size(g) / radius, g, radii)
+        r, z = residual(zero, zero, first)
+        whole = _dot(r, z)
 
         def unfinished(carry: tuple) -> Bool[Array, ""]:
-            *_, rr, done, k = carry
-            return ~done & (jnp.sqrt(rr) > forcing * size) & (k < self.max_products)
+            *_, done, k = carry
+            return ~done & (k < self.max_products)
 
         def iterate(carry: tuple) -> tuple:
-            p, hp, r, d, rr, _, k = carry
+            p, hp, r, d, shift, rz, rounds, _, k = carry
             hd = hessian(d)
-            damped = tree.add_scale(hd, damping, d)
+            damped = jax.tree.map(lambda hd, s, d: hd + _times(s, d), hd, shift, d)
             curvature = _dot(d, damped)
-            convex = curvature > 0
-            alpha = rr / jnp.where(convex, curvature, 1)
-            pp, pd, dd = _dot(p, p), _dot(p, d), _dot(d, d)
-            leaves = pp + 2 * alpha * pd + alpha**2 * dd >= radius**2
-            done = leaves | ~convex
-            to_edge = (-pd + jnp.sqrt(jnp.maximum(pd**2 + dd * (radius**2 - pp), 0))) / dd
-            alpha = jnp.where(done, to_edge, alpha)
+            along = jax.tree.map(_row_dot, d, hd)
+            squared = jax.tree.map(_row_dot, d, d)
+            norm = jax.tree.map(lambda dd, s: jnp.sum(dd * (stiffness + s)), squared, shift)
+            convex = curvature > 1e-8 * tree.sum(norm)
+            alpha = jnp.where(convex, rz / jnp.where(convex, curvature, 1), 0)
             p, hp, r = (
                 tree.add_scale(p, alpha, d),
                 tree.add_scale(hp, alpha, hd),
                 tree.add_scale(r, alpha, damped),
             )
-            new = _dot(r, r)
-            d = tree.sub(tree.scale(new / rr, d), r)
-            return p, hp, r, d, new, done, k + 1
+            z = _preconditioned(r, shift)
+            new = _dot(r, z)
+            beta = new / rz
+            small = convex & (new <= forcing**2 * whole)
+            # Once it is solved: what goes too far is damped more. That is a new system, which goes on
+            # from here, as does one that is made convex.
+            ratio = jax.tree.map(lambda p, b: _size(p) / b, p, bounds)
+            limit = jnp.where(small, 1.5, 4)
+            far = (_largest(ratio) > limit) & (rounds < _ROUNDS)
+            typical = jnp.abs(_dot(g, p)) / _dot(p, p)
 
-        start = (zero, zero, g, first, squared, squared == 0, jnp.array(0))
+            def tighter(shift: Array, ratio: Array, along: Array, squared: Array) -> Array:
+                more = jnp.maximum(ratio - 1, 0) * (shift + typical)
+                concave = jnp.where(along < 0, -2 * along / jnp.where(squared > 0, squared, 1), 0)
+                return shift + jnp.where(convex, more, concave)
+
+            def another() -> tuple:
+                new_shift = jax.tree.map(tighter, shift, ratio, along, squared)
+                r, z = residual(p, hp, new_shift)
+                return r, z, new_shift, _dot(r, z), jnp.zeros_like(beta)
+
+            same = (r, z, shift, new, beta)
+            r, z, shift, rz, beta = jax.lax.cond(far | ~convex, another, lambda: same)
+            d = tree.sub(tree.scale(beta, d), z)
+            return p, hp, r, d, shift, rz, rounds + far, small & ~far, k + 1
+
+        nothing = jnp.array(0)
+        start = (zero, zero, r, tree.scale(-1, z), first, whole, nothing, whole <= 0, nothing)
         p, hp, *_, products = jax.lax.while_loop(unfinished, iterate, start)
         return p, hp, products
 
 
+_ROUNDS = 8
+
+
 def _dot(a: PyTree, b: PyTree) -> Float[Array, ""]:
     return jnp.asarray(tree.vdot(a, b))
+
+
+def _row_dot(a: Float[Array, "rows ..."], b: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
+    return jnp.sum(a * b, axis=tuple(range(1, a.ndim)))
+
+
+def _size(x: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
+    return jnp.sqrt(_row_dot(x, x))
+
+
+def _times(rows: Float[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
+    return rows.reshape(rows.shape + (1,) * (x.ndim - rows.ndim)) * x
+
+
+def _largest(rows: Rows) -> Float[Array, ""]:
+    return jnp.max(jnp.stack([jnp.max(x) for x in jax.tree.leaves(rows)]))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax.solvers._solver import AbstractSolver
+from vertax.solvers._solver import AbstractSolver, Rows
 
 
 class PatientState(eqx.Module):
@@ -53,25 +53,12 @@ class Patient(optx.AbstractMinimiser):
         y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
         return y, self._judge(inner, options, state.n_below, state.num_steps + 1), aux
 
-    def resumed(self, fresh: PatientState, old: PatientState) -> PatientState:
-        """The state of `init` where the solver is, with what else it remembers, see `AbstractSolver`."""
-        inner = self.solver.resumed(fresh.inner, old.inner)
+    def resumed(
+        self, fresh: PatientState, old: PatientState, share: Rows, flipped: Bool[Array, ""]
+    ) -> PatientState:
+        """Where to go on when something else had a hand in the last step, see `AbstractSolver`."""
+        inner = self.solver.resumed(fresh.inner, old.inner, share, flipped)
         return eqx.tree_at(lambda s: (s.inner, s.num_steps), fresh, (inner, old.num_steps))
-
-    def retreat(
-        self,
-        fn: Any,
-        y: Any,
-        way: Any,
-        args: Any,
-        options: Any,
-        state: PatientState,
-        tags: Any,
-        inside: Callable[[PyTree], Bool[Array, ""]],
-    ) -> tuple[Any, PatientState]:
-        """Where to go on after a step that must not be taken, see `AbstractSolver`."""
-        y, inner = self.solver.retreat(fn, y, way, args, options, state.inner, tags, inside)
-        return y, self._judge(inner, options, jnp.array(0), state.num_steps + 1)
 
     def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any

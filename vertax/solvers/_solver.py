@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
+
+Rows: TypeAlias = PyTree[Float[Array, "..."]]
+"""One number for each row of the arrays of a point: of a tissue one a vertex, and one an arc."""
 
 
 class AbstractSolver(optx.AbstractMinimiser):
@@ -41,40 +43,26 @@ class AbstractSolver(optx.AbstractMinimiser):
     def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
 
-    def resumed(self, fresh: Any, old: Any) -> Any:
-        """The state of `init` at the point where the solver is, with what else it remembers.
+    def resumed(self, fresh: Any, old: Any, share: Rows, flipped: Bool[Array, ""]) -> Any:
+        """Where a solver goes on when something other than itself has had a hand in its last step.
 
-        This is asked for when the objective has changed a little: the solver needs its value and its
-        gradient anew, but no more.
-        """
-        return fresh
-
-    def retreat(
-        self,
-        fn: Any,
-        y: Any,
-        way: Any,
-        args: Any,
-        options: Any,
-        state: Any,
-        tags: Any,
-        inside: Callable[[PyTree], Bool[Array, ""]],
-    ) -> tuple[Any, Any]:
-        """Where to go on, and in what state, after a step that must not be taken.
+        By default it begins again where transitions changed the topology, or the step was cut short: what
+        is remembered of the way there misleads.
 
         **Arguments:**
 
-        - `y`, `state`: those before the step.
-        - `way`: the step, to `y + way`.
-        - `inside`: which points are allowed, as `y` is.
+        - `fresh`: the state of `init` at the point where the solver is.
+        - `old`: its last state, of which value and gradient are those of another point or objective.
+        - `share`: which share of its last step each row of `y` has taken.
+        - `flipped`: whether there were transitions.
         """
-        at = lambda share: optax.tree.add_scale(y, share, way)
-        too_far = lambda share: ~inside(at(share)) & (share > _LEAST_SHARE)
-        share = jnp.asarray(0.5, optx.max_norm(way).dtype)
-        share = jax.lax.while_loop(too_far, lambda share: 0.5 * share, share)
-        y = at(jnp.where(share > _LEAST_SHARE, share, 0))
-        struct = jax.eval_shape(fn, y, args)
-        return y, self.init(fn, y, args, options, struct[0], struct[1], tags)
+        begins = flipped | _any_below_one(share)
+        choose = lambda new, old: jnp.where(begins, new, old) if eqx.is_array(new) else new
+        return jax.tree.map(choose, fresh, self.evaluated_anew(fresh, old))
+
+    def evaluated_anew(self, fresh: Any, old: Any) -> Any:
+        """The old state with what `fresh` knows of the objective; all of `fresh` if that is not known."""
+        return fresh
 
     def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any
@@ -87,7 +75,8 @@ class AbstractSolver(optx.AbstractMinimiser):
         return y, aux, {}
 
 
-_LEAST_SHARE = 1e-6
+def _any_below_one(share: Rows) -> Bool[Array, ""]:
+    return jnp.any(jnp.stack([jnp.any(rows < 1) for rows in jax.tree.leaves(share)]))
 
 
 def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, PyTree, PyTree]:
@@ -96,6 +85,6 @@ def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, Py
     return value, gradient, aux
 
 
-def evaluated_anew(fresh: Any, old: Any) -> Any:
+def with_value_and_gradient(fresh: Any, old: Any) -> Any:
     """A state with the value and the gradient of another one."""
     return eqx.tree_at(lambda s: (s.value, s.gradient), old, (fresh.value, fresh.gradient))
