@@ -312,7 +312,7 @@ class Tissue(eqx.Module):
         angles = jnp.where(self.is_arc, scaled / self.arcs.length, self.arcs.angles)
         return moved.with_angles(angles)
 
-    def by_row(self, values: Float[Array, " vertices"]) -> PyTree[Float[Array, " rows"]]:
+    def by_row(self, values: Float[Array, " vertices"]) -> PyTree[Float[Array, "..."]]:
         """A number a vertex for each row of the `configuration`: of an arc, the lesser of its ends."""
         if self.arcs is None:
             return values

@@ -140,8 +140,7 @@ class NewtonCG(AbstractSolver):
             curvature = _dot(d, damped)
             along = jax.tree.map(_row_dot, d, hd)
             squared = jax.tree.map(_row_dot, d, d)
-            norm = jax.tree.map(lambda dd, s: jnp.sum(dd * (stiffness + s)), squared, shift)
-            convex = curvature > 1e-8 * tree.sum(norm)
+            convex = curvature > 0
             alpha = jnp.where(convex, rz / jnp.where(convex, curvature, 1), 0)
             p, hp, r = (
                 tree.add_scale(p, alpha, d),
