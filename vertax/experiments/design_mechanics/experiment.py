@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 from pydantic import Field
 
 from vertax.costs import MeanShapeFactor
@@ -18,6 +19,7 @@ from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import Fit, InverseProblem, Record, limits
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
+from vertax.plotting import plot_history
 from vertax.runs import (
     ExperimentConfig,
     Fitting,
@@ -135,4 +137,6 @@ def _save(
     panels = {"initial": (initial, observed[0]), "designed": (outcome.tissue, observed[best])}
     figure = figures.mechanics(panels, observed, targets, config.target)
     folder.save_figure("design", figure)
-    folder.save_figure("convergence", figures.convergence(outcome.history))
+    convergence = Figure()
+    plot_history(outcome.history, figure=convergence)
+    folder.save_figure("convergence", convergence)

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vertax.fitting import History
 from vertax.mesh import Tissue
-from vertax.plotting import INK, SERIES, house_style, new_figure, plot_history, plot_tissues
+from vertax.plotting import INK, SERIES, house_style, new_figure, plot_tissues
 
 
 @house_style()
@@ -43,20 +42,6 @@ def mechanics(
         label=r"shape factor $P/\sqrt{A}$",
     )
     _shape_factors(axes[n], observed, targets, wanted)
-    return figure
-
-
-def convergence(history: History) -> Figure:
-    """The curves of the fit over its epochs.
-
-    **Arguments:**
-
-    - `history`: of the fit.
-
-    **Returns:** the figure.
-    """
-    figure = Figure()
-    plot_history(history, figure=figure)
     return figure
 
 

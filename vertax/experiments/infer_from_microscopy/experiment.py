@@ -14,9 +14,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from vertax.fitting import Fit
 from vertax.inference import Micrograph
+from vertax.plotting import plot_history
 from vertax.runs import (
     ExperimentConfig,
     Fitting,
@@ -145,7 +147,9 @@ def _draw(
     found, initial = micrograph.segmentation, micrograph.first.tissue
     overlays = {"segmented": found.tissue, "relaxed first guess": initial, "fitted": outcome.tissue}
     folder.save_figure("overlay", figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
-    folder.save_figure("convergence", figures.convergence(outcome.history))
+    convergence = Figure()
+    plot_history(outcome.history, figure=convergence)
+    folder.save_figure("convergence", convergence)
     figure = figures.cells_on_image(
         pixels,
         outcome.tissue,

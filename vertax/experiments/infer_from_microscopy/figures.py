@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from matplotlib.figure import Figure
 
-from vertax.fitting import History
 from vertax.mesh import Tissue
-from vertax.plotting import plot_history, plot_tissue, plot_tissues, scale_bar
+from vertax.plotting import plot_tissue, plot_tissues, scale_bar
 
 
 def overlays(
@@ -29,20 +28,6 @@ def overlays(
     figure = Figure()
     axes = plot_tissues(panels, figure=figure, image=image, pixel_size=pixel_size, linewidth=0.9)
     scale_bar(axes[0], "pixels", unit_length=pixel_size)
-    return figure
-
-
-def convergence(history: History) -> Figure:
-    """The curves of the fit over its epochs.
-
-    **Arguments:**
-
-    - `history`: of the fit.
-
-    **Returns:** the figure.
-    """
-    figure = Figure()
-    plot_history(history, figure=figure)
     return figure
 
 

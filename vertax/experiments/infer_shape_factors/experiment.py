@@ -13,12 +13,14 @@ from typing import Any, Literal
 import jax
 import numpy as np
 from jaxtyping import Float
+from matplotlib.figure import Figure
 from pydantic import Field
 
 from vertax.costs import AbstractCost, MeshImage, VertexDistance
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.fitting import Fit, InverseProblem
 from vertax.inference import Scene, pearson, relative_error, same_neighbours, shape_factor_scene
+from vertax.plotting import plot_history
 from vertax.runs import (
     ExperimentConfig,
     Fitting,
@@ -174,7 +176,9 @@ def _save_fit(
     }
     label = f"target shape factor {_NAME}"
     folder.save_figure(f"before_after{ending}", figures.tissues(panels, label=label))
-    folder.save_figure(f"convergence{ending}", figures.convergence(outcome.history))
+    convergence = Figure()
+    plot_history(outcome.history, figure=convergence)
+    folder.save_figure(f"convergence{ending}", convergence)
     folder.save_figure(f"recovery{ending}", figures.recovery(true, inferred, initial, name=_NAME))
     if source == "image" and image is not None:
         overlays = {"image": None, "initial guess": scene.initial, "fitted": outcome.tissue}

@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
-from vertax.fitting import History
 from vertax.mesh import Tissue
-from vertax.plotting import plot_history, plot_recovery, plot_tissues, scale_bar
+from vertax.plotting import plot_recovery, plot_tissues, scale_bar
 
 Cells = Float[Array | np.ndarray, " cells"]
 
@@ -28,20 +27,6 @@ def tissues(panels: Mapping[str, tuple[Tissue, Cells]], *, label: str) -> Figure
     figure = Figure()
     shown = {title: tissue for title, (tissue, _) in panels.items()}
     plot_tissues(shown, [values for _, values in panels.values()], figure=figure, label=label)
-    return figure
-
-
-def convergence(history: History) -> Figure:
-    """The curves of the fit over its epochs.
-
-    **Arguments:**
-
-    - `history`: of the fit.
-
-    **Returns:** the figure.
-    """
-    figure = Figure()
-    plot_history(history, figure=figure)
     return figure
 
 
