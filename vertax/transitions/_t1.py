@@ -114,15 +114,25 @@ class T1(AbstractTransitions):
                 before = _faces(tissue.overlaps)
 
                 # Where there is no room for the new edge it is made shorter; then it is refused.
-                def make_room(i: Array, carry: tuple) -> tuple:
-                    accepted, share = carry
+                def crowded(carry: tuple) -> Bool[Array, ""]:
+                    i, *_, blamed = carry
+                    return (i == 0) | ((i <= _SHORTENED) & jnp.any(blamed))
+
+                def make_room(carry: tuple) -> tuple:
+                    i, accepted, share, _ = carry
                     made = _faces(flip(accepted, share).overlaps) & ~before
                     blamed = accepted & jnp.any(take(made, corner.cells), axis=-1)
                     refused = blamed & (i == _SHORTENED)
-                    return accepted & ~refused, jnp.where(blamed, 0.25 * share, share)
+                    return (
+                        i + 1,
+                        accepted & ~refused,
+                        jnp.where(blamed, 0.25 * share, share),
+                        blamed,
+                    )
 
                 whole = jnp.ones_like(length)
-                accepted, share = jax.lax.fori_loop(0, _SHORTENED + 1, make_room, (accepted, whole))
+                start = (jnp.array(0), accepted, whole, jnp.zeros_like(accepted))
+                _, accepted, share, _ = jax.lax.while_loop(crowded, make_room, start)
                 # What is inside out and stays so little that nobody would notice is put right.
                 back = chosen & ~accepted & may_turn
                 upright = corner.length / corner.stretch

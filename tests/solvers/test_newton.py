@@ -1,0 +1,58 @@
+"""Newton's method with a trust region for each vertex."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import vertax as vx
+
+N = 30
+PLACES = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (N, 2)))
+
+
+def landscape(y, difficulty):
+    """Wells, and in the place of the first one a short edge: hardly curved but at its tip."""
+    edge = jnp.sqrt(jnp.sum((y[0] - PLACES[0]) ** 2) + 1e-8)
+    return 0.5 * jnp.sum((y[1:] - PLACES[1:]) ** 2) + difficulty * edge, None
+
+
+def steps(fn, y, args, n, **options):
+    """The point after some steps, and the state of the solver."""
+    solver, tags = vx.solvers.NewtonCG(), frozenset()
+    struct = jax.eval_shape(fn, y, args)
+    state = solver.init(fn, y, args, options, *struct, tags)
+    step = lambda _, carry: solver.step(fn, *carry[:1], args, options, carry[1], tags)[:2]
+    return jax.jit(lambda n: jax.lax.fori_loop(0, n, step, (y, state)))(n)
+
+
+def test_one_difficult_place_does_not_hold_back_the_others():
+    start = jnp.zeros((N, 2))
+    radii = np.array([steps(landscape, start, 1.0, n)[1].radii for n in range(12)])
+    assert radii[:, 0].min() < 0.02
+    assert radii[:, 1:].min() > 0.02
+    y, _ = steps(landscape, start, 1.0, 6)
+    np.testing.assert_allclose(y[1:], PLACES[1:], atol=1e-3)
+    found = optx.minimise(
+        landscape, vx.solvers.NewtonCG(atol=1e-10), start, 1.0, has_aux=True, max_steps=200
+    )
+    np.testing.assert_allclose(found.value, PLACES, atol=1e-8)
+
+
+def test_no_row_goes_far_in_a_step():
+    hill = lambda y, _: (jnp.sum(jnp.cos(y)), None)  # concave where it starts
+    start = 0.05 * jnp.ones((N, 2))
+    y, _ = steps(hill, start, None, 1, length_scale=0.5)
+    far = jnp.sqrt(jnp.sum((y - start) ** 2, axis=-1))
+    assert 0 < far.max() <= 2 * 0.2 * 0.5
+    assert hill(y, None)[0] < hill(start, None)[0]
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_the_unit_of_energy_does_not_matter(scale):
+    start = jnp.zeros((N, 2))
+    scaled = lambda y, args: (scale * landscape(y, args)[0], None)
+    y, _ = steps(scaled, start, 1.0, 5, stiffness=scale)
+    expected, _ = steps(landscape, start, 1.0, 5, stiffness=1.0)
+    np.testing.assert_allclose(y, expected, atol=1e-9)
