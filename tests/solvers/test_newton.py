@@ -1,5 +1,7 @@
 """Newton's method with a trust region for each vertex."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,10 +22,13 @@ def landscape(y, difficulty):
 
 def steps(fn, y, args, n, **options):
     """The point after some steps, and the state of the solver."""
-    solver, tags = vx.solvers.NewtonCG(), frozenset()
-    struct = jax.eval_shape(fn, y, args)
-    state = solver.init(fn, y, args, options, *struct, tags)
-    step = lambda _, carry: solver.step(fn, *carry[:1], args, options, carry[1], tags)[:2]
+    solver: Any = vx.solvers.NewtonCG()
+    value, aux = jax.eval_shape(fn, y, args)
+    state = solver.init(fn, y, args, options, value, aux, frozenset())
+
+    def step(_, carry):
+        return solver.step(fn, carry[0], args, options, carry[1], frozenset())[:2]
+
     return jax.jit(lambda n: jax.lax.fori_loop(0, n, step, (y, state)))(n)
 
 
