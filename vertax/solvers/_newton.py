@@ -86,14 +86,12 @@ class NewtonCG(AbstractSolver):
             """Which rows were foreseen, and which are to blame if a step is no good."""
             scale = jnp.maximum(_size(old), _size(change))
             error = _size(new - old - change) / jnp.where(scale > 0, scale, 1)
-            uphill = _row_dot(old + new, step) > 0
-            return error < 0.25, jnp.where(accept, error > 0.75, ~(error < 0.25) | uphill)
+            return error < 0.25, jnp.where(accept, error > 0.75, ~(error < 0.25))
 
         verdicts = jax.tree.map(judged, p, g, hp, gradient)
         foreseen, blamed = jax.tree.transpose(
             jax.tree.structure(g), jax.tree.structure((0, 0)), verdicts
         )
-        nobody = ~accept & ~_any(blamed)
 
         def adapted(
             radius: Array, step: Array, foreseen: Array, blamed: Array
@@ -102,7 +100,9 @@ class NewtonCG(AbstractSolver):
             shrunk = jnp.maximum(0.25 * radius, jnp.minimum(0.5 * length, radius))
             shrunk = jnp.where(accept, shrunk, 0.25 * radius)
             grows = accept & (fine | foreseen) & (length > 0.3 * radius)
-            kept = jnp.where((blamed & ~fine) | nobody, shrunk, radius)
+            # Of a refused step those that were foreseen are to blame as well, if less.
+            kept = jnp.where(accept, radius, 0.5 * radius)
+            kept = jnp.where(blamed & ~fine, shrunk, kept)
             return jnp.where(grows, 2 * radius, kept)
 
         radii = jax.tree.map(adapted, state.radii, p, foreseen, blamed)
@@ -209,10 +209,6 @@ def _size(x: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
 
 def _times(rows: Float[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
     return rows.reshape(rows.shape + (1,) * (x.ndim - rows.ndim)) * x
-
-
-def _any(rows: PyTree[Bool[Array, "..."]]) -> Bool[Array, ""]:
-    return jnp.any(jnp.stack([jnp.any(x) for x in jax.tree.leaves(rows)]))
 
 
 def _largest(rows: Rows) -> Float[Array, ""]:
