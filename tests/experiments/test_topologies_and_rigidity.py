@@ -11,6 +11,7 @@ from vertax.costs import mismatched_neighbours
 
 ACROSS = """
 experiment = "inference_across_topologies"
+seed = 3
 replicates = 2
 least_mismatch = 2
 tissue = { n_cells = 8 }
