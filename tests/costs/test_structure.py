@@ -321,7 +321,7 @@ def test_gradients_under_guidance(crossing, adjoint):
     # Guided, the tissue comes closer than of itself.
     still = vx.Relaxation(transitions=None)
     free = vx.InverseProblem(tissue, problem.energy, cost, response=still)
-    assert value < float(free()[0])
+    assert value < 0.9 * float(free()[0])
 
 
 def test_bad_guidance_is_refused(crossing):

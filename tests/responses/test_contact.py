@@ -1,5 +1,7 @@
 """Cells never overlap on the way to equilibrium, and rest against each other smoothly."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -91,8 +93,17 @@ def test_a_negative_range_is_refused():
         vx.Relaxation(contact_range=-0.1)
 
 
-# In this tissue cells of very different target shape factors press corners against sides.
-TOUCHING = 50
+@functools.cache
+def in_contact() -> tuple[vx.Tissue, np.ndarray]:
+    """A tissue at rest whose cells, of very different target shape factors, press corners against sides."""
+    exerted = eqx.filter_jit(lambda t, e: jax.grad(lambda v: e(t.with_vertices(v)))(t.vertices))
+    for seed in range(40, 100):
+        targets = shape_factors(seed)
+        found = relaxed(tissue_of(seed), shapes(targets), throw=False)
+        # What the energy exerts there and contacts bear.
+        if found.converged and np.max(np.abs(exerted(found.tissue, shapes(targets)))) > 1e-3:
+            return found.tissue, targets
+    raise AssertionError("no tissue ends in contact")
 
 
 @pytest.mark.parametrize(
@@ -104,11 +115,8 @@ TOUCHING = 50
     ids=["implicit", "propagation"],
 )
 def test_hypergradients_of_a_tissue_in_contact(adjoint, rtol):
-    targets, rng = shape_factors(TOUCHING), np.random.default_rng(TOUCHING)
-    start = relaxed(tissue_of(TOUCHING), shapes(targets)).tissue
-    force = jax.grad(lambda v: shapes(targets)(start.with_vertices(v)))(start.vertices)
-    assert np.max(np.abs(force)) > 1e-3  # what the energy exerts and contacts bear
-    direction = jnp.asarray(rng.normal(size=N))
+    start, targets = in_contact()
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=N))
 
     @eqx.filter_jit
     def cost(targets, adjoint):

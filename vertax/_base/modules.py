@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 Tree = TypeVar("Tree", bound=Any)
 
@@ -37,6 +38,12 @@ def differs_between_devices(array: jax.typing.ArrayLike) -> bool:
     kind = jax.typeof(array)
     newer = getattr(getattr(kind, "mat", None), "varying", None)  # as of JAX 0.10
     return bool(newer or getattr(kind, "vma", None))
+
+
+def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
+    """`jnp.where` of two pytrees that may hold more than arrays, with the types of the old one."""
+    pick = lambda x, y: jnp.where(condition, x, y).astype(y.dtype) if eqx.is_array(x) else x
+    return jax.tree.map(pick, new, old)
 
 
 def traced(tree: Tree, *, integers: bool = False) -> Tree:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from vertax._base.probe import probe
 from vertax.mesh import Tissue
 
 
@@ -41,9 +42,9 @@ def cell_size(tissue: Tissue) -> Float[Array, ""]:
 
 def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:
     """The size of a typical second derivative of an energy, or of any number that a tissue has."""
-    # The Rayleigh quotient of a random vector is the mean eigenvalue, near enough.
+    # The Rayleigh quotient of a vector without pattern is the mean eigenvalue, near enough.
     y, unravel = ravel_pytree(tissue.configuration)
     slope = jax.grad(lambda x: energy(tissue.with_configuration(unravel(x))))
-    probe = jax.random.normal(jax.random.key(0), y.shape, y.dtype)
-    _, response = jax.jvp(slope, (y,), (probe,))
-    return jnp.abs(jnp.sum(probe * response)) / jnp.sum(probe**2)
+    direction = probe(y)
+    _, response = jax.jvp(slope, (y,), (direction,))
+    return jnp.abs(jnp.sum(direction * response)) / jnp.sum(direction**2)

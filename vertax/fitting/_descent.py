@@ -13,12 +13,12 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from vertax._base.modules import choose
 from vertax.fitting._checkpoint import without_addresses
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
     better,
-    choose,
     guidance_of,
     no_shift,
     relative_error,

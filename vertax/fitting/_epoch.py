@@ -8,8 +8,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
+from vertax._base.modules import choose
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
@@ -96,12 +97,6 @@ def guidance_of(problem: InverseProblem) -> Float[Array, ""]:
     return jnp.asarray(
         0 if problem.guidance is None else problem.guidance, problem.tissue.vertices.dtype
     )
-
-
-def choose(condition: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
-    # With the type of the old one, lest the next epoch be compiled anew.
-    pick = lambda a, b: jnp.where(condition, a, b).astype(b.dtype) if eqx.is_array(a) else a
-    return jax.tree.map(pick, new, old)
 
 
 def relative_error(parameters: PyTree[Array], true: PyTree[Array] | None) -> Float[Array, ""]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -53,23 +55,42 @@ class Arcs(eqx.Module):
 
 
 class _Function(NamedTuple):
-    series: tuple[
-        float, ...
-    ]  # in α²; of an odd function over α. Python's numbers leave float32 alone.
+    """A function of angles by its power series near 0 and by a closed form elsewhere."""
+
+    # In α²; of an odd function over α. Python's numbers leave float32 alone.
+    series: tuple[float, ...]
     closed: Callable[[Array], Array]
     odd: bool
 
     def __call__(self, angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        # The `where` is doubled: the branch that is not taken gets an argument at which it has
-        # derivatives.
-        near = jnp.abs(angle) < _SERIES_BELOW
-        squared = jnp.where(near, angle, 0) ** 2
-        *lower, highest = self.series
-        sum_ = jnp.full_like(angle, highest)
-        for coefficient in reversed(lower):
-            sum_ = sum_ * squared + coefficient
-        closed = self.closed(jnp.where(near, 1, angle))
-        return jnp.where(near, angle * sum_ if self.odd else sum_, closed)
+        return _evaluate(self, angle)
+
+    @property
+    def derivative(self) -> _Function:
+        powers = 2 * np.arange(len(self.series)) + self.odd
+        slopes = tuple((powers * np.array(self.series)).tolist())
+        slope = lambda x: jax.jvp(self.closed, (x,), (jnp.ones_like(x),))[1]
+        return _Function(slopes if self.odd else slopes[1:], slope, not self.odd)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _evaluate(function: _Function, angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    # The `where` is doubled: the branch that is not taken gets an argument at which it is defined.
+    near = jnp.abs(angle) < _SERIES_BELOW
+    squared = jnp.where(near, angle, 0) ** 2
+    *lower, highest = function.series
+    sum_ = jnp.full_like(angle, highest)
+    for coefficient in reversed(lower):
+        sum_ = sum_ * squared + coefficient
+    closed = function.closed(jnp.where(near, 1, angle))
+    return jnp.where(near, angle * sum_ if function.odd else sum_, closed)
+
+
+# The series of the derivative takes a third of what the derivative of the series does.
+@_evaluate.defjvp
+def _(function: _Function, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (angle,), (change,) = primals, tangents
+    return _evaluate(function, angle), _evaluate(function.derivative, angle) * change
 
 
 length_factor = _Function(tuple(_LENGTH.tolist()), lambda a: a / jnp.sin(a), odd=False)

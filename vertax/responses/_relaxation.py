@@ -288,12 +288,12 @@ def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
 def free_motions(tissue: Tissue, energy: AbstractEnergy, units: Units) -> Bool[Array, " modes"]:
     """Which motions of the whole cost nothing: all, unless the energy knows positions."""
     there = tissue.boundary.motions(tissue.vertices, 0.3 * units.length)
-    energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(there)
-    here = energy(tissue)
+    places = jnp.concatenate([tissue.vertices[None], there])
+    energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(places)
+    here = energies[0]
     rounding = jnp.finfo(here.dtype).eps ** 0.6
-    return jnp.abs(energies - here) <= rounding * (
-        jnp.abs(here) + units.stiffness * units.length**2
-    )
+    size = jnp.abs(here) + units.stiffness * units.length**2
+    return jnp.abs(energies[1:] - here) <= rounding * size
 
 
 def _pinned_energy(

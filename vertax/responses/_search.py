@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.modules import choose
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.responses._contact import Contacts, no_contacts
@@ -144,12 +145,12 @@ class Search(eqx.Module):
             fresh = self._restarted(tissue, energy, contacts)
             share = before.by_row(arrived.share)
             resumed = self.minimiser.resumed(fresh, minimiser, share, flipped)
-            return _where(state.started, resumed, fresh)
+            return choose(state.started, resumed, fresh)
 
         minimiser = _either(changed | ~state.started, restart, lambda: minimiser, minimiser)
         return SearchState(
             tissue=tissue,
-            origin=_where(flipped, tissue.configuration, state.origin),
+            origin=choose(flipped, tissue.configuration, state.origin),
             minimiser=minimiser,
             contacts=contacts,
             overlaps=jnp.any(arrived.overlapping),
@@ -164,18 +165,17 @@ class Search(eqx.Module):
         """Transitions where a step leads; vertices of what would overlap go less far."""
         before = state.tissue
 
+        def partway(a: Array, b: Array, share: Float[Array, " rows"]) -> Array:
+            rows = share.reshape(share.shape + (1,) * (a.ndim - 1))
+            return jnp.where(rows < 1, a + rows * (b - a), b)
+
         def attempt(last: _Arrival) -> _Arrival:
             less = jnp.where(last.tries < _TRIES - 2, 0.25, 0) * last.share
             share = jnp.where(last.overlapping | (last.tries == _TRIES - 1), less, last.share)
-            part = lambda a, b, rows: jnp.where(rows < 1, a + rows * (b - a), b)
-            there = before.with_configuration(
-                jax.tree.map(
-                    lambda a, b, rows: part(a, b, rows.reshape(rows.shape + (1,) * (a.ndim - 1))),
-                    before.configuration,
-                    goal.configuration,
-                    before.by_row(share),
-                )
+            on_the_way = jax.tree.map(
+                partway, before.configuration, goal.configuration, before.by_row(share)
             )
+            there = before.with_configuration(on_the_way)
             tissue, counts = there, state.counts
             if self.transitions is not None:
                 tissue, counts = self.transitions.sweep(there, energy, state.counts)
@@ -197,7 +197,11 @@ class Search(eqx.Module):
         def iterate(arrays: _Arrival) -> _Arrival:
             return eqx.filter(attempt(eqx.combine(arrays, static)), eqx.is_array)
 
-        return eqx.combine(jax.lax.while_loop(unfinished, iterate, arrays), static)
+        arrived = eqx.combine(jax.lax.while_loop(unfinished, iterate, arrays), static)
+        # Not even a sweep of transitions from where it was leads to a valid tissue.
+        stuck = guarded & jnp.any(arrived.overlapping)
+        same = (before, state.contacts, state.counts, 0 * arrived.share, nowhere, arrived.tries)
+        return choose(stuck, _Arrival(*same), arrived)
 
     def _near(
         self, tissue: Tissue, last: SearchState, anew: Bool[Array, ""]
@@ -225,6 +229,7 @@ _TAGS: frozenset[object] = frozenset()
 _TRIES = 6
 
 
+@eqx.filter_jit
 def objective(
     configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Contacts | None]
 ) -> tuple[Float[Array, ""], None]:
@@ -239,12 +244,6 @@ def _empty(tree: PyTree) -> PyTree:
     """Zeros for the arrays of a pytree of which only their shapes are known."""
     is_shape = lambda x: isinstance(x, jax.ShapeDtypeStruct)
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_shape(x) else x, tree)
-
-
-def _where(condition: Bool[Array, ""], one: Any, other: Any) -> Any:
-    """`jnp.where` of two pytrees that may hold more than arrays."""
-    choose = lambda x, y: jnp.where(condition, x, y) if eqx.is_array(x) else x
-    return jax.tree.map(choose, one, other)
 
 
 def _either(condition: Bool[Array, ""], yes: Any, no: Any, like: Any) -> Any:

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.probe import probe
 from vertax.solvers._lanczos import (
     BREAKDOWN,
     CONVERGED,
@@ -198,9 +199,9 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             r_0 = b - a(x_0)
 
         # |A| must be known before Lanczos can tell it: if b is a null vector, A b is rounding
-        # error, and this shows only in comparison with |A|. With random signs in g, the mean square
+        # error, and this shows only in comparison with |A|. With no pattern in g, the mean square
         # of |A g|/|g| is that of the eigenvalues.
-        g = jax.random.rademacher(jax.random.key(0), b.shape, b.dtype)
+        g = probe(b)
         p_g = precondition(g)
         a_g = a(p_g)
         operator_norm = over(norm(a_g, precondition(a_g)), norm(g, p_g))

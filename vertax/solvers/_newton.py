@@ -61,7 +61,7 @@ class NewtonCG(AbstractSolver):
         bounds = jax.tree.map(lambda radius: jnp.minimum(radius, reach), state.radii)
         p, hp, products = self._conjugate_gradients(hessian, g, state.radii, bounds, options)
         # Vertices may go somewhat further than they should, but none by much.
-        furthest = _largest(jax.tree.map(lambda p, b: _size(p) / b, p, bounds))
+        furthest = jnp.asarray(tree.max(jax.tree.map(lambda p, b: _size(p) / b, p, bounds)))
         shrink = jnp.minimum(1.0, 2 / jnp.where(furthest > 0, furthest, 1))
         p, hp = tree.scale(shrink, p), tree.scale(shrink, hp)
         predicted = -(_dot(g, p) + 0.5 * _dot(p, hp))
@@ -80,23 +80,14 @@ class NewtonCG(AbstractSolver):
 
         fine = accept & (lost | (ratio > 0.75))
 
-        def judged(
-            step: Array, old: Array, change: Array, new: Array
-        ) -> tuple[Bool[Array, " rows"], Bool[Array, " rows"]]:
-            """Which rows were foreseen, and which are to blame if a step is no good."""
-            scale = jnp.maximum(_size(old), _size(change))
-            error = _size(new - old - change) / jnp.where(scale > 0, scale, 1)
-            return error < 0.25, jnp.where(accept, error > 0.75, ~(error < 0.25))
-
-        verdicts = jax.tree.map(judged, p, g, hp, gradient)
-        foreseen, blamed = jax.tree.transpose(
-            jax.tree.structure(g), jax.tree.structure((0, 0)), verdicts
-        )
-
         def adapted(
-            radius: Array, step: Array, foreseen: Array, blamed: Array
+            radius: Array, step: Array, old: Array, change: Array, new: Array
         ) -> Float[Array, " rows"]:
-            length = _size(step)
+            scale, length = jnp.maximum(_size(old), _size(change)), _size(step)
+            # How far the force is from what the model said, and who is to blame if a step is no good.
+            error = _size(new - old - change) / jnp.where(scale > 0, scale, 1)
+            foreseen = error < 0.25
+            blamed = jnp.where(accept, error > 0.75, ~foreseen)
             shrunk = jnp.maximum(0.25 * radius, jnp.minimum(0.5 * length, radius))
             shrunk = jnp.where(accept, shrunk, 0.25 * radius)
             grows = accept & (fine | foreseen) & (length > 0.3 * radius)
@@ -105,7 +96,7 @@ class NewtonCG(AbstractSolver):
             kept = jnp.where(blamed & ~fine, shrunk, kept)
             return jnp.where(grows, 2 * radius, kept)
 
-        radii = jax.tree.map(adapted, state.radii, p, foreseen, blamed)
+        radii = jax.tree.map(adapted, state.radii, p, g, hp, gradient)
         kept = (y, state.value, g, state.aux)
         y, value, g, aux = tree.where(accept, (trial, value, gradient, aux), kept)
         return y, _NewtonState(value, g, radii, state.num_products + products, aux), aux
@@ -168,7 +159,7 @@ class NewtonCG(AbstractSolver):
             # from here, as does one that is made convex.
             ratio = jax.tree.map(lambda p, b: _size(p) / b, p, bounds)
             limit = jnp.where(small, 1.5, 4)
-            far = (_largest(ratio) > limit) & (rounds < _ROUNDS)
+            far = (jnp.asarray(tree.max(ratio)) > limit) & (rounds < _ROUNDS)
             typical = jnp.abs(_dot(g, p)) / _dot(p, p)
 
             def tighter(shift: Array, ratio: Array, along: Array, squared: Array) -> Array:
@@ -209,7 +200,3 @@ def _size(x: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
 
 def _times(rows: Float[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
     return rows.reshape(rows.shape + (1,) * (x.ndim - rows.ndim)) * x
-
-
-def _largest(rows: Rows) -> Float[Array, ""]:
-    return jnp.max(jnp.stack([jnp.max(x) for x in jax.tree.leaves(rows)]))

@@ -11,6 +11,9 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
+from optax import tree
+
+from vertax._base.modules import choose
 
 Rows: TypeAlias = PyTree[Float[Array, "..."]]
 """One number for each row of the arrays of a point: of a tissue one a vertex, and one an arc."""
@@ -56,9 +59,8 @@ class AbstractSolver(optx.AbstractMinimiser):
         - `share`: which share of its last step each row of `y` has taken.
         - `flipped`: whether there were transitions.
         """
-        begins = flipped | _any_below_one(share)
-        choose = lambda new, old: jnp.where(begins, new, old) if eqx.is_array(new) else new
-        return jax.tree.map(choose, fresh, self.evaluated_anew(fresh, old))
+        begins = flipped | (jnp.asarray(tree.min(share)) < 1)
+        return choose(begins, fresh, self.evaluated_anew(fresh, old))
 
     def evaluated_anew(self, fresh: Any, old: Any) -> Any:
         """The old state with what `fresh` knows of the objective; all of `fresh` if that is not known."""
@@ -73,10 +75,6 @@ class AbstractSolver(optx.AbstractMinimiser):
         self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
     ) -> tuple[Any, Any, dict[str, Any]]:
         return y, aux, {}
-
-
-def _any_below_one(share: Rows) -> Bool[Array, ""]:
-    return jnp.any(jnp.stack([jnp.any(rows < 1) for rows in jax.tree.leaves(share)]))
 
 
 def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, PyTree, PyTree]:

@@ -111,28 +111,27 @@ class T1(AbstractTransitions):
                 stretched, flipped, shorter = _judge(energy, chosen, corner, trials)
                 grows = flipped < shorter
                 accepted = chosen & may_flip & (flipped < stretched) & (grows | (counts == 0))
-                before = _faces(tissue.overlaps)
 
-                # Where there is no room for the new edge it is made shorter; then it is refused.
+                # Where there is no room for the new edge it is made shorter; then it is refused. The
+                # first round, without any flip, finds what overlaps already.
                 def crowded(carry: tuple) -> Bool[Array, ""]:
-                    i, *_, blamed = carry
-                    return (i == 0) | ((i <= _SHORTENED) & jnp.any(blamed))
+                    i, accepted, *_, blamed = carry
+                    again = (i < 2) | ((i <= _SHORTENED) & jnp.any(blamed))
+                    return again & jnp.any(accepted)
 
                 def make_room(carry: tuple) -> tuple:
-                    i, accepted, share, _ = carry
-                    made = _faces(flip(accepted, share).overlaps) & ~before
-                    blamed = accepted & jnp.any(take(made, corner.cells), axis=-1)
+                    i, accepted, share, before, _ = carry
+                    faces = _faces(flip(accepted & (i > 0), share).overlaps)
+                    before = jnp.where(i == 0, faces, before)
+                    blamed = accepted & jnp.any(take(faces & ~before, corner.cells), axis=-1)
                     refused = blamed & (i == _SHORTENED)
-                    return (
-                        i + 1,
-                        accepted & ~refused,
-                        jnp.where(blamed, 0.25 * share, share),
-                        blamed,
-                    )
+                    share = jnp.where(blamed, 0.25 * share, share)
+                    return i + 1, accepted & ~refused, share, before, blamed
 
-                whole = jnp.ones_like(length)
-                start = (jnp.array(0), accepted, whole, jnp.zeros_like(accepted))
-                _, accepted, share, _ = jax.lax.while_loop(crowded, make_room, start)
+                none = jnp.zeros_like(accepted)
+                nowhere = jnp.zeros(tissue.n_cells + 1, bool)
+                start = (jnp.array(0), accepted, jnp.ones_like(length), nowhere, none)
+                _, accepted, share, *_ = jax.lax.while_loop(crowded, make_room, start)
                 # What is inside out and stays so little that nobody would notice is put right.
                 back = chosen & ~accepted & may_turn
                 upright = corner.length / corner.stretch
@@ -148,7 +147,7 @@ class T1(AbstractTransitions):
         return tissue, counts
 
 
-_SHORTENED = 2
+_SHORTENED = 3
 
 
 def _faces(overlaps: Overlaps) -> Bool[Array, " faces"]:
