@@ -13,6 +13,7 @@ import optimistix as optx
 import pytest
 from helpers import (
     SOLVERS,
+    STILL,
     central_difference,
     dense_hypergradient,
     random_like,
@@ -27,9 +28,8 @@ from vertax.costs import VertexDistance
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 
 CELLS = 8  # in all tests, which share what is compiled for them
-# Contact has tests of its own, with all adjoints: here it would double what is compiled.
-STILL = vx.Relaxation(transitions=None, contact_range=None).traced()
 SGD = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
+STILL = STILL.traced()
 MOMENTUM = dataclasses.replace(STILL, solver=SGD, max_steps=jnp.asarray(20_000))
 
 # (name, adjoint, how to relax, relative error that it may have in float64)

@@ -9,6 +9,7 @@ import optimistix as optx
 import pytest
 from free_helpers import cluster
 from helpers import (
+    STILL,
     central_difference,
     dense_hypergradient,
     edge_cell_sets,
@@ -299,13 +300,13 @@ def test_guidance_leads_through_t1s_to_the_hidden_parameters(crossing):
 )
 def test_gradients_under_guidance(crossing, adjoint):
     _, target, problem = crossing
-    tissue = vx.equilibrate(target, problem.energy, transitions=None).tissue
+    tissue = STILL(target, problem.energy).tissue
     cost = CentroidDistance(target)
     problem = vx.InverseProblem(
         tissue,
         problem.energy,
         cost,
-        response=vx.Relaxation(transitions=None),
+        response=STILL,
         adjoint=adjoint,
         guidance=3.0,
     )
@@ -319,8 +320,7 @@ def test_gradients_under_guidance(crossing, adjoint):
     accuracy = 1e-5 if isinstance(adjoint, vx.ImplicitDifferentiation) else 1e-3
     assert slope == pytest.approx(expected, rel=accuracy)
     # Guided, the tissue comes closer than of itself.
-    still = vx.Relaxation(transitions=None)
-    free = vx.InverseProblem(tissue, problem.energy, cost, response=still)
+    free = vx.InverseProblem(tissue, problem.energy, cost, response=STILL)
     assert value < 0.9 * float(free()[0])
 
 

@@ -184,15 +184,18 @@ def _check_identity(name: str, text: str, wanted: Mapping[str, str]) -> None:
 def _difference(stored: Mapping[str, str], part: str, value: str) -> str:
     """What stands in one description and not in the other."""
     then, now = (
-        [line.strip(" ,") for line in text.splitlines()] for text in (stored.get(part, ""), value)
+        [piece.strip(" ,") for piece in re.split(r", |\n", text)]
+        for text in (stored.get(part, ""), value)
     )
-    lines = (
-        [line for line in then if line not in now][:1],
-        [line for line in now if line not in then][:1],
+    pieces = (
+        [piece for piece in then if piece not in now][:1],
+        [piece for piece in now if piece not in then][:1],
     )
     # What a description leaves out has its default.
-    texts = [next(iter(only), "the default") for only in lines]
-    return "" if max(map(len, texts)) > 60 or not any(lines) else f": {texts[0]} and not {texts[1]}"
+    texts = [next(iter(only), "the default") for only in pieces]
+    return (
+        "" if max(map(len, texts)) > 60 or not any(pieces) else f": {texts[0]} and not {texts[1]}"
+    )
 
 
 def columns_of(rows: Sequence[Row]) -> dict[str, np.ndarray]:

@@ -107,6 +107,9 @@ class Relaxation(AbstractResponse):
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         _check_adjoint(adjoint, self.minimiser)
         _check_sharding((tissue, energy))
+        if all(is_concrete(x) for x in jax.tree.leaves((tissue, energy))):
+            # Nothing is differentiated: one program serves all adjoints.
+            adjoint = ImplicitDifferentiation()
         equilibrium = _equilibrate(*traced((tissue, energy)), self.traced(), adjoint)
         # An error that is raised within a compiled program calls back to the host, and JAX keeps no such
         # program in its cache on disk.
