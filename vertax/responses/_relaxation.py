@@ -8,7 +8,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -76,9 +75,8 @@ class Relaxation(AbstractResponse):
                 f"but is {self.transitions!r}."
             )
         for name in ("tolerance", "patience", "max_steps"):
-            value = getattr(self, name)
-            if value is not None and is_concrete(value) and not np.all(np.asarray(value) > 0):
-                raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), above=0, many=True)
         if self.contact_range is not None:
             check_number("contact_range", self.contact_range, least=0, many=True)
 
