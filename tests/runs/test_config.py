@@ -58,6 +58,7 @@ def test_keys_left_out_have_their_defaults(write):
     ("override", "get", "expected"),
     [
         ("fit.epochs=50", lambda c: c.fit.epochs, 50),
+        ("relaxation.contacts=false", lambda c: c.relaxation.build().contact_range, None),
         ("fit.learning_rate=1", lambda c: c.fit.learning_rate, 1.0),
         (" fit . optimiser = nadam ", lambda c: c.fit.optimiser, "nadam"),
         ('data="image"', lambda c: c.data, "image"),

@@ -52,6 +52,8 @@ class Relaxation(Section):
     """How often one edge may flip in a relaxation."""
     tolerance: float | None = Field(default=None, gt=0)
     """Largest force that counts as equilibrium; left out, it is chosen by the precision."""
+    contacts: bool = True
+    """Whether cells keep out of one another; if not, they may overlap."""
     contact_range: float = Field(default=float(Response().contact_range or 0), ge=0)
     """How near a corner comes to a side before it is held off, in units of the root of the mean cell area."""
     patience: int = Field(default=int(Response().patience), ge=1)
@@ -68,7 +70,7 @@ class Relaxation(Section):
             solver=self._minimiser(),
             transitions=T1(self.t1_threshold, self.max_flips) if self.transitions else None,
             tolerance=self.tolerance,
-            contact_range=self.contact_range,
+            contact_range=self.contact_range if self.contacts else None,
             patience=self.patience,
             max_steps=self.max_steps,
         )
