@@ -269,7 +269,9 @@ def implicit_loss(mode):
 
     def loss(p):
         e = ShapeFactorEnergy(p)
-        found = vx.equilibrate(tissue, e, adjoint=adjoint, transitions=None, tolerance=1e-12)
+        found = vx.equilibrate(
+            tissue, e, adjoint=adjoint, transitions=None, contact_range=None, tolerance=1e-12
+        )
         return cost(found.tissue, e)
 
     p0 = shape_factors(CELLS, 3.65, 0.05, 1)
@@ -309,7 +311,9 @@ def test_adjoint_ignores_translations():
     tissue, energy, _ = start_and_cost()
 
     def loss(p):
-        found = vx.equilibrate(tissue, ShapeFactorEnergy(p), transitions=None, tolerance=1e-12)
+        found = vx.equilibrate(
+            tissue, ShapeFactorEnergy(p), transitions=None, contact_range=None, tolerance=1e-12
+        )
         return jnp.sum(found.tissue.vertices)
 
     gradient = jax.jit(jax.grad(loss))(energy.target_shape_factor)
@@ -323,7 +327,9 @@ def test_order_of_the_estimators_of_equilibrium_propagation():
     @eqx.filter_jit
     def gradient(adjoint):
         def loss(e):
-            found = vx.equilibrate(tissue, e, adjoint=adjoint, transitions=None, tolerance=1e-12)
+            found = vx.equilibrate(
+                tissue, e, adjoint=adjoint, transitions=None, contact_range=None, tolerance=1e-12
+            )
             return cost(found.tissue, e)
 
         return jax.grad(loss)(energy)
@@ -455,7 +461,7 @@ class TestNudgeByTheCost:
         # A cost of the topology has no slope, so only a nudge that may flip edges can follow it.
         tissue, energy = relaxed(CELLS, 5, 3.75)
         rule = vx.T1(threshold=0.4)
-        tissue = vx.equilibrate(tissue, energy, transitions=rule).tissue
+        tissue = vx.equilibrate(tissue, energy, transitions=rule, contact_range=None).tissue
         edge = int(jnp.argmin(tissue.edge_lengths))
         h = int(tissue.topology.half_edge[edge])
         m = tissue.topology
@@ -467,7 +473,7 @@ class TestNudgeByTheCost:
 
         def gradient(beta):
             adjoint = vx.EquilibriumPropagation(nudge="cost", beta=jnp.asarray(beta))
-            response = vx.Relaxation(transitions=rule)
+            response = vx.Relaxation(transitions=rule, contact_range=None)
             problem = vx.InverseProblem(tissue, energy, cost, response=response, adjoint=adjoint)
             return value_and_gradient(problem).gradient.target_shape_factor
 

@@ -187,7 +187,10 @@ def test_a_gradient_through_the_equilibrium_free():
 
 def _check_hypergradient(tissue, start, cost):
     problem = vx.InverseProblem(
-        tissue, start, cost, response=vx.Relaxation(transitions=None, tolerance=1e-11)
+        tissue,
+        start,
+        cost,
+        response=vx.Relaxation(transitions=None, contact_range=None, tolerance=1e-11),
     )
     evaluate = eqx.filter_jit(problem.value_and_gradient)
     evaluation = evaluate(start)

@@ -26,7 +26,7 @@ def table(folder, name):
 
 def test_inference_with_one_method(tmp_path):
     fit = {"epochs": 5}
-    relaxation = {"tolerance": 1e-3, "max_steps": 200}
+    relaxation = {"tolerance": 1e-3, "max_steps": 200, "contacts": False}
     folder, metrics = run(
         tmp_path,
         methods=["Adj-ID"],

@@ -34,6 +34,7 @@ boundaries = ["free"]
 n_types = [2]
 replicates = 2
 tissue = { n_cells = 7, lloyd_steps = 3 }
+relaxation = { contacts = false }  # which compiles less
 fit = { learning_rate = 0.3, epochs = 8 }
 """
 

@@ -16,6 +16,7 @@ replicates = 2
 least_mismatch = 2
 tissue = { n_cells = 8 }
 guidance = { epochs = 50 }
+relaxation = { contacts = false }  # which compiles less
 fit = { learning_rate = 2e-2, epochs = 90 }
 
 [[methods]]

@@ -12,6 +12,7 @@ import pytest
 from helpers import (
     ADAM,
     LEAST_SQUARES,
+    LOOSE,
     STILL,
     central_difference,
     random_like,
@@ -33,7 +34,7 @@ def hidden():
     """A relaxed tissue with hidden shape factors, and where inference begins."""
     target, truth = relaxed(10, 1)
     guess = ShapeFactorEnergy(jnp.full(10, 3.7, float))
-    return target, truth, guess, vx.equilibrate(target, guess).tissue
+    return target, truth, guess, LOOSE(target, guess).tissue
 
 
 def test_shape_factors_are_recovered_from_vertices(hidden):
@@ -109,9 +110,9 @@ def test_the_users_own_energy_is_fitted_like_any_other():
     area = AreaElasticity(20.0, 1.0)
     strength = 0.3 + 0.1 * jax.random.uniform(jax.random.key(3), (10,))
     truth = area + Contractility(strength)
-    target = vx.equilibrate(random_tissue(10, 4), truth).tissue
+    target = LOOSE(random_tissue(10, 4), truth).tissue
     guess = area + Contractility(jnp.full(10, 0.35))
-    start = vx.equilibrate(target, guess).tissue
+    start = LOOSE(target, guess).tissue
     fit = vx.fit(
         inverse_problem(start, guess, VertexDistance(target)),
         ADAM,
@@ -221,7 +222,7 @@ def batch(hidden):
     for k in range(3):
         noise = 0.05 * random_like(guess.target_shape_factor, k)
         energy = ShapeFactorEnergy(guess.target_shape_factor + noise)
-        start = vx.equilibrate(target, energy).tissue
+        start = LOOSE(target, energy).tissue
         problems.append(inverse_problem(start, energy, VertexDistance(target)))
     stacked = stack(problems)
     return problems, stacked, truth, stack([truth] * 3)

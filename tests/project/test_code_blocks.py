@@ -54,6 +54,8 @@ def run(tmp_path, monkeypatch):
 
 # Those that compile much: for `make test-slow`.
 SLOW = {
+    "docs/adjoints.md",
+    "docs/concepts.md",
     "docs/errors.md",
     "docs/extending.md",
     "docs/index.md",

@@ -33,7 +33,9 @@ def lattice():
 def test_perimeter_of_the_sheared_hexagonal_lattice(lattice, p0, epsilon):
     # Relaxed at fixed area, P = P_hex cosh ε on the rigid side.
     start = strained(lattice, pure_shear(epsilon))
-    found = vx.equilibrate(start, ShapeFactorEnergy(p0), transitions=None, tolerance=1e-11)
+    found = vx.equilibrate(
+        start, ShapeFactorEnergy(p0), transitions=None, contact_range=None, tolerance=1e-11
+    )
     np.testing.assert_allclose(found.tissue.perimeters, C * np.cosh(epsilon), rtol=1e-9)
     np.testing.assert_allclose(found.tissue.areas, 1, rtol=1e-9)
 
@@ -46,7 +48,7 @@ def test_shear_modulus_of_the_hexagonal_lattice(lattice, p0):
 
     def relaxed(epsilon):
         start = strained(lattice, pure_shear(epsilon))
-        found = vx.equilibrate(start, energy, transitions=None, tolerance=1e-11)
+        found = vx.equilibrate(start, energy, transitions=None, contact_range=None, tolerance=1e-11)
         return found.energy / lattice.n_cells
 
     affine = lambda epsilon: per_cell(strained(lattice, pure_shear(epsilon)))
@@ -145,7 +147,9 @@ def stress_of_tensions_and_pressures(tissue, k_a, a_0, k_p, p_0, gamma):
 def slope_by_strain(tissue, energy):
     def relaxed_energy(strain):
         start = strained(tissue, jnp.eye(2) + strain)
-        return vx.equilibrate(start, energy, transitions=None, tolerance=1e-11).energy
+        return vx.equilibrate(
+            start, energy, transitions=None, contact_range=None, tolerance=1e-11
+        ).energy
 
     return jax.grad(relaxed_energy)(jnp.zeros((2, 2))) / tissue.boundary.area
 

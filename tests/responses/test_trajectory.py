@@ -107,7 +107,9 @@ class TestRelaxation:
 
         tissue = cluster(3)
         energy = tension(tissue) + Trap()
-        found, way = record_relaxation(tissue, energy, vx.Relaxation(vx.solvers.FIRE(), None))
+        found, way = record_relaxation(
+            tissue, energy, vx.Relaxation(vx.solvers.FIRE(), None, contact_range=None)
+        )
         np.testing.assert_allclose(found.tissue.vertices.mean(axis=0), 9.0, atol=1e-6)
         steps = np.diff([np.asarray(frame.vertices.mean(axis=0)) for frame in way], axis=0)
         assert np.abs(steps).max() < 0.2
@@ -123,7 +125,13 @@ class TestRelaxation:
         found, way = record_relaxation(
             tissue,
             vx.energies.ShapeFactorEnergy(3.7),
-            vx.Relaxation(vx.solvers.FIRE(), transitions=None, tolerance=1e-2, patience=3),
+            vx.Relaxation(
+                vx.solvers.FIRE(),
+                transitions=None,
+                contact_range=None,
+                tolerance=1e-2,
+                patience=3,
+            ),
             every=100,
         )
         assert found.converged

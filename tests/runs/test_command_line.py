@@ -23,6 +23,7 @@ TINY = """
 experiment = "infer_shape_factors"
 tissue.n_cells = 6
 fit.epochs = 3
+relaxation = { contacts = false, transitions = false }  # which compiles less
 """
 
 

@@ -19,6 +19,7 @@ data = "both"
 tissue.n_cells = 6
 image.pixels = 16
 fit.epochs = 4
+relaxation = { contacts = false, transitions = false }  # which compiles less
 """
 
 
