@@ -38,6 +38,13 @@ from ._sections import (
     spread_of as spread_of,
 )
 from ._summary import summary as summary
+from ._sweep import (
+    SweepRun as SweepRun,
+    parse_grid as parse_grid,
+    sweep as sweep,
+    sweep_runs as sweep_runs,
+    sweep_table as sweep_table,
+)
 from ._tables import (
     fit_metrics as fit_metrics,
     histories as histories,

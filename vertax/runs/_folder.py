@@ -357,6 +357,22 @@ class RunFolder:
             json.dump(plain(metrics), file, indent=2, allow_nan=False)
             file.write("\n")
 
+    def finish(self, metrics: Mapping[str, Any]) -> None:
+        """End the run: write its metrics, and remove what only a resumed run needs.
+
+        **Arguments:**
+
+        - `metrics`: see `save_metrics`.
+
+        **Raises:**
+
+        - `KeyboardInterrupt` if a fit of the run was interrupted: then it is not finished.
+        """
+        if self.interrupted:
+            raise KeyboardInterrupt
+        self.save_metrics(metrics)
+        self.forget_parts()
+
     def metrics(self) -> dict[str, Any]:
         """The metrics of a finished run.
 

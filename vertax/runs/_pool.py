@@ -117,6 +117,11 @@ def fit_side_by_side(
     return stack_fits(fits, at_once=n_threads())
 
 
+THREADS = "VERTAX_THREADS"
+"""The environment variable that says how many run at once."""
+
+
 def n_threads() -> int:
-    """How many run at once."""
-    return os.cpu_count() or 1
+    """How many run at once: one a core, or what the environment says."""
+    said = os.environ.get(THREADS, "")
+    return max(int(said), 1) if said.isdecimal() else os.cpu_count() or 1

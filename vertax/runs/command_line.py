@@ -159,10 +159,7 @@ def run(
             typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
         folder.talkative = not quiet
         metrics = experiment.run(settings, folder, progress=not quiet)
-        if folder.interrupted:
-            raise KeyboardInterrupt
-        folder.save_metrics(metrics)
-        folder.forget_parts()
+        folder.finish(metrics)
     except KeyboardInterrupt:
         typer.echo(_interrupted(config, overrides or (), folder), err=True)
         raise typer.Exit(INTERRUPTED) from None
@@ -185,6 +182,84 @@ def run(
         typer.echo(f"Results: {folder.path}")
         for figure in folder.figures():
             typer.echo(f"  {figure}")
+
+
+@app.command()
+def sweep(
+    configs: Annotated[
+        list[Path], typer.Argument(metavar="CONFIG...", help="Configuration files.")
+    ],
+    grid: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUES",
+            help="Values of one key, e.g. tissue.n_cells=50,100 or seed=0:20; of several grids all "
+            "combinations are run.",
+        ),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Set one key in all runs."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of all runs; by default runs/NAME-sweep. What is finished in it is kept.",
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="A running Dask scheduler, e.g. tcp://node:8786; by default processes on this machine.",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Number of these processes; by default one a core.")
+    ] = None,
+    figures: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FORMAT", help="png, pdf or svg; may be repeated.", show_default=False
+        ),
+    ] = None,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Show no progress bar and no summary.")
+    ] = False,
+) -> None:
+    """Run one configuration, or several, with different keys."""
+    from vertax.runs import ConfigError, RunFolderError, parse_grid, sweep as run_all, sweep_runs
+
+    folder = Path("runs") / f"{configs[0].stem}-sweep" if output is None else output
+    try:
+        runs = sweep_runs(configs, parse_grid(grid or ()), folder, overrides or ())
+        finished = sum(run.state == "finished" for run in runs)
+        if not quiet:
+            kept = f", {finished} of them finished before" if finished else ""
+            typer.echo(f"{len(runs)} runs{kept} → {folder}")
+        runs = run_all(
+            runs,
+            folder,
+            scheduler=scheduler,
+            workers=workers,
+            figures=tuple(figures or ("png",)),
+            progress=not quiet,
+        )
+    except KeyboardInterrupt:
+        typer.echo("Interrupted. To go on, give the same command again.", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    except (ConfigError, RunFolderError) as error:
+        _stop(error, USAGE)
+    except ImportError as error:
+        _stop(error, FAILURE)
+    failed = [run for run in runs if run.state == "failed"]
+    for run in failed:
+        typer.secho(f"{run.folder}: {run.error}", err=True, fg=typer.colors.RED)
+    if not quiet:
+        typer.echo(f"{len(runs) - len(failed)} of {len(runs)} runs are finished.")
+        typer.echo(f"Results: {folder / 'sweep.csv'}")
+    if failed:
+        raise typer.Exit(FAILURE)
 
 
 @app.command()

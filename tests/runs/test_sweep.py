@@ -1,0 +1,117 @@
+"""Sweeps: which runs they have, that one that fails stops no other, and that finished ones are kept."""
+
+import csv
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from vertax.runs import ConfigError, RunFolderError, parse_grid, sweep, sweep_runs, sweep_table
+from vertax.runs.command_line import app
+
+TINY = """
+experiment = "infer_shape_factors"
+tissue.n_cells = 6
+fit.epochs = 2
+relaxation = { contacts = false, transitions = false }
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """The working directory holds tiny.toml."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.toml").write_text(TINY)
+    return tmp_path
+
+
+def table(folder):
+    with open(folder / "sweep.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("tissue.n_cells=50,100", ["50", "100"]),
+        ("seed=0:3", ["0", "1", "2"]),
+        ("seed=4:0:-2", ["4", "2"]),
+        ("data=vertices,image", ["vertices", "image"]),
+        ('data="vertices"', ['"vertices"']),
+        ("targets=[1.5, 2],[3]", ["[1.5, 2]", "[3]"]),
+        ("fit.learning_rate=1e-2", ["0.01"]),
+    ],
+)
+def test_values_of_a_grid(text, values):
+    (found,) = parse_grid([text]).values()
+    without_spaces = [value.replace(" ", "").replace(",]", "]") for value in found]
+    assert without_spaces == [value.replace(" ", "") for value in values]
+
+
+@pytest.mark.parametrize(
+    ("texts", "said"),
+    [
+        (["seed"], "must have the form key=value,value"),
+        (["=3"], "must have the form"),
+        (["seed="], "must have the form"),
+        (["seed=3:3"], "has no values"),
+        (["seed=0:3:0"], "step of 0"),
+        (["seed=1", "seed=2"], "`seed` has two grids"),
+    ],
+)
+def test_a_grid_of_another_form_is_refused(texts, said):
+    with pytest.raises(ConfigError, match=said):
+        parse_grid(texts)
+
+
+def test_runs_are_all_combinations(tiny):
+    grid = {"seed": ["0", "1"], "tissue.n_cells": ["6", "8", "10"]}
+    runs = sweep_runs(["tiny.toml"], grid, "out", ["fit.epochs=3"])
+    assert len({run.folder for run in runs}) == 6
+    assert {run.config.fit.epochs for run in runs} == {3}
+    assert [run.keys["tissue.n_cells"] for run in runs[:3]] == [6, 8, 10]
+    assert runs[-1].folder.name == "tiny-seed_1-tissue.n_cells_10"
+
+
+def test_what_cannot_be_run_is_refused_before_anything_is(tiny):
+    with pytest.raises(ConfigError, match="did you mean `tissue.n_cells`"):
+        sweep_runs(["tiny.toml"], {"tissue.n_cell": ["6"]}, "out")
+    with pytest.raises(ConfigError, match="Two runs of the sweep are called tiny-seed_1"):
+        sweep_runs(["tiny.toml"], {"seed": ["1", "1"]}, "out")
+    assert not (tiny / "out").exists()
+
+
+def test_a_sweep_goes_on_past_what_fails_and_keeps_what_is_finished(tiny):
+    # In the folder of one run lies something else, which is not overwritten.
+    (tiny / "out" / "tiny-seed_1").mkdir(parents=True)
+    (tiny / "out" / "tiny-seed_1" / "notes.txt").write_text("mine")
+    arguments = ["sweep", "tiny.toml", "--grid", "seed=0,1", "--output", "out", "--workers", "1"]
+    outcome = CliRunner().invoke(app, arguments)
+    assert outcome.exit_code == 1, outcome.output
+    assert "1 of 2 runs are finished" in outcome.output
+    rows = table(tiny / "out")
+    assert [(row["seed"], row["state"]) for row in rows] == [("0", "finished"), ("1", "failed")]
+    assert "is not empty" in rows[1]["error"]
+    file = tiny / "out" / "tiny-seed_0" / "metrics.json"
+    metrics = json.loads(file.read_text())
+    assert float(rows[0]["cost_final"]) == metrics["cost_final"]
+
+    # Again: what is finished is not done again, also without any process.
+    before = file.stat().st_mtime_ns
+    (run,) = sweep_runs(["tiny.toml"], {"seed": ["0"]}, "out")
+    assert run.state == "finished"
+    assert sweep([run], "out", progress=False) == [run]
+    assert sweep_table([run])["cost_final"] == [metrics["cost_final"]]
+    assert file.stat().st_mtime_ns == before
+
+    # The folder of another configuration is not touched.
+    with pytest.raises(RunFolderError, match="a run of another configuration"):
+        sweep_runs(["tiny.toml"], {"seed": ["0"]}, "out", ["fit.epochs=5"])
+
+
+def test_a_scheduler_that_is_not_there_is_named(tiny, monkeypatch):
+    outcome = CliRunner().invoke(
+        app, ["sweep", "tiny.toml", "--scheduler", "nonsense://here", "--quiet"]
+    )
+    assert outcome.exit_code == 2
+    assert "no Dask scheduler at nonsense://here" in outcome.output
