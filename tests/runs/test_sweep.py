@@ -74,7 +74,7 @@ def test_runs_are_all_combinations(tiny):
 
 
 def test_what_cannot_be_run_is_refused_before_anything_is(tiny):
-    with pytest.raises(ConfigError, match="did you mean `tissue.n_cells`"):
+    with pytest.raises(ConfigError, match=r"did you mean `tissue\.n_cells`"):
         sweep_runs(["tiny.toml"], {"tissue.n_cell": ["6"]}, "out")
     with pytest.raises(ConfigError, match="Two runs of the sweep are called tiny-seed_1"):
         sweep_runs(["tiny.toml"], {"seed": ["1", "1"]}, "out")
