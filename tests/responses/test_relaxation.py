@@ -156,16 +156,18 @@ def test_units_do_not_matter(solver):
 def test_what_is_a_number_compiles_once():
     tissue = random_tissue(12, 0)
 
-    def relax(p0: float, tolerance: float, max_steps: int, threshold: float):
+    def relax(p0: float, tolerance: float, max_steps: int, threshold: float, adjoint=None):
         rule = vx.T1(threshold)
         settings = {"tolerance": tolerance, "max_steps": max_steps, "transitions": rule}
-        return vx.equilibrate(tissue, ShapeFactorEnergy(p0), **settings)
+        return vx.equilibrate(tissue, ShapeFactorEnergy(p0), adjoint=adjoint, **settings)
 
     compiled = []
     relax(3.7, 1e-8, 1000, 0.02)
     with counted_compilations(compiled):
         assert relax(3.71, 1e-9, 1001, 0.03).converged
         assert relax(3.72, 1e-7, 500, 0.01).converged
+        # Where nothing is differentiated, another adjoint neither.
+        assert relax(3.7, 1e-8, 500, 0.02, vx.EquilibriumPropagation()).converged
     assert not compiled
 
 

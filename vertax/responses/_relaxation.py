@@ -105,7 +105,7 @@ class Relaxation(AbstractResponse):
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         _check_adjoint(adjoint, self.minimiser)
         _check_sharding((tissue, energy))
-        if all(is_concrete(x) for x in jax.tree.leaves((tissue, energy))):
+        if all(map(is_concrete, jax.tree.leaves((tissue, energy, self, adjoint)))):
             # Nothing is differentiated: one program serves all adjoints.
             adjoint = ImplicitDifferentiation()
         equilibrium = _equilibrate(*traced((tissue, energy)), self.traced(), adjoint)

@@ -229,6 +229,7 @@ _TAGS: frozenset[object] = frozenset()
 _TRIES = 6
 
 
+# A relaxation evaluates it in five places: so it is traced once.
 @eqx.filter_jit
 def objective(
     configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Contacts | None]
