@@ -81,6 +81,19 @@ def test_what_cannot_be_run_is_refused_before_anything_is(tiny):
     assert not (tiny / "out").exists()
 
 
+def test_bad_folders_and_formats_are_refused(tiny):
+    (tiny / "file").write_text("mine")
+    for options, said in (
+        (["--output", "file"], "file"),
+        (["--figures", "jpg", "--output", "out"], "jpg"),
+    ):
+        outcome = CliRunner().invoke(app, ["sweep", "tiny.toml", *options])
+        assert outcome.exit_code == 2, outcome.output
+        assert said in outcome.output
+    assert (tiny / "file").read_text() == "mine"
+    assert not (tiny / "out").exists()
+
+
 def test_a_sweep_goes_on_past_what_fails_and_keeps_what_is_finished(tiny):
     # In the folder of one run lies something else, which is not overwritten.
     (tiny / "out" / "tiny-seed_1").mkdir(parents=True)

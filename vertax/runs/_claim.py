@@ -84,14 +84,18 @@ def unfinished(path: str | os.PathLike[str], config: ExperimentConfig) -> Path:
             f"The run in {folder} is one of the experiment {earlier.get('experiment')!r}. Give its "
             f"own configuration: vertax run {folder / CONFIG} --resume {folder}"
         )
-    then = validate(type(config), earlier, str(folder / CONFIG))
-    if then != config:
-        changed = _changes(then.model_dump(mode="json"), config.model_dump(mode="json"))
+    if changed := changes(folder, config):
         raise RunFolderError(
             f"The run in {folder} has another configuration: {'; '.join(changed)}. Give its own, "
             f"vertax run {folder / CONFIG} --resume {folder}, or begin a new run without --resume."
         )
     return folder
+
+
+def changes(folder: Path, config: ExperimentConfig) -> list[str]:
+    """What differs between the configuration of the run in a folder and another one, in words."""
+    then = validate(type(config), read_toml(folder / CONFIG), str(folder / CONFIG))
+    return _changes(then.model_dump(mode="json"), config.model_dump(mode="json"))
 
 
 def _numbered(path: Path) -> Path:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import logging
 import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,10 @@ from vertax._base.extras import needing
 from vertax.fitting import FitError
 from vertax.io import write_csv
 from vertax.runs._cache import enable_cache
-from vertax.runs._claim import CONFIG, METRICS
-from vertax.runs._config import ExperimentConfig, read_toml, validate
+from vertax.runs._claim import CONFIG, METRICS, changes
+from vertax.runs._config import ExperimentConfig, validate
 from vertax.runs._errors import ConfigError, RunFolderError
+from vertax.runs._figures import checked_formats
 from vertax.runs._folder import RunFolder
 from vertax.runs._load import load_config
 from vertax.runs._pool import THREADS, n_threads
@@ -36,7 +37,7 @@ TABLE = "sweep"
 _EXPECTED = (FitError, ValueError, OSError, RuntimeError, MemoryError, OverflowError)
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class SweepRun:
     """One run of a sweep.
 
@@ -58,7 +59,7 @@ class SweepRun:
     def ended(self, error: str | None) -> SweepRun:
         """The same run, with how it ended."""
         state = "finished" if error is None else "failed"
-        return SweepRun(self.folder, self.keys, self.config, state, error or "")
+        return dataclasses.replace(self, state=state, error=error or "")
 
 
 def parse_grid(texts: Iterable[str]) -> dict[str, list[str]]:
@@ -156,11 +157,10 @@ def _known(run: SweepRun) -> SweepRun:
     """With what an earlier sweep left of it."""
     if not (run.folder / CONFIG).is_file():
         return run
-    earlier = validate(type(run.config), read_toml(run.folder / CONFIG), str(run.folder / CONFIG))
-    if earlier != run.config:
+    if changed := changes(run.folder, run.config):
         raise RunFolderError(
-            f"In {run.folder} there is a run of another configuration. Choose another folder with "
-            "--output."
+            f"In {run.folder} there is a run of another configuration: {'; '.join(changed)}. Choose "
+            "another folder with --output."
         )
     return run.ended(None) if (run.folder / METRICS).is_file() else run
 
@@ -196,16 +196,23 @@ def sweep(
 
     - `ImportError` if the extra `[distributed]` is missing.
     - `ConfigError` if there is no scheduler at the address.
+    - `RunFolderError` if the folder cannot be used, or for another format of pictures.
     - `KeyboardInterrupt` after an interrupt; the table is written.
     """
-    Path(output).mkdir(parents=True, exist_ok=True)
+    figures = checked_formats(figures)  # before anything runs
+    try:
+        Path(output).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(
+            f"Cannot use {output} as a folder: {error.strerror}. Choose another with --output."
+        ) from None
     ended = {run.folder: run for run in runs}
     waiting = [run for run in runs if run.state == "new"]
     bar = tqdm(total=len(runs), unit="run", disable=None if progress else True)
     try:
         with bar:
             bar.update(len(runs) - len(waiting))
-            for run in _done(waiting, scheduler, workers or n_threads(), tuple(figures)):
+            for run in _done(waiting, scheduler, workers or n_threads(), figures):
                 ended[run.folder] = run
                 bar.update()
     finally:
