@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -139,12 +140,17 @@ def squared_distance_to_arc(
     return jnp.where(faces, distance**2, ends)
 
 
-def bulge_gap(one: Sides, other: Sides, circles: tuple[Circle, Circle]) -> Float[Array, " sides"]:
-    """Distance from an arc that bulges into the face to the middle of another one; infinite for others.
+def bulge_gap(
+    one: Sides, other: Sides, circles: tuple[Circle, Circle]
+) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
+    """Distance from an arc that bulges into the face to another one, and how much that counts.
 
-    That one bulges in as well, towards the first, or out, around it.
+    That one bulges in as well, towards the first, or out, around it. The gap is where both circles are
+    nearest to each other. Where this comes to the end of an arc, or an arc is flat, its corners are as near,
+    and the weight goes smoothly from 1 to 0. (The gap is infinite where the weight is 0.)
     """
-    bulging = (one[:, 4] < -_FLAT) & (jnp.abs(other[:, 4]) > _FLAT)
+    bulge = jnp.minimum(-one[:, 4], jnp.abs(other[:, 4]))
+    bulging = bulge > _FLAT
     r1, r2 = (1 / jnp.where(bulging, c.curvature, 1) for c in circles)  # negative: bulging in
     inward = jnp.where(other[:, 4] < 0, 1, -1)
     to_centre = tuple(r[:, None] * c.normal for r, c in zip((r1, r2), circles, strict=True))
@@ -155,12 +161,28 @@ def bulge_gap(one: Sides, other: Sides, circles: tuple[Circle, Circle]) -> Float
     x = to_centre[0] - (inward * r1)[:, None] * unit
     y = to_centre[1] - jnp.abs(r2)[:, None] * unit
     gap = inward * distance + r1 + r2
+    x, y, gap = jax.lax.optimization_barrier((x, y, gap))
     facing = bulging & (squared > 0) & (gap > 0) & _on_arc(one, x) & _on_arc(other, y)
-    return jnp.where(facing, gap, jnp.inf)
+    weight = _rise(bulge / _FLAT - 1) * _inner(one, x, facing) * _inner(other, y, facing)
+    return jnp.where(facing, gap, jnp.inf), jnp.where(facing, weight, 0)
 
 
-# (Flatter arcs are nearest to each other at the end of one.)
-_FLAT = 0.02
+_FLAT = 0.01
+
+
+def _inner(
+    side: Sides, x: Float[Array, "sides 2"], where: Bool[Array, " sides"]
+) -> Float[Array, " sides"]:
+    """1 for a point on the inner part of an arc, and less near its ends."""
+    x, chord = jnp.where(where[:, None], x, 1), jnp.where(where[:, None], side[:, 2:4], 3)
+    last = x - chord
+    return _rise(10 * jnp.sqrt(dot(x, x) * dot(last, last)) / dot(chord, chord))
+
+
+def _rise(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """From 0 at 0 to 1 at 1, twice differentiable."""
+    x = jnp.clip(x, 0, 1)
+    return (10 + (6 * x - 15) * x) * x**3
 
 
 def wedge(

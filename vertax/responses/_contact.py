@@ -73,7 +73,7 @@ class Contacts(eqx.Module):
     def _nearness(
         self, one: Sides, other: Sides, after: Bool[Array, " n"], before: Bool[Array, " n"]
     ) -> list[tuple[Float[Array, " n"], Float[Array, " n"]]]:
-        """Squared distance over squared range, and the squared range.
+        """Squared distance over squared range, and the squared range, times how much that counts.
 
         The distance is that of the start of one side from the other; of arcs also that between the two, or
         the angle if one follows on the other.
@@ -98,10 +98,10 @@ class Contacts(eqx.Module):
         arms = dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])
         limit = limited(jnp.minimum(*arms))
         angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
-        gap = bulge_gap(one, other, circles)
+        gap, weight = bulge_gap(one, other, circles)
         far = jnp.isinf(gap)
         gap = jnp.where(far, jnp.inf, jnp.where(far, 1, gap) ** 2 / limit)
-        near.append((jnp.where(adjacent, angle, gap), limit))
+        near.append((jnp.where(adjacent, angle, gap), limit * jnp.where(adjacent, 1, weight)))
         return near
 
     def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, " vertices"]]:

@@ -33,6 +33,9 @@ class NewtonCG(AbstractSolver):
 
     Where a step gains less energy than the model promised, the regions shrink of those vertices whose
     forces it did not foresee, and of no others: so one difficult place does not hold back a large tissue.
+    What the error at a vertex does to the energy must matter, though: a vertex that hardly moves is not to
+    blame for what its neighbours do. Where a step was good, small regions grow again, even of vertices that
+    moved little: damped too much, soft collective motions would not come out of it.
 
     **Arguments:**
 
@@ -42,7 +45,7 @@ class NewtonCG(AbstractSolver):
     """
 
     max_displacement: float = 0.2
-    max_products: int = eqx.field(static=True, default=200)
+    max_products: int = eqx.field(static=True, default=600)
 
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
@@ -79,22 +82,30 @@ class NewtonCG(AbstractSolver):
         accept = finite & jnp.where(lost, lower_force, ratio > 1e-4)
 
         fine = accept & (lost | (ratio > 0.75))
+        # What each row may be wrong about the energy, on average.
+        due = jnp.maximum(predicted, 0) / sum(r.shape[0] for r in jax.tree.leaves(state.radii))
 
         def adapted(
             radius: Array, step: Array, old: Array, change: Array, new: Array
         ) -> Float[Array, " rows"]:
             scale, length = jnp.maximum(_size(old), _size(change)), _size(step)
             # How far the force is from what the model said, and who is to blame if a step is no good.
-            error = _size(new - old - change) / jnp.where(scale > 0, scale, 1)
-            foreseen = error < 0.25
-            blamed = jnp.where(accept, error > 0.75, ~foreseen)
+            missing = new - old - change
+            error = _size(missing) / jnp.where(scale > 0, scale, 1)
+            harmless = 0.5 * jnp.abs(_row_dot(missing, step)) < due
+            foreseen = (error < 0.25) | harmless
+            blamed = jnp.where(accept, error > 0.75, True) & ~foreseen
             shrunk = jnp.maximum(0.25 * radius, jnp.minimum(0.5 * length, radius))
             shrunk = jnp.where(accept, shrunk, 0.25 * radius)
             grows = accept & (fine | foreseen) & (length > 0.3 * radius)
+            grows |= fine & foreseen & (radius < reach)
             # Of a refused step those that were foreseen are to blame as well, if less.
             kept = jnp.where(accept, radius, 0.5 * radius)
             kept = jnp.where(blamed & ~fine, shrunk, kept)
-            return jnp.where(grows, 2 * radius, kept)
+            # (Smaller than rounding makes no sense, and would end in numbers without digits.)
+            return jnp.maximum(
+                jnp.where(grows, 2 * radius, kept), jnp.finfo(kept.dtype).eps * reach
+            )
 
         radii = jax.tree.map(adapted, state.radii, p, g, hp, gradient)
         kept = (y, state.value, g, state.aux)
