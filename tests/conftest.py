@@ -1,5 +1,6 @@
 """Settings for all tests."""
 
+import gc
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -19,6 +20,9 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 matplotlib.use("Agg")
+
+# What is traced and compiled makes very many objects that stay: looking through them a twentieth of the time.
+gc.set_threshold(20_000, 20, 10)
 
 MAPS = Path("/proc/self/maps")
 

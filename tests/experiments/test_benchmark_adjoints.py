@@ -32,7 +32,7 @@ def test_inference_with_one_method(tmp_path):
         methods=["Adj-ID"],
         least_squares_steps=0,
         paper={"fit": fit, "relaxation": relaxation, "gradient": {"strict": False}},
-        equilibrium={"fit": fit},
+        equilibrium={"fit": fit, "relaxation": {"contacts": False}},
         scaling={"sizes": []},
         accuracy={"tolerances": []},
     )

@@ -16,6 +16,7 @@ experiment = "design_mechanics"
 tissue = { n_cells = 6, lloyd_steps = 2 }
 target = 3.95
 accuracy = 5e-3
+relaxation = { contacts = false, transitions = false }  # which compiles less
 fit = { learning_rate = 1e-2, epochs = 12 }
 """
 ELONGATION = """
@@ -25,6 +26,7 @@ targets = [1.6]
 start_ratio = 1.3
 replicates = 2
 accuracy = 0.05
+relaxation = { contacts = false, transitions = false }
 start = { learning_rate = 0.2, epochs = 8 }
 fit = { learning_rate = 0.2, epochs = 15 }
 """

@@ -25,6 +25,7 @@ experiment = "infer_shape_factors"
 data = "both"
 tissue.n_cells = 6
 image = { pixels = 48, noise = 0.02 }
+relaxation = { contacts = false }  # which compiles less
 fit.epochs = 4
 """
 

@@ -30,6 +30,7 @@ shape_factors = [3.4, 4.1]
 replicates = 3
 modes = 2
 resamples = 20
+relaxation = { solver = "fire", max_steps = 5000 }  # which compiles half as much
 tissue = { n_cells = 12 }
 driving = { cycles = 1 }
 """

@@ -52,7 +52,7 @@ def run(tmp_path, monkeypatch):
     plt.close("all")
 
 
-# Those that compile much: for `make test-slow`.
+# Those that compile much: for `make test-slow`. The others are for `make test-docs`.
 SLOW = {
     "docs/adjoints.md",
     "docs/concepts.md",
@@ -89,7 +89,10 @@ PROMISES = {
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else []) for page in PAGES],
+    [
+        pytest.param(page, marks=pytest.mark.slow if page in SLOW else pytest.mark.docs)
+        for page in PAGES
+    ],
 )
 def test_its_code_runs_as_printed(page, run):
     names = run(page)

@@ -159,7 +159,10 @@ def test_stress_from_tensions_and_pressures_is_the_derivative_by_the_strain_of_t
     # σ = (1/A_box) [Σ K_A (A - A0) A I + Σ_edges T l⊗l/|l|], T = γ + Σ over both cells K_P (P - P0).
     k_a, a_0, k_p, p_0, gamma = values = jnp.array([3.0, 1.1, 1.4, p0, 0.2])
     energy = AreaElasticity(k_a, a_0) + PerimeterElasticity(k_p, p_0) + LineTension(gamma)
-    tissue = vx.equilibrate(random_tissue(16, 2), energy, tolerance=1e-11).tissue
+    # Vertices that nearly meet would be held apart by contacts, which the formula does not know.
+    tissue = vx.equilibrate(
+        random_tissue(16, 2), energy, transitions=None, contact_range=None, tolerance=1e-11
+    ).tissue
     formula = stress_of_tensions_and_pressures(tissue, *values)
     np.testing.assert_allclose(slope_by_strain(tissue, energy), formula, atol=1e-7)
 
@@ -174,5 +177,5 @@ def test_forces_sum_to_zero_and_areas_to_the_box(seed):
     energy = ShapeFactorEnergy(shape_factors(16, 3.7, 0.2, seed))
     tissue = random_tissue(16, seed)
     np.testing.assert_allclose(np.sum(forces(tissue, energy), axis=0), 0, atol=1e-10)
-    found = vx.equilibrate(tissue, energy)
+    found = vx.equilibrate(tissue, energy, tolerance=1e-10)
     assert np.sum(found.tissue.areas) == pytest.approx(16, rel=1e-12)

@@ -1,5 +1,6 @@
 """Trajectories of relaxations and fits, in memory and in files."""
 
+import dataclasses
 import os
 from itertools import pairwise
 
@@ -7,10 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from free_helpers import cluster
-from helpers import random_tissue, rewritten
+from helpers import ADAM, LOOSE, STILL, random_tissue, rewritten
 
 import vertax as vx
 from vertax.io import load_trajectory, save_trajectory
@@ -91,7 +91,7 @@ class TestRelaxation:
 
     def test_a_free_cluster_does_not_turn(self):
         tissue = cluster(5)
-        equilibrium, way = record_relaxation(tissue, tension(tissue), every=5)
+        equilibrium, way = record_relaxation(tissue, tension(tissue), LOOSE, every=5)
         assert same_bits(way[-1], equilibrium.tissue)
         assert len(way) > 2
         for frame in way:
@@ -148,25 +148,25 @@ class TestRelaxation:
             record_relaxation(jax.tree.map(lambda x: jnp.stack([x, x]), tissue), energy)
         with pytest.raises(ValueError, match="`tolerance` must be positive"):
             record_relaxation(tissue, energy, vx.Relaxation(tolerance=0.0))
+        few = dataclasses.replace(STILL, max_steps=3)
         with pytest.raises(RuntimeError, match=r"no equilibrium in 3 steps.*throw=False"):
-            record_relaxation(tissue, energy, vx.Relaxation(max_steps=3), every=2)
-        found, way = record_relaxation(
-            tissue, energy, vx.Relaxation(max_steps=3), every=2, throw=False
-        )
+            record_relaxation(tissue, energy, few, every=2)
+        found, way = record_relaxation(tissue, energy, few, every=2, throw=False)
         assert not found.converged
         assert way.values["num_steps"].tolist() == [0, 2, 3]
 
 
 class TestFit:
     def test_a_trajectory_is_a_callback(self):
-        target = vx.equilibrate(random_tissue(4), vx.energies.ShapeFactorEnergy(3.6)).tissue
+        target = STILL(random_tissue(4), vx.energies.ShapeFactorEnergy(3.6)).tissue
         problem = vx.InverseProblem(
             target,
             vx.energies.ShapeFactorEnergy(jnp.full(4, 3.7)),
             vx.costs.VertexDistance(target),
+            response=STILL,
         )
         way = Trajectory(every=2)
-        fit = vx.fit(problem, optax.adam(1e-2), 5, callback=way)
+        fit = vx.fit(problem, ADAM, 5, callback=way)
         assert way.values["epoch"].tolist() == [0, 2, 4]
         np.testing.assert_array_equal(way.values["cost"], fit.history.cost[::2])
         np.testing.assert_array_equal(way.values["num_t1"], fit.history.num_t1[::2])
