@@ -187,7 +187,7 @@ def _start(
         first, _ = _residuals(problem, constants, true, one)(fitted, problem.tissue)
         scale = jax.lax.rsqrt(jnp.maximum(jnp.sum(first**2), jnp.finfo(first.dtype).tiny))
         machine = _Machine(solver, problem, constants, true, fitted, scale)
-        leaves = jax.tree.leaves(eqx.filter(machine.blank, eqx.is_array))
+        leaves = _leaves(machine.blank)
         facts = nothing_known(problem)
         best = unbeaten(problem, parameters)
         tissues = (problem.tissue, problem.tissue)
@@ -219,7 +219,7 @@ def _epoch(
         tissue, placed = (eqx.combine(a, problem.tissue) for a in arrays)
         best = better(state.best, y[0], placed, facts, guidance_of(problem), epoch, facts.converged)
         n_still = jnp.where(facts.cost == state.facts.cost, state.n_still + 1, 0)
-        leaves = jax.tree.leaves(eqx.filter(solver_state, eqx.is_array))
+        leaves = _leaves(solver_state)
         going = ~done & (n_still < _PATIENCE)
         moved = State(y, leaves, tissue, placed, facts, state.scale, best, n_still, going)
         # In a batch a member that was done earlier stands still.
@@ -237,3 +237,8 @@ def _record(state: State) -> Record:
         sound=jnp.array(True),
         **state.facts.facts(),
     )
+
+
+def _leaves(state: Any) -> list[Array]:
+    """The arrays of a solver's state; what JAX knows while it compiles is no array of its own."""
+    return [jnp.asarray(x) for x in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
