@@ -11,7 +11,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-docs test-slow notebooks notebooks-write lint format types docs benchmark build clean
+.PHONY: help demo test test-docs test-experiments test-slow notebooks notebooks-write lint format types docs benchmark build clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 22
@@ -24,6 +24,9 @@ test: $(VENV)/.dev ## the tests that run on every change
 
 test-docs: $(VENV)/.dev ## the code in the README and in the documentation
 	$(BIN)/python tests/run.py --only project/test_code_blocks.py -m docs $(PYTEST_OPTIONS)
+
+test-experiments: $(VENV)/.dev ## short runs of each experiment
+	$(BIN)/python tests/run.py --workers $(WORKERS) --only experiments -m "experiments and not slow" $(PYTEST_OPTIONS)
 
 test-slow: $(VENV)/.dev ## the longer scientific checks
 	$(BIN)/python tests/run.py --workers $(WORKERS) -m slow $(PYTEST_OPTIONS)

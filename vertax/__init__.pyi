@@ -1,6 +1,7 @@
 from . import (
     adjoints as adjoints,
     costs as costs,
+    dissipations as dissipations,
     energies as energies,
     fitting as fitting,
     inference as inference,
@@ -20,6 +21,7 @@ from .adjoints import (
     ImplicitDifferentiation as ImplicitDifferentiation,
 )
 from .costs import AbstractCost as AbstractCost
+from .dissipations import AbstractDissipation as AbstractDissipation
 from .energies import (
     AbstractEnergy as AbstractEnergy,
     AbstractLocalEnergy as AbstractLocalEnergy,
@@ -53,8 +55,10 @@ from .plotting import (
 from .responses import (
     AbstractResponse as AbstractResponse,
     Equilibrium as Equilibrium,
+    Evolution as Evolution,
     Relaxation as Relaxation,
     equilibrate as equilibrate,
+    evolve as evolve,
 )
 from .solvers import MINRES as MINRES
 from .transitions import T1 as T1, AbstractTransitions as AbstractTransitions

@@ -8,6 +8,8 @@ import pytest
 
 from vertax.runs import RunFolder, find_experiment, validate
 
+pytestmark = pytest.mark.experiments
+
 
 def run(tmp_path, **changes):
     experiment = find_experiment("benchmark_adjoints")

@@ -8,6 +8,8 @@ from run_helpers import run
 from vertax.inference import Microscope
 from vertax.initialise import periodic_voronoi
 
+pytestmark = pytest.mark.experiments
+
 CONFIGS = Path(__file__).parents[2] / "configs"
 ONE_METHOD = '[{name = "guided", distance = "centroids", guided = true}]'
 

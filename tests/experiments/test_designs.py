@@ -11,6 +11,8 @@ import vertax as vx
 from vertax.costs import HomotypicLength, aspect_ratio
 from vertax.runs import TensionRange
 
+pytestmark = pytest.mark.experiments
+
 MECHANICS = """
 experiment = "design_mechanics"
 tissue = { n_cells = 6, lloyd_steps = 2 }

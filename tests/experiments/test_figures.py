@@ -22,6 +22,8 @@ from vertax.experiments.rigidity_transition import figures as rigidity
 from vertax.experiments.salt_and_pepper import figures as patterns
 from vertax.plotting import label_colours
 
+pytestmark = pytest.mark.experiments
+
 RNG = np.random.default_rng(0)
 
 

@@ -10,6 +10,8 @@ from PIL import Image
 import vertax as vx
 from vertax.runs import ConfigError, RunFolder, load_config
 
+pytestmark = pytest.mark.experiments
+
 
 @pytest.fixture(scope="module")
 def picture(tmp_path_factory):

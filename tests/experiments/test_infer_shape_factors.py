@@ -20,6 +20,8 @@ from vertax.runs import (
     summary,
 )
 
+pytestmark = pytest.mark.experiments
+
 TINY = """
 experiment = "infer_shape_factors"
 data = "both"

@@ -9,6 +9,8 @@ from run_helpers import run, table
 import vertax as vx
 from vertax.runs import ConfigError, find_experiment, validate
 
+pytestmark = pytest.mark.experiments
+
 TINY = """
 experiment = "infer_tensions"
 epochs = 2

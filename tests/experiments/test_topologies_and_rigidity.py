@@ -9,6 +9,8 @@ from run_helpers import run, table
 import vertax as vx
 from vertax.costs import mismatched_neighbours
 
+pytestmark = pytest.mark.experiments
+
 ACROSS = """
 experiment = "inference_across_topologies"
 seed = 3

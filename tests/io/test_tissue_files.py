@@ -94,6 +94,9 @@ class TestRefusedToSave:
             def shortest(self, displacement):
                 return displacement
 
+            def carry(self, vertices, other):
+                return vertices
+
             def drift(self, vertices, reference, pinned=None):
                 return jnp.zeros(0)
 

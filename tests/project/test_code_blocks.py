@@ -56,6 +56,7 @@ def run(tmp_path, monkeypatch):
 SLOW = {
     "docs/adjoints.md",
     "docs/concepts.md",
+    "docs/dynamics.md",
     "docs/errors.md",
     "docs/extending.md",
     "docs/index.md",

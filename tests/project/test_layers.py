@@ -12,6 +12,7 @@ LAYERS = [
     "_base",
     "mesh",
     "energies",
+    "dissipations",
     "transitions",
     "solvers",
     "adjoints",

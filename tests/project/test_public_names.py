@@ -2,11 +2,11 @@ import vertax as vx
 
 # The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
 NAMES = """
-AbstractBoundary AbstractCost AbstractEnergy AbstractLocalEnergy AbstractResponse
+AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy AbstractLocalEnergy AbstractResponse
 AbstractTransitions AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation
-Evaluation Fit FitError Free GradientOutcome History ImplicitDifferentiation InverseProblem MINRES
-Periodic Record Relaxation T1 Tissue Topology Uncertainty adjoints animate costs energies
-equilibrate fit fitting inference initialise io load_tissue mesh plot_history plot_recovery plot_tissue
+Evaluation Evolution Fit FitError Free GradientOutcome History ImplicitDifferentiation InverseProblem MINRES
+Periodic Record Relaxation T1 Tissue Topology Uncertainty adjoints animate costs
+dissipations energies equilibrate evolve fit fitting inference initialise io load_tissue mesh plot_history plot_recovery plot_tissue
 plotting responses runs save_tissue solvers transitions uncertainty
 """
 
@@ -16,6 +16,8 @@ FAMILIES = {
     "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance EdgeDistance "
     "HomotypicLength IndexAwareStructural MeanShapeFactor MeshImage VertexDistance WeightedSum "
     "adjacency aspect_ratio mirror mismatched_neighbours render",
+    "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity PerimeterViscosity "
+    "SubstrateFriction Sum ViscositySum",
     "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "
     "PerimeterElasticity ShapeFactorEnergy Sum",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts fit "
@@ -33,7 +35,8 @@ FAMILIES = {
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
     "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "
     "scale_bar series_colours",
-    "responses": "AbstractResponse Equilibrium Relaxation Trajectory equilibrate record_relaxation",
+    "responses": "AbstractResponse Equilibrium Evolution Evolved Relaxation Trajectory equilibrate evolve "
+    "record_relaxation",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
     "transitions": "AbstractTransitions T1",
 }

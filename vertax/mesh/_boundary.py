@@ -25,6 +25,17 @@ class AbstractBoundary(eqx.Module):
         """The shortest of all displacements that lead to an image of the same point."""
 
     @abc.abstractmethod
+    def carry(
+        self, vertices: Float[Array, "vertices 2"], other: AbstractBoundary
+    ) -> Float[Array, "vertices 2"]:
+        """Where vertices go when this space is deformed uniformly into another one of its kind.
+
+        **Raises:**
+
+        - `TypeError` if the other one is of another kind.
+        """
+
+    @abc.abstractmethod
     def drift(
         self,
         vertices: Float[Array, "vertices 2"],
@@ -112,6 +123,18 @@ class Periodic(AbstractBoundary):
         best = jnp.argmin(jnp.sum(choices**2, axis=-1), axis=-1)
         return jnp.take_along_axis(choices, best[..., None, None], axis=-2)[..., 0, :]
 
+    def carry(
+        self, vertices: Float[Array, "vertices 2"], other: AbstractBoundary
+    ) -> Float[Array, "vertices 2"]:
+        if not isinstance(other, Periodic):
+            raise _of_another_kind(self, other)
+        # As a displacement, so that a box that stays as it is leaves the vertices alone to the last bit.
+        (a, b), (c, d) = self.lattice
+        x, y = vertices[:, :1], vertices[:, 1:]
+        first, second = (x * d - y * c) / (a * d - b * c), (y * a - x * b) / (a * d - b * c)
+        deformation = other.lattice - self.lattice
+        return vertices + first * deformation[0] + second * deformation[1]
+
     def drift(
         self,
         vertices: Float[Array, "vertices 2"],
@@ -148,6 +171,13 @@ class Free(AbstractBoundary):
     def shortest(self, displacement: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
         return displacement
 
+    def carry(
+        self, vertices: Float[Array, "vertices 2"], other: AbstractBoundary
+    ) -> Float[Array, "vertices 2"]:
+        if not isinstance(other, Free):
+            raise _of_another_kind(self, other)
+        return vertices
+
     def drift(
         self,
         vertices: Float[Array, "vertices 2"],
@@ -180,6 +210,12 @@ class Free(AbstractBoundary):
         arm = vertices - centre
         turn = distance / jnp.sqrt(jnp.mean(jnp.sum(arm**2, axis=-1)))
         return jnp.concatenate([shifted, (centre + _turned(arm, turn))[None]])
+
+
+def _of_another_kind(one: AbstractBoundary, other: AbstractBoundary) -> TypeError:
+    return TypeError(
+        f"A tissue in a {type(one).__name__} boundary cannot go to a {type(other).__name__} one."
+    )
 
 
 def _pivot(

@@ -358,6 +358,11 @@ class Tissue(eqx.Module):
         lent = (start.boundary, vertices)
         return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, lent)
 
+    def carried(self, boundary: AbstractBoundary) -> Tissue:
+        """The same tissue, deformed uniformly with its space into another one, pinned vertices too."""
+        vertices = self.boundary.carry(self.vertices, boundary)
+        return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, (boundary, vertices))
+
     def with_topology(self, topology: Topology) -> Tissue:
         """The same vertices, connected in another way."""
         return eqx.tree_at(lambda t: t.topology, self, topology)

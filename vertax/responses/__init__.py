@@ -1,5 +1,10 @@
 """Responses: how a tissue answers to its energy."""
 
+from vertax.responses._evolution import (
+    Evolution as Evolution,
+    Evolved as Evolved,
+    evolve as evolve,
+)
 from vertax.responses._recording import record_relaxation as record_relaxation
 from vertax.responses._relaxation import Relaxation as Relaxation, equilibrate as equilibrate
 from vertax.responses._response import (

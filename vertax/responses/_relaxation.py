@@ -103,8 +103,7 @@ class Relaxation(AbstractResponse):
         **Raises:** as [`equilibrate`][vertax.equilibrate].
         """
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
-        _check_adjoint(adjoint, self.minimiser)
-        _check_sharding((tissue, energy))
+        self.check(tissue, energy, adjoint)
         if all(map(is_concrete, jax.tree.leaves((tissue, energy, self, adjoint)))):
             # Nothing is differentiated: one program serves all adjoints.
             adjoint = ImplicitDifferentiation()
@@ -112,6 +111,26 @@ class Relaxation(AbstractResponse):
         # An error that is raised within a compiled program calls back to the host, and JAX keeps no such
         # program in its cache on disk.
         return equilibrium.checked() if throw else equilibrium
+
+    def check(self, tissue: Tissue, energy: Any, adjoint: AbstractAdjoint) -> None:
+        """Refuse what does not go together.
+
+        **Raises:**
+
+        - `TypeError` for an adjoint that is none.
+        - `ValueError` for one that does not go with the solver, or a `jax.shard_map` that this does not.
+        """
+        _check_adjoint(adjoint, self.minimiser)
+        _check_sharding((tissue, energy))
+
+    def solve(
+        self, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
+    ) -> Equilibrium:
+        """Relax a tissue as a part of a larger compiled function: nothing is checked."""
+        start, constant = frozen((tissue, energy))
+        search = self.search(start, constant)
+        end = search.advance(search.begin(start, constant), constant, self.max_steps)
+        return conclude(search, end, tissue, energy, adjoint, self.max_steps)
 
     def finer(self, tolerance: Float[Array, ""]) -> Relaxation:
         """The same, at rest only where the largest force is below this tolerance too."""
@@ -196,10 +215,7 @@ def equilibrate(
 def _equilibrate(
     tissue: Tissue, energy: AbstractEnergy, response: Relaxation, adjoint: AbstractAdjoint
 ) -> Equilibrium:
-    start, constant = frozen((tissue, energy))
-    search = response.search(start, constant)
-    end = search.advance(search.begin(start, constant), constant, response.max_steps)
-    return conclude(search, end, tissue, energy, adjoint, response.max_steps)
+    return response.solve(tissue, energy, adjoint)
 
 
 def conclude(

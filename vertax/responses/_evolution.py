@@ -1,0 +1,406 @@
+"""Dynamics: overdamped motion, each step a relaxation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from vertax._base.checks import as_real, check_whole, named
+from vertax._base.modules import is_concrete, traced
+from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
+from vertax.adjoints._adjoint import frozen
+from vertax.dissipations import AbstractDissipation, AbstractViscosity
+from vertax.energies import AbstractEnergy
+from vertax.mesh import AbstractBoundary, Tissue
+from vertax.responses._relaxation import Relaxation
+from vertax.responses._response import AbstractResponse, Equilibrium
+from vertax.responses._step import Incremental
+from vertax.responses._trajectory import Trajectory
+
+
+class Evolved(Equilibrium):
+    """Where a tissue has gone in time; as an [`Equilibrium`][vertax.Equilibrium] it is the last frame.
+
+    Its `max_force` is the largest that any step was left with, `num_steps` and `num_t1` count those of all
+    steps, `valid` and `result` hold if they do for every step. Forces are those of energy and friction
+    together.
+    """
+
+    times: Float[Array, "*batch times"]
+    """The times of the frames, of which the first is the start."""
+    frames: Tissue
+    """The tissue at these times: the same tissue with a leading axis."""
+    energies: Float[Array, "*batch times"]
+    """Its energies."""
+    transitions: Int[Array, "*batch times"]
+    """T1 transitions from the frame before."""
+
+    sound: Bool[Array, "*batch times"]
+    """Whether all steps up to a frame came to an end, in tissues without overlaps."""
+
+    @property
+    def flipped(self) -> Bool[Array, "*batch times edges"]:
+        """Which edges lie between other cells than a frame before."""
+        # (Half-edges do not change places when an edge flips, and cells of half-edges do.)
+        cells = jax.vmap(lambda topology: topology.edge_cells)(self.frames.topology)
+        changed = jnp.any(cells[1:] != cells[:-1], axis=-1)
+        return jnp.concatenate([jnp.zeros_like(changed[:1]), changed])
+
+    def checked(self) -> Evolved:
+        """The same, if all steps came to an end.
+
+        **Raises:**
+
+        - `RuntimeError` (of Equinox inside `jax.jit`) if one did not, or if cells overlap.
+        """
+        if not is_concrete(self.sound):
+            reason = f"A step in time came to no end, or cells overlap. {_REMEDY}"
+            return eqx.error_if(self, ~self.converged, reason)
+        if np.all(self.sound):
+            return self
+        first = np.argmin(np.asarray(self.sound), axis=-1).max()
+        time = np.asarray(self.times).reshape(-1, np.shape(self.times)[-1])[0, first]
+        what = "cells overlap" if not np.all(self.valid) else "a step in time came to no end"
+        if not np.isfinite(np.asarray(self.max_force)).all():
+            what = "forces are not finite"
+        raise RuntimeError(
+            f"On the way to time {time:g} (frame {first}) {what} (largest force "
+            f"{np.max(self.max_force):.1e}). {_REMEDY}"
+        )
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The frames as a trajectory, for [`animate`][vertax.animate] and for files."""
+        trajectory = Trajectory()
+        arrays, static = eqx.partition(self.frames, eqx.is_array)
+        values = {"time": self.times, "energy": self.energies, "num_t1": self.transitions}
+        for number in range(len(self.times)):
+            arrays_then, values_then = jax.tree.map(lambda x, i=number: x[i], (arrays, values))
+            trajectory.append(eqx.combine(arrays_then, static), **values_then)
+        return trajectory
+
+
+_REMEDY = (
+    "Take shorter steps (more `substeps`), raise `max_steps` of its relaxation or loosen its `tolerance`, or "
+    "pass throw=False and look at `sound`."
+)
+
+
+class Evolution(AbstractResponse):
+    r"""The tissue moves, overdamped: $\partial R / \partial \dot x = - \partial E / \partial x$.
+
+    Each step is a minimising movement: from $x_0$ it goes to where
+
+    $$E(x) + \Delta t\, R\left(\frac{x - x_0}{\Delta t}; x_0\right)$$
+
+    has a minimum. That is the implicit Euler method: stable for every length of a step, and without anything
+    that drives it the energy never rises, through transitions either. And a step is a
+    [`Relaxation`][vertax.Relaxation], with its solvers, transitions, contacts and adjoints.
+
+    **Arguments:**
+
+    - `dissipation`: what resists the motion, see `vertax.dissipations`.
+    - `times`: when there is to be a frame; they increase, and at the first one the tissue is where it
+        begins.
+    - `substeps`: steps from one frame to the next.
+    - `order`: 1, or 2 for two stages a step (an SDIRK method, which is stable for every step, but of which
+        the energy may rise). The dissipation must be a sum of squares for that.
+    - `boundary`: a function of time that returns the space at that time, such as a box that is sheared; the
+        tissue is carried along, and then moves. By default it stays as it is.
+    - `pins`: a function of time that returns the positions of all vertices, of which those of pinned ones
+        count.
+    - `relaxation`: how each step is found.
+
+    **Raises:**
+
+    - `TypeError` for a dissipation, or a relaxation, that is none, or functions that are none.
+    - `ValueError` for times that do not increase, substeps or an order that do not exist, or a second
+        order of a dissipation that is no sum of squares.
+    """
+
+    dissipation: AbstractDissipation
+    times: Float[Array, " times"]
+    substeps: int = eqx.field(static=True, default=1)
+    order: int = eqx.field(static=True, default=1)
+    boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None = None
+    pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None = None
+    relaxation: Relaxation = eqx.field(default_factory=Relaxation)
+
+    def __init__(
+        self,
+        dissipation: AbstractDissipation,
+        times: ArrayLike | Sequence[Any],
+        *,
+        substeps: int = 1,
+        order: int = 1,
+        boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None = None,
+        pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None = None,
+        relaxation: Relaxation | None = None,
+    ):
+        if not isinstance(dissipation, AbstractDissipation):
+            raise TypeError(
+                "Argument `dissipation` must be one of vertax.dissipations, e.g. SubstrateFriction(1.0), "
+                f"but is {named(dissipation)}."
+            )
+        self.relaxation = Relaxation() if relaxation is None else relaxation
+        if not isinstance(self.relaxation, Relaxation):
+            raise TypeError(
+                f"Argument `relaxation` must be a vertax.Relaxation, but is {named(relaxation)}."
+            )
+        for name, function in (("boundary", boundary), ("pins", pins)):
+            if function is not None and not callable(function):
+                raise TypeError(
+                    f"Argument `{name}` must be a function of time, but is {named(function)}. For one that "
+                    f"stays, leave it out."
+                )
+        check_whole("substeps", substeps, least=1)
+        if order not in (1, 2):
+            raise ValueError(f"Argument `order` must be 1 or 2, but is {order!r}.")
+        if order == 2 and not isinstance(dissipation, AbstractViscosity):
+            raise ValueError(
+                "Argument `order` can be 2 only for a dissipation that is half a sum of squares, an "
+                f"AbstractViscosity, which {type(dissipation).__name__} is not."
+            )
+        self.dissipation = dissipation
+        self.times = _increasing(times)
+        self.substeps, self.order = substeps, order
+        self.boundary, self.pins = boundary, pins
+
+    def __call__(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy | Callable[[Float[Array, ""]], AbstractEnergy],
+        *,
+        adjoint: AbstractAdjoint | None = None,
+        throw: bool = True,
+    ) -> Evolved:
+        """Let a tissue move.
+
+        **Arguments:** as [`evolve`][vertax.evolve].
+
+        **Returns:** what happened, [`Evolved`][vertax.responses.Evolved].
+
+        **Raises:** as [`evolve`][vertax.evolve].
+        """
+        adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
+        self.relaxation.check(tissue, energy, adjoint)
+        self._check(tissue)
+        response = self.traced()
+        evolved = _evolve(*traced((tissue, energy)), response, adjoint)
+        return evolved.checked() if throw else evolved
+
+    def traced(self) -> Evolution:
+        """The same with its numbers as arrays, of which another one compiles nothing anew."""
+        new = (traced(self.dissipation), self.relaxation.traced())
+        return eqx.tree_at(lambda e: (e.dissipation, e.relaxation), self, new)
+
+    def finer(self, tolerance: Float[Array, ""]) -> Evolution:
+        """The same, each step at rest only where the largest force is below this tolerance too."""
+        return eqx.tree_at(lambda e: e.relaxation, self, self.relaxation.finer(tolerance))
+
+    def placed(self, tissue: Tissue, time: Float[Array, ""]) -> Tissue:
+        """A tissue carried into the space of a time, with its pinned vertices where they are then."""
+        if self.boundary is not None:
+            tissue = tissue.carried(self.boundary(time))
+        if self.pins is not None and tissue.pinned is not None:
+            held = jnp.where(tissue.pinned[:, None], self.pins(time), tissue.vertices)
+            tissue = tissue.with_vertices(held)
+        return tissue
+
+    def _check(self, tissue: Tissue) -> None:
+        """Refuse a dissipation that lets some vertices go without any resistance."""
+        if not all(map(is_concrete, jax.tree.leaves((tissue, self.dissipation)))):
+            return
+        with jax.ensure_compile_time_eval():
+            free = np.asarray(_resistance(tissue, self.dissipation)) == 0
+        if tissue.pinned is not None:
+            free &= ~np.asarray(tissue.pinned)
+        if free.any():
+            which = np.nonzero(free)[0]
+            some = ", ".join(map(str, which[:5])) + (", ..." if len(which) > 5 else "")
+            raise ValueError(
+                f"Argument `dissipation` resists no motion of {len(which)} of {tissue.n_vertices} vertices "
+                f"({some}): they would move at once. Add friction there, e.g. "
+                "+ vertax.dissipations.SubstrateFriction(0.01)."
+            )
+
+
+def evolve(
+    tissue: Tissue,
+    energy: AbstractEnergy | Callable[[Float[Array, ""]], AbstractEnergy],
+    dissipation: AbstractDissipation,
+    times: ArrayLike | Sequence[Any],
+    *,
+    adjoint: AbstractAdjoint | None = None,
+    throw: bool = True,
+    **settings: Any,
+) -> Evolved:
+    r"""Let a tissue move in time, overdamped: $\partial R / \partial \dot x = - \partial E / \partial x$.
+
+    ```python
+    friction = vx.dissipations.SubstrateFriction(1.0)
+    movie = vx.evolve(tissue, energy, friction, jnp.linspace(0, 10, 51))
+    vx.animate(movie.trajectory, "movie.gif")
+    ```
+
+    Works under `jax.jit`, `jax.vmap` and `jax.grad` with respect to the energy, the dissipation, the box
+    and where the tissue begins. A gradient takes a linear system for each step, backwards in time, and
+    keeps one configuration for each. It tells how the course changes as long as the same transitions happen
+    in the same steps.
+
+    **Arguments:**
+
+    - `tissue`: where it begins, at the first of the times.
+    - `energy`: its energy, or a function of time that returns one (a function, or an `equinox.Module` to
+        differentiate with respect to what it holds).
+    - `dissipation`: what resists the motion.
+    - `times`: when there is to be a frame; they increase.
+    - `adjoint`: how to differentiate each step, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation]
+        by default.
+    - `throw`: raise an error if a step finds no end. If False, look at `converged`.
+    - `settings`: those of [`Evolution`][vertax.Evolution], whose convenient form this is: `substeps`,
+        `order`, `boundary`, `pins`, `relaxation`.
+
+    **Returns:** an [`Evolved`][vertax.responses.Evolved]: `tissue` at the end, and `frames`.
+
+    **Raises:**
+
+    - `TypeError` for arguments of the wrong kind.
+    - `ValueError` for times that do not increase, or a dissipation that leaves vertices without any
+        resistance, which are named.
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a step did not converge, or cells overlap.
+    """
+    return Evolution(dissipation, times, **settings)(tissue, energy, adjoint=adjoint, throw=throw)
+
+
+class _State(eqx.Module):
+    """How far an evolution has come."""
+
+    tissue: Tissue
+    max_force: Float[Array, ""]
+    num_steps: Int[Array, ""]
+    num_t1: Int[Array, ""]
+    valid: Bool[Array, ""]
+    arrived: Bool[Array, ""]
+
+    def after(self, step: Equilibrium) -> _State:
+        """What is known when one more step is done."""
+        return _State(
+            step.tissue,
+            jnp.maximum(self.max_force, frozen(step.max_force)),
+            self.num_steps + step.num_steps,
+            self.num_t1 + step.num_t1,
+            self.valid & step.valid,
+            self.arrived & (step.result == optx.RESULTS.successful),
+        )
+
+    @property
+    def result(self) -> optx.RESULTS:
+        """The outcome of all steps."""
+        reached = optx.RESULTS.where(
+            self.arrived, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+        )
+        return optx.RESULTS.where(jnp.isfinite(self.max_force), reached, optx.RESULTS.nonfinite)
+
+
+# Of a method of second order with two stages of this share of a step each (SDIRK: Alexander 1977,
+# doi:10.1137/0714068), which damps what is fast as the implicit Euler method does.
+_SHARE = 1 - 0.5**0.5
+
+
+@eqx.filter_jit
+def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: AbstractAdjoint) -> Evolved:
+    times = evolution.times.astype(tissue.vertices.dtype)
+    energy_at = energy if not isinstance(energy, AbstractEnergy) else lambda _: energy
+    structure = eqx.partition(tissue, eqx.is_array)[1]
+    whole = lambda arrays: eqx.combine(arrays, structure)
+
+    def stage(state: _State, before: Tissue, start: Any, end: Any, strained: Any) -> _State:
+        """A relaxation of the energy at the end, and what the way there from `before` dissipates."""
+        there = evolution.placed(state.tissue, end)
+        potential = Incremental(
+            energy_at(end), evolution.dissipation, before, end - start, strained
+        )
+        return state.after(evolution.relaxation.solve(there, potential, adjoint))
+
+    def step(state: _State, start: Any, end: Any) -> _State:
+        before = state.tissue
+        if evolution.order == 1:
+            return stage(state, before, start, end, None)
+        dt = end - start
+        middle = stage(state, before, start, start + _SHARE * dt, None)
+        assert isinstance(evolution.dissipation, AbstractViscosity)
+        strained = evolution.dissipation.strains(middle.tissue, before) * (1 - _SHARE) / _SHARE
+        return stage(middle, before, end - _SHARE * dt, end, strained)
+
+    def interval(arrays: _State, ends: tuple[Array, Array]) -> tuple[_State, tuple]:
+        shares = jnp.linspace(0, 1, evolution.substeps + 1, dtype=times.dtype)
+        marks = ends[0] + shares * (ends[1] - ends[0])
+
+        def substep(arrays: _State, ends: tuple[Array, Array]) -> tuple[_State, None]:
+            return eqx.filter(step(whole_state(arrays), *ends), eqx.is_array), None
+
+        before = arrays.num_t1
+        arrays, _ = jax.lax.scan(substep, arrays, (marks[:-1], marks[1:]))
+        tissue = whole(arrays.tissue)
+        sound = arrays.arrived & arrays.valid
+        frame = (arrays.tissue, energy_at(ends[1])(tissue), arrays.num_t1 - before, sound)
+        return arrays, frame
+
+    yes, none = jnp.array(True), jnp.array(0)
+    begin = _State(tissue, jnp.zeros((), times.dtype), none, none, yes, yes)
+    arrays, static = eqx.partition(begin, eqx.is_array)
+    whole_state = lambda arrays: eqx.combine(arrays, static)
+    end, (frames, energies, flips, sound) = jax.lax.scan(interval, arrays, (times[:-1], times[1:]))
+    join = lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest])
+    end = whole_state(end)
+    energies = join(energy_at(times[0])(tissue), energies)
+    return Evolved(
+        tissue=end.tissue,
+        energy=energies[-1],
+        max_force=end.max_force,
+        num_steps=end.num_steps,
+        num_t1=end.num_t1,
+        valid=end.valid,
+        result=end.result,
+        times=times,
+        frames=whole(jax.tree.map(join, arrays.tissue, frames)),
+        energies=energies,
+        transitions=join(none, flips),
+        sound=join(yes, sound),
+    )
+
+
+def _increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
+    array = as_real("times", times)
+    if array.ndim != 1 or array.size < 2:
+        raise ValueError(
+            "Argument `times` must hold two times or more, that of the start first, but its shape is "
+            f"{array.shape}."
+        )
+    if is_concrete(array):
+        steps = np.diff(np.asarray(array))
+        if not (steps > 0).all():
+            at = int(np.argmin(steps > 0))
+            raise ValueError(
+                f"Argument `times` must increase, but entry {at} is {array[at]} and the next "
+                f"{array[at + 1]}."
+            )
+    return array
+
+
+@eqx.filter_jit
+def _resistance(tissue: Tissue, dissipation: AbstractDissipation) -> Float[Array, " vertices"]:
+    """How much each vertex is held back if all move in different directions."""
+    size = 1e-3 * jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
+    angles = 2.4 * jnp.arange(tissue.n_vertices, dtype=tissue.vertices.dtype)
+    away = size * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+    moved = lambda vertices: dissipation(tissue.with_vertices(vertices), tissue, 1.0)
+    return jnp.sum(jax.grad(moved)(tissue.vertices + away) ** 2, axis=-1)
