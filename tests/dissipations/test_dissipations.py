@@ -99,6 +99,6 @@ def test_bad_arguments(as_a_user):
     with pytest.raises(ValueError, match="`per`"):
         SubstrateFriction(1.0, per="cell")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError):
-        SubstrateFriction(1.0) + 2  # pyright: ignore[reportOperatorIssue]
+        _ = SubstrateFriction(1.0) + 2  # pyright: ignore[reportOperatorIssue]
     with pytest.raises(TypeError, match="Free"):
         before.carried(vx.Free())
