@@ -62,7 +62,7 @@ class TestDecay:
         # As many steps of half the length: an error in each of one order more.
         np.testing.assert_allclose(np.log2(errors[0] / errors[1]), order + 1, atol=0.25)
         np.testing.assert_allclose(np.log2(errors[1] / errors[2]), order + 1, atol=0.15)
-        assert errors[0] < (0.02 if order == 1 else 1e-3)
+        assert errors[0] < (0.1 if order == 1 else 2e-3)
 
 
 class TestWithoutActivity:
