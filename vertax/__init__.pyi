@@ -1,4 +1,5 @@
 from . import (
+    activities as activities,
     adjoints as adjoints,
     costs as costs,
     dissipations as dissipations,
@@ -14,6 +15,7 @@ from . import (
     solvers as solvers,
     transitions as transitions,
 )
+from .activities import AbstractActivity as AbstractActivity
 from .adjoints import (
     AutomaticDifferentiation as AutomaticDifferentiation,
     EquilibriumPropagation as EquilibriumPropagation,

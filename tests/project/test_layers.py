@@ -13,6 +13,7 @@ LAYERS = [
     "mesh",
     "energies",
     "dissipations",
+    "activities",
     "transitions",
     "solvers",
     "adjoints",

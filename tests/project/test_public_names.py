@@ -2,16 +2,18 @@ import vertax as vx
 
 # The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
 NAMES = """
-AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy AbstractLocalEnergy AbstractResponse
+AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy AbstractLocalEnergy
+AbstractResponse
 AbstractTransitions AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation
 Evaluation Evolution Fit FitError Free GradientOutcome History ImplicitDifferentiation InverseProblem MINRES
-Periodic Record Relaxation T1 Tissue Topology Uncertainty adjoints animate costs
+Periodic Record Relaxation T1 Tissue Topology Uncertainty activities adjoints animate costs
 dissipations energies equilibrate evolve fit fitting inference initialise io load_tissue mesh
 plot_history plot_recovery plot_tissue
 plotting responses runs save_tissue solvers transitions uncertainty
 """
 
 FAMILIES = {
+    "activities": "AbstractActivity FluctuatingTensions Push SelfPropulsion Sum ThermalNoise",
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
     "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance EdgeDistance "
@@ -28,8 +30,8 @@ FAMILIES = {
     "micrograph_problem pearson relative_error same_neighbours shape_factor_scene tension_problem",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
     "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
-    "io": "BoundedTables Tables atomic_write cell_table edge_table from_tables "
-    "load_energy load_problem load_tissue load_trajectory read_image "
+    "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_tables "
+    "load_energy load_problem load_tissue load_trajectory read_image read_surface_evolver "
     "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
     "write_geojson write_vtk",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",

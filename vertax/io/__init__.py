@@ -15,6 +15,10 @@ from vertax.io._module_file import (
     save_energy as save_energy,
     save_problem as save_problem,
 )
+from vertax.io._surface_evolver import (
+    Foam as Foam,
+    read_surface_evolver as read_surface_evolver,
+)
 from vertax.io._tables import Tables as Tables, from_tables as from_tables, to_tables as to_tables
 from vertax.io._tissue_file import load_tissue as load_tissue, save_tissue as save_tissue
 from vertax.io._trajectory import (

@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from vertax._base.checks import as_real, check_whole, named
+from vertax._base.checks import as_key, as_real, check_whole, named
 from vertax._base.modules import is_concrete, traced
+from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
@@ -42,6 +43,9 @@ class Evolved(Equilibrium):
     transitions: Int[Array, "*batch times"]
     """T1 transitions from the frame before."""
 
+    drive: PyTree[Array]
+    """The state of the activity at the end, and of the random numbers: a run that begins there with `drive`
+    goes on as if it had not stopped. None without an activity."""
     sound: Bool[Array, "*batch times"]
     """Whether all steps up to a frame came to an end, in tissues without overlaps."""
 
@@ -109,6 +113,9 @@ class Evolution(AbstractResponse):
     - `dissipation`: what resists the motion, see `vertax.dissipations`.
     - `times`: when there is to be a frame; they increase, and at the first one the tissue is where it
         begins.
+    - `activity`: what drives the tissue besides its energy, see `vertax.activities`.
+    - `key`: for the random numbers of the activity, a key or a seed. Steps draw from it one after the other.
+    - `drive`: in place of a key, that of an [`Evolved`][vertax.responses.Evolved] which is to go on.
     - `substeps`: steps from one frame to the next.
     - `order`: 1, or 2 for two stages a step (an SDIRK method, which is stable for every step, but of which
         the energy may rise). The dissipation must be a sum of squares for that.
@@ -120,13 +127,16 @@ class Evolution(AbstractResponse):
 
     **Raises:**
 
-    - `TypeError` for a dissipation, or a relaxation, that is none, or functions that are none.
-    - `ValueError` for times that do not increase, substeps or an order that do not exist, or a second
-        order of a dissipation that is no sum of squares.
+    - `TypeError` for a dissipation, an activity or a relaxation that is none, or functions that are none.
+    - `ValueError` for an activity without a key, times that do not increase, substeps or an order that do
+        not exist, or a second order of a dissipation that is no sum of squares.
     """
 
     dissipation: AbstractDissipation
     times: Float[Array, " times"]
+    activity: AbstractActivity | None = None
+    key: PRNGKeyArray | None = None
+    drive: PyTree[Array] = None
     substeps: int = eqx.field(static=True, default=1)
     order: int = eqx.field(static=True, default=1)
     boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None = None
@@ -138,6 +148,9 @@ class Evolution(AbstractResponse):
         dissipation: AbstractDissipation,
         times: ArrayLike | Sequence[Any],
         *,
+        activity: AbstractActivity | None = None,
+        key: PRNGKeyArray | int | None = None,
+        drive: PyTree[Array] = None,
         substeps: int = 1,
         order: int = 1,
         boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None = None,
@@ -149,6 +162,18 @@ class Evolution(AbstractResponse):
                 "Argument `dissipation` must be one of vertax.dissipations, e.g. SubstrateFriction(1.0), "
                 f"but is {named(dissipation)}."
             )
+        if not isinstance(activity, AbstractActivity | None):
+            raise TypeError(
+                "Argument `activity` must be one of vertax.activities, e.g. ThermalNoise(0.01), but is "
+                f"{named(activity)}."
+            )
+        if activity is not None and key is None and drive is None:
+            raise ValueError(
+                "Argument `key` is missing: an activity draws random numbers. Pass a seed, e.g. key=0, or "
+                "the `drive` of an evolution that is to go on."
+            )
+        self.activity, self.drive = activity, drive
+        self.key = None if key is None else as_key(key)
         self.relaxation = Relaxation() if relaxation is None else relaxation
         if not isinstance(self.relaxation, Relaxation):
             raise TypeError(
@@ -198,8 +223,9 @@ class Evolution(AbstractResponse):
 
     def traced(self) -> Evolution:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""
-        new = (traced(self.dissipation), self.relaxation.traced())
-        return eqx.tree_at(lambda e: (e.dissipation, e.relaxation), self, new)
+        new = (traced(self.dissipation), traced(self.activity), self.relaxation.traced())
+        parts = lambda e: (e.dissipation, e.activity, e.relaxation)
+        return eqx.tree_at(parts, self, new, is_leaf=lambda x: x is None)
 
     def finer(self, tolerance: Float[Array, ""]) -> Evolution:
         """The same, each step at rest only where the largest force is below this tolerance too."""
@@ -265,8 +291,8 @@ def evolve(
     - `adjoint`: how to differentiate each step, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation]
         by default.
     - `throw`: raise an error if a step finds no end. If False, look at `converged`.
-    - `settings`: those of [`Evolution`][vertax.Evolution], whose convenient form this is: `substeps`,
-        `order`, `boundary`, `pins`, `relaxation`.
+    - `settings`: those of [`Evolution`][vertax.Evolution], whose convenient form this is: `activity`, `key`,
+        `drive`, `substeps`, `order`, `boundary`, `pins`, `relaxation`.
 
     **Returns:** an [`Evolved`][vertax.responses.Evolved]: `tissue` at the end, and `frames`.
 
@@ -284,6 +310,7 @@ class _State(eqx.Module):
     """How far an evolution has come."""
 
     tissue: Tissue
+    drive: PyTree[Array]
     max_force: Float[Array, ""]
     num_steps: Int[Array, ""]
     num_t1: Int[Array, ""]
@@ -294,6 +321,7 @@ class _State(eqx.Module):
         """What is known when one more step is done."""
         return _State(
             step.tissue,
+            self.drive,
             jnp.maximum(self.max_force, frozen(step.max_force)),
             self.num_steps + step.num_steps,
             self.num_t1 + step.num_t1,
@@ -322,23 +350,30 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
     structure = eqx.partition(tissue, eqx.is_array)[1]
     whole = lambda arrays: eqx.combine(arrays, structure)
 
-    def stage(state: _State, before: Tissue, start: Any, end: Any, strained: Any) -> _State:
+    def stage(
+        state: _State, before: Tissue, acts: Any, start: Any, end: Any, strained: Any
+    ) -> _State:
         """A relaxation of the energy at the end, and what the way there from `before` dissipates."""
         there = evolution.placed(state.tissue, end)
-        potential = Incremental(
-            energy_at(end), evolution.dissipation, before, end - start, strained
-        )
+        pulls = energy_at(end) if acts is None else energy_at(end) + acts
+        potential = Incremental(pulls, evolution.dissipation, before, end - start, strained)
         return state.after(evolution.relaxation.solve(there, potential, adjoint))
 
     def step(state: _State, start: Any, end: Any) -> _State:
-        before = state.tissue
+        before, acts, dt = state.tissue, None, end - start
+        if evolution.activity is not None:
+            inner, key = state.drive
+            key, now = jax.random.split(key)
+            acts, inner = evolution.activity.drive(
+                inner, before, evolution.dissipation, start, dt, now
+            )
+            state = eqx.tree_at(lambda s: s.drive, state, (inner, key))
         if evolution.order == 1:
-            return stage(state, before, start, end, None)
-        dt = end - start
-        middle = stage(state, before, start, start + _SHARE * dt, None)
+            return stage(state, before, acts, start, end, None)
+        middle = stage(state, before, acts, start, start + _SHARE * dt, None)
         assert isinstance(evolution.dissipation, AbstractViscosity)
         strained = evolution.dissipation.strains(middle.tissue, before) * (1 - _SHARE) / _SHARE
-        return stage(middle, before, end - _SHARE * dt, end, strained)
+        return stage(middle, before, acts, end - _SHARE * dt, end, strained)
 
     def interval(arrays: _State, ends: tuple[Array, Array]) -> tuple[_State, tuple]:
         shares = jnp.linspace(0, 1, evolution.substeps + 1, dtype=times.dtype)
@@ -355,7 +390,12 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
         return arrays, frame
 
     yes, none = jnp.array(True), jnp.array(0)
-    begin = _State(tissue, jnp.zeros((), times.dtype), none, none, yes, yes)
+    drive = evolution.drive
+    if drive is None and evolution.activity is not None:
+        assert evolution.key is not None
+        first, rest = jax.random.split(evolution.key)
+        drive = (evolution.activity.init(tissue, first), rest)
+    begin = _State(tissue, drive, jnp.zeros((), times.dtype), none, none, yes, yes)
     arrays, static = eqx.partition(begin, eqx.is_array)
     whole_state = lambda arrays: eqx.combine(arrays, static)
     end, (frames, energies, flips, sound) = jax.lax.scan(interval, arrays, (times[:-1], times[1:]))
@@ -374,6 +414,7 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
         frames=whole(jax.tree.map(join, arrays.tissue, frames)),
         energies=energies,
         transitions=join(none, flips),
+        drive=end.drive,
         sound=join(yes, sound),
     )
 

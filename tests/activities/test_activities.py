@@ -1,0 +1,222 @@
+"""What drives a tissue in time."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+from helpers import STILL, central_difference, dense_hessian, relaxed
+
+import vertax as vx
+from vertax.activities import FluctuatingTensions, Push, SelfPropulsion, ThermalNoise
+from vertax.dissipations import PerimeterViscosity, SubstrateFriction
+from vertax.energies import ShapeFactorEnergy
+
+FRICTION = SubstrateFriction(2.0)
+CELLS = 12
+KEY = jax.random.key(0)
+
+
+@functools.cache
+def solid():
+    tissue, energy = relaxed(CELLS, 1, 3.5)
+    return STILL(tissue, energy).tissue, energy
+
+
+def evolve(activity, times, dissipation=FRICTION, key=0, **settings):
+    tissue, energy = solid()
+    return vx.evolve(
+        settings.pop("tissue", tissue),
+        energy,
+        dissipation,
+        times,
+        activity=activity,
+        key=key,
+        relaxation=STILL,
+        **settings,
+    )
+
+
+class TestThermalNoise:
+    def test_its_forces_belong_to_the_dissipation(self):
+        # Their covariance is 2 T / dt times the matrix of the dissipation, of which this is a diagonal form.
+        tissue, _ = solid()
+        dissipation = SubstrateFriction(0.7) + PerimeterViscosity(0.3)
+        dt, temperature = 0.1, 0.02
+        matrix = jax.hessian(
+            lambda x: dissipation(tissue.with_vertices(x.reshape(-1, 2)), tissue, 1.0)
+        )(tissue.vertices.ravel())
+        directions = np.random.default_rng(0).normal(size=(5, 48))
+
+        @jax.jit
+        def forces(keys):
+            draw = lambda key: ThermalNoise(temperature).drive(
+                None, tissue, dissipation, jnp.array(0.0), jnp.array(dt), key
+            )[0]
+            return jax.vmap(lambda key: draw(key).force.ravel())(keys)
+
+        works = np.asarray(forces(jax.random.split(KEY, 4000))) @ directions.T
+        wanted = 2 * temperature / dt * np.einsum("ki,ij,kj->k", directions, matrix, directions)
+        np.testing.assert_allclose((works**2).mean(axis=0), wanted, rtol=0.08)
+        np.testing.assert_allclose(works.mean(axis=0) / np.sqrt(wanted), 0, atol=0.06)
+
+    def test_equipartition(self):
+        # Of implicit Euler steps each mode has λ <q²> = T / (1 + λ dt / 2 ζ).
+        tissue, energy = solid()
+        temperature, dt, friction = 1e-6, 0.4, 2.0
+        values, modes = np.linalg.eigh(dense_hessian(tissue, energy))
+        values, modes = values[2:], modes[:, 2:]
+        movie = evolve(ThermalNoise(temperature), dt * jnp.arange(1500))
+        moved = np.asarray(movie.frames.vertices - tissue.vertices)[200:]
+        amplitudes = moved.reshape(len(moved), -1) @ modes
+        energies = values * (amplitudes**2).mean(axis=0) * (1 + values * dt / (2 * friction))
+        # Stiff modes forget at once; so the mean over modes, by how often each has forgotten.
+        weights = 1 - np.exp(-values * dt / friction)
+        assert np.average(energies, weights=weights) == pytest.approx(temperature, rel=0.03)
+        slow, fast = values < np.median(values), values > np.median(values)
+        assert energies[fast].mean() == pytest.approx(temperature, rel=0.04)
+        assert energies[slow].mean() == pytest.approx(temperature, rel=0.15)
+
+    def test_the_same_key_gives_the_same_course_and_it_can_go_on(self):
+        times = 0.1 * jnp.arange(9)
+        whole = evolve(ThermalNoise(1e-4), times)
+        again = evolve(ThermalNoise(1e-4), times)
+        np.testing.assert_array_equal(whole.frames.vertices, again.frames.vertices)
+        other = evolve(ThermalNoise(1e-4), times, key=1)
+        assert jnp.abs(other.tissue.vertices - whole.tissue.vertices).max() > 1e-3
+        half = evolve(ThermalNoise(1e-4), times[:5])
+        rest = evolve(ThermalNoise(1e-4), times[4:], key=None, drive=half.drive, tissue=half.tissue)
+        np.testing.assert_array_equal(rest.frames.vertices, whole.frames.vertices[4:])
+
+    def test_its_strength_has_a_gradient(self):
+        weights = np.random.default_rng(0).normal(size=(24, 2))
+
+        @eqx.filter_jit
+        def cost(temperature):
+            return jnp.sum(
+                weights * evolve(ThermalNoise(temperature), [0.0, 0.2, 0.4]).tissue.vertices
+            )
+
+        slope = eqx.filter_jit(jax.grad(cost))(jnp.array(1e-3))
+        difference = central_difference(cost, jnp.array(1e-3), jnp.array(1.0), 1e-6)
+        np.testing.assert_allclose(slope, difference, rtol=1e-6)
+
+    def test_bad_arguments(self, as_a_user):
+        class Own(vx.AbstractDissipation):
+            def __call__(self, tissue, before, dt):
+                return jnp.sum((tissue.vertices - before.vertices) ** 2) / dt
+
+        with pytest.raises(ValueError, match="`temperature` must be at least 0"):
+            ThermalNoise(-1.0)
+        with pytest.raises(ValueError, match="AbstractViscosity"):
+            evolve(ThermalNoise(1.0), [0.0, 1.0], Own())
+        with pytest.raises(ValueError, match="`key` is missing"):
+            evolve(ThermalNoise(1.0), [0.0, 1.0], key=None)
+        with pytest.raises(TypeError, match="`activity`"):
+            evolve(1.0, [0.0, 1.0])
+
+
+class TestSelfPropulsion:
+    @pytest.mark.parametrize("make", [lambda: solid()[0], lambda: cluster(9, 2)])
+    def test_forces_add_up_to_those_of_the_cells(self, make):
+        tissue = make()
+        activity = SelfPropulsion(jnp.linspace(0.1, 1.0, tissue.n_cells), 0.0)
+        angles, _ = state = activity.init(tissue, KEY)
+        push, (after, _) = activity.drive(
+            state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.1), KEY
+        )
+        assert isinstance(push, Push)
+        np.testing.assert_array_equal(after, angles)
+        direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+        total = jnp.sum(activity.force[:, None] * direction, axis=0)
+        np.testing.assert_allclose(push.force.sum(axis=0), total, atol=1e-12)
+
+    def test_a_cell_walks_at_random_and_persistently(self):
+        # The centre of a cluster moves at v = F / (n ζ) with the sum F of the forces of its cells; that of
+        # each decays as exp(-D_r t), so <F(t) F(0)> does.
+        diffusion, dt, n = 0.8, 0.05, 40
+        activity = SelfPropulsion(1.0, diffusion)
+        tissue = solid()[0]
+
+        @jax.jit
+        def walk(key):
+            first, *keys = jax.random.split(key, n + 1)
+            state = activity.init(tissue, first)
+            angles = [state[0]]
+            for k in keys:
+                _, state = activity.drive(state, tissue, FRICTION, jnp.array(0.0), jnp.array(dt), k)
+                angles.append(state[0])
+            return jnp.stack(angles)
+
+        angles = np.asarray(jax.vmap(walk)(jax.random.split(KEY, 200)))
+        alike = np.cos(angles - angles[:, :1]).mean(axis=(0, 2))
+        np.testing.assert_allclose(alike, np.exp(-diffusion * dt * np.arange(n + 1)), atol=0.04)
+
+    def test_the_centre_moves_with_the_sum_of_forces(self):
+        tissue = cluster(9, 2)
+        energy = ShapeFactorEnergy(jnp.full(9, 3.4))
+        activity = SelfPropulsion(0.3, 0.5)
+        movie = vx.evolve(
+            tissue, energy, FRICTION, [0.0, 0.1], activity=activity, key=3, relaxation=STILL
+        )
+        angles, _ = movie.drive[0]
+        force = 0.3 * np.stack([np.cos(angles), np.sin(angles)], axis=-1).sum(axis=0)
+        moved = movie.tissue.vertices.mean(axis=0) - tissue.vertices.mean(axis=0)
+        np.testing.assert_allclose(moved, 0.1 * force / (2.0 * tissue.n_vertices), atol=1e-9)
+
+    def test_directions_align_with_movement(self):
+        tissue = solid()[0]
+        activity = SelfPropulsion(0.1, 0.0, alignment=5.0)
+        angles, _ = activity.init(tissue, KEY)
+        came_from = tissue.vertices - jnp.array([0.0, 0.01])
+        for _ in range(40):
+            _, (angles, _) = activity.drive(
+                (angles, came_from), tissue, FRICTION, jnp.array(0.0), jnp.array(0.05), KEY
+            )
+        np.testing.assert_allclose(jnp.sin(angles), 1, atol=0.05)
+
+    def test_bad_arguments(self):
+        with pytest.raises(ValueError, match="`force`"):
+            SelfPropulsion(-1.0)
+        with pytest.raises(ValueError, match="one entry a cell"):
+            evolve(SelfPropulsion(jnp.ones(5)), [0.0, 1.0])
+
+
+def test_fluctuating_tensions_forget():
+    tissue = solid()[0]
+    activity = FluctuatingTensions(0.2, persistence=0.5)
+
+    @jax.jit
+    def pair(key):
+        first, second = jax.random.split(key)
+        state = activity.init(tissue, first)
+        tensions, after = activity.drive(
+            state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.3), second
+        )
+        return state, after, tensions.tension
+
+    before, after, tension = map(np.asarray, jax.vmap(pair)(jax.random.split(KEY, 600)))
+    np.testing.assert_allclose(tension, 0.2 * after)
+    assert after.std() == pytest.approx(1, rel=0.02)
+    assert (before * after).mean() == pytest.approx(np.exp(-0.3 / 0.5), abs=0.02)
+    with pytest.raises(ValueError, match="`persistence` must be positive"):
+        FluctuatingTensions(0.1, 0.0)
+
+
+def test_activities_add_and_can_be_ones_own():
+    class Wind(vx.AbstractActivity):
+        force: float
+
+        def drive(self, state, tissue, dissipation, time, dt, key):
+            return Push(jnp.full_like(tissue.vertices, self.force)), state
+
+    tissue = solid()[0]
+    movie = evolve(Wind(0.4) + FluctuatingTensions(0.0, 1.0), [0.0, 0.5, 1.0])
+    # The whole drifts at the force over the friction.
+    np.testing.assert_allclose(movie.tissue.vertices - tissue.vertices, 0.2, atol=1e-8)
+    assert movie.drive[0][1].shape == (36,)
+    with pytest.raises(TypeError):
+        _ = Wind(1.0) + 1  # pyright: ignore[reportOperatorIssue]

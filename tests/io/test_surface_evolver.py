@@ -1,0 +1,115 @@
+"""Foams of Surface Evolver."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vertax as vx
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "surface_evolver"
+# Two cells side by side, their interface of two pieces; the right one is listed clockwise, the left one is
+# turned over by its body.
+DOUBLET = """// a comment
+SPACE_DIMENSION 2
+STRING
+TOTAL_TIME 12.5
+vertices        /*  coordinates  */
+ 1   0  -1
+ 2   0.1  0.0
+ 5   0   1
+ 6   1.5   0
+ 7  -1.5   0
+edges
+ 1   1 2  density 0.5
+ 2   2 5  density 0.5
+ 3   1 6  density 2
+ 4   6 5  density 3 original 3
+ 5   5 7
+ 6   7 1  color red
+faces    /* edge loop */
+ 1   1 2 -4 \\
+     -3 /*area 1.4*/
+ 2   1 2 5 6
+bodies  /* facets */
+ 1   1  volume 1.5 lagrange_multiplier 0.25 centerofmass
+ 2  -2
+read
+show_all_edges off
+"""
+
+
+@pytest.fixture
+def doublet(tmp_path):
+    path = tmp_path / "doublet.fe"
+    path.write_text(DOUBLET, encoding="utf-8")
+    return path
+
+
+def test_a_doublet(doublet):
+    foam = vx.io.read_surface_evolver(doublet)
+    tissue = foam.tissue
+    assert (tissue.n_cells, tissue.n_vertices, tissue.n_edges) == (2, 2, 3)
+    assert not tissue.overlaps.any
+    np.testing.assert_allclose(tissue.areas, [1.4, 1.6], rtol=1e-12)
+    np.testing.assert_allclose(foam.target_areas, [1.5, 1.6], rtol=1e-12)
+    np.testing.assert_allclose(foam.pressures, [0.25, 0.0])
+    assert foam.time == 12.5
+    inner = int(np.argmin(np.asarray(tissue.topology.on_outline)))
+    assert foam.tensions[inner] == 0.5
+    assert len(foam.chains[inner]) == 3
+    # The outline of the first cell has pieces of tension 2 and 3, of the same length.
+    right = next(e for e, chain in enumerate(foam.chains) if chain[:, 0].max() > 1)
+    np.testing.assert_allclose(foam.tensions[right], 2.5)
+    np.testing.assert_allclose(foam.tension_spreads[right], 1.0)
+    left = 3 - right - inner
+    np.testing.assert_allclose([foam.tensions[left], foam.tension_spreads[left]], [1.0, 0.0])
+    ends = np.asarray(tissue.topology.edge_vertices)
+    for chain, (first, last) in zip(foam.chains, ends, strict=True):
+        np.testing.assert_array_equal(chain[[0, -1]], tissue.vertices[np.array([first, last])])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t[: t.index("bodies")], "no section `bodies`"),
+        (lambda t: t.replace("DIMENSION 2", "DIMENSION 3"), "3 dimensions"),
+        (lambda t: t.replace(" 6   7 1  color red\n", ""), "element 6 is used and not there"),
+        (lambda t: t.replace("1 2 5 6", "1 2 5 -6"), "no closed loop"),
+        (lambda t: t.replace(" 5   0   1", " 5   0"), "a line cannot be read"),
+        (lambda t: "nothing", "no section `vertices`"),
+    ],
+)
+def test_a_broken_file_is_refused(doublet, change, message):
+    doublet.write_text(change(DOUBLET), encoding="utf-8")
+    with pytest.raises(ValueError, match=f"doublet.fe is no planar foam.*{message}"):
+        vx.io.read_surface_evolver(doublet)
+
+
+def test_four_edges_at_a_point_are_refused(doublet):
+    text = DOUBLET.replace("edges\n", " 8 0.5 2\n 9 -0.5 2\nedges\n 7 5 8\n 8 8 9\n 9 9 5\n")
+    text = text.replace("bodies", " 3 7 8 9\nbodies").replace("read", " 3 3\nread", 1)
+    doublet.write_text(text.replace("/* facets */ 3 3\nread", ""), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"5 edges meet at the point \[0.0, 1.0\]"):
+        vx.io.read_surface_evolver(doublet)
+
+
+def test_no_text(tmp_path):
+    path = tmp_path / "image.dmp"
+    path.write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(ValueError, match="not text"):
+        vx.io.read_surface_evolver(path)
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="the folder shared/data is not there")
+@pytest.mark.parametrize("name", ["movie_0", "movie_3", "cells100"])
+def test_foams_with_known_areas(name):
+    path = DATA / f"{name}.dmp"
+    foam = vx.io.read_surface_evolver(path)
+    actual = re.findall(r"/\*actual: (\S+)\*/", path.read_text())
+    np.testing.assert_allclose(foam.tissue.areas, np.array(actual, float), rtol=1e-9)
+    outline = np.asarray(foam.tissue.topology.on_outline)
+    assert (np.asarray(foam.tension_spreads)[~outline] == 0).all()
+    assert not foam.tissue.overlaps.any
+    assert (np.asarray(foam.pressures) > 0).all()

@@ -1,0 +1,257 @@
+"""Dumps of Surface Evolver: planar foams whose tensions and pressures are known."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vertax.mesh import Free, Tissue, Topology
+from vertax.mesh._arcs import angle_of_area
+
+
+class Foam(eqx.Module):
+    """A foam of Surface Evolver."""
+
+    tissue: Tissue
+    """Its cells as a free tissue with arcs, inner ones too. Each arc encloses what its chain of pieces does,
+    so areas are those of the file."""
+    tensions: Float[Array, " edges"]
+    """Line tension of each edge, energy per length: the `density` of its pieces. Where they differ, as they
+    may on the outline, their mean by length."""
+    tension_spreads: Float[Array, " edges"]
+    """The largest difference between pieces of an edge; 0 where they agree."""
+    pressures: Float[Array, " cells"]
+    """Lagrange multipliers of the areas, energy per area; 0 for cells without."""
+    target_areas: Float[Array, " cells"]
+    """What the areas are held at; the area where a cell has none."""
+    time: float
+    """`TOTAL_TIME`."""
+    chains: tuple[Float[np.ndarray, "points 2"], ...]
+    """The points of each edge from one end to the other."""
+
+
+def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
+    """Read a planar foam from a dump or a data file of Surface Evolver (Brakke 1992,
+    doi:10.1080/10586458.1992.10504253).
+
+    Vertices, edges (with `density`), faces and bodies (with `volume` and `lagrange_multiplier`) are read, in
+    the string model; commands at the end are not. Vertices at which three edges meet become those of the
+    tissue, and what lies between is one edge.
+
+    **Arguments:**
+
+    - `path`: the file.
+
+    **Returns:** a [`Foam`][vertax.io.Foam].
+
+    **Raises:**
+
+    - `OSError` if the file cannot be read.
+    - `ValueError`, naming the file and the place, for one that is no such file or ends too soon, a foam that
+        is not planar, vertices at which more than three edges meet, and cells that make no cluster.
+    """
+    path = Path(path)
+    pieces = _parsed(path)
+    return _foam(pieces, path)
+
+
+class _Pieces(NamedTuple):
+    """What the file holds, numbered from 0."""
+
+    points: np.ndarray
+    edges: np.ndarray  # two points each
+    density: np.ndarray
+    loops: list[np.ndarray]  # of each body: edges from 1, negative if backwards; counter-clockwise
+    pressures: np.ndarray
+    volumes: np.ndarray
+    time: float
+
+
+_SECTIONS = ("vertices", "edges", "faces", "bodies")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+
+
+def _parsed(path: Path) -> _Pieces:
+    broken = lambda what: ValueError(f"{path} is no planar foam of Surface Evolver: {what}.")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise broken("it is not text") from error
+    text = re.sub(r"/\*.*?\*/", " ", text, flags=re.DOTALL)
+    text = re.sub(r"//[^\n]*", " ", text)
+    text = re.sub(r"\\[ \t]*\n", " ", text)
+    dimension = re.search(r"^SPACE_DIMENSION\s+(\d+)", text, re.MULTILINE | re.IGNORECASE)
+    if dimension is not None and dimension[1] != "2":
+        raise broken(f"its space has {dimension[1]} dimensions")
+    time = re.search(rf"^TOTAL_TIME\s+({_NUMBER})", text, re.MULTILINE | re.IGNORECASE)
+    rows: dict[str, list[list[str]]] = {name: [] for name in _SECTIONS}
+    section = None
+    for line in text.splitlines():
+        words = line.split()
+        if not words:
+            continue
+        first = words[0].lower()
+        if first in _SECTIONS or first in ("facets", "read"):
+            section = {"facets": "faces", "read": None}.get(first, first)
+            if first == "read":
+                break
+        elif section is not None and re.fullmatch(r"\d+", words[0]):
+            rows[section].append(words)
+    for name in _SECTIONS:
+        if not rows[name]:
+            raise broken(f"it has no section `{name}`, or ends before")
+    try:
+        points = {int(w[0]): (float(w[1]), float(w[2])) for w in rows["vertices"]}
+        edges = {
+            int(w[0]): (int(w[1]), int(w[2]), _after(w, "density", 1.0)) for w in rows["edges"]
+        }
+        faces = {int(w[0]): _integers(w[1:]) for w in rows["faces"]}
+        bodies = [
+            (_integers(w[1:]), _after(w, "volume", np.nan), _after(w, "lagrange_multiplier", 0.0))
+            for w in rows["bodies"]
+        ]
+    except (ValueError, IndexError) as error:
+        raise broken(f"a line cannot be read ({error})") from error
+    try:
+        number = {name: index for index, name in enumerate(points)}
+        place = {name: index for index, name in enumerate(edges)}
+        ends = np.array([(number[a], number[b]) for a, b, _ in edges.values()])
+        loops = [
+            np.array([(place[abs(e)] + 1) * np.sign(e) for e in _turned(faces, body)])
+            for body, *_ in bodies
+        ]
+    except KeyError as error:
+        raise broken(f"element {error} is used and not there; it may end too soon") from error
+    where = np.array(list(points.values()))
+    loops = [_counter_clockwise(loop, ends, where, broken) for loop in loops]
+    return _Pieces(
+        points=where,
+        edges=ends,
+        density=np.array([density for *_, density in edges.values()]),
+        loops=loops,
+        pressures=np.array([pressure for *_, pressure in bodies]),
+        volumes=np.array([volume for _, volume, _ in bodies]),
+        time=float(time[1]) if time else 0.0,
+    )
+
+
+def _after(words: list[str], name: str, default: float) -> float:
+    """The number after a word."""
+    lower = [word.lower() for word in words]
+    return float(words[lower.index(name) + 1]) if name in lower else default
+
+
+def _integers(words: list[str]) -> list[int]:
+    """The integers that a row begins with."""
+    found = []
+    for word in words:
+        if not re.fullmatch(r"[-+]?\d+", word):
+            break
+        found.append(int(word))
+    return found
+
+
+def _turned(faces: dict[int, list[int]], body: list[int]) -> list[int]:
+    """The edges around the one face of a body, in its direction."""
+    if len(body) != 1:
+        raise KeyError(f"of a body of {len(body)} faces")
+    loop = faces[abs(body[0])]
+    return loop if body[0] > 0 else [-edge for edge in reversed(loop)]
+
+
+def _counter_clockwise(
+    loop: np.ndarray, ends: np.ndarray, points: np.ndarray, broken: Callable[[str], ValueError]
+) -> np.ndarray:
+    """The edges around a face, such that it lies on their left."""
+    start = np.where(loop > 0, ends[abs(loop) - 1, 0], ends[abs(loop) - 1, 1])
+    stop = np.where(loop > 0, ends[abs(loop) - 1, 1], ends[abs(loop) - 1, 0])
+    if not np.array_equal(stop, np.roll(start, -1)):
+        raise broken("the edges of a face make no closed loop")
+    x, y = points[start].T
+    area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+    return loop if area > 0 else -loop[::-1]
+
+
+def _foam(pieces: _Pieces, path: Path) -> Foam:
+    n_cells, n_pieces = len(pieces.loops), len(pieces.edges)
+    # A directed piece is 2 e along edge e and 2 e + 1 against it.
+    directed = [2 * (abs(loop) - 1) + (loop < 0) for loop in pieces.loops]
+    face = np.full(2 * n_pieces, n_cells)
+    for cell, loop in enumerate(directed):
+        face[loop] = cell
+    used = np.minimum(face[0::2], face[1::2]) < n_cells
+    source = np.stack([pieces.edges[:, 0], pieces.edges[:, 1]], axis=1).ravel()
+    degree = np.bincount(pieces.edges[used].ravel(), minlength=len(pieces.points))
+    if degree.max() > 3:
+        raise ValueError(
+            f"{path}: {degree.max()} edges meet at the point {pieces.points[np.argmax(degree)].tolist()}, "
+            "and in a tissue three do. Split it by a short edge, e.g. with `pop`."
+        )
+    junction = degree == 3
+    following = np.full(2 * n_pieces, -1)
+    for loop in directed:
+        following[loop] = np.roll(loop, -1)
+    # Around the exterior the next piece leaves from where one arrives, and there is one such.
+    outside = (face == n_cells) & np.repeat(used, 2)
+    leaving = np.full(len(pieces.points), -1)
+    leaving[source[outside]] = np.flatnonzero(outside)
+    following[outside] = leaving[source[np.flatnonzero(outside) ^ 1]]
+
+    begins = np.flatnonzero(junction[source] & np.repeat(used, 2))
+    if len(begins) == 0:
+        raise ValueError(
+            f"{path}: no three edges meet anywhere, so there are no cells side by side."
+        )
+    chains = {int(first): _chain(int(first), following, junction[source]) for first in begins}
+    # Half-edges 3 v, 3 v + 1, 3 v + 2 leave vertex v counter-clockwise.
+    way = pieces.points[source[begins ^ 1]] - pieces.points[source[begins]]
+    order = np.lexsort((np.arctan2(way[:, 1], way[:, 0]), source[begins]))
+    begins = begins[order]
+    slot = {int(first): number for number, first in enumerate(begins)}
+    twin = np.array([slot[chains[int(first)][-1] ^ 1] for first in begins])
+    topology = Topology(twin, face[begins], np.zeros((len(begins), 2), int), exterior=True)
+
+    length = np.linalg.norm(np.diff(pieces.points[pieces.edges], axis=1)[:, 0], axis=1)
+    tensions, spreads, angles, courses = [], [], [], []
+    for half_edge in np.asarray(topology.half_edge):
+        chain = chains[int(begins[half_edge])]
+        which = np.array(chain) // 2
+        course = pieces.points[[source[chain[0]], *(source[piece ^ 1] for piece in chain)]]
+        density = pieces.density[which]
+        tensions.append(np.average(density, weights=np.maximum(length[which], 1e-300)))
+        spreads.append(np.ptp(density))
+        courses.append(course)
+        chord = course[-1] - course[0]
+        rest = course - course[0]
+        bulge = 0.5 * np.sum(rest[:-1, 0] * rest[1:, 1] - rest[:-1, 1] * rest[1:, 0])
+        angles.append(angle_of_area(np.array([bulge]), np.array([np.linalg.norm(chord)]))[0])
+    vertices = pieces.points[source[begins[::3]]]
+    tissue = Tissue(vertices, topology, Free(), angles=np.array(angles), inner_arcs=True)
+    areas = np.asarray(tissue.areas)
+    volumes = np.where(np.isnan(pieces.volumes), areas, pieces.volumes)
+    as_numbers = lambda values: jnp.asarray(values, tissue.vertices.dtype)
+    return Foam(
+        tissue=tissue,
+        tensions=as_numbers(tensions),
+        tension_spreads=as_numbers(spreads),
+        pressures=as_numbers(pieces.pressures),
+        target_areas=as_numbers(volumes),
+        time=pieces.time,
+        chains=tuple(courses),
+    )
+
+
+def _chain(first: int, following: np.ndarray, begins: np.ndarray) -> list[int]:
+    """Pieces from one junction to the next."""
+    chain = [first]
+    while not begins[following[chain[-1]]]:
+        chain.append(int(following[chain[-1]]))
+    return chain
