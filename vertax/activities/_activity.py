@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import abc
+import functools
+import operator
 
 import equinox as eqx
 import jax
@@ -85,14 +87,10 @@ class Sum(AbstractActivity):
     ) -> tuple[AbstractEnergy, PyTree[Array]]:
         """What all do in one step."""
         keys = jax.random.split(key, len(self.terms))
-        acts, states = zip(
-            *(
-                term.drive(s, tissue, dissipation, time, dt, k)
-                for term, s, k in zip(self.terms, state, keys, strict=True)
-            ),
-            strict=True,
-        )
-        return sum(acts[1:], acts[0]), states
+        parts = zip(self.terms, state, keys, strict=True)
+        drawn = [term.drive(s, tissue, dissipation, time, dt, key) for term, s, key in parts]
+        first, *rest = (acts for acts, _ in drawn)
+        return functools.reduce(operator.add, rest, first), tuple(state for _, state in drawn)
 
 
 def _terms(activity: AbstractActivity) -> tuple[AbstractActivity, ...]:

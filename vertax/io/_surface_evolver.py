@@ -11,7 +11,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vertax.mesh import Free, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
@@ -66,12 +66,13 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
 class _Pieces(NamedTuple):
     """What the file holds, numbered from 0."""
 
-    points: np.ndarray
-    edges: np.ndarray  # two points each
-    density: np.ndarray
-    loops: list[np.ndarray]  # of each body: edges from 1, negative if backwards; counter-clockwise
-    pressures: np.ndarray
-    volumes: np.ndarray
+    points: Float[np.ndarray, "points 2"]
+    edges: Int[np.ndarray, "edges 2"]
+    density: Float[np.ndarray, " edges"]
+    # Of each body: edges from 1, negative if backwards; counter-clockwise.
+    loops: list[Int[np.ndarray, " pieces"]]
+    pressures: Float[np.ndarray, " bodies"]
+    volumes: Float[np.ndarray, " bodies"]
     time: float
 
 
@@ -125,7 +126,7 @@ def _parsed(path: Path) -> _Pieces:
         place = {name: index for index, name in enumerate(edges)}
         ends = np.array([(number[a], number[b]) for a, b, _ in edges.values()])
         loops = [
-            np.array([(place[abs(e)] + 1) * np.sign(e) for e in _turned(faces, body)])
+            np.array([(place[abs(e)] + 1) * (1 if e > 0 else -1) for e in _turned(faces, body)])
             for body, *_ in bodies
         ]
     except KeyError as error:
@@ -168,11 +169,14 @@ def _turned(faces: dict[int, list[int]], body: list[int]) -> list[int]:
 
 
 def _counter_clockwise(
-    loop: np.ndarray, ends: np.ndarray, points: np.ndarray, broken: Callable[[str], ValueError]
-) -> np.ndarray:
+    loop: Int[np.ndarray, " pieces"],
+    ends: Int[np.ndarray, "edges 2"],
+    points: Float[np.ndarray, "points 2"],
+    broken: Callable[[str], ValueError],
+) -> Int[np.ndarray, " pieces"]:
     """The edges around a face, such that it lies on their left."""
-    start = np.where(loop > 0, ends[abs(loop) - 1, 0], ends[abs(loop) - 1, 1])
-    stop = np.where(loop > 0, ends[abs(loop) - 1, 1], ends[abs(loop) - 1, 0])
+    start = np.where(loop > 0, ends[np.abs(loop) - 1, 0], ends[np.abs(loop) - 1, 1])
+    stop = np.where(loop > 0, ends[np.abs(loop) - 1, 1], ends[np.abs(loop) - 1, 0])
     if not np.array_equal(stop, np.roll(start, -1)):
         raise broken("the edges of a face make no closed loop")
     x, y = points[start].T
@@ -183,7 +187,7 @@ def _counter_clockwise(
 def _foam(pieces: _Pieces, path: Path) -> Foam:
     n_cells, n_pieces = len(pieces.loops), len(pieces.edges)
     # A directed piece is 2 e along edge e and 2 e + 1 against it.
-    directed = [2 * (abs(loop) - 1) + (loop < 0) for loop in pieces.loops]
+    directed = [2 * (np.abs(loop) - 1) + (loop < 0) for loop in pieces.loops]
     face = np.full(2 * n_pieces, n_cells)
     for cell, loop in enumerate(directed):
         face[loop] = cell
@@ -249,7 +253,9 @@ def _foam(pieces: _Pieces, path: Path) -> Foam:
     )
 
 
-def _chain(first: int, following: np.ndarray, begins: np.ndarray) -> list[int]:
+def _chain(
+    first: int, following: Int[np.ndarray, " directed"], begins: Bool[np.ndarray, " directed"]
+) -> list[int]:
     """Pieces from one junction to the next."""
     chain = [first]
     while not begins[following[chain[-1]]]:

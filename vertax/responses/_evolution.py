@@ -45,7 +45,7 @@ class Evolved(Equilibrium):
 
     drive: PyTree[Array]
     """The state of the activity at the end, and of the random numbers: a run that begins there with `drive`
-    goes on as if it had not stopped. None without an activity."""
+    goes on as if it had not stopped, to rounding. None without an activity."""
     sound: Bool[Array, "*batch times"]
     """Whether all steps up to a frame came to an end, in tissues without overlaps."""
 
@@ -66,7 +66,9 @@ class Evolved(Equilibrium):
         """
         if not is_concrete(self.sound):
             reason = f"A step in time came to no end, or cells overlap. {_REMEDY}"
-            return eqx.error_if(self, ~self.converged, reason)
+            # (A callback to the host takes no keys.)
+            keys, rest = eqx.partition(self, _is_key)
+            return eqx.combine(eqx.error_if(rest, ~self.converged, reason), keys)
         if np.all(self.sound):
             return self
         first = np.argmin(np.asarray(self.sound), axis=-1).max()
@@ -89,6 +91,10 @@ class Evolved(Equilibrium):
             arrays_then, values_then = jax.tree.map(lambda x, i=number: x[i], (arrays, values))
             trajectory.append(eqx.combine(arrays_then, static), **values_then)
         return trajectory
+
+
+def _is_key(x: Any) -> bool:
+    return eqx.is_array(x) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 _REMEDY = (
