@@ -1,0 +1,71 @@
+"""Movement in time: a step against a relaxation, and a gradient against the way forward.
+
+    python benchmarks/evolution.py [--cells 100 1000] [--steps 20]
+
+A random tissue relaxes against friction, first in T1 transitions and then slowly, in so many steps over five
+units of time. Printed are steps a second, the time of one step as a share of a whole relaxation from the
+same start, the time of a gradient (with respect to all target shape factors and the friction) as a share of
+the way forward, and what the gradient keeps in memory for each step, as XLA counts it.
+"""
+
+import argparse
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from _timing import first_and_best
+
+import vertax as vx
+
+jax.config.update("jax_enable_x64", True)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description="Measure movement in time.")
+    parser.add_argument("--cells", type=int, nargs="+", default=[100, 1000])
+    parser.add_argument("--steps", type=int, default=20)
+    chosen = parser.parse_args()
+    print("cells  steps/s  step/relaxation  gradient/forward  kB a step  T1s")
+    best = lambda *call: first_and_best(*call, repeats=3)[1]
+    for n_cells in chosen.cells:
+        tissue = vx.initialise.periodic_voronoi(n_cells=n_cells, key=0)
+        parameters = (jnp.full(n_cells, 3.7), jnp.array(1.0))
+        times = jnp.linspace(0, 5, chosen.steps + 1)
+
+        def movie(parameters, times, tissue=tissue):
+            targets, friction = parameters
+            energy = vx.energies.ShapeFactorEnergy(targets)
+            dissipation = vx.dissipations.SubstrateFriction(friction)
+            return vx.evolve(tissue, energy, dissipation, times, throw=False)
+
+        def cost(parameters, times, movie=movie):
+            return jnp.sum(movie(parameters, times).tissue.perimeters ** 2)
+
+        forward = eqx.filter_jit(lambda p, t, movie=movie: movie(p, t).tissue.vertices)
+        gradient = eqx.filter_jit(jax.grad(cost))
+        relax = eqx.filter_jit(
+            lambda p, tissue=tissue: (
+                vx.equilibrate(
+                    tissue, vx.energies.ShapeFactorEnergy(p[0]), throw=False
+                ).tissue.vertices
+            )
+        )
+        step = best(forward, parameters, times) / chosen.steps
+        rest = best(relax, parameters)
+        back = best(gradient, parameters, times) / chosen.steps
+        sizes = []
+        for part in (times, times[: chosen.steps // 2 + 1]):
+            analysis = jax.jit(jax.grad(cost)).lower(parameters, part).compile().memory_analysis()
+            sizes.append(analysis.temp_size_in_bytes if analysis else float("nan"))
+        kept = (sizes[0] - sizes[1]) / (chosen.steps - chosen.steps // 2)
+        num_t1 = movie(parameters, times).num_t1
+        print(
+            f"{n_cells:5d}  {1 / step:7.1f}  {step / rest:15.2f}  {back / step:16.2f}  {kept / 1e3:9.1f}  "
+            f"{num_t1:3d}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
