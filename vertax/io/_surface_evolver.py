@@ -34,7 +34,7 @@ class Foam(eqx.Module):
     """What the areas are held at; the area where a cell has none."""
     time: float
     """`TOTAL_TIME`."""
-    chains: tuple[Float[np.ndarray, "points 2"], ...]
+    chains: tuple[Float[np.ndarray, "_ 2"], ...]
     """The points of each edge from one end to the other."""
 
 
@@ -70,7 +70,7 @@ class _Pieces(NamedTuple):
     edges: Int[np.ndarray, "edges 2"]
     density: Float[np.ndarray, " edges"]
     # Of each body: edges from 1, negative if backwards; counter-clockwise.
-    loops: list[Int[np.ndarray, " pieces"]]
+    loops: list[Int[np.ndarray, " _"]]
     pressures: Float[np.ndarray, " bodies"]
     volumes: Float[np.ndarray, " bodies"]
     time: float
