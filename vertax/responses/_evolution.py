@@ -363,7 +363,7 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
         there = evolution.placed(state.tissue, end)
         pulls = energy_at(end) if acts is None else energy_at(end) + acts
         potential = Incremental(pulls, evolution.dissipation, before, end - start, strained)
-        return state.after(evolution.relaxation.solve(there, potential, adjoint))
+        return state.after(evolution.relaxation.solve_thriftily(there, potential, adjoint))
 
     def step(state: _State, start: Any, end: Any) -> _State:
         before, acts, dt = state.tissue, None, end - start
