@@ -56,9 +56,9 @@ class ThermalNoise(AbstractActivity):
         moved = lambda vertices: dissipation.strains(tissue.with_vertices(vertices), tissue)
         strains, pull = jax.vjp(moved, tissue.vertices)
         (force,) = pull(jax.random.normal(key, strains.shape, strains.dtype))
-        return Push(_root(2 * self.temperature / dt) * force), state
+        return Push(root(2 * self.temperature / dt) * force), state
 
 
-def _root(x: Float[Array, ""]) -> Float[Array, ""]:
+def root(x: Float[Array, ""]) -> Float[Array, ""]:
     """The square root, with the slope 0 at 0."""
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)

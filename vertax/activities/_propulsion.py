@@ -8,9 +8,11 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
 from vertax._base.checks import as_real, check_number
 from vertax.activities._activity import AbstractActivity
+from vertax.activities._noise import root
 from vertax.activities._push import Push
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import per_cell
 from vertax.mesh import Tissue
 
 
@@ -61,11 +63,6 @@ class SelfPropulsion(AbstractActivity):
         key: PRNGKeyArray,
     ) -> tuple[AbstractEnergy, PyTree[Array]]:
         """Forces on vertices."""
-        if self.force.shape not in ((), (tissue.n_cells,)):
-            raise ValueError(
-                f"Argument `force` must be a scalar or have one entry a cell, shape ({tissue.n_cells},), "
-                f"but its shape is {self.force.shape}."
-            )
         angles, last = state
         m = tissue.topology
         # Cells of half-edges; the exterior, of number n_cells, is dropped.
@@ -75,14 +72,12 @@ class SelfPropulsion(AbstractActivity):
         ahead = jnp.arctan2(velocity[:, 1], jnp.where(still, 1, velocity[:, 0]))
         turn = jnp.where(still, 0, self.alignment * jnp.sin(ahead - angles)) * dt
         noise = jax.random.normal(key, angles.shape, angles.dtype)
-        spread = 2 * self.rotational_diffusion * dt
-        angles = (
-            angles
-            + turn
-            + jnp.where(spread > 0, jnp.sqrt(jnp.where(spread > 0, spread, 1)), 0) * noise
-        )
+        angles = angles + turn + root(2 * self.rotational_diffusion * dt) * noise
         direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-        shares = jnp.broadcast_to(self.force, angles.shape) / m.neighbour_counts
+        shares = (
+            jnp.broadcast_to(per_cell(self.force, tissue, "force"), angles.shape)
+            / m.neighbour_counts
+        )
         of_cells = jnp.append(shares[:, None] * direction, jnp.zeros((1, 2), angles.dtype), axis=0)
         force = jnp.sum(of_cells[m.cell].reshape(-1, 3, 2), axis=1)
         return Push(force), (angles, tissue.vertices)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from vertax.dissipations._dissipation import AbstractViscosity
 from vertax.dissipations._friction import coefficient_of, entries
@@ -22,10 +25,7 @@ class EdgeViscosity(AbstractViscosity):
     - `ValueError` for a negative viscosity or one of another shape.
     """
 
-    viscosity: Float[Array, "*edges"]
-
-    def __init__(self, viscosity: ArrayLike):
-        self.viscosity = coefficient_of("viscosity", viscosity)
+    viscosity: Float[Array, "*edges"] = eqx.field(converter=partial(coefficient_of, "viscosity"))
 
     def strains(self, tissue: Tissue, before: Tissue) -> Float[Array, " strains"]:
         """Elongations, weighted."""
@@ -48,10 +48,7 @@ class PerimeterViscosity(AbstractViscosity):
     - `ValueError` for a negative viscosity or one of another shape.
     """
 
-    viscosity: Float[Array, "*cells"]
-
-    def __init__(self, viscosity: ArrayLike):
-        self.viscosity = coefficient_of("viscosity", viscosity)
+    viscosity: Float[Array, "*cells"] = eqx.field(converter=partial(coefficient_of, "viscosity"))
 
     def strains(self, tissue: Tissue, before: Tissue) -> Float[Array, " strains"]:
         """Changes of perimeters, weighted."""
@@ -71,10 +68,7 @@ class AreaViscosity(AbstractViscosity):
     - `ValueError` for a negative viscosity or one of another shape.
     """
 
-    viscosity: Float[Array, "*cells"]
-
-    def __init__(self, viscosity: ArrayLike):
-        self.viscosity = coefficient_of("viscosity", viscosity)
+    viscosity: Float[Array, "*cells"] = eqx.field(converter=partial(coefficient_of, "viscosity"))
 
     def strains(self, tissue: Tissue, before: Tissue) -> Float[Array, " strains"]:
         """Changes of areas, weighted."""

@@ -140,14 +140,14 @@ class Evolution(AbstractResponse):
 
     dissipation: AbstractDissipation
     times: Float[Array, " times"]
-    activity: AbstractActivity | None = None
-    key: PRNGKeyArray | None = None
-    drive: PyTree[Array] = None
-    substeps: int = eqx.field(static=True, default=1)
-    order: int = eqx.field(static=True, default=1)
-    boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None = None
-    pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None = None
-    relaxation: Relaxation = eqx.field(default_factory=Relaxation)
+    activity: AbstractActivity | None
+    key: PRNGKeyArray | None
+    drive: PyTree[Array]
+    substeps: int = eqx.field(static=True)
+    order: int = eqx.field(static=True)
+    boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None
+    pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None
+    relaxation: Relaxation
 
     def __init__(
         self,
@@ -189,7 +189,7 @@ class Evolution(AbstractResponse):
             if function is not None and not callable(function):
                 raise TypeError(
                     f"Argument `{name}` must be a function of time, but is {named(function)}. For one that "
-                    f"stays, leave it out."
+                    "stays, leave it out."
                 )
         check_whole("substeps", substeps, least=1)
         if order not in (1, 2):
@@ -353,8 +353,6 @@ _SHARE = 1 - 0.5**0.5
 def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: AbstractAdjoint) -> Evolved:
     times = evolution.times.astype(tissue.vertices.dtype)
     energy_at = energy if not isinstance(energy, AbstractEnergy) else lambda _: energy
-    structure = eqx.partition(tissue, eqx.is_array)[1]
-    whole = lambda arrays: eqx.combine(arrays, structure)
 
     def stage(
         state: _State, before: Tissue, acts: Any, start: Any, end: Any, strained: Any
@@ -363,7 +361,7 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
         there = evolution.placed(state.tissue, end)
         pulls = energy_at(end) if acts is None else energy_at(end) + acts
         potential = Incremental(pulls, evolution.dissipation, before, end - start, strained)
-        return state.after(evolution.relaxation.solve_thriftily(there, potential, adjoint))
+        return state.after(evolution.relaxation.solve(there, potential, adjoint, thrifty=True))
 
     def step(state: _State, start: Any, end: Any) -> _State:
         before, acts, dt = state.tissue, None, end - start
@@ -386,11 +384,11 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
         marks = ends[0] + shares * (ends[1] - ends[0])
 
         def substep(arrays: _State, ends: tuple[Array, Array]) -> tuple[_State, None]:
-            return eqx.filter(step(whole_state(arrays), *ends), eqx.is_array), None
+            return eqx.filter(step(whole(arrays), *ends), eqx.is_array), None
 
         before = arrays.num_t1
         arrays, _ = jax.lax.scan(substep, arrays, (marks[:-1], marks[1:]))
-        tissue = whole(arrays.tissue)
+        tissue = whole(arrays).tissue
         sound = arrays.arrived & arrays.valid
         frame = (arrays.tissue, energy_at(ends[1])(tissue), arrays.num_t1 - before, sound)
         return arrays, frame
@@ -403,10 +401,10 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
         drive = (evolution.activity.init(tissue, first), rest)
     begin = _State(tissue, drive, jnp.zeros((), times.dtype), none, none, yes, yes)
     arrays, static = eqx.partition(begin, eqx.is_array)
-    whole_state = lambda arrays: eqx.combine(arrays, static)
+    whole = lambda arrays: eqx.combine(arrays, static)
     end, (frames, energies, flips, sound) = jax.lax.scan(interval, arrays, (times[:-1], times[1:]))
     join = lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest])
-    end = whole_state(end)
+    end = whole(end)
     energies = join(energy_at(times[0])(tissue), energies)
     return Evolved(
         tissue=end.tissue,
@@ -417,7 +415,7 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
         valid=end.valid,
         result=end.result,
         times=times,
-        frames=whole(jax.tree.map(join, arrays.tissue, frames)),
+        frames=eqx.combine(jax.tree.map(join, arrays.tissue, frames), static.tissue),
         energies=energies,
         transitions=join(none, flips),
         drive=end.drive,

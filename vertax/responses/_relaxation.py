@@ -124,24 +124,22 @@ class Relaxation(AbstractResponse):
         _check_sharding((tissue, energy))
 
     def solve(
-        self, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        adjoint: AbstractAdjoint,
+        *,
+        thrifty: bool = False,
     ) -> Equilibrium:
-        """Relax a tissue as a part of a larger compiled function: nothing is checked."""
-        search, end = self._searched(tissue, energy)
-        return conclude(search, end, tissue, energy, adjoint, self.max_steps)
+        """Relax a tissue as a part of a larger compiled function: nothing is checked.
 
-    def solve_thriftily(
-        self, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
-    ) -> Equilibrium:
-        """The same as one of many in a row: a gradient keeps little of it, and evaluates the rest again."""
-        search, end = self._searched(tissue, energy)
-        again = eqx.filter_checkpoint(conclude)
-        return again(search, end, tissue, energy, adjoint, self.max_steps)
-
-    def _searched(self, tissue: Tissue, energy: AbstractEnergy) -> tuple[Search, SearchState]:
+        If `thrifty`, a gradient keeps little of it and evaluates the rest again: for one of many in a row.
+        """
         start, constant = frozen((tissue, energy))
         search = self.search(start, constant)
-        return search, search.advance(search.begin(start, constant), constant, self.max_steps)
+        end = search.advance(search.begin(start, constant), constant, self.max_steps)
+        finish = eqx.filter_checkpoint(conclude) if thrifty else conclude
+        return finish(search, end, tissue, energy, adjoint, self.max_steps)
 
     def finer(self, tolerance: Float[Array, ""]) -> Relaxation:
         """The same, at rest only where the largest force is below this tolerance too."""

@@ -94,7 +94,7 @@ class NewtonCG(AbstractSolver):
             error = _size(missing) / jnp.where(scale > 0, scale, 1)
             harmless = 0.5 * jnp.abs(_row_dot(missing, step)) < due
             foreseen = (error < 0.25) | harmless
-            blamed = jnp.where(accept, error > 0.75, True) & ~foreseen
+            blamed = ~foreseen & (~accept | (error > 0.75))
             shrunk = jnp.maximum(0.25 * radius, jnp.minimum(0.5 * length, radius))
             shrunk = jnp.where(accept, shrunk, 0.25 * radius)
             grows = accept & (fine | foreseen) & (length > 0.3 * radius)
