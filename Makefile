@@ -11,7 +11,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-docs test-experiments test-slow notebooks notebooks-write lint format types docs benchmark build clean
+.PHONY: help demo test test-thorough test-docs test-experiments test-slow notebooks notebooks-write lint format types docs benchmark build clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 22
@@ -21,6 +21,9 @@ demo: $(VENV)/.base ## infer hidden shape factors of a synthetic tissue and show
 
 test: $(VENV)/.dev ## the tests that run on every change
 	$(BIN)/python tests/run.py --workers $(WORKERS) $(PYTEST_OPTIONS)
+
+test-thorough: $(VENV)/.dev ## the same with other solvers, adjoints and boundaries
+	$(BIN)/python tests/run.py --workers $(WORKERS) -m "thorough and not slow" $(PYTEST_OPTIONS)
 
 test-docs: $(VENV)/.dev ## the code in the README and in the documentation
 	$(BIN)/python tests/run.py --only project/test_code_blocks.py -m docs $(PYTEST_OPTIONS)

@@ -8,7 +8,8 @@ from pathlib import Path
 # Tests compile more than they compute: less optimisation is a third of the time. Read when JAX starts.
 FLAGS = ["--xla_backend_optimization_level=0"]
 if version("jaxlib").startswith("0.10."):
-    FLAGS.append("--xla_cpu_use_fusion_emitters=false")  # XLA stops at flags that it does not know
+    # (XLA stops at flags that it does not know.)
+    FLAGS += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["VERTAX_CACHE"] = "off"  # nothing of the tests in the user's cache folder
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS])
 

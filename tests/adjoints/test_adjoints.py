@@ -113,6 +113,7 @@ def test_hypergradient_against_a_dense_reference(adjoint, response, rtol, n_cell
 
 
 @adjoints("automatic")
+@pytest.mark.thorough
 def test_topology_changes_on_the_way(adjoint, response, rtol):
     _, _, cost = start_and_cost()
     tissue = random_tissue(CELLS, 5)
@@ -190,6 +191,7 @@ def test_parameters_of_every_kind(adjoint, response, rtol):
 
 
 @adjoints("propagation")
+@pytest.mark.thorough
 def test_vmap(adjoint, response, rtol):
     tissue, _, cost = start_and_cost()
     p0 = shape_factors(CELLS, 3.7, 0.1, 9)
@@ -201,6 +203,7 @@ def test_vmap(adjoint, response, rtol):
 
 
 @adjoints("propagation")
+@pytest.mark.thorough
 def test_float32(adjoint, response, rtol):
     tissue, _, cost = start_and_cost()
     energy = ShapeFactorEnergy(shape_factors(CELLS, 3.7, 0.1, 4))
@@ -216,12 +219,13 @@ def test_float32(adjoint, response, rtol):
 
 def solver_pairs():
     """Every adjoint with every solver; only some of the pairs are tried on every change."""
-    quick = {("propagation", "lbfgs")}
+    often = {("propagation", "lbfgs")}
     for adjoint_name, adjoint, _, rtol in ADJOINTS:
         for name, solver, reach in SOLVERS:
             if adjoint.unrolls and name not in ("gradient_descent", "optax_adam"):
                 continue
-            mark = () if (adjoint_name, name) in quick else (pytest.mark.slow,)
+            pair = adjoint_name, name
+            mark = pytest.mark.thorough if pair in often else pytest.mark.slow
             label = f"{adjoint_name}-{name}"
             yield pytest.param(adjoint, rtol, name, solver, reach, id=label, marks=mark)
 
@@ -280,6 +284,7 @@ def implicit_loss(mode):
 
 
 @pytest.mark.parametrize("mode", ["adjoint", pytest.param("sensitivity", marks=pytest.mark.slow)])
+@pytest.mark.thorough
 def test_forward_mode(mode):
     loss, p0, gradient = implicit_loss(mode)
     assert distance(jax.jit(jax.jacfwd(loss))(p0), gradient) < 1e-7
@@ -386,7 +391,9 @@ class TestOutcome:
             pytest.param(
                 vx.EquilibriumPropagation(), RASH, id="propagation", marks=pytest.mark.slow
             ),
-            pytest.param(vx.AutomaticDifferentiation(), RASH, id="automatic"),
+            pytest.param(
+                vx.AutomaticDifferentiation(), RASH, id="automatic", marks=pytest.mark.thorough
+            ),
         ],
     )
     def test_a_gradient_that_cannot_be_trusted_is_refused(self, adjoint, response):
@@ -457,6 +464,7 @@ class TestNudgeByTheCost:
         with pytest.raises(ValueError, match="InverseProblem"):
             vx.equilibrate(tissue, energy, adjoint=vx.EquilibriumPropagation(nudge="cost"))
 
+    @pytest.mark.thorough
     def test_it_steers_topology(self):
         # A cost of the topology has no slope, so only a nudge that may flip edges can follow it.
         tissue, energy = relaxed(CELLS, 2, 3.75)

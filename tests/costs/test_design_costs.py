@@ -178,6 +178,7 @@ def test_a_gradient_through_the_equilibrium_periodic():
     _check_hypergradient(tissue, start, cost)
 
 
+@pytest.mark.thorough
 def test_a_gradient_through_the_equilibrium_free():
     tissue = cluster(6, 1, lloyd_steps=2)
     start = e2(tissue)

@@ -300,6 +300,7 @@ def test_guidance_leads_through_t1s_to_the_hidden_parameters(crossing):
     ],
     ids=["ID", "EP"],
 )
+@pytest.mark.thorough
 def test_gradients_under_guidance(adjoint):
     target, _ = relaxed(12, 3)
     guess = vx.energies.ShapeFactorEnergy(shape_factors(12, 3.7, 0.1, 5))

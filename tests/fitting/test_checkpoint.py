@@ -72,13 +72,11 @@ def path(tmp_path):
     return tmp_path / "fit.npz"
 
 
-COMPILES_LONG = ("least squares, batch", "batch", "guided", "noisy")
+MARKS = dict.fromkeys(("least squares, batch", "batch", "guided", "noisy"), pytest.mark.slow)
+MARKS |= dict.fromkeys(("least squares", "position"), pytest.mark.thorough)
 
 
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(c, marks=[pytest.mark.slow] if c in COMPILES_LONG else []) for c in CASES],
-)
+@pytest.mark.parametrize("case", [pytest.param(c, marks=MARKS.get(c, ())) for c in CASES])
 def test_an_interrupted_fit_goes_on_to_the_same_numbers(case, path):
     whole = run(case, callback=interrupt_at(None))
     stopped = run(case, callback=interrupt_at(3), checkpoint=path)

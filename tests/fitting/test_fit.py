@@ -61,6 +61,7 @@ def test_shape_factors_are_recovered_from_vertices(hidden):
     assert equilibrium.num_steps <= 1
 
 
+@pytest.mark.thorough
 def test_shape_factors_are_recovered_from_an_image_of_a_displaced_tissue(hidden):
     target, truth, guess, start = hidden
     image = render(target, (96, 96), 0.07)
@@ -74,6 +75,7 @@ def test_shape_factors_are_recovered_from_an_image_of_a_displaced_tissue(hidden)
     assert biased.history.relative_error[-1] > 10 * fit.history.relative_error[-1]
 
 
+@pytest.mark.thorough
 def test_the_loss_without_the_helper_is_plain_jax(hidden):
     target, _, guess, start = hidden
     cost, adjoint = VertexDistance(target), vx.ImplicitDifferentiation()
@@ -96,6 +98,7 @@ def test_gradient_with_respect_to_the_position(hidden):
     assert slope == pytest.approx(float(difference), rel=1e-7)
 
 
+@pytest.mark.thorough
 def test_only_chosen_leaves_are_fitted(hidden):
     target, _, guess, start = hidden
     energy = guess + LineTension(jnp.full(30, 0.01))
@@ -255,6 +258,7 @@ def test_a_batch_is_fitted_as_its_members_are(batch, optimiser):
         )
 
 
+@pytest.mark.thorough
 def test_a_member_that_breaks_down_leaves_the_others_alone(batch):
     _, stacked, _, truths = batch
     broken = eqx.tree_at(
@@ -324,6 +328,7 @@ def test_a_gradient_that_cannot_be_trusted_ends_a_fit(hidden):
     assert (run(False).history.gradient_residual > 1e-3).all()
 
 
+@pytest.mark.thorough
 def test_the_protocol_of_the_paper(hidden):
     target, truth, guess, start = hidden
     problem = vx.InverseProblem(

@@ -94,7 +94,7 @@ class OneNumber(vx.costs.AbstractLeastSquaresCost):
         return tissue.perimeters[0] - self.wanted
 
 
-@pytest.mark.parametrize("noise", [1e-1, 1e-7])
+@pytest.mark.parametrize("noise", [pytest.param(1e-1, marks=pytest.mark.thorough), 1e-7])
 def test_it_names_what_the_data_do_not_determine(hidden, noise):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + noise * jax.random.normal(jax.random.key(0), (20,))

@@ -23,6 +23,7 @@ def pinned(image):
     return micrograph_problem(image, border="pinned", pixels=96, response=LOOSE)
 
 
+@pytest.mark.thorough
 def test_a_pinned_border_does_not_move(pinned):
     problem = pinned.problem
     on_outline = np.asarray(problem.tissue.topology.on_outline)

@@ -39,6 +39,7 @@ def test_a_balance_of_forces_gives_back_tensions_and_pressures(foam):
     np.testing.assert_allclose(area.pressures(tissue), pressure, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_shape_that_no_tensions_hold_is_met_as_well_as_can_be(foam):
     tissue, *_ = foam
     noise = 0.02 * jax.random.normal(jax.random.key(5), tissue.vertices.shape)

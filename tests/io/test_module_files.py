@@ -237,6 +237,7 @@ class TestRoundTrip:
         loaded = load_problem(path, classes=[Contractility, Nearest, lx.LU, Steepest])
         assert same(loaded, problem)
 
+    @pytest.mark.thorough
     def test_a_loaded_problem_has_the_same_gradient(self, path, tissues):
         problem = problem_of(tissues["periodic"], response=STILL, guidance=None)
         save_problem(path, problem)

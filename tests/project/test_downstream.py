@@ -5,10 +5,12 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from downstream import contraction
 from helpers import central_difference, random_tissue
 
 
+@pytest.mark.thorough
 def test_it_fits_and_finds_everything_again(tmp_path):
     tissue = random_tissue(4)
     problem = contraction.problem(tissue)

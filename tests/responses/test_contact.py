@@ -12,6 +12,7 @@ from hypothesis import given, settings, strategies as st
 from tilings import faces_that_overlap
 
 import vertax as vx
+from vertax.responses._contact import no_contacts
 
 N = 20
 relaxed = vx.Relaxation(max_steps=300)
@@ -54,7 +55,7 @@ def test_a_random_cluster_stays_valid(seed, inner_arcs):
     "solver",
     [
         pytest.param(vx.solvers.FIRE(), id="FIRE", marks=pytest.mark.slow),
-        pytest.param(vx.solvers.LBFGS(), id="LBFGS"),
+        pytest.param(vx.solvers.LBFGS(), id="LBFGS", marks=pytest.mark.thorough),
     ],
 )
 def test_steps_of_any_solver_are_undone_where_cells_would_overlap(solver):
@@ -90,6 +91,24 @@ def test_nothing_changes_where_nothing_touches():
     held, free = (vx.Relaxation(contact_range=r)(start, pushed) for r in (0.01, None))
     assert held.num_steps == free.num_steps
     np.testing.assert_allclose(held.tissue.vertices, free.tissue.vertices, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-3])
+def test_an_edge_that_vanishes_along_another_side_has_a_moderate_curvature(offset):
+    tissue = tissue_of(0)
+    m = tissue.topology
+    # The edge from a to b folds back onto the side of the same face that ends at a.
+    side = int(m.previous[0])
+    along = np.asarray(tissue.sides[side, 2:4])
+    away = 1e-7 * (offset * np.array([-along[1], along[0]]) - along)
+    b = int(m.next[0]) // 3
+    there = tissue.with_vertices(tissue.vertices.at[b].add(away - tissue.sides[0, 2:4]))
+    one = jnp.asarray(1.0)
+    contacts, _ = no_contacts(0.01, {"length_scale": one, "stiffness": one}, there).found(there)
+    assert [int(m.next[0]), side] in contacts.pairs.tolist()
+    own = lambda x: contacts(there.with_vertices(there.vertices.at[b].set(x)))
+    curvature = jax.hessian(own)(there.vertices[b])
+    assert np.abs(curvature).max() < 1e5 * contacts.strength
 
 
 def test_a_negative_range_is_refused():

@@ -153,6 +153,7 @@ class TestGradients:
                 slope, central_difference(f, parameters, tuple(direction)), rtol=1e-6
             )
 
+    @pytest.mark.thorough
     def test_equilibrium_propagation_agrees_step_by_step(self):
         parameters, cost = self.problem()
         slope = lambda adjoint: eqx.filter_jit(jax.grad(lambda p: cost(p, adjoint)))(parameters)
@@ -277,6 +278,7 @@ def test_other_numbers_compile_nothing_and_batches_agree():
     np.testing.assert_allclose(first.tissue.vertices, other.tissue.vertices, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_a_cluster_with_arcs_rounds_up_and_stays_where_it_is():
     tissue = cluster(9, 2)
     energy = AreaElasticity(2.0, 1.0) + LineTension(jnp.full(tissue.n_edges, 0.3))

@@ -142,6 +142,7 @@ def test_all_solvers_reach_the_same_drop(solver, force):
     np.testing.assert_allclose(found.tissue.areas, exact.areas, atol=100 * force)
 
 
+@pytest.mark.thorough
 def test_units_of_length_do_not_matter_to_the_solver():
     # Micrometres: lengths and angles differ by orders of magnitude, and the energy has a scale too.
     unit = 20.0
@@ -212,6 +213,7 @@ def test_pinned_vertices_stay_and_are_differentiable(n_pinned, seed):
     assert jnp.sum(gradient * direction) == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_pinned_vertices_of_a_periodic_tissue():
     whole = vx.initialise.periodic_voronoi(9, key=jax.random.key(2))
     pinned = jnp.zeros(18, bool).at[jnp.array([0, 7])].set(True)

@@ -114,6 +114,7 @@ def test_zero_modes_count_rigid_and_fluid_states():
     assert zero_modes(found.tissue, fluid) == 2 * n + 1
 
 
+@pytest.mark.thorough
 def test_tissues_are_rigid_at_low_and_fluid_at_high_target_shape_factor():
     # Random Voronoi tissues, quenched with T1s: all carry energy well below the transition near 3.81
     # (Bi et al. 2015). Above 4.0 even cells with four sides (index 4 at best) reach their target; in
@@ -154,7 +155,7 @@ def slope_by_strain(tissue, energy):
     return jax.grad(relaxed_energy)(jnp.zeros((2, 2))) / tissue.boundary.area
 
 
-@pytest.mark.parametrize("p0", [3.6, 3.75])
+@pytest.mark.parametrize("p0", [pytest.param(3.6, marks=pytest.mark.thorough), 3.75])
 def test_stress_from_tensions_and_pressures_is_the_derivative_by_the_strain_of_the_box(p0):
     # σ = (1/A_box) [Σ K_A (A - A0) A I + Σ_edges T l⊗l/|l|], T = γ + Σ over both cells K_P (P - P0).
     k_a, a_0, k_p, p_0, gamma = values = jnp.array([3.0, 1.1, 1.4, p0, 0.2])

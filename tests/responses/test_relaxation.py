@@ -88,7 +88,7 @@ def relaxed_one_by_one(tissues, targets):
 @pytest.mark.parametrize(
     "p0",
     [
-        3.5,
+        pytest.param(3.5, marks=pytest.mark.thorough),
         pytest.param(3.7, marks=pytest.mark.slow),
         pytest.param(3.8, marks=pytest.mark.slow),
         3.9,
@@ -115,6 +115,7 @@ def test_random_tissues_reach_true_equilibria(p0):
     assert by_themselves >= 4
 
 
+@pytest.mark.thorough
 def test_vmap_and_single_runs_agree():
     batch = [random_tissue(12, s) for s in range(3)]
     energy = AreaElasticity(20.0, 1.0) + LineTension(jnp.full(36, 0.5))
@@ -153,6 +154,7 @@ class Scaled(vx.AbstractEnergy):
 @pytest.mark.parametrize(
     "solver", [vx.solvers.NewtonCG(), vx.solvers.FIRE()], ids=["newton", "fire"]
 )
+@pytest.mark.thorough
 def test_units_do_not_matter(solver):
     # The same physics in cells, in micrometres and in pixels, with all defaults and any unit of energy.
     tissue, p0 = random_tissue(12, 3), shape_factors(12, 3.7, 0.1)
@@ -292,6 +294,7 @@ class Substrate(vx.AbstractEnergy):
 
 
 @pytest.mark.parametrize("boundary", ["periodic", "free"])
+@pytest.mark.thorough
 def test_an_energy_may_know_where_the_tissue_is(boundary):
     tissue = random_tissue(9, 1) if boundary == "periodic" else cluster(6, 1, lloyd_steps=2)
     home = tissue.vertices + jnp.array([0.4, -0.2])

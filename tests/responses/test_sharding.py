@@ -34,5 +34,6 @@ np.testing.assert_allclose(share(check_vma=False)(p0), jax.lax.map(area, p0), rt
 
 # With transitions and contacts four times as much is compiled.
 @pytest.mark.parametrize("what", ["solver", pytest.param("all", marks=pytest.mark.slow)])
+@pytest.mark.thorough
 def test_a_batch_is_shared_between_devices(what):
     subprocess.run([sys.executable, "-c", CODE, what], check=True)

@@ -89,6 +89,7 @@ class TestRelaxation:
         for k, frame in zip(sparse.values["num_steps"].tolist(), sparse, strict=True):
             assert same_bits(frame, way[numbers.index(k)])
 
+    @pytest.mark.thorough
     def test_a_free_cluster_does_not_turn(self):
         tissue = cluster(5)
         equilibrium, way = record_relaxation(tissue, tension(tissue), LOOSE, every=5)
@@ -98,6 +99,7 @@ class TestRelaxation:
             drift = frame.boundary.drift(frame.vertices, tissue.vertices)
             np.testing.assert_allclose(drift, 0, atol=1e-12)
 
+    @pytest.mark.thorough
     def test_an_energy_that_knows_positions_may_move_the_whole(self):
         class Trap(vx.AbstractEnergy):
             stiffness: float = 1.0
@@ -157,6 +159,7 @@ class TestRelaxation:
 
 
 class TestFit:
+    @pytest.mark.thorough
     def test_a_trajectory_is_a_callback(self):
         target = STILL(random_tissue(4), vx.energies.ShapeFactorEnergy(3.6)).tissue
         problem = vx.InverseProblem(

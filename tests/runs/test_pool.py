@@ -103,6 +103,7 @@ def test_a_fit_that_ends_does_not_take_back_an_interrupt(tmp_path, monkeypatch):
         folder.fit("c", short, None, 3)
 
 
+@pytest.mark.thorough
 def test_an_interrupt_ends_fits_in_other_threads_after_their_epoch(tmp_path):
     """Ctrl-C reaches one thread; here it comes while the second of three fits is at its third epoch."""
     problems = [problem(p0) for p0 in (3.6, 3.65, 3.7)]

@@ -68,6 +68,7 @@ def tables(run):
 
 # In the first fit, and in the second one, when the first is kept.
 @pytest.mark.parametrize("epoch", [pytest.param(2, marks=pytest.mark.slow), 5])
+@pytest.mark.thorough
 def test_an_interrupted_run_goes_on_to_the_same_numbers(whole, interrupt, tmp_path, epoch):
     run = tmp_path / "run"
     interrupt(epoch)

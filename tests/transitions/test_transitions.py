@@ -143,7 +143,7 @@ def test_the_number_of_flips_of_an_edge_is_bounded():
     np.testing.assert_array_equal(counts, full)
 
 
-@pytest.mark.parametrize("boundary", ["periodic", "free"])
+@pytest.mark.parametrize("boundary", ["periodic", pytest.param("free", marks=pytest.mark.thorough)])
 def test_edges_of_high_tension_end_in_four_fold_vertices(boundary):
     # An edge under three times the tension of its neighbours shrinks to nothing in either configuration
     # (two pull at each end, with at most twice their tension). It must come to rest there, not flip for

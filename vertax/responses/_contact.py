@@ -26,8 +26,13 @@ from vertax.mesh._topology import take
 #
 #     -d² (1 - s)² ln s     if s < 1, otherwise 0:   twice differentiable, and infinite at s = 0.
 #
+# (With s + FLOOR in the logarithm it ends at a finite height, which no force in a tissue climbs: an edge that
+# shrinks to nothing may point anywhere, along another side as well, and an infinite curvature there would
+# hide all others.)
+#
 # Corners that share a short edge are near each other and not in contact. So for a side next to one of the
 # corner's own the range is a share of the distance r to their common end: what counts there is the angle.
+FLOOR = 1e-4
 SLOPE = 5.0
 """That share over the range in cells: both are the same at a fifth of a cell from the end."""
 
@@ -67,7 +72,7 @@ class Contacts(eqx.Module):
         values = jnp.zeros(corner.shape, sides.dtype)
         for near, squared in self._nearness(take(sides, corner), take(sides, side), after, before):
             near = jnp.where((near < 1) & (corner != side), near, 1)
-            values -= squared * (1 - near) ** 2 * jnp.log(near)
+            values -= squared * (1 - near) ** 2 * jnp.log((near + FLOOR) / (1 + FLOOR))
         return self.strength * jnp.sum(values)
 
     def _nearness(
