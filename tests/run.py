@@ -35,7 +35,7 @@ TOGETHER = (
     ("responses/test_free_equilibrium.py", "responses/test_relaxation.py"),
     ("experiments",),
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
-    ("mesh", "energies", "dissipations", "initialise"),
+    ("_base", "mesh", "energies", "dissipations", "initialise"),
     ("transitions", "solvers"),
     ("runs", "inference"),
     ("costs",),

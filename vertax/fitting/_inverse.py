@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.memory_maps import spare_memory_maps
 from vertax.adjoints import (
     AbstractAdjoint,
     EquilibriumPropagation,
@@ -150,6 +151,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge; and
             for a gradient that cannot be trusted, unless the adjoint is told not to with `throw=False`.
         """
+        spare_memory_maps()
         energy = self.energy if energy is None else energy
         parameters, constants = eqx.partition(energy, self.trainable)
 

@@ -13,6 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.checks import as_key, as_real, check_whole, named
+from vertax._base.memory_maps import spare_memory_maps
 from vertax._base.modules import is_concrete, traced
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
@@ -223,6 +224,7 @@ class Evolution(AbstractResponse):
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.relaxation.check(tissue, energy, adjoint)
         self._check(tissue)
+        spare_memory_maps()
         response = self.traced()
         evolved = _evolve(*traced((tissue, energy)), response, adjoint)
         return evolved.checked() if throw else evolved

@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.checks import check_number
+from vertax._base.memory_maps import spare_memory_maps
 from vertax._base.modules import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
@@ -107,6 +108,7 @@ class Relaxation(AbstractResponse):
         if all(map(is_concrete, jax.tree.leaves((tissue, energy, self, adjoint)))):
             # Nothing is differentiated: one program serves all adjoints.
             adjoint = ImplicitDifferentiation()
+            spare_memory_maps()
         equilibrium = _equilibrate(*traced((tissue, energy)), self.traced(), adjoint)
         # An error that is raised within a compiled program calls back to the host, and JAX keeps no such
         # program in its cache on disk.
