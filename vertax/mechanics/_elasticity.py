@@ -16,7 +16,6 @@ from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._landscape import (
     Landscape,
-    Motion,
     area_of,
     checked,
     dot,
@@ -154,7 +153,7 @@ class _Elasticity(eqx.Module):
         """The tensor, given those motions."""
         tissue, energy = args
         landscape = Landscape(tissue, energy)
-        motions: Motion = (voigt_basis(tissue)[0], solution)
+        motions = (voigt_basis(tissue)[0], solution)
         pulled = jax.vmap(landscape.curvature())(motions)
         products = jax.vmap(lambda a: jax.vmap(partial(dot, a))(pulled))(motions)
         # That of the log of the strain; first derivatives make it one of the stress.

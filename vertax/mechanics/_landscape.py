@@ -104,7 +104,9 @@ def dissipation_landscape(tissue: Tissue, dissipation: AbstractDissipation) -> L
 VOIGT = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]], [[0.0, 0.5], [0.5, 0.0]]])
 
 
-def voigt_basis(tissue: Tissue) -> Motion:
+def voigt_basis(
+    tissue: Tissue,
+) -> tuple[Float[Array, "3 2 2"], PyTree[Float[Array, "3 ..."]]]:
     """The three affine strains xx, yy and xy, along a first axis."""
     still = jax.tree.map(lambda x: jnp.zeros((3, *x.shape), x.dtype), tissue.configuration)
     return jnp.asarray(VOIGT, tissue.vertices.dtype), still

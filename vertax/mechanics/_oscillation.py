@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
@@ -18,7 +19,6 @@ from vertax.energies import AbstractEnergy
 from vertax.mechanics._elasticity import shear_part
 from vertax.mechanics._landscape import (
     Landscape,
-    Motion,
     area_of,
     checked,
     dissipation_landscape,
@@ -102,20 +102,28 @@ class _Oscillation(eqx.Module):
         still = jnp.zeros((2, 2), tissue.vertices.dtype)
         left, resisted = jax.vmap(stiff)(basis)[1], jax.vmap(viscous)(basis)[1]
 
+        n = omegas.size
+
+        def product_at(omega: Array) -> Callable[[PyTree], PyTree]:
+            def product(u: PyTree[Array]) -> PyTree[Array]:
+                # Real and imaginary part along a first axis.
+                motions = jnp.zeros((2, 2, 2), omega.dtype), u
+                h, g = jax.vmap(stiff)(motions)[1], jax.vmap(viscous)(motions)[1]
+                sign = lambda x: jnp.array([1.0, -1.0], x.dtype).reshape(2, *[1] * (x.ndim - 1))
+                return jax.tree.map(lambda h, g: sign(h) * h - omega * g[::-1], h, g)
+
+            return product
+
         def one(omega: Array, xi: PyTree, z: PyTree) -> PyTree[Array]:
-            def product(u: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
-                a, b = u
-                (_, ha), (_, hb) = stiff((still, a)), stiff((still, b))
-                (_, ga), (_, gb) = viscous((still, a)), viscous((still, b))
-                first = jax.tree.map(lambda h, g: h - omega * g, ha, gb)
-                second = jax.tree.map(lambda g, h: -omega * g - h, ga, hb)
-                return first, second
+            rhs = jax.tree.map(lambda x, z: jnp.stack([-x, omega * z]), xi, z)
+            return solve(product_at(omega), rhs, self.solver)
 
-            rhs = jax.tree.map(jnp.negative, xi), jax.tree.map(lambda x: omega * x, z)
-            return solve(product, rhs, self.solver)
-
-        three = jax.vmap(one, in_axes=(None, 0, 0))
-        return jax.vmap(three, in_axes=(0, None, None))(omegas, left, resisted)
+        # One batch of all frequencies and strains.
+        each = lambda x: jnp.tile(x, (n,) + (1,) * (x.ndim - 1))
+        found = jax.vmap(one)(
+            jnp.repeat(omegas, 3), jax.tree.map(each, left), jax.tree.map(each, resisted)
+        )
+        return jax.tree.map(lambda x: x.reshape(n, 3, *x.shape[1:]), found)
 
     def value(self, args: _Args, solution: PyTree[Array]) -> Float[Array, "2 frequencies 3 3"]:
         tissue, energy, dissipation, omegas = args
@@ -125,15 +133,18 @@ class _Oscillation(eqx.Module):
         table = lambda x, y: jax.vmap(lambda p: jax.vmap(partial(dot, p))(y))(x)
         both = lambda matrix: matrix + matrix.T
 
-        def one(omega: Array, a: PyTree, b: PyTree) -> Float[Array, "2 3 3"]:
-            x: Motion = (strains, a)
-            y: Motion = (jnp.zeros_like(strains), b)
-            kx, ky, gx, gy = stiff(x), stiff(y), viscous(x), viscous(y)
+        def one(omega: Array, u: PyTree) -> Float[Array, "2 3 3"]:
+            part = lambda i: jax.tree.map(lambda x: x[:, i], u)
+            x = (strains, part(0))
+            y = (jnp.zeros_like(strains), part(1))
+            both_parts = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), x, y)
+            split = lambda z: (jax.tree.map(lambda a: a[:3], z), jax.tree.map(lambda a: a[3:], z))
+            (kx, ky), (gx, gy) = split(stiff(both_parts)), split(viscous(both_parts))
             real = table(x, kx) - table(y, ky) - omega * both(table(x, gy))
             imaginary = both(table(x, ky)) + omega * (table(x, gx) - table(y, gy))
             return jnp.stack([real, imaginary])
 
-        tensors = jax.vmap(one)(omegas, *solution)
+        tensors = jax.vmap(one)(omegas, solution)
         return jnp.moveaxis(tensors, 1, 0) / area_of(tissue)
 
 
