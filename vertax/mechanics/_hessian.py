@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from scipy import sparse
 
-from vertax.energies import AbstractEnergy, AbstractLocalEnergy
+from vertax.energies import AbstractLocalEnergy
 from vertax.mechanics._landscape import Landscape
 from vertax.mesh import Tissue
 
@@ -28,28 +28,25 @@ def movable(tissue: Tissue) -> PyTree[Bool[Array, "..."]]:
     return free if tissue.arcs is None else (free, tissue.is_arc)
 
 
-def hessian_products(
-    tissue: Tissue, energy: AbstractEnergy, vectors: Float[Array, "vectors dofs"]
-) -> Float[Array, "vectors dofs"]:
-    """Products of the Hessian with rows of a matrix."""
-    product = flat_hessian(tissue, energy)
-    return jax.lax.map(product, vectors, batch_size=_BATCH)
-
-
-def flat_hessian(
-    tissue: Tissue, energy: AbstractEnergy
-) -> Callable[[Float[Array, " dofs"]], Float[Array, " dofs"]]:
-    """Products of the Hessian with flat vectors."""
-    landscape = Landscape(tissue, energy)
+def flat_hessian(landscape: Landscape) -> Callable[[Float[Array, " dofs"]], Float[Array, " dofs"]]:
+    """Products of the second derivatives by the configuration with flat vectors."""
     curvature, (still, y) = landscape.curvature(), landscape.still
     unravel = ravel_pytree(y)[1]
     return lambda v: ravel_pytree(curvature((still, unravel(v)))[1])[0]
 
 
-def dense_hessian(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "dofs dofs"]:
-    """All of the Hessian; rows of what cannot move are 0."""
+def hessian_products(
+    landscape: Landscape, vectors: Float[Array, "vectors dofs"]
+) -> Float[Array, "vectors dofs"]:
+    """Products of the second derivatives by the configuration with rows of a matrix."""
+    return jax.lax.map(flat_hessian(landscape), vectors, batch_size=_BATCH)
+
+
+def dense_hessian(landscape: Landscape) -> Float[Array, "dofs dofs"]:
+    """All second derivatives by the configuration; rows of what cannot move are 0."""
+    tissue = landscape.tissue
     size = ravel_pytree(tissue.configuration)[0].size
-    matrix = hessian_products(tissue, energy, jnp.eye(size, dtype=tissue.vertices.dtype))
+    matrix = hessian_products(landscape, jnp.eye(size, dtype=tissue.vertices.dtype))
     return 0.5 * (matrix + matrix.T)
 
 
@@ -68,7 +65,7 @@ def sparse_hessian(tissue: Tissue, energy: AbstractLocalEnergy) -> sparse.csr_ar
     seeds = np.zeros((32 * (seed.max() // 32 + 1), seed.size))
     seeds[seed, np.arange(seed.size)] = 1
     products = np.asarray(
-        _products(tissue, energy, jnp.asarray(seeds, tissue.vertices.dtype)), float
+        _products(Landscape(tissue, energy), jnp.asarray(seeds, tissue.vertices.dtype)), float
     )
     rows, columns = sparse.csr_array(near[owner][:, owner]).nonzero()
     values = products[seed[columns], rows]

@@ -17,7 +17,7 @@ from vertax._base.checks import check_number, check_whole
 from vertax._base.modules import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mechanics._hessian import dense_hessian, flat_hessian, movable, sparse_hessian
-from vertax.mechanics._landscape import stationary
+from vertax.mechanics._landscape import Landscape, stationary
 from vertax.mesh import Tissue
 
 # A dense eigenproblem of that size takes a fraction of a second.
@@ -45,9 +45,7 @@ class Modes(eqx.Module):
         doi:10.1039/DF9705000055).
         """
         squared = jnp.sum(self.displacements**2, axis=-1)
-        return jnp.sum(squared, axis=-1) ** 2 / (
-            squared.shape[-1] * jnp.sum(squared**2, axis=-1)
-        )
+        return jnp.sum(squared, axis=-1) ** 2 / (squared.shape[-1] * jnp.sum(squared**2, axis=-1))
 
 
 def modes(
@@ -59,7 +57,8 @@ def modes(
 ) -> Modes:
     r"""The $k$ softest modes of a tissue at rest, $H u = \lambda u$ with the Hessian $H$ of the energy.
 
-    The motions of the whole that cost nothing are among them: in a periodic tissue two, of the eigenvalue 0.
+    The motions of the whole that cost nothing are among them: in a periodic tissue two, of the
+    eigenvalue 0.
 
     **Arguments:**
 
@@ -69,8 +68,8 @@ def modes(
     - `method`: `"dense"` takes the whole spectrum of the matrix, and works under `jax.jit`, `jax.vmap` and
         `jax.grad`. `"sparse"` takes the eigenvalues next to 0 by ARPACK with one sparse factorisation,
         on the host: for energies that are local (see
-        [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]) and large tissues. By default that, if the tissue has
-        more than 200 cells or so and nothing is traced.
+        [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]) and large tissues. By default that, if the
+        tissue has more than 200 cells or so and nothing is traced.
 
     **Returns:** [`Modes`][vertax.mechanics.Modes].
 
@@ -114,7 +113,7 @@ def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
 
     **Returns:** the eigenvalues, energy per length squared.
     """
-    matrix = np.asarray(_dense(*traced((tissue, energy))))
+    matrix = np.asarray(_dense(Landscape(*traced((tissue, energy)))))
     free = np.asarray(ravel_pytree(movable(tissue))[0])
     return jnp.asarray(np.linalg.eigvalsh(matrix[np.ix_(free, free)]))
 
@@ -148,7 +147,8 @@ def density_of_states(
     - `bins`: number of bins, from 0 to the largest frequency.
     - `tolerance`: eigenvalues that are that much smaller than the largest one are zero modes, and left out.
 
-    **Returns:** the middle of each bin, and the share of all modes per frequency in it: its integral is the share
+    **Returns:** the middle of each bin, and the share of all modes per frequency in it: its integral is
+    the share
         of the modes that are no zero modes.
     """
     check_whole("bins", bins, least=1)
@@ -165,7 +165,7 @@ class _Spectrum(eqx.Module):
 
     def solve(self, args: tuple[Tissue, AbstractEnergy]) -> Float[Array, "modes dofs"]:
         tissue, energy = args
-        matrix = dense_hessian(tissue, energy)
+        matrix = dense_hessian(Landscape(tissue, energy))
         # What cannot move comes last.
         held = ~ravel_pytree(movable(tissue))[0]
         above = 2 * jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + 1
@@ -181,7 +181,7 @@ class _Spectrum(eqx.Module):
 def _quotients(
     tissue: Tissue, energy: AbstractEnergy, vectors: Float[Array, "modes dofs"]
 ) -> Float[Array, " modes"]:
-    product = flat_hessian(tissue, energy)
+    product = flat_hessian(Landscape(tissue, energy))
     return jax.vmap(lambda v: jnp.sum(v * product(v)))(vectors)
 
 

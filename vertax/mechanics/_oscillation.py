@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from vertax._base.checks import as_real, check_number
@@ -17,19 +16,17 @@ from vertax._base.modules import traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._elasticity import shear_part
+from vertax.mechanics._hessian import dense_hessian
 from vertax.mechanics._landscape import (
     Landscape,
     area_of,
-    checked,
     dissipation_landscape,
     dot,
     require_box,
-    solve,
     stationary,
     voigt_basis,
 )
 from vertax.mesh import Tissue
-from vertax.solvers import MINRES
 
 _Args: TypeAlias = tuple[Tissue, AbstractEnergy, AbstractDissipation, Array]
 
@@ -41,14 +38,12 @@ def complex_modulus(
     frequencies: ArrayLike,
     *,
     angle: ArrayLike | None = None,
-    linear_solver: lx.AbstractLinearSolver | None = None,
-    throw: bool = True,
 ) -> Complex[Array, " frequencies"]:
     r"""The complex shear modulus $G^*(\omega) = G' + i G''$ of a tissue at rest, for small oscillations.
 
     With the Hessian $H$ of the energy and the matrix $\Gamma$ of the dissipation
-    ($R = \tfrac12 \dot x \cdot \Gamma \dot x$), vertices move by $u e^{i\omega t}$ where the box is strained by
-    $\epsilon e^{i\omega t}$, and
+    ($R = \tfrac12 \dot x \cdot \Gamma \dot x$), vertices move by $u e^{i\omega t}$ where the box is
+    strained by $\epsilon e^{i\omega t}$, and
 
     $$(H + i\omega\Gamma)\,u = -(\Xi + i\omega Z)\,\epsilon, \qquad
       G^*(\omega) = G_\mathrm{affine} + \frac1A \big( i\omega\,\Gamma_{\epsilon\epsilon}
@@ -56,8 +51,10 @@ def complex_modulus(
 
     with the forces $\Xi$ that an affine strain leaves and those, $Z$, that resist an affine rate of strain
     (0 for friction with a substrate that goes with the box). $G^*(0)$ is the relaxed
-    [`shear_modulus`][vertax.mechanics.shear_modulus] and, with friction alone, $G^*(\infty)$ the affine one (Tong et al. 2022,
-    doi:10.1371/journal.pcbi.1010135). All frequencies are one batch.
+    [`shear_modulus`][vertax.mechanics.shear_modulus] and, with friction alone, $G^*(\infty)$ the affine
+    one (Tong et al. 2022, doi:10.1371/journal.pcbi.1010135). One decomposition of both matrices
+    serves all frequencies; they are dense, so time grows with the cube of the number of cells (1000
+    cells take about a minute).
 
     **Arguments:**
 
@@ -66,23 +63,19 @@ def complex_modulus(
     - `dissipation`: what resists.
     - `frequencies`: angular frequencies $\omega$, one over time; not negative.
     - `angle`: direction of the shear, as in `shear_modulus`; by default the mean over all.
-    - `linear_solver`: for real symmetric indefinite systems, [`MINRES`][vertax.MINRES] by default.
-    - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
 
-    **Returns:** one complex number a frequency, energy per area: real part $G'$, storage; imaginary part $G''$,
+    **Returns:** one complex number a frequency, energy per area: real part $G'$, storage; imaginary part
+    $G''$,
         loss. Differentiable as `elastic_tensor` is, with respect to the dissipation too.
 
     **Raises:**
 
     - `ValueError` for a free tissue, or a negative frequency.
-    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
     require_box(tissue, "a complex modulus")
     check_number("frequencies", frequencies, least=0, many=True)
     omegas = jnp.atleast_1d(as_real("frequencies", frequencies)).astype(tissue.vertices.dtype)
-    system = _Oscillation(MINRES() if linear_solver is None else linear_solver)
-    tensors = _tensors(*traced((tissue, energy, dissipation)), omegas, system)
-    real, imaginary = checked(tensors, _REASON) if throw else tensors
+    real, imaginary = _tensors(*traced((tissue, energy, dissipation)), omegas)
     part = jax.vmap(lambda tensor: shear_part(tensor, angle))
     return jax.lax.complex(part(real), part(imaginary))
 
@@ -90,40 +83,23 @@ def complex_modulus(
 class _Oscillation(eqx.Module):
     """Real and imaginary part of the elastic tensor as stationary values."""
 
-    # (H + iωΓ) u = f is complex and symmetric, not Hermitian. For the real and the imaginary part of
-    # u = a + i b it is real and symmetric: [[H, -ωΓ], [-ωΓ, -H]] [a, b] = [Re f, -Im f].
-    solver: lx.AbstractLinearSolver
-
     def solve(self, args: _Args) -> PyTree[Array]:
+        """Real and imaginary part of how vertices move by themselves, for each frequency and strain."""
         tissue, energy, dissipation, omegas = args
-        basis = voigt_basis(tissue)
-        stiff = Landscape(tissue, energy).curvature()
-        viscous = dissipation_landscape(tissue, dissipation).curvature()
-        still = jnp.zeros((2, 2), tissue.vertices.dtype)
-        left, resisted = jax.vmap(stiff)(basis)[1], jax.vmap(viscous)(basis)[1]
-
-        n = omegas.size
-
-        def product_at(omega: Array) -> Callable[[PyTree], PyTree]:
-            def product(u: PyTree[Array]) -> PyTree[Array]:
-                # Real and imaginary part along a first axis.
-                motions = jnp.zeros((2, 2, 2), omega.dtype), u
-                h, g = jax.vmap(stiff)(motions)[1], jax.vmap(viscous)(motions)[1]
-                sign = lambda x: jnp.array([1.0, -1.0], x.dtype).reshape(2, *[1] * (x.ndim - 1))
-                return jax.tree.map(lambda h, g: sign(h) * h - omega * g[::-1], h, g)
-
-            return product
-
-        def one(omega: Array, xi: PyTree, z: PyTree) -> PyTree[Array]:
-            rhs = jax.tree.map(lambda x, z: jnp.stack([-x, omega * z]), xi, z)
-            return solve(product_at(omega), rhs, self.solver)
-
-        # One batch of all frequencies and strains.
-        each = lambda x: jnp.tile(x, (n,) + (1,) * (x.ndim - 1))
-        found = jax.vmap(one)(
-            jnp.repeat(omegas, 3), jax.tree.map(each, left), jax.tree.map(each, resisted)
-        )
-        return jax.tree.map(lambda x: x.reshape(n, 3, *x.shape[1:]), found)
+        elastic, viscous = Landscape(tissue, energy), dissipation_landscape(tissue, dissipation)
+        basis, unravel = voigt_basis(tissue), ravel_pytree(tissue.configuration)[1]
+        flat = jax.vmap(lambda x: ravel_pytree(x)[0])
+        left = flat(jax.vmap(elastic.curvature())(basis)[1])
+        resisted = flat(jax.vmap(viscous.curvature())(basis)[1])
+        h, g, x = _simultaneously_diagonal(dense_hessian(elastic), dense_hessian(viscous))
+        denominator = h + 1j * omegas[:, None] * g
+        # What neither costs energy nor is resisted does not move.
+        size = jnp.max(jnp.abs(denominator), axis=1, keepdims=True)
+        moves = jnp.abs(denominator) > _rounding(h.dtype) * size
+        load = (left @ x)[None] + 1j * omegas[:, None, None] * (resisted @ x)[None]
+        answer = jnp.where(moves, -1 / jnp.where(moves, denominator, 1), 0)[:, None] * load
+        parts = jnp.stack([answer.real @ x.T, answer.imag @ x.T], axis=2)
+        return jax.vmap(jax.vmap(jax.vmap(unravel)))(parts)
 
     def value(self, args: _Args, solution: PyTree[Array]) -> Float[Array, "2 frequencies 3 3"]:
         tissue, energy, dissipation, omegas = args
@@ -148,20 +124,36 @@ class _Oscillation(eqx.Module):
         return jnp.moveaxis(tensors, 1, 0) / area_of(tissue)
 
 
+def _rounding(dtype: jnp.dtype) -> float:
+    """What is nothing but rounding, next to 1."""
+    return 1e3 * float(jnp.finfo(dtype).eps)
+
+
+def _simultaneously_diagonal(
+    hessian: Float[Array, "dofs dofs"], resistance: Float[Array, "dofs dofs"]
+) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"], Float[Array, "dofs dofs"]]:
+    r"""Numbers h and g, and columns X with $X^T H X = h$ and $X^T \Gamma X = g$, both diagonal.
+
+    Either matrix may have null vectors. Common ones are left out: their columns are 0.
+    """
+    scale = lambda a: jnp.maximum(jnp.max(jnp.sum(jnp.abs(a), axis=1)), jnp.finfo(a.dtype).tiny)
+    of_h, of_g = scale(hessian), scale(resistance)
+    sizes, vectors = jnp.linalg.eigh(hessian / of_h + resistance / of_g)
+    kept = sizes > _rounding(sizes.dtype) * sizes[-1]
+    whitening = vectors * jnp.where(kept, 1 / jnp.sqrt(jnp.where(kept, sizes, 1)), 0)
+    g, rotation = jnp.linalg.eigh(whitening.T @ (resistance / of_g) @ whitening)
+    x = whitening @ rotation
+    # Where g is nearly 1, h is what is left of 1, and known better from H itself.
+    h = jnp.sum(x * (hessian @ x), axis=0)
+    return h, of_g * g, x
+
+
 @eqx.filter_jit
 def _tensors(
     tissue: Tissue,
     energy: AbstractEnergy,
     dissipation: AbstractDissipation,
     omegas: Float[Array, " frequencies"],
-    system: _Oscillation,
 ) -> Float[Array, "2 frequencies 3 3"]:
     # (A stress adds to the modulus of a change of area only, and shear is without.)
-    return stationary((tissue, energy, dissipation, omegas), system)
-
-
-_REASON = (
-    "The complex modulus is not known: a linear solve with the Hessian and the dissipation failed. Relax the "
-    "tissue to a smaller tolerance, give MINRES(rtol=..., max_steps=...) as `linear_solver`, or pass "
-    "throw=False to get NaN."
-)
+    return stationary((tissue, energy, dissipation, omegas), _Oscillation())

@@ -31,8 +31,8 @@ def recoil(
 
     $$\Gamma\,\dot x = - \nabla_X (E - T_e\,\ell_e), \qquad T_e = \partial E / \partial \ell_e$$
 
-    with the matrix $\Gamma$ of the dissipation, and $T_e$ held: in a tissue at rest all that acts is what the
-    edge pulled with (Mayer et al. 2010, doi:10.1038/nature09376).
+    with the matrix $\Gamma$ of the dissipation, and $T_e$ held: in a tissue at rest all that acts is
+    what the edge pulled with (Mayer et al. 2010, doi:10.1038/nature09376).
 
     **Arguments:**
 
@@ -44,7 +44,8 @@ def recoil(
         resists do not take place.
     - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
 
-    **Returns:** velocities, length per time. (Those of the angles of arcs are solved for, but not returned.)
+    **Returns:** velocities, length per time. (Those of the angles of arcs are solved for, but not
+    returned.)
 
     **Raises:**
 

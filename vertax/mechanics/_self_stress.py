@@ -82,8 +82,8 @@ def self_stresses(
     r"""States of self-stress: null vectors of the transposed compatibility matrix.
 
     $N_\mathrm{states} = N_\mathrm{zero} + N_\mathrm{constraints} - N_\mathrm{dof}$ (Calladine 1978,
-    doi:10.1016/0020-7683(78)90052-5). A tissue in a box always has one, since its areas sum to that of the box; a
-    rigid one has one more, which is what its tensions and pressures are (Merkel & Manning 2018,
+    doi:10.1016/0020-7683(78)90052-5). A tissue in a box always has one, since its areas sum to that of
+    the box; a rigid one has one more, which is what its tensions and pressures are (Merkel & Manning 2018,
     doi:10.1088/1367-2630/aaaa13).
 
     **Arguments:**

@@ -49,8 +49,8 @@ def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2
     $$\sigma_c = -p_c\, I + \frac1{2 A_c} \sum_{e \in c} T_e \int_e t \otimes t\, \mathrm ds$$
 
     with unit tangents $t$. An edge on the outline of a free tissue has one cell only, which gets all of
-    its tension. At rest the mean over cells, weighted by their areas, is the [`stress`][vertax.mechanics.stress]
-    of the whole (if all edges are straight, anywhere).
+    its tension. At rest the mean over cells, weighted by their areas, is the
+    [`stress`][vertax.mechanics.stress] of the whole (if all edges are straight, anywhere).
 
     **Arguments:**
 
