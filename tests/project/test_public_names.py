@@ -16,8 +16,9 @@ FAMILIES = {
     "activities": "AbstractActivity FluctuatingTensions Push SelfPropulsion Sum ThermalNoise",
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
-    "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance EdgeDistance "
-    "HomotypicLength IndexAwareStructural MeanShapeFactor MeshImage VertexDistance WeightedSum "
+    "costs": "AbstractCost AbstractLeastSquaresCost Anisotropy AspectRatio BulkModulus CellAreas "
+    "CellStress CentroidDistance EdgeDistance HomotypicLength IndexAwareStructural "
+    "MeanShapeFactor MeshImage ShearModulus SpectralGap Stress VertexDistance WeightedSum "
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity PerimeterViscosity "
     "SubstrateFriction Sum ViscositySum",
@@ -36,7 +37,7 @@ FAMILIES = {
     "write_geojson write_vtk",
     "mechanics": "Modes SelfStress bulk_modulus cell_stress compatibility complex_modulus deformed "
     "density_of_states elastic_tensor modes pressures principal recoil self_stresses shear_modulus spectrum "
-    "stress tensions zero_modes",
+    "stress tensions youngs_modulus zero_modes",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
     "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "

@@ -4,6 +4,7 @@ from vertax.mechanics._elasticity import (
     bulk_modulus as bulk_modulus,
     elastic_tensor as elastic_tensor,
     shear_modulus as shear_modulus,
+    youngs_modulus as youngs_modulus,
 )
 from vertax.mechanics._forces import pressures as pressures, tensions as tensions
 from vertax.mechanics._landscape import deformed as deformed

@@ -120,6 +120,36 @@ def bulk_modulus(tissue: Tissue, energy: AbstractEnergy, **options: Any) -> Floa
     return jnp.sum(elastic_tensor(tissue, energy, **options)[:2, :2]) / 4
 
 
+def youngs_modulus(
+    tissue: Tissue, energy: AbstractEnergy, *, angle: ArrayLike = 0.0, **options: Any
+) -> Float[Array, ""]:
+    r"""Young's modulus along a direction: stress over strain of a tissue that may contract across.
+
+    In an isotropic tissue it is $4 B G / (B + G)$. It must resist in all directions.
+
+    **Arguments:**
+
+    - `tissue`: a periodic tissue at rest.
+    - `energy`: the energy that it is at rest under.
+    - `angle`: the direction, in radians from the x axis.
+    - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
+        `throw`.
+
+    **Returns:** the modulus, energy per area; differentiable as `elastic_tensor` is.
+
+    **Raises:** as `elastic_tensor`.
+    """
+    return young_part(elastic_tensor(tissue, energy, **options), angle)
+
+
+def young_part(tensor: Float[Array, "3 3"], angle: ArrayLike) -> Float[Array, ""]:
+    """Young's modulus along a direction, of an elastic tensor."""
+    angle = as_real("angle", angle)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    stress = jnp.stack([c**2, s**2, c * s]).astype(tensor.dtype)
+    return 1 / (stress @ jnp.linalg.solve(tensor, stress))
+
+
 def shear_part(tensor: Float[Array, "3 3"], angle: ArrayLike | None = None) -> Float[Array, ""]:
     """The shear modulus of an elastic tensor, along a direction or the mean over all."""
     if angle is None:

@@ -58,7 +58,7 @@ def sparse_hessian(tissue: Tissue, energy: AbstractLocalEnergy) -> sparse.csr_ar
     """
     owner, component = _degrees_of_freedom(tissue)
     incidence = _incidence(tissue)
-    near = sparse.csr_array(incidence @ incidence.T).astype(bool)
+    near = sparse.csr_array((incidence @ incidence.T).astype(bool))
     colour = _colours(sparse.csr_array(near @ near))
     seed = 2 * colour[owner] + component
     # A multiple, lest each tissue compile another program.
@@ -103,7 +103,8 @@ def _incidence(tissue: Tissue) -> sparse.csr_array:
 
 def _colours(graph: sparse.csr_array) -> Int[np.ndarray, " nodes"]:
     """Colours such that neighbours differ, each as often as it can be (Luby 1986, doi:10.1137/0215074)."""
-    n, pointers, neighbours = graph.shape[0], graph.indptr[:-1], graph.indices
+    pointers, neighbours = graph.indptr[:-1], graph.indices
+    n = pointers.size
     order = np.random.default_rng(0).permutation(n)
     largest = lambda values: np.maximum.reduceat(values[neighbours], pointers)
     colour = np.full(n, -1)

@@ -227,7 +227,8 @@ def _softest(
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    inverse = LinearOperator(matrix.shape, matvec=factors.solve, dtype=float)
+    # Its constructor makes one of a class that type checkers do not see.
+    inverse = LinearOperator(matrix.shape, matvec=factors.solve, dtype=float)  # pyright: ignore[reportCallIssue]
     start = np.cos(np.arange(free.size) * (np.arange(free.size) + 0.5))
     values, vectors = eigsh(matrix, k, sigma=-shift, OPinv=inverse, v0=start)
     found = np.zeros((k, ravel_pytree(tissue.configuration)[0].size))
