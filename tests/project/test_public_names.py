@@ -40,8 +40,8 @@ FAMILIES = {
     "stress tensions youngs_modulus zero_modes",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
-    "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "
-    "scale_bar series_colours",
+    "plot_band plot_boxes plot_density_of_states plot_history plot_image plot_mode plot_moduli "
+    "plot_recovery plot_stress plot_tissue plot_tissues same_limits scale_bar series_colours",
     "responses": "AbstractResponse Equilibrium Evolution Evolved Relaxation Trajectory equilibrate evolve "
     "record_relaxation",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
