@@ -39,6 +39,7 @@ TOGETHER = (
     ("transitions", "solvers"),
     ("runs", "inference"),
     ("costs",),
+    ("mechanics",),
     ("project",),
     ("plotting", "io"),
 )

@@ -8,6 +8,7 @@ from . import (
     inference as inference,
     initialise as initialise,
     io as io,
+    mechanics as mechanics,
     mesh as mesh,
     plotting as plotting,
     responses as responses,

@@ -7,7 +7,7 @@ AbstractResponse
 AbstractTransitions AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation
 Evaluation Evolution Fit FitError Free GradientOutcome History ImplicitDifferentiation InverseProblem MINRES
 Periodic Record Relaxation T1 Tissue Topology Uncertainty activities adjoints animate costs
-dissipations energies equilibrate evolve fit fitting inference initialise io load_tissue mesh
+dissipations energies equilibrate evolve fit fitting inference initialise io load_tissue mechanics mesh
 plot_history plot_recovery plot_tissue
 plotting responses runs save_tissue solvers transitions uncertainty
 """
@@ -16,8 +16,9 @@ FAMILIES = {
     "activities": "AbstractActivity FluctuatingTensions Push SelfPropulsion Sum ThermalNoise",
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
-    "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance EdgeDistance "
-    "HomotypicLength IndexAwareStructural MeanShapeFactor MeshImage VertexDistance WeightedSum "
+    "costs": "AbstractCost AbstractLeastSquaresCost Anisotropy AspectRatio BulkModulus CellAreas "
+    "CellStress CentroidDistance EdgeDistance HomotypicLength IndexAwareStructural "
+    "MeanShapeFactor MeshImage ShearModulus SpectralGap Stress VertexDistance WeightedSum "
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity PerimeterViscosity "
     "SubstrateFriction Sum ViscositySum",
@@ -34,10 +35,13 @@ FAMILIES = {
     "load_energy load_problem load_tissue load_trajectory read_image read_surface_evolver "
     "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
     "write_geojson write_vtk",
+    "mechanics": "Modes SelfStress bulk_modulus cell_stress compatibility complex_modulus deformed "
+    "density_of_states elastic_tensor modes pressures principal recoil self_stresses shear_modulus spectrum "
+    "stress tensions youngs_modulus zero_modes",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
-    "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "
-    "scale_bar series_colours",
+    "plot_band plot_boxes plot_density_of_states plot_history plot_image plot_mode plot_moduli "
+    "plot_recovery plot_stress plot_tissue plot_tissues same_limits scale_bar series_colours",
     "responses": "AbstractResponse Equilibrium Evolution Evolved Relaxation Trajectory equilibrate evolve "
     "record_relaxation",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",

@@ -9,6 +9,14 @@ from vertax.costs._cost import (
 )
 from vertax.costs._image import MeshImage as MeshImage, mirror as mirror, render as render
 from vertax.costs._interfaces import HomotypicLength as HomotypicLength
+from vertax.costs._mechanics import (
+    Anisotropy as Anisotropy,
+    BulkModulus as BulkModulus,
+    CellStress as CellStress,
+    ShearModulus as ShearModulus,
+    SpectralGap as SpectralGap,
+    Stress as Stress,
+)
 from vertax.costs._positions import (
     CentroidDistance as CentroidDistance,
     EdgeDistance as EdgeDistance,

@@ -1,0 +1,122 @@
+"""Response to oscillation, and recoil after a cut."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import STILL, hexagon_index, random_tissue, shape_factors
+
+import vertax as vx
+from vertax import mechanics
+from vertax.dissipations import PerimeterViscosity, SubstrateFriction
+from vertax.energies import AreaElasticity, PerimeterElasticity, ShapeFactorEnergy
+
+C = hexagon_index()
+OMEGAS = jnp.array([0.0, 0.3, 2.0, 1e7])
+
+
+def elastic(p0):
+    return AreaElasticity(jnp.array(1.0), jnp.array(1.0)) + PerimeterElasticity(jnp.array(1.0), p0)
+
+
+@pytest.fixture(scope="module")
+def lattice():
+    return vx.initialise.hexagonal(4, 4, softening=0.0)
+
+
+FRICTION = SubstrateFriction(jnp.array(0.7)) + PerimeterViscosity(jnp.array(0.0))
+
+
+def test_plateaus_of_the_hexagonal_lattice(lattice):
+    # Tong et al. 2022: with energies ½ K_P (P - P0)² and P0 = 0 these are 2√3 and 3√3 K_P.
+    found = mechanics.complex_modulus(lattice, elastic(jnp.array(0.0)), FRICTION, OMEGAS)
+    assert float(found[0].real) == pytest.approx(2 * np.sqrt(3), rel=1e-9)
+    assert float(found[-1].real) == pytest.approx(3 * np.sqrt(3), rel=1e-6)
+    assert (np.diff(found.real) > 0).all()
+    assert (found.imag[1:] > 0).all()
+    # One relaxation time: a standard linear solid.
+    g0, g1 = 2 * np.sqrt(3), 3 * np.sqrt(3)
+    tau = np.asarray(found.imag / ((g1 - found.real) * OMEGAS))[1:3]
+    np.testing.assert_allclose(tau, tau[0], rtol=1e-6)
+    np.testing.assert_allclose(
+        found[1:3],
+        g0 + (g1 - g0) * (1j * OMEGAS[1:3] * tau) / (1 + 1j * OMEGAS[1:3] * tau),
+        rtol=1e-6,
+    )
+
+
+def test_viscosity_of_perimeters_against_a_dense_solution(lattice):
+    # A disordered configuration of as many cells, so that nothing vanishes by symmetry.
+    tissue = random_tissue(16, 3)
+    energy = elastic(jnp.array(3.0))
+    resistance = SubstrateFriction(jnp.array(0.7)) + PerimeterViscosity(jnp.array(0.4))
+    found = mechanics.complex_modulus(tissue, energy, resistance, OMEGAS, angle=0.0)
+
+    strain = jnp.array([[0.0, 0.5], [0.5, 0.0]])
+
+    def there(z):
+        gradient = jnp.eye(2) + z[0] * strain + 0.5 * z[0] ** 2 * strain @ strain
+        return mechanics.deformed(
+            tissue.with_vertices(tissue.vertices + z[1:].reshape(-1, 2)), gradient
+        )
+
+    zero = jnp.zeros(65)
+    stiff = np.asarray(jax.jit(jax.hessian(lambda z: energy(there(z))))(zero))
+    viscous = np.asarray(jax.jit(jax.hessian(lambda z: resistance(there(z), tissue, 1.0)))(zero))
+    for omega, value in zip(OMEGAS[1:3], found[1:3], strict=True):
+        k = stiff + 1j * float(omega) * viscous
+        wanted = (k[0, 0] - k[0, 1:] @ np.linalg.solve(k[1:, 1:], k[1:, 0])) / 16
+        assert complex(value) == pytest.approx(wanted, rel=1e-7)
+
+
+@pytest.mark.slow
+def test_derivatives_against_differences(lattice):
+    def loss(p0):
+        found = mechanics.complex_modulus(lattice, elastic(p0), FRICTION, OMEGAS)
+        return jnp.sum(found.real) + 2 * jnp.sum(found.imag)
+
+    p0, h = jnp.array(2.0), 1e-5
+    wanted = (loss(p0 + h) - loss(p0 - h)) / (2 * h)
+    assert jax.jit(jax.grad(loss))(p0) == pytest.approx(float(wanted), rel=1e-6)
+
+
+def test_recoil_against_a_dense_solution():
+    n = 12
+    energy = ShapeFactorEnergy(shape_factors(n, 3.5, 0.1))
+    tissue = random_tissue(n, 1)
+    velocity = mechanics.recoil(tissue, energy, 5, SubstrateFriction(2.0))
+    grad = jax.grad(lambda x: energy(tissue.with_vertices(x)))(tissue.vertices)
+    pull = jax.grad(lambda x: tissue.with_vertices(x).edge_lengths[5])(tissue.vertices)
+    tension = mechanics.tensions(tissue, energy)[5]
+    np.testing.assert_allclose(velocity, (tension * pull - grad) / 2.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_recoil_at_rest_is_the_first_motion_of_a_tissue_without_that_tension():
+    n = 12
+    energy = ShapeFactorEnergy(shape_factors(n, 3.5, 0.1))
+    tissue = STILL(random_tissue(n, 1), energy).tissue
+    friction = SubstrateFriction(2.0) + PerimeterViscosity(0.3)
+    velocity = mechanics.recoil(tissue, energy, 5, friction)
+    # Only the four vertices near the cut move much, and its ends move apart.
+    first, last = np.asarray(velocity)[tissue.topology.edge_vertices[5]]
+    assert np.sum((last - first) * tissue.edge_vectors[5]) > 0
+    tension = jnp.zeros(tissue.n_edges).at[5].set(-mechanics.tensions(tissue, energy)[5])
+    cut = energy + vx.energies.LineTension(tension)
+    movie = vx.evolve(
+        tissue,
+        cut,
+        friction,
+        [0.0, 1e-5],
+        relaxation=eqx.tree_at(lambda r: r.tolerance, STILL, 1e-13, is_leaf=lambda x: x is None),
+    )
+    moved = np.asarray(movie.tissue.vertices - tissue.vertices) / 1e-5
+    np.testing.assert_allclose(moved, velocity, atol=2e-3 * np.abs(velocity).max())
+
+
+def test_what_is_refused(lattice):
+    with pytest.raises(ValueError, match="at least 0"):
+        mechanics.complex_modulus(lattice, elastic(jnp.array(3.0)), FRICTION, jnp.array([-1.0]))
+    with pytest.raises(ValueError, match="one of the 48 edges"):
+        mechanics.recoil(lattice, elastic(jnp.array(3.0)), 48, FRICTION)

@@ -1,0 +1,67 @@
+"""Stress crosses, arrows of modes, moduli and densities of states."""
+
+import numpy as np
+import pytest
+from helpers import random_tissue
+from matplotlib import pyplot as plt
+from matplotlib.collections import LineCollection
+from matplotlib.quiver import Quiver
+
+from vertax.plotting import plot_density_of_states, plot_mode, plot_moduli, plot_stress
+
+tissue = random_tissue(9, 2)
+
+
+@pytest.fixture(autouse=True)
+def no_figures_left():
+    yield
+    plt.close("all")
+
+
+def test_crosses_lie_along_the_principal_directions_and_are_as_long_as_stresses():
+    stress = np.array([[3.0, 0.0], [0.0, -1.5]])
+    ax = plot_stress(tissue, np.broadcast_to(stress, (9, 2, 2)), scale=3.0)
+    bars = [c for c in ax.collections if isinstance(c, LineCollection)][-1]
+    size = float(np.sqrt(np.mean(tissue.areas)))
+    ways = np.abs(np.diff(np.array(bars.get_segments()), axis=1)[:, 0])
+    np.testing.assert_allclose(ways[0::2], [[0, size / 2]] * 9, atol=1e-12)
+    np.testing.assert_allclose(ways[1::2], [[size, 0]] * 9, atol=1e-12)
+    # Tension is red, pressure blue.
+    blue, red = bars.get_colors()[:2, [0, 2]]
+    assert blue[1] > blue[0]
+    assert red[0] > red[1]
+
+
+def test_arrows_begin_at_vertices_in_the_box():
+    moves = np.zeros((18, 2))
+    moves[4] = (0.0, 2.0)
+    ax = plot_mode(tissue, moves)
+    (arrows,) = [c for c in ax.collections if isinstance(c, Quiver)]
+    assert arrows.XY.min() >= 0
+    assert arrows.XY.max() <= np.asarray(tissue.boundary.lattice).max()
+    assert arrows.V[4] == pytest.approx(float(np.sqrt(np.mean(tissue.areas))))
+    assert np.abs(arrows.U).max() == 0
+
+
+def test_moduli_and_densities():
+    omega = np.array([0.0, 1.0, 10.0])
+    ax = plot_moduli(omega, np.array([1, 1 + 1j, 2 + 0.5j]), label="a")
+    storage, loss = ax.lines
+    np.testing.assert_allclose(storage.get_ydata(), [1, 2])
+    np.testing.assert_allclose(loss.get_ydata(), [1, 0.5])
+    assert ax.get_xscale() == "log"
+    (line,) = plot_density_of_states(np.array([0.5, 1.5]), np.array([0.2, 0.4])).lines
+    np.testing.assert_allclose(line.get_ydata(), [0.2, 0.4])
+
+
+def test_what_is_refused(as_a_user):
+    with pytest.raises(ValueError, match="`stresses` must have shape"):
+        plot_stress(tissue, np.zeros((4, 2, 2)))
+    with pytest.raises(ValueError, match="`scale` must be positive"):
+        plot_stress(tissue, np.zeros((9, 2, 2)), scale=0.0)
+    with pytest.raises(ValueError, match="`displacements` must have shape"):
+        plot_mode(tissue, np.zeros((4, 2)))
+    with pytest.raises(ValueError, match="one entry for each frequency"):
+        plot_moduli(np.ones(2), np.ones(3, complex))
+    with pytest.raises(ValueError, match="one entry for each frequency"):
+        plot_density_of_states(np.ones(2), np.ones(3))

@@ -1,0 +1,212 @@
+"""Elastic moduli: how the stress of a tissue answers to strain."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from vertax._base.checks import as_real
+from vertax._base.modules import traced
+from vertax.energies import AbstractEnergy
+from vertax.mechanics._landscape import (
+    Landscape,
+    area_of,
+    checked,
+    dot,
+    require_box,
+    solve,
+    stationary,
+    voigt_basis,
+)
+from vertax.mesh import Tissue
+from vertax.solvers import MINRES
+
+
+def elastic_tensor(
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    *,
+    affine: bool = False,
+    linear_solver: lx.AbstractLinearSolver | None = None,
+    throw: bool = True,
+) -> Float[Array, "3 3"]:
+    r"""The elastic tensor of a tissue at rest, in Voigt's notation, energy per area.
+
+    How the (Cauchy) stress answers to a further strain while the vertices come to rest again:
+
+    $$C_{ijkl} = \frac1A \left( \frac{\partial^2 E}{\partial\epsilon_{ij} \partial\epsilon_{kl}}
+      - \Xi_{ij} \cdot H^+ \Xi_{kl} \right)
+      - \tfrac12 (\sigma_{ij} \delta_{kl} + \delta_{ij} \sigma_{kl}),$$
+
+    with logarithmic strain $F = e^\epsilon$ of box and vertices, the forces
+    $\Xi_{ij} = \partial^2 E / \partial X \partial\epsilon_{ij}$ that an affine strain leaves, and the
+    pseudo-inverse of the Hessian $H$ (Lutsko 1989, doi:10.1063/1.342716; Merkel & Manning 2018,
+    doi:10.1088/1367-2630/aaaa13). In a tissue under stress moduli depend on how strain is measured. With
+    the last term these are the stress-strain coefficients of Barron & Klein 1965
+    (doi:10.1088/0370-1328/85/3/313), symmetrised: $\mathrm d\sigma / \mathrm d\epsilon$ itself if the
+    stress is isotropic.
+
+    Derivatives are exact and solve no further system, for moduli are stationary in the motion of the
+    vertices; if the tissue comes from [`equilibrate`][vertax.equilibrate], whose adjoint adds how the
+    equilibrium depends on the parameters, they are those of the relaxed tissue.
+
+    **Arguments:**
+
+    - `tissue`: a periodic tissue at rest. Contacts between vertices that nearly meet are not part of
+        the energy.
+    - `energy`: the energy that it is at rest under.
+    - `affine`: vertices only follow the strain, and do not come to rest.
+    - `linear_solver`: for systems with the Hessian, [`MINRES`][vertax.MINRES] by default.
+    - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
+
+    **Returns:** a symmetric matrix, shape `(3, 3)`, for the strains $\epsilon_{xx}$, $\epsilon_{yy}$ and
+        $\gamma = 2 \epsilon_{xy}$.
+
+    **Raises:**
+
+    - `ValueError` for a free tissue.
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
+    """
+    require_box(tissue, "an elastic modulus")
+    solver = MINRES() if linear_solver is None else linear_solver
+    tensor = _elastic_tensor(*traced((tissue, energy)), _Elasticity(solver, affine))
+    return checked(tensor, _REASON) if throw else tensor
+
+
+def shear_modulus(
+    tissue: Tissue, energy: AbstractEnergy, *, angle: ArrayLike | None = None, **options: Any
+) -> Float[Array, ""]:
+    r"""Shear modulus $G$ of a tissue at rest: stress over shear angle, energy per area.
+
+    **Arguments:**
+
+    - `tissue`: a periodic tissue at rest.
+    - `energy`: the energy that it is at rest under.
+    - `angle`: direction of the shear, in radians from the x axis; 0 is $C_{xyxy}$, and π/4 pure shear
+        along the axes. By default the mean over all directions, which is no matter of the choice of axes:
+        $(C_{xxxx} + C_{yyyy} - 2 C_{xxyy}) / 8 + C_{xyxy} / 2$.
+    - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
+        `throw`.
+
+    **Returns:** the modulus; differentiable as `elastic_tensor` is.
+
+    **Raises:** as `elastic_tensor`.
+    """
+    tensor = elastic_tensor(tissue, energy, **options)
+    return shear_part(tensor, angle)
+
+
+def bulk_modulus(tissue: Tissue, energy: AbstractEnergy, **options: Any) -> Float[Array, ""]:
+    r"""Bulk modulus $B$ of a tissue at rest: $A\,\mathrm d^2 E / \mathrm d A^2$ at a given shape of the
+    box.
+
+    **Arguments:**
+
+    - `tissue`: a periodic tissue at rest.
+    - `energy`: the energy that it is at rest under.
+    - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
+        `throw`.
+
+    **Returns:** the modulus, energy per area; differentiable as `elastic_tensor` is.
+
+    **Raises:** as `elastic_tensor`.
+    """
+    return jnp.sum(elastic_tensor(tissue, energy, **options)[:2, :2]) / 4
+
+
+def youngs_modulus(
+    tissue: Tissue, energy: AbstractEnergy, *, angle: ArrayLike = 0.0, **options: Any
+) -> Float[Array, ""]:
+    r"""Young's modulus along a direction: stress over strain of a tissue that may contract across.
+
+    In an isotropic tissue it is $4 B G / (B + G)$. It must resist in all directions.
+
+    **Arguments:**
+
+    - `tissue`: a periodic tissue at rest.
+    - `energy`: the energy that it is at rest under.
+    - `angle`: the direction, in radians from the x axis.
+    - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
+        `throw`.
+
+    **Returns:** the modulus, energy per area; differentiable as `elastic_tensor` is.
+
+    **Raises:** as `elastic_tensor`.
+    """
+    return young_part(elastic_tensor(tissue, energy, **options), angle)
+
+
+def young_part(tensor: Float[Array, "3 3"], angle: ArrayLike) -> Float[Array, ""]:
+    """Young's modulus along a direction, of an elastic tensor."""
+    angle = as_real("angle", angle)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    stress = jnp.stack([c**2, s**2, c * s]).astype(tensor.dtype)
+    return 1 / (stress @ jnp.linalg.solve(tensor, stress))
+
+
+def shear_part(tensor: Float[Array, "3 3"], angle: ArrayLike | None = None) -> Float[Array, ""]:
+    """The shear modulus of an elastic tensor, along a direction or the mean over all."""
+    if angle is None:
+        return (tensor[0, 0] + tensor[1, 1] - 2 * tensor[0, 1]) / 8 + tensor[2, 2] / 2
+    angle = as_real("angle", angle)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    # ε = (t n + n t) / 2 with t along the direction and n to its left.
+    strain = jnp.stack([-c * s, c * s, c**2 - s**2]).astype(tensor.dtype)
+    return strain @ tensor @ strain
+
+
+class _Elasticity(eqx.Module):
+    """The elastic tensor as a stationary value: the energy of strain and of what vertices add to it."""
+
+    solver: lx.AbstractLinearSolver
+    affine: bool = eqx.field(static=True)
+
+    def solve(self, args: tuple[Tissue, AbstractEnergy]) -> PyTree[Array]:
+        """How vertices move by themselves, for each of the three strains."""
+        tissue, energy = args
+        basis = voigt_basis(tissue)
+        if self.affine:
+            return basis[1]
+        curvature = Landscape(tissue, energy).curvature()
+        still = jnp.zeros((2, 2), tissue.vertices.dtype)
+        hessian = lambda change: curvature((still, change))[1]
+        left = jax.vmap(curvature)(basis)[1]
+        # One after the other, which takes less time than a batch that waits for its slowest.
+        rhs = jax.tree.map(jnp.negative, left)
+        return jax.lax.map(lambda one: solve(hessian, one, self.solver), rhs)
+
+    def value(
+        self, args: tuple[Tissue, AbstractEnergy], solution: PyTree[Array]
+    ) -> Float[Array, "3 3"]:
+        """The tensor, given those motions."""
+        tissue, energy = args
+        landscape = Landscape(tissue, energy)
+        motions = (voigt_basis(tissue)[0], solution)
+        pulled = jax.vmap(landscape.curvature())(motions)
+        products = jax.vmap(lambda a: jax.vmap(partial(dot, a))(pulled))(motions)
+        # That of the log of the strain; first derivatives make it one of the stress.
+        slope = landscape.pushes()[0]
+        stress = jnp.stack([slope[0, 0], slope[1, 1], 0.5 * (slope[0, 1] + slope[1, 0])])
+        trace = jnp.array([1.0, 1.0, 0.0], stress.dtype)
+        prestress = jnp.outer(stress, trace)
+        return (products - 0.5 * (prestress + prestress.T)) / area_of(tissue)
+
+
+@eqx.filter_jit
+def _elastic_tensor(
+    tissue: Tissue, energy: AbstractEnergy, system: _Elasticity
+) -> Float[Array, "3 3"]:
+    return stationary((tissue, energy), system)
+
+
+_REASON = (
+    "The elastic tensor is not known: the linear solve with the Hessian failed. Relax the tissue to a "
+    "smaller "
+    "tolerance, give MINRES(rtol=..., max_steps=...) as `linear_solver`, or pass throw=False to get NaN."
+)

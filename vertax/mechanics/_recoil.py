@@ -1,0 +1,92 @@
+"""Recoil after an edge is cut."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Float, Int
+
+from vertax._base.checks import check_whole
+from vertax._base.modules import is_concrete, traced
+from vertax.dissipations import AbstractDissipation
+from vertax.energies import AbstractEnergy
+from vertax.mechanics._forces import tensions
+from vertax.mechanics._landscape import checked, dissipation_landscape, solve
+from vertax.mesh import Tissue
+from vertax.solvers import MINRES
+
+
+def recoil(
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    edge: int | Int[Array, ""],
+    dissipation: AbstractDissipation,
+    *,
+    linear_solver: lx.AbstractLinearSolver | None = None,
+    throw: bool = True,
+) -> Float[Array, "vertices 2"]:
+    r"""Velocities of all vertices right after the tension of an edge is gone, as after laser ablation.
+
+    $$\Gamma\,\dot x = - \nabla_X (E - T_e\,\ell_e), \qquad T_e = \partial E / \partial \ell_e$$
+
+    with the matrix $\Gamma$ of the dissipation, and $T_e$ held: in a tissue at rest all that acts is
+    what the edge pulled with (Mayer et al. 2010, doi:10.1038/nature09376).
+
+    **Arguments:**
+
+    - `tissue`: a tissue at rest.
+    - `energy`: an energy of areas and lengths, see [`tensions`][vertax.mechanics.tensions].
+    - `edge`: the number of the edge.
+    - `dissipation`: what resists.
+    - `linear_solver`: for systems with $\Gamma$, [`MINRES`][vertax.MINRES] by default. Motions that nothing
+        resists do not take place.
+    - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
+
+    **Returns:** velocities, length per time. (Those of the angles of arcs are solved for, but not
+    returned.)
+
+    **Raises:**
+
+    - `ValueError` for an edge that is none.
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
+    """
+    if is_concrete(edge):
+        number = int(edge)
+        check_whole("edge", number, least=0)
+        if number >= tissue.n_edges:
+            raise ValueError(
+                f"Argument `edge` must be one of the {tissue.n_edges} edges, but is {number}."
+            )
+    solver = MINRES() if linear_solver is None else linear_solver
+    tissue, energy, dissipation = traced((tissue, energy, dissipation))
+    velocities = _recoil(tissue, energy, jnp.asarray(edge), dissipation, solver)
+    return checked(velocities, _REASON) if throw else velocities
+
+
+@eqx.filter_jit
+def _recoil(
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    edge: Int[Array, ""],
+    dissipation: AbstractDissipation,
+    solver: lx.AbstractLinearSolver,
+) -> Float[Array, "vertices 2"]:
+    tension = tensions(tissue, energy)[edge]
+
+    def after(configuration: Array) -> Float[Array, ""]:
+        there = tissue.with_configuration(configuration)
+        return energy(there) - tension * there.edge_lengths[edge]
+
+    released = jax.tree.map(jnp.negative, jax.grad(after)(tissue.configuration))
+    resistance = dissipation_landscape(tissue, dissipation).curvature()
+    still = jnp.zeros((2, 2), tissue.vertices.dtype)
+    velocity = solve(lambda v: resistance((still, v))[1], released, solver)
+    return velocity if tissue.arcs is None else velocity[0]
+
+
+_REASON = (
+    "The recoil is not known: the linear solve with the dissipation failed. Give another `linear_solver`, "
+    "add some friction, or pass throw=False to get NaN."
+)

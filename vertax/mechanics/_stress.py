@@ -1,0 +1,109 @@
+"""Stress of a tissue and of its cells."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vertax._base.modules import traced
+from vertax.energies import AbstractEnergy
+from vertax.mechanics._forces import pressures_and_tensions
+from vertax.mechanics._landscape import area_of, deformed
+from vertax.mesh import Tissue
+from vertax.mesh._arcs import area_factor, length_factor
+
+
+def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
+    r"""Stress of a tissue, $\sigma = \frac1A\,\partial E / \partial F$, energy per area.
+
+    $F$ deforms box and vertices together, and $A$ is the area of the box, or of all cells of a free
+    tissue. Where areas and lengths are all that the energy knows,
+
+    $$\sigma = \frac1A \Big( -\sum_c p_c A_c\, I + \sum_e T_e \frac{\ell_e \otimes \ell_e}{|\ell_e|} \Big)$$
+
+    (Batchelor 1970; Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017). A free tissue at rest, on
+    which nothing acts from outside, has the stress 0.
+
+    **Arguments:**
+
+    - `tissue`: the tissue; for its stress at rest, a relaxed one.
+    - `energy`: any energy.
+
+    **Returns:** a symmetric matrix, shape `(2, 2)` (symmetric unless the energy knows directions); positive
+        where the tissue would contract. Differentiable with respect to everything.
+    """
+    return _stress(*traced((tissue, energy)))
+
+
+@eqx.filter_jit
+def _stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
+    whole = jnp.eye(2, dtype=tissue.vertices.dtype)
+    return jax.grad(lambda gradient: energy(deformed(tissue, gradient)))(whole) / area_of(tissue)
+
+
+def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2 2"]:
+    r"""Stress of each cell: its pressure, and half of the tension of each of its edges.
+
+    $$\sigma_c = -p_c\, I + \frac1{2 A_c} \sum_{e \in c} T_e \int_e t \otimes t\, \mathrm ds$$
+
+    with unit tangents $t$. An edge on the outline of a free tissue has one cell only, which gets all of
+    its tension. At rest the mean over cells, weighted by their areas, is the
+    [`stress`][vertax.mechanics.stress] of the whole (if all edges are straight, anywhere).
+
+    **Arguments:**
+
+    - `tissue`: the tissue.
+    - `energy`: an energy of areas and lengths, see [`pressures`][vertax.mechanics.pressures].
+
+    **Returns:** one symmetric matrix a cell, energy per area, positive where it would contract.
+    """
+    return _cell_stress(*traced((tissue, energy)))
+
+
+@eqx.filter_jit
+def _cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2 2"]:
+    pressure, tension = pressures_and_tensions(tissue, energy)
+    cells = tissue.topology.edge_cells
+    # An edge whose other side is the exterior belongs to its one cell.
+    inside = cells < tissue.n_cells
+    share = tension / jnp.sum(inside, axis=1)
+    pull = share[:, None, None] * _directed_lengths(tissue)
+    sums = jax.ops.segment_sum(
+        jnp.concatenate([pull, pull]), jnp.concatenate([cells[:, 0], cells[:, 1]]), tissue.n_cells
+    )
+    isotropic = pressure[:, None, None] * jnp.eye(2, dtype=pull.dtype)
+    return sums / tissue.areas[:, None, None] - isotropic
+
+
+def _directed_lengths(tissue: Tissue) -> Float[Array, "edges 2 2"]:
+    """The integral of t ⊗ t along each edge, whose trace is its length."""
+    # Of an arc with the half-angle α over the chord c, with R = c / (2 sin α), it is
+    # R (α + sin α cos α) along the chord and R (α - sin α cos α) = 2 c g sin α across it.
+    chord, angle = tissue.edge_vectors, tissue.edge_angles
+    squared = chord[:, 0] ** 2 + chord[:, 1] ** 2 + tissue.softening**2
+    length = jnp.sqrt(jnp.where(squared > 0, squared, 1))
+    outer = lambda v: v[:, :, None] * v[:, None, :] / length[:, None, None]
+    if tissue.arcs is None:
+        return outer(chord)
+    across = 2 * area_factor(angle) * jnp.sin(angle)
+    along = length_factor(angle) - across
+    aside = jnp.stack([-chord[:, 1], chord[:, 0]], axis=-1)
+    return along[:, None, None] * outer(chord) + across[:, None, None] * outer(aside)
+
+
+def principal(
+    stresses: Float[Array, "*cells 2 2"],
+) -> tuple[Float[Array, "*cells 2"], Float[Array, "*cells 2 2"]]:
+    """Principal stresses and their directions.
+
+    **Arguments:**
+
+    - `stresses`, shape `(…, 2, 2)`: symmetric matrices, of the whole or of cells.
+
+    **Returns:** the principal stresses, the larger one first, shape `(…, 2)`; and the unit vectors along
+        them as rows, shape `(…, 2, 2)`. (Where both are equal the directions mean nothing.)
+    """
+    values, vectors = jnp.linalg.eigh(0.5 * (stresses + jnp.swapaxes(stresses, -1, -2)))
+    return values[..., ::-1], jnp.swapaxes(vectors, -1, -2)[..., ::-1, :]
