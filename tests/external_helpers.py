@@ -47,7 +47,8 @@ class Foam(AbstractSimulator):
             "shape": tissue.vertices[1:],
             "nan": np.full_like(tissue.vertices, np.nan),
             "text": np.full(tissue.vertices.shape, "here"),
-            "no rest": tissue.vertices + 0.01 * np.sin(np.arange(tissue.vertices.size)).reshape(-1, 2),
+            "no rest": tissue.vertices
+            + 0.01 * np.sin(np.arange(tissue.vertices.size)).reshape(-1, 2),
         }
         if self.mood in wrong:
             return wrong[self.mood]

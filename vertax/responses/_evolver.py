@@ -61,7 +61,9 @@ class SurfaceEvolver(AbstractSimulator):
 
     def __post_init__(self) -> None:
         if self.areas not in ("elastic", "fixed"):
-            raise ValueError(f"Argument `areas` must be 'elastic' or 'fixed', but is {self.areas!r}.")
+            raise ValueError(
+                f"Argument `areas` must be 'elastic' or 'fixed', but is {self.areas!r}."
+            )
         for name in ("tolerance", "timeout"):
             check_number(name, getattr(self, name), above=0)
         if self.t1_below is not None:
@@ -118,9 +120,7 @@ class SurfaceEvolver(AbstractSimulator):
     ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
         command = [self.command, "-i", "-frelax.cmd", "tissue.fe"]
         files = {"tissue.fe": text, "relax.cmd": commands}
-        found, log = run_program(
-            command, files, ["result"], timeout=self.timeout, install=INSTALL
-        )
+        found, log = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
         return _read(found["result"], pieces, log)
 
     def _commands(self, pieces: Pieces) -> str:
@@ -297,9 +297,7 @@ def _springs(
     return [f"sum_{name}" for name in modes]
 
 
-def _read(
-    text: str, pieces: Pieces, log: str
-) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+def _read(text: str, pieces: Pieces, log: str) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Points, pressures (of areas that are held) and numbers that the program wrote."""
     points = np.full_like(pieces.points, np.nan)
     pressures = np.full(pieces.n_cells, np.nan)

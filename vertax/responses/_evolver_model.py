@@ -69,7 +69,7 @@ class Pieces(NamedTuple):
         vectors = home[last] + wraps @ lattice - home[first]
         added, ends, steps, of_edge = [home], [], [], []
         n_points = len(home)
-        for e, n in enumerate(chains):
+        for e, n in enumerate(chains.tolist()):
             inner = np.arange(n_points, n_points + n - 1)
             added.append(_on_arc(home[first[e]], vectors[e], angles[e], n))
             course = np.concatenate([[first[e]], inner, [last[e]]])

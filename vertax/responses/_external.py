@@ -89,8 +89,8 @@ class External(AbstractResponse):
             )
         if self.slope != "energy" and self.stiffness is None:
             raise ValueError(
-                "Argument `stiffness` is missing: the nudge is measured in it, and without an energy that JAX "
-                "can differentiate nobody knows it. Pass a typical second derivative of the energy, e.g. "
+                "Argument `stiffness` is missing: the nudge is measured in it, and without an energy that "
+                "JAX can differentiate nobody knows it. Pass a typical second derivative of the energy, e.g. "
                 "stiffness=1.0; the `beta` of the adjoint multiplies it."
             )
         for name in ("tolerance", "stiffness", "step"):
@@ -128,11 +128,14 @@ class External(AbstractResponse):
         """
         adjoint = EquilibriumPropagation() if adjoint is None else adjoint
         self.goes_with(adjoint)
+        assert isinstance(adjoint, EquilibriumPropagation)
         inputs = (tissue, energy, self, adjoint)
         concrete = all(map(is_concrete, jax.tree.leaves(inputs)))
         failed = self.ledger.failed
         response = self.traced()
-        equilibrium = _answered(*traced((tissue, energy)), response, adjoint, throw and not concrete)
+        equilibrium = _answered(
+            *traced((tissue, energy)), response, adjoint, throw and not concrete
+        )
         if not throw:
             return equilibrium
         if concrete and self.ledger.failed > failed:
@@ -204,7 +207,14 @@ class External(AbstractResponse):
         slope = None if self.slope == "energy" else eqx.filter(request.energy, eqx.is_inexact_array)
         dynamic, fixed = eqx.partition(tissue.topology, eqx.is_array)
         wanted = Answer(
-            *shapes((tissue.vertices, tissue.angles, dynamic)), number, number, whole, whole, shapes(slope)
+            vertices=shapes(tissue.vertices),
+            angles=shapes(tissue.angles),
+            topology=shapes(dynamic),
+            energy=number,
+            max_force=number,
+            num_steps=whole,
+            num_t1=whole,
+            slope=shapes(slope),
         )
         ranks = [x.ndim for x in leaves]
         workers = self.workers or os.cpu_count() or 1
@@ -280,7 +290,9 @@ def _answered(
 ) -> Equilibrium:
     start, constant = frozen((tissue, energy))
     answer = frozen(response.ask(Request(start, constant, None, None), throw))
-    there = eqx.tree_at(lambda t: (t.vertices, t.topology), start, (answer.vertices, answer.topology))
+    there = eqx.tree_at(
+        lambda t: (t.vertices, t.topology), start, (answer.vertices, answer.topology)
+    )
     if answer.angles is not None:
         there = there.with_angles(answer.angles)
     units = response.units(there, constant)

@@ -176,8 +176,8 @@ def _array(name: str, value: Any, shape: tuple[int, ...]) -> Shaped[np.ndarray, 
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.shape != tuple(shape):
         raise SimulatorError(
-            f"The program returned `{name}` as an array of shape {array.shape} and type {array.dtype}, but it "
-            f"must hold real numbers in the shape {tuple(shape)}."
+            f"The program returned `{name}` as an array of shape {array.shape} and type {array.dtype}, but "
+            f"it must hold real numbers in the shape {tuple(shape)}."
         )
     if not np.isfinite(array).all():
         raise SimulatorError(f"The program returned `{name}` with NaN or infinity in it.")

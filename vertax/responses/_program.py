@@ -36,8 +36,8 @@ def run_program(
 
     **Raises:**
 
-    - [`SimulatorError`][vertax.responses.SimulatorError] with the tail of its log if it is not there, crashes,
-        takes too long, or leaves a result out.
+    - [`SimulatorError`][vertax.responses.SimulatorError] with the tail of its log if it is not there,
+        crashes, takes too long, or leaves a result out.
     """
     program = shutil.which(command[0])
     if program is None:
