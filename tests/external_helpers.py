@@ -76,7 +76,8 @@ class Foam(AbstractSimulator):
             raise ValueError("a tension is negative")
 
     def parameter_gradient(self, tissue, energy):
-        lengths = np.hypot(*Edges.of(tissue).vectors(tissue.vertices).T)
+        vertices = np.asarray(tissue.vertices)
+        lengths = np.hypot(*Edges.of(tissue).vectors(vertices).T)
         return eqx.tree_at(lambda e: e.terms[1].tension, energy, lengths)
 
     def energy(self, tissue, energy):

@@ -41,6 +41,7 @@ TOGETHER = (
     ("costs",),
     ("project",),
     ("plotting", "io"),
+    ("responses/test_external.py", "responses/test_evolver.py"),
 )
 NOTHING_SELECTED = 5
 

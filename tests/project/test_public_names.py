@@ -5,8 +5,8 @@ NAMES = """
 AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy AbstractLocalEnergy
 AbstractResponse
 AbstractTransitions AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation
-Evaluation Evolution Fit FitError Free GradientOutcome History ImplicitDifferentiation InverseProblem MINRES
-Periodic Record Relaxation T1 Tissue Topology Uncertainty activities adjoints animate costs
+Evaluation Evolution External Fit FitError Free GradientOutcome History ImplicitDifferentiation
+InverseProblem MINRES Periodic Record Relaxation T1 Tissue Topology Uncertainty activities adjoints animate costs
 dissipations energies equilibrate evolve fit fitting inference initialise io load_tissue mesh
 plot_history plot_recovery plot_tissue
 plotting responses runs save_tissue solvers transitions uncertainty
@@ -38,8 +38,9 @@ FAMILIES = {
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
     "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "
     "scale_bar series_colours",
-    "responses": "AbstractResponse Equilibrium Evolution Evolved Relaxation Trajectory equilibrate evolve "
-    "record_relaxation",
+    "responses": "AbstractResponse AbstractSimulator Edges Equilibrium Evolution Evolved External Ledger "
+    "Relaxation Relaxed SimulatorError SurfaceEvolver Trajectory equilibrate evolve record_relaxation "
+    "run_program",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
     "transitions": "AbstractTransitions T1",
 }

@@ -135,6 +135,8 @@ def test_differences_of_the_energy_are_its_derivatives(case):
     jobs = [Job(FOAM, request, slope, 1e-4) for slope in ("program", "differences")]
     (known, found), reason = ask(jobs, 2, False, True)
     assert reason is None
+    assert known is not None
+    assert found is not None
     lengths = known.slope.terms[1].tension
     np.testing.assert_allclose(found.slope.terms[1].tension, lengths, rtol=1e-8)
     there = case[0].with_vertices(jnp.asarray(known.vertices))
