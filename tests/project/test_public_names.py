@@ -6,7 +6,8 @@ AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnerg
 AbstractResponse
 AbstractTransitions AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation
 Evaluation Evolution External Fit FitError Free GradientOutcome History ImplicitDifferentiation
-InverseProblem MINRES Periodic Record Relaxation T1 Tissue Topology Uncertainty activities adjoints animate costs
+InverseProblem MINRES Periodic Record Relaxation T1 Tissue Topology Uncertainty activities adjoints
+animate costs
 dissipations energies equilibrate evolve fit fitting inference initialise io load_tissue mesh
 plot_history plot_recovery plot_tissue
 plotting responses runs save_tissue solvers transitions uncertainty
