@@ -42,6 +42,7 @@ TOGETHER = (
     ("mechanics",),
     ("project",),
     ("plotting", "io"),
+    ("responses/test_external.py", "responses/test_evolver.py"),
 )
 NOTHING_SELECTED = 5
 

@@ -59,6 +59,7 @@ from .responses import (
     AbstractResponse as AbstractResponse,
     Equilibrium as Equilibrium,
     Evolution as Evolution,
+    External as External,
     Relaxation as Relaxation,
     equilibrate as equilibrate,
     evolve as evolve,

@@ -2,14 +2,13 @@ import vertax as vx
 
 # The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
 NAMES = """
-AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy AbstractLocalEnergy
-AbstractResponse
-AbstractTransitions AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation
-Evaluation Evolution Fit FitError Free GradientOutcome History ImplicitDifferentiation InverseProblem MINRES
-Periodic Record Relaxation T1 Tissue Topology Uncertainty activities adjoints animate costs
-dissipations energies equilibrate evolve fit fitting inference initialise io load_tissue mechanics mesh
-plot_history plot_recovery plot_tissue
-plotting responses runs save_tissue solvers transitions uncertainty
+AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy
+AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiation Checkpoint
+Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free GradientOutcome
+History ImplicitDifferentiation InverseProblem MINRES Periodic Record Relaxation T1 Tissue
+Topology Uncertainty activities adjoints animate costs dissipations energies equilibrate evolve
+fit fitting inference initialise io load_tissue mechanics mesh plot_history plot_recovery
+plot_tissue plotting responses runs save_tissue solvers transitions uncertainty
 """
 
 FAMILIES = {
@@ -20,30 +19,32 @@ FAMILIES = {
     "CellStress CentroidDistance EdgeDistance HomotypicLength IndexAwareStructural "
     "MeanShapeFactor MeshImage ShearModulus SpectralGap Stress VertexDistance WeightedSum "
     "adjacency aspect_ratio mirror mismatched_neighbours render",
-    "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity PerimeterViscosity "
-    "SubstrateFriction Sum ViscositySum",
-    "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension LocalSum "
-    "PerimeterElasticity ShapeFactorEnergy Sum",
-    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts fit "
-    "limits member stack stack_fits uncertainty",
-    "inference": "Micrograph Microscope PinnedEnergy RecoveryWatch RelativeTensions Scene TensionProblem "
-    "Tensions Transition fit_onset fit_transition foam_energy foam_terms force_balance label_image "
-    "micrograph_problem pearson relative_error same_neighbours shape_factor_scene tension_problem",
+    "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity "
+    "PerimeterViscosity SubstrateFriction Sum ViscositySum",
+    "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension "
+    "LocalSum PerimeterElasticity ShapeFactorEnergy Sum",
+    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts "
+    "fit limits member stack stack_fits uncertainty",
+    "inference": "Micrograph Microscope PinnedEnergy RecoveryWatch RelativeTensions Scene "
+    "TensionProblem Tensions Transition fit_onset fit_transition foam_energy "
+    "foam_terms force_balance label_image micrograph_problem pearson relative_error "
+    "same_neighbours shape_factor_scene tension_problem",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
     "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
-    "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_tables "
-    "load_energy load_problem load_tissue load_trajectory read_image read_surface_evolver "
-    "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
-    "write_geojson write_vtk",
+    "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_tables load_energy "
+    "load_problem load_tissue load_trajectory read_image read_surface_evolver save_energy "
+    "save_problem save_tissue save_trajectory to_tables write_csv write_geojson write_vtk",
     "mechanics": "Modes SelfStress bulk_modulus cell_stress compatibility complex_modulus deformed "
-    "density_of_states elastic_tensor modes pressures principal recoil self_stresses shear_modulus spectrum "
-    "stress tensions youngs_modulus zero_modes",
+    "density_of_states elastic_tensor modes pressures principal recoil self_stresses "
+    "shear_modulus spectrum stress tensions youngs_modulus zero_modes",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
-    "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
-    "plot_band plot_boxes plot_density_of_states plot_history plot_image plot_mode plot_moduli "
-    "plot_recovery plot_stress plot_tissue plot_tissues same_limits scale_bar series_colours",
-    "responses": "AbstractResponse Equilibrium Evolution Evolved Relaxation Trajectory equilibrate evolve "
-    "record_relaxation",
+    "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours "
+    "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
+    "plot_mode plot_moduli plot_recovery plot_stress plot_tissue plot_tissues "
+    "same_limits scale_bar series_colours",
+    "responses": "AbstractResponse AbstractSimulator Edges Equilibrium Evolution Evolved External "
+    "Ledger Relaxation Relaxed SimulatorError SurfaceEvolver Trajectory equilibrate "
+    "evolve record_relaxation run_program",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
     "transitions": "AbstractTransitions T1",
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -111,12 +111,11 @@ class _Nudged(eqx.Module):
     """An objective with a constant force on every degree of freedom."""
 
     fn: Callable
-    force: PyTree[Array]
-    strength: Float[Array, ""]
+    slope: PyTree[Array]
 
     def __call__(self, y: PyTree[Array], args: Any) -> tuple[Array, Any]:
         value, aux = self.fn(y, args)
-        return value + self.strength * jnp.asarray(optax.tree.vdot(self.force, y)), aux
+        return value + jnp.asarray(optax.tree.vdot(self.slope, y)), aux
 
 
 @eqx.filter_custom_vjp
@@ -146,18 +145,9 @@ def _(
 ) -> Any:
     fn, args, slot = vjp_arg
     options = others.options
-    cotangent = materialise(cotangent, root)
-    size = optx.max_norm(cotangent)
-    force = optax.tree.scale(1 / jnp.where(size > 0, size, 1), cotangent)
-    strength = adjoint.strength(adjoint.beta, options, size.dtype)
     # The solver of an equilibrium that is known takes no step; the relaxation that found it does.
-    solver = options.get("relaxation", others.solver)
+    nudge = others.but(solver=options.get("relaxation", others.solver), y0=root, args=args)
     coarsest = options.get("tolerance", jnp.inf)
-    tolerance = jnp.minimum(coarsest, adjoint.tolerance(strength))
-    nudge = others.but(
-        solver=solver, y0=root, args=args, options=options | {"tolerance": tolerance}
-    )
-
     moving, fixed = differentiable((fn, args))
 
     def slope(y: PyTree[Array]) -> PyTree[Array]:
@@ -167,23 +157,61 @@ def _(
 
         return jax.grad(energy)(moving)
 
-    def phase(sign: Array) -> tuple[PyTree[Array], Array, Array]:
-        nudged = _Nudged(fn, force, sign * strength)
-        y, residual = nudge.but(fn=nudged).run()
+    def phase(
+        force: PyTree[Array], strength: Float[Array, ""]
+    ) -> tuple[PyTree[Array], Array, Array]:
+        nudged = _Nudged(fn, force)
+        tolerance = jnp.minimum(coarsest, adjoint.tolerance(strength))
+        y, residual = nudge.but(fn=nudged, options=options | {"tolerance": tolerance}).run()
         left = optx.max_norm(jax.grad(lambda y: nudged(y, args)[0])(y))
         return slope(y), left, steps_of(residual)
 
+    cotangent = materialise(cotangent, root)
+    at_rest = None if adjoint.centred else slope(root)
+    gradient, outcome = two_phases(adjoint, cotangent, options, phase, at_rest)
+    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
+    return d_fn, d_args, outcome
+
+
+Phase: TypeAlias = Callable[
+    [PyTree[Array], Float[Array, ""]], tuple[PyTree[Array], Float[Array, ""], Array]
+]
+
+
+def two_phases(
+    adjoint: EquilibriumPropagation,
+    cotangent: PyTree[Array],
+    options: dict[str, Any],
+    phase: Phase,
+    at_rest: PyTree[Array] | None,
+) -> tuple[PyTree[Array], GradientOutcome]:
+    """The gradient from relaxations under weak forces, whoever does them, and how it came about.
+
+    **Arguments:**
+
+    - `adjoint`: how strong, and with which signs.
+    - `cotangent`: derivative of the cost with respect to the configuration.
+    - `options`: the typical sizes `stiffness` and `length_scale`.
+    - `phase`: of a term linear in the configuration that is added to the energy, and its largest entry: the
+        partial derivative of the energy with respect to the parameters where the nudged system comes to
+        rest, the largest force there, and the steps it took.
+    - `at_rest`: that derivative without a nudge, for a difference that is one-sided.
+
+    **Returns:** the gradient, shaped as the derivatives; and its outcome.
+    """
+    size = optx.max_norm(cotangent)
+    direction = optax.tree.scale(1 / jnp.where(size > 0, size, 1), cotangent)
+    strength = adjoint.strength(adjoint.beta, options, size.dtype)
     # One phase is a batch of the two signs. A one-sided difference needs no second relaxation.
     signs = jnp.asarray([s for s in adjoint.signs if s != 0], size.dtype)
-    slopes, left, num_steps = jax.vmap(phase)(signs)
+    nudged = lambda sign: phase(optax.tree.scale(sign * strength, direction), strength)
+    slopes, left, num_steps = jax.vmap(nudged)(signs)
     if adjoint.centred:
         difference = jax.tree.map(lambda s: (s[0] - s[1]) / 2, slopes)
     else:
-        difference = jax.tree.map(lambda s, at_rest: s[0] - at_rest, slopes, slope(root))
+        difference = jax.tree.map(lambda s, at_rest: s[0] - at_rest, slopes, at_rest)
     gradient = jax.tree.map(lambda d: size / strength * d, difference)
-    outcome = _outcome(jnp.max(left) / strength, jnp.sum(num_steps))
-    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
-    return d_fn, d_args, outcome
+    return gradient, _outcome(jnp.max(left) / strength, jnp.sum(num_steps))
 
 
 class AbstractNudging(eqx.Module):

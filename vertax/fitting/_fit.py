@@ -129,6 +129,9 @@ def fit(
         checkpoint = Checkpoint(checkpoint)
     keeper = Keeper(checkpoint, lambda: identity_of(given, true, method.description(), batched))
     done, stopped, interrupted = _run(method, keeper, epochs, progress, callback)
+    complaint = given.response.complaint()
+    if stopped is not None and complaint is not None:
+        stopped = f"{stopped}. {complaint.rstrip('.')}"
     if not done.rows:
         raise FitError(f"The fit stopped: {stopped}.", None)
     best = done.state.best

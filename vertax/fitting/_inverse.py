@@ -67,6 +67,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     **Raises:**
 
     - `TypeError` for a response or a cost that is none.
+    - `ValueError` for an adjoint, or guidance, that does not go with the response.
     """
 
     tissue: Tissue
@@ -84,6 +85,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
                 f"Argument `response` must be a response such as vertax.Relaxation(), but is "
                 f"{self.response!r}."
             )
+        self.response.goes_with(self.adjoint, guided=self.guidance is not None)
 
     def __call__(
         self,

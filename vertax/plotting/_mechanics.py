@@ -198,5 +198,7 @@ def plot_density_of_states(
         if ax is None:
             (ax,) = _style.new_axes(width=3.0, height=2.3, figure=figure)
         ax.step(x, y, where="mid", label=label)
-        ax.set(xlabel=r"frequency $\omega$", ylabel=r"density of states $D(\omega)$", ylim=(0, None))
+        ax.set(
+            xlabel=r"frequency $\omega$", ylabel=r"density of states $D(\omega)$", ylim=(0, None)
+        )
     return ax

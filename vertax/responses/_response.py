@@ -110,6 +110,23 @@ class AbstractResponse(eqx.Module):
         **Returns:** where it ends.
         """
 
+    def goes_with(self, adjoint: AbstractAdjoint, *, guided: bool = False) -> None:
+        """Refuse an adjoint, or a cost that pulls the tissue, that this response has no use for.
+
+        **Arguments:**
+
+        - `adjoint`: how an inverse problem is to differentiate.
+        - `guided`: whether its cost is to pull the tissue, see `guidance` there.
+
+        **Raises:**
+
+        - `ValueError` with the reason, and with what to take instead.
+        """
+
+    def complaint(self) -> str | None:
+        """What went wrong last, in words, if it keeps them."""
+        return None
+
     @abc.abstractmethod
     def traced(self) -> AbstractResponse:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""

@@ -1,0 +1,247 @@
+"""Surface Evolver as a forward model. What needs the program is skipped where it is not installed."""
+
+import shutil
+import stat
+import sys
+import tempfile
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vertax as vx
+from vertax.responses import SimulatorError, SurfaceEvolver, run_program
+from vertax.responses._evolver_model import Pieces, Terms, slope_of
+
+needs_evolver = pytest.mark.skipif(
+    shutil.which("evolver") is None,
+    reason="Surface Evolver is not installed: apt-get install evolver-nox",
+)
+
+
+def straight(tissue, **settings):
+    return vx.Tissue(tissue.vertices, tissue.topology, tissue.boundary, **settings)
+
+
+def on_host(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+PERIODIC = vx.initialise.periodic_voronoi(6, key=jax.random.key(3))
+# Vertices far outside of the box, each elsewhere.
+STRAY = PERIODIC.with_vertices(
+    PERIODIC.vertices + PERIODIC.boundary.translation(jnp.array([3, -2]))
+)
+CLUSTER = straight(vx.initialise.free_voronoi(6, key=jax.random.key(3)))
+TISSUES = {"periodic": PERIODIC, "stray": STRAY, "free": CLUSTER}
+
+
+def energies(tissue):
+    tension = vx.energies.LineTension(0.3 + 0.04 * jnp.sin(1.7 * jnp.arange(tissue.n_edges)))
+    areas = vx.energies.AreaElasticity(jnp.array(10.0), jnp.linspace(0.9, 1.1, tissue.n_cells))
+    perimeters = vx.energies.PerimeterElasticity(0.1, 3.0)
+    bounded = vx.energies.BoundedTension(jnp.full(tissue.n_edges, 0.3), 0.0, 1.0)
+    return {
+        "foam": areas + tension,
+        "all": areas + tension + bounded + perimeters,
+        "shape factors": vx.energies.ShapeFactorEnergy(jnp.full(tissue.n_cells, 3.6), 1.1),
+    }
+
+
+@eqx.filter_jit
+def forces(tissue, energy):
+    return jax.grad(lambda x: energy(tissue.with_vertices(x)))(tissue.vertices)
+
+
+@eqx.filter_jit
+def slopes(tissue, energy):
+    return eqx.filter_grad(lambda e: e(tissue))(energy)
+
+
+@pytest.mark.parametrize("tissue", TISSUES.values(), ids=TISSUES)
+def test_pieces_are_the_tissue(tissue):
+    pieces = Pieces.of(on_host(tissue), 8)
+    np.testing.assert_allclose(pieces.lengths(pieces.points), tissue.edge_lengths, rtol=1e-12)
+    np.testing.assert_allclose(pieces.areas(pieces.points), tissue.areas, rtol=1e-10)
+    np.testing.assert_allclose(pieces.perimeters(pieces.points), tissue.perimeters, rtol=1e-12)
+
+
+def test_arcs_become_chains_that_come_near_them():
+    plain = vx.initialise.free_voronoi(6, key=jax.random.key(3))
+    angles = 0.4 * np.cos(np.arange(plain.n_edges))
+    tissue = straight(plain, angles=angles, inner_arcs=True)
+    errors = []
+    for n in (8, 16):
+        pieces = Pieces.of(on_host(tissue), n)
+        errors.append(np.abs(pieces.areas(pieces.points) - np.asarray(tissue.areas)).max())
+        lengths = pieces.lengths(pieces.points)
+        assert np.abs(lengths - np.asarray(tissue.edge_lengths)).max() < 1e-2
+        found = pieces.angles(pieces.points, angles)
+        assert found is not None
+        assert np.abs(found - angles).max() < 2.0 / n**2
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["all", "shape factors"])
+def test_derivatives_are_those_of_the_energy(name):
+    energy = energies(PERIODIC)[name]
+    # (Numbers are parameters too.)
+    energy = jax.tree.map(jnp.asarray, energy)
+    pieces = Pieces.of(on_host(PERIODIC), 8)
+    at = pieces.points
+    measures = (pieces.lengths(at), pieces.areas(at), pieces.perimeters(at))
+    found = slope_of(on_host(energy), *measures, None)
+    wanted = slopes(PERIODIC, energy)
+    leaves = lambda tree: jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array_like))
+    if name == "all":  # the bounds of tensions are constants
+        bounds = lambda e: (e.terms[2].low, e.terms[2].high)
+        found, wanted = (eqx.tree_at(bounds, tree, (0.0, 0.0)) for tree in (found, wanted))
+    for a, b in zip(leaves(found), leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
+def test_terms_add_up():
+    areas = vx.energies.AreaElasticity(2.0, 1.0) + vx.energies.AreaElasticity(6.0, 2.0)
+    terms = Terms.of(areas + vx.energies.LineTension(1.0), 3, 9)
+    np.testing.assert_array_equal(terms.tension, np.ones(9))
+    np.testing.assert_allclose(terms.area_stiffness, 8.0)
+    np.testing.assert_allclose(terms.area, 1.75)
+
+
+def test_energies_that_cannot_be_told_are_refused():
+    class Odd(vx.AbstractEnergy):
+        def __call__(self, tissue):
+            return jnp.sum(tissue.areas**3)
+
+    with pytest.raises(SimulatorError, match="is not told of a Odd"):
+        SurfaceEvolver().relax(on_host(PERIODIC), Odd(), None)
+
+
+@pytest.mark.parametrize("settings", [{"timeout": 0.0}, {"pieces": 0}, {"t1_below": -1.0}])
+def test_settings_are_checked(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        SurfaceEvolver(**settings)
+
+
+@pytest.fixture
+def impostor(tmp_path, monkeypatch):
+    """A program in place of Surface Evolver, and a folder for temporary files that must be empty then."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
+    (tmp_path / "scratch").mkdir()
+
+    def make(source):
+        path = tmp_path / "evolver"
+        path.write_text(f"#!{sys.executable}\nimport os, sys, time\n{source}\n")
+        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+        return str(path)
+
+    yield make
+    assert list((tmp_path / "scratch").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("print('no memory'); sys.exit(3)", "exit code 3.*\n    no memory"),
+        ("print('on fire', flush=True); os.abort()", "signal SIGABRT.*\n    on fire"),
+        ("print('done')", "wrote no 'result'.*\n    done"),
+        ("print('odd'); open('result', 'w').write('point 1 x y')", "cannot be read.*\n    odd"),
+        (
+            "print('half'); open('result', 'w').write('energy 1')",
+            "did not come to an end.*\n    half",
+        ),
+        ("open('result', 'w').write('point 9999 0 0')", "cannot be read.*It printed nothing"),
+    ],
+)
+def test_failures_are_errors_with_the_tail_of_the_log(impostor, source, says):
+    evolver = SurfaceEvolver(command=impostor(source))
+    with pytest.raises(SimulatorError, match=f"(?s){says}"):
+        evolver.relax(on_host(PERIODIC), energies(PERIODIC)["foam"], None)
+
+
+def test_what_takes_too_long_is_ended(impostor):
+    # It starts another one, which must not live on.
+    child = "import subprocess; subprocess.Popen(['sleep', '60']); print('working', flush=True)"
+    evolver = SurfaceEvolver(command=impostor(f"{child}; time.sleep(60)"), timeout=1.5)
+    began = time.perf_counter()
+    with pytest.raises(SimulatorError, match=r"(?s)not done after 1.5 s.*working"):
+        evolver.relax(on_host(PERIODIC), energies(PERIODIC)["foam"], None)
+    assert time.perf_counter() - began < 20
+
+
+def test_a_program_that_is_not_there_says_how_to_install_it():
+    evolver = SurfaceEvolver(command="no-such-evolver")
+    with pytest.raises(
+        SimulatorError, match=r"no program 'no-such-evolver'.*apt-get install evolver"
+    ):
+        evolver.relax(on_host(PERIODIC), energies(PERIODIC)["foam"], None)
+
+
+def test_programs_get_files_and_leave_results():
+    code = (
+        "import pathlib; pathlib.Path('b').write_text(pathlib.Path('a').read_text() * 2); print(1)"
+    )
+    found, log = run_program([sys.executable, "-c", code], {"a": "x"}, ["b"], timeout=30.0)
+    assert (found, log) == ({"b": "xx"}, "1\n")
+
+
+@needs_evolver
+@pytest.mark.parametrize("name", ["foam", "all", "shape factors"])
+@pytest.mark.parametrize("tissue", TISSUES.values(), ids=TISSUES)
+def test_the_program_means_the_same_energy(tissue, name):
+    energy = energies(tissue)[name]
+    there = SurfaceEvolver().energy(on_host(tissue), on_host(energy))
+    assert there == pytest.approx(float(energy(tissue)), rel=1e-12)
+
+
+@needs_evolver
+@pytest.mark.parametrize("tissue", [PERIODIC, CLUSTER], ids=["periodic", "free"])
+def test_it_comes_to_rest_under_a_pull(tissue):
+    energy = energies(tissue)["foam"]
+    first = SurfaceEvolver().relax(on_host(tissue), on_host(energy), None)
+    at_rest = tissue.with_vertices(jnp.asarray(first.vertices))
+    assert jnp.abs(forces(at_rest, energy)).max() < 1e-11
+    pull = 1e-4 * np.sin(np.arange(tissue.vertices.size)).reshape(-1, 2)
+    pull -= pull.mean(axis=0)
+    if tissue is CLUSTER:  # which would turn
+        arms = first.vertices - first.vertices.mean(axis=0)
+        aside = np.stack([-arms[:, 1], arms[:, 0]], axis=-1)
+        pull -= aside * np.sum(aside * pull) / np.sum(aside**2)
+    pulled = SurfaceEvolver().relax(on_host(at_rest), on_host(energy), pull)
+    left = forces(tissue.with_vertices(jnp.asarray(pulled.vertices)), energy) - pull
+    assert jnp.abs(left).max() < 1e-7
+    assert np.abs(pulled.vertices - first.vertices).max() > 1e-5
+
+
+@needs_evolver
+def test_gradient_by_two_runs_of_it():
+    energy = energies(PERIODIC)["foam"]
+    response = vx.External(SurfaceEvolver())
+    tissue = response(PERIODIC, energy).tissue
+    away = 0.03 * np.cos(np.arange(tissue.vertices.size)).reshape(-1, 2)
+    cost = vx.costs.VertexDistance(tissue.with_vertices(tissue.vertices + away))
+
+    @eqx.filter_jit
+    def gradient(energy):
+        adjoint = vx.EquilibriumPropagation()
+        problem = vx.InverseProblem(tissue, energy, cost, response=response, adjoint=adjoint)
+        return problem.value_and_gradient().gradient.terms[1].tension
+
+    @eqx.filter_jit
+    def derivatives(tensions):
+        value = lambda x, t: (energy.terms[0] + vx.energies.LineTension(t))(
+            tissue.with_vertices(x.reshape(-1, 2))
+        )
+        x = tissue.vertices.ravel()
+        pull = jax.grad(lambda x: cost(tissue.with_vertices(x.reshape(-1, 2)), energy))(x)
+        return pull, jax.hessian(value)(x, tensions), jax.jacobian(jax.grad(value), 1)(x, tensions)
+
+    found = np.asarray(gradient(energy))
+    pull, hessian, mixed = map(np.asarray, derivatives(energy.terms[1].tension))
+    implicit = -mixed.T @ np.linalg.pinv(hessian, rcond=1e-10) @ pull
+    cosine = found @ implicit / np.linalg.norm(found) / np.linalg.norm(implicit)
+    assert cosine > 0.9999
+    assert np.linalg.norm(found - implicit) < 1e-6 * np.linalg.norm(implicit)

@@ -1,0 +1,273 @@
+"""Tissues and energies as Surface Evolver knows them: points, straight pieces, and named quantities."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from vertax.energies import (
+    AbstractEnergy,
+    AreaElasticity,
+    BoundedTension,
+    LineTension,
+    PerimeterElasticity,
+    ShapeFactorEnergy,
+)
+from vertax.mesh import Periodic, Tissue
+from vertax.responses._simulator import Edges, SimulatorError
+
+
+class Pieces(NamedTuple):
+    """A tissue as points and straight pieces between them; in a periodic one, in the home box."""
+
+    points: Float[np.ndarray, "points 2"]
+    """The vertices, and then points on arcs."""
+    images: Int[np.ndarray, "vertices 2"]
+    """In which image of the box each vertex is."""
+    ends: Int[np.ndarray, "pieces 2"]
+    wraps: Int[np.ndarray, "pieces 2"]
+    edge: Int[np.ndarray, " pieces"]
+    """The edge that each piece belongs to."""
+    cells: Int[np.ndarray, "edges 2"]
+    shifts: Float[np.ndarray, "edges 2 2"]
+    """What to add to the first vertex of an edge to see it in the frame of the cell on either side."""
+    lattice: Float[np.ndarray, "2 2"]
+    periodic: bool
+    softening: float
+    n_cells: int
+    fixed: Int[np.ndarray, " _"]
+
+    @classmethod
+    def of(cls, tissue: Tissue, pieces: int) -> Pieces:
+        """Those of a tissue; arcs become so many pieces."""
+        edges = Edges.of(tissue)
+        vertices = np.asarray(tissue.vertices, float)
+        periodic = isinstance(tissue.boundary, Periodic)
+        lattice = np.zeros((2, 2))
+        images = np.zeros((len(vertices), 2), int)
+        if isinstance(tissue.boundary, Periodic):
+            lattice = np.asarray(tissue.boundary.lattice, float)
+            images = np.floor(vertices @ np.linalg.inv(lattice)).astype(int)
+        home = vertices - images @ lattice
+        across = np.zeros(edges.ends.shape, int)
+        if periodic:
+            across = np.rint(edges.across @ np.linalg.inv(lattice)).astype(int)
+        first, last = edges.ends.T
+        wraps = across + images[last] - images[first]
+        shifts = edges.shifts + (images[first] @ lattice)[:, None]
+        angles = np.zeros(len(edges.ends))
+        if tissue.arcs is not None:
+            on_outline = edges.cells[:, 1] == edges.n_cells
+            arc = np.full(len(angles), True) if tissue.arcs.inner else on_outline
+            angles = np.where(arc, np.asarray(tissue.arcs.angles, float), 0)
+            chains = np.where(arc, pieces, 1)
+        else:
+            chains = np.ones(len(angles), int)
+        vectors = home[last] + wraps @ lattice - home[first]
+        added, ends, steps, of_edge = [home], [], [], []
+        n_points = len(home)
+        for e, n in enumerate(chains.tolist()):
+            inner = np.arange(n_points, n_points + n - 1)
+            added.append(_on_arc(home[first[e]], vectors[e], angles[e], n))
+            course = np.concatenate([[first[e]], inner, [last[e]]])
+            ends.append(np.stack([course[:-1], course[1:]], axis=-1))
+            steps.append(np.concatenate([np.zeros((n - 1, 2), int), wraps[e][None]]))
+            of_edge.append(np.full(n, e))
+            n_points += n - 1
+        if np.abs(wraps).max(initial=0) > 1:
+            raise SimulatorError(
+                "An edge is longer than the periodic box, which Surface Evolver's datafiles cannot say."
+            )
+        pinned = () if tissue.pinned is None else np.flatnonzero(np.asarray(tissue.pinned))
+        return cls(
+            np.concatenate(added),
+            images,
+            np.concatenate(ends),
+            np.concatenate(steps),
+            np.concatenate(of_edge),
+            edges.cells,
+            shifts,
+            lattice,
+            periodic,
+            float(np.asarray(tissue.softening)),
+            edges.n_cells,
+            np.asarray(pinned, int),
+        )
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of points that are vertices."""
+        return len(self.images)
+
+    def lengths(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " edges"]:
+        """Length of each edge."""
+        d = self._vectors(points)
+        lengths = np.sqrt(np.sum(d**2, axis=1) + self.softening**2)
+        return np.bincount(self.edge, lengths, minlength=len(self.cells))
+
+    def perimeters(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " cells"]:
+        """Perimeter of each cell."""
+        lengths = np.repeat(self.lengths(points), 2)
+        return np.bincount(self.cells.ravel(), lengths, self.n_cells + 1)[: self.n_cells]
+
+    def areas(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " cells"]:
+        """Area of each cell."""
+        d = self._vectors(points)
+        corners = points[self.ends[:, 0], None] + self.shifts[self.edge]
+        shares = corners[..., 0] * d[:, None, 1] - corners[..., 1] * d[:, None, 0]
+        shares = (0.5 * shares * [1, -1]).ravel()
+        return np.bincount(self.cells[self.edge].ravel(), shares, self.n_cells + 1)[: self.n_cells]
+
+    def _vectors(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "pieces 2"]:
+        return points[self.ends[:, 1]] + self.wraps @ self.lattice - points[self.ends[:, 0]]
+
+    def angles(
+        self, points: Float[np.ndarray, "points 2"], old: Any
+    ) -> Float[np.ndarray, " edges"] | None:
+        """The angle of the arc that bulges as far as each chain does in its middle."""
+        if old is None:
+            return None
+        angles = np.array(old, float)
+        for e in np.flatnonzero(np.bincount(self.edge) > 1):
+            which = np.flatnonzero(self.edge == e)
+            course = np.concatenate([points[self.ends[which, 0]], points[self.ends[which[-1:], 1]]])
+            course[-1] += self.wraps[which[-1]] @ self.lattice
+            rest = course - course[0]
+            bulge = 0.5 * np.sum(rest[:-1, 0] * rest[1:, 1] - rest[:-1, 1] * rest[1:, 0])
+            angles[e] = _angle_of(bulge / np.sum(rest[-1] ** 2))
+        return angles
+
+
+def _on_arc(
+    start: np.ndarray, vector: np.ndarray, angle: float, n: int
+) -> Float[np.ndarray, "inner 2"]:
+    """Points that part an arc into so many equal pieces."""
+    t = np.arange(1, n)[:, None] / n
+    right = np.array([vector[1], -vector[0]])
+    if abs(angle) < 1e-6:
+        return start + t * vector + 2 * angle * t * (1 - t) * right
+    phi = angle * (2 * t - 1)
+    along = 0.5 + 0.5 * np.sin(phi) / np.sin(angle)
+    return start + along * vector + (np.cos(phi) - np.cos(angle)) / (2 * np.sin(angle)) * right
+
+
+def _angle_of(share: float) -> float:
+    """The angle of an arc whose segment has a share of the square of its chord as area."""
+    # Newton's method on (α - sin α cos α) / (4 sin² α) would meet 0/0; bisection does not care.
+    function = lambda a: (
+        (a - np.sin(a) * np.cos(a)) / (4 * np.sin(a) ** 2) if abs(a) > 1e-4 else a / 6
+    )
+    low, high = -0.98 * np.pi, 0.98 * np.pi
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if function(middle) < share else (low, middle)
+    return 0.5 * (low + high)
+
+
+class Terms(NamedTuple):
+    """What an energy asks of edges and cells; NaN where it asks nothing."""
+
+    tension: Float[np.ndarray, " edges"]
+    area_stiffness: Float[np.ndarray, " cells"]
+    area: Float[np.ndarray, " cells"]
+    perimeter_stiffness: Float[np.ndarray, " cells"]
+    perimeter: Float[np.ndarray, " cells"]
+
+    @classmethod
+    def of(cls, energy: AbstractEnergy, n_cells: int, n_edges: int) -> Terms:
+        """Those of an energy."""
+        tension = np.zeros(n_edges)
+        targets: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        per_cell = lambda x: np.broadcast_to(np.asarray(x, float), n_cells)
+
+        def add(name: str, stiffness: Any, target: Any) -> None:
+            # Two parabolas are one, up to a constant.
+            k, x = per_cell(stiffness), per_cell(target)
+            if name in targets:
+                k0, x0 = targets[name]
+                k, x = k0 + k, np.divide(k0 * x0 + k * x, k0 + k)
+            targets[name] = (k, x)
+
+        for term in terms_of(energy):
+            if isinstance(term, LineTension | BoundedTension):
+                tension = tension + tension_of(term)
+            elif isinstance(term, AreaElasticity):
+                add("area", term.stiffness, term.target_area)
+            elif isinstance(term, PerimeterElasticity):
+                add("perimeter", term.stiffness, term.target_perimeter)
+            elif isinstance(term, ShapeFactorEnergy):
+                area = np.asarray(term.mean_area, float)
+                add("area", 2 / area**2, area)
+                add("perimeter", 2 / area, np.asarray(term.target_shape_factor) * np.sqrt(area))
+            else:
+                raise SimulatorError(
+                    f"Surface Evolver is not told of a {type(term).__name__}: its energy may consist of "
+                    "LineTension, BoundedTension, AreaElasticity, PerimeterElasticity and ShapeFactorEnergy."
+                )
+        none = (np.zeros(n_cells), np.zeros(n_cells))
+        return cls(tension, *targets.get("area", none), *targets.get("perimeter", none))
+
+
+def terms_of(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:
+    """The terms of a sum, or the energy itself."""
+    return getattr(energy, "terms", (energy,))
+
+
+def tension_of(term: Any) -> Any:
+    """The tensions of a term, by NumPy."""
+    if isinstance(term, BoundedTension):
+        low, high = (np.asarray(x, float) for x in (term.low, term.high))
+        return low + (high - low) / (1 + np.exp(-np.asarray(term.logits, float)))
+    return np.asarray(term.tension, float)
+
+
+def slope_of(
+    energy: AbstractEnergy,
+    lengths: Float[np.ndarray, " edges"],
+    areas: Float[np.ndarray, " cells"],
+    perimeters: Float[np.ndarray, " cells"],
+    pressures: Float[np.ndarray, " cells"] | None,
+) -> AbstractEnergy:
+    """The partial derivatives of an energy with respect to its parameters, in their place.
+
+    With `pressures`, areas are held at their targets, and these are the multipliers.
+    """
+
+    def put(term: Any, **slopes: np.ndarray) -> Any:
+        for name, slope in slopes.items():
+            old = getattr(term, name)
+            if not isinstance(old, np.ndarray | np.generic):
+                continue
+            new = np.sum(slope) if old.ndim == 0 else slope
+            term = eqx.tree_at(lambda t, n=name: getattr(t, n), term, np.asarray(new, old.dtype))
+        return term
+
+    def derived(term: Any) -> Any:
+        if isinstance(term, LineTension):
+            return put(term, tension=lengths)
+        if isinstance(term, BoundedTension):
+            tension, low, high = tension_of(term), float(term.low), float(term.high)
+            return put(term, logits=lengths * (tension - low) * (high - tension) / (high - low))
+        if isinstance(term, AreaElasticity):
+            if pressures is not None:
+                return put(term, stiffness=0 * areas, target_area=pressures)
+            excess = areas - np.asarray(term.target_area)
+            return put(
+                term, stiffness=0.5 * excess**2, target_area=-np.asarray(term.stiffness) * excess
+            )
+        if isinstance(term, PerimeterElasticity):
+            excess = perimeters - np.asarray(term.target_perimeter)
+            slopes = (0.5 * excess**2, -np.asarray(term.stiffness) * excess)
+            return put(term, stiffness=slopes[0], target_perimeter=slopes[1])
+        area = np.asarray(term.mean_area, float)
+        off = perimeters / np.sqrt(area) - np.asarray(term.target_shape_factor)
+        by_area = -2 * (areas / area - 1) * areas / area**2 - off * perimeters / area**1.5
+        return put(term, target_shape_factor=-2 * off, mean_area=by_area)
+
+    terms = tuple(derived(term) for term in terms_of(energy))
+    if hasattr(energy, "terms"):
+        return eqx.tree_at(lambda e: e.terms, energy, terms)
+    return terms[0]
