@@ -17,7 +17,7 @@ FAMILIES = {
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
     "costs": "AbstractCost AbstractLeastSquaresCost AspectRatio CellAreas CentroidDistance EdgeDistance "
-    "HomotypicLength IndexAwareStructural MeanShapeFactor MeshImage VertexDistance WeightedSum "
+    "Frames HomotypicLength IndexAwareStructural MeanShapeFactor MeshImage VertexDistance WeightedSum "
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity PerimeterViscosity "
     "SubstrateFriction Sum ViscositySum",
@@ -38,8 +38,8 @@ FAMILIES = {
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
     "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "
     "scale_bar series_colours",
-    "responses": "AbstractResponse Equilibrium Evolution Evolved Relaxation Trajectory equilibrate evolve "
-    "record_relaxation",
+    "responses": "AbstractResponse Equilibrium Evolution Evolved Material Relaxation Trajectory equilibrate "
+    "evolve record_relaxation",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
     "transitions": "AbstractTransitions T1",
 }

@@ -5,6 +5,7 @@ from vertax.responses._evolution import (
     Evolved as Evolved,
     evolve as evolve,
 )
+from vertax.responses._material import Material as Material
 from vertax.responses._recording import record_relaxation as record_relaxation
 from vertax.responses._relaxation import Relaxation as Relaxation, equilibrate as equilibrate
 from vertax.responses._response import (

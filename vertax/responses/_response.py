@@ -89,6 +89,11 @@ _REMEDY = (
 class AbstractResponse(eqx.Module):
     """How a tissue answers to its energy."""
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether the next epoch of a fit may begin where this one ended, as it may at rest."""
+        return True
+
     @abc.abstractmethod
     def __call__(
         self,
