@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+import scipy.sparse as sp
+from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import least_squares
 
 from vertax._base.checks import check_whole
 from vertax.mesh import Tissue
@@ -35,26 +34,7 @@ class MovingTensions(eqx.Module):
     """How far they went in it: the root mean square."""
 
 
-class _Ring(eqx.Module):
-    """What is around each point: two or three others, in places of which the third may be empty."""
-
-    neighbours: Int[Array, "points 3"]
-    edges: Int[Array, "points 3"]
-    """The edges that lead there."""
-    cells: Int[Array, "points 3"]
-    """The cells on the left of the way there; the number of cells for the exterior and empty places."""
-    after: Int[Array, "points 3"]
-    """The place whose way has that cell on its right."""
-    empty: Bool[Array, "points 3"]
-    ways: Int[Array, "cells most"]
-    """The places (of all, one after the other) with a cell on the left; one too many where there are fewer."""
-
-    def per_cell(self, values: Float[Array, "points 3"]) -> Float[Array, " cells"]:
-        """The sum of what is in the places of each cell."""
-        return jnp.sum(jnp.append(values, 0)[self.ways], axis=1)
-
-
-class EdgeMotion(eqx.Module):
+class EdgeMotion:
     r"""A cluster in motion whose edges are chains of points, each of which goes where the force on it points:
 
     $$\zeta \dot x_i = - \frac{\partial}{\partial x_i} \sum_e \gamma_e \ell_e
@@ -90,18 +70,6 @@ class EdgeMotion(eqx.Module):
         neighbours, no exterior, or two cells that share two edges, and for chains of other sizes.
     """
 
-    start: Float[Array, "intervals points 2"]
-    end: Float[Array, "intervals points 2"]
-    dt: Float[Array, " intervals"]
-    ring: _Ring
-    seen: Bool[Array, " points"]
-    """Which points are on the outline."""
-    inner: Bool[np.ndarray, " edges"]
-    """Which edges are not."""
-    n_vertices: int = eqx.field(static=True)
-    n_cells: int = eqx.field(static=True)
-    substeps: int = eqx.field(static=True)
-
     def __init__(
         self,
         tissues: Sequence[Tissue],
@@ -134,164 +102,199 @@ class EdgeMotion(eqx.Module):
                         f"{edge} has {len(row)} in frame 0 and {len(course)} in frame {number}."
                     )
                 places[np.array(row)] = course
-        cells = np.asarray(first.topology.edge_cells)
+        self.n_cells, self.n_vertices = first.n_cells, first.n_vertices
         self.inner = ~np.asarray(first.topology.on_outline)
-        seen = np.zeros(points.shape[1], bool)
-        for edge in np.flatnonzero(~self.inner):
-            seen[np.array(rows[edge])] = True
-        self.seen = jnp.asarray(seen)
-        self.ring = _ring(rows, cells, points.shape[1], first.n_cells)
-        self.n_vertices, self.n_cells, self.substeps = first.n_vertices, first.n_cells, substeps
-        places = jnp.asarray(points)
-        self.start, self.end, self.dt = places[:-1], places[1:], jnp.asarray(steps, places.dtype)
+        self.substeps = substeps
+        self._dt, self._points = steps, points
+        sizes = [len(row) - 1 for row in rows]
+        self._pieces = np.concatenate([np.stack([row[:-1], row[1:]], axis=1) for row in rows])
+        self._edge = np.repeat(np.arange(len(rows)), sizes)
+        n_pieces, n_points = len(self._pieces), points.shape[1]
+        free = np.ones(n_points, bool)
+        free[self._pieces[~self.inner[self._edge]]] = False
+        self._free = np.flatnonzero(np.repeat(free, 2))
+        # Coordinates are x and y of one point after the other; a piece goes from its first to its second.
+        one = sp.kron(self._ends(1) - self._ends(0), sp.identity(2))
+        self._difference = one.tocsr()
+        each = np.arange(n_pieces)
+        left, right = np.asarray(first.topology.edge_cells)[self._edge].T
+        side = lambda cells: sp.csr_array(
+            (np.ones(n_pieces), (cells, each)), (self.n_cells + 1, n_pieces)
+        )
+        self._sides = (side(left) - side(right))[: self.n_cells]
 
-    def residuals(self, tension: Float[Array, " edges"]) -> Float[Array, "intervals points 2"]:
+    def residuals(
+        self, tension: Float[np.ndarray, " edges"]
+    ) -> Float[np.ndarray, "intervals coordinates"]:
         r"""How far points are at the end of each interval from what was seen.
 
-        Junctions from where they were seen, points of edges across the edge, and 0 on the outline.
+        Junctions from where they were seen, points of edges across the edge; of points off the outline.
 
         **Arguments:**
 
         - `tension`: $\gamma / \zeta$ of each edge; of those on the outline it does not matter.
         """
-        ends = jax.vmap(lambda *one: self._followed(tension, *one))(self.start, self.end, self.dt)
-        return jax.vmap(self._across)(ends - self.end, self.end)
+        return self._left(np.asarray(tension, float), False)[0]
 
     def tensions(self) -> MovingTensions:
         r"""The tensions that explain the motion best, by least squares.
 
         Their standard deviations are those of the Laplace approximation, where what is left over is taken
-        for independent noise.
+        for independent noise. Misfits of neighbours that are alike make them too small.
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox) if the fit comes to no end.
+        - `RuntimeError` if the fit comes to no end.
         """
         which = np.flatnonzero(self.inner)
-        found, left, gram, ns = (np.asarray(x) for x in _fitted(self, jnp.asarray(which)))
-        print('steps',ns)
-        free = ~np.asarray(self.seen)
-        n_numbers = len(left) * (free.sum() + free[: self.n_vertices].sum())
-        variance = np.sum(left**2) / max(n_numbers - len(which), 1)
-        covariance = variance * np.linalg.pinv(gram, hermitian=True)
+        whole = lambda inner: np.bincount(which, inner, len(self.inner))
+        pace = self._pace(self.inner.astype(float))
+        fit = least_squares(
+            lambda relative: self._left(pace * whole(relative), False)[0].ravel(),
+            np.ones(len(which)),
+            lambda relative: pace * self._left(pace * whole(relative), True)[1][:, which],
+            xtol=1e-6,
+            max_nfev=50,
+        )
+        if not fit.success:
+            raise RuntimeError(
+                "The tensions could not be found: after 50 steps they still change. Are the points the same "
+                "in all frames, and the times right?"
+            )
+        found, slopes = pace * fit.x, fit.jac / pace
+        n_free = len(self._dt) * (self._free < 2 * self.n_vertices).sum()
+        n_free += len(self._dt) * (self._free >= 2 * self.n_vertices).sum() // 2
+        variance = np.sum(fit.fun**2) / max(n_free - len(which), 1)
+        covariance = variance * np.linalg.pinv(slopes.T @ slopes, hermitian=True)
         mean = found.mean()
         # Slopes of relative tensions, γ over the mean.
-        slopes = (np.eye(len(which)) - found[:, None] / mean / len(which)) / mean
+        relative = (np.eye(len(which)) - found[:, None] / mean / len(which)) / mean
         tension, deviation = np.full((2, len(self.inner)), np.nan)
         tension[which] = found / mean
-        deviation[which] = np.sqrt(np.diag(slopes @ covariance @ slopes.T))
-        rms = lambda x: np.sqrt(np.mean(np.sum(x[:, free] ** 2, axis=-1), axis=-1))
-        went = jax.vmap(self._across)(self.end - self.start, self.end)
-        return MovingTensions(tension, deviation, float(mean), rms(left), rms(np.asarray(went)))
+        deviation[which] = np.sqrt(np.diag(relative @ covariance @ relative.T))
+        rms = lambda away: np.sqrt(2 * np.mean(np.square(away), axis=1))
+        went = [
+            self._across(end) @ (end - start).ravel()[self._free]
+            for start, end in zip(self._points, self._points[1:], strict=False)
+        ]
+        left = fit.fun.reshape(len(self._dt), -1)
+        return MovingTensions(tension, deviation, float(mean), rms(left), rms(went))
 
-    def pace(self, tension: Float[Array, " edges"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The factor of some tensions with which junctions set out as fast as they were seen to go on average,
-        and how far all points went."""
-        velocity = jax.vmap(lambda *one: self._velocity(tension, *one)(one[0]))
-        set_out = velocity(self.start, self.end, self.dt)
-        went = self.end - self.start
-        seen = went / self.dt[:, None, None]
-        junctions = lambda x: jnp.where(self.seen[:, None], 0, x)[:, : self.n_vertices]
-        squared = jnp.sum(junctions(set_out) ** 2)
-        pace = jnp.sum(junctions(set_out) * junctions(seen)) / squared
-        return pace, jnp.sqrt(jnp.sum(jax.vmap(self._across)(went, self.end) ** 2))
-
-    def _across(
-        self, away: Float[Array, "points 2"], x: Float[Array, "points 2"]
-    ) -> Float[Array, "points 2"]:
-        """Displacements without what is along an edge."""
-        along = x[self.ring.neighbours[:, 0]] - x[self.ring.neighbours[:, 1]]
-        across = jnp.stack([-along[:, 1], along[:, 0]], axis=-1)
-        squared = jnp.sum(across**2, axis=-1, keepdims=True)
-        share = jnp.sum(across * away, axis=-1, keepdims=True) / squared
-        inside = jnp.arange(len(x))[:, None] >= self.n_vertices
-        return jnp.where(self.seen[:, None], 0, jnp.where(inside, share * across, away))
-
-    def _followed(
-        self,
-        tension: Float[Array, " edges"],
-        start: Float[Array, "points 2"],
-        end: Float[Array, "points 2"],
-        dt: Float[Array, ""],
-    ) -> Float[Array, "points 2"]:
-        """Where points are at the end of an interval."""
-        velocity = self._velocity(tension, start, end, dt)
-        h = dt / self.substeps
-
-        def step(x: Float[Array, "points 2"], _: None) -> tuple[Float[Array, "points 2"], None]:
-            one = velocity(x)
-            return x + 0.5 * h * (one + velocity(x + h * one)), None
-
-        return jax.lax.scan(step, start, None, self.substeps)[0]
+    def _left(
+        self, tension: Float[np.ndarray, " edges"], sensitive: bool
+    ) -> tuple[Float[np.ndarray, "intervals coordinates"], Float[np.ndarray, "all edges"]]:
+        """The residuals, and how they depend on the tensions, if that is asked for."""
+        left, slopes = [], []
+        for number, dt in enumerate(self._dt):
+            start, end = self._points[number : number + 2]
+            x, dx = start.ravel(), np.zeros((len(self._free), len(tension) if sensitive else 0))
+            drive = (end - start).ravel() / dt, (self._areas(end.ravel()) - self._areas(x)) / dt
+            h = dt / self.substeps
+            for _ in range(self.substeps):  # Heun
+                one, d_one = self._velocity(x, dx, tension, *drive)
+                two, d_two = self._velocity(x + h * one, dx + h * d_one, tension, *drive)
+                x, dx = x + 0.5 * h * (one + two), dx + 0.5 * h * (d_one + d_two)
+            across = self._across(end)
+            left.append(across @ (x - end.ravel())[self._free])
+            slopes.append(across @ dx)
+        return np.stack(left), np.concatenate(slopes)
 
     def _velocity(
         self,
-        tension: Float[Array, " edges"],
-        start: Float[Array, "points 2"],
-        end: Float[Array, "points 2"],
-        dt: Float[Array, ""],
-    ) -> Callable[[Float[Array, "points 2"]], Float[Array, "points 2"]]:
-        """How fast points go, as a function of where they are, in an interval."""
-        ring, seen = self.ring, self.seen[:, None]
-        as_seen = (end - start) / dt
-        growth = (self._areas(end) - self._areas(start)) / dt
+        x: Float[np.ndarray, " coordinates"],
+        dx: Float[np.ndarray, "free edges"],
+        tension: Float[np.ndarray, " edges"],
+        as_seen: Float[np.ndarray, " coordinates"],
+        growth: Float[np.ndarray, " cells"],
+    ) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, "free edges"]]:
+        """How fast points go, and how that depends on tensions on which `x` depends as in `dx`."""
+        free = self._free
+        way = (self._difference @ x).reshape(-1, 2)
+        length = np.linalg.norm(way, axis=1)
+        along = way / length[:, None]
+        pull = tension[self._edge]
+        v = as_seen.copy()
+        v[free] = -(self._difference.T @ (pull[:, None] * along).ravel())[free]
+        area = self._area_slopes(x)
+        loose = area[:, free]
+        gram = (loose @ loose.T).toarray()
+        # One pressure for all moves nothing within a given outline: their sum is 0.
+        factors = cho_factor(gram + np.trace(gram) / len(gram) ** 2)
+        pressure = cho_solve(factors, growth - area @ v)
+        v[free] += loose.T @ pressure
+        if dx.shape[1] == 0:
+            return v, dx
+        # What a change of places does to pulls (across pieces alone) and to pressures, then both together.
+        stretched = self._difference[:, free]
+        ways = (stretched @ dx).reshape(len(way), 2, -1)
+        turned = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        swing = np.einsum("pi,pik->pk", turned, ways) * (pull / length)[:, None]
+        pulls = (turned[:, :, None] * swing[:, None]).reshape(2 * len(way), -1)
+        dv = -(stretched.T @ pulls)
+        each = np.arange(along.size)
+        own = sp.csr_array((along.ravel(), (each, np.repeat(self._edge, 2))), (along.size, dx.shape[1]))
+        dv -= (stretched.T @ own).toarray()
+        dv += self._area_curvature(pressure)[free][:, free] @ dx
+        dv += loose.T @ -cho_solve(factors, self._area_slopes(v)[:, free] @ dx + loose @ dv)
+        return v, dv
 
-        def velocity(x: Float[Array, "points 2"]) -> Float[Array, "points 2"]:
-            outward = x[ring.neighbours] - x[:, None]
-            length = jnp.sqrt(jnp.sum(outward**2, axis=-1) + ring.empty)
-            pull = jnp.where(ring.empty, 0, tension[ring.edges]) / length
-            v = jnp.where(seen, as_seen, jnp.sum(pull[..., None] * outward, axis=1))
-            turned = 0.5 * jnp.stack([outward[..., 1], -outward[..., 0]], axis=-1)
-            # Derivatives of the areas of the cells around each point.
-            slopes = turned - jnp.take_along_axis(turned, ring.after[..., None], axis=1)
-            free = jnp.where(seen[..., None], 0, slopes)
-            short = growth - ring.per_cell(jnp.sum(slopes * v[:, None], axis=-1))
+    def _pace(self, tension: Float[np.ndarray, " edges"]) -> float:
+        """The factor of tensions with which junctions set out as fast as they were seen to go."""
+        junctions = self._free[self._free < 2 * self.n_vertices]
+        none = np.zeros((len(self._free), 0))
+        sums = np.zeros(2)
+        for number, dt in enumerate(self._dt):
+            start, end = self._points[number : number + 2].reshape(2, -1)
+            seen = (end - start) / dt
+            growth = (self._areas(end) - self._areas(start)) / dt
+            rest, _ = self._velocity(start, none, 0 * tension, seen, growth)
+            pulled, _ = self._velocity(start, none, tension, seen, growth)
+            pulled, seen = (pulled - rest)[junctions], (seen - rest)[junctions]
+            sums += pulled @ seen, pulled @ pulled
+        return sums[0] / sums[1]
 
-            def push(pressure: Float[Array, " cells"]) -> Float[Array, "points 2"]:
-                return jnp.sum(jnp.append(pressure, 0)[ring.cells][..., None] * free, axis=1)
+    def _ends(self, which: int) -> sp.csr_array:
+        """Takes the first or second point of each piece."""
+        n = len(self._pieces)
+        places = (np.arange(n), self._pieces[:, which])
+        return sp.csr_array((np.ones(n), places), (n, self._points.shape[1]))
 
-            # One pressure for all moves nothing within a given outline: their sum is 0.
-            size = jax.lax.stop_gradient(jnp.sum(free**2)) / self.n_cells
+    def _areas(self, x: Float[np.ndarray, " coordinates"]) -> Float[np.ndarray, " cells"]:
+        a, b = x.reshape(-1, 2)[self._pieces.T]
+        return self._sides @ (0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
 
-            def grown(pressure: Float[Array, " cells"]) -> Float[Array, " cells"]:
-                grows = jnp.sum(free * push(pressure)[:, None], axis=-1)
-                return ring.per_cell(grows) + size * jnp.mean(pressure)
+    def _area_slopes(self, x: Float[np.ndarray, " coordinates"]) -> sp.csr_array:
+        """Derivatives of areas, which are linear in `x`."""
+        a, b = x.reshape(-1, 2)[self._pieces.T]
+        columns = np.stack([2 * self._pieces, 2 * self._pieces + 1], axis=2).reshape(-1, 4)
+        values = 0.5 * np.stack([b[:, 1], -b[:, 0], -a[:, 1], a[:, 0]], axis=1)
+        rows = 4 * np.arange(len(a) + 1)
+        swept = sp.csr_array((values.ravel(), columns.ravel(), rows), (len(a), len(x)))
+        return (self._sides @ swept).tocsr()
 
-            matrix = jax.vmap(grown)(jnp.eye(self.n_cells, dtype=x.dtype))
-            factors = jax.scipy.linalg.cho_factor(jax.lax.stop_gradient(matrix))
-            # A derivative needs no more than the product with the matrix, which is much cheaper.
-            solve = lambda _, b: jax.scipy.linalg.cho_solve(factors, b)
-            pressure = jax.lax.custom_linear_solve(grown, short, solve, symmetric=True)
-            return v + push(pressure)
+    def _area_curvature(self, pressure: Float[np.ndarray, " cells"]) -> sp.csr_array:
+        """Second derivatives of the areas, times pressures."""
+        share = 0.5 * (self._sides.T @ pressure)
+        a, b = 2 * self._pieces.T
+        rows = np.concatenate([a, b + 1, a + 1, b])
+        columns = np.concatenate([b + 1, a, b, a + 1])
+        values = np.concatenate([share, share, -share, -share])
+        n = 2 * self._points.shape[1]
+        return sp.csr_array((values, (rows, columns)), (n, n))
 
-        return velocity
-
-    def _areas(self, x: Float[Array, "points 2"]) -> Float[Array, " cells"]:
-        next_ = x[self.ring.neighbours]
-        swept = 0.5 * (x[:, None, 0] * next_[..., 1] - x[:, None, 1] * next_[..., 0])
-        return self.ring.per_cell(swept)
-
-
-@eqx.filter_jit
-def _fitted(
-    motion: EdgeMotion, which: Int[Array, " inner"]
-) -> tuple[Float[Array, " inner"], Float[Array, "intervals points 2"], Float[Array, "inner inner"], Any]:
-    """Tensions of inner edges, what they leave over, and JᵀJ."""
-
-    ones = jnp.zeros(len(motion.inner)).at[which].set(1)
-    pace, moved = motion.pace(ones)
-
-    def residuals(relative: Float[Array, " inner"], _: None = None) -> Array:
-        return motion.residuals(pace * jnp.zeros_like(ones).at[which].set(relative)) / moved
-
-    # The motion is nearly linear in the tensions, so few of these steps are needed.
-    solver = optx.Dogleg(rtol=1e-4, atol=1e-4)
-    options = {"jac": "fwd"}
-    solution = optx.least_squares(residuals, solver, ones[which], options=options, max_steps=30)
-    slopes = jax.jacfwd(residuals)(solution.value) / pace
-    gram = jnp.tensordot(slopes, slopes, ((0, 1, 2), (0, 1, 2)))
-    left = moved * residuals(solution.value)
-    return pace * solution.value, left, moved**2 * gram, solution.stats["num_steps"]
+    def _across(self, end: Float[np.ndarray, "points 2"]) -> sp.csr_array:
+        """Displacements of free points without what is along an edge."""
+        n = len(end)
+        # Each point within an edge is the second of one piece and the first of the next.
+        before, after = np.arange(n), np.arange(n)
+        before[self._pieces[:, 1]], after[self._pieces[:, 0]] = self._pieces.T
+        along = end[after] - end[before]
+        across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        across /= np.maximum(np.linalg.norm(across, axis=1), 1e-300)[:, None]
+        blocks = across[:, :, None] * across[:, None]
+        blocks[: self.n_vertices] = np.eye(2)
+        whole = sp.bsr_array((blocks, np.arange(n), np.arange(n + 1))).tocsr()
+        return whole[self._free][:, self._free]
 
 
 def _numbered(tissue: Tissue, sizes: Sequence[int]) -> list[list[int]]:
@@ -304,32 +307,6 @@ def _numbered(tissue: Tissue, sizes: Sequence[int]) -> list[list[int]]:
         [int(a), *range(end - size + 2, end), int(b)]
         for a, b, end, size in zip(first, last, ends.tolist(), sizes, strict=True)
     ]
-
-
-def _ring(
-    rows: list[list[int]], cells: Int[np.ndarray, "edges 2"], n_points: int, n_cells: int
-) -> _Ring:
-    """What is around each point."""
-    own = np.arange(n_points)[:, None].repeat(3, axis=1)
-    edges, left, right = (np.full_like(own, value) for value in (0, n_cells, -1))
-    neighbours, filled = own.copy(), np.zeros(n_points, int)
-    for edge, row in enumerate(rows):
-        ways = [*zip(row[:-1], row[1:], strict=True)]
-        for (a, b), sides in (
-            *((way, cells[edge]) for way in ways),
-            *((way[::-1], cells[edge][::-1]) for way in ways),
-        ):
-            place = (a, filled[a])
-            neighbours[place], edges[place] = b, edge
-            left[place], right[place] = sides
-            filled[a] += 1
-    after = np.argmax(right[:, None, :] == left[:, :, None], axis=2)
-    of_cells = [np.flatnonzero(left == cell) for cell in range(n_cells)]
-    ways = np.full((n_cells, max(map(len, of_cells))), left.size)
-    for cell, places in enumerate(of_cells):
-        ways[cell, : len(places)] = places
-    empty = np.arange(3) >= filled[:, None]
-    return _Ring(*map(jnp.asarray, (neighbours, edges, left, after, empty, ways)))
 
 
 def _as_in_first(
