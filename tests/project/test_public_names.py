@@ -16,7 +16,7 @@ FAMILIES = {
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
     "costs": "AbstractCost AbstractLeastSquaresCost Anisotropy AspectRatio BulkModulus CellAreas "
-    "CellStress CentroidDistance EdgeDistance HomotypicLength IndexAwareStructural "
+    "CellStress CentroidDistance EdgeDistance Frames HomotypicLength IndexAwareStructural "
     "MeanShapeFactor MeshImage ShearModulus SpectralGap Stress VertexDistance WeightedSum "
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity "
@@ -43,8 +43,8 @@ FAMILIES = {
     "plot_mode plot_moduli plot_recovery plot_stress plot_tissue plot_tissues "
     "same_limits scale_bar series_colours",
     "responses": "AbstractResponse AbstractSimulator Edges Equilibrium Evolution Evolved External "
-    "Ledger Relaxation Relaxed SimulatorError SurfaceEvolver Trajectory equilibrate "
-    "evolve record_relaxation run_program",
+    "Ledger Material Relaxation Relaxed SimulatorError SurfaceEvolver Trajectory "
+    "equilibrate evolve record_relaxation run_program",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
     "transitions": "AbstractTransitions T1",
 }

@@ -7,6 +7,7 @@ from vertax.costs._cost import (
     AbstractLeastSquaresCost as AbstractLeastSquaresCost,
     WeightedSum as WeightedSum,
 )
+from vertax.costs._frames import Frames as Frames
 from vertax.costs._image import MeshImage as MeshImage, mirror as mirror, render as render
 from vertax.costs._interfaces import HomotypicLength as HomotypicLength
 from vertax.costs._mechanics import (

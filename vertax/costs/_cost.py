@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from vertax._base.batch import member
 from vertax._base.checks import check_number
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -23,6 +24,14 @@ class AbstractCost(eqx.Module):
     @abc.abstractmethod
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Cost of a relaxed tissue and the energy that it minimises."""
+
+    @property
+    def of_frames(self) -> bool:
+        """Whether it is to see all frames of a movement, a tissue with a leading axis of times.
+
+        By default False: it sees one tissue, the last. See [`Frames`][vertax.costs.Frames].
+        """
+        return False
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The numbers of which the cost is half the sum of squares.
@@ -83,9 +92,15 @@ class WeightedSum(AbstractCost):
     weights: Float[Array, " costs"]
     costs: tuple[AbstractCost, ...]
 
+    @property
+    def of_frames(self) -> bool:
+        """Whether one of the terms sees all frames; others see the last one then."""
+        return any(cost.of_frames for cost in self.costs)
+
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Weighted sum of the costs."""
-        return jnp.sum(self.weights * jnp.stack([cost(tissue, energy) for cost in self.costs]))
+        values = [cost(self._seen(cost, tissue), energy) for cost in self.costs]
+        return jnp.sum(self.weights * jnp.stack(values))
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The residuals of all terms, times the roots of the weights.
@@ -102,8 +117,11 @@ class WeightedSum(AbstractCost):
             "solver needs: make the weight positive, or fit with an Optax optimiser.",
         )
         roots = jnp.sqrt(weights)
-        parts = [cost.residuals(tissue, energy) for cost in self.costs]
+        parts = [cost.residuals(self._seen(cost, tissue), energy) for cost in self.costs]
         return jnp.concatenate([root * part for root, part in zip(roots, parts, strict=True)])
+
+    def _seen(self, cost: AbstractCost, tissue: Tissue) -> Tissue:
+        return member(tissue, -1) if self.of_frames and not cost.of_frames else tissue
 
 
 def _parts(cost: AbstractCost) -> tuple[Float[Array, " costs"], tuple[AbstractCost, ...]]:

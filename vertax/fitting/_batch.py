@@ -1,76 +1,16 @@
-"""Batches: many of a kind as one pytree with a leading axis, and one of them again."""
+"""Fits of a batch, joined."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vertax._base.batch import stack
 from vertax.fitting._history import Fit, History
-
-Tree = TypeVar("Tree", bound=Any)
-
-
-def stack(trees: Sequence[Tree]) -> Tree:
-    """A batch of pytrees of one structure: each array gets a leading axis.
-
-    ```python
-    problems = [make(key) for key in jax.random.split(jax.random.key(0), 8)]
-    fits = vx.fit(vx.fitting.stack(problems), optax.adam(1e-2), 200, batched=True)
-    first = vx.fitting.member(fits.energy, 0)
-    ```
-
-    **Arguments:**
-
-    - `trees`: tissues of one size, energies, inverse problems, … What is no array in them (functions,
-        Python numbers) must be the same in all.
-
-    **Returns:** the batch.
-
-    **Raises:**
-
-    - `ValueError` for no trees, and for those that differ in structure, in the shape of an array or in
-        what is no array.
-    """
-    trees = list(trees)
-    if not trees:
-        raise ValueError("Argument `trees` must hold at least one pytree, but is empty.")
-    structures = [jax.tree.structure(tree) for tree in trees]
-    for number, structure in enumerate(structures):
-        if structure != structures[0]:
-            raise ValueError(
-                "Argument `trees` must hold pytrees of one structure, such as tissues with equally many "
-                f"cells and one kind of boundary, but number {number} differs from number 0."
-            )
-    return jax.tree.map(_stacked, *trees)
-
-
-def member(tree: Tree, index: int) -> Tree:
-    """One of a batch.
-
-    **Arguments:**
-
-    - `tree`: the batch: each of its arrays has a leading axis.
-    - `index`: which, from 0.
-
-    **Returns:** its member.
-
-    **Raises:**
-
-    - `IndexError` if there are not so many.
-    """
-    sizes = {x.shape[0] if x.ndim else 0 for x in jax.tree.leaves(tree) if _is_array(x)}
-    # JAX takes the last one for an index beyond the end.
-    if sizes and not -min(sizes) <= index < min(sizes):
-        raise IndexError(
-            f"Argument `index` must lie in 0 … {min(sizes) - 1}, the members of the batch, but is {index}."
-        )
-    return jax.tree.map(lambda x: x[index] if _is_array(x) else x, tree)
 
 
 def stack_fits(fits: Sequence[Fit[Any]], *, at_once: int = 1) -> Fit[Any]:
@@ -108,25 +48,3 @@ def stack_fits(fits: Sequence[Fit[Any]], *, at_once: int = 1) -> Fit[Any]:
         notes={n: np.stack([fit.notes[n][:epochs] for fit in fits], axis=1) for n in names},
         interrupted=any(fit.interrupted for fit in fits),
     )
-
-
-def _is_array(x: Any) -> bool:
-    return eqx.is_array(x) or isinstance(x, np.ndarray)
-
-
-def _stacked(first: Any, *others: Any) -> Any:
-    if _is_array(first):
-        shapes = [np.shape(x) for x in (first, *others)]
-        if len(set(shapes)) > 1:
-            raise ValueError(
-                "Argument `trees` must hold arrays of equal shapes in the same places, but some are of "
-                f"shapes {', '.join(map(str, dict.fromkeys(shapes)))}."
-            )
-        return jnp.stack([first, *others])
-    for other in others:
-        if other is not first and other != first:
-            raise ValueError(
-                "Argument `trees` must not differ in what is no array, but one holds "
-                f"{first!r} where another holds {other!r}. Make numbers that differ arrays: jnp.array(…)."
-            )
-    return first

@@ -148,7 +148,7 @@ def _epoch(
             grad=gradient,
         )
         parameters, shift = eqx.apply_updates(fitted, updates)
-        following = equilibrium.tissue
+        following = problem.onward(equilibrium.tissue)
         if shift is not None:
             following = following.with_vertices(following.vertices + shift)
         best = better(

@@ -24,7 +24,7 @@ from vertax.costs import AbstractCost
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import mean_stiffness, units_of
 from vertax.mesh import Tissue
-from vertax.responses import AbstractResponse, Equilibrium, Relaxation
+from vertax.responses import AbstractResponse, Equilibrium, Evolved, Relaxation
 
 Energy = TypeVar("Energy", bound=AbstractEnergy)
 
@@ -50,7 +50,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
 
     **Arguments:**
 
-    - `tissue`: where the first relaxation starts.
+    - `tissue`: where the first relaxation starts; of a movement the first frame.
     - `energy`: the energy, with the first guess of its parameters.
     - `cost`: what to minimise.
     - `trainable`: which leaves of the energy are fitted: a predicate of a leaf, or a pytree of booleans
@@ -58,7 +58,10 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         Python floats are constants.
     - `fit_position`: fit also where the whole tissue lies. No parameter of an energy moves the centroid
         of a tissue, so a cost that sees positions (an image) needs this unless they are known.
-    - `response`: how the tissue answers to its energy, a [`Relaxation`][vertax.Relaxation].
+    - `response`: how the tissue answers to its energy, a [`Relaxation`][vertax.Relaxation], or an
+        [`Evolution`][vertax.Evolution] if it is on its way. Then the cost sees the last frame, or all if it
+        is of [`Frames`][vertax.costs.Frames]; and the energy may be a
+        [`Material`][vertax.responses.Material], of which what resists and what drives are fitted as well.
     - `adjoint`: how to differentiate, one of `vertax.adjoints`.
     - `guidance`: strength $\kappa$, energy per cost. If given, the tissue minimises $E + \kappa C$:
         the cost pulls it, through T1 transitions too, towards what it asks for, while the parameters
@@ -67,7 +70,8 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     **Raises:**
 
     - `TypeError` for a response or a cost that is none.
-    - `ValueError` for an adjoint, or guidance, that does not go with the response.
+    - `ValueError` for an adjoint, guidance or a fitted position that do not go with the response, or a cost
+        of frames without an evolution.
     """
 
     tissue: Tissue
@@ -85,7 +89,14 @@ class InverseProblem(eqx.Module, Generic[Energy]):
                 f"Argument `response` must be a response such as vertax.Relaxation(), but is "
                 f"{self.response!r}."
             )
-        self.response.goes_with(self.adjoint, guided=self.guidance is not None)
+        self.response.goes_with(
+            self.adjoint, guided=self.guidance is not None, placed=self.fit_position
+        )
+        if self.response.goes_on and self.cost.of_frames:
+            raise ValueError(
+                "Argument `cost` is one of several frames, and a relaxation has one: pass "
+                "response=vertax.Evolution(dissipation, times)."
+            )
 
     def __call__(
         self,
@@ -124,15 +135,25 @@ class InverseProblem(eqx.Module, Generic[Energy]):
             return cost, _placed(settled, shift)
         relaxed = self.relax(tissue, energy, shift, adjoint=self.adjoint, throw=throw)
         equilibrium = _placed(relaxed, shift)
-        return self.cost(equilibrium.tissue, energy), equilibrium
+        return self.cost(self._seen(equilibrium), energy), equilibrium
 
     def residuals(
         self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
     ) -> tuple[Float[Array, " residuals"], Equilibrium, Tissue]:
         """Residuals of a least-squares cost, the equilibrium, and its tissue displaced by `shift`."""
         equilibrium = self.relax(tissue, energy, shift, adjoint=self.adjoint)
-        placed = _moved(equilibrium.tissue, shift)
-        return self.cost.residuals(placed, energy), equilibrium, placed
+        placed = _placed(equilibrium, shift)
+        return self.cost.residuals(self._seen(placed), energy), equilibrium, placed.tissue
+
+    def _seen(self, equilibrium: Equilibrium) -> Tissue:
+        """What the cost sees."""
+        if self.cost.of_frames and isinstance(equilibrium, Evolved):
+            return equilibrium.frames
+        return equilibrium.tissue
+
+    def onward(self, reached: Tissue) -> Tissue:
+        """Where the next epoch starts after one has reached an equilibrium, or the end of a movement."""
+        return reached if self.response.goes_on else self.tissue
 
     def value_and_gradient(
         self,

@@ -164,7 +164,8 @@ def _residuals(
             gradient_steps=unknown,
             relative_error=relative_error(parameters, true),
         )
-        return residuals, (eqx.filter((relaxed.tissue, placed), eqx.is_array), facts)
+        tissues = (problem.onward(relaxed.tissue), placed)
+        return residuals, (eqx.filter(tissues, eqx.is_array), facts)
 
     return evaluate
 

@@ -81,7 +81,9 @@ def uncertainty(
     parameters, constants = eqx.partition(fit.energy, problem.trainable)
     flat, unravel = jfu.ravel_pytree(parameters)
     shift = jnp.zeros(2, flat.dtype) if problem.fit_position else None
-    gram, squares, n_residuals = _gram(problem, fit.tissue, flat, unravel, constants, shift)
+    gram, squares, n_residuals = _gram(
+        problem, problem.onward(fit.tissue), flat, unravel, constants, shift
+    )
     n_free = n_residuals if n_independent is None else n_independent
     n_fitted = len(gram)
     if not n_free > n_fitted:

@@ -7,6 +7,7 @@ from vertax.responses._evolution import (
 )
 from vertax.responses._evolver import SurfaceEvolver as SurfaceEvolver
 from vertax.responses._external import External as External
+from vertax.responses._material import Material as Material
 from vertax.responses._program import run_program as run_program
 from vertax.responses._recording import record_relaxation as record_relaxation
 from vertax.responses._relaxation import Relaxation as Relaxation, equilibrate as equilibrate

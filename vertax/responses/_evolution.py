@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,11 +17,12 @@ from vertax._base.checks import as_key, as_real, check_whole, named
 from vertax._base.memory_maps import spare_memory_maps
 from vertax._base.modules import is_concrete, traced
 from vertax.activities import AbstractActivity
-from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
+from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Tissue
+from vertax.responses._material import Material
 from vertax.responses._relaxation import Relaxation
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._step import Incremental
@@ -222,12 +224,51 @@ class Evolution(AbstractResponse):
         **Raises:** as [`evolve`][vertax.evolve].
         """
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
-        self.relaxation.check(tissue, energy, adjoint)
-        self._check(tissue)
+        response = self
+        if isinstance(energy, Material):
+            response, energy = self.of(energy), energy.energy
+        response.relaxation.check(tissue, energy, adjoint)
+        response._check(tissue)
         spare_memory_maps()
-        response = self.traced()
+        response = response.traced()
         evolved = _evolve(*traced((tissue, energy)), response, adjoint)
         return evolved.checked() if throw else evolved
+
+    def goes_with(
+        self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
+    ) -> None:
+        """Refuse what goes with tissues at rest alone.
+
+        **Arguments:** as for every response.
+
+        **Raises:**
+
+        - `ValueError` for a cost that pulls the tissue, and for a position that is fitted.
+        """
+        by_cost = isinstance(adjoint, EquilibriumPropagation) and adjoint.nudge == "cost"
+        for what, wrong in (
+            ("`fit_position`", placed),
+            ("`guidance`", guided),
+            ("EquilibriumPropagation(nudge='cost')", by_cost),
+        ):
+            if wrong:
+                raise ValueError(
+                    f"{what} goes with a tissue at rest, but the response is an Evolution. Leave it out."
+                )
+
+    @property
+    def goes_on(self) -> bool:
+        """Each epoch of a fit begins at the first of the times."""
+        return False
+
+    def of(self, material: Material) -> Evolution:
+        """The same for a material with a dissipation or an activity of its own."""
+        dissipation, activity = material.dissipation, material.activity
+        parts = {"dissipation": dissipation, "activity": activity}
+        own = {name: part for name, part in parts.items() if part is not None}
+        return Evolution(
+            **({f.name: getattr(self, f.name) for f in dataclasses.fields(self)} | own)
+        )
 
     def traced(self) -> Evolution:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""

@@ -147,7 +147,9 @@ class External(AbstractResponse):
             )
         return equilibrium.checked()
 
-    def goes_with(self, adjoint: AbstractAdjoint, *, guided: bool = False) -> None:
+    def goes_with(
+        self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
+    ) -> None:
         """Refuse all adjoints but equilibrium propagation by constant forces.
 
         **Arguments:** as for every response.

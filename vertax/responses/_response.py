@@ -89,6 +89,11 @@ _REMEDY = (
 class AbstractResponse(eqx.Module):
     """How a tissue answers to its energy."""
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether the next epoch of a fit may begin where this one ended, as it may at rest."""
+        return True
+
     @abc.abstractmethod
     def __call__(
         self,
@@ -110,13 +115,16 @@ class AbstractResponse(eqx.Module):
         **Returns:** where it ends.
         """
 
-    def goes_with(self, adjoint: AbstractAdjoint, *, guided: bool = False) -> None:
+    def goes_with(
+        self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
+    ) -> None:
         """Refuse an adjoint, or a cost that pulls the tissue, that this response has no use for.
 
         **Arguments:**
 
         - `adjoint`: how an inverse problem is to differentiate.
         - `guided`: whether its cost is to pull the tissue, see `guidance` there.
+        - `placed`: whether it is to fit where the whole tissue lies.
 
         **Raises:**
 
