@@ -19,6 +19,7 @@ from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
+from vertax.energies._units import cell_size
 from vertax.mesh import AbstractBoundary, Tissue
 from vertax.responses._relaxation import Relaxation
 from vertax.responses._response import AbstractResponse, Equilibrium
@@ -252,8 +253,8 @@ class Evolution(AbstractResponse):
             return
         with jax.ensure_compile_time_eval():
             free = np.asarray(_resistance(tissue, self.dissipation)) == 0
-        if tissue.pinned is not None:
-            free &= ~np.asarray(tissue.pinned)
+        if tissue.held is not None:
+            free &= ~np.asarray(tissue.held)
         if free.any():
             which = np.nonzero(free)[0]
             some = ", ".join(map(str, which[:5])) + (", ..." if len(which) > 5 else "")
@@ -444,7 +445,7 @@ def _increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
 @eqx.filter_jit
 def _resistance(tissue: Tissue, dissipation: AbstractDissipation) -> Float[Array, " vertices"]:
     """How much each vertex is held back if all move in different directions."""
-    size = 1e-3 * jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
+    size = 1e-3 * cell_size(tissue)
     angles = 2.4 * jnp.arange(tissue.n_vertices, dtype=tissue.vertices.dtype)
     away = size * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
     moved = lambda vertices: dissipation(tissue.with_vertices(vertices), tissue, 1.0)
