@@ -382,7 +382,7 @@ class Tissue(eqx.Module):
         degrees of freedom that `with_configuration` ignores. All are lengths.
         """
         vertices, scaled = self._split(configuration)
-        here, there = self._gathered(self.vertices), self._gathered(vertices)
+        here, there = self.gathered(self.vertices), self.gathered(vertices)
         drift = [self.boundary.drift(there, here, self.pinned)]
         held = self.held
         if held is not None:
@@ -393,7 +393,7 @@ class Tissue(eqx.Module):
 
     def settled(self, start: Tissue) -> Tissue:
         """The same shape, moved as a whole to where it has no drift from the vertices of `start`."""
-        here, there = self._gathered(self.vertices), self._gathered(start.vertices)
+        here, there = self.gathered(self.vertices), self.gathered(start.vertices)
         return self.with_vertices(self.boundary.settle(here, there, self.pinned))
 
     def held_as(self, start: Tissue) -> Tissue:
@@ -425,7 +425,7 @@ class Tissue(eqx.Module):
         spare = ~self.topology.alive_vertices
         return spare if self.pinned is None else self.pinned | spare
 
-    def _gathered(self, vertices: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
+    def gathered(self, vertices: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
         """Vertices with those of spare slots in the middle of the others, where they count for nothing."""
         if not self.topology.spare:
             return vertices

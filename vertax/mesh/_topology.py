@@ -303,7 +303,7 @@ class Topology(eqx.Module):
             coo_array((np.ones(n_half, bool), (h // 3, twin // 3)), shape=(n_vertices, n_vertices)),
             directed=False,
         )
-        n_spare = np.count_nonzero(nowhere) // 6
+        n_spare = int(np.count_nonzero(nowhere)) // 6
         require(n_pieces - n_spare == 1, "the tissue must be in one piece")
         euler = n_vertices - n_half // 2 + n_orbits - 2 * n_spare  # each of which is a sphere
         if self.exterior:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -41,7 +41,7 @@ class Change(eqx.Module):
         """
         n_cells, n_edges = self.cells.shape[-1], self.edges.shape[-1]
 
-        def of(x: Array) -> Array:
+        def of(x: Any) -> Any:
             if not eqx.is_array(x) or x.ndim == 0 or x.shape[0] not in (n_cells, n_edges):
                 return x
             return take(x, self.cells if x.shape[0] == n_cells else self.edges)

@@ -12,7 +12,7 @@ from vertax._base.checks import as_real
 from vertax._base.modules import is_concrete
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import arc_points
-from vertax.mesh._sides import cross, dot
+from vertax.mesh._sides import cross
 from vertax.mesh._surgery import spare_slot, split_cell
 from vertax.mesh._topology import take
 from vertax.transitions._change import Change, raised_if, unchanged
@@ -55,7 +55,7 @@ def divide(
     **Raises:**
 
     - `ValueError` for an axis that is none, or a cell that is not there.
-    - `RuntimeError` (of Equinox inside `jax.jit`) if there is no spare slot left, or if the cell cannot be cut
+    - `RuntimeError` (of Equinox inside `jax.jit`) if there is no spare slot left, or if it cannot be cut
         in two along this axis.
     """
     if axis is not None:
@@ -108,10 +108,11 @@ def divided(
     axis = axis / jnp.sqrt(jnp.sum(axis**2))
     along = jnp.stack([-axis[1], axis[0]])  # of the cut
     first, last = sides[:, :2] - centre, sides[:, :2] + sides[:, 2:4] - centre
-    before, after = cross(along, first), cross(along, last)
+    beside = lambda x: -jnp.sum(axis * x, axis=-1)
+    before, after = beside(first), beside(last)
     leaves, enters = mine & (before < 0) & (after >= 0), mine & (before >= 0) & (after < 0)
     share = before / jnp.where(leaves | enters, before - after, 1)
-    at = dot(along, first) + share * dot(along, sides[:, 2:4])
+    at = jnp.sum(along * (first + share[:, None] * sides[:, 2:4]), axis=-1)
     # Where the line leaves the cell after the centroid, and where it last came in before.
     out = jnp.argmin(jnp.where(leaves & (at > 0), at, jnp.inf)).astype(m.twin.dtype)
     into = jnp.argmax(jnp.where(enters & (at < at[out]), at, -jnp.inf)).astype(m.twin.dtype)
@@ -122,7 +123,7 @@ def divided(
     cut = take(sides, both)
     share = take(share, both)
     if tissue.arcs is not None:
-        share = _where_arcs_meet(cut, centre, along, share)
+        share = _where_arcs_meet(cut, centre, axis)
     share = jnp.clip(share, _MARGIN, 1 - _MARGIN)
     points = cut[:, :2] + share[:, None] * cut[:, 2:4]
     if tissue.arcs is not None:
@@ -190,19 +191,19 @@ def _on_arcs(sides: Float[Array, "2 parts"], shares: Float[Array, "2"]) -> Float
 def _where_arcs_meet(
     sides: Float[Array, "2 parts"],
     centre: Float[Array, "2"],
-    along: Float[Array, "2"],
-    shares: Float[Array, "2"],
+    axis: Float[Array, "2"],
 ) -> Float[Array, "2"]:
-    """At which share of their length two sides cross a line, by bisection."""
-    beside = lambda x: cross(along, x - centre)
-    rising = beside(sides[:, :2]) < 0
+    """At which share of their length two sides cross the line across an axis, by bisection."""
+    beyond = lambda x: jnp.sum(axis * (x - centre), axis=-1) > 0
+    before = beyond(sides[:, :2])
 
     def halve(_: Array, ends: tuple) -> tuple:
         low, high = ends
         middle = 0.5 * (low + high)
-        early = (beside(_on_arcs(sides, middle)) < 0) == rising
+        early = beyond(_on_arcs(sides, middle)) == before
         return jnp.where(early, middle, low), jnp.where(early, high, middle)
 
+    none = jnp.zeros(2, sides.dtype)
     steps = 10 - int(np.log2(jnp.finfo(sides.dtype).eps))
-    low, high = jax.lax.fori_loop(0, steps, halve, (jnp.zeros_like(shares), jnp.ones_like(shares)))
+    low, high = jax.lax.fori_loop(0, steps, halve, (none, none + 1))
     return 0.5 * (low + high)

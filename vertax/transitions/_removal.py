@@ -80,23 +80,7 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
         may = candidates(tissue, frames, refused)
         edge = jnp.argmin(jnp.where(may, frames.length, jnp.inf))
         which = may & (edges == edge)
-        before = overlapping_faces(tissue.overlaps)
-        flipped = flip_edges(tissue.topology, which)
-
-        def with_share(share: Array) -> Tissue:
-            placed = frames.place(tissue, which, frames.across, share * frames.length)
-            return straightened(placed, which).with_topology(flipped)
-
-        def crowded(tissue: Tissue) -> Array:
-            return jnp.any(overlapping_faces(tissue.overlaps) & ~before)
-
-        shares = jnp.asarray(_SHARES, frames.length.dtype)
-        tries = lambda carry: carry[1] & (carry[0] < len(_SHARES))
-        longer = lambda carry: (carry[0] + 1, crowded(with_share(shares[carry[0]])))
-        tried, bad = jax.lax.while_loop(tries, longer, (jnp.array(0), jnp.array(True)))
-        good = ~bad & jnp.any(which)
-        new = with_share(shares[tried - 1])
-        tissue = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, tissue)
+        tissue, good = flipped(tissue, frames, which)
         # What found no room before may find some now.
         refused = jnp.where(good, False, refused | which)
         return tissue, refused, (sides(tissue) > 3) & (good | jnp.any(may & ~which))
@@ -110,3 +94,25 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     done = go & ~jnp.any(overlapping_faces(gone.overlaps) & ~overlapping_faces(tissue.overlaps))
     kept = jax.tree.map(lambda a, b: jnp.where(done, a, b), gone, tissue)
     return Change(kept, none.cells, none.edges, done)
+
+
+def flipped(
+    tissue: Tissue, frames: EdgeFrames, which: Bool[Array, " edges"]
+) -> tuple[Tissue, Bool[Array, ""]]:
+    """The tissue with an edge flipped where there is room for it, and whether it is."""
+    before = overlapping_faces(tissue.overlaps)
+    topology = flip_edges(tissue.topology, which)
+    shares = jnp.asarray(_SHARES, frames.length.dtype)
+
+    def with_share(k: Int[Array, ""]) -> Tissue:
+        placed = frames.place(tissue, which, frames.across, shares[k] * frames.length)
+        return straightened(placed, which).with_topology(topology)
+
+    def crowded(carry: tuple) -> tuple:
+        k, _ = carry
+        return k + 1, jnp.any(overlapping_faces(with_share(k).overlaps) & ~before)
+
+    again = lambda carry: carry[1] & (carry[0] < len(_SHARES))
+    tries, bad = jax.lax.while_loop(again, crowded, (jnp.array(0), jnp.array(True)))
+    good = ~bad & jnp.any(which)
+    return jax.tree.map(lambda a, b: jnp.where(good, a, b), with_share(tries - 1), tissue), good
