@@ -19,6 +19,7 @@ LAYERS = [
     "adjoints",
     "costs",
     "responses",
+    "growth",
     "fitting",
     "initialise",
     "io",

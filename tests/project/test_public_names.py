@@ -6,8 +6,8 @@ AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnerg
 AbstractResponse
 AbstractTransitions AutomaticDifferentiation Checkpoint Equilibrium EquilibriumPropagation
 Evaluation Evolution Fit FitError Free GradientOutcome History ImplicitDifferentiation InverseProblem MINRES
-Periodic Record Relaxation T1 Tissue Topology Uncertainty activities adjoints animate costs
-dissipations energies equilibrate evolve fit fitting inference initialise io load_tissue mesh
+Periodic Record Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate costs
+dissipations energies equilibrate evolve fit fitting growth inference initialise io load_tissue mesh
 plot_history plot_recovery plot_tissue
 plotting responses runs save_tissue solvers transitions uncertainty
 """
@@ -25,6 +25,7 @@ FAMILIES = {
     "PerimeterElasticity ShapeFactorEnergy Sum",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts fit "
     "limits member stack stack_fits uncertainty",
+    "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow",
     "inference": "Micrograph Microscope PinnedEnergy RecoveryWatch RelativeTensions Scene TensionProblem "
     "Tensions Transition fit_onset fit_transition foam_energy foam_terms force_balance label_image "
     "micrograph_problem pearson relative_error same_neighbours shape_factor_scene tension_problem",
@@ -41,7 +42,7 @@ FAMILIES = {
     "responses": "AbstractResponse Equilibrium Evolution Evolved Relaxation Trajectory equilibrate evolve "
     "record_relaxation",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
-    "transitions": "AbstractTransitions T1",
+    "transitions": "AbstractTransitions Change T1 T2 divide remove",
 }
 
 

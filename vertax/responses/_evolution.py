@@ -201,7 +201,7 @@ class Evolution(AbstractResponse):
                 f"AbstractViscosity, which {type(dissipation).__name__} is not."
             )
         self.dissipation = dissipation
-        self.times = _increasing(times)
+        self.times = increasing(times)
         self.substeps, self.order = substeps, order
         self.boundary, self.pins = boundary, pins
 
@@ -424,7 +424,13 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
     )
 
 
-def _increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
+def increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
+    """Times as an array.
+
+    **Raises:**
+
+    - `ValueError` if there are fewer than two, or they do not increase.
+    """
     array = as_real("times", times)
     if array.ndim != 1 or array.size < 2:
         raise ValueError(
