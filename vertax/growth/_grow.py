@@ -128,8 +128,9 @@ def grow(
 
     In each step cells age by the rules of the cycle, those whose time has come divide, and then the tissue
     comes to rest; or, if there is a dissipation, it moves for the length of the step as in
-    [`evolve`][vertax.evolve]. Works under `jax.jit` and `jax.vmap`. A gradient tells how the course changes as
-    long as the same events happen in the same steps; it does not see that rates change which events happen.
+    [`evolve`][vertax.evolve]. Works under `jax.jit` and `jax.vmap`. A gradient tells how the course changes
+    [`evolve`][vertax.evolve]. Works under `jax.jit` and `jax.vmap`. A gradient tells how the course
+    changes as long as the same events happen in the same steps; it does not see that rates change which
 
     **Arguments:**
 
@@ -165,8 +166,8 @@ def grow(
             raise TypeError(f"Argument `{name}` is of a wrong kind: {named(value)}.")
     if isinstance(energy, AbstractEnergy) or not callable(energy):
         raise TypeError(
-            "Argument `energy` must be a function of what cells know of themselves that returns an energy, but "
-            f"is {named(energy)}."
+            "Argument `energy` must be a function of what cells know of themselves that returns an energy, "
+            f"but is {named(energy)}."
         )
     if not tissue.topology.spare:
         raise ValueError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from vertax._base.modules import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free
-from vertax.mesh._capacity import with_capacity, without_spare
+from vertax.mesh._capacity import with_slots, without_slots
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
 
@@ -362,7 +364,17 @@ class Tissue(eqx.Module):
 
         - `ValueError` if there is room for more already.
         """
-        return with_capacity(self, n_cells)
+        topology = with_slots(self.topology, n_cells)
+
+        def longer(x: Array, size: int, filling: Array | float = 0) -> Array:
+            more = jnp.broadcast_to(filling, (size - len(x), *x.shape[1:]))
+            return jnp.concatenate([x, more.astype(x.dtype)])
+
+        of_vertices = lambda x: longer(x, topology.n_vertices)
+        of_edges = lambda x: longer(x, topology.n_edges)
+        middle = jnp.mean(self.vertices, axis=0)
+        vertices = longer(self.vertices, topology.n_vertices, middle)
+        return self._with(topology, vertices, of_vertices, of_edges)
 
     def without_spare(self) -> Tissue:
         """The same tissue without spare slots: cells, edges and vertices are numbered anew, in their order.
@@ -373,7 +385,11 @@ class Tissue(eqx.Module):
 
         - `TypeError` under `jax.jit`: its size depends on what lives.
         """
-        return without_spare(self)
+        if not self.topology.spare:
+            return self
+        topology, vertices, edges = without_slots(self.topology)
+        of_vertices, of_edges = (lambda x: x[vertices]), (lambda x: x[edges])
+        return self._with(topology, of_vertices(self.vertices), of_vertices, of_edges)
 
     def drift(self, configuration: PyTree[Float[Array, "..."]]) -> Float[Array, " modes"]:
         """How far a configuration strayed from that of this tissue in ways that have no energy.
@@ -424,6 +440,19 @@ class Tissue(eqx.Module):
             return self.pinned
         spare = ~self.topology.alive_vertices
         return spare if self.pinned is None else self.pinned | spare
+
+    def _with(
+        self,
+        topology: Topology,
+        vertices: Float[Array, "other 2"],
+        of_vertices: Callable[[Array], Array],
+        of_edges: Callable[[Array], Array],
+    ) -> Tissue:
+        """A tissue of another size; and what becomes of arrays with one entry a vertex, or one an edge."""
+        tissue = eqx.tree_at(lambda t: (t.topology, t.vertices), self, (topology, vertices))
+        if self.pinned is not None:
+            tissue = eqx.tree_at(lambda t: t.pinned, tissue, of_vertices(self.pinned))
+        return tissue if self.arcs is None else tissue.with_angles(of_edges(self.arcs.angles))
 
     def gathered(self, vertices: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
         """Vertices with those of spare slots in the middle of the others, where they count for nothing."""
