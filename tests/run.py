@@ -38,6 +38,7 @@ TOGETHER = (
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
     ("_base", "mesh", "energies", "dissipations", "initialise"),
     ("transitions", "solvers"),
+    ("transitions/test_cells.py", "transitions/test_t2.py", "growth"),
     ("runs", "inference"),
     ("costs",),
     ("mechanics",),

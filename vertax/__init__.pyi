@@ -5,6 +5,7 @@ from . import (
     dissipations as dissipations,
     energies as energies,
     fitting as fitting,
+    growth as growth,
     inference as inference,
     initialise as initialise,
     io as io,
@@ -65,4 +66,4 @@ from .responses import (
     evolve as evolve,
 )
 from .solvers import MINRES as MINRES
-from .transitions import T1 as T1, AbstractTransitions as AbstractTransitions
+from .transitions import T1 as T1, T2 as T2, AbstractTransitions as AbstractTransitions

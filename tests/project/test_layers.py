@@ -20,6 +20,7 @@ LAYERS = [
     "responses",
     "mechanics",
     "costs",
+    "growth",
     "fitting",
     "initialise",
     "io",

@@ -5,9 +5,9 @@ NAMES = """
 AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy
 AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiation Checkpoint
 Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free GradientOutcome
-History ImplicitDifferentiation InverseProblem MINRES Periodic Record Relaxation T1 Tissue
+History ImplicitDifferentiation InverseProblem MINRES Periodic Record Relaxation T1 T2 Tissue
 Topology Uncertainty activities adjoints animate costs dissipations energies equilibrate evolve
-fit fitting inference initialise io load_tissue mechanics mesh plot_history plot_recovery
+fit fitting growth inference initialise io load_tissue mechanics mesh plot_history plot_recovery
 plot_tissue plotting responses runs save_tissue solvers transitions uncertainty
 """
 
@@ -25,6 +25,7 @@ FAMILIES = {
     "LocalSum PerimeterElasticity ShapeFactorEnergy Sum",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts "
     "fit limits member stack stack_fits uncertainty",
+    "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow",
     "inference": "Micrograph Microscope PinnedEnergy RecoveryWatch RelativeTensions Scene "
     "TensionProblem Tensions Transition fit_onset fit_transition foam_energy "
     "foam_terms force_balance label_image micrograph_problem pearson relative_error "
@@ -46,7 +47,7 @@ FAMILIES = {
     "Ledger Material Relaxation Relaxed SimulatorError SurfaceEvolver Trajectory "
     "equilibrate evolve record_relaxation run_program",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
-    "transitions": "AbstractTransitions T1",
+    "transitions": "AbstractTransitions Change T1 T2 divide remove",
 }
 
 

@@ -74,10 +74,9 @@ class SelfPropulsion(AbstractActivity):
         noise = jax.random.normal(key, angles.shape, angles.dtype)
         angles = angles + turn + root(2 * self.rotational_diffusion * dt) * noise
         direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-        shares = (
-            jnp.broadcast_to(per_cell(self.force, tissue, "force"), angles.shape)
-            / m.neighbour_counts
-        )
-        of_cells = jnp.append(shares[:, None] * direction, jnp.zeros((1, 2), angles.dtype), axis=0)
-        force = jnp.sum(of_cells[m.cell].reshape(-1, 3, 2), axis=1)
+        shares = jnp.broadcast_to(
+            per_cell(self.force, tissue, "force"), angles.shape
+        ) / jnp.maximum(m.neighbour_counts, 1)
+        at_corners = (shares[:, None] * direction).at[m.cell].get(mode="fill", fill_value=0)
+        force = jnp.sum(at_corners.reshape(-1, 3, 2), axis=1)
         return Push(force), (angles, tissue.vertices)

@@ -127,7 +127,7 @@ def _second_moments(tissue: Tissue) -> tuple[Array, Array, Array]:
 
 
 def _from_farthest(tissue: Tissue) -> Float[Array, ""]:
-    vertices = tissue.vertices
+    vertices = tissue.gathered(tissue.vertices)
     between = vertices[:, None] - vertices[None]
     flat = jnp.argmax(jnp.sum(between**2, axis=-1))
     axis = between.reshape(-1, 2)[flat]

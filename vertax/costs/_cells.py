@@ -33,7 +33,7 @@ class MeanShapeFactor(AbstractLeastSquaresCost):
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The distance, times the root of 2: the paper's cost is the square, not half of it."""
         check_number("target", self.target)
-        return jnp.sqrt(2.0) * (jnp.mean(tissue.shape_factors) - self.target)[None]
+        return jnp.sqrt(2.0) * (_mean(tissue, tissue.shape_factors) - self.target)[None]
 
 
 class CellAreas(AbstractLeastSquaresCost):
@@ -60,4 +60,13 @@ class CellAreas(AbstractLeastSquaresCost):
                 "The target of CellAreas must be a scalar or have one entry a cell, shape "
                 f"({tissue.n_cells},), but its shape is {self.target.shape}."
             )
-        return (tissue.areas - self.target) / jnp.sqrt(1.0 * tissue.n_cells)
+        differences = tissue.areas - self.target
+        if tissue.topology.spare:
+            differences = jnp.where(tissue.alive, differences, 0)
+            return differences / jnp.sqrt(1.0 * jnp.sum(tissue.alive))
+        return differences / jnp.sqrt(1.0 * tissue.n_cells)
+
+
+def _mean(tissue: Tissue, values: Float[Array, " cells"]) -> Float[Array, ""]:
+    """The mean over the cells that there are; spare slots have 0."""
+    return jnp.sum(values) / jnp.sum(tissue.alive) if tissue.topology.spare else jnp.mean(values)

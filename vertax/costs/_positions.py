@@ -61,7 +61,7 @@ class VertexDistance(AbstractLeastSquaresCost):
             counterpart, matched = matching_vertices(tissue, self.target)
             goal = jnp.where(matched[:, None], take(goal, counterpart), tissue.vertices)
         displacement = tissue.boundary.shortest(tissue.vertices - goal)
-        return displacement.ravel() / jnp.sqrt(1.0 * tissue.n_vertices)
+        return _root_of_mean(displacement, tissue.topology.alive_vertices, tissue)
 
 
 class EdgeDistance(AbstractLeastSquaresCost):
@@ -132,7 +132,16 @@ class CentroidDistance(AbstractLeastSquaresCost):
         """Displacements from the target over the root of the number of cells."""
         check_equal(type(self).__name__, tissue, self.target, "cells", place=True)
         displacement = tissue.boundary.shortest(tissue.centroids - self.target.centroids)
-        return displacement.ravel() / jnp.sqrt(1.0 * tissue.n_cells)
+        return _root_of_mean(displacement, tissue.alive & self.target.alive, tissue)
+
+
+def _root_of_mean(
+    displacement: Float[Array, "n 2"], there: Bool[Array, " n"], tissue: Tissue
+) -> Float[Array, " residuals"]:
+    """Residuals of which half the sum of squares is the mean square over what there is."""
+    if not tissue.topology.spare:
+        return displacement.ravel() / jnp.sqrt(1.0 * len(displacement))
+    return jnp.where(there[:, None], displacement, 0).ravel() / jnp.sqrt(1.0 * jnp.sum(there))
 
 
 def matching_vertices(

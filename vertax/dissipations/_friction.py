@@ -81,6 +81,6 @@ def entries(
 def _areas_of_vertices(tissue: Tissue) -> Float[Array, " vertices"]:
     """The area that the cells around each vertex share out to it."""
     m = tissue.topology
-    shares = jax.lax.stop_gradient(jnp.abs(tissue.areas)) / m.neighbour_counts
-    # The exterior, of number n_cells, has none.
-    return jnp.sum(jnp.append(shares, 0)[m.cell].reshape(-1, 3), axis=1)
+    shares = jax.lax.stop_gradient(jnp.abs(tissue.areas)) / jnp.maximum(m.neighbour_counts, 1)
+    # The exterior, and what is nowhere, have none.
+    return jnp.sum(shares.at[m.cell].get(mode="fill", fill_value=0).reshape(-1, 3), axis=1)

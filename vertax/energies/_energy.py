@@ -68,8 +68,12 @@ class AbstractLocalEnergy(AbstractEnergy):
         return jnp.zeros(tissue.n_edges, tissue.vertices.dtype)
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
-        """Energy of a tissue: the sum of all terms."""
-        return jnp.sum(self.cell_terms(tissue)) + jnp.sum(self.edge_terms(tissue))
+        """Energy of a tissue: the sum of all terms, of cells and edges that there are."""
+        by_cell, by_edge = self.cell_terms(tissue), self.edge_terms(tissue)
+        if tissue.topology.spare:
+            by_cell = jnp.where(tissue.alive, by_cell, 0)
+            by_edge = jnp.where(tissue.topology.alive_edges, by_edge, 0)
+        return jnp.sum(by_cell) + jnp.sum(by_edge)
 
 
 class Sum(AbstractEnergy):

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from vertax._base.probe import probe
 from vertax.mesh import Tissue
+from vertax.mesh._tissue import mean_area
 
 
 class Units(eqx.Module):
@@ -37,7 +38,7 @@ def units_of(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Units:
 
 def cell_size(tissue: Tissue) -> Float[Array, ""]:
     """The root mean cell area."""
-    return jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
+    return jnp.sqrt(mean_area(tissue))
 
 
 def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:
@@ -46,5 +47,9 @@ def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[A
     y, unravel = ravel_pytree(tissue.configuration)
     slope = jax.grad(lambda x: energy(tissue.with_configuration(unravel(x))))
     direction = probe(y)
+    if tissue.topology.spare:  # what cannot move must not make the rest look soft
+        weights = tissue.by_row(tissue.topology.alive_vertices.astype(y.dtype))
+        weigh = lambda x, w: (x.T * w).T
+        direction, _ = ravel_pytree(jax.tree.map(weigh, unravel(direction), weights))
     _, response = jax.jvp(slope, (y,), (direction,))
     return jnp.abs(jnp.sum(direction * response)) / jnp.sum(direction**2)

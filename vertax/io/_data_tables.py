@@ -37,7 +37,8 @@ def cell_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray
 
     **Returns:** NumPy arrays by the name of the column: `cell`, the number, from 0; `x` and `y`, the
     centroid, in the home box of a periodic tissue; `area`, `perimeter` and `shape_factor`; `sides`, the
-    number of edges; `on_outline`, whether the cell borders on the exterior; and those of `columns`.
+    number of edges; `on_outline`, whether the cell borders on the exterior; and those of `columns`. Spare
+    slots have no rows.
 
     **Raises:**
 
@@ -129,7 +130,8 @@ def cell_columns(
         "sides": tissue.neighbour_counts,
         "on_outline": np.isin(np.arange(tissue.n_cells), outline),
     }
-    return _joined(table, columns, "cell", tissue.n_cells)
+    table = _joined(table, columns, "cell", tissue.n_cells)
+    return {name: column[drawing.alive] for name, column in table.items()}
 
 
 def edge_columns(
@@ -154,7 +156,8 @@ def edge_columns(
         "angle": tissue.edge_angles,
         "on_outline": m.on_outline,
     }
-    return _joined(table, columns, "edge", tissue.n_edges)
+    table = _joined(table, columns, "edge", tissue.n_edges)
+    return {name: column[drawing.alive_edges] for name, column in table.items()}
 
 
 def check_single(tissue: Tissue) -> None:

@@ -54,7 +54,7 @@ def write_geojson(
         and as [`cell_table`][vertax.io.cell_table].
     """
     drawing = checked_drawing(tissue, points_per_arc)
-    if not np.isfinite(drawing.lines).all():
+    if not np.isfinite(drawing.lines[drawing.cell < drawing.n_cells]).all():
         raise ValueError(
             "Argument `tissue` must have finite positions: JSON has no numbers that are not."
         )
@@ -63,6 +63,7 @@ def write_geojson(
     rings = [
         [[*polygon[:n].tolist(), polygon[0].tolist()]]
         for polygon, n in zip(polygons, counts, strict=True)
+        if n > 0
     ]
     files = {
         Path(path): (
@@ -72,7 +73,7 @@ def write_geojson(
         )
     }
     if edges is not None:
-        lines = drawing.lines[drawing.half_edge].tolist()
+        lines = drawing.lines[drawing.half_edge][drawing.alive_edges].tolist()
         files[edge_path(path)] = ("LineString", lines, edge_columns(tissue, drawing, edges))
     for file_path, (kind, shapes, table) in files.items():
         collection = {"type": "FeatureCollection", "features": _features(kind, shapes, table)}

@@ -170,7 +170,8 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
 
     Vertices and cells keep their numbers; edge `e` becomes rows `2 e` (in the edge's direction) and
     `2 e + 1`, as in the paper's files, so `np.repeat(values, 2)` takes values per edge to the rows.
-    Vertices outside the box are moved into it by whole boxes; the others keep their bits. The
+    Spare slots are left out, and what there is numbered anew. Vertices outside the box are moved into it by
+    whole boxes; the others keep their bits. The
     tables have no softening.
 
     **Arguments:**
@@ -187,6 +188,7 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
         its first vector is not along x, or an edge reaches beyond the neighbouring box.
     """
     check_single(tissue)
+    tissue = tissue.without_spare()
     if tissue.inner_arcs:
         raise ValueError(
             "Tables hold arcs on the outline only. Use `save_tissue`, which keeps all."

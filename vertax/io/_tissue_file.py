@@ -39,7 +39,7 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
     The file is a NumPy `.npz` archive without pickles, so other programs can read it. It holds
     `format`, `version` and `boundary` (the header), `vertices`, `softening`, the arrays of the
     [`Topology`][vertax.Topology] by name, and those of the boundary as `boundary_…`; where a tissue
-    has them, `angles`, `angle_length`, `inner_arcs` and `pinned` (0 or 1). It is written
+    has them, `angles`, `angle_length`, `inner_arcs`, `pinned` (0 or 1) and `spare` (1). It is written
     atomically: an interrupted save leaves the old file, if any, as it was.
 
     **Arguments:**
@@ -98,6 +98,8 @@ def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
         arrays |= {"inner_arcs": int(tissue.inner_arcs)}
     if tissue.pinned is not None:
         arrays |= {"pinned": np.asarray(tissue.pinned).astype(np.int8)}
+    if topology.spare:
+        arrays |= {"spare": 1}
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
     if arrays["vertices"].ndim != 2:
         raise ValueError(
@@ -178,7 +180,8 @@ def tissue_from(
         options["pinned"] = get("pinned", "i", n_half // 3) != 0
     try:
         if topology is None:
-            topology = _topology_from(twin, cell, frame, edge, half_edge, record.build is Free)
+            faces = {"exterior": record.build is Free, "spare": "spare" in arrays}
+            topology = _topology_from(twin, cell, frame, edge, half_edge, **faces)
         boundary = record.build(**{field: jnp.asarray(array) for field, array in fields.items()})
         return Tissue(jnp.asarray(vertices), topology, boundary, jnp.asarray(softening), **options)
     except ValueError as error:
@@ -191,9 +194,11 @@ def _topology_from(
     frame: np.ndarray,
     edge: np.ndarray,
     half_edge: np.ndarray,
+    *,
     exterior: bool,
+    spare: bool,
 ) -> Topology:
-    topology = Topology(twin, cell, frame, edge, exterior=exterior)
+    topology = Topology(twin, cell, frame, edge, exterior=exterior, spare=spare)
     # The direction of an edge is not in the other arrays: after a T1 it need not be the first half-edge
     # of the pair.
     direction = jnp.asarray(half_edge, topology.half_edge.dtype)

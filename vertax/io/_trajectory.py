@@ -14,7 +14,7 @@ from vertax.responses import Trajectory
 
 _VERSION = 1
 _TOPOLOGY = ("twin", "cell", "frame", "edge", "half_edge")
-_ONCE = ("boundary", "inner_arcs")
+_ONCE = ("boundary", "inner_arcs", "spare")
 
 
 def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> None:

@@ -60,7 +60,7 @@ def write_vtk(
         )
     drawing = checked_drawing(tissue, points_per_arc)
     polygons, counts = drawing.polygons()
-    corners = [polygon[:n] for polygon, n in zip(polygons, counts, strict=True)]
+    corners = [polygon[:n] for polygon, n in zip(polygons, counts, strict=True) if n > 0]
     meshes = {
         Path(path): (
             "polygon",
@@ -73,7 +73,8 @@ def write_vtk(
         table = edge_columns(tissue, drawing, edges)
         # meshio has no lines of many pieces: each piece is an element of its own.
         pieces = np.stack([lines[:, :-1], lines[:, 1:]], axis=2)
-        owner = np.repeat(shown, pieces.shape[1])
+        row = np.cumsum(drawing.alive_edges) - 1
+        owner = np.repeat(row[shown], pieces.shape[1])
         table = {name: column[owner] for name, column in table.items()}
         meshes[edge_path(path)] = ("line", list(pieces.reshape(-1, 2, 2)), table)
     files = {

@@ -36,6 +36,9 @@ class Drawing(eqx.Module):
     edge: Int[np.ndarray, " halfedges"]
     n_cells: int
     n_edges: int
+    alive: Bool[np.ndarray, " cells"]
+    """Which cells there are; the others have no corners."""
+    alive_edges: Bool[np.ndarray, " edges"]
     centroids: Float[np.ndarray, "cells 2"]
     """Of the cells, where they are drawn."""
     cell_size: float
@@ -65,9 +68,9 @@ class Drawing(eqx.Module):
             fractions = np.nan_to_num(fractions, posinf=0, neginf=0)
             image = -np.floor(fractions + 1e-6).astype(int)
             if near is not None:
-                image[: tissue.n_cells] = np.rint(
-                    near @ np.linalg.inv(lattice) - fractions[: tissue.n_cells]
-                )
+                # A cell that was not there before is in the home box.
+                known = np.flatnonzero(np.isfinite(near).all(axis=1))
+                image[known] = np.rint(near[known] @ np.linalg.inv(lattice) - fractions[known])
             shift = image @ lattice
             first, second = lattice
             self.box = np.stack([0 * first, first, first + second, second, 0 * first])
@@ -76,18 +79,23 @@ class Drawing(eqx.Module):
         self.image = np.asarray(m.frame) + image[self.cell]
         self.n_cells = tissue.n_cells
         self.n_edges = tissue.n_edges
+        self.alive, self.alive_edges = np.asarray(tissue.alive), np.asarray(m.alive_edges)
         self.centroids = centroids.astype(float) + shift[: tissue.n_cells]
+        self.centroids[~self.alive] = np.nan
         self.following = following
         self.twin = np.asarray(m.twin)
         self.half_edge = np.asarray(m.half_edge)
         self.edge = np.asarray(m.edge)
-        self.cell_size = float(np.sqrt(np.mean(np.abs(areas.astype(float)))))
+        self.cell_size = float(np.sqrt(np.mean(np.abs(areas.astype(float)[self.alive]))))
 
     def polygons(self) -> tuple[Float[np.ndarray, "cells sides 2"], Int[np.ndarray, " cells"]]:
         """Corners of all cells and their numbers of corners, see `cell_polygons`."""
         n_points = self.lines.shape[1] - 1
-        sides = np.bincount(self.cell)[: self.n_cells]
-        half_edge = np.unique(self.cell, return_index=True)[1][: self.n_cells]
+        sides = np.bincount(self.cell, minlength=self.n_cells)[: self.n_cells]
+        # The first half-edge of each cell; of spare slots any one.
+        cells, first = np.unique(self.cell, return_index=True)
+        half_edge = np.zeros(self.n_cells, int)
+        half_edge[cells[cells < self.n_cells]] = first[cells < self.n_cells]
         polygons = np.repeat(self.lines[half_edge, :1], n_points * sides.max(), axis=1)
         # All cells at once, one side at a time.
         for k in range(sides.max()):
@@ -105,7 +113,7 @@ class Drawing(eqx.Module):
         An edge between two cells drawn side by side is one line; one across the periodic boundary
         shows at both cells, in two places.
         """
-        mask = np.append(mask, False)  # the exterior
+        mask = np.append(mask & self.alive, [False, False])  # the exterior, and nowhere
         first, other = self.half_edge, self.twin[self.half_edge]
         # Both cells of an edge draw it in the same place if they see its first vertex in the same
         # image.
@@ -129,7 +137,7 @@ def cell_polygons(
     - `points_per_arc`: number of straight pieces that stand for an arc.
 
     **Returns:** the corners, in units of length, where rows of cells with fewer sides than others
-    are filled up with their first corner; and the number of corners of each cell.
+    are filled up with their first corner; and the number of corners of each cell, 0 of spare slots.
 
     **Raises:**
 

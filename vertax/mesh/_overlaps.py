@@ -49,7 +49,8 @@ class Overlaps(eqx.Module):
         """The corners of cells that overlap, and the ends of sides of the outline that cross."""
         crosses, after = self.sides, topology.next
         other = jnp.where(crosses, self.crossed, jnp.arange(after.size))
-        bad = take(jnp.append(self.cells, False), topology.cell) | crosses
+        outside = jnp.zeros(topology.n_faces - topology.n_cells, bool)
+        bad = take(jnp.concatenate([self.cells, outside]), topology.cell) | crosses
         for half_edge in (after, other, take(after, other)):
             bad = bad.at[half_edge].max(crosses)
         return jnp.any(bad.reshape(-1, 3), axis=1)
@@ -147,8 +148,9 @@ def _overlaps(
 ) -> Overlaps:
     crosses = (crossed != _numbers(m)).astype(jnp.int32)
     faces = jax.ops.segment_max(crosses, m.cell, m.n_faces) > 0
-    exterior = faces[-1] if m.exterior else jnp.array(False)
-    return Overlaps(crossed, faces[: m.n_cells] | ~(areas > 0), exterior)
+    exterior = faces[m.n_cells] if m.exterior else jnp.array(False)
+    inside_out = ~(areas > 0) & m.alive if m.spare else ~(areas > 0)
+    return Overlaps(crossed, faces[: m.n_cells] | inside_out, exterior)
 
 
 def _numbers(topology: Topology) -> Int[Array, " halfedges"]:
@@ -157,6 +159,8 @@ def _numbers(topology: Topology) -> Int[Array, " halfedges"]:
 
 def _last(topology: Topology) -> Int[Array, " halfedges"]:
     n_sides = jax.ops.segment_sum(jnp.ones_like(topology.cell), topology.cell, topology.n_faces)
+    if topology.spare:
+        n_sides = n_sides.at[topology.nowhere].set(0)
     return take(n_sides, topology.cell) - 2
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from vertax._base.modules import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free
+from vertax.mesh._capacity import with_slots, without_slots
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
 
@@ -151,6 +154,11 @@ class Tissue(eqx.Module):
         """Number of vertices."""
         return self.topology.n_vertices
 
+    @property
+    def alive(self) -> Bool[Array, " cells"]:
+        """Which cells there are; the others are spare slots, see `with_capacity`."""
+        return self.topology.alive
+
     @compiled_property
     def neighbour_counts(self) -> Int[Array, " cells"]:
         """Number of sides of each cell."""
@@ -186,7 +194,10 @@ class Tissue(eqx.Module):
         """Which edges are arcs; the angles of the others do not count."""
         if self.arcs is None:
             return jnp.zeros(self.n_edges, bool)
-        return jnp.ones(self.n_edges, bool) if self.arcs.inner else self.topology.on_outline
+        if not self.arcs.inner:
+            return self.topology.on_outline
+        spare = self.topology.spare
+        return self.topology.alive_edges if spare else jnp.ones(self.n_edges, bool)
 
     @compiled_property
     def edge_angles(self) -> Float[Array, " edges"]:
@@ -223,6 +234,8 @@ class Tissue(eqx.Module):
     def edge_lengths(self) -> Float[Array, " edges"]:
         """Length of each edge (softened, see the class)."""
         lengths = self._lengths(self.edge_vectors)
+        if self.topology.spare:
+            lengths = jnp.where(self.topology.alive_edges, lengths, 0)
         return lengths if self.arcs is None else lengths * length_factor(self.edge_angles)
 
     @compiled_property
@@ -239,7 +252,8 @@ class Tissue(eqx.Module):
     @compiled_property
     def shape_factors(self) -> Float[Array, " cells"]:
         r"""Observed shape factor $P/\sqrt{A}$ of each cell (Bi et al. 2015, doi:10.1038/nphys3471)."""
-        return self.perimeters / jnp.sqrt(self.areas)
+        areas = jnp.where(self.alive, self.areas, 1) if self.topology.spare else self.areas
+        return self.perimeters / jnp.sqrt(areas)
 
     @compiled_property
     def corners(self) -> Float[Array, "halfedges 2"]:
@@ -251,11 +265,14 @@ class Tissue(eqx.Module):
 
     @compiled_property
     def centroids(self) -> Float[Array, "cells 2"]:
-        """Centre of area of each cell, in the frame of the cell."""
+        """Centre of area of each cell, in the frame of the cell; 0 of spare slots."""
         # Relative to the mean corner: the polygon formula loses digits far from the origin.
         m, corners = self.topology, self.corners
         face_sums = lambda values: jax.ops.segment_sum(values, m.cell, m.n_faces)
-        centre = face_sums(corners) / face_sums(jnp.ones_like(corners[:, :1]))
+        count = face_sums(jnp.ones_like(corners[:, :1]))
+        spare = jnp.append(~m.alive, jnp.ones(2, bool))[:, None] if m.spare else None
+        over = lambda sums, x: sums / (x if spare is None else jnp.where(spare, 1, x))
+        centre = over(face_sums(corners), count)
         p = corners - take(centre, m.cell)
         q = take(p, m.next)
         area = _cross(p, q) / 2
@@ -270,7 +287,8 @@ class Tissue(eqx.Module):
             area += bulge
             moment += (p + q) * bulge[:, None] / 2
             moment += right * (squared * moment_factor(angle))[:, None]
-        return (centre + face_sums(moment) / face_sums(area)[:, None])[: self.n_cells]
+        centre = centre + over(face_sums(moment), face_sums(area)[:, None])
+        return (centre if spare is None else jnp.where(spare, 0, centre))[: self.n_cells]
 
     @compiled_property
     def sides(self) -> Float[Array, "halfedges parts"]:
@@ -301,11 +319,12 @@ class Tissue(eqx.Module):
     def with_configuration(self, configuration: PyTree[Float[Array, "..."]]) -> Tissue:
         """The same tissue with its degrees of freedom replaced.
 
-        What cannot move (pinned vertices, and angles of straight edges) stays as it is.
+        What cannot move (pinned and spare vertices, and angles of straight edges) stays as it is.
         """
         vertices, scaled = self._split(configuration)
-        if self.pinned is not None:
-            vertices = jnp.where(self.pinned[:, None], self.vertices, vertices)
+        held = self.held
+        if held is not None:
+            vertices = jnp.where(held[:, None], self.vertices, vertices)
         moved = self.with_vertices(vertices)
         if scaled is None or self.arcs is None:
             return moved
@@ -326,6 +345,52 @@ class Tissue(eqx.Module):
         """The same tissue, which has arcs, with other angles."""
         return eqx.tree_at(lambda t: t.arcs.angles, self, angles)
 
+    def with_capacity(self, n_cells: int) -> Tissue:
+        """The same tissue with room for more cells to come; works under `jax.jit`.
+
+        Arrays of cells, edges and vertices become longer by spare slots, in which `alive` is False: their
+        areas, perimeters and edge lengths are 0, and they feel no force. Divisions take them and cells that
+        vanish leave some behind. Cells keep their numbers. A periodic tissue has then `2 * n_cells` vertices
+        and `3 * n_cells` edges, a free one those of one cell less; parameters that are one a cell, or one an
+        edge, need as many entries.
+
+        **Arguments:**
+
+        - `n_cells`: number of cells that there is to be room for, living ones included.
+
+        **Returns:** the tissue, whose `n_cells` that is.
+
+        **Raises:**
+
+        - `ValueError` if there is room for more already.
+        """
+        topology = with_slots(self.topology, n_cells)
+
+        def longer(x: Array, size: int, filling: Array | float = 0) -> Array:
+            more = jnp.broadcast_to(filling, (size - len(x), *x.shape[1:]))
+            return jnp.concatenate([x, more.astype(x.dtype)])
+
+        of_vertices = lambda x: longer(x, topology.n_vertices)
+        of_edges = lambda x: longer(x, topology.n_edges)
+        middle = jnp.mean(self.vertices, axis=0)
+        vertices = longer(self.vertices, topology.n_vertices, middle)
+        return self._with(topology, vertices, of_vertices, of_edges)
+
+    def without_spare(self) -> Tissue:
+        """The same tissue without spare slots: cells, edges and vertices are numbered anew, in their order.
+
+        **Returns:** the tissue, as large as what lives of it.
+
+        **Raises:**
+
+        - `TypeError` under `jax.jit`: its size depends on what lives.
+        """
+        if not self.topology.spare:
+            return self
+        topology, vertices, edges = without_slots(self.topology)
+        of_vertices, of_edges = (lambda x: x[vertices]), (lambda x: x[edges])
+        return self._with(topology, of_vertices(self.vertices), of_vertices, of_edges)
+
     def drift(self, configuration: PyTree[Float[Array, "..."]]) -> Float[Array, " modes"]:
         """How far a configuration strayed from that of this tissue in ways that have no energy.
 
@@ -333,18 +398,19 @@ class Tissue(eqx.Module):
         degrees of freedom that `with_configuration` ignores. All are lengths.
         """
         vertices, scaled = self._split(configuration)
-        drift = [self.boundary.drift(vertices, self.vertices, self.pinned)]
-        if self.pinned is not None:
-            held = jnp.where(self.pinned[:, None], vertices - self.vertices, 0)
-            drift.append(held.ravel())
+        here, there = self.gathered(self.vertices), self.gathered(vertices)
+        drift = [self.boundary.drift(there, here, self.pinned)]
+        held = self.held
+        if held is not None:
+            drift.append(jnp.where(held[:, None], vertices - self.vertices, 0).ravel())
         if scaled is not None and self.arcs is not None:
             drift.append(jnp.where(self.is_arc, 0, scaled - self.arcs.scaled))
         return jnp.concatenate(drift)
 
     def settled(self, start: Tissue) -> Tissue:
         """The same shape, moved as a whole to where it has no drift from the vertices of `start`."""
-        settle = self.boundary.settle
-        return self.with_vertices(settle(self.vertices, start.vertices, self.pinned))
+        here, there = self.gathered(self.vertices), self.gathered(start.vertices)
+        return self.with_vertices(self.boundary.settle(here, there, self.pinned))
 
     def held_as(self, start: Tissue) -> Tissue:
         """This tissue in the boundary of `start` and with its vertices.
@@ -366,6 +432,35 @@ class Tissue(eqx.Module):
     def with_topology(self, topology: Topology) -> Tissue:
         """The same vertices, connected in another way."""
         return eqx.tree_at(lambda t: t.topology, self, topology)
+
+    @property
+    def held(self) -> Bool[Array, " vertices"] | None:
+        """Which vertices do not move: pinned ones and those of spare slots; None if all do."""
+        if not self.topology.spare:
+            return self.pinned
+        spare = ~self.topology.alive_vertices
+        return spare if self.pinned is None else self.pinned | spare
+
+    def _with(
+        self,
+        topology: Topology,
+        vertices: Float[Array, "other 2"],
+        of_vertices: Callable[[Array], Array],
+        of_edges: Callable[[Array], Array],
+    ) -> Tissue:
+        """A tissue of another size; and what becomes of arrays with one entry a vertex, or one an edge."""
+        tissue = eqx.tree_at(lambda t: (t.topology, t.vertices), self, (topology, vertices))
+        if self.pinned is not None:
+            tissue = eqx.tree_at(lambda t: t.pinned, tissue, of_vertices(self.pinned))
+        return tissue if self.arcs is None else tissue.with_angles(of_edges(self.arcs.angles))
+
+    def gathered(self, vertices: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
+        """Vertices with those of spare slots in the middle of the others, where they count for nothing."""
+        if not self.topology.spare:
+            return vertices
+        alive = self.topology.alive_vertices[:, None]
+        middle = jnp.sum(jnp.where(alive, vertices, 0), axis=0) / jnp.sum(alive)
+        return jnp.where(alive, vertices, middle)
 
     def _split(
         self, configuration: PyTree[Float[Array, "..."]]
@@ -416,7 +511,13 @@ def _checked_angles(
 
 @eqx.filter_jit
 def _mean_area(tissue: Tissue) -> Float[Array, ""]:
-    return jnp.mean(jnp.abs(tissue.areas))
+    return mean_area(tissue)
+
+
+def mean_area(tissue: Tissue) -> Float[Array, ""]:
+    """The mean area of the cells that there are."""
+    areas = jnp.abs(tissue.areas)
+    return jnp.sum(areas) / jnp.sum(tissue.alive) if tissue.topology.spare else jnp.mean(areas)
 
 
 def _cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:

@@ -32,6 +32,10 @@ from vertax.mesh._half_edges import check_arrays
 #
 # In a free tissue the outside is one more face, so that vertices on the outline are trivalent too. Its
 # half-edges carry the label n_cells, which sums over cells drop: a segment number out of range.
+#
+# A tissue may have room for more cells than live in it. A cell spends two vertices and three edges, so a
+# spare slot is two vertices joined by three edges, closed in itself, whose half-edges carry the label of
+# nowhere, n_cells + 1. Arrays keep their sizes while cells come and go.
 class Topology(eqx.Module):
     """The connectivity of a tissue: a trivalent half-edge rotation system.
 
@@ -49,7 +53,10 @@ class Topology(eqx.Module):
         the cell on its left. Zero where there is no periodicity.
     - `edge`, shape `(halfedges,)`: an edge number for each half-edge, shared with its twin. Numbered in
         the order of the half-edges when left out.
-    - `exterior`: whether the face of the largest label is the outside of a free tissue.
+    - `exterior`: whether there is the outside of a free tissue.
+    - `spare`: whether there may be spare slots for cells to come: pairs of vertices joined by three edges,
+        whose half-edges have the label `n_cells + 1`. `n_cells` is then the number of cells that there is
+        room for.
 
     **Raises:**
 
@@ -64,9 +71,11 @@ class Topology(eqx.Module):
     half_edge: Int[Array, " edges"]
     """One half-edge of each edge; it gives the edge its direction. The exterior is never on its left."""
     n_cells: int = eqx.field(static=True)
-    """Number of cells, without the exterior."""
+    """Number of cells, without the exterior; with spare slots, that there is room for."""
     exterior: bool = eqx.field(static=True)
     """Whether there is an exterior."""
+    spare: bool = eqx.field(static=True)
+    """Whether there may be spare slots."""
 
     def __init__(
         self,
@@ -76,6 +85,7 @@ class Topology(eqx.Module):
         edge: ArrayLike | None = None,
         *,
         exterior: bool = False,
+        spare: bool = False,
     ):
         known = all(is_concrete(x) for x in (twin, cell, frame, edge))
         xp = np if known else jnp
@@ -98,7 +108,9 @@ class Topology(eqx.Module):
         else:
             half_edge = jnp.full(n_edges, twin.size).at[edge].min(h)
         # A trivalent mesh of a torus has half as many faces as vertices, one of a sphere two more.
-        n_cells = int(cell.max()) + (not exterior) if known else twin.size // 6 + exterior
+        n_cells = twin.size // 6 + exterior
+        if known and not spare:
+            n_cells = int(cell.max()) + (not exterior)
         half_edge = xp.where(cell[half_edge] == n_cells, twin[half_edge], half_edge)
         to_int32 = lambda x: jnp.asarray(x, jnp.int32)
         self.twin = to_int32(twin)
@@ -108,6 +120,7 @@ class Topology(eqx.Module):
         self.half_edge = to_int32(half_edge)
         self.n_cells = n_cells
         self.exterior = exterior
+        self.spare = spare
         if known:
             self.validate()
 
@@ -128,8 +141,28 @@ class Topology(eqx.Module):
 
     @property
     def n_faces(self) -> int:
-        """Number of cells and, if there is one, the exterior."""
-        return self.n_cells + self.exterior
+        """How many labels half-edges may have: cells, the exterior and nowhere."""
+        return self.n_cells + (2 if self.spare else self.exterior)
+
+    @property
+    def nowhere(self) -> int:
+        """The label of the half-edges of spare slots."""
+        return self.n_cells + 1
+
+    @compiled_property
+    def alive(self) -> Bool[Array, " cells"]:
+        """Which cells there are; the others are spare slots."""
+        return self.neighbour_counts > 0
+
+    @property
+    def alive_vertices(self) -> Bool[Array, " vertices"]:
+        """Which vertices belong to no spare slot."""
+        return self.cell.reshape(-1, 3)[:, 0] != self.nowhere
+
+    @property
+    def alive_edges(self) -> Bool[Array, " edges"]:
+        """Which edges belong to no spare slot."""
+        return take(self.cell, self.half_edge) != self.nowhere
 
     @compiled_property
     def source(self) -> Int[Array, " halfedges"]:
@@ -210,6 +243,7 @@ class Topology(eqx.Module):
         require(edge.shape == (n_half,), "`edge` must have one entry a half-edge")
         require(half_edge.shape == (n_half // 2,), "`half_edge` must have one entry an edge")
         require(0 < n_faces <= n_half, "there must be cells, and no more than half-edges")
+        nowhere = cell == self.nowhere if self.spare else np.zeros(n_half, bool)
         for name, index, bound, at in (
             ("twin", twin, n_half, "half-edges"),
             ("edge", edge, n_half // 2, "half-edges"),
@@ -231,23 +265,31 @@ class Topology(eqx.Module):
             edge[half_edge] == np.arange(n_half // 2),
             "`half_edge` must point into its edge, at edges",
         )
-        require((cell >= 0) & (cell < n_faces), "`cell` must lie in 0 … n_cells - 1, at half-edges")
-        sides = np.bincount(cell, minlength=n_faces)
-        require(sides > 0, "every cell must have half-edges, at cells")
+        inside = (cell >= 0) & (cell < self.n_cells + self.exterior)
+        require(inside | nowhere, "`cell` must lie in 0 … n_cells - 1, at half-edges")
+        sides = np.bincount(cell[~nowhere], minlength=n_faces)[: self.n_cells + self.exterior]
+        may_be_spare = (np.arange(sides.size) < self.n_cells) & self.spare
+        require((sides > 0) | may_be_spare, "every cell must have half-edges, at cells")
 
         following = np.where(twin % 3 == 0, twin + 2, twin - 1)
         require(cell[following] == cell, "`cell` must be the same all around a face, at half-edges")
+        closed = following[following] == h
+        require(
+            ~nowhere | closed,
+            "a spare slot must be two vertices joined by three edges, at half-edges",
+        )
         n_orbits, face = connected_components(
             coo_array((np.ones(n_half, bool), (h, following)), shape=(n_half, n_half)),
             directed=False,
         )
-        faces_of_cell = np.bincount(cell[np.unique(face, return_index=True)[1]], minlength=n_faces)
-        require(faces_of_cell == 1, "every cell must be one face, at cells")
+        labels = cell[np.unique(face, return_index=True)[1]]
+        faces_of_cell = np.bincount(labels, minlength=sides.size)[: sides.size]
+        require((faces_of_cell == 1) | (sides == 0), "every cell must be one face, at cells")
         # A side on the outline may be an arc, so two sides are enough there.
-        outside = np.bincount(cell, cell[twin] == self.n_cells, n_faces) > 0
+        outside = np.bincount(cell, cell[twin] == self.n_cells, n_faces)[: sides.size] > 0
         outside[self.n_cells :] = True
         require(
-            sides >= np.where(outside, 2, 3),
+            (sides >= np.where(outside, 2, 3)) | (sides == 0),
             "every cell must have at least three sides, or two on the outline, at cells",
         )
 
@@ -261,15 +303,18 @@ class Topology(eqx.Module):
             coo_array((np.ones(n_half, bool), (h // 3, twin // 3)), shape=(n_vertices, n_vertices)),
             directed=False,
         )
-        require(n_pieces == 1, "the tissue must be in one piece")
-        euler = n_vertices - n_half // 2 + n_orbits
+        n_spare = int(np.count_nonzero(nowhere)) // 6
+        require(n_pieces - n_spare == 1, "the tissue must be in one piece")
+        euler = n_vertices - n_half // 2 + n_orbits - 2 * n_spare  # each of which is a sphere
         if self.exterior:
             require(
                 euler == 2,
                 f"vertices - edges + cells must be 1 for a free tissue, but is {euler - 1}",
             )
             require(np.all(frame == 0, axis=1), "`frame` must be 0 in a free tissue, at half-edges")
-            require(cell[twin] != cell, "an edge must lie between two faces, at half-edges")
+            require(
+                (cell[twin] != cell) | nowhere, "an edge must lie between two faces, at half-edges"
+            )
             require(
                 cell[half_edge] != self.n_cells,
                 "the exterior must not be on the left of an edge, at edges",

@@ -99,7 +99,7 @@ def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
 
     - `before`, `after`: two states of one tissue.
 
-    **Returns:** a boolean for each edge.
+    **Returns:** a boolean for each edge. Edges of cells that came or went in between did not flip.
 
     **Raises:**
 
@@ -112,7 +112,8 @@ def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
             f"{before.n_edges}."
         )
     then, now = (np.sort(np.asarray(t.topology.edge_cells), axis=1) for t in (before, after))
-    return np.any(then != now, axis=1)
+    stayed = np.append(np.asarray(before.alive & after.alive), [True, False])
+    return np.any(then != now, axis=1) & stayed[then].all(axis=1) & stayed[now].all(axis=1)
 
 
 def _check(

@@ -148,7 +148,7 @@ def draw(
     cell_values = checked("cells", cells, drawing.n_cells)
     edge_values = checked("edges", edges, drawing.n_edges)
     shown = checked("mask", mask, drawing.n_cells)
-    shown = np.ones(drawing.n_cells, bool) if shown is None else shown.astype(bool)
+    shown = drawing.alive if shown is None else shown.astype(bool) & drawing.alive
     marked = checked("highlight", highlight, drawing.n_edges)
     opacity = 1.0 if alpha is None else float(alpha)
     if not 0 <= opacity <= 1:

@@ -175,4 +175,7 @@ def _angles_are_open(tissue: Tissue, least: Float[Array, ""]) -> Bool[Array, ""]
     squared = jnp.sum(u**2, axis=-1)
     narrow = (cosine > 0) & (sine**2 < least**2 * squared * jnp.roll(squared, -1, axis=1))
     # In order at least two of the three angles are less than π.
-    return ~jnp.any(narrow) & jnp.all(jnp.sum(sine > 0, axis=1) >= 2)
+    ordered = jnp.sum(sine > 0, axis=1) >= 2
+    if m.spare:
+        ordered, narrow = ordered | ~m.alive_vertices, narrow & m.alive_vertices[:, None]
+    return ~jnp.any(narrow) & jnp.all(ordered)

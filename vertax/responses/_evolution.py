@@ -21,6 +21,7 @@ from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDif
 from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
+from vertax.energies._units import cell_size
 from vertax.mesh import AbstractBoundary, Tissue
 from vertax.responses._material import Material
 from vertax.responses._relaxation import Relaxation
@@ -203,7 +204,7 @@ class Evolution(AbstractResponse):
                 f"AbstractViscosity, which {type(dissipation).__name__} is not."
             )
         self.dissipation = dissipation
-        self.times = _increasing(times)
+        self.times = increasing(times)
         self.substeps, self.order = substeps, order
         self.boundary, self.pins = boundary, pins
 
@@ -295,8 +296,8 @@ class Evolution(AbstractResponse):
             return
         with jax.ensure_compile_time_eval():
             free = np.asarray(_resistance(tissue, self.dissipation)) == 0
-        if tissue.pinned is not None:
-            free &= ~np.asarray(tissue.pinned)
+        if tissue.held is not None:
+            free &= ~np.asarray(tissue.held)
         if free.any():
             which = np.nonzero(free)[0]
             some = ", ".join(map(str, which[:5])) + (", ..." if len(which) > 5 else "")
@@ -466,7 +467,13 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
     )
 
 
-def _increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
+def increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
+    """Times as an array.
+
+    **Raises:**
+
+    - `ValueError` if there are fewer than two, or they do not increase.
+    """
     array = as_real("times", times)
     if array.ndim != 1 or array.size < 2:
         raise ValueError(
@@ -487,7 +494,7 @@ def _increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
 @eqx.filter_jit
 def _resistance(tissue: Tissue, dissipation: AbstractDissipation) -> Float[Array, " vertices"]:
     """How much each vertex is held back if all move in different directions."""
-    size = 1e-3 * jnp.sqrt(jnp.mean(jnp.abs(tissue.areas)))
+    size = 1e-3 * cell_size(tissue)
     angles = 2.4 * jnp.arange(tissue.n_vertices, dtype=tissue.vertices.dtype)
     away = size * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
     moved = lambda vertices: dissipation(tissue.with_vertices(vertices), tissue, 1.0)

@@ -28,7 +28,7 @@ class SearchState(eqx.Module):
     contacts: Contacts | None
     overlaps: Bool[Array, ""]
     """Whether the tissue overlaps, and always has."""
-    counts: Int[Array, " edges"]
+    counts: Int[Array, "*rules edges"]
     """How often each edge took part in a transition."""
     num_steps: Int[Array, ""]
     started: Bool[Array, ""]
@@ -45,7 +45,7 @@ class _Arrival(eqx.Module):
 
     tissue: Tissue
     contacts: Contacts | None
-    counts: Int[Array, " edges"]
+    counts: Int[Array, "*rules edges"]
     share: Float[Array, " vertices"]
     """Which share of the step each vertex has taken."""
     overlapping: Bool[Array, " vertices"]

@@ -88,7 +88,7 @@ class T1(AbstractTransitions):
 
         def one_round(carry: tuple) -> tuple:
             tissue, counts, todo = carry
-            corner = _EdgeFrames(tissue)
+            corner = EdgeFrames(tissue)
             short = corner.length < threshold
             may_flip = corner.can_flip & (counts < self.max_flips)
             may_turn = corner.inside_out & short & corner.free
@@ -105,7 +105,7 @@ class T1(AbstractTransitions):
                 ) -> Tissue:
                     placed = corner.place(tissue, which, corner.across, share * length)
                     flipped = flip_edges(tissue.topology, which)
-                    return _straightened(placed, which).with_topology(flipped)
+                    return straightened(placed, which).with_topology(flipped)
 
                 trials = lambda which: (stretch(which), flip(which), flip(which, 0.5))
                 stretched, flipped, shorter = _judge(energy, chosen, corner, trials)
@@ -121,7 +121,7 @@ class T1(AbstractTransitions):
 
                 def make_room(carry: tuple) -> tuple:
                     i, accepted, share, before, _ = carry
-                    faces = _faces(flip(accepted & (i > 0), share).overlaps)
+                    faces = overlapping_faces(flip(accepted & (i > 0), share).overlaps)
                     before = jnp.where(i == 0, faces, before)
                     blamed = accepted & jnp.any(take(faces & ~before, corner.cells), axis=-1)
                     refused = blamed & (i == _SHORTENED)
@@ -150,12 +150,12 @@ class T1(AbstractTransitions):
 _SHORTENED = 3
 
 
-def _faces(overlaps: Overlaps) -> Bool[Array, " faces"]:
+def overlapping_faces(overlaps: Overlaps) -> Bool[Array, " faces"]:
     """Which faces overlap, the exterior last."""
     return jnp.append(overlaps.cells, overlaps.exterior)
 
 
-class _EdgeFrames(eqx.Module):
+class EdgeFrames(eqx.Module):
     """The surroundings of every edge: its cells, its length and the directions a T1 places it in."""
 
     start: Int[Array, " edges"]
@@ -214,8 +214,8 @@ class _EdgeFrames(eqx.Module):
         losses = jnp.where(left == right, 2, 1)
         self.can_flip = (spare >= losses) & (at_start != at_end) & (self.start != self.end)
         self.free = jnp.ones_like(upright)
-        if tissue.pinned is not None:
-            self.free = ~take(tissue.pinned, self.start) & ~take(tissue.pinned, self.end)
+        if tissue.held is not None:
+            self.free = ~take(tissue.held, self.start) & ~take(tissue.held, self.end)
         self.can_flip &= self.free
 
     def place(
@@ -246,14 +246,14 @@ def _spare_sides(tissue: Tissue) -> Int[Array, "edges 2"]:
     return sides - jnp.where(arcs > m.on_outline[:, None], 2, 3)
 
 
-def _straightened(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
+def straightened(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
     if tissue.angles is None:
         return tissue
     return tissue.with_angles(jnp.where(which, 0, tissue.angles))
 
 
 def _independent(
-    candidates: Bool[Array, " edges"], corner: _EdgeFrames, n_cells: int
+    candidates: Bool[Array, " edges"], corner: EdgeFrames, n_cells: int
 ) -> Bool[Array, " edges"]:
     """The candidates that are the shortest of all candidates at each of their four cells."""
     # Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute. (An
@@ -273,7 +273,7 @@ _Trials = Callable[[Bool[Array, " edges"]], tuple[Tissue, Tissue, Tissue]]
 
 
 def _judge(
-    energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
+    energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
 ) -> Float[Array, "3 edges"]:
     """What the trials of each chosen edge cost."""
     if isinstance(energy, AbstractLocalEnergy):
@@ -282,7 +282,7 @@ def _judge(
 
 
 def _judge_local(
-    energy: AbstractLocalEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
+    energy: AbstractLocalEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
 ) -> Float[Array, "3 edges"]:
     """The same for a local energy: all at once, each by the terms of its own cells and edges."""
     by_cell, by_edge = _of_each(
@@ -299,7 +299,7 @@ def _judge_local(
 
 
 def _judge_total(
-    energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: _EdgeFrames, trials: _Trials
+    energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
 ) -> Float[Array, "3 edges"]:
     """The same for an arbitrary energy: one edge after the other."""
     edges = jnp.arange(chosen.shape[0])

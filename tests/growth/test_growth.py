@@ -1,0 +1,117 @@
+"""Tissues that grow."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import central_difference, random_tissue
+
+import vertax as vx
+from vertax.growth import GrowAndDivide, grow
+
+FRICTION = vx.dissipations.SubstrateFriction(1.0)
+
+
+def energy_of(cells):
+    return (
+        vx.energies.AreaElasticity(1.0, cells.target_area)
+        + vx.energies.PerimeterElasticity(0.02, 0.0)
+        + vx.energies.LineTension(0.02)
+    )
+
+
+def founders(capacity=9):
+    return vx.initialise.free_voronoi(4, key=0, lloyd_steps=2).with_capacity(capacity)
+
+
+@pytest.fixture(scope="module")
+def grown():
+    cycle = GrowAndDivide(0.2, 1.5)
+    return grow(founders(), energy_of, cycle, jnp.linspace(0, 5, 6), key=1)
+
+
+def test_cells_divide_and_the_tissue_stays_sound(grown):
+    n_alive = np.asarray(grown.n_alive)
+    assert n_alive[0] == 4
+    assert n_alive[-1] > 5
+    assert (np.diff(n_alive) >= 0).all()
+    for frame in grown.trajectory:
+        frame.topology.validate()
+        assert not frame.overlaps.any
+    assert grown.sound.all()
+    np.testing.assert_array_equal(grown.number[-1] >= 0, grown.tissue.alive)
+    # A daughter begins with half of what her mother had.
+    young = np.asarray(grown.tissue.alive & (grown.cells.age == 0))
+    assert (np.asarray(grown.cells.target_area)[young] < 1.2).all()
+
+
+def test_the_lineage_is_a_forest(grown):
+    lineage = grown.lineage
+    count = int(lineage.count)
+    mother, fate = np.asarray(lineage.mother)[:count], np.asarray(lineage.fate)[:count]
+    begun, ended = np.asarray(lineage.begun)[:count], np.asarray(lineage.ended)[:count]
+    born = mother >= 0
+    assert (mother[:4] == -1).all()
+    assert born[4:].all()
+    assert (mother[born] < np.flatnonzero(born)).all()
+    np.testing.assert_array_equal(np.bincount(mother[born], minlength=count), 2 * (fate == 1))
+    np.testing.assert_array_equal(begun[born], ended[mother[born]])
+    np.testing.assert_array_equal(np.isinf(ended), fate == 0)
+    alive = np.asarray(grown.number)[-1]
+    assert sorted(alive[alive >= 0]) == np.flatnonzero(fate == 0).tolist()
+
+
+def test_a_full_pool_and_bad_arguments_are_named(grown):
+    cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 5, 6)
+    with pytest.raises(RuntimeError, match="capacity of 9 cells"):
+        eqx.tree_at(lambda g: g.full, grown, jnp.array(True)).checked()
+    with pytest.raises(ValueError, match="with_capacity"):
+        grow(random_tissue(6), energy_of, cycle, times, key=0)
+    with pytest.raises(ValueError, match="orientation"):
+        GrowAndDivide(0.2, 1.5, orientation="short")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="`times`"):
+        grow(founders(), energy_of, cycle, jnp.zeros(3), key=0)
+
+
+@pytest.mark.slow
+def test_the_dying_are_extruded():
+    tissue = random_tissue(12, 3, lloyd_steps=5).with_capacity(12)
+    cycle = GrowAndDivide(0.0, 5.0, death_rate=0.15, shrinking_time=0.3)
+    energy = lambda cells: energy_of(cells) + vx.energies.LineTension(0.03)
+    grown = grow(tissue, energy, cycle, jnp.linspace(0, 4, 9), key=2)
+    grown.tissue.topology.validate()
+    n_dead = int((grown.lineage.fate == 2).sum())
+    assert n_dead > 0
+    assert n_dead == 12 - int(grown.n_alive[-1])
+    assert grown.tissue.areas.sum() == pytest.approx(12.0)
+
+
+@pytest.mark.slow
+def test_gradient_by_the_rate_of_growth_between_events():
+    tissue = founders(8)
+    still = vx.Relaxation(transitions=vx.T1() + vx.T2(), tolerance=1e-11)
+
+    @eqx.filter_jit
+    def size(rate):
+        cycle = GrowAndDivide(rate, 1.5)
+        times = jnp.linspace(0, 2, 5)
+        grown = grow(
+            tissue,
+            energy_of,
+            cycle,
+            times,
+            key=1,
+            dissipation=FRICTION,
+            relaxation=still,
+            divisions=1,
+            throw=False,
+        )
+        return jnp.sum(grown.tissue.areas**2), grown.lineage.count
+
+    rate = jnp.asarray(0.2)
+    (_, count), slope = jax.value_and_grad(size, has_aux=True)(rate)
+    assert count > 4
+    assert slope == pytest.approx(
+        float(central_difference(lambda r: size(r)[0], rate, 1.0, 1e-5)), rel=1e-5
+    )

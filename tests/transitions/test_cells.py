@@ -1,0 +1,259 @@
+"""Cells come and go."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_tissue
+from hypothesis import given, settings, strategies as st
+
+import vertax as vx
+from vertax.transitions import divide, remove
+from vertax.transitions._removal import flipped, removed
+from vertax.transitions._t1 import EdgeFrames
+
+
+def cluster(**options):
+    return vx.initialise.free_voronoi(6, key=1, lloyd_steps=3, **options)
+
+
+def foam():
+    tissue = cluster(inner_arcs=True)
+    return tissue.with_angles(0.15 * jnp.cos(1.0 * jnp.arange(tissue.n_edges)))
+
+
+KINDS = {"periodic": lambda: random_tissue(6, 3, lloyd_steps=3), "free": cluster, "foam": foam}
+each_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+def newborn(before, after):
+    (cell,) = np.flatnonzero(np.asarray(after.alive & ~before.alive))
+    return int(cell)
+
+
+@each_kind
+@settings(max_examples=6, deadline=None)
+@given(mother=st.integers(0, 5), angle=st.one_of(st.none(), st.floats(0, 6.2)))
+def test_daughters_cover_what_the_mother_did(kind, mother, angle):
+    tissue = KINDS[kind]().with_capacity(8)
+    axis = None if angle is None else jnp.array([np.cos(angle), np.sin(angle)])
+    change = divide(tissue, mother, axis)
+    new = change.tissue
+    new.topology.validate()
+    assert change.done
+    assert not new.overlaps.any
+    daughter = newborn(tissue, new)
+    areas = np.asarray(new.areas)
+    assert areas[mother] + areas[daughter] == pytest.approx(float(tissue.areas[mother]), abs=1e-13)
+    others = np.setdiff1d(np.arange(8), [mother, daughter])
+    np.testing.assert_allclose(areas[others], tissue.areas[others], atol=1e-13)
+    # Lengths too, but for the new edge; arcs are cut into arcs of the same circle.
+    ends = np.sort(np.asarray(new.topology.edge_cells), axis=1)
+    inner = (ends == sorted([mother, daughter])).all(axis=1) & ~np.asarray(
+        tissue.topology.alive_edges
+    )
+    total = new.edge_lengths.sum() - new.edge_lengths[inner].sum()
+    assert inner.sum() == 1
+    assert total == pytest.approx(float(tissue.edge_lengths.sum()), abs=1e-4)
+    if axis is not None:
+        apart = new.centroids[daughter] - new.centroids[mother]
+        edge = new.edge_vectors[inner][0]
+        assert abs(apart @ axis) > 0
+        assert abs(edge @ axis) < 0.3 * np.linalg.norm(edge)  # clear of the corners
+
+
+def test_the_long_axis_is_cut_across():
+    box = jnp.array([[6.0, 0.0], [0.0, 1.5]])
+    tissue = random_tissue(4, 1, lattice=box, lloyd_steps=30).with_capacity(5)
+    for mother in range(4):
+        new = divide(tissue, mother).tissue
+        halves = new.areas[jnp.array([mother, newborn(tissue, new)])]
+        assert (halves > 0.3 * tissue.areas[mother]).all()
+
+
+def test_a_single_periodic_cell_grows_to_many():
+    tissue = random_tissue(1).with_capacity(12)
+
+    @jax.jit
+    def grow(tissue):
+        def once(i, carry):
+            tissue, done = carry
+            change = divide(tissue, i // 2, throw=False)
+            return change.tissue, done & change.done
+
+        return jax.lax.fori_loop(0, 11, once, (tissue, jnp.array(True)))
+
+    grown, done = grow(tissue)
+    grown.topology.validate()
+    assert done
+    assert grown.alive.all()
+    assert not grown.overlaps.any
+    assert grown.areas.sum() == pytest.approx(1)
+
+
+def test_parameters_are_inherited():
+    tissue = random_tissue(6, 3).with_capacity(8)
+    change = divide(tissue, 2)
+    energy = vx.energies.AreaElasticity(1.0, jnp.arange(8.0)) + vx.energies.LineTension(
+        jnp.arange(24.0)
+    )
+    areas, tension = (
+        change.inherited(energy).terms[0].target_area,
+        change.inherited(energy).terms[1].tension,
+    )
+    daughter = newborn(tissue, change.tissue)
+    assert areas[daughter] == 2
+    assert areas[2] == 2
+    # Parts of an edge keep its tension: on either side of the new corner lie the same cells but one.
+    cells = np.sort(np.asarray(change.tissue.topology.edge_cells), axis=1)
+    old = np.sort(np.asarray(tissue.topology.edge_cells), axis=1)
+    born = np.flatnonzero(
+        np.asarray(change.tissue.topology.alive_edges & ~tissue.topology.alive_edges)
+    )
+    for edge in born:
+        origin = int(tension[edge])
+        mothers = np.sort(np.where(cells[edge] == daughter, 2, cells[edge]))
+        if not np.array_equal(mothers, [2, 2]):
+            np.testing.assert_array_equal(mothers, old[origin])
+
+
+def test_a_full_pool_names_its_capacity(as_a_user):
+    tissue = random_tissue(6, 3).with_capacity(7)
+    full = divide(tissue, 0).tissue
+    with pytest.raises(RuntimeError, match="capacity of 7 cells"):
+        divide(full, 0)
+    with pytest.raises(Exception, match="capacity of 7 cells"):
+        jax.block_until_ready(jax.jit(lambda t: divide(t, 0).tissue.vertices)(full))
+    change = divide(full, 0, throw=False)
+    assert not change.done
+    assert eqx.tree_equal(change.tissue, full)
+    with pytest.raises(ValueError, match="living cell"):
+        divide(tissue, 6)
+    with pytest.raises(ValueError, match="direction"):
+        divide(tissue, 0, jnp.zeros(2))
+    with pytest.raises(ValueError, match="with_capacity"):
+        remove(random_tissue(6), 0)
+
+
+@each_kind
+def test_a_cell_goes_and_its_neighbours_close_the_gap(kind):
+    tissue = KINDS[kind]().with_capacity(6)
+    for cell in range(2):
+        change = remove(tissue, cell)
+        new = change.tissue
+        new.topology.validate()
+        assert not new.alive[cell]
+        assert new.alive.sum() == 5
+        assert not new.overlaps.any
+        if kind == "periodic":
+            assert new.areas.sum() == pytest.approx(float(tissue.areas.sum()))
+
+
+def test_events_in_a_batch():
+    tissues = [random_tissue(6, seed, lloyd_steps=2).with_capacity(7) for seed in (1, 2)]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *tissues)
+    cells = jnp.array([1, 4])
+    changes = eqx.filter_vmap(lambda t, c: divide(t, c, throw=False))(batch, cells)
+    gone = eqx.filter_vmap(lambda t, c: remove(t, c, throw=False))(batch, cells)
+    for k, tissue in enumerate(tissues):
+        for many, one in ((changes, divide(tissue, cells[k])), (gone, remove(tissue, cells[k]))):
+            mine = jax.tree.map(lambda x, k=k: x[k], many.tissue)
+            assert eqx.tree_equal(mine.topology, one.tissue.topology)
+            np.testing.assert_allclose(mine.vertices, one.tissue.vertices, atol=1e-13)
+
+
+def smoothed(tissue):
+    """Vertices half-way to the middle of their neighbours, if no cells overlap then."""
+    m = tissue.topology
+    vector = tissue.edge_vectors[m.edge]
+    vector = jnp.where(m.forward[:, None], vector, -vector)
+    pull = jnp.mean(vector.reshape(-1, 3, 2), axis=1)
+    moved = tissue.with_vertices(
+        tissue.vertices + 0.5 * jnp.where(m.alive_vertices[:, None], pull, 0)
+    )
+    return jax.tree.map(lambda a, b: jnp.where(moved.overlaps.any, a, b), tissue, moved)
+
+
+def sound(tissue, box):
+    """Every invariant of a mesh that a compiled program can look at."""
+    m = tissue.topology
+    h = jnp.arange(m.n_half_edges)
+    nowhere = m.cell == m.nowhere
+    conditions = [
+        m.twin[m.twin] == h,
+        m.twin != h,
+        m.edge[m.twin] == m.edge,
+        m.edge[m.half_edge] == jnp.arange(m.n_edges),
+        m.cell[m.next] == m.cell,
+        m.offset[m.twin] == -m.offset,
+        (m.next[m.next] == h) | ~nowhere,
+        m.neighbour_counts != 1,
+        jnp.sum(m.alive_vertices) == 2 * jnp.sum(m.alive),  # that of Euler
+        jnp.sum(m.alive_edges) == 3 * jnp.sum(m.alive),
+        # Simple polygons that run counter-clockwise, and cover the box once.
+        ~tissue.overlaps.any,
+        jnp.abs(jnp.sum(tissue.areas) - box) < 1e-9 * box,
+    ]
+    return jnp.all(jnp.stack([jnp.all(c) for c in conditions]))
+
+
+@eqx.filter_jit
+def random_events(tissue, key, n_events):
+    """Many T1 transitions, divisions and removals at random, and how many there were of each."""
+    box = jnp.linalg.det(tissue.boundary.lattice)
+    keep = lambda yes, new, old: jax.tree.map(lambda a, b: jnp.where(yes, a, b), new, old)
+
+    def event(i, carry):
+        tissue, counts, ok = carry
+        keys = jax.random.split(jax.random.fold_in(key, i), 4)
+        n_alive = jnp.sum(tissue.alive)
+        cell = jax.random.categorical(keys[0], jnp.where(tissue.alive, 0.0, -jnp.inf))
+        axis = jax.random.normal(keys[1], (2,))
+
+        def t1():
+            frames = EdgeFrames(tissue)
+            edge = jax.random.categorical(keys[2], jnp.where(frames.can_flip, 0.0, -jnp.inf))
+            which = frames.can_flip & (jnp.arange(tissue.n_edges) == edge)
+            return flipped(tissue, frames, which)
+
+        def birth():
+            change = divide(tissue, cell, axis, throw=False)
+            # One through a concave cell may cross it: the geometry is nobody's here.
+            good = change.done & ~change.tissue.overlaps.any
+            return keep(good, change.tissue, tissue), good
+
+        def death():
+            change = removed(tissue, cell, n_alive > 4)
+            return change.tissue, change.done
+
+        kind = jax.random.randint(keys[3], (), 0, 3)
+        tissue, done = jax.lax.switch(kind, [t1, birth, death])
+        tissue = jax.lax.fori_loop(0, 3, lambda _, t: smoothed(t), tissue)
+        return tissue, counts.at[kind].add(done), ok & sound(tissue, box)
+
+    start = (tissue, jnp.zeros(3, int), sound(tissue, box))
+    return jax.lax.fori_loop(0, n_events, event, start)
+
+
+def run_events(n_events):
+    tissue = random_tissue(10, 5, lloyd_steps=3).with_capacity(16)
+    tissue, counts, ok = random_events(tissue, jax.random.key(0), n_events)
+    assert ok, counts
+    tissue.topology.validate()
+    return tissue, np.asarray(counts)
+
+
+def test_random_events_keep_every_invariant():
+    _, counts = run_events(300)
+    assert (counts > 20).all()
+
+
+@pytest.mark.slow
+def test_very_many_random_events_keep_every_invariant():
+    tissue, counts = run_events(200_000)
+    assert counts.sum() > 100_000
+    assert (counts > 10_000).all()
+    energy = vx.energies.AreaElasticity(1.0, 1.0) + vx.energies.LineTension(0.1)
+    force = jax.grad(lambda y: energy(tissue.with_configuration(y)))(tissue.vertices)
+    np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e-12)

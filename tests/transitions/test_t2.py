@@ -1,0 +1,67 @@
+"""T2 transitions in relaxations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_tissue
+
+import vertax as vx
+
+BOTH = vx.T1() + vx.T2()
+
+
+def shrinking(capacity, cells, tension=0.1):
+    areas = jnp.ones(capacity).at[jnp.asarray(cells)].set(0.0)
+    return vx.energies.AreaElasticity(1.0, areas) + vx.energies.LineTension(tension)
+
+
+def test_a_shrinking_cell_is_extruded():
+    tissue = random_tissue(9, 1, lloyd_steps=2).with_capacity(10)
+    relaxed = vx.equilibrate(tissue, shrinking(10, [3]), transitions=BOTH)
+    relaxed.tissue.topology.validate()
+    assert relaxed.converged
+    assert not relaxed.tissue.alive[3]
+    assert relaxed.tissue.alive.sum() == 8
+    assert relaxed.tissue.areas.sum() == pytest.approx(float(tissue.areas.sum()))
+    # What is left is at rest by itself.
+    alone = relaxed.tissue.without_spare()
+    energy = vx.energies.AreaElasticity(1.0, 1.0) + vx.energies.LineTension(0.1)
+    force = jax.grad(lambda y: energy(alone.with_configuration(y)))(alone.vertices)
+    np.testing.assert_allclose(force, 0, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("inner_arcs", [False, True])
+def test_cells_are_extruded_at_the_outline_too(inner_arcs):
+    cluster = vx.initialise.free_voronoi(9, key=2, lloyd_steps=3, inner_arcs=inner_arcs)
+    tissue = cluster.with_capacity(9)
+    relaxed = vx.equilibrate(tissue, shrinking(9, [0, 1]), transitions=BOTH)
+    relaxed.tissue.topology.validate()
+    assert relaxed.converged
+    np.testing.assert_array_equal(relaxed.tissue.alive, [False] * 2 + [True] * 7)
+
+
+@pytest.mark.slow
+def test_gradients_where_slots_are_spare():
+    tissue = random_tissue(9, 1, lloyd_steps=2)
+    energy = lambda a, n: (
+        vx.energies.AreaElasticity(1.0, a[:n]) + vx.energies.PerimeterElasticity(0.1, 3.6)
+    )
+    areas = jnp.linspace(0.8, 1.2, 12)
+
+    def cost(a, start, n):
+        relaxed = vx.equilibrate(start, energy(a, n), transitions=None)
+        return jnp.sum(relaxed.tissue.perimeters**3)
+
+    plain = jax.grad(cost)(areas, tissue, 9)
+    roomy = jax.grad(cost)(areas, tissue.with_capacity(12), 12)
+    np.testing.assert_allclose(roomy, plain, atol=1e-8)
+
+
+def test_t2_needs_a_place_for_spare_slots():
+    with pytest.raises(ValueError, match="with_capacity"):
+        vx.equilibrate(random_tissue(6), shrinking(6, [0]), transitions=vx.T2())
+    with pytest.raises(ValueError, match="threshold"):
+        vx.T2(threshold=0.0)
+    assert len((BOTH + vx.T2()).rules) == 3  # pyright: ignore[reportAttributeAccessIssue]

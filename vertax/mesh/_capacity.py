@@ -1,0 +1,71 @@
+"""Room for cells to come."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from vertax._base.checks import check_concrete, check_whole
+from vertax.mesh._topology import Topology
+
+
+def with_slots(m: Topology, n_cells: int) -> Topology:
+    """The same with spare slots, so many that there is room for a number of cells."""
+    check_whole("n_cells", n_cells)
+    have = m.n_cells
+    if n_cells < have:
+        raise ValueError(
+            f"Argument `n_cells` must be at least {have}, the number of cells that there is room for "
+            f"already, but is {n_cells}. To drop spare slots call `without_spare()` first."
+        )
+    more = n_cells - have
+    slot = 6 * jnp.arange(more, dtype=m.twin.dtype)[:, None]
+    # Of a slot the half-edges 0, 1, 2 leave one vertex, and 3, 5, 4 are their twins.
+    twins = m.n_half_edges + slot + jnp.asarray([3, 5, 4, 0, 2, 1], m.twin.dtype)
+    edges = m.n_edges + slot // 2 + jnp.asarray([0, 1, 2, 0, 2, 1], m.twin.dtype)
+    begins = m.n_half_edges + slot + jnp.arange(3, dtype=m.twin.dtype)
+    # The labels of what is no cell come after those of the cells.
+    cell = jnp.where(m.cell >= have, m.cell + more, m.cell)
+    join = lambda a, b: jnp.concatenate([a, b.astype(a.dtype)])
+    topology = Topology(
+        join(m.twin, twins.ravel()),
+        join(cell, jnp.full(6 * more, n_cells + 1)),
+        join(m.frame, jnp.zeros((6 * more, 2))),
+        join(m.edge, edges.ravel()),
+        exterior=m.exterior,
+        spare=True,
+    )
+    return _directed(topology, join(m.half_edge, begins.ravel()))
+
+
+def without_slots(
+    m: Topology,
+) -> tuple[Topology, Int[Array, " vertices"], Int[Array, " edges"]]:
+    """The same without spare slots; and which vertices and edges those of the result are."""
+    check_concrete("without_spare", m)
+    cells, vertices, edges = (
+        jnp.flatnonzero(alive) for alive in (m.alive, m.alive_vertices, m.alive_edges)
+    )
+    halves = (3 * vertices[:, None] + jnp.arange(3)).ravel()
+
+    def rank(kept: Array, size: int) -> Array:
+        numbers = jnp.arange(len(kept), dtype=m.twin.dtype)
+        return jnp.zeros(size, m.twin.dtype).at[kept].set(numbers)
+
+    of_half = rank(halves, m.n_half_edges)
+    # (The label of the exterior comes after those of the cells.)
+    of_cell = rank(jnp.append(cells, m.n_cells), m.n_faces)
+    topology = Topology(
+        of_half[m.twin[halves]],
+        of_cell[m.cell[halves]],
+        m.frame[halves],
+        rank(edges, m.n_edges)[m.edge[halves]],
+        exterior=m.exterior,
+    )
+    return _directed(topology, of_half[m.half_edge[edges]]), vertices, edges
+
+
+def _directed(topology: Topology, half_edge: Int[Array, " edges"]) -> Topology:
+    """The same with edges that run as these half-edges do."""
+    return eqx.tree_at(lambda m: m.half_edge, topology, half_edge)
