@@ -5,6 +5,11 @@ from vertax.inference._foam import (
     foam_terms as foam_terms,
     force_balance as force_balance,
 )
+from vertax.inference._infer_tensions import (
+    InferredTensions as InferredTensions,
+    infer_tensions as infer_tensions,
+)
+from vertax.inference._mask import read_mask as read_mask
 from vertax.inference._micrograph import (
     Micrograph as Micrograph,
     PinnedEnergy as PinnedEnergy,
