@@ -185,7 +185,7 @@ def test_what_cannot_be_used_is_refused(foam):
 
 @needs_data
 @pytest.mark.parametrize(
-    ("name", "least", "error"), [("movie_0.dmp", 0.998, 0.005), ("cells100.dmp", 0.998, 0.11)]
+    ("name", "least", "error"), [("movie_0.dmp", 0.998, 0.005), ("cells100.dmp", 0.997, 0.12)]
 )
 def test_foams_with_known_tensions(name, least, error):
     path = DATA / "surface_evolver" / name

@@ -25,10 +25,9 @@ FAMILIES = {
     "PerimeterElasticity ShapeFactorEnergy Sum",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts fit "
     "limits member stack stack_fits uncertainty",
-    "inference": "InferredTensions Micrograph Microscope PinnedEnergy RecoveryWatch RelativeTensions Scene "
-    "TensionProblem Tensions Transition fit_onset fit_transition foam_energy foam_terms force_balance "
-    "infer_tensions label_image micrograph_problem pearson read_mask relative_error same_neighbours "
-    "shape_factor_scene tension_problem",
+    "inference": "InferredTensions Micrograph Microscope PinnedEnergy RecoveryWatch Scene Transition "
+    "fit_onset fit_transition foam_energy foam_terms infer_tensions label_image micrograph_problem pearson "
+    "read_mask relative_error same_neighbours shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses Segmentation Watershed free_voronoi from_labels "
     "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
     "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_tables "

@@ -201,9 +201,9 @@ def infer_tensions(
 
     Junctions on the outline, where cells beyond it may pull, do not count, so the tissue may have been cut
     out of a larger one. Vertices and arcs are fitted to the pixels; how far pixels are from arcs is the
-    noise, which is carried through the balance with all its correlations, and the geometry is adjusted within it
-    (total least squares). What is left tells how far the tissue is from a balance at all, which enters the
-    standard deviations too.
+    noise, which is carried through the balance with all its correlations, and the geometry is adjusted
+    within it (total least squares). What is left tells how far the tissue is from a balance at all, which
+    enters the standard deviations too.
 
     **Arguments:**
 
@@ -302,6 +302,7 @@ def _inferred(
         )
     used = np.isin(edge, which.edges)
     edge, away = edge[used], away[used]
+    exact = pixel_size is None or noise is not None
     if pixel_size is None:
         noise = _EXACT * geometry.size if noise is None else noise
         apart = float(np.mean(np.linalg.norm(geometry.chord, axis=1))) / _POINTS
@@ -314,8 +315,8 @@ def _inferred(
         arcs = fit_arcs(geometry, edge, away, pixel_size, apart)
         noise = arcs.noise if noise is None else noise
     fitted = geometry.moved(arcs.change)
-    balance = solve(fitted, arcs, which, noise=noise, prior=prior)
-    return _result(_moved(tissue, arcs.change), which, balance, labels, noise, apart, pixel_size)
+    balance = solve(fitted, arcs, which, noise=noise, exact=exact, prior=prior)
+    return _result(_moved(tissue, arcs.change), which, balance, labels, apart, pixel_size)
 
 
 def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
@@ -332,7 +333,6 @@ def _result(
     which: Equations,
     balance: Balance,
     labels: Int[np.ndarray, " cells"],
-    noise: float,
     apart: float,
     pixel_size: float | None,
 ) -> InferredTensions:
@@ -376,7 +376,7 @@ def _result(
         pressures_determined=known,
         stresses=_stresses(tissue, tensions, pressures, determined),
         labels=np.asarray(labels),
-        noise=float(noise),
+        noise=balance.noise,
         correlation=float(apart),
         model_errors=balance.model_errors,
         pixel_size=pixel_size,

@@ -19,7 +19,10 @@ _LOOSE, _UNKNOWN = 0.2, 10.0
 _PRESSURE, _WIDTHS = 10.0, (0.2, 3.0)
 # Least tension by which noise is judged.
 _SMALL = 0.4
-_FIRST = (0.05, 0.5)
+_FIRST = (0.05, 0.5, 1.0)
+# How much less or more noise than pixels tell may be found, logarithms: pixels on a straight line depart from
+# it by a pattern that averages out.
+_SHARES = (-2.3, 0.7)
 # No tissue is a foam better than that: half a degree, and an arc of 1 per cent of a cell.
 _LEAST = (0.005, 0.02)
 
@@ -36,6 +39,8 @@ class Balance(NamedTuple):
     model_errors: tuple[float, float]
     """Standard deviations of angles at junctions, and of the angles of arcs of the length of a cell, that no
     noise explains."""
+    noise: float
+    """Standard deviation of a point of an edge, as forces tell it."""
     residual: Float[np.ndarray, " rows"]
     """Forces that are left where the geometry is as it was seen, over their standard deviations."""
     loose: Bool[np.ndarray, " edges"]
@@ -58,6 +63,7 @@ def solve(
     which: Equations,
     *,
     noise: float,
+    exact: bool,
     prior: float | None,
     rounds: int = 8,
 ) -> Balance:
@@ -68,6 +74,7 @@ def solve(
     - `fitted`, `arcs`: the geometry, and how well it is known.
     - `which`: the balances that count.
     - `noise`: standard deviation of a point of an edge.
+    - `exact`: whether there cannot be more noise than that.
     - `prior`: of tensions about 1; left out, from how much they differ.
     - `rounds`: of adjusting the geometry.
 
@@ -91,7 +98,7 @@ def solve(
     unknown = _UNKNOWN**2 * unknown @ unknown.T
     mean = np.append(~loose, np.zeros(n_cells, bool)) / max(1, np.sum(~loose))
     basis = np.linalg.svd(mean[None])[2][1:].T
-    known = _FIRST
+    known, shares = _FIRST, (_SHARES[0], 0.0 if exact else _SHARES[1])
     covariance = residual = np.zeros(0)
     for attempt in range(rounds):
         here = fitted.moved(change)
@@ -102,11 +109,16 @@ def solve(
         slope = slopes(here, which, turns, tension, step)
         answer = noise**2 * inverse.solve(slope.geometry.T.toarray())
         offset = -slope.geometry @ change - _turning(slope, turns)
-        seen = slope.geometry @ answer + unknown
+        seen = slope.geometry @ answer
         model = _model(slope, length)
         if attempt in (2, 4):
-            known = model_errors(matrix @ basis, matrix @ expected + offset, seen, model, known)
-        spread = seen + known[0] ** 2 * model[0] + known[1] ** 2 * model[1]
+            known = model_errors(
+                matrix @ basis, matrix @ expected + offset, seen, unknown, model, known, shares
+            )
+        answer = known[2] ** 2 * answer
+        spread = (
+            known[2] ** 2 * seen + unknown + known[0] ** 2 * model[0] + known[1] ** 2 * model[1]
+        )
         factor = np.linalg.cholesky(spread)
         white = solve_triangular(factor, np.column_stack([matrix, offset]), lower=True)
         white, given = white[:, :-1], white[:, -1]
@@ -131,7 +143,9 @@ def solve(
         residual = solve_triangular(factor, left, lower=True)
         if prior is None:
             width = _varied(x[:n_edges][~loose], np.diag(covariance)[:n_edges][~loose], width)
-    return Balance(x[:n_edges], x[n_edges:], covariance, change, known, residual, loose)
+    return Balance(
+        x[:n_edges], x[n_edges:], covariance, change, known[:2], noise * known[2], residual, loose
+    )
 
 
 def _direction_deviations(
@@ -222,26 +236,28 @@ def model_errors(
     matrix: Float[np.ndarray, "rows unknowns"],
     given: Float[np.ndarray, " rows"],
     seen: Float[np.ndarray, "rows rows"],
+    unknown: Float[np.ndarray, "rows rows"],
     model: tuple[Float[np.ndarray, "rows rows"], Float[np.ndarray, "rows rows"]],
-    guess: tuple[float, float],
-) -> tuple[float, float]:
-    """Errors of the model by restricted maximum likelihood.
+    guess: tuple[float, float, float],
+    shares: tuple[float, float],
+) -> tuple[float, float, float]:
+    """Errors of the model, and the true noise over that of the pixels, by restricted maximum likelihood.
 
     Combinations of the equations in which no unknown is left, N, have the covariance Nᵀ S N.
     """
     left, values, _ = np.linalg.svd(matrix)
     free = left[:, int(np.sum(values > 1e-9 * values[0])) :]
     z = free.T @ given
-    noise, junction, arc = (free.T @ part @ free for part in (seen, *model))
+    noise, loose, junction, arc = (free.T @ part @ free for part in (seen, unknown, *model))
 
     def loss(logs: np.ndarray) -> float:
         ratio = np.exp(2 * logs)
-        total = noise + ratio[0] * junction + ratio[1] * arc
+        total = ratio[2] * noise + loose + ratio[0] * junction + ratio[1] * arc
         factor = np.linalg.cholesky(total)
         left = solve_triangular(factor, z, lower=True)
-        return left @ left + 2 * np.sum(np.log(np.diag(factor)))
+        return left @ left + 2 * np.sum(np.log(np.diag(factor))) + logs[2] ** 2
 
-    bounds = [(np.log(least), np.log(1.5)) for least in _LEAST]
+    bounds = [(np.log(least), np.log(1.5)) for least in _LEAST] + [shares]
     found = minimize(
         loss,
         np.log(np.array(guess)),
@@ -249,4 +265,4 @@ def model_errors(
         bounds=bounds,
         options={"xatol": 0.05, "fatol": 0.02},
     ).x
-    return float(np.exp(found[0])), float(np.exp(found[1]))
+    return float(np.exp(found[0])), float(np.exp(found[1])), float(np.exp(found[2]))
