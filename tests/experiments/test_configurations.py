@@ -44,7 +44,7 @@ SHORT = {
     "design_mechanics": ["tissue.n_cells=6", "fit.epochs=2"],
     "infer_from_microscopy": ["image.pixels=96", "fit.epochs=2"],
     "infer_shape_factors": ["tissue.n_cells=6", "fit.epochs=2"],
-    "infer_tensions": ["cluster.n_cells=4", "cluster.pixels=200", "epochs=2"],
+    "infer_tensions": ["cluster.n_cells=6", "cluster.pixels=200"],
     "inference_across_topologies": [
         "replicates=1",
         "least_mismatch=2",

@@ -89,14 +89,24 @@ def test_designs_before_and_after_have_one_scale(tissue, cluster):
 
 def test_a_label_image_shows_its_labels_under_the_edges(cluster):
     labels = np.repeat(np.arange(7), 10).reshape(7, 10)
-    nothing = np.zeros(0, int)
-    whole = np.ones(6, bool)
-    found = vx.initialise.Segmentation(
-        cluster, np.arange(1, 7), whole, nothing, nothing, 0.4, labels.shape
-    )
     picture = label_colours(labels)
-    values = np.ones(cluster.n_edges), np.ones(cluster.n_cells)
-    left, right = panels(tensions.foam(picture, found, cluster, *values))
+    edges, cells = np.ones(cluster.n_edges), np.ones(cluster.n_cells)
+    found = vx.inference.InferredTensions(
+        tissue=cluster,
+        tensions=edges,
+        tension_deviations=edges,
+        determined=edges > 0,
+        pressures=cells,
+        pressure_deviations=cells,
+        pressures_determined=cells > 0,
+        stresses=np.ones((cluster.n_cells, 2, 2)),
+        labels=np.arange(1, 7),
+        noise=0.1,
+        correlation=0.1,
+        model_errors=(0.0, 0.0),
+        pixel_size=0.4,
+    )
+    left, right = panels(tensions.foam(picture, found))
     np.testing.assert_allclose(left.images[0].get_array(), picture)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 7
     assert (left.get_xlim(), left.get_ylim()) == (right.get_xlim(), right.get_ylim())

@@ -3,8 +3,12 @@
 from vertax.inference._foam import (
     foam_energy as foam_energy,
     foam_terms as foam_terms,
-    force_balance as force_balance,
 )
+from vertax.inference._infer_tensions import (
+    InferredTensions as InferredTensions,
+    infer_tensions as infer_tensions,
+)
+from vertax.inference._mask import read_mask as read_mask
 from vertax.inference._micrograph import (
     Micrograph as Micrograph,
     PinnedEnergy as PinnedEnergy,
@@ -20,12 +24,6 @@ from vertax.inference._recovery import (
 from vertax.inference._scene import (
     Scene as Scene,
     shape_factor_scene as shape_factor_scene,
-)
-from vertax.inference._tensions import (
-    RelativeTensions as RelativeTensions,
-    TensionProblem as TensionProblem,
-    Tensions as Tensions,
-    tension_problem as tension_problem,
 )
 from vertax.inference._transition import (
     Transition as Transition,

@@ -1,7 +1,11 @@
 """Ways to make a first tissue."""
 
 from vertax.initialise._free import free_voronoi as free_voronoi
-from vertax.initialise._labels import Segmentation as Segmentation, from_labels as from_labels
+from vertax.initialise._labels import (
+    Courses as Courses,
+    Segmentation as Segmentation,
+    from_labels as from_labels,
+)
 from vertax.initialise._microscopy import from_microscopy as from_microscopy
 from vertax.initialise._segmenters import (
     AbstractSegmenter as AbstractSegmenter,

@@ -78,6 +78,11 @@ class Mesh(NamedTuple):
     """The number that each cell has in the image, ascending."""
     bulge: Float[np.ndarray, " halfedges"]
     """Area between each edge as the pixels have it and its chord, right of the chord, in pixels."""
+    course: Int[np.ndarray, " sides"]
+    """The half-edge that each side between two pixels of different cells belongs to, from its first to its
+    last."""
+    away: Float[np.ndarray, "sides 2"]
+    """The middle of that side, seen from the vertex that the half-edge leaves, in pixel sides."""
 
 
 def crack_graph(image: Int[np.ndarray, "rows columns"]) -> CrackGraph:
@@ -210,15 +215,26 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     half_edge[crack[real]] = np.flatnonzero(real)
     every = np.arange(len(graph.target))
     onwards = np.where(degree[graph.target] == 2, graph.following, every)
-    last, way, swept = _follow(onwards, np.tile(_STEP, (len(graph.corner), 1)))
+    step = np.tile(_STEP, (len(graph.corner), 1))
+    last, way, swept = _follow(onwards, step)
+    # What leads from a crack to the end of its edge: the longest way is that of the first crack.
+    steps = _follow(onwards, np.ones_like(step))[1][:, 0]
+    ahead = way
     swept += _cross(way, _STEP[last % 4])
-    way += _STEP[last % 4]
+    way = way + _STEP[last % 4]
     bulge = np.zeros(len(crack))
     bulge[real] = 0.5 * swept[crack[real]]
     twin = 3 * np.repeat(partner, 3) + 2
     displacement = np.zeros((len(crack), 2), int)
     twin[real] = half_edge[graph.twin[last[crack[real]]]]
     displacement[real] = way[crack[real]]
+    owner = np.full(len(graph.target), -1)
+    owner[last[crack[real]]] = np.flatnonzero(real)
+    course = np.where(graph.present.ravel(), owner[last], -1)
+    along = np.lexsort((-steps, course))
+    along = along[course[along] >= 0]
+    course = course[along]
+    away = ahead[crack[course]] - ahead[along] + 0.5 * step[along]
 
     source = np.repeat(position, 3, axis=0)
     offset = (source + displacement - source[twin]) // size
@@ -227,11 +243,11 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     following = 3 * (twin // 3) + (twin + 2) % 3  # one slot clockwise of the twin
     previous = np.empty_like(twin)
     previous[following] = np.arange(len(twin))
-    step = offset[previous]
+    before = offset[previous]
     first = np.unique(cell, return_index=True)[1]
     previous[first] = first
-    frame = _follow(previous, step)[1]
-    return Mesh(position, twin, following, cell, frame, cells, bulge)
+    frame = _follow(previous, before)[1]
+    return Mesh(position, twin, following, cell, frame, cells, bulge, course, away)
 
 
 def _follow(

@@ -7,7 +7,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Integer, Shaped
+from jaxtyping import Array, Bool, Float, Int, Integer, Shaped
 
 from vertax._base.checks import check_concrete, check_number, check_whole
 from vertax.initialise._cracks import Mesh, crack_graph
@@ -25,6 +25,15 @@ from vertax.mesh import Free, Periodic, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
 
 _BOUNDARIES = ("mirrored", "periodic", "free")
+
+
+class Courses(eqx.Module):
+    """Where the edges of a tissue run in a label image."""
+
+    edge: Int[np.ndarray, " points"]
+    """The edge of each point; edges in ascending order, the points of each from its first vertex on."""
+    points: Float[np.ndarray, "points 2"]
+    """Middles of the sides between two pixels of different cells, in the tissue's unit of length."""
 
 
 class Segmentation(eqx.Module):
@@ -53,6 +62,8 @@ class Segmentation(eqx.Module):
     """Rows and columns of the given mask."""
     background: int | None = eqx.field(static=True, default=None)
     """The positive label in the mask that was taken for the background, if there is one."""
+    courses: Courses | None = None
+    """Where the edges run, pixel by pixel."""
 
 
 def from_labels(
@@ -180,6 +191,7 @@ def from_labels(
         pixel_size=float(pixel_size),
         image_shape=(int(image.shape[0]), int(image.shape[1])),
         background=background,
+        courses=_courses(tissue.topology, mesh, 0, pixel_size),
     )
 
 
@@ -234,7 +246,18 @@ def _free_from_labels(
         inflated=np.unique(values[label[moved]]),
         pixel_size=float(pixel_size),
         image_shape=(rows, columns),
+        courses=_courses(topology, mesh, margin, pixel_size),
     )
+
+
+def _courses(topology: Topology, mesh: Mesh, margin: int, pixel_size: float) -> Courses:
+    """Where the edges run in their own direction."""
+    edge, half_edge = np.asarray(topology.edge), np.asarray(topology.half_edge)
+    mine = half_edge[edge[mesh.course]] == mesh.course
+    course = mesh.course[mine]
+    order = np.argsort(edge[course], kind="stable")
+    points = mesh.vertices[course // 3] + mesh.away[mine] - margin
+    return Courses(edge[course][order], points[order] * pixel_size)
 
 
 def _with_arcs(

@@ -1,10 +1,9 @@
-"""Relative tensions and pressures of a cluster of cells, from its geometry alone.
+"""Relative tensions and pressures of a tissue, with their errors, from its geometry alone.
 
-A free cluster is seen as a segmented image: outlines of its cells, or labels. Each of its edges becomes
-an arc, and the foam model E2 (a tension in each edge, a pressure in each cell) is fitted until its
-equilibrium has the edges that were seen. A shape tells tensions and pressures but for one factor: they
-are given relative to the mean tension. Without an image a cluster of known tensions is drawn and
-segmented, to see how well they are found.
+A tissue is seen as a segmented image: outlines of its cells, or labels. Each of its edges becomes an arc, and
+tensions and pressures are those that balance at junctions between three cells and along arcs. A shape tells
+them but for one factor: they are given relative to the mean tension. Without an image a cluster of known
+tensions is drawn and segmented, to see how well they are found.
 """
 
 from __future__ import annotations
@@ -14,34 +13,24 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Int
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from vertax.energies import LocalSum
-from vertax.fitting import Fit
 from vertax.inference import (
-    TensionProblem,
-    Tensions,
+    InferredTensions,
     foam_energy,
     foam_terms,
-    force_balance,
+    infer_tensions,
     label_image,
     pearson,
-    tension_problem,
+    read_mask,
 )
-from vertax.initialise import Segmentation, free_voronoi, from_labels, labels_from_skeleton
+from vertax.initialise import free_voronoi
+from vertax.io import write_geojson
 from vertax.mesh import Tissue
 from vertax.plotting import label_colours
-from vertax.runs import (
-    ExperimentConfig,
-    ImageFile,
-    Relaxation,
-    RunFolder,
-    Section,
-    fit_metrics,
-    history_columns,
-)
+from vertax.runs import ExperimentConfig, ImageFile, Relaxation, RunFolder, Section
 
 from . import figures
 
@@ -49,46 +38,33 @@ from . import figures
 class ImageSection(ImageFile):
     """The segmented image; without a file, one of a synthetic cluster."""
 
-    kind: Literal["skeleton", "labels"] = "skeleton"
-    """Whether it shows the outlines of cells, or a number in each pixel of a cell."""
+    kind: Literal["auto", "outlines", "labels"] = "auto"
+    """Whether it shows the outlines of cells, or a number or colour in each pixel of a cell; `"auto"` takes
+    an image of two values for outlines."""
+    background: int | None = None
+    """The label of what is no cell, if it is not 0 and does not lie around all others."""
+    gap_width: float = Field(default=3.0, ge=0)
+    """How wide lines between labels may be, in pixels."""
+
+    def labels(self) -> Int[np.ndarray, "rows columns"]:
+        """A label for each pixel."""
+        chosen = self.channel is not None or self.plane is not None
+        return read_mask(
+            self.read() if chosen else self.path, kind=self.kind, background=self.background
+        )
 
 
 class Cluster(Section):
     """The synthetic cluster, and its image."""
 
-    n_cells: int = Field(default=16, ge=4)
+    n_cells: int = Field(default=16, ge=6)
     """Number of cells."""
     deviation: float = Field(default=0.2, ge=0, lt=0.5)
     """Standard deviation of the tensions, of mean 1."""
+    stiffness: float = Field(default=20.0, gt=0)
+    """Stiffness of the areas, relative to the mean tension."""
     pixels: int = Field(default=800, ge=64)
     """Longer side of the image, in pixels."""
-
-
-class Foam(Section):
-    """The foam model, relative to the mean tension."""
-
-    stiffness: float = Field(default=20.0, gt=0)
-    """Stiffness of the areas."""
-    low: float = Field(default=0.05, ge=0, lt=1)
-    """Least relative tension."""
-    high: float = Field(default=4.0, gt=1)
-    """Largest relative tension."""
-
-
-class Model(Foam):
-    """The foam model, and how much the image counts."""
-
-    inner_arcs: bool = True
-    """Whether edges between two cells are arcs too, whose curvature tells differences of pressure."""
-    prior: float = Field(default=0.5, gt=0)
-    """Standard deviation of relative tensions before the image was seen; it decides what the geometry
-    leaves open."""
-    noise: float = Field(default=1.0, gt=0)
-    """Standard deviation of the position of an edge, in pixels: how much the image counts against that."""
-
-    def foam(self) -> dict[str, float]:
-        """Stiffness and bounds of the tensions, by name."""
-        return {name: getattr(self, name) for name in Foam.model_fields}
 
 
 class Config(ExperimentConfig):
@@ -98,21 +74,10 @@ class Config(ExperimentConfig):
     """The segmented image."""
     cluster: Cluster = Cluster()
     """What is drawn if there is no image."""
-    model: Model = Model()
-    """What is fitted."""
-    epochs: int = Field(default=30, ge=1)
-    """Most steps of Levenberg and Marquardt."""
-    relaxation: Relaxation = Relaxation(transitions=False)
-    """How the cluster is relaxed; it has the neighbours that the image shows."""
-
-    @model_validator(mode="after")
-    def _without_transitions(self) -> Config:
-        if self.relaxation.transitions:
-            raise ValueError(
-                "relaxation.transitions must be false: edges are compared one by one with those of the "
-                "image"
-            )
-        return self
+    noise: float | None = Field(default=None, gt=0)
+    """Standard deviation of the position of an edge, in pixels; left out, how far pixels are from arcs."""
+    prior: float | None = Field(default=None, gt=0)
+    """Standard deviation of relative tensions before the image was seen; left out, how much they differ."""
 
 
 def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
@@ -122,157 +87,123 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
 
     - `config`: its configuration.
     - `folder`: where the results go.
-    - `progress`: show a progress bar (only on a terminal).
+    - `progress`: not used; nothing takes long.
 
-    **Returns:** the metrics: distances of the edges from those of the image in pixels (for tensions that
-    are all equal, those that balance forces best in the shape as it was seen, and the fitted ones),
-    spread and uncertainty of tensions and pressures; for a synthetic cluster how well they were found.
-    Edges that are further from those of the image than the noise allows are a warning.
+    **Returns:** the metrics: how many tensions and pressures are determined, their spread and uncertainty,
+    the noise of the image and how far the tissue is from a balance; for a synthetic cluster how well they
+    were found. What speaks against believing them is a warning.
 
     **Raises:**
 
-    - `FileNotFoundError` and `ValueError` for an image that cannot be used; `FitError` if the fit cannot
-        go on.
+    - `FileNotFoundError` and `ValueError` for an image that cannot be used.
     """
     truth = None
     if config.image.path:
-        image = config.image.read()
-        labels = labels_from_skeleton(image) if config.image.kind == "skeleton" else image
+        labels = config.image.labels()
     else:
         truth, labels = _synthetic(config)
-        image = labels
-    model = config.model
-    found = from_labels(labels, boundary="free", inner_arcs=model.inner_arcs)
-    folder.save_tissue("target", found.tissue)
-    foam = tension_problem(
-        found,
-        prior=model.prior,
-        noise=model.noise,
-        response=config.relaxation.build(),
-        **model.foam(),
-    )
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    outcome = folder.fit("tensions", foam.problem, solver, config.epochs, progress=progress)
-    folder.save_tissue("fitted", outcome.tissue)
-    folder.save_table("history", history_columns(outcome.history))
-    result = foam.tensions(outcome)
-    edges, cells = _tables(found, outcome, result, truth)
+    options: dict[str, Any] = {"gap_width": config.image.gap_width, "prior": config.prior}
+    found = infer_tensions(labels, kind="labels", **options)
+    if config.noise is not None and found.pixel_size is not None:
+        noise = config.noise * found.pixel_size
+        found = infer_tensions(labels, kind="labels", noise=noise, **options)
+    for doubt in found.doubts:
+        folder.warn(doubt)
+    folder.save_tissue("seen", found.tissue)
+    edges, cells = found.edge_table(), found.cell_table()
+    if truth is not None:
+        _add_truth(found, truth, edges, cells)
     folder.save_table("edges", edges)
     folder.save_table("cells", cells)
-    # Labels differ by their colours, and outlines are light on dark.
-    picture = label_colours(labels) if image is labels else np.asarray(image != 0, float)
-    tensions, pressures = result.tension, result.pressure
-    figure = figures.foam(picture, found, outcome.tissue, tensions, pressures)
-    folder.save_figure("tensions", figure)
-    if truth is not None:
+    write_geojson(
+        folder.path / "cells.geojson",
+        found.tissue,
+        cells={name: cells[name] for name in ("label", "pressure", "pressure_deviation")},
+        edges={name: edges[name] for name in ("tension", "tension_deviation", "determined")},
+    )
+    folder.save_figure("tensions", figures.foam(label_colours(labels), found))
+    if truth is not None and found.determined.any():
         folder.save_figure("recovery", figures.recovery(edges, cells))
-    metrics = _metrics(config, foam, outcome, result, edges, cells)
-    _check(config, metrics, folder)
-    return metrics
-
-
-def _check(config: Config, metrics: dict[str, Any], folder: RunFolder) -> None:
-    """Say so if the model does not have the edges of the image."""
-    noise, inner = config.model.noise, metrics["rms_distance_pixels_inner"]
-    everywhere = metrics["rms_distance_pixels_fitted"]
-    if inner > 2 * noise:
-        folder.warn(
-            f"the fitted edges do not explain the image: those between cells are {inner:.1f} pixels off, "
-            f"root mean square, where model.noise is {noise:g}; the tensions are not to be trusted"
-        )
-    elif everywhere > 2 * noise:
-        folder.warn(
-            f"the outline of the fitted cluster is not that of the image: all edges are {everywhere:.1f} "
-            f"pixels off, root mean square, those between cells {inner:.1f}; tensions of the outline are "
-            "not to be trusted"
-        )
+    return _metrics(found, edges, cells)
 
 
 def _synthetic(config: Config) -> tuple[tuple[LocalSum, Tissue], Int[np.ndarray, "rows columns"]]:
     """A cluster in equilibrium with its energy, and its label image."""
-    model, options = config.model, config.cluster
+    options = config.cluster
     shape_key, tension_key, area_key = jax.random.split(jax.random.key(config.seed), 3)
-    cluster = free_voronoi(
-        options.n_cells, key=shape_key, lloyd_steps=3, inner_arcs=model.inner_arcs
-    )
+    cluster = free_voronoi(options.n_cells, key=shape_key, lloyd_steps=3, inner_arcs=True)
     # Tensions between half and one and a half: at every junction of three they can balance.
     tension = 1 + options.deviation * jax.random.truncated_normal(
         tension_key, -0.5 / options.deviation, 0.5 / options.deviation, (cluster.n_edges,)
     )
     areas = jax.random.uniform(area_key, (options.n_cells,), minval=0.9, maxval=1.3)
-    energy = foam_energy(tension / jnp.mean(tension), areas, **model.foam())
+    energy = foam_energy(
+        tension / jnp.mean(tension), areas, stiffness=options.stiffness, low=0.05, high=4.0
+    )
     relaxed = Relaxation().build()(cluster, energy).tissue
     return (energy, relaxed), label_image(relaxed, options.pixels)
 
 
-def _tables(
-    found: Segmentation, outcome: Fit, result: Tensions, truth: tuple[LocalSum, Tissue] | None
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """A row an edge, and a row a cell; the exterior is label 0."""
-    tissue = outcome.tissue
-    labels = np.append(found.labels, 0)
-    between = np.sort(labels[np.asarray(tissue.topology.edge_cells)], axis=1)
-    edges = {
-        "label": between[:, 0],
-        "other_label": between[:, 1],
-        "length": np.asarray(tissue.edge_lengths),
-        "tension": result.tension,
-        "tension_deviation": result.tension_deviation,
-    }
-    cells = {
-        "label": np.asarray(found.labels),
-        "area": np.asarray(tissue.areas),
-        "pressure": result.pressure,
-        "pressure_deviation": result.pressure_deviation,
-    }
-    if truth is not None:
-        energy, relaxed = truth
-        area, tension = foam_terms(energy)
-        # Labels are the numbers of the true cells, from 1.
-        number = np.append(np.arange(1, relaxed.n_cells + 1), 0)
-        true_between = np.sort(number[np.asarray(relaxed.topology.edge_cells)], axis=1)
-        by_pair: dict[tuple[int, ...], list[float]] = {}
-        for pair, value in zip(true_between.tolist(), np.asarray(tension.tension), strict=True):
-            by_pair.setdefault(tuple(pair), []).append(float(value))
-        # Two cells may meet in two edges, which then cannot be told apart.
-        single = [by_pair.get(tuple(pair), []) for pair in between.tolist()]
-        true_tension = np.array([v[0] if len(v) == 1 else np.nan for v in single])
-        true_pressure = np.asarray(area.pressures(relaxed))[np.asarray(found.labels) - 1]
-        # Both have the mean tension 1 of all edges, and units of length of their own.
-        edges["true_tension"] = true_tension
-        cells["true_pressure"] = true_pressure * np.sqrt(np.mean(np.asarray(relaxed.areas)))
-    return edges, cells
+def _add_truth(
+    found: InferredTensions,
+    truth: tuple[LocalSum, Tissue],
+    edges: dict[str, np.ndarray],
+    cells: dict[str, np.ndarray],
+) -> None:
+    """Add the true tensions and pressures of what is determined, in the units of what was found."""
+    energy, relaxed = truth
+    area, tension = foam_terms(energy)
+    # Labels are the numbers of the true cells, from 1.
+    number = np.append(np.arange(1, relaxed.n_cells + 1), 0)
+    true_between = np.sort(number[np.asarray(relaxed.topology.edge_cells)], axis=1)
+    between = np.sort(np.stack([edges["left_label"], edges["right_label"]], axis=1), axis=1)
+    by_pair: dict[tuple[int, ...], list[float]] = {}
+    for pair, value in zip(true_between.tolist(), np.asarray(tension.tension), strict=True):
+        by_pair.setdefault(tuple(pair), []).append(float(value))
+    # Two cells may meet in two edges, which then cannot be told apart.
+    single = [by_pair.get(tuple(pair), []) for pair in between.tolist()]
+    true = np.array([v[0] if len(v) == 1 else np.nan for v in single])
+    seen = true[found.determined & np.isfinite(true)]
+    mean = seen.mean() if seen.size else 1.0
+    edges["true_tension"] = np.where(found.determined, true / mean, np.nan)
+    length = np.sqrt(np.mean(np.asarray(relaxed.areas)) / np.mean(cells["area"]))
+    pressure = np.asarray(area.pressures(relaxed))[np.asarray(found.labels) - 1] / mean * length
+    known = found.pressures_determined
+    cells["true_pressure"] = np.where(
+        known, pressure - np.sum(pressure[known]) / max(1, known.sum()), np.nan
+    )
 
 
 def _metrics(
-    config: Config,
-    foam: TensionProblem,
-    outcome: Fit,
-    result: Tensions,
-    edges: dict[str, np.ndarray],
-    cells: dict[str, np.ndarray],
+    found: InferredTensions, edges: dict[str, np.ndarray], cells: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    found = foam.segmentation
-    equal = force_balance(found.tissue, prior=1e-3, **config.model.foam())
-    distances = foam.distances(equal, foam.balanced, outcome.energy)
-    names = ("equal", "balanced", "fitted")
+    pixel = found.pixel_size or 1.0
     metrics: dict[str, Any] = {
-        f"rms_distance_pixels_{name}": x for name, x in zip(names, distances, strict=True)
-    }
-    metrics |= {
-        "rms_distance_pixels_inner": foam.inner_distance(outcome),
         "n_cells": found.tissue.n_cells,
         "n_edges": found.tissue.n_edges,
-        "pixel_size": found.pixel_size,
-        "tension_min": result.tension.min(),
-        "tension_max": result.tension.max(),
+        "n_tensions_determined": int(found.determined.sum()),
+        "n_pressures_determined": int(found.pressures_determined.sum()),
+        "pixel_size": pixel,
+        "noise_pixels": found.noise / pixel,
+        "noise_correlation_pixels": found.correlation / pixel,
+        "out_of_balance_degrees_junctions": np.degrees(found.model_errors[0]),
+        "out_of_balance_degrees_arcs": np.degrees(found.model_errors[1]),
     }
-    for name, values in (("tension", edges), ("pressure", cells)):
-        metrics[f"{name}_std"] = values[name].std()
-        metrics[f"{name}_deviation_median"] = np.median(values[f"{name}_deviation"])
+    for name, values, sure in (
+        ("tension", edges, found.determined),
+        ("pressure", cells, found.pressures_determined),
+    ):
+        if not sure.any():
+            continue
+        inferred, deviation = values[name][sure], values[f"{name}_deviation"][sure]
+        metrics[f"{name}_min"], metrics[f"{name}_max"] = inferred.min(), inferred.max()
+        metrics[f"{name}_std"] = inferred.std()
+        metrics[f"{name}_deviation_median"] = np.median(deviation)
         if f"true_{name}" in values:
-            true = values[f"true_{name}"]
+            true = values[f"true_{name}"][sure]
             known = np.isfinite(true)
-            metrics[f"pearson_{name}"] = pearson(true[known], values[name][known])
-            metrics[f"rms_error_{name}"] = np.sqrt(np.mean((values[name] - true)[known] ** 2))
-    return metrics | fit_metrics(outcome)
+            away = (inferred - true)[known]
+            metrics[f"pearson_{name}"] = pearson(true[known], inferred[known])
+            metrics[f"rms_error_{name}"] = np.sqrt(np.mean(away**2))
+            metrics[f"{name}_within_two_deviations"] = np.mean(np.abs(away) < 2 * deviation[known])
+    return metrics

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Real
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from vertax.initialise import Segmentation
-from vertax.mesh import Tissue
+from vertax.inference import InferredTensions
 from vertax.plotting import house_style, new_figure, plot_recovery, plot_tissue, scale_bar
 
 # Without the palest end, which would look like no colour at all.
@@ -19,37 +18,29 @@ _PRESSURES = ListedColormap(colormaps["Blues"](np.linspace(0.15, 1, 256)), "pres
 
 
 @house_style()
-def foam(
-    image: Real[np.ndarray, "rows columns *colours"],
-    found: Segmentation,
-    fitted: Tissue,
-    tension: Float[np.ndarray, " edges"],
-    pressure: Float[np.ndarray, " cells"],
-) -> Figure:
-    """The image with the fitted edges, and their tensions and the pressures of the cells.
+def foam(image: Real[np.ndarray, "rows columns *colours"], found: InferredTensions) -> Figure:
+    """The image with the arcs, and a map of tensions and pressures; what is not determined is grey.
 
     **Arguments:**
 
-    - `image`: a picture of what was segmented: grey outlines, or a colour for each label.
-    - `found`: the cells found in it.
-    - `fitted`: the equilibrium that comes closest.
-    - `tension`, `pressure`: its tensions and pressures, relative to the mean tension.
+    - `image`: a picture of what was segmented, such as a colour for each label.
+    - `found`: what was inferred.
 
     **Returns:** the figure.
     """
     rows, columns = image.shape[:2]
     height = 3.4 * rows / columns + 0.5
     figure, ((left, right),) = new_figure(1, 2, width=3.6, height=height, room=1.2)
-    plot_tissue(fitted, ax=left, image=image, pixel_size=found.pixel_size)
-    left.set_title("edges of the equilibrium, over the image")
-    scale_bar(left, "pixels", unit_length=found.pixel_size)
+    plot_tissue(found.tissue, ax=left, image=image, pixel_size=found.pixel_size or 1.0)
+    left.set_title("arcs over the image")
+    scale_bar(left, "pixels", unit_length=found.pixel_size or 1.0)
     plot_tissue(
-        fitted,
-        pressure,
-        tension,
+        found.tissue,
+        np.where(found.pressures_determined, found.pressures, np.nan),
+        np.where(found.determined, found.tensions, np.nan),
         ax=right,
         cmap=_PRESSURES,
-        label=r"pressure $p\,\sqrt{\bar A}\,/\,\bar\gamma$",
+        label=r"pressure $(p - \bar p)\,\sqrt{\bar A}\,/\,\bar\gamma$",
         edge_label=r"tension $\gamma / \bar\gamma$",
     )
     # As in the image, y points down.
@@ -71,7 +62,7 @@ def recovery(edges: Mapping[str, np.ndarray], cells: Mapping[str, np.ndarray]) -
     figure, ((left, right),) = new_figure(1, 2, width=2.9, height=2.7)
     for ax, table, key, name in (
         (left, edges, "tension", r"tension $\gamma / \bar\gamma$"),
-        (right, cells, "pressure", r"pressure $p\,\sqrt{\bar A}\,/\,\bar\gamma$"),
+        (right, cells, "pressure", r"pressure $(p - \bar p)\,\sqrt{\bar A}\,/\,\bar\gamma$"),
     ):
         deviation = table[f"{key}_deviation"]
         plot_recovery(table[f"true_{key}"], table[key], deviation=deviation, ax=ax, name=name)

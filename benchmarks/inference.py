@@ -1,0 +1,180 @@
+"""Tensions and pressures inferred from shapes whose tensions are known: how well, how sure, how fast.
+
+Foams of Surface Evolver (`--data`), as they are and as images of 1000 and 500 pixels, and synthetic clusters
+as images with rough outlines. With `--forsys PYTHON`, the interpreter of an environment that has ForSys
+(`pip install forsys`), its static inference of the same foams stands beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+import vertax as vx
+from vertax.inference import InferredTensions, infer_tensions, label_image, pearson
+
+jax.config.update("jax_enable_x64", True)
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "surface_evolver"
+HEADER = f"{'what':>34} | determined | r tension | error | r pressure | within 1, 2 s.d. of tensions, pressures | s"
+# Runs in an environment with ForSys: both sides scaled to mean 1, inner edges.
+FORSYS = """
+import sys, time
+import numpy as np
+import forsys as fs
+import forsys.surface_evolver
+began = time.time()
+lattice = fs.surface_evolver.SurfaceEvolver(sys.argv[1])
+frame = fs.frames.Frame(0, lattice.vertices, lattice.edges, lattice.cells, time=0, gt=True)
+system = fs.ForSys({0: frame})
+system.build_force_matrix(when=0)
+system.solve_stress(when=0, allow_negatives=False)
+rows = [
+    (e.gt, e.tension) for e in system.frames[0].big_edges.values() if not e.external
+]
+true, found = np.array(rows, float).T
+true, found = true / true.mean(), found / found.mean()
+print(len(true), np.corrcoef(true, found)[0, 1], np.mean(abs(found - true) / true), time.time() - began)
+"""
+
+
+class Truth(NamedTuple):
+    """A tissue with its tensions and pressures."""
+
+    tissue: vx.Tissue
+    tension: np.ndarray
+    pressure: np.ndarray
+
+
+def compare(truth: Truth, found: InferredTensions) -> tuple[np.ndarray, ...]:
+    """True and inferred tensions, their standard scores, and the same of pressures."""
+    tissue = truth.tissue
+    exact = found.pixel_size is None
+    cell = np.append(found.labels - (0 if exact else 1), tissue.n_cells)
+    pairs = np.sort(np.asarray(tissue.topology.edge_cells), axis=1).tolist()
+    number = {tuple(pair): k for k, pair in enumerate(pairs) if pairs.count(pair) == 1}
+    between = np.sort(cell[np.asarray(found.tissue.topology.edge_cells)], axis=1).tolist()
+    edge = np.array([number.get(tuple(pair), -1) for pair in between])
+    use = found.determined & (edge >= 0)
+    true, inferred = truth.tension[edge[use]], found.tensions[use]
+    scale = true.mean() / inferred.mean()
+    scores = (inferred - true / scale) / found.tension_deviations[use]
+    known = found.pressures_determined
+    length = np.sqrt(np.mean(np.asarray(tissue.areas)) / np.mean(np.asarray(found.tissue.areas)))
+    pressure = truth.pressure[cell[:-1][known]] / scale * length
+    away = found.pressures[known] - pressure + pressure.mean() - found.pressures[known].mean()
+    return (
+        true / true.mean(),
+        inferred / inferred.mean(),
+        scores,
+        pressure,
+        found.pressures[known],
+        away / found.pressure_deviations[known],
+    )
+
+
+def row(name: str, cases: list[tuple[Truth, object]]) -> None:
+    """Infer all, and print what came out."""
+    parts, determined, seconds = [], [], []
+    for truth, image in cases:
+        began = time.perf_counter()
+        found = infer_tensions(truth.tissue if image is None else image)  # pyright: ignore[reportArgumentType]
+        seconds.append(time.perf_counter() - began)
+        asked = np.isfinite(found.tensions).sum()
+        determined.append(found.determined.sum() / asked)
+        if found.determined.sum() > 2:
+            parts.append(compare(truth, found))
+    if not parts:
+        print(f"{name:>34} | {np.mean(determined):10.0%} | nothing is determined", flush=True)
+        return
+    r = np.mean([pearson(p[0], p[1]) for p in parts])
+    error = np.mean([np.mean(np.abs(p[1] - p[0]) / p[0]) for p in parts])
+    by_pressure = np.mean([pearson(p[3], p[4]) for p in parts])
+    scores = [np.abs(np.concatenate([p[k] for p in parts])) for k in (2, 5)]
+    cover = [f"{np.mean(s < 1):4.0%} {np.mean(s < 1.96):4.0%}" for s in scores]
+    print(
+        f"{name:>34} | {np.mean(determined):10.0%} | {r:9.4f} | {error:5.1%} | {by_pressure:10.4f} | "
+        f"{cover[0]:>18} {cover[1]:>20} | {np.median(seconds):.1f}",
+        flush=True,
+    )
+
+
+def foam(path: Path) -> Truth:
+    """A foam of Surface Evolver."""
+    read = vx.io.read_surface_evolver(path)
+    return Truth(read.tissue, np.asarray(read.tensions), np.asarray(read.pressures))
+
+
+def cluster(n_cells: int, seed: int) -> Truth:
+    """A cluster in equilibrium."""
+    keys = jax.random.split(jax.random.key(seed), 3)
+    tissue = vx.initialise.free_voronoi(n_cells, key=keys[0], lloyd_steps=3, inner_arcs=True)
+    tension = 1 + 0.25 * jax.random.truncated_normal(keys[1], -2, 2, (tissue.n_edges,))
+    areas = jax.random.uniform(keys[2], (n_cells,), minval=0.9, maxval=1.3)
+    area = vx.energies.AreaElasticity(20.0, areas)
+    relaxed = vx.equilibrate(tissue, area + vx.energies.LineTension(tension), throw=False).tissue
+    return Truth(relaxed, np.asarray(tension), np.asarray(area.pressures(relaxed)))
+
+
+def drawn(
+    truth: Truth, pixels_per_cell: int, rough: float, random: np.random.Generator
+) -> np.ndarray:
+    """A label image of the cluster, turned at random, its outlines off by so many pixels."""
+    angle = random.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turned = truth.tissue.with_vertices(jnp.asarray(np.asarray(truth.tissue.vertices) @ turn.T))
+    points = np.asarray(turned.vertices)
+    side = np.ptp(points, axis=0).max() / np.sqrt(np.mean(np.asarray(turned.areas)))
+    labels = label_image(turned, int(pixels_per_cell * side / 0.9))
+    if rough:
+        place = np.indices(labels.shape).astype(float)
+        for axis in range(2):
+            waves = gaussian_filter(random.normal(size=labels.shape), 4.0)
+            place[axis] += rough * waves / waves.std()
+        labels = map_coordinates(labels, place, order=0)
+    return labels
+
+
+def main() -> None:
+    """Print one row a case."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of dumps")
+    parser.add_argument("--sizes", type=int, nargs="*", default=[20], help="cells of clusters")
+    parser.add_argument("--repeats", type=int, default=6, help="images of each cluster")
+    parser.add_argument("--forsys", help="interpreter that has ForSys")
+    arguments = parser.parse_args()
+    print(HEADER)
+    for path in sorted(arguments.data.glob("*.dmp")):
+        truth = foam(path)
+        row(f"{path.stem}, exact", [(truth, None)])
+        for pixels in (1000, 500):
+            row(f"{path.stem}, {pixels} pixels", [(truth, label_image(truth.tissue, pixels))])
+        if arguments.forsys:
+            told = subprocess.run(
+                [arguments.forsys, "-c", FORSYS, str(path)], capture_output=True, text=True
+            )
+            last = (told.stdout.strip() or told.stderr.strip() or "nothing").splitlines()[-1]
+            print(f"{path.stem + ', ForSys':>34} | edges, r, error, s: {last}", flush=True)
+    random = np.random.default_rng(0)
+    for n in arguments.sizes:
+        truths = [cluster(n, seed) for seed in range(max(1, 40 // n))]
+        for pixels in (20, 50, 150):
+            for rough in (0.0, 0.3, 0.6):
+                cases = [
+                    (truth, drawn(truth, pixels, rough, random))
+                    for truth in truths
+                    for _ in range(arguments.repeats)
+                ]
+                row(f"{n} cells, {pixels} px each, rough {rough}", cases)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""Tensions and pressures from masks and exact shapes, by the balance of forces."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+
+import vertax as vx
+from vertax.energies import AreaElasticity, LineTension
+from vertax.inference import infer_tensions, label_image, pearson, read_mask
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+needs_data = pytest.mark.skipif(
+    not DATA.exists(), reason="the data beside the repository, ../shared/data, are not there"
+)
+
+
+@pytest.fixture(scope="module")
+def foam():
+    """A cluster in equilibrium, its tensions and pressures."""
+    tissue = cluster(14, 3, lloyd_steps=3, inner_arcs=True)
+    tension = jax.random.uniform(jax.random.key(1), (tissue.n_edges,), minval=0.7, maxval=1.3)
+    area = AreaElasticity(
+        20.0, jax.random.uniform(jax.random.key(2), (14,), minval=0.9, maxval=1.3)
+    )
+    relax = vx.Relaxation(tolerance=1e-11, contact_range=None)
+    relaxed = relax(tissue, area + LineTension(tension)).tissue
+    return relaxed, np.asarray(tension), np.asarray(area.pressures(relaxed))
+
+
+def against_truth(found, foam):
+    """True and found tensions of what is determined, and deviations, each relative to its mean."""
+    tissue, tension, _ = foam
+    number = np.append(found.labels, 0)
+    pairs = np.sort(number[np.asarray(found.tissue.topology.edge_cells)], axis=1)
+    true = np.append(np.arange(1, tissue.n_cells + 1), 0)
+    known = np.sort(true[np.asarray(tissue.topology.edge_cells)], axis=1).tolist()
+    edge = np.array([known.index(pair) if pair in known else -1 for pair in pairs.tolist()])
+    use = found.determined & (edge >= 0)
+    wanted = tension[edge[use]]
+    return wanted / wanted.mean(), found.tensions[use], found.tension_deviations[use]
+
+
+def test_an_exact_shape_gives_tensions_and_pressures_back(foam):
+    tissue, tension, pressure = foam
+    found = infer_tensions(tissue)
+    sure = found.determined
+    assert sure.sum() > 10
+    np.testing.assert_allclose(
+        found.tensions[sure], tension[sure] / tension[sure].mean(), rtol=1e-2
+    )
+    cells = found.pressures_determined
+    wanted = pressure[cells] / tension[sure].mean()
+    np.testing.assert_allclose(found.pressures[cells], wanted - wanted.mean(), atol=1e-2)
+    assert not found.determined[np.asarray(tissue.topology.on_outline)].any()
+    assert np.isnan(found.tensions[np.asarray(tissue.topology.on_outline)]).all()
+    assert found.doubts == []
+
+
+def test_turning_moving_and_scaling_a_tissue_changes_nothing(foam):
+    tissue, *_ = foam
+    turn = jnp.array([[0.6, -0.8], [0.8, 0.6]])
+    moved = tissue.with_vertices(3.0 * tissue.vertices @ turn.T + 5.0)
+    found, again = infer_tensions(tissue), infer_tensions(moved)
+    np.testing.assert_allclose(found.tensions, again.tensions, atol=1e-6)
+    np.testing.assert_allclose(found.tension_deviations, again.tension_deviations, atol=1e-6)
+    np.testing.assert_allclose(found.pressures, 3 * again.pressures, atol=1e-6)
+    np.testing.assert_allclose(
+        found.stresses, 3 * np.einsum("ai,nij,bj->nab", turn.T, again.stresses, turn.T), atol=1e-5
+    )
+
+
+def test_a_mask_gives_them_within_their_deviations(foam):
+    found = infer_tensions(label_image(foam[0], 500))
+    true, inferred, deviation = against_truth(found, foam)
+    assert pearson(true, inferred) > 0.9
+    assert np.mean(np.abs(inferred - true) < 2 * deviation) > 0.85
+    # Not by deviations that are too large.
+    assert np.mean(np.abs(inferred - true) < 0.5 * deviation) < 0.7
+    assert np.median(deviation) < 0.1
+    assert found.pixel_size is not None
+    assert found.noise < found.pixel_size
+
+
+def test_stresses_are_the_tensions_less_the_pressure(foam):
+    tissue, *_ = foam
+    found = infer_tensions(tissue)
+    inside = np.isfinite(found.stresses).all(axis=(1, 2))
+    assert inside.any()
+    half = 0.5 * np.where(np.isfinite(found.tensions), found.tensions, 0) * tissue.edge_lengths
+    pull = np.zeros(tissue.n_cells + 1)
+    for side in np.asarray(tissue.topology.edge_cells).T:
+        np.add.at(pull, side, half)
+    trace = pull[:-1] / np.asarray(tissue.areas) - 2 * found.pressures
+    found_trace = np.trace(found.stresses, axis1=1, axis2=2)
+    np.testing.assert_allclose(found_trace[inside], trace[inside], rtol=1e-3, atol=1e-4)
+
+
+def test_a_shape_out_of_balance_is_told_from_noise(foam):
+    tissue, *_ = foam
+    noise = 0.06 * jax.random.normal(jax.random.key(5), tissue.vertices.shape)
+    found = infer_tensions(tissue.with_vertices(tissue.vertices + noise))
+    still = infer_tensions(tissue)
+    assert found.model_errors[0] > 5 * still.model_errors[0]
+    assert np.nanmedian(found.tension_deviations) > 3 * np.nanmedian(still.tension_deviations)
+
+
+def test_results_are_written_as_tables_and_shapes(foam, tmp_path):
+    found = infer_tensions(foam[0])
+    for name in ("cells.csv", "cells.geojson", "cells.vtu"):
+        for path in found.write(tmp_path / name):
+            assert path.stat().st_size > 500
+    header = (tmp_path / "cells-edges.csv").read_text().splitlines()[0]
+    assert {"tension", "tension_deviation", "determined"} <= set(header.split(","))
+    with pytest.raises(ValueError, match=r"must end in \.csv"):
+        found.write(tmp_path / "cells.xlsx")
+
+
+def outlines(labels, width=1):
+    """The lines of a label image, so many pixels wide."""
+    lines = np.zeros(labels.shape, bool)
+    for shift in range(1, width + 1):
+        lines[:, shift:] |= labels[:, shift:] != labels[:, :-shift]
+        lines[shift:] |= labels[shift:] != labels[:-shift]
+    return lines
+
+
+@pytest.mark.parametrize("width", [1, 4])
+def test_outlines_of_any_kind_give_the_cells(foam, width):
+    labels = label_image(foam[0], 300)
+    lines = outlines(labels, width)
+    red = np.stack([255 * lines, 0 * lines, 0 * lines], axis=-1).astype(np.uint8)
+    grey = np.where(lines, 0, 200).astype(np.uint8)
+    n = foam[0].n_cells
+    for image in (lines, red, grey):
+        found = read_mask(image)
+        assert len(np.unique(found)) == n + 1
+        inside = (labels > 0) & (found > 0)
+        # One label for one label.
+        assert len(np.unique(np.stack([labels, found])[:, inside & ~lines], axis=1).T) == n
+
+
+def test_cells_that_the_border_cuts_are_cells(foam):
+    labels = label_image(foam[0], 300)
+    cut = labels[90:210, 90:210]
+    assert (cut > 0).all()
+    found = read_mask(outlines(cut))
+    assert (found > 0).all()
+    assert len(np.unique(found)) == len(np.unique(cut))
+
+
+def test_masks_of_cellpose_and_of_other_backgrounds_are_read(foam, tmp_path):
+    labels = label_image(foam[0], 200)
+    np.save(tmp_path / "a_seg.npy", {"masks": labels, "diams": 30.0}, allow_pickle=True)
+    np.save(tmp_path / "a.npy", labels)
+    np.testing.assert_array_equal(read_mask(tmp_path / "a_seg.npy"), labels)
+    np.testing.assert_array_equal(read_mask(tmp_path / "a.npy"), labels)
+    np.testing.assert_array_equal(read_mask(labels + 7, background=7) > 0, labels > 0)
+    colours = np.stack([labels % 4, labels // 4, 0 * labels], axis=-1).astype(np.uint8)
+    assert len(np.unique(read_mask(colours))) == len(np.unique(labels))
+
+
+def test_what_cannot_be_used_is_refused(foam):
+    tissue, *_ = foam
+    with pytest.raises(ValueError, match="`noise`"):
+        infer_tensions(tissue, noise=0.0)
+    with pytest.raises(ValueError, match="must be one of 'auto', 'labels', 'outlines'"):
+        read_mask(np.eye(5, dtype=int), kind="skeleton")
+    with pytest.raises(ValueError, match="no pixel has 9"):
+        read_mask(np.eye(5, dtype=int), background=9)
+    with pytest.raises(ValueError, match="whole numbers"):
+        read_mask(np.full((4, 4), 0.5))
+    with pytest.raises(ValueError, match="enclose"):
+        read_mask(np.eye(9, dtype=bool)[:, ::-1] & False | (np.arange(81).reshape(9, 9) == 3))
+    with pytest.raises(ValueError, match="inner edges are arcs"):
+        infer_tensions(cluster(6, 0))
+    mask = label_image(tissue, 200)
+    mirrored = vx.initialise.from_labels(np.maximum(mask, 1), inner_arcs=True)
+    with pytest.raises(ValueError, match="must not be mirrored"):
+        infer_tensions(mirrored)
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "least", "error"), [("movie_0.dmp", 0.998, 0.005), ("cells100.dmp", 0.997, 0.12)]
+)
+def test_foams_with_known_tensions(name, least, error):
+    path = DATA / "surface_evolver" / name
+    found, foam = infer_tensions(path), vx.io.read_surface_evolver(path)
+    sure = found.determined
+    true = np.asarray(foam.tensions)[sure]
+    true = true / true.mean()
+    assert pearson(true, found.tensions[sure]) > least
+    assert np.mean(np.abs(found.tensions[sure] - true) / true) < error
+
+
+@needs_data
+@pytest.mark.slow
+def test_a_segmented_wing_cut_out_of_a_tissue():
+    found = infer_tensions(DATA / "segmentations" / "wing_t0.tif")
+    assert found.tissue.n_cells >= 45
+    assert found.determined.sum() > 40
