@@ -69,6 +69,7 @@ def test_sparse_modes_with_arcs_and_pins_are_the_dense_ones():
         assert mechanics.spectrum(one, energy).size == n_free
 
 
+@pytest.mark.slow
 def test_derivatives_of_eigenvalues_against_differences():
     direction, h = jnp.cos(jnp.arange(N)), 1e-6
     values = jax.jit(lambda p: mechanics.modes(tissue, ShapeFactorEnergy(p), 6).values[2:])

@@ -95,9 +95,11 @@ def test_a_free_cluster_at_rest_is_without_stress_and_its_cells_are_not():
     cells = np.asarray(mechanics.cell_stress(free, energy))
     assert np.abs(cells).max() > 0.1
     np.testing.assert_allclose(mechanics.stress(free, energy), 0, atol=1e-8)
-    np.testing.assert_allclose(np.tensordot(free.areas, cells, 1), 0, atol=1e-7)
+    # To the softening of lengths, which areas do not have.
+    np.testing.assert_allclose(np.tensordot(free.areas, cells, 1), 0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_integral_of_tangents_along_arcs():
     # Against many points on each arc; not at rest, and some arcs bulge inward.
     start = cluster(5, 3)

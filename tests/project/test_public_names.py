@@ -35,9 +35,10 @@ FAMILIES = {
     "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_tables load_energy "
     "load_problem load_tissue load_trajectory read_image read_surface_evolver save_energy "
     "save_problem save_tissue save_trajectory to_tables write_csv write_geojson write_vtk",
-    "mechanics": "Modes SelfStress bulk_modulus cell_stress compatibility complex_modulus deformed "
-    "density_of_states elastic_tensor modes pressures principal recoil self_stresses "
-    "shear_modulus spectrum stress tensions youngs_modulus zero_modes",
+    "mechanics": "BoxRelaxation Modes Ramp SelfStress bulk_modulus cell_stress compatibility "
+    "complex_modulus deformed density_of_states elastic_tensor modes pressures "
+    "principal pure_shear ramp recoil self_stresses shear_modulus simple_shear "
+    "spectrum stress tensions youngs_modulus zero_modes",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "

@@ -1,5 +1,6 @@
 """Mechanics: what one measures at an equilibrium."""
 
+from vertax.mechanics._box import BoxRelaxation as BoxRelaxation
 from vertax.mechanics._elasticity import (
     bulk_modulus as bulk_modulus,
     elastic_tensor as elastic_tensor,
@@ -16,6 +17,12 @@ from vertax.mechanics._modes import (
     zero_modes as zero_modes,
 )
 from vertax.mechanics._oscillation import complex_modulus as complex_modulus
+from vertax.mechanics._ramp import (
+    Ramp as Ramp,
+    pure_shear as pure_shear,
+    ramp as ramp,
+    simple_shear as simple_shear,
+)
 from vertax.mechanics._recoil import recoil as recoil
 from vertax.mechanics._self_stress import (
     SelfStress as SelfStress,

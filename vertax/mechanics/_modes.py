@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -228,7 +228,8 @@ def _softest(
         options={"SymmetricMode": True},
     )
     # Its constructor makes one of a class that type checkers do not see.
-    inverse = LinearOperator(matrix.shape, matvec=factors.solve, dtype=float)  # pyright: ignore[reportCallIssue]
+    linear: Any = LinearOperator
+    inverse = linear(matrix.shape, matvec=factors.solve, dtype=float)
     start = np.cos(np.arange(free.size) * (np.arange(free.size) + 0.5))
     values, vectors = eigsh(matrix, k, sigma=-shift, OPinv=inverse, v0=start)
     found = np.zeros((k, ravel_pytree(tissue.configuration)[0].size))

@@ -25,8 +25,8 @@ def plot_stress(
 ) -> Axes:
     """Draw the stress of each cell as a cross over it.
 
-    Its two bars lie along the principal directions and are as long as the principal stresses: red where the cell
-    would contract (tension), blue where it would expand (pressure).
+    Its two bars lie along the principal directions and are as long as the principal stresses: red where
+    the cell would contract (tension), blue where it would expand (pressure).
 
     **Arguments:**
 
@@ -156,7 +156,10 @@ def plot_moduli(
         if ax is None:
             (ax,) = _style.new_axes(width=3.0, height=2.3, figure=figure)
         colour = _style.SERIES[len(ax.lines) // 2 % len(_style.SERIES)]
-        for part, name, dashes in ((y.real, "storage $G'$", "-"), (y.imag, "loss $G''$", "--")):
+        for part, name, dashes in (
+            (np.real(y), "storage $G'$", "-"),
+            (np.imag(y), "loss $G''$", "--"),
+        ):
             shown = kept & (part > 0)
             ax.plot(x[shown], part[shown], dashes, color=colour, label=f"{name}{of}")
         ax.set(xscale="log", yscale="log", xlabel=r"frequency $\omega$", ylabel="modulus")
