@@ -1,7 +1,7 @@
 """What it costs that cells come and go: time of an event, and of relaxations with spare slots.
 
-Prints the time of one division, one removal and one sweep of T2 transitions in tissues of some sizes, within one
-compiled program; and how much longer a relaxation takes if a fourth of the slots is spare.
+Prints the time of one division, one removal and one sweep of T2 transitions in tissues of some sizes, within
+one compiled program; and how much longer a relaxation takes if a fourth of the slots is spare.
 """
 
 from __future__ import annotations

@@ -20,9 +20,8 @@ def _as_mask(name: str, value: ArrayLike | None) -> Bool[Array, "..."] | None:
 class Ablated(AbstractLocalEnergy):
     r"""An energy of which some cells and edges have lost their part, as after a cut by a laser.
 
-    A cut edge has no tension any more; a cell that is gone is a hole, which neither resists a change of its area
-    nor has a perimeter. Their neighbours are as they were. A hole of several cells is best one cell, see
-    [`merge`][vertax.transitions.merge]: vertices inside a hole feel no force.
+    A cut edge has no tension any more; a cell that is gone is a hole, which neither resists a change of its
+    area nor has a perimeter. Their neighbours are as they were.
 
     ```python
     cut = vx.energies.Ablated(energy, edges=jnp.arange(tissue.n_edges) == 7)

@@ -7,11 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.checks import check_number
+from vertax._base.modules import choose
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._surgery import collapse_triangle, merge_cells
 from vertax.mesh._tissue import mean_area
 from vertax.mesh._topology import clockwise, counter_clockwise, source, take
+from vertax.transitions._t1 import overlapping_faces
 from vertax.transitions._transitions import AbstractTransitions
 
 
@@ -20,7 +22,8 @@ class T2(AbstractTransitions):
 
     A cell vanishes if it is smaller than the threshold, has three sides (on the outline of a tissue with
     arcs also two), and does not want to grow: the energy would be higher if it were twice as long and wide.
-    Its neighbours lose a side each; where one would be left with too few, or a corner is pinned, it stays.
+    Its neighbours lose a side each; where one would be left with too few, cells would overlap, or a corner is
+    pinned, it stays.
     Cells with more sides lose them by T1 transitions first, so use both:
 
     ```python
@@ -69,9 +72,13 @@ class T2(AbstractTransitions):
             tissue, counts, todo = carry
             cell = jnp.argmin(jnp.where(todo, tissue.areas, jnp.inf)).astype(jnp.int32)
             accepted = energy(_enlarged(tissue, cell)) >= energy(tissue)
+            gone = vanished(tissue, cell, accepted)
+            # Where there is no room for that, there will be when it is smaller.
+            crossed = overlapping_faces(gone.overlaps) & ~overlapping_faces(tissue.overlaps)
+            accepted &= ~jnp.any(crossed)
             h = jnp.argmax(tissue.topology.cell == cell)
             edge = jnp.where(accepted, take(tissue.topology.edge, h), tissue.n_edges)
-            tissue = vanished(tissue, cell, accepted)
+            tissue = choose(accepted, gone, tissue)
             todo = candidates(tissue, todo & (jnp.arange(tissue.n_cells) != cell))
             return tissue, counts.at[edge].add(1, mode="drop"), todo
 
