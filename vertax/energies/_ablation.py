@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from vertax._base.checks import as_real
-from vertax.energies._energy import AbstractLocalEnergy, per_cell, per_edge
+from vertax.energies._energy import AbstractLocalEnergy
 from vertax.mesh import Tissue
 
 
@@ -36,7 +36,6 @@ class Ablated(AbstractLocalEnergy):
 
     **Raises:**
 
-    - `TypeError` for an energy that is no sum over cells and edges.
     - `ValueError` in an energy for masks of the wrong length.
     """
 
@@ -44,21 +43,22 @@ class Ablated(AbstractLocalEnergy):
     cells: Bool[Array, "..."] | None = eqx.field(default=None, converter=partial(_as_mask, "cells"))
     edges: Bool[Array, "..."] | None = eqx.field(default=None, converter=partial(_as_mask, "edges"))
 
-    def __check_init__(self):
-        if not isinstance(self.energy, AbstractLocalEnergy):
-            raise TypeError(
-                "Argument `energy` must be a sum over cells and edges, an AbstractLocalEnergy, but is "
-                f"{type(self.energy).__name__}."
-            )
-
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell that is no hole."""
         terms = self.energy.cell_terms(tissue)
-        gone = self.cells
-        return terms if gone is None else jnp.where(per_cell(gone, tissue, "cells"), 0, terms)
+        return _without(terms, self.cells, "cells", tissue.n_cells)
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
         """Energy of each edge that is not cut."""
         terms = self.energy.edge_terms(tissue)
-        cut = self.edges
-        return terms if cut is None else jnp.where(per_edge(cut, tissue, "edges"), 0, terms)
+        return _without(terms, self.edges, "edges", tissue.n_edges)
+
+
+def _without(
+    terms: Float[Array, "*n"], mask: Bool[Array, "..."] | None, name: str, size: int
+) -> Float[Array, "*n"]:
+    if mask is None:
+        return terms
+    if mask.shape != (size,):
+        raise ValueError(f"Argument `{name}` must have shape ({size},), but has {mask.shape}.")
+    return jnp.where(mask, 0, terms)
