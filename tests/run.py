@@ -38,7 +38,12 @@ TOGETHER = (
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
     ("_base", "mesh", "energies", "dissipations", "initialise"),
     ("transitions", "solvers"),
-    ("transitions/test_cells.py", "transitions/test_t2.py", "growth"),
+    (
+        "transitions/test_cells.py",
+        "transitions/test_t2.py",
+        "transitions/test_ablation.py",
+        "growth",
+    ),
     ("runs", "inference"),
     ("costs",),
     ("mechanics",),

@@ -62,7 +62,7 @@ def test_the_lineage_is_a_forest(grown):
     assert sorted(alive[alive >= 0]) == np.flatnonzero(fate == 0).tolist()
 
 
-def test_a_full_pool_and_bad_arguments_are_named(grown):
+def test_a_full_pool_and_bad_arguments_are_named(grown, as_a_user):
     cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 5, 6)
     with pytest.raises(RuntimeError, match="capacity of 9 cells"):
         eqx.tree_at(lambda g: g.full, grown, jnp.array(True)).checked()
@@ -77,7 +77,7 @@ def test_a_full_pool_and_bad_arguments_are_named(grown):
 @pytest.mark.slow
 def test_the_dying_are_extruded():
     tissue = random_tissue(12, 3, lloyd_steps=5).with_capacity(12)
-    cycle = GrowAndDivide(0.0, 5.0, death_rate=0.15, shrinking_time=0.3)
+    cycle = GrowAndDivide(0.0, 2.0, death_rate=0.15, shrinking_time=0.3)
     energy = lambda cells: energy_of(cells) + vx.energies.LineTension(0.03)
     grown = grow(tissue, energy, cycle, jnp.linspace(0, 4, 9), key=2)
     grown.tissue.topology.validate()

@@ -21,8 +21,8 @@ FAMILIES = {
     "adjacency aspect_ratio mirror mismatched_neighbours render",
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity "
     "PerimeterViscosity SubstrateFriction Sum ViscositySum",
-    "energies": "AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension LineTension "
-    "LocalSum PerimeterElasticity ShapeFactorEnergy Sum",
+    "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
+    "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts "
     "fit limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow",
@@ -48,7 +48,7 @@ FAMILIES = {
     "Ledger Material Relaxation Relaxed SimulatorError SurfaceEvolver Trajectory "
     "equilibrate evolve record_relaxation run_program",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
-    "transitions": "AbstractTransitions Change T1 T2 divide remove",
+    "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",
 }
 
 

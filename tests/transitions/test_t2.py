@@ -12,7 +12,7 @@ BOTH = vx.T1() + vx.T2()
 
 
 def shrinking(capacity, cells, tension=0.1):
-    areas = jnp.ones(capacity).at[jnp.asarray(cells)].set(0.0)
+    areas = jnp.full(capacity, 1.2).at[jnp.asarray(cells)].set(0.0)
     return vx.energies.AreaElasticity(1.0, areas) + vx.energies.LineTension(tension)
 
 
@@ -26,7 +26,7 @@ def test_a_shrinking_cell_is_extruded():
     assert relaxed.tissue.areas.sum() == pytest.approx(float(tissue.areas.sum()))
     # What is left is at rest by itself.
     alone = relaxed.tissue.without_spare()
-    energy = vx.energies.AreaElasticity(1.0, 1.0) + vx.energies.LineTension(0.1)
+    energy = vx.energies.AreaElasticity(1.0, 1.2) + vx.energies.LineTension(0.1)
     force = jax.grad(lambda y: energy(alone.with_configuration(y)))(alone.vertices)
     np.testing.assert_allclose(force, 0, atol=1e-8)
 

@@ -1,5 +1,6 @@
 """Energies: how a tissue wants to deform."""
 
+from vertax.energies._ablation import Ablated as Ablated
 from vertax.energies._elasticity import (
     AreaElasticity as AreaElasticity,
     PerimeterElasticity as PerimeterElasticity,

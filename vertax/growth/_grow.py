@@ -129,8 +129,7 @@ def grow(
     In each step cells age by the rules of the cycle, those whose time has come divide, and then the tissue
     comes to rest; or, if there is a dissipation, it moves for the length of the step as in
     [`evolve`][vertax.evolve]. Works under `jax.jit` and `jax.vmap`. A gradient tells how the course changes
-    [`evolve`][vertax.evolve]. Works under `jax.jit` and `jax.vmap`. A gradient tells how the course
-    changes as long as the same events happen in the same steps; it does not see that rates change which
+    as long as the same events happen in the same steps; it does not see that rates change which happen.
 
     **Arguments:**
 

@@ -133,7 +133,7 @@ class GrowAndDivide(AbstractLifeCycle):
     def born(self, cells: Cells, tissue: Tissue, pair: Int[Array, "2"], key: PRNGKeyArray) -> Cells:
         """Two cells of half the size."""
         return Cells(
-            cells.target_area.at[pair].multiply(0.5),
+            cells.target_area.at[pair].set(0.5 * cells.target_area[pair]),
             cells.division_area.at[pair].set(self._drawn(key, (2,), cells.age.dtype)),
             cells.age.at[pair].set(0),
             cells.dying,

@@ -1,5 +1,6 @@
 """Transitions: how a mesh changes its topology."""
 
+from vertax.transitions._ablation import ablate as ablate
 from vertax.transitions._change import Change as Change
 from vertax.transitions._division import divide as divide
 from vertax.transitions._removal import remove as remove

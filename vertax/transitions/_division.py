@@ -85,7 +85,7 @@ def check_cell(tissue: Tissue, cell: int | Int[Array, ""]) -> None:
     """Refuse a cell that is not there, if that can be seen."""
     if not is_concrete(cell) or not is_concrete(tissue.topology.cell):
         return
-    there = 0 <= int(cell) < tissue.n_cells and bool(tissue.alive[cell])
+    there = 0 <= int(cell) < tissue.n_cells and int(cell) in np.asarray(tissue.topology.cell)
     if not there:
         raise ValueError(f"Argument `cell` must be the number of a living cell, but is {cell}.")
 
@@ -194,16 +194,20 @@ def _where_arcs_meet(
     axis: Float[Array, "2"],
 ) -> Float[Array, "2"]:
     """At which share of their length two sides cross the line across an axis, by bisection."""
-    beyond = lambda x: jnp.sum(axis * (x - centre), axis=-1) > 0
-    before = beyond(sides[:, :2])
+    distance = lambda x: jnp.sum(axis * (x - centre), axis=-1)
+    before = distance(sides[:, :2]) > 0
 
     def halve(_: Array, ends: tuple) -> tuple:
         low, high = ends
         middle = 0.5 * (low + high)
-        early = beyond(_on_arcs(sides, middle)) == before
+        early = (distance(_on_arcs(sides, middle)) > 0) == before
         return jnp.where(early, middle, low), jnp.where(early, high, middle)
 
     none = jnp.zeros(2, sides.dtype)
     steps = 10 - int(np.log2(jnp.finfo(sides.dtype).eps))
     low, high = jax.lax.fori_loop(0, steps, halve, (none, none + 1))
-    return 0.5 * (low + high)
+    # Bisection knows no derivative; a step of Newton's method has the right one.
+    found = jax.lax.stop_gradient(0.5 * (low + high))
+    at = lambda share: distance(_on_arcs(sides, share))
+    value, slope = jax.jvp(at, (found,), (jnp.ones_like(found),))
+    return found - value / jax.lax.stop_gradient(slope)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from vertax._base.modules import choose
 from vertax.mesh import Tissue
 from vertax.mesh._topology import flip_edges
 from vertax.transitions._change import Change, raised_if, unchanged
@@ -92,8 +93,7 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     go = do & can_vanish(reduced)[cell]
     gone = vanished(reduced, cell, go)
     done = go & ~jnp.any(overlapping_faces(gone.overlaps) & ~overlapping_faces(tissue.overlaps))
-    kept = jax.tree.map(lambda a, b: jnp.where(done, a, b), gone, tissue)
-    return Change(kept, none.cells, none.edges, done)
+    return Change(choose(done, gone, tissue), none.cells, none.edges, done)
 
 
 def flipped(
@@ -115,4 +115,4 @@ def flipped(
     again = lambda carry: carry[1] & (carry[0] < len(_SHARES))
     tries, bad = jax.lax.while_loop(again, crowded, (jnp.array(0), jnp.array(True)))
     good = ~bad & jnp.any(which)
-    return jax.tree.map(lambda a, b: jnp.where(good, a, b), with_share(tries - 1), tissue), good
+    return choose(good, with_share(tries - 1), tissue), good

@@ -7,11 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.checks import check_number
+from vertax._base.modules import choose
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._surgery import collapse_triangle, merge_cells
 from vertax.mesh._tissue import mean_area
 from vertax.mesh._topology import clockwise, counter_clockwise, source, take
+from vertax.transitions._t1 import overlapping_faces
 from vertax.transitions._transitions import AbstractTransitions
 
 
@@ -19,9 +21,10 @@ class T2(AbstractTransitions):
     """T2 transitions: a small cell of three sides becomes a vertex.
 
     A cell vanishes if it is smaller than the threshold, has three sides (on the outline of a tissue with
-    arcs also two), and the energy would be lower if it were smaller still. Its neighbours lose a side each;
-    where one would be left with too few, or a corner is pinned, it stays. Cells with more sides lose them by
-    T1 transitions first, so use both:
+    arcs also two), and does not want to grow: the energy would be higher if it were twice as long and wide.
+    Its neighbours lose a side each; where one would be left with too few, cells would overlap, or a corner is
+    pinned, it stays.
+    Cells with more sides lose them by T1 transitions first, so use both:
 
     ```python
     vx.equilibrate(tissue.with_capacity(tissue.n_cells), energy, transitions=vx.T1() + vx.T2())
@@ -58,7 +61,9 @@ class T2(AbstractTransitions):
         limit = self.threshold * mean_area(tissue)
 
         def candidates(tissue: Tissue, todo: Array) -> Array:
-            return todo & (tissue.areas < limit) & can_vanish(tissue)
+            # (What a large step has turned inside out will be put right by the relaxation.)
+            small = (tissue.areas < limit) & (tissue.areas > -_ROUNDING * limit)
+            return todo & small & can_vanish(tissue)
 
         def unfinished(carry: tuple) -> Bool[Array, ""]:
             return jnp.any(carry[-1])
@@ -66,16 +71,23 @@ class T2(AbstractTransitions):
         def vanish(carry: tuple) -> tuple:
             tissue, counts, todo = carry
             cell = jnp.argmin(jnp.where(todo, tissue.areas, jnp.inf)).astype(jnp.int32)
-            accepted = energy(_shrunk(tissue, cell)) < energy(tissue)
+            accepted = energy(_enlarged(tissue, cell)) >= energy(tissue)
+            gone = vanished(tissue, cell, accepted)
+            # Where there is no room for that, there will be when it is smaller.
+            crossed = overlapping_faces(gone.overlaps) & ~overlapping_faces(tissue.overlaps)
+            accepted &= ~jnp.any(crossed)
             h = jnp.argmax(tissue.topology.cell == cell)
             edge = jnp.where(accepted, take(tissue.topology.edge, h), tissue.n_edges)
-            tissue = vanished(tissue, cell, accepted)
+            tissue = choose(accepted, gone, tissue)
             todo = candidates(tissue, todo & (jnp.arange(tissue.n_cells) != cell))
             return tissue, counts.at[edge].add(1, mode="drop"), todo
 
         start = (tissue, counts, candidates(tissue, jnp.ones(tissue.n_cells, bool)))
         tissue, counts, _ = jax.lax.while_loop(unfinished, vanish, start)
         return tissue, counts
+
+
+_ROUNDING = 1e-2
 
 
 def can_vanish(tissue: Tissue) -> Bool[Array, " cells"]:
@@ -108,13 +120,13 @@ def _meets_again(cell: Array, across: Array, twin: Array) -> list[Array]:
     return [(take(across, other) == across).astype(cell.dtype) for other in (following, previous)]
 
 
-def _shrunk(tissue: Tissue, cell: Int[Array, ""]) -> Tissue:
-    """The tissue with a cell of half the size."""
+def _enlarged(tissue: Tissue, cell: Int[Array, ""]) -> Tissue:
+    """The tissue with a cell twice as long and wide."""
     m = tissue.topology
     mine = m.cell == cell
     corners = tissue.corners
     centre = jnp.sum(jnp.where(mine[:, None], corners, 0), axis=0) / jnp.sum(mine)
-    step = jnp.where(mine[:, None], 0.5 * (centre - corners), 0)
+    step = jnp.where(mine[:, None], corners - centre, 0)
     return tissue.with_vertices(tissue.vertices + jnp.sum(step.reshape(-1, 3, 2), axis=1))
 
 
