@@ -120,7 +120,7 @@ def test_energies_that_cannot_be_told_are_refused():
         SurfaceEvolver().relax(on_host(PERIODIC), Odd(), None)
 
 
-@pytest.mark.parametrize("settings", [{"timeout": 0.0}, {"pieces": 0}, {"t1_below": -1.0}])
+@pytest.mark.parametrize("settings", [{"timeout": 0.0}, {"pieces": 0}, {"steps": -1}])
 def test_settings_are_checked(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         SurfaceEvolver(**settings)

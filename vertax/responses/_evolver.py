@@ -38,8 +38,6 @@ class SurfaceEvolver(AbstractSimulator):
     - `pieces`: into how many straight pieces an arc is cut. They move one by one, so that an edge is as
         curved as the program wants it, and its length is theirs: again with `slope="program"`. Straight
         edges stay whole.
-    - `t1_below`: edges that get shorter than this flip, by the program's own `t1_edgeswap`, in the first
-        relaxation; None to keep the topology. Cells and edges keep their numbers.
     - `tolerance`: the program has relaxed when a step lowers the energy by less than this share.
     - `steps`: of conjugate gradients to begin with, where a tissue is far from rest.
     - `newton_steps`: at most; 0 for conjugate gradients only, until the tolerance ends them.
@@ -53,7 +51,6 @@ class SurfaceEvolver(AbstractSimulator):
     command: str = "evolver"
     areas: Literal["elastic", "fixed"] = "elastic"
     pieces: int = 8
-    t1_below: float | None = None
     tolerance: float = 1e-14
     steps: int = 20
     newton_steps: int = 40
@@ -66,8 +63,6 @@ class SurfaceEvolver(AbstractSimulator):
             )
         for name in ("tolerance", "timeout"):
             check_number(name, getattr(self, name), above=0)
-        if self.t1_below is not None:
-            check_number("t1_below", self.t1_below, above=0)
         check_whole("pieces", self.pieces, least=1)
         check_whole("steps", self.steps, least=0)
         check_whole("newton_steps", self.newton_steps, least=0)
@@ -89,6 +84,8 @@ class SurfaceEvolver(AbstractSimulator):
         terms = Terms.of(energy, pieces.n_cells, len(pieces.cells))
         fixed = self.areas == "fixed"
         held = range(pieces.n_cells) if fixed else ()
+        if fixed:  # whatever the stiffness is
+            terms = terms._replace(area_stiffness=np.zeros(pieces.n_cells))
         text = datafile(pieces, terms, forces, fixed=fixed)
         points, pressures, numbers = self._run(text, self._commands(pieces) + _report(held), pieces)
         vertices = points[: pieces.n_vertices] + pieces.images @ pieces.lattice
@@ -125,10 +122,8 @@ class SurfaceEvolver(AbstractSimulator):
 
     def _commands(self, pieces: Pieces) -> str:
         """How it relaxes: conjugate gradients, and then Newton's method with a search along each step."""
-        # Points on an arc may glide along it at no cost: they move across it only.
-        normal = "on" if len(pieces.points) > pieces.n_vertices else "off"
         # (With this toggle on, as it is, the index of the Hessian is wrong and its steps stall.)
-        lines = ["function_quantity_sparse off;", f"hessian_normal {normal};"]
+        lines = ["function_quantity_sparse off;", "hessian_normal off;"]
         lines += ["steps_done := 0;", "recalc;"]
         if self.steps:
             lines += [f"U; g {self.steps}; U;", f"steps_done := {self.steps};"]
@@ -155,7 +150,7 @@ INSTALL = (
 def _report(held: Sequence[int] = ()) -> str:
     """Commands that write where all points are, and the multipliers of areas held; and end the program."""
     lines = [
-        'printf "energy %.17g\\n", total_energy-nudge.value >> "result";',
+        'printf "energy %.17g\\n", total_energy-nudge.value-glide.value >> "result";',
         'printf "steps %g\\n", steps_done >> "result";',
         'foreach vertex vv do printf "point %d %.17g %.17g\\n", vv.id, vv.x, vv.y >> "result";',
         *(f'printf "pressure {c} %.17g\\n", keep_{c}.pressure >> "result";' for c in held),
@@ -172,7 +167,7 @@ def datafile(
         lines += ["TORUS", "PERIODS", *(f"{a:.17g} {b:.17g}" for a, b in pieces.lattice)]
     lines += [
         f"define {kind} attribute {name} real"
-        for kind, names in (("vertex", ("pull_x", "pull_y", "arm_x", "arm_y")), ("edge", ("gam",)))
+        for kind, names in (("vertex", ("pull_x", "pull_y", "arm_x", "arm_y", "glide_x", "glide_y", "home_x", "home_y")), ("edge", ("gam",)))
         for name in names
     ]
     length = f"sqrt(x3^2+x4^2+{pieces.softening**2:.17g})"
@@ -190,14 +185,24 @@ def datafile(
         "quantity nudge energy method vertex_scalar_integral scalar_integrand: -(pull_x*x+pull_y*y)"
     )
     held = _springs(lines, pieces, terms, arms)
+    # Points on an arc glide along it at no cost, which makes the Hessian singular: a stiff spring lets them
+    # move across it only.
+    glides = pieces.tangents()
+    lines.append(
+        "quantity glide energy method vertex_scalar_integral scalar_integrand: "
+        f"{0.5 * _stiffness(pieces, terms):.17g}*(glide_x*(x-home_x)+glide_y*(y-home_y))^2"
+    )
     lines.append("vertices")
     names = " ".join(["nudge", *held])
     pinned = set(pieces.fixed.tolist())
     for i, ((x, y), (px, py), (ax, ay)) in enumerate(zip(points, pulls, arms, strict=True)):
+        gx, gy = glides[i]
+        on_arc = "glide" if i >= pieces.n_vertices else ""
         fix = " fixed" if i in pinned else ""
         lines.append(
             f"{i + 1} {x:.17g} {y:.17g}{fix} pull_x {px:.17g} pull_y {py:.17g} arm_x {ax:.17g} "
-            f"arm_y {ay:.17g} {names}"
+            f"arm_y {ay:.17g} glide_x {gx:.17g} glide_y {gy:.17g} home_x {x:.17g} home_y {y:.17g} "
+            f"{names} {on_arc}"
         )
     lines.append("edges")
     sign = {0: "*", 1: "+", -1: "-"}
@@ -237,7 +242,9 @@ def _areas(
         area = "+".join(f"{name}.value" for name in some)
         target = terms.area[cell]
         if fixed:
-            lines.append(f"quantity keep_{cell} fixed = {target:.17g} function {area}")
+            # (Not as a function of the instances: its Hessian would be dense, for each cell.)
+            parts_of = " ".join(f"method {name}" for name in some)
+            lines.append(f"quantity keep_{cell} fixed = {target:.17g} {parts_of}")
             continue
         k = terms.area_stiffness[cell]
         lines.append(
@@ -268,12 +275,7 @@ def _springs(
 ) -> list[str]:
     """Springs that hold the whole where it is; they change no shape, and make the Hessian regular."""
     points, n = pieces.points, len(pieces.points)
-    size = np.abs(pieces.areas(points)).mean()
-    k = max(
-        float(np.mean(np.abs(terms.tension))) / np.sqrt(size),
-        float(np.mean(terms.area_stiffness)) * size,
-        float(np.mean(terms.perimeter_stiffness)),
-    )
+    k = _stiffness(pieces, terms)
     modes = {}
     if len(pieces.fixed) == 0:
         modes |= {"x": "x", "y": "y"}
@@ -295,6 +297,16 @@ def _springs(
             f"{0.5 * k / n:.17g}*(sum_{name}.value-({at[name]:.17g}))^2"
         )
     return [f"sum_{name}" for name in modes]
+
+
+def _stiffness(pieces: Pieces, terms: Terms) -> float:
+    """A typical second derivative of the energy."""
+    size = np.abs(pieces.areas(pieces.points)).mean()
+    return max(
+        float(np.mean(np.abs(terms.tension))) / np.sqrt(size),
+        float(np.mean(terms.area_stiffness)) * size,
+        float(np.mean(terms.perimeter_stiffness)),
+    )
 
 
 def _read(text: str, pieces: Pieces, log: str) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:

@@ -124,6 +124,16 @@ class Pieces(NamedTuple):
     def _vectors(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "pieces 2"]:
         return points[self.ends[:, 1]] + self.wraps @ self.lattice - points[self.ends[:, 0]]
 
+    def tangents(self) -> Float[np.ndarray, "points 2"]:
+        """The direction of the arc at each point that lies on one; 0 at vertices."""
+        d = self._vectors(self.points)
+        d = d / np.linalg.norm(d, axis=1, keepdims=True)
+        tangents = np.zeros_like(self.points)
+        for side in (0, 1):
+            np.add.at(tangents, self.ends[:, side], 0.5 * d)
+        tangents[: self.n_vertices] = 0
+        return tangents
+
     def angles(
         self, points: Float[np.ndarray, "points 2"], old: Any
     ) -> Float[np.ndarray, " edges"] | None:
