@@ -27,7 +27,8 @@ FAMILIES = {
     "limits member stack stack_fits uncertainty",
     "inference": "EdgeMotion Micrograph Microscope MovingTensions PinnedEnergy RecoveryWatch "
     "RelativeTensions Scene TensionProblem Tensions Transition fit_onset fit_transition foam_energy "
-    "foam_terms force_balance label_image micrograph_problem pearson relative_error same_neighbours shape_factor_scene tension_problem",
+    "foam_terms force_balance label_image micrograph_problem pearson "
+    "relative_error same_neighbours shape_factor_scene tension_problem",
     "initialise": "AbstractSegmenter Cellpose Segmentation Watershed free_voronoi from_labels "
     "from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
     "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_tables "

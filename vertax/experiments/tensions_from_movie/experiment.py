@@ -1,7 +1,7 @@
 """Tensions of a cluster on its way, from how the points of its edges move.
 
-The frames are dumps of Surface Evolver, which know their tensions, or those of a synthetic cluster whose
-tensions jump and whose outline is held. Tensions are inferred from the first two frames, the first three, and
+The frames are dumps of Surface Evolver, which know their tensions, or those of a synthetic cluster that is let
+go while its outline is held. Tensions are inferred from the first two frames, the first three, and
 so on, and compared with the true ones; and those of the first two predict the others.
 """
 
@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from vertax.inference import EdgeMotion, MovingTensions, foam_energy, pearson
+from vertax.inference import EdgeMotion, MovingTensions, pearson
 from vertax.initialise import free_voronoi
 from vertax.io import read_surface_evolver
 from vertax.mesh import Tissue
-from vertax.runs import ExperimentConfig, Relaxation, RunFolder, Section
+from vertax.runs import ExperimentConfig, RunFolder, Section
 
 from . import figures
 
@@ -38,7 +38,7 @@ class Cluster(Section):
     n_cells: int = Field(default=12, ge=4)
     """Number of cells."""
     deviation: float = Field(default=0.2, ge=0, lt=0.5)
-    """Standard deviation of the tensions after they jumped from 1, of mean 1."""
+    """Standard deviation of the tensions, of mean 1."""
     pieces: int = Field(default=8, ge=2)
     """Pieces of each edge."""
     frames: int = Field(default=4, ge=2)
@@ -153,24 +153,22 @@ def _read(paths: Sequence[str]) -> Frames:
 
 
 def _drawn(config: Config) -> Frames:
-    """A foam in equilibrium whose tensions jump, with its outline held."""
+    """A cluster of straight edges that is let go, with its outline held."""
     options = config.cluster
     shape_key, tension_key = jax.random.split(jax.random.key(config.seed))
-    cluster = free_voronoi(options.n_cells, key=shape_key, lloyd_steps=3, inner_arcs=True)
-    foam = foam_energy(jnp.ones(cluster.n_edges), stiffness=20.0, low=0.05, high=4.0)
-    relaxed = Relaxation().build()(cluster, foam).tissue
+    cluster = free_voronoi(options.n_cells, key=shape_key, lloyd_steps=3)
     spread = options.deviation * jax.random.truncated_normal(
         tension_key, -0.5 / options.deviation, 0.5 / options.deviation, (cluster.n_edges,)
     )
     tension = np.asarray(1 + spread if options.deviation else jnp.ones(cluster.n_edges))
     fractions = jnp.linspace(0, 1, options.pieces + 1)
-    chains = [list(np.asarray(relaxed.edge_points(fractions)))]
+    chains = [list(np.asarray(cluster.edge_points(fractions)))]
     times = options.interval * np.arange(options.frames)
     for number in range(1, options.frames):
         held = EdgeMotion(
-            [relaxed] * 2, [chains[0]] * 2, [0, times[number]], substeps=number * config.substeps
+            [cluster] * 2, [chains[0]] * 2, [0, times[number]], substeps=number * config.substeps
         )
         chains += held.predicted(tension)
     rng = np.random.default_rng(config.seed)
     blurred = [[c + options.noise * rng.normal(size=c.shape) for c in frame] for frame in chains]
-    return Frames([relaxed] * options.frames, blurred, times.tolist(), tension)
+    return Frames([cluster] * options.frames, blurred, times.tolist(), tension)
