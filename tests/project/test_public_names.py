@@ -34,7 +34,7 @@ FAMILIES = {
     "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_tables "
     "load_energy load_problem load_tissue load_trajectory read_image read_surface_evolver "
     "save_energy save_problem save_tissue save_trajectory to_tables write_csv "
-    "write_geojson write_vtk",
+    "write_geojson write_vtk write_vtk_series",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours new_figure "
     "plot_band plot_boxes plot_history plot_image plot_recovery plot_tissue plot_tissues same_limits "

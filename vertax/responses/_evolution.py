@@ -78,7 +78,11 @@ class Evolved(Equilibrium):
             return self
         first = np.argmin(np.asarray(self.sound), axis=-1).max()
         time = np.asarray(self.times).reshape(-1, np.shape(self.times)[-1])[0, first]
-        what = "cells overlap, or the box folds" if not np.all(self.valid) else "a step in time came to no end"
+        what = (
+            "cells overlap, or the box folds"
+            if not np.all(self.valid)
+            else "a step in time came to no end"
+        )
         if not np.isfinite(np.asarray(self.max_force)).all():
             what = "forces are not finite"
         raise RuntimeError(

@@ -1,8 +1,8 @@
 """Tensions of a cluster on its way, from how the points of its edges move.
 
-The frames are dumps of Surface Evolver, which know their tensions, or those of a synthetic cluster that is let
-go while its outline is held. Tensions are inferred from the first two frames, the first three, and
-so on, and compared with the true ones; and those of the first two predict the others.
+The frames are dumps of Surface Evolver, which know their tensions, or those of a synthetic cluster that is
+let go while its outline is held. Tensions are inferred from the first two frames, the first three, and so on,
+and compared with the true ones; and those of the first two predict the others.
 """
 
 from __future__ import annotations
