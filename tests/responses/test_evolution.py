@@ -105,6 +105,10 @@ class TestWithoutActivity:
         np.testing.assert_allclose(movie.trajectory.values["time"], movie.times)
         assert movie.converged
         assert movie.sound.all()
+        batch = vx.fitting.stack([movie, movie])
+        np.testing.assert_array_equal(batch.flipped, jnp.stack([movie.flipped] * 2))
+        with pytest.raises(ValueError, match="a batch of"):
+            _ = batch.trajectory
 
 
 class TestGradients:
@@ -309,6 +313,29 @@ class TestBadInput:
         some = SubstrateFriction(jnp.ones(24).at[jnp.array([3, 5])].set(0.0))
         with pytest.raises(ValueError, match=r"2 of 24 vertices \(3, 5\)"):
             vx.evolve(tissue, energy, some, [0.0, 1.0])
+
+    def test_an_energy_that_is_none(self, as_a_user):
+        tissue, _ = solid()
+        with pytest.raises(TypeError, match="function of time that returns one, but returned"):
+            vx.evolve(tissue, lambda time: 3.0 * time, FRICTION, [0.0, 1.0])  # pyright: ignore
+
+    def test_a_box_that_folds(self):
+        tissue, energy = solid()
+        shrunk = lambda time: vx.Periodic(
+            tissue.boundary.lattice @ jnp.diag(jnp.stack([1.0 - time, jnp.ones_like(time)]))
+        )
+        few = vx.Relaxation(transitions=None, contact_range=None, max_steps=20)
+        with pytest.raises(RuntimeError, match=r"time 1.5 \(frame 1\) .*the box folds"):
+            vx.evolve(tissue, energy, FRICTION, [0.0, 1.5], boundary=shrunk, relaxation=few)
+
+    def test_a_drive_of_another_activity_or_tissue(self):
+        tissue, energy = solid()
+        noise, moving = vx.activities.ThermalNoise(0.1), vx.activities.SelfPropulsion(0.1)
+        other = vx.initialise.periodic_voronoi(9, key=0)
+        for activity, place in ((noise, tissue), (moving, other)):
+            drive = (activity.init(place, jax.random.key(0)), jax.random.key(1))
+            with pytest.raises(ValueError, match="`drive` does not go with this"):
+                vx.evolve(tissue, energy, FRICTION, [0, 1], activity=moving, drive=drive)
 
     def test_settings(self, as_a_user):
         class Own(vx.AbstractDissipation):

@@ -15,6 +15,10 @@ from vertax.inference._micrograph import (
     micrograph_problem as micrograph_problem,
 )
 from vertax.inference._microscope import Microscope as Microscope, label_image as label_image
+from vertax.inference._motion import (
+    EdgeMotion as EdgeMotion,
+    MovingTensions as MovingTensions,
+)
 from vertax.inference._recovery import (
     RecoveryWatch as RecoveryWatch,
     pearson as pearson,

@@ -8,11 +8,10 @@ import equinox as eqx
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import least_squares
 
 from vertax._base.checks import check_whole
-from vertax.mesh import Tissue
+from vertax.mesh import Free, Tissue
 
 Chain = Float[np.ndarray, "_ 2"]
 
@@ -28,10 +27,10 @@ class MovingTensions(eqx.Module):
     mobility: float
     """Velocity of a point over the force on it, where the mean tension is 1."""
     misfit: Float[np.ndarray, " intervals"]
-    """How far points are at the end of each interval from where the tensions would have them: the root mean
-    square."""
+    """How far points are at the end of each interval from where the tensions would have them, across their
+    edges: the root mean square."""
     moved: Float[np.ndarray, " intervals"]
-    """How far they went in it: the root mean square."""
+    """How far they went in it, likewise."""
 
 
 class EdgeMotion:
@@ -74,7 +73,7 @@ class EdgeMotion:
         self,
         tissues: Sequence[Tissue],
         chains: Sequence[Sequence[Chain]],
-        times: Sequence[float],
+        times: Sequence[float | int],
         *,
         substeps: int = 50,
     ):
@@ -88,6 +87,11 @@ class EdgeMotion:
         if not (steps > 0).all():
             raise ValueError(f"Argument `times` must increase, but is {list(times)}.")
         first = tissues[0]
+        if not isinstance(first.boundary, Free):
+            raise ValueError(
+                "Argument `tissues` must hold free clusters, but the boundary of the first is "
+                f"{type(first.boundary).__name__}."
+            )
         courses = [
             _as_in_first(number, first, tissue, frame)
             for number, (tissue, frame) in enumerate(zip(tissues, chains, strict=True))
@@ -105,7 +109,7 @@ class EdgeMotion:
         self.n_cells, self.n_vertices = first.n_cells, first.n_vertices
         self.inner = ~np.asarray(first.topology.on_outline)
         self.substeps = substeps
-        self._dt, self._points = steps, points
+        self._dt, self._points, self._rows = steps, points, rows
         sizes = [len(row) - 1 for row in rows]
         self._pieces = np.concatenate([np.stack([row[:-1], row[1:]], axis=1) for row in rows])
         self._edge = np.repeat(np.arange(len(rows)), sizes)
@@ -121,7 +125,7 @@ class EdgeMotion:
         side = lambda cells: sp.csr_array(
             (np.ones(n_pieces), (cells, each)), (self.n_cells + 1, n_pieces)
         )
-        self._sides = (side(left) - side(right))[: self.n_cells]
+        self._sides = sp.csr_array(side(left) - side(right))[: self.n_cells].tocsr()
 
     def residuals(
         self, tension: Float[np.ndarray, " edges"]
@@ -136,11 +140,26 @@ class EdgeMotion:
         """
         return self._left(np.asarray(tension, float), False)[0]
 
+    def predicted(self, tension: Float[np.ndarray, " edges"]) -> list[list[Chain]]:
+        r"""The chains at the end of each interval, from what was seen where it begins.
+
+        **Arguments:**
+
+        - `tension`: $\gamma / \zeta$ of each edge; of those on the outline it does not matter.
+
+        **Returns:** for each interval the points of each edge, in the order of the first tissue.
+        """
+        ends = [
+            self._followed(number, np.asarray(tension, float), False)[0].reshape(-1, 2)
+            for number in range(len(self._dt))
+        ]
+        return [[end[row] for row in self._rows] for end in ends]
+
     def tensions(self) -> MovingTensions:
         r"""The tensions that explain the motion best, by least squares.
 
         Their standard deviations are those of the Laplace approximation, where what is left over is taken
-        for independent noise. Misfits of neighbours that are alike make them too small.
+        for noise, independent for each coordinate of a junction and for each edge.
 
         **Raises:**
 
@@ -152,8 +171,9 @@ class EdgeMotion:
         fit = least_squares(
             lambda relative: self._left(pace * whole(relative), False)[0].ravel(),
             np.ones(len(which)),
-            lambda relative: pace * self._left(pace * whole(relative), True)[1][:, which],
-            xtol=1e-6,
+            lambda relative: pace * self._left(pace * whole(relative), True)[1][:, which],  # pyright: ignore[reportArgumentType]
+            ftol=1e-4,
+            xtol=1e-5,
             max_nfev=50,
         )
         if not fit.success:
@@ -162,9 +182,10 @@ class EdgeMotion:
                 "in all frames, and the times right?"
             )
         found, slopes = pace * fit.x, fit.jac / pace
-        n_free = len(self._dt) * (self._free < 2 * self.n_vertices).sum()
-        n_free += len(self._dt) * (self._free >= 2 * self.n_vertices).sum() // 2
-        variance = np.sum(fit.fun**2) / max(n_free - len(which), 1)
+        # Points of one edge move together, and count as one.
+        junctions = np.sum(self._free < 2 * self.n_vertices)
+        n_independent = len(self._dt) * (junctions + len(which))
+        variance = np.sum(fit.fun**2) / max(n_independent - len(which), 1)
         covariance = variance * np.linalg.pinv(slopes.T @ slopes, hermitian=True)
         mean = found.mean()
         # Slopes of relative tensions, γ over the mean.
@@ -182,31 +203,46 @@ class EdgeMotion:
 
     def _left(
         self, tension: Float[np.ndarray, " edges"], sensitive: bool
-    ) -> tuple[Float[np.ndarray, "intervals coordinates"], Float[np.ndarray, "all edges"]]:
+    ) -> tuple[Float[np.ndarray, "intervals coordinates"], Float[np.ndarray, "all parameters"]]:
         """The residuals, and how they depend on the tensions, if that is asked for."""
         left, slopes = [], []
-        for number, dt in enumerate(self._dt):
-            start, end = self._points[number : number + 2]
-            x, dx = start.ravel(), np.zeros((len(self._free), len(tension) if sensitive else 0))
-            drive = (end - start).ravel() / dt, (self._areas(end.ravel()) - self._areas(x)) / dt
-            h = dt / self.substeps
-            for _ in range(self.substeps):  # Heun
-                one, d_one = self._velocity(x, dx, tension, *drive)
-                two, d_two = self._velocity(x + h * one, dx + h * d_one, tension, *drive)
-                x, dx = x + 0.5 * h * (one + two), dx + 0.5 * h * (d_one + d_two)
+        for number, end in enumerate(self._points[1:]):
+            x, dx = self._followed(number, tension, sensitive)
             across = self._across(end)
             left.append(across @ (x - end.ravel())[self._free])
             slopes.append(across @ dx)
         return np.stack(left), np.concatenate(slopes)
 
+    def _followed(
+        self, number: int, tension: Float[np.ndarray, " edges"], sensitive: bool
+    ) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, "free parameters"]]:
+        """Where points are at the end of an interval."""
+        x = self._points[number].ravel()
+        dx = np.zeros((len(self._free), len(tension) if sensitive else 0))
+        drive = self._seen(number)
+        h = self._dt[number] / self.substeps
+        for _ in range(self.substeps):  # Heun
+            one, d_one = self._velocity(x, dx, tension, *drive)
+            two, d_two = self._velocity(x + h * one, dx + h * d_one, tension, *drive)
+            x, dx = x + 0.5 * h * (one + two), dx + 0.5 * h * (d_one + d_two)
+        return x, dx
+
+    def _seen(
+        self, number: int
+    ) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, " cells"]]:
+        """How fast points went in an interval, and how fast areas grew."""
+        start, end = self._points[number : number + 2].reshape(2, -1)
+        dt = self._dt[number]
+        return (end - start) / dt, (self._areas(end) - self._areas(start)) / dt
+
     def _velocity(
         self,
         x: Float[np.ndarray, " coordinates"],
-        dx: Float[np.ndarray, "free edges"],
+        dx: Float[np.ndarray, "free parameters"],
         tension: Float[np.ndarray, " edges"],
         as_seen: Float[np.ndarray, " coordinates"],
         growth: Float[np.ndarray, " cells"],
-    ) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, "free edges"]]:
+    ) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, "free parameters"]]:
         """How fast points go, and how that depends on tensions on which `x` depends as in `dx`."""
         free = self._free
         way = (self._difference @ x).reshape(-1, 2)
@@ -219,8 +255,8 @@ class EdgeMotion:
         loose = area[:, free]
         gram = (loose @ loose.T).toarray()
         # One pressure for all moves nothing within a given outline: their sum is 0.
-        factors = cho_factor(gram + np.trace(gram) / len(gram) ** 2)
-        pressure = cho_solve(factors, growth - area @ v)
+        inverse = np.linalg.inv(gram + np.trace(gram) / len(gram) ** 2)
+        pressure = inverse @ (growth - area @ v)
         v[free] += loose.T @ pressure
         if dx.shape[1] == 0:
             return v, dx
@@ -228,7 +264,8 @@ class EdgeMotion:
         stretched = self._difference[:, free]
         ways = (stretched @ dx).reshape(len(way), 2, -1)
         turned = np.stack([-along[:, 1], along[:, 0]], axis=1)
-        swing = np.einsum("pi,pik->pk", turned, ways) * (pull / length)[:, None]
+        swing = turned[:, :1] * ways[:, 0] + turned[:, 1:] * ways[:, 1]
+        swing *= (pull / length)[:, None]
         pulls = (turned[:, :, None] * swing[:, None]).reshape(2 * len(way), -1)
         dv = -(stretched.T @ pulls)
         each = np.arange(along.size)
@@ -237,7 +274,7 @@ class EdgeMotion:
         )
         dv -= (stretched.T @ own).toarray()
         dv += self._area_curvature(pressure)[free][:, free] @ dx
-        dv += loose.T @ -cho_solve(factors, self._area_slopes(v)[:, free] @ dx + loose @ dv)
+        dv += loose.T @ -(inverse @ (self._area_slopes(v)[:, free] @ dx + loose @ dv))
         return v, dv
 
     def _pace(self, tension: Float[np.ndarray, " edges"]) -> float:
@@ -245,10 +282,8 @@ class EdgeMotion:
         junctions = self._free[self._free < 2 * self.n_vertices]
         none = np.zeros((len(self._free), 0))
         sums = np.zeros(2)
-        for number, dt in enumerate(self._dt):
-            start, end = self._points[number : number + 2].reshape(2, -1)
-            seen = (end - start) / dt
-            growth = (self._areas(end) - self._areas(start)) / dt
+        for number, start in enumerate(self._points[:-1].reshape(len(self._dt), -1)):
+            seen, growth = self._seen(number)
             rest, _ = self._velocity(start, none, 0 * tension, seen, growth)
             pulled, _ = self._velocity(start, none, tension, seen, growth)
             pulled, seen = (pulled - rest)[junctions], (seen - rest)[junctions]

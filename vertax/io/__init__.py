@@ -26,3 +26,4 @@ from vertax.io._trajectory import (
     save_trajectory as save_trajectory,
 )
 from vertax.io._vtk import write_vtk as write_vtk
+from vertax.io._vtk_series import write_vtk_series as write_vtk_series

@@ -22,7 +22,7 @@ from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import cell_size
-from vertax.mesh import AbstractBoundary, Tissue
+from vertax.mesh import AbstractBoundary, Periodic, Tissue
 from vertax.responses._material import Material
 from vertax.responses._relaxation import Relaxation
 from vertax.responses._response import AbstractResponse, Equilibrium
@@ -57,9 +57,12 @@ class Evolved(Equilibrium):
     def flipped(self) -> Bool[Array, "*batch times edges"]:
         """Which edges lie between other cells than a frame before."""
         # (Half-edges do not change places when an edge flips, and cells of half-edges do.)
-        cells = jax.vmap(lambda topology: topology.edge_cells)(self.frames.topology)
-        changed = jnp.any(cells[1:] != cells[:-1], axis=-1)
-        return jnp.concatenate([jnp.zeros_like(changed[:1]), changed])
+        each = lambda topology: topology.edge_cells
+        for _ in self.times.shape:
+            each = jax.vmap(each)
+        cells = each(self.frames.topology)
+        changed = jnp.any(cells[..., 1:, :, :] != cells[..., :-1, :, :], axis=-1)
+        return jnp.concatenate([jnp.zeros_like(changed[..., :1, :]), changed], axis=-2)
 
     def checked(self) -> Evolved:
         """The same, if all steps came to an end.
@@ -77,7 +80,11 @@ class Evolved(Equilibrium):
             return self
         first = np.argmin(np.asarray(self.sound), axis=-1).max()
         time = np.asarray(self.times).reshape(-1, np.shape(self.times)[-1])[0, first]
-        what = "cells overlap" if not np.all(self.valid) else "a step in time came to no end"
+        what = (
+            "cells overlap, or the box folds"
+            if not np.all(self.valid)
+            else "a step in time came to no end"
+        )
         if not np.isfinite(np.asarray(self.max_force)).all():
             what = "forces are not finite"
         raise RuntimeError(
@@ -87,7 +94,17 @@ class Evolved(Equilibrium):
 
     @property
     def trajectory(self) -> Trajectory:
-        """The frames as a trajectory, for [`animate`][vertax.animate] and for files."""
+        """The frames as a trajectory, for [`animate`][vertax.animate] and for files.
+
+        **Raises:**
+
+        - `ValueError` for a batch.
+        """
+        if self.times.ndim != 1:
+            raise ValueError(
+                f"This is a batch of {self.times.shape[:-1]} movies, and a trajectory is one. Take a member: "
+                "vertax.fitting.member(movies, 0).trajectory."
+            )
         trajectory = Trajectory()
         arrays, static = eqx.partition(self.frames, eqx.is_array)
         values = {"time": self.times, "energy": self.energies, "num_t1": self.transitions}
@@ -230,6 +247,7 @@ class Evolution(AbstractResponse):
             response, energy = self.of(energy), energy.energy
         response.relaxation.check(tissue, energy, adjoint)
         response._check(tissue)
+        response._check_drive(tissue)
         spare_memory_maps()
         response = response.traced()
         evolved = _evolve(*traced((tissue, energy)), response, adjoint)
@@ -289,6 +307,20 @@ class Evolution(AbstractResponse):
             held = jnp.where(tissue.pinned[:, None], self.pins(time), tissue.vertices)
             tissue = tissue.with_vertices(held)
         return tissue
+
+    def _check_drive(self, tissue: Tissue) -> None:
+        """Refuse the drive of another activity, or of another tissue."""
+        if self.activity is None or self.drive is None:
+            return
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        own = eqx.filter_eval_shape(self.activity.init, tissue, key)
+        kinds = lambda tree: jax.tree.map(lambda x: (jnp.shape(x), jnp.result_type(x)), tree)
+        whole = isinstance(self.drive, tuple) and len(self.drive) == 2
+        if not whole or not eqx.tree_equal(kinds(own), kinds(self.drive[0])):
+            raise ValueError(
+                "Argument `drive` does not go with this activity and this tissue: it must be that of an "
+                "evolution of a tissue of this size with this activity. Pass a key to begin anew."
+            )
 
     def _check(self, tissue: Tissue) -> None:
         """Refuse a dissipation that lets some vertices go without any resistance."""
@@ -375,7 +407,7 @@ class _State(eqx.Module):
             jnp.maximum(self.max_force, frozen(step.max_force)),
             self.num_steps + step.num_steps,
             self.num_t1 + step.num_t1,
-            self.valid & step.valid,
+            self.valid & step.valid & _right_handed(step.tissue.boundary),
             self.arrived & (step.result == optx.RESULTS.successful),
         )
 
@@ -396,7 +428,15 @@ _SHARE = 1 - 0.5**0.5
 @eqx.filter_jit
 def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: AbstractAdjoint) -> Evolved:
     times = evolution.times.astype(tissue.vertices.dtype)
-    energy_at = energy if not isinstance(energy, AbstractEnergy) else lambda _: energy
+
+    def energy_at(time: Any) -> AbstractEnergy:
+        found = energy if isinstance(energy, AbstractEnergy) else energy(time)
+        if not isinstance(found, AbstractEnergy):
+            raise TypeError(
+                "Argument `energy` must be an energy, or a function of time that returns one, but returned "
+                f"{named(found)}."
+            )
+        return found
 
     def stage(
         state: _State, before: Tissue, acts: Any, start: Any, end: Any, strained: Any
@@ -465,6 +505,11 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
         drive=end.drive,
         sound=join(yes, sound),
     )
+
+
+def _right_handed(boundary: AbstractBoundary) -> Bool[Array, ""]:
+    """Whether a box that depends on time has not folded over."""
+    return boundary.area > 0 if isinstance(boundary, Periodic) else jnp.array(True)
 
 
 def increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
