@@ -67,6 +67,7 @@ SHORT = {
         "tissue.n_cells=7",
         "fit.epochs=2",
     ],
+    "tissue_moduli": ["shape_factors=[3.5, 3.7]", "replicates=2", "tissue.n_cells=9"],
 }
 
 

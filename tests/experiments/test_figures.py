@@ -20,6 +20,7 @@ from vertax.experiments.infer_tensions import figures as tensions
 from vertax.experiments.inference_across_topologies import figures as topologies
 from vertax.experiments.rigidity_transition import figures as rigidity
 from vertax.experiments.salt_and_pepper import figures as patterns
+from vertax.experiments.tissue_moduli import figures as moduli
 from vertax.plotting import label_colours
 
 pytestmark = pytest.mark.experiments
@@ -240,3 +241,17 @@ def test_more_cycles_than_colours_are_all_drawn():
     assert len(axes) == 3
     # Before, the sixth curve and those after it were left out without a word.
     assert len(axes[0].get_legend_handles_labels()[1]) == 9
+
+
+def test_moduli_of_all_tissues_and_their_means():
+    p0, shear = np.linspace(3.5, 4.0, 4), RNG.uniform(size=(4, 3))
+    shear[3, 1] = np.nan
+    means = {name: np.arange(4.0) for name in ("shear", "affine", "bulk", "tension")}
+    left, _, right = panels(moduli.moduli(p0, shear, means, np.array([1, 1, 0.5, 0])))
+    np.testing.assert_allclose(left.lines[0].get_ydata(), shear.ravel())
+    assert [text.get_text() for text in left.get_legend().get_texts()] == [
+        "relaxed",
+        "affine",
+        "hexagons",
+    ]
+    np.testing.assert_allclose(right.lines[0].get_ydata(), [1, 1, 0.5, 0])

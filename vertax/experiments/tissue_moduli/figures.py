@@ -1,0 +1,56 @@
+"""Pictures of moduli against the target shape factor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from vertax.plotting import INK, SERIES, house_style, new_figure
+
+REFERENCE = 3.81
+"""The transition of disordered tissues, from D. Bi et al. 2015."""
+# Of the regular hexagon, at which the ordered lattice softens.
+HEXAGON = float(np.sqrt(8 * np.sqrt(3)))
+
+
+@house_style()
+def moduli(
+    shape_factors: Float[np.ndarray, " values"],
+    shear: Float[np.ndarray, "values tissues"],
+    means: Mapping[str, Float[np.ndarray, " values"]],
+    solid: Float[np.ndarray, " values"],
+) -> Figure:
+    """Shear moduli, bulk modulus and tension, and the share of solid tissues, against the shape factor.
+
+    **Arguments:**
+
+    - `shape_factors`: target shape factors.
+    - `shear`: relaxed shear modulus of each tissue.
+    - `means`: mean `shear`, `affine`, `bulk` and `tension` at each shape factor.
+    - `solid`: share of solid tissues.
+
+    **Returns:** the figure.
+    """
+    figure, (axes,) = new_figure(1, 3, width=2.3)
+    each = np.repeat(shape_factors, shear.shape[1])
+    axes[0].plot(each, shear.ravel(), ".", ms=2, color=SERIES[0], alpha=0.4)
+    axes[0].plot(shape_factors, means["shear"], color=SERIES[0], label="relaxed")
+    axes[0].plot(shape_factors, means["affine"], color=SERIES[1], label="affine")
+    # With E = (A - 1)² + (P - p0)² the stiffness K_P is 2.
+    lattice = np.maximum(2 * HEXAGON * (HEXAGON - shape_factors) / 4, 0)
+    axes[0].plot(shape_factors, lattice, "--", color=INK, lw=0.8, label="hexagons")
+    axes[0].set(ylabel="shear modulus", ylim=(0, None))
+    axes[0].legend()
+    axes[1].plot(shape_factors, means["bulk"], color=SERIES[2], label="bulk modulus")
+    axes[1].plot(shape_factors, means["tension"], color=SERIES[3], label="tension")
+    axes[1].set(ylabel="energy per area", ylim=(0, None))
+    axes[1].legend()
+    axes[2].plot(shape_factors, solid, "o-", ms=3, color=SERIES[0])
+    axes[2].set(ylabel="share of solid tissues", ylim=(-0.03, 1.03))
+    for ax in axes:
+        ax.axvline(REFERENCE, color=INK, lw=0.7, ls=":")
+        ax.set_xlabel("target shape factor $p_0$")
+    return figure
