@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import central_difference, random_tissue
+from helpers import STILL, central_difference, random_tissue
 
 import vertax as vx
 from vertax.growth import GrowAndDivide, grow
@@ -25,10 +25,17 @@ def founders(capacity=9):
     return vx.initialise.free_voronoi(4, key=0, lloyd_steps=2).with_capacity(capacity)
 
 
-@pytest.fixture(scope="module")
-def grown():
-    cycle = GrowAndDivide(0.2, 1.5)
-    return grow(founders(), energy_of, cycle, jnp.linspace(0, 5, 6), key=1)
+# With contacts and transitions several times as much is compiled.
+RELAXATIONS = [
+    pytest.param(STILL, id="still"),
+    pytest.param(None, id="default", marks=pytest.mark.slow),
+]
+
+
+@pytest.fixture(scope="module", params=RELAXATIONS)
+def grown(request):
+    cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 4, 6)
+    return grow(founders(), energy_of, cycle, times, key=1, relaxation=request.param)
 
 
 def test_cells_divide_and_the_tissue_stays_sound(grown):

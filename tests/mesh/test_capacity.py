@@ -18,7 +18,9 @@ KINDS = {
     "free": free_tissue,
     "foam": lambda: free_tissue(inner_arcs=True),
 }
-each_kind = pytest.mark.parametrize("kind", KINDS)
+each_kind = pytest.mark.parametrize(
+    "kind", ["periodic", pytest.param("free", marks=pytest.mark.slow), "foam"]
+)
 
 
 @each_kind

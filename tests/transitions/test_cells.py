@@ -24,7 +24,9 @@ def foam():
 
 
 KINDS = {"periodic": lambda: random_tissue(6, 3, lloyd_steps=3), "free": cluster, "foam": foam}
-each_kind = pytest.mark.parametrize("kind", KINDS)
+each_kind = pytest.mark.parametrize(
+    "kind", ["periodic", pytest.param("free", marks=pytest.mark.slow), "foam"]
+)
 
 
 def newborn(before, after):
@@ -150,6 +152,7 @@ def test_a_cell_goes_and_its_neighbours_close_the_gap(kind):
             assert new.areas.sum() == pytest.approx(float(tissue.areas.sum()))
 
 
+@pytest.mark.slow
 def test_events_in_a_batch():
     tissues = [random_tissue(6, seed, lloyd_steps=2).with_capacity(7) for seed in (1, 2)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *tissues)

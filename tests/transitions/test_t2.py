@@ -18,7 +18,8 @@ def shrinking(capacity, cells, tension=0.1):
 
 def test_a_shrinking_cell_is_extruded():
     tissue = random_tissue(9, 1, lloyd_steps=2).with_capacity(10)
-    relaxed = vx.equilibrate(tissue, shrinking(10, [3]), transitions=BOTH)
+    energy = shrinking(10, [3])
+    relaxed = vx.equilibrate(tissue, energy, transitions=BOTH, contact_range=None)
     relaxed.tissue.topology.validate()
     assert relaxed.converged
     assert not relaxed.tissue.alive[3]
