@@ -15,6 +15,7 @@ from vertax.experiments.benchmark_adjoints import figures as benchmark
 from vertax.experiments.compare_conditions import figures as conditions
 from vertax.experiments.convergent_extension import figures as extension
 from vertax.experiments.design_mechanics import figures as mechanics
+from vertax.experiments.external_tensions import figures as external
 from vertax.experiments.infer_from_microscopy import figures as microscopy
 from vertax.experiments.infer_tensions import figures as tensions
 from vertax.experiments.inference_across_topologies import figures as topologies
@@ -230,3 +231,14 @@ def test_more_cycles_than_colours_are_all_drawn():
     assert len(axes) == 3
     # Before, the sixth curve and those after it were left out without a word.
     assert len(axes[0].get_legend_handles_labels()[1]) == 9
+
+
+def test_tensions_through_another_program_are_beside_those_through_vertax(tissue):
+    true = RNG.uniform(0.2, 0.4, tissue.n_edges)
+    found = {"Surface Evolver": true + 0.01, "vertax": true}
+    errors = {name: SimpleNamespace(relative_error=np.geomspace(0.1, 0.01, 5)) for name in found}
+    foam, recovered, history = panels(external.recovery(tissue, true, found, errors))
+    del foam
+    lines = [line for line in recovered.lines if len(line.get_xdata()) == tissue.n_edges]
+    np.testing.assert_array_equal([line.get_ydata() for line in lines], list(found.values()))
+    assert len(history.lines) == 2
