@@ -1,7 +1,7 @@
 """Gradients by two nudged runs of Surface Evolver, against the implicit gradient of vertax.
 
-Of the vertex distance with respect to the tensions of a periodic foam of 20 cells: against the strength of the
-nudge, one-sided and centred; with a program that stops early; and against finite differences.
+Of the vertex distance with respect to the tensions of a periodic foam of 20 cells: against the strength of
+the nudge, one-sided and centred; with a program that stops early; and against finite differences.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from vertax.experiments.benchmark_adjoints import figures as benchmark
 from vertax.experiments.compare_conditions import figures as conditions
 from vertax.experiments.convergent_extension import figures as extension
 from vertax.experiments.design_mechanics import figures as mechanics
+from vertax.experiments.external_tensions import figures as external
 from vertax.experiments.infer_from_microscopy import figures as microscopy
 from vertax.experiments.infer_tensions import figures as tensions
 from vertax.experiments.inference_across_topologies import figures as topologies
@@ -255,3 +256,14 @@ def test_moduli_of_all_tissues_and_their_means():
         "hexagons",
     ]
     np.testing.assert_allclose(right.lines[0].get_ydata(), [1, 1, 0.5, 0])
+
+
+def test_tensions_through_another_program_are_beside_those_through_vertax(tissue):
+    true = RNG.uniform(0.2, 0.4, tissue.n_edges)
+    found = {"Surface Evolver": true + 0.01, "vertax": true}
+    errors = {name: SimpleNamespace(relative_error=np.geomspace(0.1, 0.01, 5)) for name in found}
+    foam, recovered, history = panels(external.recovery(tissue, true, found, errors))
+    del foam
+    lines = [line for line in recovered.lines if len(line.get_xdata()) == tissue.n_edges]
+    np.testing.assert_array_equal([line.get_ydata() for line in lines], list(found.values()))
+    assert len(history.lines) == 2

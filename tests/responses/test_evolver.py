@@ -14,7 +14,7 @@ import pytest
 
 import vertax as vx
 from vertax.responses import SimulatorError, SurfaceEvolver, run_program
-from vertax.responses._evolver_model import Pieces, Terms, slope_of
+from vertax.responses._evolver_model import Strings, Terms, slope_of
 
 needs_evolver = pytest.mark.skipif(
     shutil.which("evolver") is None,
@@ -62,27 +62,17 @@ def slopes(tissue, energy):
 
 
 @pytest.mark.parametrize("tissue", TISSUES.values(), ids=TISSUES)
-def test_pieces_are_the_tissue(tissue):
-    pieces = Pieces.of(on_host(tissue), 8)
-    np.testing.assert_allclose(pieces.lengths(pieces.points), tissue.edge_lengths, rtol=1e-12)
-    np.testing.assert_allclose(pieces.areas(pieces.points), tissue.areas, rtol=1e-10)
-    np.testing.assert_allclose(pieces.perimeters(pieces.points), tissue.perimeters, rtol=1e-12)
+def test_strings_are_the_tissue(tissue):
+    strings = Strings.of(on_host(tissue))
+    np.testing.assert_allclose(strings.lengths(strings.points), tissue.edge_lengths, rtol=1e-12)
+    np.testing.assert_allclose(strings.areas(strings.points), tissue.areas, rtol=1e-10)
+    np.testing.assert_allclose(strings.perimeters(strings.points), tissue.perimeters, rtol=1e-12)
 
 
-def test_arcs_become_chains_that_come_near_them():
-    plain = vx.initialise.free_voronoi(6, key=jax.random.key(3))
-    angles = 0.4 * np.cos(np.arange(plain.n_edges))
-    tissue = straight(plain, angles=angles, inner_arcs=True)
-    errors = []
-    for n in (8, 16):
-        pieces = Pieces.of(on_host(tissue), n)
-        errors.append(np.abs(pieces.areas(pieces.points) - np.asarray(tissue.areas)).max())
-        lengths = pieces.lengths(pieces.points)
-        assert np.abs(lengths - np.asarray(tissue.edge_lengths)).max() < 1e-2
-        found = pieces.angles(pieces.points, angles)
-        assert found is not None
-        assert np.abs(found - angles).max() < 2.0 / n**2
-    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+def test_arcs_are_refused():
+    cluster = on_host(vx.initialise.free_voronoi(6, key=jax.random.key(3)))
+    with pytest.raises(SimulatorError, match="this tissue has arcs"):
+        SurfaceEvolver().relax(cluster, energies(CLUSTER)["foam"], None)
 
 
 @pytest.mark.parametrize("name", ["all", "shape factors"])
@@ -90,9 +80,9 @@ def test_derivatives_are_those_of_the_energy(name):
     energy = energies(PERIODIC)[name]
     # (Numbers are parameters too.)
     energy = jax.tree.map(jnp.asarray, energy)
-    pieces = Pieces.of(on_host(PERIODIC), 8)
-    at = pieces.points
-    measures = (pieces.lengths(at), pieces.areas(at), pieces.perimeters(at))
+    strings = Strings.of(on_host(PERIODIC))
+    at = strings.points
+    measures = (strings.lengths(at), strings.areas(at), strings.perimeters(at))
     found = slope_of(on_host(energy), *measures, None)
     wanted = slopes(PERIODIC, energy)
     leaves = lambda tree: jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array_like))
@@ -120,7 +110,7 @@ def test_energies_that_cannot_be_told_are_refused():
         SurfaceEvolver().relax(on_host(PERIODIC), Odd(), None)
 
 
-@pytest.mark.parametrize("settings", [{"timeout": 0.0}, {"pieces": 0}, {"steps": -1}])
+@pytest.mark.parametrize("settings", [{"timeout": 0.0}, {"steps": -1}])
 def test_settings_are_checked(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         SurfaceEvolver(**settings)
@@ -214,6 +204,44 @@ def test_it_comes_to_rest_under_a_pull(tissue):
     left = forces(tissue.with_vertices(jnp.asarray(pulled.vertices)), energy) - pull
     assert jnp.abs(left).max() < 1e-7
     assert np.abs(pulled.vertices - first.vertices).max() > 1e-5
+
+
+def test_fixed_areas_are_for_free_tissues_with_targets():
+    program = SurfaceEvolver(areas="fixed")
+    with pytest.raises(SimulatorError, match="Fixed areas are for free tissues"):
+        program.relax(on_host(PERIODIC), on_host(energies(PERIODIC)["foam"]), None)
+    with pytest.raises(SimulatorError, match="add an AreaElasticity"):
+        program.relax(on_host(CLUSTER), vx.energies.LineTension(1.0), None)
+
+
+@needs_evolver
+def test_fixed_areas_are_held_and_have_pressures():
+    tissue = CLUSTER
+    energy = energies(tissue)["foam"]
+    soft = SurfaceEvolver().relax(on_host(tissue), on_host(energy), None)
+    tissue = tissue.with_vertices(jnp.asarray(soft.vertices))
+    areas = np.asarray(tissue.areas)
+    program = SurfaceEvolver(areas="fixed")
+    at_rest = lambda tension, areas: program.relax(
+        on_host(tissue),
+        on_host(
+            vx.energies.AreaElasticity(1.0, jnp.array(areas)) + vx.energies.LineTension(tension)
+        ),
+        None,
+    )
+    tension = 1.05 * energy.terms[1].tension
+    found = at_rest(tension, areas)
+    held = tissue.with_vertices(jnp.asarray(found.vertices)).areas
+    np.testing.assert_allclose(held, areas, atol=1e-9)
+    # The energy is differentiated where the vertices are, and the areas by their multipliers.
+    tensions = 1e-4 * np.cos(np.arange(tension.size))
+    swell = 1e-4 * np.eye(areas.size)[1]
+    for by, (first, second) in {"tension": (tensions, 0), "target_area": (0, swell)}.items():
+        up = at_rest(tension + first, areas + second).energy
+        down = at_rest(tension - first, areas - second).energy
+        term = found.slope.terms[by == "tension"]
+        slope = getattr(term, by) @ (first + second)
+        assert (up - down) / 2 == pytest.approx(slope, rel=1e-4)
 
 
 @needs_evolver

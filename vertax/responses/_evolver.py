@@ -13,7 +13,7 @@ from jaxtyping import Float
 from vertax._base.checks import check_number, check_whole
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.responses._evolver_model import Pieces, Terms, slope_of
+from vertax.responses._evolver_model import Strings, Terms, slope_of
 from vertax.responses._program import run_program, tail
 from vertax.responses._simulator import AbstractSimulator, Relaxed, SimulatorError
 
@@ -33,11 +33,8 @@ class SurfaceEvolver(AbstractSimulator):
 
     - `command`: the program.
     - `areas`: `"elastic"`, as the energy says, or `"fixed"` at the `target_area` of its `AreaElasticity`,
-        whose stiffness is infinite then, as in a foam. Then the energy does not describe the program: use
-        `External(..., slope="program", stiffness=...)`.
-    - `pieces`: into how many straight pieces an arc is cut. They move one by one, so that an edge is as
-        curved as the program wants it, and its length is theirs: again with `slope="program"`. Straight
-        edges stay whole.
+        whose stiffness is infinite then, as in a foam; of free tissues only. Then the energy does not
+        describe the program: use `External(..., slope="program", stiffness=...)`.
     - `tolerance`: the program has relaxed when a step lowers the energy by less than this share.
     - `steps`: of conjugate gradients to begin with, where a tissue is far from rest.
     - `newton_steps`: at most; 0 for conjugate gradients only, until the tolerance ends them.
@@ -50,7 +47,6 @@ class SurfaceEvolver(AbstractSimulator):
 
     command: str = "evolver"
     areas: Literal["elastic", "fixed"] = "elastic"
-    pieces: int = 8
     tolerance: float = 1e-14
     steps: int = 20
     newton_steps: int = 40
@@ -63,7 +59,6 @@ class SurfaceEvolver(AbstractSimulator):
             )
         for name in ("tolerance", "timeout"):
             check_number(name, getattr(self, name), above=0)
-        check_whole("pieces", self.pieces, least=1)
         check_whole("steps", self.steps, least=0)
         check_whole("newton_steps", self.newton_steps, least=0)
 
@@ -80,19 +75,26 @@ class SurfaceEvolver(AbstractSimulator):
         - [`SimulatorError`][vertax.responses.SimulatorError], with the tail of the log, if the program fails,
             and for an energy that it cannot be told of.
         """
-        pieces = Pieces.of(tissue, self.pieces)
-        terms = Terms.of(energy, pieces.n_cells, len(pieces.cells))
+        strings = Strings.of(tissue)
+        terms = Terms.of(energy, strings.n_cells, len(strings.cells))
         fixed = self.areas == "fixed"
-        held = range(pieces.n_cells) if fixed else ()
-        if fixed:  # whatever the stiffness is
-            terms = terms._replace(area_stiffness=np.zeros(pieces.n_cells))
-        text = datafile(pieces, terms, forces, fixed=fixed)
-        points, pressures, numbers = self._run(text, self._commands(pieces) + _report(held), pieces)
-        vertices = points[: pieces.n_vertices] + pieces.images @ pieces.lattice
-        measures = (pieces.lengths(points), pieces.areas(points), pieces.perimeters(points))
+        held = range(strings.n_cells) if fixed else ()
+        if fixed and strings.periodic:
+            raise SimulatorError(
+                "Fixed areas are for free tissues: those of a periodic one add up to its box."
+            )
+        if fixed and not terms.area_stiffness.any():
+            raise SimulatorError(
+                "Areas that are fixed need targets: add an AreaElasticity to the energy, of any stiffness."
+            )
+        if fixed:
+            terms = terms._replace(area_stiffness=np.zeros(strings.n_cells))
+        text = datafile(strings, terms, forces, fixed=fixed)
+        points, pressures, numbers = self._run(text, self._commands() + _report(held), strings)
+        vertices = points + strings.images @ strings.lattice
+        measures = (strings.lengths(points), strings.areas(points), strings.perimeters(points))
         return Relaxed(
             vertices,
-            angles=pieces.angles(points, tissue.angles),
             energy=numbers["energy"],
             num_steps=int(numbers["steps"]),
             slope=slope_of(energy, *measures, pressures if fixed else None),
@@ -107,20 +109,20 @@ class SurfaceEvolver(AbstractSimulator):
 
         **Returns:** its energy.
         """
-        pieces = Pieces.of(tissue, self.pieces)
-        terms = Terms.of(energy, pieces.n_cells, len(pieces.cells))
-        text = datafile(pieces, terms, None, fixed=False)
-        return self._run(text, "steps_done := 0;\nrecalc;\n" + _report(), pieces)[2]["energy"]
+        strings = Strings.of(tissue)
+        terms = Terms.of(energy, strings.n_cells, len(strings.cells))
+        text = datafile(strings, terms, None, fixed=False)
+        return self._run(text, "steps_done := 0;\nrecalc;\n" + _report(), strings)[2]["energy"]
 
     def _run(
-        self, text: str, commands: str, pieces: Pieces
+        self, text: str, commands: str, strings: Strings
     ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
         command = [self.command, "-i", "-frelax.cmd", "tissue.fe"]
         files = {"tissue.fe": text, "relax.cmd": commands}
         found, log = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
-        return _read(found["result"], pieces, log)
+        return _read(found["result"], strings, log)
 
-    def _commands(self, pieces: Pieces) -> str:
+    def _commands(self) -> str:
         """How it relaxes: conjugate gradients, and then Newton's method with a search along each step."""
         # (With this toggle on, as it is, the index of the Hessian is wrong and its steps stall.)
         lines = ["function_quantity_sparse off;", "hessian_normal off;"]
@@ -150,7 +152,7 @@ INSTALL = (
 def _report(held: Sequence[int] = ()) -> str:
     """Commands that write where all points are, and the multipliers of areas held; and end the program."""
     lines = [
-        'printf "energy %.17g\\n", total_energy-nudge.value-glide.value >> "result";',
+        'printf "energy %.17g\\n", total_energy-nudge.value >> "result";',
         'printf "steps %g\\n", steps_done >> "result";',
         'foreach vertex vv do printf "point %d %.17g %.17g\\n", vv.id, vv.x, vv.y >> "result";',
         *(f'printf "pressure {c} %.17g\\n", keep_{c}.pressure >> "result";' for c in held),
@@ -158,76 +160,66 @@ def _report(held: Sequence[int] = ()) -> str:
     return "\n".join([*lines, 'printf "end\\n" >> "result";', "quit", "quit", ""])
 
 
+_OF_VERTICES = ("pull_x", "pull_y", "arm_x", "arm_y")
+
+
 def datafile(
-    pieces: Pieces, terms: Terms, forces: Float[np.ndarray, "vertices 2"] | None, *, fixed: bool
+    strings: Strings, terms: Terms, forces: Float[np.ndarray, "vertices 2"] | None, *, fixed: bool
 ) -> str:
     """A tissue, its energy and a nudge in the language of Surface Evolver."""
     lines = ["STRING", "SPACE_DIMENSION 2", "KEEP_ORIGINALS"]
-    if pieces.periodic:
-        lines += ["TORUS", "PERIODS", *(f"{a:.17g} {b:.17g}" for a, b in pieces.lattice)]
-    lines += [
-        f"define {kind} attribute {name} real"
-        for kind, names in (("vertex", ("pull_x", "pull_y", "arm_x", "arm_y", "glide_x", "glide_y", "home_x", "home_y")), ("edge", ("gam",)))
-        for name in names
-    ]
-    length = f"sqrt(x3^2+x4^2+{pieces.softening**2:.17g})"
+    if strings.periodic:
+        lines += ["TORUS", "PERIODS", *(f"{a:.17g} {b:.17g}" for a, b in strings.lattice)]
+    lines += [f"define vertex attribute {name} real" for name in _OF_VERTICES]
+    lines.append("define edge attribute gam real")
+    length = f"sqrt(x3^2+x4^2+{strings.softening**2:.17g})"
     lines.append(
         f"quantity tensions energy method edge_general_integral scalar_integrand: gam*{length}"
     )
-    of_piece: list[list[str]] = [["tensions"] for _ in pieces.ends]
-    _areas(lines, of_piece, pieces, terms, fixed)
-    _perimeters(lines, of_piece, pieces, terms, length)
-    points, arms = pieces.points, np.zeros_like(pieces.points)
+    of_edge: list[list[str]] = [["tensions"] for _ in strings.ends]
+    _areas(lines, of_edge, strings, terms, fixed)
+    _perimeters(lines, of_edge, strings, terms, length)
+    points, arms = strings.points, np.zeros_like(strings.points)
     pulls = np.zeros_like(points)
     if forces is not None:
-        pulls[: pieces.n_vertices] = forces
+        pulls[:] = forces
     lines.append(
         "quantity nudge energy method vertex_scalar_integral scalar_integrand: -(pull_x*x+pull_y*y)"
     )
-    held = _springs(lines, pieces, terms, arms)
-    # Points on an arc glide along it at no cost, which makes the Hessian singular: a stiff spring lets them
-    # move across it only.
-    glides = pieces.tangents()
-    lines.append(
-        "quantity glide energy method vertex_scalar_integral scalar_integrand: "
-        f"{0.5 * _stiffness(pieces, terms):.17g}*(glide_x*(x-home_x)+glide_y*(y-home_y))^2"
-    )
+    held = _springs(lines, strings, terms, arms)
     lines.append("vertices")
     names = " ".join(["nudge", *held])
-    pinned = set(pieces.fixed.tolist())
+    pinned = set(strings.fixed.tolist())
     for i, ((x, y), (px, py), (ax, ay)) in enumerate(zip(points, pulls, arms, strict=True)):
-        gx, gy = glides[i]
-        on_arc = "glide" if i >= pieces.n_vertices else ""
         fix = " fixed" if i in pinned else ""
         lines.append(
             f"{i + 1} {x:.17g} {y:.17g}{fix} pull_x {px:.17g} pull_y {py:.17g} arm_x {ax:.17g} "
-            f"arm_y {ay:.17g} glide_x {gx:.17g} glide_y {gy:.17g} home_x {x:.17g} home_y {y:.17g} "
-            f"{names} {on_arc}"
+            f"arm_y {ay:.17g} {names}"
         )
     lines.append("edges")
     sign = {0: "*", 1: "+", -1: "-"}
-    for i, ((a, b), wrap) in enumerate(zip(pieces.ends, pieces.wraps, strict=True)):
-        around = " " + " ".join(sign[int(w)] for w in wrap) if pieces.periodic else ""
-        gamma = terms.tension[pieces.edge[i]]
+    for i, ((a, b), wrap) in enumerate(zip(strings.ends, strings.wraps, strict=True)):
+        around = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
+        gamma = terms.tension[i]
         lines.append(
-            f"{i + 1} {a + 1} {b + 1}{around} density 0 gam {gamma:.17g} {' '.join(of_piece[i])}"
+            f"{i + 1} {a + 1} {b + 1}{around} density 0 gam {gamma:.17g} {' '.join(of_edge[i])}"
         )
     return "\n".join([*lines, "read", ""])
 
 
 def _areas(
-    lines: list[str], of_piece: list[list[str]], pieces: Pieces, terms: Terms, fixed: bool
+    lines: list[str], of_edge: list[list[str]], strings: Strings, terms: Terms, fixed: bool
 ) -> None:
     """A quantity for the area of each cell that wants one."""
-    wanted = np.full(pieces.n_cells, True) if fixed else terms.area_stiffness != 0
+    wanted = np.full(strings.n_cells, True) if fixed else terms.area_stiffness != 0
     instances: dict[tuple, str] = {}
     parts: dict[int, list[str]] = {}
-    for i, e in enumerate(pieces.edge):
+    for e in range(len(strings.ends)):
         for side, sign in ((0, 1), (1, -1)):
-            cell = int(pieces.cells[e, side])
-            if cell == pieces.n_cells or not wanted[cell]:
+            cell = int(strings.cells[e, side])
+            if cell == strings.n_cells or not wanted[cell]:
                 continue
-            x, y = pieces.shifts[e, side]
+            x, y = strings.shifts[e, side]
             key = (cell, sign, round(float(x), 9), round(float(y), 9))
             if key not in instances:
                 # Half the integral of x dy - y dx, as the cell sees the edge.
@@ -237,7 +229,7 @@ def _areas(
                     f"method_instance {name} method edge_vector_integral vector_integrand: "
                     f"q1: {-0.5 * sign:g}*(y+({y:.17g})) q2: {0.5 * sign:g}*(x+({x:.17g}))"
                 )
-            of_piece[i].append(instances[key])
+            of_edge[e].append(instances[key])
     for cell, some in parts.items():
         area = "+".join(f"{name}.value" for name in some)
         target = terms.area[cell]
@@ -253,7 +245,7 @@ def _areas(
 
 
 def _perimeters(
-    lines: list[str], of_piece: list[list[str]], pieces: Pieces, terms: Terms, length: str
+    lines: list[str], of_edge: list[list[str]], strings: Strings, terms: Terms, length: str
 ) -> None:
     """A quantity for the perimeter of each cell that wants one."""
     for cell in np.flatnonzero(terms.perimeter_stiffness):
@@ -266,21 +258,21 @@ def _perimeters(
             f"{0.5 * k:.17g}*(around_{cell}.value-({target:.17g}))^2"
         )
     wanted = set(np.flatnonzero(terms.perimeter_stiffness).tolist())
-    for i, e in enumerate(pieces.edge):
-        of_piece[i] += [f"around_{c}" for c in pieces.cells[e].tolist() if c in wanted]
+    for e in range(len(strings.ends)):
+        of_edge[e] += [f"around_{c}" for c in strings.cells[e].tolist() if c in wanted]
 
 
 def _springs(
-    lines: list[str], pieces: Pieces, terms: Terms, arms: Float[np.ndarray, "points 2"]
+    lines: list[str], strings: Strings, terms: Terms, arms: Float[np.ndarray, "points 2"]
 ) -> list[str]:
     """Springs that hold the whole where it is; they change no shape, and make the Hessian regular."""
-    points, n = pieces.points, len(pieces.points)
-    k = _stiffness(pieces, terms)
+    points, n = strings.points, len(strings.points)
+    k = _stiffness(strings, terms)
     modes = {}
-    if len(pieces.fixed) == 0:
+    if len(strings.fixed) == 0:
         modes |= {"x": "x", "y": "y"}
-    centre = points.mean(axis=0) if len(pieces.fixed) == 0 else points[pieces.fixed[0]]
-    if not pieces.periodic and len(pieces.fixed) <= 1:
+    centre = points.mean(axis=0) if len(strings.fixed) == 0 else points[strings.fixed[0]]
+    if not strings.periodic and len(strings.fixed) <= 1:
         arms[:] = (points - centre) / np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1)))
         modes |= {"turn": "arm_x*y-arm_y*x"}
     at = {
@@ -299,9 +291,9 @@ def _springs(
     return [f"sum_{name}" for name in modes]
 
 
-def _stiffness(pieces: Pieces, terms: Terms) -> float:
+def _stiffness(strings: Strings, terms: Terms) -> float:
     """A typical second derivative of the energy."""
-    size = np.abs(pieces.areas(pieces.points)).mean()
+    size = np.abs(strings.areas(strings.points)).mean()
     return max(
         float(np.mean(np.abs(terms.tension))) / np.sqrt(size),
         float(np.mean(terms.area_stiffness)) * size,
@@ -309,10 +301,10 @@ def _stiffness(pieces: Pieces, terms: Terms) -> float:
     )
 
 
-def _read(text: str, pieces: Pieces, log: str) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+def _read(text: str, strings: Strings, log: str) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Points, pressures (of areas that are held) and numbers that the program wrote."""
-    points = np.full_like(pieces.points, np.nan)
-    pressures = np.full(pieces.n_cells, np.nan)
+    points = np.full_like(strings.points, np.nan)
+    pressures = np.zeros(strings.n_cells)
     numbers: dict[str, float] = {}
     lines = text.splitlines()
     try:

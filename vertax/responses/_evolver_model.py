@@ -1,4 +1,4 @@
-"""Tissues and energies as Surface Evolver knows them: points, straight pieces, and named quantities."""
+"""Tissues and energies as Surface Evolver knows them: points, strings, and named quantities."""
 
 from __future__ import annotations
 
@@ -20,17 +20,15 @@ from vertax.mesh import Periodic, Tissue
 from vertax.responses._simulator import Edges, SimulatorError
 
 
-class Pieces(NamedTuple):
-    """A tissue as points and straight pieces between them; in a periodic one, in the home box."""
+class Strings(NamedTuple):
+    """A tissue as points and straight strings between them; in a periodic one, in the home box."""
 
-    points: Float[np.ndarray, "points 2"]
-    """The vertices, and then points on arcs."""
+    points: Float[np.ndarray, "vertices 2"]
     images: Int[np.ndarray, "vertices 2"]
     """In which image of the box each vertex is."""
-    ends: Int[np.ndarray, "pieces 2"]
-    wraps: Int[np.ndarray, "pieces 2"]
-    edge: Int[np.ndarray, " pieces"]
-    """The edge that each piece belongs to."""
+    ends: Int[np.ndarray, "edges 2"]
+    wraps: Int[np.ndarray, "edges 2"]
+    """How often each edge goes around the box."""
     cells: Int[np.ndarray, "edges 2"]
     shifts: Float[np.ndarray, "edges 2 2"]
     """What to add to the first vertex of an edge to see it in the frame of the cell on either side."""
@@ -41,8 +39,13 @@ class Pieces(NamedTuple):
     fixed: Int[np.ndarray, " _"]
 
     @classmethod
-    def of(cls, tissue: Tissue, pieces: int) -> Pieces:
-        """Those of a tissue; arcs become so many pieces."""
+    def of(cls, tissue: Tissue) -> Strings:
+        """Those of a tissue."""
+        if tissue.arcs is not None:
+            raise SimulatorError(
+                "Surface Evolver is given straight edges only, and this tissue has arcs. Make one without: "
+                "vertax.Tissue(tissue.vertices, tissue.topology, tissue.boundary)."
+            )
         edges = Edges.of(tissue)
         vertices = np.asarray(tissue.vertices, float)
         periodic = isinstance(tissue.boundary, Periodic)
@@ -58,36 +61,16 @@ class Pieces(NamedTuple):
         first, last = edges.ends.T
         wraps = across + images[last] - images[first]
         shifts = edges.shifts + (images[first] @ lattice)[:, None]
-        angles = np.zeros(len(edges.ends))
-        if tissue.arcs is not None:
-            on_outline = edges.cells[:, 1] == edges.n_cells
-            arc = np.full(len(angles), True) if tissue.arcs.inner else on_outline
-            angles = np.where(arc, np.asarray(tissue.arcs.angles, float), 0)
-            chains = np.where(arc, pieces, 1)
-        else:
-            chains = np.ones(len(angles), int)
-        vectors = home[last] + wraps @ lattice - home[first]
-        added, ends, steps, of_edge = [home], [], [], []
-        n_points = len(home)
-        for e, n in enumerate(chains.tolist()):
-            inner = np.arange(n_points, n_points + n - 1)
-            added.append(_on_arc(home[first[e]], vectors[e], angles[e], n))
-            course = np.concatenate([[first[e]], inner, [last[e]]])
-            ends.append(np.stack([course[:-1], course[1:]], axis=-1))
-            steps.append(np.concatenate([np.zeros((n - 1, 2), int), wraps[e][None]]))
-            of_edge.append(np.full(n, e))
-            n_points += n - 1
         if np.abs(wraps).max(initial=0) > 1:
             raise SimulatorError(
                 "An edge is longer than the periodic box, which Surface Evolver's datafiles cannot say."
             )
         pinned = () if tissue.pinned is None else np.flatnonzero(np.asarray(tissue.pinned))
         return cls(
-            np.concatenate(added),
+            home,
             images,
-            np.concatenate(ends),
-            np.concatenate(steps),
-            np.concatenate(of_edge),
+            edges.ends,
+            wraps,
             edges.cells,
             shifts,
             lattice,
@@ -97,84 +80,26 @@ class Pieces(NamedTuple):
             np.asarray(pinned, int),
         )
 
-    @property
-    def n_vertices(self) -> int:
-        """Number of points that are vertices."""
-        return len(self.images)
-
-    def lengths(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " edges"]:
+    def lengths(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, " edges"]:
         """Length of each edge."""
         d = self._vectors(points)
-        lengths = np.sqrt(np.sum(d**2, axis=1) + self.softening**2)
-        return np.bincount(self.edge, lengths, minlength=len(self.cells))
+        return np.sqrt(np.sum(d**2, axis=1) + self.softening**2)
 
-    def perimeters(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " cells"]:
+    def perimeters(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, " cells"]:
         """Perimeter of each cell."""
         lengths = np.repeat(self.lengths(points), 2)
         return np.bincount(self.cells.ravel(), lengths, self.n_cells + 1)[: self.n_cells]
 
-    def areas(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " cells"]:
+    def areas(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, " cells"]:
         """Area of each cell."""
         d = self._vectors(points)
-        corners = points[self.ends[:, 0], None] + self.shifts[self.edge]
+        corners = points[self.ends[:, 0], None] + self.shifts
         shares = corners[..., 0] * d[:, None, 1] - corners[..., 1] * d[:, None, 0]
         shares = (0.5 * shares * [1, -1]).ravel()
-        return np.bincount(self.cells[self.edge].ravel(), shares, self.n_cells + 1)[: self.n_cells]
+        return np.bincount(self.cells.ravel(), shares, self.n_cells + 1)[: self.n_cells]
 
-    def _vectors(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "pieces 2"]:
+    def _vectors(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, "edges 2"]:
         return points[self.ends[:, 1]] + self.wraps @ self.lattice - points[self.ends[:, 0]]
-
-    def tangents(self) -> Float[np.ndarray, "points 2"]:
-        """The direction of the arc at each point that lies on one; 0 at vertices."""
-        d = self._vectors(self.points)
-        d = d / np.linalg.norm(d, axis=1, keepdims=True)
-        tangents = np.zeros_like(self.points)
-        for side in (0, 1):
-            np.add.at(tangents, self.ends[:, side], 0.5 * d)
-        tangents[: self.n_vertices] = 0
-        return tangents
-
-    def angles(
-        self, points: Float[np.ndarray, "points 2"], old: Any
-    ) -> Float[np.ndarray, " edges"] | None:
-        """The angle of the arc that bulges as far as each chain does in its middle."""
-        if old is None:
-            return None
-        angles = np.array(old, float)
-        for e in np.flatnonzero(np.bincount(self.edge) > 1):
-            which = np.flatnonzero(self.edge == e)
-            course = np.concatenate([points[self.ends[which, 0]], points[self.ends[which[-1:], 1]]])
-            course[-1] += self.wraps[which[-1]] @ self.lattice
-            rest = course - course[0]
-            bulge = 0.5 * np.sum(rest[:-1, 0] * rest[1:, 1] - rest[:-1, 1] * rest[1:, 0])
-            angles[e] = _angle_of(bulge / np.sum(rest[-1] ** 2))
-        return angles
-
-
-def _on_arc(
-    start: np.ndarray, vector: np.ndarray, angle: float, n: int
-) -> Float[np.ndarray, "inner 2"]:
-    """Points that part an arc into so many equal pieces."""
-    t = np.arange(1, n)[:, None] / n
-    right = np.array([vector[1], -vector[0]])
-    if abs(angle) < 1e-6:
-        return start + t * vector + 2 * angle * t * (1 - t) * right
-    phi = angle * (2 * t - 1)
-    along = 0.5 + 0.5 * np.sin(phi) / np.sin(angle)
-    return start + along * vector + (np.cos(phi) - np.cos(angle)) / (2 * np.sin(angle)) * right
-
-
-def _angle_of(share: float) -> float:
-    """The angle of an arc whose segment has a share of the square of its chord as area."""
-    # Newton's method on (α - sin α cos α) / (4 sin² α) would meet 0/0; bisection does not care.
-    function = lambda a: (
-        (a - np.sin(a) * np.cos(a)) / (4 * np.sin(a) ** 2) if abs(a) > 1e-4 else a / 6
-    )
-    low, high = -0.98 * np.pi, 0.98 * np.pi
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if function(middle) < share else (low, middle)
-    return 0.5 * (low + high)
 
 
 class Terms(NamedTuple):

@@ -21,7 +21,7 @@ from vertax.adjoints._propagation import two_phases
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units, cell_size, units_of
 from vertax.mesh import Tissue
-from vertax.responses._host import Answer, Job, Request, ask
+from vertax.responses._host import Answer, Job, Request, ask, stacked
 from vertax.responses._relaxation import free_motions
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
@@ -234,7 +234,7 @@ class External(AbstractResponse):
             answers, reason = ask(jobs, workers, self.processes, throw)
             if throw and reason is not None:
                 raise reason
-            return _stacked(answers, requests, wanted, batch)
+            return stacked(answers, requests, wanted, batch)
 
         answer = jax.pure_callback(host, wanted, *leaves, vmap_method="broadcast_all")
         return answer._replace(topology=eqx.combine(answer.topology, fixed))
@@ -249,37 +249,6 @@ _REASON = (
     "not small beside the nudge. Let it relax further, raise `beta`, or allow it with "
     "EquilibriumPropagation(throw=False)."
 )
-
-
-def _stacked(
-    answers: list[Answer | None], requests: list[Request], wanted: Answer, batch: tuple[int, ...]
-) -> Answer:
-    """The answers of a batch as JAX expects them; NaN where there is none."""
-    structure = jax.tree.structure(wanted)
-    like = jax.tree.leaves(wanted)
-
-    def leaves(answer: Answer | None, request: Request) -> list[Any]:
-        if answer is None:
-            nothing = [
-                np.full(x.shape, np.nan if x.dtype.kind == "f" else 0, x.dtype) for x in like
-            ]
-            empty = jax.tree.unflatten(structure, nothing)
-            # An index that is none would be worse than a position.
-            answer = empty._replace(topology=eqx.filter(request.tissue.topology, _is_array))
-        else:
-            answer = answer._replace(topology=eqx.filter(answer.topology, _is_array))
-        return jax.tree.leaves(answer)
-
-    rows = [leaves(*pair) for pair in zip(answers, requests, strict=True)]
-    columns = [
-        np.stack([np.asarray(row[i]) for row in rows]).astype(x.dtype).reshape((*batch, *x.shape))
-        for i, x in enumerate(like)
-    ]
-    return jax.tree.unflatten(structure, columns)
-
-
-def _is_array(x: Any) -> bool:
-    return isinstance(x, np.ndarray) or eqx.is_array(x)
 
 
 @eqx.filter_jit

@@ -61,7 +61,7 @@ class Job(NamedTuple):
         said = self.simulator.relax(tissue, energy, forces)
         said = said if isinstance(said, Relaxed) else Relaxed(said)
         vertices = _array("vertices", said.vertices, np.shape(tissue.vertices))
-        angles = tissue.angles
+        angles = None if tissue.arcs is None else tissue.arcs.angles
         if said.angles is not None:
             if angles is None:
                 raise SimulatorError("The program returned `angles`, but the tissue has no arcs.")
@@ -114,6 +114,33 @@ def ask(
         found = [one(job) for job in asked]
     answers = iter(found)
     return [next(answers) if ok else None for ok in sound], reasons[0] if reasons else None
+
+
+def stacked(
+    answers: list[Answer | None], requests: list[Request], wanted: Answer, batch: tuple[int, ...]
+) -> Answer:
+    """The answers of a batch as JAX expects them; NaN where there is none."""
+    structure = jax.tree.structure(wanted)
+    like = jax.tree.leaves(wanted)
+
+    def leaves(answer: Answer | None, request: Request) -> list[Any]:
+        if answer is None:
+            nothing = [
+                np.full(x.shape, np.nan if x.dtype.kind == "f" else 0, x.dtype) for x in like
+            ]
+            empty = jax.tree.unflatten(structure, nothing)
+            # An index that is none would be worse than a position.
+            answer = empty._replace(topology=eqx.filter(request.tissue.topology, _numeric))
+        else:
+            answer = answer._replace(topology=eqx.filter(answer.topology, _numeric))
+        return jax.tree.leaves(answer)
+
+    rows = [leaves(*pair) for pair in zip(answers, requests, strict=True)]
+    columns = [
+        np.stack([np.asarray(row[i]) for row in rows]).astype(x.dtype).reshape((*batch, *x.shape))
+        for i, x in enumerate(like)
+    ]
+    return jax.tree.unflatten(structure, columns)
 
 
 def _as_error(error: Exception) -> SimulatorError:
@@ -169,7 +196,9 @@ def _differences(job: Job, tissue: Tissue, energy: Any) -> PyTree[np.ndarray]:
 
 def _there(tissue: Tissue, topology: Any, vertices: np.ndarray, angles: Any) -> Tissue:
     there = eqx.tree_at(lambda t: (t.vertices, t.topology), tissue, (vertices, topology))
-    return there if angles is None else there.with_angles(angles)
+    if angles is None:
+        return there
+    return eqx.tree_at(lambda t: t.arcs.angles, there, angles)
 
 
 def _array(name: str, value: Any, shape: tuple[int, ...]) -> Shaped[np.ndarray, "..."]:

@@ -1,8 +1,9 @@
 """Find the line tensions of a foam from its shape, with Surface Evolver as the only forward model.
 
-A periodic foam with elastic areas (the paper's energy E2) rests under tensions drawn at random. From where its
-vertices are they are found again: by equilibrium propagation, for which the program relaxes it once an epoch,
-and twice under a weak force. The same fit with vertax's own equilibrium, and an implicit gradient, stands beside it.
+A periodic foam with elastic areas (the paper's energy E2) rests under tensions drawn at random. From where
+its vertices are they are found again: by equilibrium propagation, for which the program relaxes it once an
+epoch, and twice under a weak force. The same fit with vertax's own equilibrium, and an implicit gradient,
+stands beside it.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     external = External(program)
     ways = {
         "Surface Evolver": (external, EquilibriumPropagation()),
-        "vertax": (Relaxation(transitions=None), ImplicitDifferentiation()),
+        "vertax": (Relaxation(transitions=None, contact_range=None), ImplicitDifferentiation()),
     }
     # (Where the program has run before, in a test, say.)
     runs, seconds = external.ledger.runs, external.ledger.seconds
@@ -135,6 +136,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
             f"pearson_{label}": pearson(found, np.asarray(true)),
             f"cost_{label}": history.cost[best],
             f"seconds_{label}": history.seconds.sum(),
+            f"seconds_of_an_epoch_{label}": np.median(history.seconds),
             f"gradient_residual_{label}": np.nanmax(history.gradient_residual),
         }
     metrics |= {

@@ -32,13 +32,15 @@ def recovery(
     **Returns:** the figure.
     """
     figure, (axes,) = new_figure(1, 3, width=[2.3, 2.3, 2.7], height=2.4, room=0.7)
-    plot_tissues({"the foam": target}, axes=axes[:1], edges=[true], label="true tension")
+    plot_tissues({"the foam": target}, axes=axes[:1], edges=[true], edge_label="true tension")
     colours = series_colours(found)
     axes[1].axline((true.mean(), true.mean()), slope=1, color=INK, lw=0.7)
-    marks = {name: mark for name, mark in zip(found, ("o", "x"), strict=False)}
+    marks = dict(zip(found, ("o", "x"), strict=False))
     for name, values in found.items():
         filled = {"mfc": "none"} if marks[name] == "o" else {}
-        axes[1].plot(true, values, marks[name], ms=4, mew=0.8, color=colours[name], label=name, **filled)
+        axes[1].plot(
+            true, values, marks[name], ms=4, mew=0.8, color=colours[name], label=name, **filled
+        )
     axes[1].set(xlabel="true tension", ylabel="tension found")
     for name, history in histories.items():
         solid = "-" if marks[name] == "o" else (0, (3, 3))
