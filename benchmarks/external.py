@@ -30,9 +30,9 @@ class Program(AbstractSimulator):
     def __init__(self) -> None:
         self.evolver = SurfaceEvolver()
 
-    def relax(self, *args: Any) -> Relaxed:
+    def relax(self, tissue: Any, energy: Any, forces: Any) -> Relaxed:
         """As the program does."""
-        return self.evolver.relax(*args)
+        return self.evolver.relax(tissue, energy, forces)
 
 
 def compared(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:

@@ -261,7 +261,7 @@ def test_moduli_of_all_tissues_and_their_means():
 def test_tensions_through_another_program_are_beside_those_through_vertax(tissue):
     true = RNG.uniform(0.2, 0.4, tissue.n_edges)
     found = {"Surface Evolver": true + 0.01, "vertax": true}
-    errors = {name: SimpleNamespace(relative_error=np.geomspace(0.1, 0.01, 5)) for name in found}
+    errors = dict.fromkeys(found, np.geomspace(0.1, 0.01, 5))
     foam, recovered, history = panels(external.recovery(tissue, true, found, errors))
     del foam
     lines = [line for line in recovered.lines if len(line.get_xdata()) == tissue.n_edges]

@@ -148,8 +148,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     columns |= {f"found_{name.split()[-1].lower()}": values for name, values in tensions.items()}
     folder.save_table("edges", columns)
     folder.save_tissue("target", target)
-    histories = {name: fit.history for name, fit in fits.items()}
-    folder.save_figure("recovery", figures.recovery(target, np.asarray(true), tensions, histories))
+    errors = {name: fit.history.relative_error for name, fit in fits.items()}
+    folder.save_figure("recovery", figures.recovery(target, np.asarray(true), tensions, errors))
     return metrics
 
 

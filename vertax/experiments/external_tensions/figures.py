@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from vertax.fitting import History
 from vertax.mesh import Tissue
 from vertax.plotting import INK, house_style, new_figure, plot_tissues, series_colours
 
@@ -18,7 +17,7 @@ def recovery(
     target: Tissue,
     true: Float[np.ndarray, " edges"],
     found: Mapping[str, Float[np.ndarray, " edges"]],
-    histories: Mapping[str, History],
+    errors: Mapping[str, Float[np.ndarray, " epochs"]],
 ) -> Figure:
     """The foam, tensions against the true ones, and errors against epochs, by forward model.
 
@@ -27,7 +26,7 @@ def recovery(
     - `target`: the foam whose shape is known.
     - `true`: its tensions.
     - `found`: tensions by the name of the forward model.
-    - `histories`: of the fits, by the same names.
+    - `errors`: mean relative error of each epoch, by the same names.
 
     **Returns:** the figure.
     """
@@ -42,9 +41,9 @@ def recovery(
             true, values, marks[name], ms=4, mew=0.8, color=colours[name], label=name, **filled
         )
     axes[1].set(xlabel="true tension", ylabel="tension found")
-    for name, history in histories.items():
+    for name, values in errors.items():
         solid = "-" if marks[name] == "o" else (0, (3, 3))
-        axes[2].semilogy(history.relative_error, color=colours[name], ls=solid, label=name)
+        axes[2].semilogy(values, color=colours[name], ls=solid, label=name)
     axes[2].set(xlabel="epoch", ylabel="mean relative error")
     axes[2].legend()
     return figure
