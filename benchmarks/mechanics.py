@@ -2,8 +2,8 @@
 
     python benchmarks/mechanics.py [--cells 100 1000] [--modes 20]
 
-Printed are the seconds (the best of three, without compiling) of the elastic tensor, relaxed and affine, of its
-gradient with respect to all target shape factors as a share of that, and of the softest modes.
+Printed are the seconds (the best of three, without compiling) of the elastic tensor, relaxed and affine,
+of its gradient with respect to all target shape factors as a share of that, and of the softest modes.
 """
 
 import argparse

@@ -73,6 +73,7 @@ def hypergradient_against_differences(cost, rtol, **options):
     assert found.outcome.trusted
 
 
+@pytest.mark.slow
 def test_hypergradient_of_stresses():
     hypergradient_against_differences(CHEAP[0] + 0.5 * CHEAP[1], 1e-6)
 

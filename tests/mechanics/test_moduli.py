@@ -111,6 +111,7 @@ def test_the_mean_over_directions(disordered):
     assert np.ptp(along) > 1e-3
 
 
+@pytest.mark.slow
 def test_derivatives_of_relaxed_moduli_against_differences(disordered):
     tissue, energy = disordered
     weights = jnp.array([[1.0, 0.3, -0.4], [0.3, -0.8, 0.5], [-0.4, 0.5, 2.0]])

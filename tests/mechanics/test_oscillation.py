@@ -46,6 +46,7 @@ def test_plateaus_of_the_hexagonal_lattice(lattice):
     )
 
 
+@pytest.mark.slow
 def test_viscosity_of_perimeters_against_a_dense_solution(lattice):
     # A disordered configuration of as many cells, so that nothing vanishes by symmetry.
     tissue = random_tissue(16, 3)

@@ -1,10 +1,10 @@
 """Moduli of disordered tissues against the target shape factor.
 
-Independent random tissues with one target shape factor in all cells are relaxed in a square box. Measured are the
-relaxed and the affine shear modulus and the bulk modulus, and the tension that the tissue has. The shear
-modulus vanishes where the tissue becomes fluid (Bi et al. 2015, doi:10.1038/nphys3471; Merkel & Manning 2018,
-doi:10.1088/1367-2630/aaaa13); the affine one does not, since what vanishes is the resistance to motions of the
-vertices.
+Independent random tissues with one target shape factor in all cells are relaxed in a square box.
+Measured are the relaxed and the affine shear modulus and the bulk modulus, and the tension that the
+tissue has. The shear modulus vanishes where the tissue becomes fluid (Bi et al. 2015,
+doi:10.1038/nphys3471; Merkel & Manning 2018, doi:10.1088/1367-2630/aaaa13); the affine one does not,
+since what vanishes is the resistance to motions of the vertices.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     - `folder`: where the results go.
     - `progress`: show a progress bar (only on a terminal).
 
-    **Returns:** the metrics: mean moduli at each shape factor, the share of solid tissues, and the shape factor
-    at which half of them are.
+    **Returns:** the metrics: mean moduli at each shape factor, the share of solid tissues, and the shape
+    factor at which half of them are.
     """
     began = time.perf_counter()
     response = config.relaxation.build()
