@@ -66,7 +66,7 @@ class Drawing(eqx.Module):
             # The margin keeps a centroid on the side of the box (a regular lattice, say) from
             # jumping to the other side by rounding. A cell of area 0 has no centroid and stays put.
             fractions = np.nan_to_num(fractions, posinf=0, neginf=0)
-            image = -np.floor(fractions + 1e-6).astype(int)
+            image[: tissue.n_cells] = -np.floor(fractions + 1e-6).astype(int)
             if near is not None:
                 # A cell that was not there before is in the home box.
                 known = np.flatnonzero(np.isfinite(near).all(axis=1))

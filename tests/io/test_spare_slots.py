@@ -1,0 +1,50 @@
+"""Tissues with spare slots in files and pictures."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from helpers import random_tissue
+from matplotlib.collections import PolyCollection
+
+import vertax as vx
+
+
+@pytest.fixture(scope="module")
+def tissue():
+    roomy = random_tissue(6, 3, lloyd_steps=2).with_capacity(9)
+    divided = vx.transitions.divide(roomy, 2).tissue
+    return vx.transitions.remove(divided, 0).tissue
+
+
+def test_files_keep_them_bit_for_bit(tissue, tmp_path):
+    vx.save_tissue(tmp_path / "tissue.npz", tissue)
+    assert eqx.tree_equal(vx.load_tissue(tmp_path / "tissue.npz"), tissue)
+    trajectory = vx.responses.Trajectory()
+    for frame in (random_tissue(6, 3).with_capacity(9), tissue):
+        trajectory.append(frame, time=0.0)
+    vx.io.save_trajectory(tmp_path / "movie.npz", trajectory)
+    assert eqx.tree_equal(vx.io.load_trajectory(tmp_path / "movie.npz")[1], tissue)
+
+
+def test_tables_have_rows_for_what_there_is(tissue, tmp_path):
+    alive = np.flatnonzero(np.asarray(tissue.alive))
+    cells = vx.io.cell_table(tissue, number=np.arange(9))
+    np.testing.assert_array_equal(cells["cell"], alive)
+    np.testing.assert_array_equal(cells["number"], alive)
+    assert np.isfinite(cells["x"]).all()
+    edges = vx.io.edge_table(tissue)
+    assert len(edges["edge"]) == 3 * len(alive)
+    assert set(edges["left_cell"]) <= set(alive.tolist())
+    vx.io.write_geojson(tmp_path / "cells.json", tissue, edges={})
+    assert (tmp_path / "cells.json").exists()
+    tables = vx.io.to_tables(tissue.without_spare())
+    np.testing.assert_array_equal(vx.io.to_tables(tissue).he_table, tables.he_table)
+
+
+def test_pictures_leave_them_out(tissue):
+    ax = vx.plot_tissue(tissue, tissue.neighbour_counts)
+    (faces,) = (c for c in ax.collections if isinstance(c, PolyCollection))
+    assert len(faces.get_paths()) == int(tissue.alive.sum())
+    before = random_tissue(6, 3, lloyd_steps=2).with_capacity(9)
+    after = vx.transitions.divide(before, 2).tissue
+    assert not vx.plotting.flipped_edges(before, after).any()
