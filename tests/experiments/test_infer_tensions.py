@@ -17,6 +17,7 @@ cluster = { n_cells = 9, pixels = 400 }
 """
 
 
+@pytest.mark.slow  # compiles for half a minute
 def test_the_experiment_finds_what_it_drew(tmp_path):
     (tmp_path / "tiny.toml").write_text(TINY)
     folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out")
@@ -30,6 +31,7 @@ def test_the_experiment_finds_what_it_drew(tmp_path):
     assert (folder / "figures" / "recovery.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow  # compiles for half a minute
 def test_a_mask_that_says_little_says_so(tmp_path):
     (tmp_path / "tiny.toml").write_text(TINY)
     _, metrics = run(tmp_path / "tiny.toml", tmp_path / "out", "noise=20")

