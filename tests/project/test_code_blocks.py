@@ -61,6 +61,7 @@ SLOW = {
     "docs/extending.md",
     "docs/index.md",
     "docs/masks.md",
+    "docs/mechanics.md",
     "docs/performance.md",
     "docs/pictures.md",
     "docs/topologies.md",
