@@ -55,6 +55,7 @@ def run(tmp_path, monkeypatch):
 # Those that compile much: for `make test-slow`. The others are for `make test-docs`.
 SLOW = {
     "docs/adjoints.md",
+    "docs/cells.md",
     "docs/concepts.md",
     "docs/dynamics.md",
     "docs/errors.md",

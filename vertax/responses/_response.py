@@ -28,7 +28,7 @@ class Equilibrium(eqx.Module):
     num_steps: Int[Array, "*batch"]
     """Steps of the minimiser."""
     num_t1: Int[Array, "*batch"]
-    """T1 transitions on the way."""
+    """Transitions on the way: T1, and T2 if the rule has them."""
     valid: Bool[Array, "*batch"]
     """Whether its cells tile the plane; `tissue.overlaps` says where they do not."""
     result: optx.RESULTS
