@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -83,7 +84,7 @@ def compare(truth: Truth, found: InferredTensions) -> tuple[np.ndarray, ...]:
     )
 
 
-def row(name: str, cases: list[tuple[Truth, object]]) -> None:
+def row(name: str, cases: Sequence[tuple[Truth, object]]) -> None:
     """Infer all, and print what came out."""
     parts, determined, seconds = [], [], []
     for truth, image in cases:

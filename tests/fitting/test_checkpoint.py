@@ -1,6 +1,7 @@
 """Fits that stop in the middle and go on."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +73,9 @@ def path(tmp_path):
     return tmp_path / "fit.npz"
 
 
-MARKS = dict.fromkeys(("least squares, batch", "batch", "guided", "noisy"), pytest.mark.slow)
+MARKS: dict[str, Any] = dict.fromkeys(
+    ("least squares, batch", "batch", "guided", "noisy"), pytest.mark.slow
+)
 MARKS |= dict.fromkeys(("least squares", "position"), pytest.mark.thorough)
 
 

@@ -154,7 +154,8 @@ def test_cells_that_the_border_cuts_are_cells(foam):
 
 def test_masks_of_cellpose_and_of_other_backgrounds_are_read(foam, tmp_path):
     labels = label_image(foam[0], 200)
-    np.save(tmp_path / "a_seg.npy", {"masks": labels, "diams": 30.0}, allow_pickle=True)
+    of_cellpose = np.array({"masks": labels, "diams": 30.0}, object)
+    np.save(tmp_path / "a_seg.npy", of_cellpose, allow_pickle=True)
     np.save(tmp_path / "a.npy", labels)
     np.testing.assert_array_equal(read_mask(tmp_path / "a_seg.npy"), labels)
     np.testing.assert_array_equal(read_mask(tmp_path / "a.npy"), labels)

@@ -114,13 +114,13 @@ def test_gradient_of_a_relaxed_box_against_differences(adjoint):
 def test_what_is_refused(as_a_user):
     energy = ShapeFactorEnergy(p0)
     with pytest.raises(ValueError, match="must be periodic"):
-        mechanics.ramp(cluster(4, 1), energy, [0.0, 0.1])
+        mechanics.ramp(cluster(4, 1), energy, np.array([0.0, 0.1]))
     with pytest.raises(ValueError, match="must be a list of numbers"):
         mechanics.ramp(start, energy, 0.1)
     with pytest.raises(ValueError, match="must be periodic"):
         BoxRelaxation()(cluster(4, 1), energy)
     with pytest.raises(ValueError, match="must be one of all, area"):
-        BoxRelaxation(free="none")
+        BoxRelaxation(free="none")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="a number or have shape"):
         BoxRelaxation(jnp.zeros(3))
     unrolling = vx.Relaxation(solver=vx.solvers.GradientDescent())

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, PRNGKeyArray, Shaped
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, Shaped
 
 from vertax._base.modules import is_concrete
 
@@ -226,3 +226,27 @@ def _shown(value: Any) -> str:
     """A number, or the range of some."""
     array = np.asarray(value)
     return str(value) if array.shape == () else f"from {array.min()} to {array.max()}"
+
+
+def increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
+    """The argument `times` as an array.
+
+    **Raises:**
+
+    - `ValueError` if there are fewer than two, or they do not increase.
+    """
+    array = as_real("times", times)
+    if array.ndim != 1 or array.size < 2:
+        raise ValueError(
+            "Argument `times` must hold two times or more, that of the start first, but its shape is "
+            f"{array.shape}."
+        )
+    if is_concrete(array):
+        steps = np.diff(np.asarray(array))
+        if not (steps > 0).all():
+            at = int(np.argmin(steps > 0))
+            raise ValueError(
+                f"Argument `times` must increase, but entry {at} is {array[at]} and the next "
+                f"{array[at + 1]}."
+            )
+    return array

@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from vertax._base.checks import as_key, check_whole, named
+from vertax._base.checks import as_key, check_whole, increasing, named
 from vertax._base.modules import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
@@ -21,7 +21,6 @@ from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, died_at, divided_at, founded
 from vertax.mesh import Tissue
 from vertax.responses import Relaxation, Trajectory
-from vertax.responses._evolution import increasing
 from vertax.responses._step import Incremental
 from vertax.transitions import T1, T2
 from vertax.transitions._division import divided

@@ -1,10 +1,7 @@
 """Responses: how a tissue answers to its energy."""
 
-from vertax.responses._evolution import (
-    Evolution as Evolution,
-    Evolved as Evolved,
-    evolve as evolve,
-)
+from vertax.responses._evolution import Evolution as Evolution, evolve as evolve
+from vertax.responses._evolved import Evolved as Evolved
 from vertax.responses._evolver import SurfaceEvolver as SurfaceEvolver
 from vertax.responses._external import External as External
 from vertax.responses._material import Material as Material

@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from vertax._base.checks import as_key, as_real, check_whole, named
+from vertax._base.checks import as_key, check_whole, increasing, named
 from vertax._base.memory_maps import spare_memory_maps
 from vertax._base.modules import is_concrete, traced
 from vertax.activities import AbstractActivity
@@ -23,105 +23,11 @@ from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import AbstractBoundary, Periodic, Tissue
+from vertax.responses._evolved import Evolved
 from vertax.responses._material import Material
 from vertax.responses._relaxation import Relaxation
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._step import Incremental
-from vertax.responses._trajectory import Trajectory
-
-
-class Evolved(Equilibrium):
-    """Where a tissue has gone in time; as an [`Equilibrium`][vertax.Equilibrium] it is the last frame.
-
-    Its `max_force` is the largest that any step was left with, `num_steps` and `num_t1` count those of all
-    steps, `valid` and `result` hold if they do for every step. Forces are those of energy and friction
-    together.
-    """
-
-    times: Float[Array, "*batch times"]
-    """The times of the frames, of which the first is the start."""
-    frames: Tissue
-    """The tissue at these times: the same tissue with a leading axis."""
-    energies: Float[Array, "*batch times"]
-    """Its energies."""
-    transitions: Int[Array, "*batch times"]
-    """T1 transitions from the frame before."""
-
-    drive: PyTree[Array]
-    """The state of the activity at the end, and of the random numbers: a run that begins there with `drive`
-    goes on as if it had not stopped, to rounding. None without an activity."""
-    sound: Bool[Array, "*batch times"]
-    """Whether all steps up to a frame came to an end, in tissues without overlaps."""
-
-    @property
-    def flipped(self) -> Bool[Array, "*batch times edges"]:
-        """Which edges lie between other cells than a frame before."""
-        # (Half-edges do not change places when an edge flips, and cells of half-edges do.)
-        each = lambda topology: topology.edge_cells
-        for _ in self.times.shape:
-            each = jax.vmap(each)
-        cells = each(self.frames.topology)
-        changed = jnp.any(cells[..., 1:, :, :] != cells[..., :-1, :, :], axis=-1)
-        return jnp.concatenate([jnp.zeros_like(changed[..., :1, :]), changed], axis=-2)
-
-    def checked(self) -> Evolved:
-        """The same, if all steps came to an end.
-
-        **Raises:**
-
-        - `RuntimeError` (of Equinox inside `jax.jit`) if one did not, or if cells overlap.
-        """
-        if not is_concrete(self.sound):
-            reason = f"A step in time came to no end, or cells overlap. {_REMEDY}"
-            # (A callback to the host takes no keys.)
-            keys, rest = eqx.partition(self, _is_key)
-            return eqx.combine(eqx.error_if(rest, ~self.converged, reason), keys)
-        if np.all(self.sound):
-            return self
-        first = np.argmin(np.asarray(self.sound), axis=-1).max()
-        time = np.asarray(self.times).reshape(-1, np.shape(self.times)[-1])[0, first]
-        what = (
-            "cells overlap, or the box folds"
-            if not np.all(self.valid)
-            else "a step in time came to no end"
-        )
-        if not np.isfinite(np.asarray(self.max_force)).all():
-            what = "forces are not finite"
-        raise RuntimeError(
-            f"On the way to time {time:g} (frame {first}) {what} (largest force "
-            f"{np.max(self.max_force):.1e}). {_REMEDY}"
-        )
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """The frames as a trajectory, for [`animate`][vertax.animate] and for files.
-
-        **Raises:**
-
-        - `ValueError` for a batch.
-        """
-        if self.times.ndim != 1:
-            raise ValueError(
-                f"This is a batch of {self.times.shape[:-1]} movies, and a trajectory is one. Take a member: "
-                "vertax.fitting.member(movies, 0).trajectory."
-            )
-        trajectory = Trajectory()
-        arrays, static = eqx.partition(self.frames, eqx.is_array)
-        values = {"time": self.times, "energy": self.energies, "num_t1": self.transitions}
-        for number in range(len(self.times)):
-            arrays_then, values_then = jax.tree.map(lambda x, i=number: x[i], (arrays, values))
-            trajectory.append(eqx.combine(arrays_then, static), **values_then)
-        return trajectory
-
-
-def _is_key(x: Any) -> bool:
-    return eqx.is_array(x) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-_REMEDY = (
-    "Take shorter steps (more `substeps`), raise `max_steps` of its relaxation or loosen its `tolerance`, or "
-    "pass throw=False and look at `sound`."
-)
 
 
 class Evolution(AbstractResponse):
@@ -510,30 +416,6 @@ def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: Abstract
 def _right_handed(boundary: AbstractBoundary) -> Bool[Array, ""]:
     """Whether a box that depends on time has not folded over."""
     return boundary.area > 0 if isinstance(boundary, Periodic) else jnp.array(True)
-
-
-def increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
-    """Times as an array.
-
-    **Raises:**
-
-    - `ValueError` if there are fewer than two, or they do not increase.
-    """
-    array = as_real("times", times)
-    if array.ndim != 1 or array.size < 2:
-        raise ValueError(
-            "Argument `times` must hold two times or more, that of the start first, but its shape is "
-            f"{array.shape}."
-        )
-    if is_concrete(array):
-        steps = np.diff(np.asarray(array))
-        if not (steps > 0).all():
-            at = int(np.argmin(steps > 0))
-            raise ValueError(
-                f"Argument `times` must increase, but entry {at} is {array[at]} and the next "
-                f"{array[at + 1]}."
-            )
-    return array
 
 
 @eqx.filter_jit
