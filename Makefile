@@ -20,7 +20,7 @@ demo: $(VENV)/.base ## infer hidden shape factors of a synthetic tissue and show
 	$(BIN)/vertax run configs/demo.toml $(DEMO_OPTIONS)
 
 test: $(VENV)/.dev ## the tests that run on every change
-	$(BIN)/python tests/run.py --workers $(WORKERS) $(PYTEST_OPTIONS)
+	$(BIN)/python tests/run.py --workers $(WORKERS) --without experiments $(PYTEST_OPTIONS)
 
 test-thorough: $(VENV)/.dev ## the same with other solvers, adjoints and boundaries
 	$(BIN)/python tests/run.py --workers $(WORKERS) -m "thorough and not slow" $(PYTEST_OPTIONS)

@@ -29,38 +29,28 @@ CACHE = {
 # seven seconds to begin. What takes longest begins first, and the others fill up the end.
 TOGETHER = (
     ("fitting",),
-    ("fitting/test_frames.py",),
-    ("adjoints",),
+    ("adjoints", "responses/test_external.py", "responses/test_evolver.py"),
     ("responses",),
     ("responses/test_evolution.py", "activities"),
     ("responses/test_free_equilibrium.py", "responses/test_relaxation.py"),
     ("experiments",),
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
     ("_base", "mesh", "energies", "dissipations", "initialise"),
-    ("transitions", "solvers"),
-    (
-        "transitions/test_cells.py",
-        "transitions/test_t2.py",
-        "transitions/test_ablation.py",
-        "growth",
-    ),
+    ("transitions", "growth"),
     ("runs", "inference"),
-    ("costs",),
-    ("mechanics",),
-    ("project",),
-    ("plotting", "io"),
-    ("responses/test_external.py", "responses/test_evolver.py"),
+    ("costs", "mechanics"),
+    ("project", "plotting", "io", "solvers"),
 )
 NOTHING_SELECTED = 5
 
 
-def groups(only: str = "") -> list[list[Path]]:
-    """The files of tests that share a process; of those whose path begins with something."""
+def groups(only: str = "", without: str | None = None) -> list[list[Path]]:
+    """The files of tests that share a process; of those whose path begins with something, and not so."""
     place = {name: number for number, names in enumerate(TOGETHER) for name in names}
     shared: dict[int, list[Path]] = {}
     for file in sorted(FOLDER.rglob("test_*.py")):
         name, folder = (path.relative_to(FOLDER).as_posix() for path in (file, file.parent))
-        if name.startswith(only):
+        if name.startswith(only) and not (without and name.startswith(without)):
             number = place.get(name, place.get(folder, len(TOGETHER)))
             shared.setdefault(number, []).append(file)
     return [files for _, files in sorted(shared.items())]
@@ -89,10 +79,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Run the tests.", allow_abbrev=False)
     parser.add_argument("--workers", type=int, default=2, help="processes at a time")
     parser.add_argument("--only", default="", help="folder or file of tests, without `tests/`")
+    parser.add_argument("--without", help="what to leave out, in the same way")
     chosen, options = parser.parse_known_args()
     began = time.perf_counter()
     with ThreadPoolExecutor(chosen.workers) as pool:
-        outcomes = list(pool.map(lambda files: run(files, options), groups(chosen.only)))
+        outcomes = list(
+            pool.map(lambda files: run(files, options), groups(chosen.only, chosen.without))
+        )
     count: Counter[str] = Counter()
     for _, line in outcomes:
         for number, what in re.findall(

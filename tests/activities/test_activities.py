@@ -47,6 +47,7 @@ def evolve(
 
 
 class TestThermalNoise:
+    @pytest.mark.thorough
     def test_its_forces_belong_to_the_dissipation(self):
         # Their covariance is 2 T / dt times the matrix of the dissipation, of which this is a diagonal form.
         tissue, _ = solid()
@@ -97,6 +98,7 @@ class TestThermalNoise:
         rest = evolve(ThermalNoise(1e-4), times[4:], key=None, drive=half.drive, tissue=half.tissue)
         np.testing.assert_allclose(rest.frames.vertices, whole.frames.vertices[4:], atol=1e-13)
 
+    @pytest.mark.thorough
     def test_its_strength_has_a_gradient(self):
         weights = np.random.default_rng(0).normal(size=(24, 2))
 

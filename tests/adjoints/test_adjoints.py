@@ -396,6 +396,7 @@ class TestOutcome:
             ),
         ],
     )
+    @pytest.mark.thorough
     def test_a_gradient_that_cannot_be_trusted_is_refused(self, adjoint, response):
         tissue, energy, cost = start_and_cost()
         with pytest.raises(RuntimeError, match=r"cannot be trusted|maximum number of solver steps"):
@@ -432,6 +433,7 @@ value_and_gradient = eqx.filter_jit(lambda problem: problem.value_and_gradient()
 
 
 class TestNudgeByTheCost:
+    @pytest.mark.thorough
     def test_it_agrees_with_implicit_differentiation(self):
         tissue, energy, cost = start_and_cost()
         adjoint = vx.EquilibriumPropagation(nudge="cost")

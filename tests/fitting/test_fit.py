@@ -110,6 +110,7 @@ def test_only_chosen_leaves_are_fitted(hidden):
     assert not np.allclose(fit.energy.terms[0].target_shape_factor, 3.7)
 
 
+@pytest.mark.thorough
 def test_the_users_own_energy_is_fitted_like_any_other():
     class Contractility(vx.AbstractEnergy):
         strength: Float[Array, " cells"]
@@ -177,6 +178,7 @@ def test_one_compilation_serves_all_epochs(hidden):
     assert len(set(counts)) == 1
 
 
+@pytest.mark.thorough
 def test_levenberg_marquardt_recovers_many_digits_in_a_dozen_steps(hidden):
     target, truth, guess, start = hidden
     problem = inverse_problem(start, guess, VertexDistance(target))
@@ -240,6 +242,7 @@ def batch(hidden):
         pytest.param(LEAST_SQUARES, id="lm", marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.thorough
 def test_a_batch_is_fitted_as_its_members_are(batch, optimiser):
     problems, stacked, truth, truths = batch
     together = vx.fit(stacked, optimiser, 8, truth=truths, batched=True, progress=False)
@@ -314,6 +317,7 @@ def test_the_bar_says_that_it_compiles_until_the_first_epoch_is_done(hidden, mon
     assert "compiling" not in after
 
 
+@pytest.mark.thorough
 def test_a_gradient_that_cannot_be_trusted_ends_a_fit(hidden):
     target, _, guess, start = hidden
 
@@ -371,6 +375,7 @@ def test_an_interrupt_ends_a_least_squares_fit_too(hidden):
     assert fit.cost < 1e-2 * fit.history.cost[0]
 
 
+@pytest.mark.thorough
 def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):
     target, _, guess, start = hidden
     problem = inverse_problem(start, guess, VertexDistance(target))

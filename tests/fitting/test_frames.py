@@ -46,6 +46,7 @@ def test_energy_and_friction_are_found_from_a_movie():
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(known.deviation))
 
 
+@pytest.mark.thorough
 def test_the_cost_is_the_sum_of_those_of_the_frames_and_mixes_with_others():
     movie, truth, problem = seen()
     centroid = vx.costs.CentroidDistance(movie.tissue)
@@ -73,6 +74,7 @@ def test_its_gradient_matches_finite_differences():
     )
 
 
+@pytest.mark.thorough
 def test_an_optax_fit_begins_each_epoch_at_the_first_frame():
     _, _, problem = seen()
     fit = vx.fit(problem, optax.adam(1e-2), 4, progress=False)
@@ -86,12 +88,12 @@ class TestBadInput:
         arguments = (problem.tissue, problem.energy, problem.cost)
         with pytest.raises(ValueError, match="`cost` is one of several frames"):
             vx.InverseProblem(*arguments)
-        for wrong in (
-            {"fit_position": True},
-            {"guidance": 1.0},
-            {"adjoint": vx.EquilibriumPropagation(nudge="cost")},
+        for what, wrong in (
+            ("`fit_position`", {"fit_position": True}),
+            ("`guidance`", {"guidance": 1.0}),
+            ("nudge='cost'", {"adjoint": vx.EquilibriumPropagation(nudge="cost")}),
         ):
-            with pytest.raises(ValueError, match=f"`{next(iter(wrong))}` is .* tissue at rest"):
+            with pytest.raises(ValueError, match=f"{what}.* goes with a tissue at rest"):
                 vx.InverseProblem(*arguments, response=problem.response, **wrong)  # pyright: ignore[reportArgumentType]
 
     def test_costs_of_frames(self, as_a_user):

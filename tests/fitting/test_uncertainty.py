@@ -95,6 +95,7 @@ class OneNumber(vx.costs.AbstractLeastSquaresCost):
 
 
 @pytest.mark.parametrize("noise", [pytest.param(1e-1, marks=pytest.mark.thorough), 1e-7])
+@pytest.mark.thorough
 def test_it_names_what_the_data_do_not_determine(hidden, noise):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + noise * jax.random.normal(jax.random.key(0), (20,))
@@ -128,6 +129,7 @@ def _slope(problem, fit):
     return np.array([float(residual(p0 + e) - residual(p0 - e)) / 2e-5 for e in step])
 
 
+@pytest.mark.thorough
 def test_a_position_that_the_cost_does_not_see_makes_no_difference(hidden):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + 0.1 * jax.random.normal(jax.random.key(0), (20,))

@@ -35,6 +35,7 @@ def test_a_pinned_border_does_not_move(pinned):
     assert pinned.pixel_size == pytest.approx(pinned.segmentation.pixel_size * 160 / 96)
 
 
+@pytest.mark.thorough
 def test_parameters_of_a_pinned_border(pinned):
     shape_factors, areas = pinned.parameters(pinned.problem.energy)
     np.testing.assert_allclose(shape_factors, 3.7)

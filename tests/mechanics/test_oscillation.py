@@ -82,6 +82,7 @@ def test_derivatives_against_differences(lattice):
     assert jax.jit(jax.grad(loss))(p0) == pytest.approx(float(wanted), rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_recoil_against_a_dense_solution():
     n = 12
     energy = ShapeFactorEnergy(shape_factors(n, 3.5, 0.1))

@@ -24,6 +24,7 @@ def test_it_fits_and_finds_everything_again(tmp_path):
     assert len((tmp_path / "cells.csv").read_text().splitlines()) == 5
 
 
+@pytest.mark.thorough
 def test_its_gradient_is_that_of_finite_differences():
     tissue, strength = random_tissue(4), jnp.linspace(0.1, 0.2, 4)
     along = jnp.array([1.0, 0.5, -1.0, 0.3])

@@ -167,6 +167,7 @@ class TestGradients:
                 one, other, rtol=1e-4, atol=1e-5 * float(jnp.abs(other).max())
             )
 
+    @pytest.mark.thorough
     def test_an_inverse_problem_of_a_tissue_that_is_not_at_rest(self):
         tissue, energy = solid()
         target = tissue.with_vertices(tissue.vertices + 0.05 * random_like(tissue.vertices, 2))
@@ -237,6 +238,7 @@ def test_pinned_vertices_go_where_they_are_told():
     np.testing.assert_allclose(moved[:, :2], movie.times[:, None, None] * jnp.stack([velocity] * 2))
 
 
+@pytest.mark.thorough
 def test_an_energy_and_a_dissipation_of_ones_own():
     class Ramp(eqx.Module):
         rate: jax.Array

@@ -205,6 +205,7 @@ def test_a_failure_under_the_nudge_is_no_gradient(case, moody):
     assert not evaluation.outcome.trusted
 
 
+@pytest.mark.thorough
 def test_fits_find_tensions_and_go_on_from_a_checkpoint(case, tmp_path, moody):
     tissue, energy, _ = case
     target = vx.External(FOAM)(tissue, foam_energy(energy.terms[1].tension[::-1])).tissue

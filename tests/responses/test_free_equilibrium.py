@@ -178,6 +178,7 @@ def hypergradient_problem(tissue, seed=0, **options):
 
 
 @pytest.mark.parametrize("inner_arcs", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.thorough
 def test_hypergradient_from_far_away_against_central_differences(inner_arcs):
     # The relaxation starts out of equilibrium, with T1s on the way: the orientation in which it ends
     # must not depend on the solver's way there, or the gradient would miss that.
@@ -262,6 +263,7 @@ def test_the_gauge_makes_the_hessian_regular():
     )
 
 
+@pytest.mark.thorough
 def test_float32():
     tissue = cluster(8, 4)
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x

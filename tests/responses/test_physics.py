@@ -101,6 +101,7 @@ def zero_modes(tissue, energy):
     return int(np.sum(np.abs(spectrum) < 1e-7 * spectrum[-1]))
 
 
+@pytest.mark.thorough
 def test_zero_modes_count_rigid_and_fluid_states():
     n = 16
     rigid = ShapeFactorEnergy(shape_factors(n, 3.6, 0.05))
@@ -156,6 +157,7 @@ def slope_by_strain(tissue, energy):
 
 
 @pytest.mark.parametrize("p0", [pytest.param(3.6, marks=pytest.mark.thorough), 3.75])
+@pytest.mark.thorough
 def test_stress_from_tensions_and_pressures_is_the_derivative_by_the_strain_of_the_box(p0):
     # σ = (1/A_box) [Σ K_A (A - A0) A I + Σ_edges T l⊗l/|l|], T = γ + Σ over both cells K_P (P - P0).
     k_a, a_0, k_p, p_0, gamma = values = jnp.array([3.0, 1.1, 1.4, p0, 0.2])

@@ -94,6 +94,7 @@ def relaxed_one_by_one(tissues, targets):
         3.9,
     ],
 )
+@pytest.mark.thorough
 def test_random_tissues_reach_true_equilibria(p0):
     batch = [random_tissue(64, s) for s in range(6)]
     tissues = jax.tree.map(lambda *x: jnp.stack(x), *batch)

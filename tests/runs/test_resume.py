@@ -90,6 +90,7 @@ def test_an_interrupted_run_goes_on_to_the_same_numbers(whole, interrupt, tmp_pa
     assert not (run / "unfinished").exists()
 
 
+@pytest.mark.thorough
 def test_an_interrupt_before_the_first_epoch_keeps_the_folder(whole, interrupt, tmp_path):
     interrupt(0)
     stopped = vertax("run", whole / "tiny.toml", "--output", tmp_path / "run", "--set", "seed=1")

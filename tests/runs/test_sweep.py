@@ -94,6 +94,7 @@ def test_bad_folders_and_formats_are_refused(tiny):
     assert not (tiny / "out").exists()
 
 
+@pytest.mark.thorough
 def test_a_sweep_goes_on_past_what_fails_and_keeps_what_is_finished(tiny):
     # In the folder of one run lies something else, which is not overwritten.
     (tiny / "out" / "tiny-seed_1").mkdir(parents=True)

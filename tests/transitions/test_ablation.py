@@ -15,6 +15,7 @@ def foam(n_edges):
     return vx.energies.AreaElasticity(1.0, 1.3) + vx.energies.LineTension(tension), tension
 
 
+@pytest.mark.thorough
 def test_the_first_recoil_is_the_tension_of_the_edge():
     tissue = random_tissue(9, 2, lloyd_steps=2)
     energy, tension = foam(tissue.n_edges)

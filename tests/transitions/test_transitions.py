@@ -115,6 +115,7 @@ def test_two_sided_cells_never_come_out():
     assert flips > 5
 
 
+@pytest.mark.thorough
 def test_edge_parameters_stay_with_their_edge():
     # Mark one edge by a huge tension: wherever it goes, its number goes with it.
     tissue = random_tissue(30, 7)
@@ -158,6 +159,7 @@ def test_edges_of_high_tension_end_in_four_fold_vertices(boundary):
     assert 3 <= relaxed.num_t1 < tissue.n_edges
 
 
+@pytest.mark.thorough
 def test_an_edge_that_flipped_flips_again_only_if_it_grows():
     # Cells pull the two at the ends of the edge together; only its own tension says whether it grows.
     tissue = vx.initialise.hexagonal(4, 4)
