@@ -417,6 +417,23 @@ class TestRefusedToLoad:
             load_problem(path)
 
 
+@pytest.mark.parametrize(
+    "response",
+    [
+        vx.Relaxation(transitions=vx.T1() + vx.T2()),
+        vx.Evolution(vx.dissipations.SubstrateFriction(2.0), [0.0, 0.5]),
+        vx.mechanics.BoxRelaxation(stress=0.1),
+    ],
+    ids=["transitions that add", "movement", "box"],
+)
+def test_every_response_has_a_place_in_files(path, tissues, response):
+    target, energy = tissues["periodic"], vx.energies.ShapeFactorEnergy(3.7)
+    cost = vx.costs.VertexDistance(target)
+    problem = vx.InverseProblem(target, energy, cost, response=response)
+    save_problem(path, problem)
+    assert same(load_problem(path), problem)
+
+
 def test_every_public_part_of_a_problem_has_a_place_in_files():
     # A new boundary or rule of transitions is one more entry; the families are looked through.
     parts = (vx.AbstractBoundary, vx.AbstractTransitions, vx.AbstractCost, vx.AbstractEnergy)

@@ -17,14 +17,24 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from vertax import adjoints, costs, energies, responses, solvers
+from vertax import (
+    activities,
+    adjoints,
+    costs,
+    dissipations,
+    energies,
+    mechanics,
+    responses,
+    solvers,
+)
 from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax._base.checks import named
 from vertax.energies import AbstractEnergy
 from vertax.fitting import InverseProblem
 from vertax.mesh import Free, Periodic, Tissue, Topology
 from vertax.mesh._arcs import Arcs
-from vertax.transitions import T1
+from vertax.transitions import T1, T2
+from vertax.transitions._transitions import InTurn
 
 _VERSION = 1
 
@@ -192,9 +202,10 @@ def _load(
 @functools.cache
 def _public_classes() -> dict[str, type[eqx.Module]]:
     """The classes of vertax by the name that a file knows them by."""
-    single = (Arcs, Free, InverseProblem, Periodic, T1, Tissue, Topology)
+    single = (Arcs, Free, InTurn, InverseProblem, Periodic, T1, T2, Tissue, Topology)
     classes: dict[str, type[eqx.Module]] = {cls.__name__: cls for cls in single}
-    for family in (adjoints, costs, energies, responses, solvers):
+    families = (activities, adjoints, costs, dissipations, energies, mechanics, responses, solvers)
+    for family in families:
         for name, cls in vars(family).items():
             if (
                 isinstance(cls, type)
