@@ -3,7 +3,6 @@
 import gc
 import os
 from importlib.metadata import version
-from pathlib import Path
 
 # Tests compile more than they compute: less optimisation is a third of the time. Read when JAX starts.
 FLAGS = ["--xla_backend_optimization_level=0"]
@@ -13,7 +12,6 @@ if version("jaxlib").startswith("0.10."):
 os.environ["VERTAX_CACHE"] = "off"  # nothing of the tests in the user's cache folder
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS])
 
-import equinox as eqx
 import jax
 import jaxtyping
 import matplotlib
@@ -25,16 +23,16 @@ matplotlib.use("Agg")
 # What is traced and compiled makes very many objects that stay: looking through them a twentieth of the time.
 gc.set_threshold(20_000, 20, 10)
 
-MAPS = Path("/proc/self/maps")
-
 
 @pytest.fixture(autouse=True)
 def _few_compiled_functions():
     """Forget compiled functions before there are too many."""
     # Each holds some memory maps, of which Linux allows a process 65530; beyond, the compiler aborts.
+    from vertax._base.memory_maps import forget_compiled, memory_maps
+
     yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 15_000:
-        eqx.clear_caches()
+    if memory_maps() > 15_000:
+        forget_compiled()
 
 
 @pytest.fixture

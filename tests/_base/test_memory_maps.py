@@ -3,6 +3,7 @@
 import warnings
 
 import equinox as eqx
+import jax.numpy as jnp
 import pytest
 
 from vertax._base import memory_maps
@@ -27,6 +28,19 @@ def test_they_are_forgotten_with_a_warning_where_there_are_too_many(square, monk
         memory_maps.spare_memory_maps()
     assert forgotten
     assert square(3) == 9
+
+
+def test_nothing_is_forgotten_within_a_trace(monkeypatch):
+    monkeypatch.setattr(memory_maps, "SHARE", 0.0)
+    monkeypatch.setattr(memory_maps, "PAUSE", 0.0)
+
+    def square(x):
+        memory_maps.spare_memory_maps()
+        return x**2
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert eqx.filter_jit(square)(jnp.asarray(3.0)) == 9
 
 
 def test_one_look_a_second_is_enough(monkeypatch):

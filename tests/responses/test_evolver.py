@@ -65,7 +65,7 @@ def slopes(tissue, energy):
 def test_strings_are_the_tissue(tissue):
     strings = Strings.of(on_host(tissue))
     np.testing.assert_allclose(strings.lengths(strings.points), tissue.edge_lengths, rtol=1e-12)
-    np.testing.assert_allclose(strings.areas(strings.points), tissue.areas, rtol=1e-10)
+    np.testing.assert_allclose(strings.edges.areas(strings.points), tissue.areas, rtol=1e-10)
     np.testing.assert_allclose(strings.perimeters(strings.points), tissue.perimeters, rtol=1e-12)
 
 
@@ -82,7 +82,7 @@ def test_derivatives_are_those_of_the_energy(name):
     energy = jax.tree.map(jnp.asarray, energy)
     strings = Strings.of(on_host(PERIODIC))
     at = strings.points
-    measures = (strings.lengths(at), strings.areas(at), strings.perimeters(at))
+    measures = (strings.lengths(at), strings.edges.areas(at), strings.perimeters(at))
     found = slope_of(on_host(energy), *measures, None)
     wanted = slopes(PERIODIC, energy)
     leaves = lambda tree: jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array_like))

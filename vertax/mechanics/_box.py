@@ -114,13 +114,26 @@ class BoxRelaxation(AbstractResponse):
         require_box(tissue, "a BoxRelaxation")
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.relaxation.check(tissue, energy, adjoint)
+        self.goes_with(adjoint)
+        found = _relax_box(*traced((tissue, energy)), self.traced(), adjoint)
+        return found.checked() if throw else found
+
+    def goes_with(
+        self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
+    ) -> None:
+        """Refuse adjoints that unroll a relaxation.
+
+        **Arguments:** as for every response.
+
+        **Raises:**
+
+        - `ValueError` for one that does.
+        """
         if adjoint.unrolls:
             raise ValueError(
                 f"{type(adjoint).__name__} differentiates the steps of one relaxation, and a box takes "
                 "many: pass ImplicitDifferentiation or EquilibriumPropagation."
             )
-        found = _relax_box(*traced((tissue, energy)), self.traced(), adjoint)
-        return found.checked() if throw else found
 
     def traced(self) -> BoxRelaxation:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""

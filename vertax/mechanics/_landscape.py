@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax._base.modules import is_concrete
 from vertax.dissipations import AbstractDissipation
-from vertax.energies import AbstractEnergy
 from vertax.mesh import Periodic, Tissue
 
 Motion: TypeAlias = tuple[Float[Array, "2 2"], PyTree[Float[Array, "..."]]]
@@ -80,11 +79,6 @@ class Landscape(eqx.Module):
         return jax.linearize(jax.grad(self), self.still)[1]
 
 
-def energy_landscape(tissue: Tissue, energy: AbstractEnergy) -> Landscape:
-    """The energy around a tissue."""
-    return Landscape(tissue, energy)
-
-
 class _Dissipation(eqx.Module):
     """What a motion from a tissue dissipates if it takes the time 1."""
 
@@ -131,24 +125,15 @@ def solve(
     return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), solution.value)
 
 
-class Stationary(Protocol):
-    """A number that is stationary at the solution of a linear system."""
-
-    def solve(self, args: Any) -> PyTree[Array]:
-        """The solution."""
-        ...
-
-    def value(self, args: Any, solution: PyTree[Array]) -> Array:
-        """The number there."""
-        ...
-
-
 # Moduli are minima of a quadratic form over motions u, and eigenvalues stationary values of one. Their
 # derivatives are those of the form with u held, so none of them needs the derivative of u; derivatives of
 # higher order do, and get it, since the rule below solves for u as a function of the arguments.
 @eqx.filter_custom_jvp
 def stationary(args: Any, system: Any) -> Array:
-    """The stationary value of a system; its first derivatives solve nothing that is not solved anyway."""
+    """The stationary value of a system, which has a method `solve(args)` and one `value(args, solution)`.
+
+    Its first derivatives solve nothing that is not solved anyway.
+    """
     return system.value(args, system.solve(args))
 
 

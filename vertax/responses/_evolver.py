@@ -76,9 +76,9 @@ class SurfaceEvolver(AbstractSimulator):
             and for an energy that it cannot be told of.
         """
         strings = Strings.of(tissue)
-        terms = Terms.of(energy, strings.n_cells, len(strings.cells))
+        terms = Terms.of(energy, strings.edges.n_cells, len(strings.edges.cells))
         fixed = self.areas == "fixed"
-        held = range(strings.n_cells) if fixed else ()
+        held = range(strings.edges.n_cells) if fixed else ()
         if fixed and strings.periodic:
             raise SimulatorError(
                 "Fixed areas are for free tissues: those of a periodic one add up to its box."
@@ -88,11 +88,15 @@ class SurfaceEvolver(AbstractSimulator):
                 "Areas that are fixed need targets: add an AreaElasticity to the energy, of any stiffness."
             )
         if fixed:
-            terms = terms._replace(area_stiffness=np.zeros(strings.n_cells))
+            terms = terms._replace(area_stiffness=np.zeros(strings.edges.n_cells))
         text = datafile(strings, terms, forces, fixed=fixed)
         points, pressures, numbers = self._run(text, self._commands() + _report(held), strings)
         vertices = points + strings.images @ strings.lattice
-        measures = (strings.lengths(points), strings.areas(points), strings.perimeters(points))
+        measures = (
+            strings.lengths(points),
+            strings.edges.areas(points),
+            strings.perimeters(points),
+        )
         return Relaxed(
             vertices,
             energy=numbers["energy"],
@@ -110,7 +114,7 @@ class SurfaceEvolver(AbstractSimulator):
         **Returns:** its energy.
         """
         strings = Strings.of(tissue)
-        terms = Terms.of(energy, strings.n_cells, len(strings.cells))
+        terms = Terms.of(energy, strings.edges.n_cells, len(strings.edges.cells))
         text = datafile(strings, terms, None, fixed=False)
         return self._run(text, "steps_done := 0;\nrecalc;\n" + _report(), strings)[2]["energy"]
 
@@ -176,7 +180,7 @@ def datafile(
     lines.append(
         f"quantity tensions energy method edge_general_integral scalar_integrand: gam*{length}"
     )
-    of_edge: list[list[str]] = [["tensions"] for _ in strings.ends]
+    of_edge: list[list[str]] = [["tensions"] for _ in strings.edges.ends]
     _areas(lines, of_edge, strings, terms, fixed)
     _perimeters(lines, of_edge, strings, terms, length)
     points, arms = strings.points, np.zeros_like(strings.points)
@@ -198,7 +202,7 @@ def datafile(
         )
     lines.append("edges")
     sign = {0: "*", 1: "+", -1: "-"}
-    for i, ((a, b), wrap) in enumerate(zip(strings.ends, strings.wraps, strict=True)):
+    for i, ((a, b), wrap) in enumerate(zip(strings.edges.ends, strings.wraps, strict=True)):
         around = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
         gamma = terms.tension[i]
         lines.append(
@@ -211,15 +215,15 @@ def _areas(
     lines: list[str], of_edge: list[list[str]], strings: Strings, terms: Terms, fixed: bool
 ) -> None:
     """A quantity for the area of each cell that wants one."""
-    wanted = np.full(strings.n_cells, True) if fixed else terms.area_stiffness != 0
+    wanted = np.full(strings.edges.n_cells, True) if fixed else terms.area_stiffness != 0
     instances: dict[tuple, str] = {}
     parts: dict[int, list[str]] = {}
-    for e in range(len(strings.ends)):
+    for e in range(len(strings.edges.ends)):
         for side, sign in ((0, 1), (1, -1)):
-            cell = int(strings.cells[e, side])
-            if cell == strings.n_cells or not wanted[cell]:
+            cell = int(strings.edges.cells[e, side])
+            if cell == strings.edges.n_cells or not wanted[cell]:
                 continue
-            x, y = strings.shifts[e, side]
+            x, y = strings.edges.shifts[e, side]
             key = (cell, sign, round(float(x), 9), round(float(y), 9))
             if key not in instances:
                 # Half the integral of x dy - y dx, as the cell sees the edge.
@@ -258,8 +262,8 @@ def _perimeters(
             f"{0.5 * k:.17g}*(around_{cell}.value-({target:.17g}))^2"
         )
     wanted = set(np.flatnonzero(terms.perimeter_stiffness).tolist())
-    for e in range(len(strings.ends)):
-        of_edge[e] += [f"around_{c}" for c in strings.cells[e].tolist() if c in wanted]
+    for e in range(len(strings.edges.ends)):
+        of_edge[e] += [f"around_{c}" for c in strings.edges.cells[e].tolist() if c in wanted]
 
 
 def _springs(
@@ -293,7 +297,7 @@ def _springs(
 
 def _stiffness(strings: Strings, terms: Terms) -> float:
     """A typical second derivative of the energy."""
-    size = np.abs(strings.areas(strings.points)).mean()
+    size = np.abs(strings.edges.areas(strings.points)).mean()
     return max(
         float(np.mean(np.abs(terms.tension))) / np.sqrt(size),
         float(np.mean(terms.area_stiffness)) * size,
@@ -304,7 +308,7 @@ def _stiffness(strings: Strings, terms: Terms) -> float:
 def _read(text: str, strings: Strings, log: str) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Points, pressures (of areas that are held) and numbers that the program wrote."""
     points = np.full_like(strings.points, np.nan)
-    pressures = np.zeros(strings.n_cells)
+    pressures = np.zeros(strings.edges.n_cells)
     numbers: dict[str, float] = {}
     lines = text.splitlines()
     try:

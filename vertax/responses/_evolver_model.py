@@ -26,16 +26,13 @@ class Strings(NamedTuple):
     points: Float[np.ndarray, "vertices 2"]
     images: Int[np.ndarray, "vertices 2"]
     """In which image of the box each vertex is."""
-    ends: Int[np.ndarray, "edges 2"]
+    edges: Edges
+    """The strings, seen from these points."""
     wraps: Int[np.ndarray, "edges 2"]
-    """How often each edge goes around the box."""
-    cells: Int[np.ndarray, "edges 2"]
-    shifts: Float[np.ndarray, "edges 2 2"]
-    """What to add to the first vertex of an edge to see it in the frame of the cell on either side."""
+    """How often each goes around the box."""
     lattice: Float[np.ndarray, "2 2"]
     periodic: bool
     softening: float
-    n_cells: int
     fixed: Int[np.ndarray, " _"]
 
     @classmethod
@@ -66,40 +63,20 @@ class Strings(NamedTuple):
                 "An edge is longer than the periodic box, which Surface Evolver's datafiles cannot say."
             )
         pinned = () if tissue.pinned is None else np.flatnonzero(np.asarray(tissue.pinned))
+        edges = edges._replace(across=wraps @ lattice, shifts=shifts)
+        softening = float(np.asarray(tissue.softening))
         return cls(
-            home,
-            images,
-            edges.ends,
-            wraps,
-            edges.cells,
-            shifts,
-            lattice,
-            periodic,
-            float(np.asarray(tissue.softening)),
-            edges.n_cells,
-            np.asarray(pinned, int),
+            home, images, edges, wraps, lattice, periodic, softening, np.asarray(pinned, int)
         )
 
     def lengths(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, " edges"]:
         """Length of each edge."""
-        d = self._vectors(points)
+        d = self.edges.vectors(points)
         return np.sqrt(np.sum(d**2, axis=1) + self.softening**2)
 
     def perimeters(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, " cells"]:
         """Perimeter of each cell."""
-        lengths = np.repeat(self.lengths(points), 2)
-        return np.bincount(self.cells.ravel(), lengths, self.n_cells + 1)[: self.n_cells]
-
-    def areas(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, " cells"]:
-        """Area of each cell."""
-        d = self._vectors(points)
-        corners = points[self.ends[:, 0], None] + self.shifts
-        shares = corners[..., 0] * d[:, None, 1] - corners[..., 1] * d[:, None, 0]
-        shares = (0.5 * shares * [1, -1]).ravel()
-        return np.bincount(self.cells.ravel(), shares, self.n_cells + 1)[: self.n_cells]
-
-    def _vectors(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, "edges 2"]:
-        return points[self.ends[:, 1]] + self.wraps @ self.lattice - points[self.ends[:, 0]]
+        return self.edges.sums(np.repeat(self.lengths(points), 2))
 
 
 class Terms(NamedTuple):

@@ -158,9 +158,11 @@ class Edges(NamedTuple):
         vectors = self.vectors(vertices)
         corners = vertices[self.ends[:, 0], None] + self.shifts
         shares = corners[..., 0] * vectors[:, None, 1] - corners[..., 1] * vectors[:, None, 0]
-        return np.bincount(
-            self.cells.ravel(), (0.5 * shares * [1, -1]).ravel(), minlength=self.n_cells
-        )[: self.n_cells]
+        return self.sums((0.5 * shares * [1, -1]).ravel())
+
+    def sums(self, values: Float[np.ndarray, " sides"]) -> Float[np.ndarray, " cells"]:
+        """Of values on the left and on the right of each edge, in turn, the sum for each cell."""
+        return np.bincount(self.cells.ravel(), values, self.n_cells + 1)[: self.n_cells]
 
 
 class Ledger:
