@@ -13,8 +13,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from vertax._base.checkpoints import without_addresses
 from vertax._base.modules import choose
-from vertax.fitting._checkpoint import without_addresses
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,

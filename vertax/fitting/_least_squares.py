@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.checkpoints import without_addresses
 from vertax._base.modules import choose
 from vertax.adjoints import ImplicitDifferentiation
-from vertax.fitting._checkpoint import without_addresses
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
