@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import STILL, central_difference, random_like, random_tissue
 
 import vertax as vx
@@ -49,6 +50,7 @@ def test_pinned_vertices_stand_still_and_gradients_are_right():
     np.testing.assert_allclose(jnp.sum(gradient * direction), slope, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_explicit_steps_of_diffrax_go_where_implicit_ones_go():
     tissue = STILL(random_tissue(9, 4), ENERGY).tissue
     start = tissue.with_vertices(tissue.vertices + 0.02 * random_like(tissue.vertices, 7))

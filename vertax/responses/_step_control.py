@@ -32,7 +32,7 @@ class StepControl(eqx.Module):
     that any vertex is off, in units of the size of a cell. Where it exceeds the tolerance, or a part of the
     step comes to no end, the step is done again, shorter. The next one follows the last two errors. (Step
     doubling and a PI controller, as in Hairer & Wanner, Solving Ordinary Differential Equations II, IV.2.)
-    The error at the end, after many steps, goes as the tolerance to the power $p / (p + 1)$.
+    The error at the end, after many steps, goes about as the tolerance to the power $p / (p + 1)$.
 
     **Arguments:**
 
