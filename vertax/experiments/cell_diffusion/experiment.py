@@ -76,7 +76,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     - `progress`: show a progress bar (only on a terminal).
 
     **Returns:** the metrics: diffusion relative to that of a free cell for each speed and shape factor,
-    transitions per cell and time, and the shape factor from which on each speed makes the tissue fluid.
+    transitions per cell and time, the shape factor from which on each speed makes the tissue fluid, and the
+    share of all frames before which each step came to an end: only these count.
     """
     began = time.perf_counter()
     pairs = [
@@ -100,10 +101,10 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         for name in results[0]
     }
     lags = config.interval * np.arange(1, found["squared"].shape[-1] + 1)
-    squared = found["squared"].mean(axis=2)
+    squared = np.nanmean(found["squared"], axis=2)
     free = np.asarray(config.speeds)[:, None] ** 2 / (2 * config.rotational_diffusion)
     diffusion = _diffusion(lags, squared) / free
-    rate = found["num_t1"].mean(axis=2) / (config.tissue.n_cells * config.duration)
+    rate = np.nanmean(found["t1_rate"], axis=2) / config.tissue.n_cells
     onset = [_onset(config, values) for values in diffusion]
     folder.save_table(
         "diffusion",
@@ -145,11 +146,15 @@ def _move(config: Config, speed: float, p0: float, replicate: int) -> dict[str, 
         relaxation=config.relaxation.build(),
     )
     movie = evolution(tissue, ShapeFactorEnergy(jnp.asarray(p0)), throw=False)
-    places = np.asarray(_places(movie.frames))[warm:]
+    # A step that came to no end spoils what comes after it.
+    n_sound = int(np.sum(movie.sound))
+    places = np.asarray(_places(movie.frames))[warm:n_sound]
+    lasted = max(n_sound - 1 - warm, 0)
+    transitions = float(movie.transitions[warm + 1 : n_sound].sum())
     return {
-        "squared": _squared_displacements(places),
-        "num_t1": np.asarray(movie.transitions[warm + 1 :].sum()),
-        "sound": np.asarray(movie.sound[-1]),
+        "squared": _squared_displacements(places, n_frames // 2),
+        "t1_rate": np.asarray(transitions / (lasted * config.interval) if lasted else np.nan),
+        "sound": np.asarray(lasted / n_frames),
     }
 
 
@@ -163,19 +168,26 @@ def _places(frames: Tissue) -> Float[Array, "times cells 2"]:
     return jnp.concatenate([jnp.zeros_like(centroids[:1]), jnp.cumsum(steps, axis=0)])
 
 
-def _squared_displacements(places: Float[np.ndarray, "times cells 2"]) -> np.ndarray:
-    """The mean over cells and beginnings, for lags up to half of the time."""
-    lags = range(1, max(len(places) // 2, 3))
-    return np.array([np.mean(np.sum((places[k:] - places[:-k]) ** 2, axis=-1)) for k in lags])
+def _squared_displacements(
+    places: Float[np.ndarray, "times cells 2"], most: int
+) -> Float[np.ndarray, " lags"]:
+    """The mean over cells and beginnings, for lags up to so many frames; NaN of those that are not known."""
+    squared = np.full(most, np.nan)
+    for k in range(1, min(len(places), most + 1)):
+        squared[k - 1] = np.mean(np.sum((places[k:] - places[:-k]) ** 2, axis=-1))
+    return squared
 
 
 def _diffusion(
     lags: Float[np.ndarray, " lags"], squared: Float[np.ndarray, "speeds values lags"]
 ) -> Float[np.ndarray, "speeds values"]:
     """A quarter of the slope of mean squared displacements over the later half of the lags."""
-    late = slice(len(lags) // 2, None)
-    x = lags[late] - lags[late].mean()
-    slope = np.sum(x * squared[..., late], axis=-1) / np.sum(x**2)
+    late = np.where(lags > lags[-1] / 2, squared, np.nan)
+    known = np.isfinite(late)
+    count = np.maximum(known.sum(axis=-1, keepdims=True), 1)
+    x = np.where(known, lags - np.sum(known * lags, axis=-1, keepdims=True) / count, 0)
+    size = np.sum(x**2, axis=-1)
+    slope = np.sum(x * np.where(known, late, 0), axis=-1) / np.where(size > 0, size, np.nan)
     return slope / 4
 
 

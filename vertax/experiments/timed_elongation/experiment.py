@@ -132,7 +132,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         outcome = folder.fit(
             name, problem, config.fit.build(), config.fit.epochs, partial=True, progress=progress
         )
-        folder.save_table(f"history_{name}", history_columns(outcome))
+        folder.save_table(f"history_{name}", history_columns(outcome.history))
         found = outcome.energy.energy
         assert isinstance(found, Schedule)
         movie = evolution(tissue, outcome.energy, throw=False)

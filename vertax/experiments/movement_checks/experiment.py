@@ -1,0 +1,287 @@
+r"""What must hold of movement in time, measured.
+
+1. A small deviation from rest decays, mode by mode, at the rate $\lambda / \zeta$; how wrong that is goes as
+   the length of the step, or as its square for steps of second order.
+2. In a quench the energy falls, whatever the step.
+3. T1 transitions of a quench, and when they take place, do not depend on the step once it is short (Kursawe
+   et al. 2017 find that other programs suppress transitions by long steps).
+4. With noise at a temperature $T$ each mode of a solid has $\lambda \langle q^2 \rangle = T$.
+5. Gradients through time agree with differences.
+6. The error of controlled steps follows their tolerance.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from pydantic import Field
+
+from vertax.activities import ThermalNoise
+from vertax.adjoints import EquilibriumPropagation, ImplicitDifferentiation
+from vertax.dissipations import SubstrateFriction
+from vertax.energies import ShapeFactorEnergy
+from vertax.initialise import periodic_voronoi
+from vertax.mechanics import modes
+from vertax.mesh import Tissue
+from vertax.responses import Relaxation, StepControl, evolve
+from vertax.runs import ExperimentConfig, RunFolder, TissueSection
+
+from . import figures
+
+STILL = Relaxation(transitions=None, contact_range=None, tolerance=1e-12)
+
+
+class Config(ExperimentConfig):
+    """Configuration of this experiment."""
+
+    tissue: TissueSection = TissueSection(n_cells=16)
+    """The tissue."""
+    shape_factor: float = Field(default=3.5, gt=0, lt=3.7)
+    """Mean target shape factor, of a solid tissue."""
+    friction: float = Field(default=1.0, gt=0)
+    """Friction of a vertex with the substrate."""
+    quench: float = Field(default=2.0, gt=0)
+    """How long a random tissue is watched on its way to rest."""
+    halvings: int = Field(default=8, ge=2)
+    """How often the step of the quench is halved; the first is a tenth of its time."""
+    noise_steps: int = Field(default=4000, ge=100)
+    """Steps with noise, each of 0.4 units of time."""
+    tolerances: list[float] = Field(default=[1e-2, 1e-3, 1e-4, 1e-5], min_length=2)
+    """Tolerances of controlled steps, in units of the size of a cell."""
+
+
+class Findings(NamedTuple):
+    """What was measured, for the figure and the metrics."""
+
+    decay_steps: np.ndarray
+    decay_errors: np.ndarray
+    quench_times: list[np.ndarray]
+    quench_energies: list[np.ndarray]
+    events: list[np.ndarray]
+    eigenvalues: np.ndarray
+    mode_energies: np.ndarray
+    differences: np.ndarray
+    gradient_errors: dict[str, np.ndarray]
+    control_errors: np.ndarray
+    control_steps: np.ndarray
+
+
+def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
+    """Run the experiment.
+
+    **Arguments:**
+
+    - `config`: its configuration.
+    - `folder`: where the results go.
+    - `progress`: say what is being measured.
+
+    **Returns:** the metrics: the orders of decay, the largest rise of an energy, how many transitions a
+    quench has with each step and how much they are early or late, the mean energy of modes over the
+    temperature, the error of gradients, and the power by which errors follow the tolerance.
+    """
+    began = time.perf_counter()
+    key = jax.random.key(config.seed)
+    first = periodic_voronoi(config.tissue.n_cells, key=key, lloyd_steps=config.tissue.lloyd_steps)
+    spread = 0.1 * jax.random.normal(jax.random.fold_in(key, 1), (first.n_cells,))
+    energy = ShapeFactorEnergy(config.shape_factor + spread)
+    rest = Relaxation(contact_range=None)(first, energy).tissue
+    solid = STILL(rest, energy, throw=False).tissue
+    steps, decay = _decay(config, solid, energy)
+    folder.say("decay")
+    times, energies, events = _quench(config, first, energy)
+    folder.say("quench")
+    values, shares = _equipartition(config, solid, energy)
+    folder.say("noise")
+    widths, slopes = _gradients(config, solid, energy)
+    folder.say("gradients")
+    errors, counts = _controlled(config, solid, energy)
+    folder.say("controlled steps")
+    found = Findings(
+        steps, decay, times, energies, events, values, shares, widths, slopes, errors, counts
+    )
+    folder.save_figure("checks", figures.checks(config, found))
+    folder.save_table(
+        "quench",
+        {
+            "step": [t[1] - t[0] for t in times],
+            "num_t1": [len(e) for e in events],
+            "latest": [float(np.max(_apart(e, events[-1]), initial=0)) for e in events],
+        },
+    )
+    return _metrics(config, found) | {"seconds": time.perf_counter() - began}
+
+
+def _metrics(config: Config, found: Findings) -> dict[str, Any]:
+    power = lambda x, y: float(np.polyfit(np.log(x), np.log(y), 1)[0])
+    rises = [np.max(np.diff(e) / np.ptp(e)) for e in found.quench_energies]
+    same = [
+        np.array_equal(e[:, 0], found.events[-1][:, 0]) if len(e) else False for e in found.events
+    ]
+    firm = next((i for i in range(len(same)) if all(same[i:])), len(same) - 1)
+    weights = 1 - np.exp(-found.eigenvalues * 0.4 / config.friction)
+    return {
+        "decay_order": [power(found.decay_steps[1:], e[1:]) for e in found.decay_errors],
+        "largest_rise": float(max(rises)),
+        "num_t1": [len(e) for e in found.events],
+        "same_order_from_step": float(np.diff(found.quench_times[firm][:2])[0]),
+        "t1_times_off": [
+            float(np.max(_apart(e, found.events[-1]), initial=0)) for e in found.events
+        ],
+        "mode_energy": float(np.average(found.mode_energies, weights=weights)),
+        "gradient_error": {name: float(e.min()) for name, e in found.gradient_errors.items()},
+        "control_power": [power(config.tolerances, e) for e in found.control_errors],
+    }
+
+
+def _decay(
+    config: Config, solid: Tissue, energy: ShapeFactorEnergy
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps in units of the time of decay, and the error after that time for both orders."""
+    number = solid.n_vertices  # in the middle
+    found = modes(solid, energy, number + 1)
+    value, mode = float(found.values[-1]), np.asarray(found.displacements[-1])
+    size, lasts = 1e-5, config.friction / value
+    start = solid.with_vertices(solid.vertices + size * mode)
+    counts = 4 * 2 ** np.arange(5)
+    errors = np.zeros((2, len(counts)))
+    for order in (1, 2):
+        for i, n in enumerate(counts):
+            movie = _by_frames(
+                config, start, energy, np.linspace(0, lasts, n + 1), order=order, relaxation=STILL
+            )
+            left = np.sum(np.asarray(movie.tissue.vertices - solid.vertices) * mode) / size
+            errors[order - 1, i] = abs(left / np.exp(-1) - 1)
+    return 1 / counts, errors
+
+
+def _by_frames(
+    config: Config, tissue: Tissue, energy: Any, times: np.ndarray, **settings: Any
+) -> Any:
+    """A movement of which each step is a frame: one program for any number of steps."""
+    friction = SubstrateFriction(config.friction)
+    return evolve(tissue, energy, friction, times, progress=True, throw=False, **settings)
+
+
+def _quench(
+    config: Config, first: Tissue, energy: ShapeFactorEnergy
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Times and energies for each step, and edges and times of the transitions in their order."""
+    all_times, energies, events = [], [], []
+    for halving in range(config.halvings + 1):
+        n = 10 * 2**halving
+        times = config.quench * np.arange(n + 1) / n
+        movie = _by_frames(config, first, energy, times, relaxation=Relaxation(contact_range=None))
+        frames, edges = np.nonzero(np.asarray(movie.flipped))
+        all_times.append(times)
+        energies.append(np.asarray(movie.energies))
+        events.append(np.stack([edges, times[frames]], axis=1).reshape(-1, 2))
+    return all_times, energies, events
+
+
+def _apart(events: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """How far first transitions of edges are from those of the same edges in another run."""
+    there = dict(reversed(reference.tolist()))
+    here = dict(reversed(events.tolist()))
+    return np.array([abs(here[edge] - there[edge]) for edge in here if edge in there])
+
+
+def _equipartition(
+    config: Config, solid: Tissue, energy: ShapeFactorEnergy
+) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues, and the energy of each mode over the temperature."""
+    found = modes(solid, energy, 2 * solid.n_vertices)
+    values = np.asarray(found.values)[2:]
+    vectors = np.asarray(found.displacements)[2:].reshape(len(values), -1)
+    temperature, dt = 1e-6, 0.4
+    movie = evolve(
+        solid,
+        energy,
+        SubstrateFriction(config.friction),
+        dt * np.arange(config.noise_steps + 1),
+        activity=ThermalNoise(temperature),
+        key=config.seed,
+        relaxation=Relaxation(transitions=None, contact_range=None),
+    )
+    moved = np.asarray(movie.frames.vertices - solid.vertices)[config.noise_steps // 10 :]
+    amplitudes = moved.reshape(len(moved), -1) @ vectors.T
+    # Of implicit Euler steps each mode has λ <q²> = T / (1 + λ dt / 2 ζ).
+    damped = 1 + values * dt / (2 * config.friction)
+    return values, values * (amplitudes**2).mean(axis=0) * damped / temperature
+
+
+def _gradients(
+    config: Config, solid: Tissue, energy: ShapeFactorEnergy
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Widths of central differences, and the relative error of the slope by each adjoint."""
+    key = jax.random.key(config.seed + 1)
+    start = solid.with_vertices(
+        solid.vertices + 0.02 * jax.random.normal(key, solid.vertices.shape)
+    )
+    weights, along = (
+        jax.random.normal(jax.random.fold_in(key, i), shape)
+        for i, shape in enumerate((solid.vertices.shape, (solid.n_cells,)))
+    )
+    targets = jnp.asarray(energy.target_shape_factor)
+
+    @eqx.filter_jit
+    def cost(by: Array, adjoint: Any = None) -> Array:
+        friction = SubstrateFriction(config.friction * (1 + by))
+        movie = evolve(
+            start,
+            ShapeFactorEnergy(targets + by * along),
+            friction,
+            [0.0, 0.1, 0.4],
+            relaxation=STILL,
+            adjoint=adjoint,
+            throw=False,
+        )
+        return jnp.sum(weights * movie.tissue.vertices**2)
+
+    adjoints = {
+        "implicit": ImplicitDifferentiation(),
+        "propagation": EquilibriumPropagation(beta=1e-5),
+    }
+    zero = jnp.array(0.0)
+    slopes = {
+        name: float(eqx.filter_jit(jax.grad(lambda by, a=adjoint: cost(by, a)))(zero))
+        for name, adjoint in adjoints.items()
+    }
+    widths = 10.0 ** np.arange(-7, -1.5, 0.5)
+    differences = np.array([float(cost(zero + h) - cost(zero - h)) / (2 * h) for h in widths])
+    return widths, {name: np.abs(differences / slope - 1) for name, slope in slopes.items()}
+
+
+def _controlled(
+    config: Config, solid: Tissue, energy: ShapeFactorEnergy
+) -> tuple[Float[np.ndarray, "orders tolerances"], Float[np.ndarray, "orders tolerances"]]:
+    """Errors at the end for both orders and all tolerances, and how many steps that took."""
+    key = jax.random.key(config.seed + 2)
+    bend = 0.02 * jax.random.normal(key, solid.vertices.shape)
+    start = solid.with_vertices(solid.vertices + bend)
+    times = np.linspace(0, 1, 3)
+    fine = np.linspace(0, 1, 1001)
+    exact = _by_frames(config, start, energy, fine, order=2, relaxation=STILL).tissue.vertices
+    errors = np.zeros((2, len(config.tolerances)))
+    counts = np.zeros_like(errors)
+    for order in (1, 2):
+        for i, tolerance in enumerate(config.tolerances):
+            control = StepControl(tolerance, most=400)
+            movie = evolve(
+                start,
+                energy,
+                SubstrateFriction(config.friction),
+                times,
+                control=control,
+                order=order,
+                relaxation=STILL,
+                throw=False,
+            )
+            errors[order - 1, i] = jnp.max(jnp.abs(movie.tissue.vertices - exact))
+            counts[order - 1, i] = (movie.steps > 0).sum()
+    return errors, counts
