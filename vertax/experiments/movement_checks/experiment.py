@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 from pydantic import Field
 
 from vertax.activities import ThermalNoise
@@ -48,7 +48,7 @@ class Config(ExperimentConfig):
     """Friction of a vertex with the substrate."""
     quench: float = Field(default=2.0, gt=0)
     """How long a random tissue is watched on its way to rest."""
-    halvings: int = Field(default=8, ge=2)
+    halvings: int = Field(default=7, ge=2)
     """How often the step of the quench is halved; the first is a tenth of its time."""
     noise_steps: int = Field(default=4000, ge=100)
     """Steps with noise, each of 0.4 units of time."""
@@ -67,7 +67,7 @@ class Findings(NamedTuple):
     eigenvalues: np.ndarray
     mode_energies: np.ndarray
     differences: np.ndarray
-    gradient_errors: dict[str, np.ndarray]
+    gradient_errors: np.ndarray
     control_errors: np.ndarray
     control_steps: np.ndarray
 
@@ -92,26 +92,28 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     energy = ShapeFactorEnergy(config.shape_factor + spread)
     rest = Relaxation(contact_range=None)(first, energy).tissue
     solid = STILL(rest, energy, throw=False).tissue
-    steps, decay = _decay(config, solid, energy)
-    folder.say("decay")
-    times, energies, events = _quench(config, first, energy)
-    folder.say("quench")
-    values, shares = _equipartition(config, solid, energy)
-    folder.say("noise")
-    widths, slopes = _gradients(config, solid, energy)
-    folder.say("gradients")
-    errors, counts = _controlled(config, solid, energy)
-    folder.say("controlled steps")
+    decay = folder.part("decay", lambda: _decay(config, solid, energy))
+    quenches = [
+        folder.part(f"quench {n}", lambda n=n: _quench(config, first, energy, n))
+        for n in 10 * 2 ** np.arange(config.halvings + 1)
+    ]
     found = Findings(
-        steps, decay, times, energies, events, values, shares, widths, slopes, errors, counts
+        decay["steps"],
+        decay["errors"],
+        [quench["times"] for quench in quenches],
+        [quench["energies"] for quench in quenches],
+        [quench["events"] for quench in quenches],
+        **folder.part("noise", lambda: _equipartition(config, solid, energy)),
+        **folder.part("gradients", lambda: _gradients(config, solid, energy)),
+        **folder.part("control", lambda: _controlled(config, solid, energy)),
     )
     folder.save_figure("checks", figures.checks(config, found))
     folder.save_table(
         "quench",
         {
-            "step": [t[1] - t[0] for t in times],
-            "num_t1": [len(e) for e in events],
-            "latest": [float(np.max(_apart(e, events[-1]), initial=0)) for e in events],
+            "step": [t[1] - t[0] for t in found.quench_times],
+            "num_t1": [len(e) for e in found.events],
+            "latest": [_latest(e, found.events[-1]) for e in found.events],
         },
     )
     return _metrics(config, found) | {"seconds": time.perf_counter() - began}
@@ -124,24 +126,21 @@ def _metrics(config: Config, found: Findings) -> dict[str, Any]:
         np.array_equal(e[:, 0], found.events[-1][:, 0]) if len(e) else False for e in found.events
     ]
     firm = next((i for i in range(len(same)) if all(same[i:])), len(same) - 1)
+    implicit, propagation = found.gradient_errors
     weights = 1 - np.exp(-found.eigenvalues * 0.4 / config.friction)
     return {
         "decay_order": [power(found.decay_steps[1:], e[1:]) for e in found.decay_errors],
         "largest_rise": float(max(rises)),
         "num_t1": [len(e) for e in found.events],
         "same_order_from_step": float(np.diff(found.quench_times[firm][:2])[0]),
-        "t1_times_off": [
-            float(np.max(_apart(e, found.events[-1]), initial=0)) for e in found.events
-        ],
+        "t1_times_off": [_latest(e, found.events[-1]) for e in found.events],
         "mode_energy": float(np.average(found.mode_energies, weights=weights)),
-        "gradient_error": {name: float(e.min()) for name, e in found.gradient_errors.items()},
+        "gradient_error": {"implicit": implicit.min(), "propagation": propagation.min()},
         "control_power": [power(config.tolerances, e) for e in found.control_errors],
     }
 
 
-def _decay(
-    config: Config, solid: Tissue, energy: ShapeFactorEnergy
-) -> tuple[np.ndarray, np.ndarray]:
+def _decay(config: Config, solid: Tissue, energy: ShapeFactorEnergy) -> dict[str, np.ndarray]:
     """Steps in units of the time of decay, and the error after that time for both orders."""
     number = solid.n_vertices  # in the middle
     found = modes(solid, energy, number + 1)
@@ -157,7 +156,7 @@ def _decay(
             )
             left = np.sum(np.asarray(movie.tissue.vertices - solid.vertices) * mode) / size
             errors[order - 1, i] = abs(left / np.exp(-1) - 1)
-    return 1 / counts, errors
+    return {"steps": 1 / counts, "errors": errors}
 
 
 def _by_frames(
@@ -169,31 +168,25 @@ def _by_frames(
 
 
 def _quench(
-    config: Config, first: Tissue, energy: ShapeFactorEnergy
-) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """Times and energies for each step, and edges and times of the transitions in their order."""
-    all_times, energies, events = [], [], []
-    for halving in range(config.halvings + 1):
-        n = 10 * 2**halving
-        times = config.quench * np.arange(n + 1) / n
-        movie = _by_frames(config, first, energy, times, relaxation=Relaxation(contact_range=None))
-        frames, edges = np.nonzero(np.asarray(movie.flipped))
-        all_times.append(times)
-        energies.append(np.asarray(movie.energies))
-        events.append(np.stack([edges, times[frames]], axis=1).reshape(-1, 2))
-    return all_times, energies, events
+    config: Config, first: Tissue, energy: ShapeFactorEnergy, n: int
+) -> dict[str, np.ndarray]:
+    """Times and energies with so many steps, and edges and times of the transitions in their order."""
+    times = config.quench * np.arange(n + 1) / n
+    movie = _by_frames(config, first, energy, times, relaxation=Relaxation(contact_range=None))
+    frames, edges = np.nonzero(np.asarray(movie.flipped))
+    events = np.stack([edges, times[frames]], axis=1).reshape(-1, 2)
+    return {"times": times, "energies": np.asarray(movie.energies), "events": events}
 
 
-def _apart(events: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """How far first transitions of edges are from those of the same edges in another run."""
-    there = dict(reversed(reference.tolist()))
-    here = dict(reversed(events.tolist()))
-    return np.array([abs(here[edge] - there[edge]) for edge in here if edge in there])
+def _latest(events: np.ndarray, reference: np.ndarray) -> float:
+    """How far the first transition of an edge is at most from that of the same edge in another run."""
+    there, here = (dict(reversed(x.tolist())) for x in (reference, events))
+    return max((abs(here[edge] - there[edge]) for edge in here if edge in there), default=0.0)
 
 
 def _equipartition(
     config: Config, solid: Tissue, energy: ShapeFactorEnergy
-) -> tuple[np.ndarray, np.ndarray]:
+) -> dict[str, np.ndarray]:
     """Eigenvalues, and the energy of each mode over the temperature."""
     found = modes(solid, energy, 2 * solid.n_vertices)
     values = np.asarray(found.values)[2:]
@@ -212,12 +205,11 @@ def _equipartition(
     amplitudes = moved.reshape(len(moved), -1) @ vectors.T
     # Of implicit Euler steps each mode has λ <q²> = T / (1 + λ dt / 2 ζ).
     damped = 1 + values * dt / (2 * config.friction)
-    return values, values * (amplitudes**2).mean(axis=0) * damped / temperature
+    energies = values * (amplitudes**2).mean(axis=0) * damped / temperature
+    return {"eigenvalues": values, "mode_energies": energies}
 
 
-def _gradients(
-    config: Config, solid: Tissue, energy: ShapeFactorEnergy
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _gradients(config: Config, solid: Tissue, energy: ShapeFactorEnergy) -> dict[str, np.ndarray]:
     """Widths of central differences, and the relative error of the slope by each adjoint."""
     key = jax.random.key(config.seed + 1)
     start = solid.with_vertices(
@@ -243,23 +235,18 @@ def _gradients(
         )
         return jnp.sum(weights * movie.tissue.vertices**2)
 
-    adjoints = {
-        "implicit": ImplicitDifferentiation(),
-        "propagation": EquilibriumPropagation(beta=1e-5),
-    }
     zero = jnp.array(0.0)
-    slopes = {
-        name: float(eqx.filter_jit(jax.grad(lambda by, a=adjoint: cost(by, a)))(zero))
-        for name, adjoint in adjoints.items()
-    }
+    slopes = [
+        float(eqx.filter_jit(jax.grad(lambda by, a=adjoint: cost(by, a)))(zero))
+        for adjoint in (ImplicitDifferentiation(), EquilibriumPropagation(beta=1e-5))
+    ]
     widths = 10.0 ** np.arange(-7, -1.5, 0.5)
     differences = np.array([float(cost(zero + h) - cost(zero - h)) / (2 * h) for h in widths])
-    return widths, {name: np.abs(differences / slope - 1) for name, slope in slopes.items()}
+    errors = [np.abs(differences / slope - 1) for slope in slopes]
+    return {"differences": widths, "gradient_errors": np.stack(errors)}
 
 
-def _controlled(
-    config: Config, solid: Tissue, energy: ShapeFactorEnergy
-) -> tuple[Float[np.ndarray, "orders tolerances"], Float[np.ndarray, "orders tolerances"]]:
+def _controlled(config: Config, solid: Tissue, energy: ShapeFactorEnergy) -> dict[str, np.ndarray]:
     """Errors at the end for both orders and all tolerances, and how many steps that took."""
     key = jax.random.key(config.seed + 2)
     bend = 0.02 * jax.random.normal(key, solid.vertices.shape)
@@ -284,4 +271,4 @@ def _controlled(
             )
             errors[order - 1, i] = jnp.max(jnp.abs(movie.tissue.vertices - exact))
             counts[order - 1, i] = (movie.steps > 0).sum()
-    return errors, counts
+    return {"control_errors": errors, "control_steps": counts}

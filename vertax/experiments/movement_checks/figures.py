@@ -80,7 +80,8 @@ def _noise(ax: Axes, found: Any) -> None:
 
 
 def _gradients(ax: Axes, found: Any) -> None:
-    for colour, (name, errors) in zip(SERIES, found.gradient_errors.items(), strict=False):
+    names = ("implicit", "propagation")
+    for colour, name, errors in zip(SERIES, names, found.gradient_errors, strict=False):
         ax.plot(found.differences, errors, "o-", ms=3, lw=0.8, color=colour, label=name)
     ax.set(xscale="log", yscale="log", xlabel="width of the difference", ylabel="relative error")
     ax.set_title("5. gradient against differences")
