@@ -60,6 +60,13 @@ SHORT = {
         "fit.epochs=2",
         f"methods={ONE_METHOD}",
     ],
+    "movement_checks": [
+        "tissue.n_cells=9",
+        "quenched.n_cells=9",
+        "halvings=2",
+        "noise_steps=100",
+        "tolerances=[1e-2, 1e-3]",
+    ],
     "oscillatory_shear": ["frequencies=[1, 10]", "steps=8", "cycles=1", "n_cells=0"],
     "paper_benchmark": ["tissue.n_cells=6", "fit.epochs=2"],
     "rigidity_transition": [

@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PRNGKeyArray
 from pydantic import Field
 
 from vertax.activities import ThermalNoise
@@ -46,8 +46,10 @@ class Config(ExperimentConfig):
     """Mean target shape factor, of a solid tissue."""
     friction: float = Field(default=1.0, gt=0)
     """Friction of a vertex with the substrate."""
-    quench: float = Field(default=2.0, gt=0)
-    """How long a random tissue is watched on its way to rest."""
+    quenched: TissueSection = TissueSection(n_cells=36)
+    """A random tissue that is watched on its way to rest."""
+    quench: float = Field(default=1.0, gt=0)
+    """How long it is watched."""
     halvings: int = Field(default=7, ge=2)
     """How often the step of the quench is halved; the first is a tenth of its time."""
     noise_steps: int = Field(default=4000, ge=100)
@@ -87,15 +89,14 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     """
     began = time.perf_counter()
     key = jax.random.key(config.seed)
-    first = periodic_voronoi(config.tissue.n_cells, key=key, lloyd_steps=config.tissue.lloyd_steps)
-    spread = 0.1 * jax.random.normal(jax.random.fold_in(key, 1), (first.n_cells,))
-    energy = ShapeFactorEnergy(config.shape_factor + spread)
+    first, energy = _random(config, config.tissue, key)
+    wild = _random(config, config.quenched, jax.random.fold_in(key, 2))
     rest = Relaxation(contact_range=None)(first, energy).tissue
     solid = STILL(rest, energy, throw=False).tissue
     decay = folder.part("decay", lambda: _decay(config, solid, energy))
     quenches = [
-        folder.part(f"quench {n}", lambda n=n: _quench(config, first, energy, n))
-        for n in 10 * 2 ** np.arange(config.halvings + 1)
+        folder.part(f"quench {n}", lambda n=n: _quench(config, *wild, n))
+        for n in (10 * 2 ** np.arange(config.halvings + 1)).tolist()
     ]
     found = Findings(
         decay["steps"],
@@ -117,6 +118,15 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         },
     )
     return _metrics(config, found) | {"seconds": time.perf_counter() - began}
+
+
+def _random(
+    config: Config, section: TissueSection, key: PRNGKeyArray
+) -> tuple[Tissue, ShapeFactorEnergy]:
+    """A random tissue and its energy."""
+    tissue = periodic_voronoi(section.n_cells, key=key, lloyd_steps=section.lloyd_steps)
+    spread = 0.1 * jax.random.normal(jax.random.fold_in(key, 1), (section.n_cells,))
+    return tissue, ShapeFactorEnergy(config.shape_factor + spread)
 
 
 def _metrics(config: Config, found: Findings) -> dict[str, Any]:
