@@ -19,7 +19,7 @@ from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Periodic, Tissue
 from vertax.responses._evolved import Evolved
 from vertax.responses._response import Equilibrium
-from vertax.responses._step import Incremental
+from vertax.responses._step import Incremental, flipped_as
 
 # Of a method of second order with two stages of this share of a step each (SDIRK: Alexander 1977,
 # doi:10.1137/0714068), which damps what is fast as the implicit Euler method does.
@@ -103,7 +103,7 @@ def march(
 ) -> tuple[State, Frames]:
     """From the first of the times of an `Evolution` to the last."""
     times = evolution.times.astype(state.tissue.vertices.dtype)
-    control = evolution.control
+    control, flips = evolution.control, evolution.relaxation.transitions is not None
 
     def stage(
         state: State, before: Tissue, acts: Any, start: Any, end: Any, strained: Any
@@ -112,7 +112,7 @@ def march(
         there = evolution.placed(state.tissue, end)
         pulls = _energy_at(energy, end)
         pulls = pulls if acts is None else pulls + acts
-        potential = Incremental(pulls, evolution.dissipation, before, end - start, strained)
+        potential = Incremental(pulls, evolution.dissipation, before, end - start, strained, flips)
         return state.after(evolution.relaxation.solve(there, potential, adjoint, thrifty=True))
 
     def step(state: State, start: Any, end: Any) -> State:
@@ -128,7 +128,8 @@ def march(
             return stage(state, before, acts, start, end, None)
         middle = stage(state, before, acts, start, start + _SHARE * dt, None)
         assert isinstance(evolution.dissipation, AbstractViscosity)
-        strained = evolution.dissipation.strains(middle.tissue, before) * (1 - _SHARE) / _SHARE
+        base = flipped_as(before, middle.tissue) if flips else before
+        strained = evolution.dissipation.strains(middle.tissue, base) * (1 - _SHARE) / _SHARE
         return stage(middle, before, acts, end - _SHARE * dt, end, strained)
 
     def attempt(state: State, start: Any, stop: Any) -> tuple[State, Any, Array]:

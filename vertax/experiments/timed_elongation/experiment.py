@@ -60,7 +60,7 @@ class Config(ExperimentConfig):
     """Friction of a vertex with the substrate."""
     tensions: TensionRange = TensionRange()
     """Range of the tensions of edges, and stiffness of the cells."""
-    fit: Fitting = Fitting(learning_rate=0.1, epochs=150)
+    fit: Fitting = Fitting(learning_rate=0.2, epochs=80)
     """How the tensions (their logits) are fitted."""
     gradient: Gradient = Gradient()
     """How gradients through each step are taken."""
