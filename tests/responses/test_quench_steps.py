@@ -17,7 +17,7 @@ def quenched(n_steps, duration=0.4):
     times = duration * np.arange(n_steps + 1) / n_steps
     # Frame by frame: one program serves all lengths of steps.
     movie = vx.evolve(
-        random_tissue(16, 3),
+        random_tissue(16, 5),
         ShapeFactorEnergy(p0),
         SubstrateFriction(1.0),
         times,

@@ -50,7 +50,7 @@ class Config(ExperimentConfig):
     """A random tissue that is watched on its way to rest."""
     quench: float = Field(default=1.0, gt=0)
     """How long it is watched."""
-    halvings: int = Field(default=7, ge=2)
+    halvings: int = Field(default=6, ge=2)
     """How often the step of the quench is halved; the first is a tenth of its time."""
     noise_steps: int = Field(default=4000, ge=100)
     """Steps with noise, each of 0.4 units of time."""
@@ -262,8 +262,10 @@ def _controlled(config: Config, solid: Tissue, energy: ShapeFactorEnergy) -> dic
     bend = 0.02 * jax.random.normal(key, solid.vertices.shape)
     start = solid.with_vertices(solid.vertices + bend)
     times = np.linspace(0, 1, 3)
+    # (In very short steps no force gets below that of STILL, for rounding.)
+    plain = Relaxation(transitions=None, contact_range=None)
     fine = np.linspace(0, 1, 1001)
-    exact = _by_frames(config, start, energy, fine, order=2, relaxation=STILL).tissue.vertices
+    exact = _by_frames(config, start, energy, fine, order=2, relaxation=plain).tissue.vertices
     errors = np.zeros((2, len(config.tolerances)))
     counts = np.zeros_like(errors)
     for order in (1, 2):
@@ -276,7 +278,7 @@ def _controlled(config: Config, solid: Tissue, energy: ShapeFactorEnergy) -> dic
                 times,
                 control=control,
                 order=order,
-                relaxation=STILL,
+                relaxation=plain,
                 throw=False,
             )
             errors[order - 1, i] = jnp.max(jnp.abs(movie.tissue.vertices - exact))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from vertax.plotting import INK, SERIES, house_style, new_figure
 
@@ -41,6 +42,7 @@ def _decay(ax: Axes, found: Any) -> None:
     ax.set(
         xscale="log", yscale="log", xlabel=r"$\Delta t\,\lambda / \zeta$", ylabel="relative error"
     )
+    ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_title("1. decay of a mode")
     ax.legend()
 
@@ -51,7 +53,7 @@ def _energies(ax: Axes, found: Any) -> None:
         times, energies = found.quench_times[i], found.quench_energies[i]
         style: Any = {"marker": ".", "ms": 4} if i == 0 else {}
         ax.plot(times, energies, color=colour, label=f"$\\Delta t$ = {times[1]:.2g}", **style)
-    ax.set(yscale="log", xlabel="time", ylabel="energy", title="2. a quench")
+    ax.set(xlabel="time", ylabel="energy", title="2. a quench")
     ax.legend()
 
 
@@ -96,5 +98,5 @@ def _controlled(ax: Axes, config: Any, found: Any) -> None:
         for x, y, n in zip(config.tolerances, errors, counts, strict=True):
             ax.annotate(f"{n:.0f}", (x, y), xytext=(3, -7), textcoords="offset points", fontsize=6)
     ax.set(xscale="log", yscale="log", xlabel="tolerance of a step", ylabel="error at the end")
-    ax.set_title("6. controlled steps, and how many")
+    ax.set_title("6. controlled steps")
     ax.legend()
