@@ -103,7 +103,7 @@ class TestBadInput:
     def test_numbers(self):
         for settings in ({"tolerance": 0.0}, {"first": -1.0}, {"most": 0}):
             with pytest.raises(ValueError, match=next(iter(settings))):
-                StepControl(**settings)
+                StepControl(**settings)  # pyright: ignore[reportArgumentType]
 
     def test_what_does_not_go_with_it(self, as_a_user):
         control = StepControl()

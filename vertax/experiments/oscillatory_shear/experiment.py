@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 from pydantic import Field, field_validator
 
 from vertax.dissipations import SubstrateFriction
@@ -83,7 +83,7 @@ class _Sample(NamedTuple):
     """A tissue at rest, and what its moduli should be."""
 
     tissue: Tissue
-    expected: np.ndarray
+    expected: Complex[np.ndarray, " frequencies"]
 
 
 def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
@@ -116,7 +116,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     columns: dict[str, Any] = {"frequency": frequencies}
     metrics: dict[str, Any] = {}
     for name, sample in samples.items():
-        found, expected = measured[name], sample.expected
+        found: Any = measured[name]
+        expected: Any = sample.expected
         for what, values in (("measured", found), ("expected", expected)):
             columns |= {f"{name}_storage_{what}": values.real, f"{name}_loss_{what}": values.imag}
         metrics[name] = {
@@ -125,8 +126,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
             "error": np.max(np.abs(found - expected) / np.abs(expected)),
         }
     folder.save_table("moduli", columns)
-    expected = {name: sample.expected for name, sample in samples.items()}
-    folder.save_figure("moduli", figures.moduli(frequencies, measured, expected))
+    known = {name: sample.expected for name, sample in samples.items()}
+    folder.save_figure("moduli", figures.moduli(frequencies, measured, known))
     return metrics | {"seconds": time.perf_counter() - began}
 
 
@@ -171,7 +172,7 @@ def _modulus(
     movie = evolution(tissue, energy)
     stresses = np.asarray(_stresses(movie.frames, energy) - stress(tissue, energy))[-steps:, 0, 1]
     phase = frequency * times[-steps:]
-    return 2 * np.mean(stresses * (np.sin(phase) + 1j * np.cos(phase))) / config.strain
+    return np.asarray(2 * np.mean(stresses * (np.sin(phase) + 1j * np.cos(phase))) / config.strain)
 
 
 @eqx.filter_jit
