@@ -22,7 +22,7 @@ from vertax.adjoints._adjoint import (
     settle,
 )
 from vertax.solvers import MINRES
-from vertax.solvers._long_waves import ElasticMINRES
+from vertax.solvers._elastic_minres import ElasticMINRES
 
 
 class ImplicitDifferentiation(AbstractAdjoint):

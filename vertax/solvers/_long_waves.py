@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax.mesh import Periodic, Tissue
 from vertax.mesh._topology import take
-from vertax.solvers._minres import MINRES
 
 # Smaller tissues have no waves that are long enough to be slow, and pay more than they gain.
 FEWEST_CELLS = 300
@@ -84,7 +81,7 @@ class LongWaves(eqx.Module):
         return 1e-4 * stiffness / shortest
 
     def fitted(
-        self, hessian: Callable[[PyTree], PyTree], like: PyTree[Array], floor: Float[Array, ""]
+        self, hessian: Callable[[PyTree], PyTree], like: PyTree, floor: Float[Array, ""]
     ) -> Medium:
         """The medium with the stiffness of waves in a tissue.
 
@@ -141,7 +138,9 @@ class Medium(eqx.Module):
         modes = jnp.fft.rfft2(on_grid.reshape(*shape, 2), axes=(0, 1))
         numbers = np.stack(
             np.meshgrid(
-                np.fft.fftfreq(w.size, 1 / w.size), np.fft.rfftfreq(w.size, 1 / w.size), indexing="ij"
+                np.fft.fftfreq(w.size, 1 / w.size),
+                np.fft.rfftfreq(w.size, 1 / w.size),
+                indexing="ij",
             ),
             axis=-1,
         )
@@ -157,69 +156,6 @@ class Medium(eqx.Module):
         moved = jnp.fft.irfft2(jnp.where(whole, 0, modes), s=shape, axes=(0, 1)).reshape(-1, 2)
         there = jnp.sum(w.weights[:, :, None] * take(moved, w.indices), axis=1)
         return (there / w.filled).astype(force.dtype)
-
-
-class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Medium]]):
-    """MINRES for the Hessian of a large tissue, preconditioned by its long waves.
-
-    Where the system has no solution, as if there are zero modes that the right-hand side sees, the result
-    would depend on the preconditioner: such a system is solved again without.
-    """
-
-    plain: MINRES
-    waves: LongWaves
-    stiffness: Float[Array, ""]
-
-    def init(
-        self, operator: lx.AbstractLinearOperator, options: dict[str, Any]
-    ) -> tuple[Any, Medium]:
-        linear = self.plain.init(operator, options)
-        floor = self.waves.floor(self.stiffness)
-        return linear, self.waves.fitted(linear.mv, operator.in_structure(), floor)
-
-    def compute(
-        self, state: tuple[Any, Medium], vector: PyTree[Array], options: dict[str, Any]
-    ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        linear, medium = state
-
-        def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
-            first, *rest = jax.tree.leaves(r)
-            shift = jnp.zeros((), first.dtype)
-            first = first / self.stiffness + medium.yields(first, shift)
-            leaves = [first, *(x / self.stiffness for x in rest)]
-            return jax.tree.unflatten(jax.tree.structure(r), leaves)
-
-        preconditioner = lx.FunctionLinearOperator(
-            approximate_inverse, linear.in_structure(), lx.positive_semidefinite_tag
-        )
-        helped = self.plain.compute(linear, vector, options | {"preconditioner": preconditioner})
-        taken = helped[2]["num_steps"]
-
-        def plainly(last: tuple) -> tuple:
-            solution, result, stats = self.plain.compute(linear, vector, options)
-            return solution, result, stats | {"num_steps": stats["num_steps"] + taken}, False
-
-        def unsolved(last: tuple) -> Any:
-            *_, doubtful = last
-            return doubtful
-
-        arrays = lambda x: jax.tree.map(jnp.asarray, x)
-        value, result, stats = helped
-        doubtful = stats["inconsistent"] | (result != lx.RESULTS.successful)
-        # (A loop and not a branch, of which `vmap` would make both.)
-        *solved, _ = jax.lax.while_loop(
-            unsolved, lambda x: arrays(plainly(x)), arrays((value, result, stats, doubtful))
-        )
-        return tuple(solved)  # pyright: ignore[reportReturnType]
-
-    def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return state, options
-
-    def conj(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return state, options
-
-    def assume_full_rank(self) -> bool:
-        return self.plain.assume_full_rank()
 
 
 def _box(tissue: Tissue) -> tuple[Float[Array, "2 2"], Float[Array, "2"]]:

@@ -219,9 +219,7 @@ class _Waves(eqx.Module):
             return None
         stiffness = options["stiffness"]
         fitted = lambda: waves.fitted(hessian, like, waves.floor(stiffness))
-        nothing = jax.tree.map(
-            lambda x: jnp.ones(x.shape, x.dtype), eqx.filter_eval_shape(fitted)
-        )
+        nothing = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), eqx.filter_eval_shape(fitted))
         return cls(jax.lax.cond(used, fitted, lambda: nothing), stiffness, used)
 
     def added(self, near: PyTree, r: PyTree, shift: Rows) -> PyTree:
