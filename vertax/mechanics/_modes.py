@@ -13,9 +13,10 @@ from jaxtyping import Array, Float, PyTree
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
-from vertax._base.checks import check_number, check_whole
+from vertax._base.checks import as_doubles, check_concrete, check_number, check_whole
 from vertax._base.modules import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
+from vertax.mechanics._arguments import check_tissue
 from vertax.mechanics._hessian import dense_hessian, flat_hessian, movable, sparse_hessian
 from vertax.mechanics._landscape import Landscape, stationary
 from vertax.mesh import Tissue
@@ -76,8 +77,10 @@ def modes(
     **Raises:**
 
     - `ValueError` for more modes than degrees of freedom, or another method.
-    - `TypeError` for `"sparse"` with an energy that is not local, or inside `jax.jit`.
+    - `TypeError` for what is no tissue or no energy, and for `"sparse"` with an energy that is not local,
+        or inside `jax.jit`.
     """
+    check_tissue(tissue, energy)
     check_whole("k", k, least=1)
     if method not in (None, "dense", "sparse"):
         raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
@@ -112,7 +115,13 @@ def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
     - `energy`: the energy that it is at rest under.
 
     **Returns:** the eigenvalues, energy per length squared.
+
+    **Raises:**
+
+    - `TypeError` inside `jax.jit`, and for what is no tissue or no energy.
     """
+    check_tissue(tissue, energy)
+    check_concrete("spectrum", tissue, energy)
     matrix = np.asarray(_dense(Landscape(*traced((tissue, energy)))))
     free = np.asarray(ravel_pytree(movable(tissue))[0])
     return jnp.asarray(np.linalg.eigvalsh(matrix[np.ix_(free, free)]))
@@ -130,6 +139,8 @@ def zero_modes(tissue: Tissue, energy: AbstractEnergy, *, tolerance: float = 1e-
     - `tolerance`: an eigenvalue counts as 0 if it is that much smaller than the largest one.
 
     **Returns:** their number.
+
+    **Raises:** as `spectrum`.
     """
     check_number("tolerance", tolerance, above=0)
     values = np.abs(np.asarray(spectrum(tissue, energy)))
@@ -147,12 +158,20 @@ def density_of_states(
     - `bins`: number of bins, from 0 to the largest frequency.
     - `tolerance`: eigenvalues that are that much smaller than the largest one are zero modes, and left out.
 
-    **Returns:** the middle of each bin, and the share of all modes per frequency in it: its integral is
-    the share
-        of the modes that are no zero modes.
+    **Returns:** the middle of each bin, and the share of all modes per frequency in it: its integral is the
+        share of the modes that are no zero modes.
+
+    **Raises:**
+
+    - `ValueError` for what is no list of finite eigenvalues, or no bins.
     """
     check_whole("bins", bins, least=1)
-    found = np.asarray(values, float)
+    found = as_doubles("values", values)
+    if found.ndim != 1 or found.size == 0:
+        raise ValueError(
+            f"Argument `values` must be one list of eigenvalues, but its shape is {found.shape}."
+        )
+    check_number("tolerance", tolerance, above=0)
     frequencies = np.sqrt(found[found > tolerance * np.abs(found).max()])
     counts, edges = np.histogram(frequencies, bins, (0, frequencies.max(initial=0) or 1))
     return 0.5 * (edges[1:] + edges[:-1]), counts / (found.size * np.diff(edges))

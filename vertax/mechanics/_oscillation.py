@@ -15,6 +15,7 @@ from vertax._base.checks import as_real, check_number
 from vertax._base.modules import traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
+from vertax.mechanics._arguments import check_dissipation, check_tissue
 from vertax.mechanics._elasticity import shear_part
 from vertax.mechanics._hessian import dense_hessian
 from vertax.mechanics._landscape import (
@@ -22,7 +23,6 @@ from vertax.mechanics._landscape import (
     area_of,
     dissipation_landscape,
     dot,
-    require_box,
     stationary,
     voigt_basis,
 )
@@ -70,11 +70,17 @@ def complex_modulus(
 
     **Raises:**
 
-    - `ValueError` for a free tissue, or a negative frequency.
+    - `TypeError` for what is no tissue, no energy or no dissipation.
+    - `ValueError` for a free tissue, a negative frequency, or no list of them.
     """
-    require_box(tissue, "a complex modulus")
+    check_tissue(tissue, energy, box="a complex modulus")
+    check_dissipation(dissipation)
     check_number("frequencies", frequencies, least=0, many=True)
     omegas = jnp.atleast_1d(as_real("frequencies", frequencies)).astype(tissue.vertices.dtype)
+    if omegas.ndim != 1 or omegas.size == 0:
+        raise ValueError(
+            f"Argument `frequencies` must be a list of numbers, but its shape is {omegas.shape}."
+        )
     real, imaginary = _tensors(*traced((tissue, energy, dissipation)), omegas)
     part = jax.vmap(lambda tensor: shear_part(tensor, angle))
     return jax.lax.complex(part(real), part(imaginary))
