@@ -71,6 +71,22 @@ def test_viscosity_of_perimeters_against_a_dense_solution(lattice):
         assert complex(value) == pytest.approx(wanted, rel=1e-7)
 
 
+def test_sparse_factorisations_give_what_the_dense_decomposition_does():
+    # Not at rest, but friction holds whatever the energy lets go.
+    tissue, energy = random_tissue(36, 3), ShapeFactorEnergy(3.4)
+    friction = SubstrateFriction(0.7) + PerimeterViscosity(0.4)
+    found = [
+        mechanics.complex_modulus(tissue, energy, friction, [0.0, 0.3, 2.0, 1e4], method=method)
+        for method in ("dense", "sparse")
+    ]
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-8)
+    by = lambda p: mechanics.complex_modulus(
+        tissue, ShapeFactorEnergy(p), friction, 1.0, method="sparse"
+    )
+    with pytest.raises(TypeError, match='"sparse" only for an AbstractLocalEnergy'):
+        jax.jit(by)(3.4)
+
+
 @pytest.mark.slow
 def test_derivatives_against_differences(lattice):
     def loss(p0):

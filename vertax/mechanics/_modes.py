@@ -11,18 +11,22 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 from scipy.sparse import diags_array
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vertax._base.checks import as_doubles, check_concrete, check_number, check_whole
 from vertax._base.modules import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mechanics._arguments import check_tissue
-from vertax.mechanics._hessian import dense_hessian, flat_hessian, movable, sparse_hessian
+from vertax.mechanics._hessian import (
+    DENSE,
+    dense_hessian,
+    factorised,
+    flat_hessian,
+    movable,
+    sparse_hessian,
+)
 from vertax.mechanics._landscape import Landscape, stationary
 from vertax.mesh import Tissue
-
-# A dense eigenproblem of that size takes a fraction of a second.
-_DENSE = 800
 
 
 class Modes(eqx.Module):
@@ -97,9 +101,9 @@ def modes(
             'jax.vmap and jax.grad: pass method="dense".'
         )
     tissue, energy = traced((tissue, energy))
-    sparse = possible and size > max(_DENSE, 4 * k) if method is None else method == "sparse"
+    sparse = possible and size > max(DENSE, 4 * k) if method is None else method == "sparse"
     if sparse and isinstance(energy, AbstractLocalEnergy):
-        vectors = jnp.asarray(_softest(tissue, energy, k), tissue.vertices.dtype)
+        vectors = jnp.asarray(_softest(Landscape(tissue, energy), k), tissue.vertices.dtype)
         return _modes_along(tissue, energy, vectors)
     return _dense_modes(tissue, energy, k)
 
@@ -232,20 +236,20 @@ def _unravelled(
     return jax.vmap(ravel_pytree(tissue.configuration)[1])(vectors)
 
 
-def _softest(
-    tissue: Tissue, energy: AbstractLocalEnergy, k: int
-) -> Float[np.ndarray, "modes dofs"]:
+def _softest(landscape: Landscape, k: int) -> Float[np.ndarray, "modes dofs"]:
     """The eigenvectors of the eigenvalues next to 0, by shift and invert."""
+    tissue = landscape.tissue
     free = np.flatnonzero(np.asarray(ravel_pytree(movable(tissue))[0]))
-    matrix = sparse_hessian(tissue, energy)[free][:, free]
+    found = sparse_hessian(landscape)
+    if found is None:
+        raise TypeError(
+            "Argument `energy` says that it is local, but vertices without a cell in common feel each other: "
+            'pass method="dense".'
+        )
+    matrix = found[free][:, free]
     # So little below 0 that it changes no order, and far enough that zero modes can be inverted.
     shift = 1e-7 * matrix.diagonal().mean()
-    factors = splu(
-        (matrix + diags_array(np.full(free.size, shift))).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    factors = factorised(matrix + diags_array(np.full(free.size, shift)))
     # Its constructor makes one of a class that type checkers do not see.
     linear: Any = LinearOperator
     inverse = linear(matrix.shape, matvec=factors.solve, dtype=float)

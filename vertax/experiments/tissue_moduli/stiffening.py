@@ -8,9 +8,11 @@ which jumps from 0 to $\Delta G$, have
 
 $$\frac{G - \Delta G}{\tau} = \frac{3}{\gamma_c}$$
 
-whatever the numbers (Merkel, Baumgarten, Tighe & Manning 2019, doi:10.1073/pnas.1815436116). Here the
-strain is simple shear both ways from a random fluid tissue, which need not be at $\gamma_0$: so $\gamma_c$ is
-half of the distance between both onsets.
+whatever the numbers (Merkel, Baumgarten, Tighe & Manning 2019, doi:10.1073/pnas.1815436116).
+
+Here random tissues are quenched where they are solid, and keep their neighbours from then on. The target
+shape factor at which each becomes fluid is found, and a little more makes it fluid. It is then sheared both
+ways; since it need not begin at $\gamma_0$, $\gamma_c$ is half of the distance between both onsets.
 """
 
 from __future__ import annotations
@@ -25,10 +27,11 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from vertax.energies import ShapeFactorEnergy
+from vertax.fitting import member
 from vertax.mechanics import ramp, shear_modulus
 from vertax.mesh import Tissue
 from vertax.responses import Relaxation as Response
-from vertax.runs import RunFolder, Section, TissueSection, scan
+from vertax.runs import RunFolder, Section, TissueSection, scan, spread_of
 
 from . import figures
 
@@ -36,18 +39,21 @@ from . import figures
 class Stiffening(Section):
     """Fluid tissues, sheared slowly both ways until they are solid; cells keep their neighbours."""
 
-    shape_factors: list[float] = Field(default=[3.9, 3.92, 3.95, 4.0], min_length=1)
-    """Target shape factors of all cells."""
+    quench: float = Field(default=3.75, gt=0)
+    """Target shape factor of all cells at which tissues are quenched; solid."""
+    excess: list[float] = Field(default=[0.002, 0.005, 0.01, 0.02], min_length=1)
+    """How much more than at its transition the target shape factor of a tissue is."""
     replicates: int = Field(default=20, ge=0)
-    """Independent tissues for each of them; 0 leaves all this out."""
-    strain: float = Field(default=0.8, gt=0)
+    """Independent tissues; 0 leaves all this out."""
+    strain: float = Field(default=0.4, gt=0)
     """The largest shear."""
-    steps: int = Field(default=80, ge=8)
+    steps: int = Field(default=50, ge=8)
     """Steps to it."""
-    window: float = Field(default=0.06, gt=0)
+    window: float = Field(default=0.05, gt=0)
     """The range of strains beyond the onset in which stress and modulus are compared."""
-    zero_energy: float = Field(default=1e-8, gt=0)
-    """Energy per cell below which a tissue counts as fluid."""
+    zero_stress: float = Field(default=1e-6, gt=0)
+    """Shear stress below which a tissue counts as fluid. (One cell with four sides may have energy, and is
+    alone with it.)"""
     tissue: TissueSection = TissueSection(n_cells=64, lloyd_steps=2)
     """The tissues."""
 
@@ -84,33 +90,42 @@ def stiffen(
     if not config.replicates:
         return {}
     strains = np.linspace(0, config.strain, config.steps + 1)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1), config.replicates)
+    drawn = config.tissue.draw(keys)
+    # The minimal perimeter is that of one arrangement of cells.
+    same = eqx.tree_at(lambda r: r.transitions, response, None, is_leaf=lambda x: x is None)
+    quench = jnp.asarray(config.quench)
+    edges = [_edge_of_the_solid(member(drawn, k), quench, response, same) for k in range(len(keys))]
 
-    def compute(p0: float) -> dict[str, np.ndarray]:
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1), config.replicates)
-        arguments = (config.tissue.draw(keys), jnp.asarray(p0), jnp.asarray(strains), response)
-        return {name: np.asarray(value) for name, value in _shear(*arguments).items()}
+    def compute(excess: float) -> dict[str, np.ndarray]:
+        numbers = [jnp.asarray(x) for x in (strains, config.zero_stress)]
+        courses = [_shear(tissue, p0 + excess, *numbers, same) for tissue, p0 in edges]
+        return {name: np.stack([np.asarray(c[name]) for c in courses]) for name in courses[0]}
 
-    found = scan("sheared p0", config.shape_factors, compute, folder, progress=progress)
+    found = scan("excess", config.excess, compute, folder, progress=progress)
     pairs: list[tuple[Branch, Branch]] = []
     rows: list[dict[str, float]] = []
-    for i, k in np.ndindex(len(config.shape_factors), config.replicates):
+    for i, k in np.ndindex(len(config.excess), config.replicates):
         one = {name: values[i, k] for name, values in found.items()}
         sides = [branch(strains, one, side, config) for side in range(2)]
         if sides[0] is not None and sides[1] is not None:
             pairs.append((sides[0], sides[1]))
-            rows.append({"p0": config.shape_factors[i], "tissue": k} | compared(*pairs[-1]))
+            row = {"tissue": k, "p0": float(edges[k][1]), "excess": config.excess[i]}
+            rows.append(row | compared(*pairs[-1]))
     if not rows:
         return {"sheared": 0}
     table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     folder.save_table("stiffening", table)
     folder.save_figure("stiffening", figures.stiffening(pairs, table))
-    factor = table["factor"]
+    chosen = {f"{excess:g}": table["excess"] == excess for excess in config.excess}
     return {
         "sheared": len(rows),
-        "critical_strain": float(table["critical_strain"].mean()),
-        "factor": float(factor.mean()),
-        "factor_error": float(factor.std() / np.sqrt(factor.size)),
-        "factor_median": float(np.median(factor)),
+        "transition": spread_of(table["p0"]),
+        "critical_strain": {
+            name: spread_of(table["critical_strain"][c]) for name, c in chosen.items()
+        },
+        "factor": {name: spread_of(table["factor"][c]) for name, c in chosen.items()},
+        "factor_median": {name: float(np.median(table["factor"][c])) for name, c in chosen.items()},
     }
 
 
@@ -125,25 +140,22 @@ def branch(
     **Arguments:**
 
     - `strains`: the strains, from 0 on.
-    - `found`: energies per cell, shear stresses and moduli along both ways, shape `(2, strains)`.
+    - `found`: shear stresses and moduli along both ways, shape `(2, strains)`.
     - `side`: which way.
     - `config`: the section of the configuration.
 
     **Returns:** the branch, with positive stresses.
     """
-    energy, modulus = found["energy"][side], found["modulus"][side]
-    stress = np.abs(found["stress"][side])
-    solid = energy > config.zero_energy
-    known = found["converged"][side] & (~solid | np.isfinite(modulus))
+    modulus, stress = found["modulus"][side], np.abs(found["stress"][side])
+    solid = stress > config.zero_stress
     first = int(np.argmax(solid))
-    if first < 2 or not known.all() or not solid[first:].all():
-        return None
     near = slice(first, int(np.searchsorted(strains, strains[first] + config.window)) + 1)
-    x, root = strains[near], np.sqrt(energy[near])
-    if x.size < 4:
+    known = found["converged"][side][near].all() and np.isfinite(modulus[near]).all()
+    x = strains[near]
+    if first == 0 or not known or not solid[near].all() or x.size < 5:
         return None
-    # The root of the energy is what is missing to the perimeter: smooth, and 0 at the onset.
-    zeros = np.roots(np.polyfit(x - x[0], root, 2))
+    # The stress is smooth beyond the onset, and 0 there.
+    zeros = np.roots(np.polyfit(x - x[0], stress[near], 2))
     zeros = zeros[np.isreal(zeros)].real
     if zeros.size == 0:
         return None
@@ -171,35 +183,57 @@ def compared(right: Branch, left: Branch) -> dict[str, float]:
 
 
 @eqx.filter_jit
+def _edge_of_the_solid(
+    start: Tissue, p0: Float[Array, ""], response: Response, same: Response
+) -> tuple[Tissue, Float[Array, ""]]:
+    """A quenched tissue, still solid, and the shape factor at which it becomes fluid."""
+    # The root of the energy is what is missing to the perimeter: nearly a line in the shape factor.
+    step = jnp.asarray(0.01, p0.dtype)
+    quenched = response(start, ShapeFactorEnergy(p0), throw=False)
+    arrays, static = eqx.partition(quenched.tissue, eqx.is_array)
+
+    def nearer(carry: tuple, _: None) -> tuple[tuple, Array]:
+        arrays, p0, root, step = carry
+        further = p0 + step
+        found = same(eqx.combine(arrays, static), ShapeFactorEnergy(further), throw=False)
+        slope = (jnp.sqrt(found.energy) - root) / step
+        left = -jnp.sqrt(found.energy) / slope
+        arrays = eqx.filter(found.tissue, eqx.is_array)
+        # Not as far as the line says, lest it be passed.
+        return (arrays, further, jnp.sqrt(found.energy), 0.7 * left), left
+
+    first = arrays, p0, jnp.sqrt(quenched.energy), step
+    (arrays, p0, *_), left = jax.lax.scan(nearer, first, length=8)
+    return eqx.combine(arrays, static), p0 + left[-1]
+
+
+@eqx.filter_jit
 def _shear(
-    first: Tissue, p0: Float[Array, ""], strains: Float[Array, " strains"], response: Response
+    rest: Tissue,
+    p0: Float[Array, ""],
+    strains: Float[Array, " strains"],
+    zero_stress: Float[Array, ""],
+    same: Response,
 ) -> dict[str, Array]:
     energy = ShapeFactorEnergy(p0)
-    # The minimal perimeter is that of one arrangement of cells.
-    same = eqx.tree_at(lambda r: r.transitions, response, None, is_leaf=lambda x: x is None)
 
-    def one(start: Tissue) -> dict[str, Array]:
-        rest = response(start, energy, throw=False).tissue
+    def way(sign: Array) -> dict[str, Array]:
+        course = ramp(rest, energy, sign * strains, relaxation=same, throw=False)
+        arrays, static = eqx.partition(course.frames, eqx.is_array)
 
-        def way(sign: Array) -> dict[str, Array]:
-            course = ramp(rest, energy, sign * strains, relaxation=same, throw=False)
-            arrays, static = eqx.partition(course.frames, eqx.is_array)
+        def modulus(part: tuple[Tissue, Array]) -> Array:
+            arrays, stress = part
+            tissue = eqx.combine(arrays, static)
+            # Simple shear turns the tissue as well.
+            turning = (stress[0, 0] - stress[1, 1]) / 2
+            g = lambda: shear_modulus(tissue, energy, angle=0.0, throw=False) - turning
+            resists = jnp.abs(stress[0, 1]) > zero_stress
+            return jax.lax.cond(resists, g, lambda: jnp.zeros_like(turning))
 
-            def modulus(part: tuple[Tissue, Array, Array]) -> Array:
-                arrays, value, stress = part
-                tissue = eqx.combine(arrays, static)
-                # Simple shear turns the tissue as well.
-                turning = (stress[0, 0] - stress[1, 1]) / 2
-                g = lambda: shear_modulus(tissue, energy, angle=0.0, throw=False) - turning
-                return jax.lax.cond(value > 1e-10, g, lambda: jnp.zeros_like(value))
+        return {
+            "stress": course.stresses[:, 0, 1],
+            "modulus": jax.lax.map(modulus, (arrays, course.stresses)),
+            "converged": course.converged,
+        }
 
-            return {
-                "energy": course.energies / start.n_cells,
-                "stress": course.stresses[:, 0, 1],
-                "modulus": jax.lax.map(modulus, (arrays, course.energies, course.stresses)),
-                "converged": course.converged,
-            }
-
-        return jax.lax.map(way, jnp.array([1.0, -1.0], strains.dtype))
-
-    return jax.lax.map(one, first)
+    return jax.lax.map(way, jnp.array([1.0, -1.0], strains.dtype))

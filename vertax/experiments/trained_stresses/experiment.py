@@ -35,9 +35,9 @@ from vertax.runs import (
 )
 
 from . import figures
-from .learning import Course, Teacher, learn
+from .learning import Course, Teacher, learn, solve
 
-Rule = Literal["gradient", "propagation", "coupled"]
+Rule = Literal["gradient", "propagation", "coupled", "least_squares"]
 
 
 class Clamp(Section):
@@ -52,8 +52,11 @@ class Clamp(Section):
 class Config(ExperimentConfig):
     """Configuration of this experiment."""
 
-    rules: list[Rule] = Field(default=["gradient", "propagation", "coupled"], min_length=1)
-    """How tensions learn."""
+    rules: list[Rule] = Field(
+        default=["gradient", "propagation", "coupled", "least_squares"], min_length=1
+    )
+    """How tensions learn; least squares (Levenberg-Marquardt) are no learning, but tell what there is to
+    learn."""
     trained: list[int] = Field(default=[1, 2, 4, 8, 16], min_length=1)
     """Numbers of cells that are trained at once."""
     replicates: int = Field(default=3, ge=1)
@@ -112,12 +115,15 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         def one(index: int, rule: Rule = rule, teacher: Teacher | None = teacher) -> Course:
             number, k = np.unravel_index(index, shape)
             problem = _problem(config, response, tissues[k], int(number), int(k), rule)
+            if rule == "least_squares":
+                return solve(problem, config.fit.epochs)
             return learn(problem, config.fit.build(), config.fit.epochs, teacher)
 
         courses = side_by_side(one, shape[0] * shape[1], folder, progress=progress, unit=rule)
         cost = np.stack([np.where(c.converged, c.cost, np.nan) for c in courses])
         errors[rule] = np.sqrt(cost / cost[:, :1]).reshape(*shape, config.fit.epochs)
-        firsts[rule] = np.stack([ravel_pytree(c.first)[0] for c in courses])
+        if rule != "least_squares":
+            firsts[rule] = np.stack([ravel_pytree(c.first)[0] for c in courses])
         shown = courses[-1]
         folder.save_tissue(rule, shown.tissue)
     folder.save_array("errors", np.stack(list(errors.values())))
@@ -127,12 +133,11 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     folder.save_table("distances", columns)
     stresses = np.asarray(cell_stress(shown.tissue, shown.energy))
     folder.save_figure("training", figures.training(shown.tissue, stresses, config.trained, errors))
-    reference = firsts.get("gradient")
     return {
         rule: {
             "trained_share": (values <= config.accuracy).mean(axis=1).tolist(),
             "distance": np.median(values, axis=1).tolist(),
-            "cosine": None if reference is None else _cosine(firsts[rule], reference),
+            "cosine": _cosine(firsts.get(rule), firsts.get("gradient")),
         }
         for rule, values in best.items()
     } | {"seconds": time.perf_counter() - began}
@@ -179,7 +184,9 @@ def _problem(
     )
 
 
-def _cosine(a: np.ndarray, b: np.ndarray) -> float:
+def _cosine(a: np.ndarray | None, b: np.ndarray | None) -> float | None:
     """Mean over rows."""
+    if a is None or b is None:
+        return None
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return float(np.mean(np.sum(a * b, axis=1) / lengths))

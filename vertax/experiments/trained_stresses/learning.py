@@ -3,7 +3,8 @@ r"""Three rules by which the tensions of edges learn, each a direction for the s
 The gradient by implicit differentiation, the same by equilibrium propagation, and *coupled learning* (Stern,
 Hexner, Rocks & Liu 2021, doi:10.1103/PhysRevX.11.021045), a local rule. There a teacher takes hold of the
 outputs and pulls them a share $\eta$ of the way to what is asked for,
-$\sigma^C = \sigma^F + \eta (\sigma^t - \sigma^F)$, and each parameter compares the free state $F$ with the clamped one $C$:
+$\sigma^C = \sigma^F + \eta (\sigma^t - \sigma^F)$, and each parameter compares the free state $F$ with the
+clamped one $C$:
 
 $$\dot\theta \propto -\frac1\eta \frac{\partial}{\partial\theta} \big(E_C(X_C, \theta) - E(X_F, \theta)\big),
 \qquad E_C = E + \frac k2 \sum_c |\sigma_c - \sigma^C_c|^2$$
@@ -19,11 +20,15 @@ from functools import partial
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PyTree
+from optimistix import LevenbergMarquardt
 
 from vertax import AbstractEnergy, InverseProblem, Tissue
 from vertax.costs import CellStress
+from vertax.fitting import fit
 from vertax.mechanics import cell_stress
 
 
@@ -95,7 +100,7 @@ class Course(eqx.Module):
     cost: Float[Array, " epochs"]
     converged: Bool[Array, " epochs"]
     first: PyTree[Array]
-    """The direction of the first epoch."""
+    """The direction of the first epoch, where there are directions."""
     energy: AbstractEnergy
     tissue: Tissue
 
@@ -137,3 +142,22 @@ def learn(
     first = jax.tree.map(lambda x: x[0], directions)
     energy, tissue = eqx.combine(parameters, constants), eqx.combine(arrays, static)
     return Course(cost, converged, first, energy, tissue)
+
+
+def solve(problem: InverseProblem, epochs: int) -> Course:
+    """Find the parameters by least squares, which tells what can be learnt at all.
+
+    **Arguments:**
+
+    - `problem`: the stresses asked for.
+    - `epochs`: most steps; a course that ends before stays where it is.
+
+    **Returns:** the course.
+    """
+    solver = LevenbergMarquardt(rtol=1e-8, atol=1e-10)
+    found = fit(problem, solver, epochs, progress=False)
+    history, left = found.history, epochs - len(found.history.cost)
+    cost, converged = (np.pad(x, (0, left), mode="edge") for x in (history.cost, history.converged))
+    start = problem.cost(problem.tissue, problem.energy)
+    cost = np.concatenate([[float(start)], cost[:-1]])
+    return Course(jnp.asarray(cost), jnp.asarray(converged), None, found.energy, found.tissue)
