@@ -69,22 +69,23 @@ def stiffening(
     **Arguments:**
 
     - `pairs`: both ways of each tissue.
-    - `table`: `critical_strain` and `factor` of each tissue.
+    - `table`: `critical_strain`, `centre` and `factor` of each tissue.
 
     **Returns:** the figure.
     """
     figure, (axes,) = new_figure(1, 3, width=2.3)
-    for pair, critical in zip(pairs, table["critical_strain"], strict=True):
-        for way in pair:
+    for pair, centre in zip(pairs, table["centre"], strict=True):
+        for way, middle in zip(pair, (centre, -centre), strict=True):
             axes[0].plot(way.strains, way.stresses, color=SERIES[0], lw=0.5, alpha=0.5)
-            over = 3 * way.stresses / critical
-            axes[1].plot(over, way.moduli - way.jump, color=SERIES[0], lw=0.5, alpha=0.5)
+            over = 3 * way.stresses / (way.strains - middle)
+            excess = way.moduli - way.line(middle)[1]
+            axes[1].plot(over, excess, color=SERIES[0], lw=0.5, alpha=0.5)
     axes[0].set(xlabel="shear strain", ylabel="shear stress", ylim=(0, None))
     top = min(axes[1].get_xlim()[1], axes[1].get_ylim()[1])
     axes[1].plot([0, top], [0, top], color=INK, lw=0.8, ls="--")
-    axes[1].set(xlabel=r"$3\,\tau / \gamma_c$", ylabel=r"excess modulus $G - \Delta G$")
+    axes[1].set(xlabel=r"$3\,\tau / (\gamma - \gamma_0)$", ylabel=r"excess modulus $G - \Delta G$")
     axes[2].plot(table["critical_strain"], table["factor"], "o", ms=3, color=SERIES[0])
     axes[2].axhline(3, color=INK, lw=0.8, ls="--")
     axes[2].set(xlabel=r"critical strain $\gamma_c$", ylim=(0, 6))
-    axes[2].set_ylabel(r"factor $\gamma_c (G - \Delta G) / \tau$")
+    axes[2].set_ylabel(r"factor $(\gamma - \gamma_0) (G - \Delta G) / \tau$")
     return figure
