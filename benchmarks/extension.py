@@ -49,17 +49,15 @@ def main() -> None:
         gradient = eqx.filter_jit(eqx.filter_grad(lambda e, t: ratio(e, t)[0]))
         tissue = response(tissue, energy).tissue
         _, of_gradient = first_and_best(gradient, energy, tissue, repeats=2)
-        slopes = np.asarray(gradient(energy, tissue).terms[1].logits)
+        logits_of = lambda e: vx.inference.foam_terms(e)[1].logits
+        slopes = np.asarray(logits_of(gradient(energy, tissue)))
         edges = np.argsort(-np.abs(slopes))[:: max(1, tissue.n_edges // (2 * chosen.edges))]
         seconds, off = [], []
         for edge in edges[: chosen.edges]:
             ends = []
             for sign in (1, -1):
-                moved = eqx.tree_at(
-                    lambda e: e.terms[1].logits,
-                    energy,
-                    energy.terms[1].logits.at[edge].add(sign * STEP),
-                )
+                logits = logits_of(energy).at[edge].add(sign * STEP)
+                moved = eqx.tree_at(logits_of, energy, logits)
                 seconds.append(first_and_best(ratio, moved, tissue, repeats=1)[1])
                 ends.append(float(ratio(moved, tissue)[0]))
             off.append(abs((ends[0] - ends[1]) / (2 * STEP) - slopes[edge]))

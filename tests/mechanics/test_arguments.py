@@ -1,5 +1,8 @@
 """What functions of mechanics refuse: the message names the argument and says what it must be."""
 
+# Wrong types are the point here.
+# pyright: reportArgumentType=false
+
 import jax
 import jax.numpy as jnp
 import numpy as np

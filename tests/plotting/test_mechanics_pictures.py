@@ -76,14 +76,14 @@ def slow_shear():
 def test_stress_over_strain_breaks_at_plastic_events():
     ax = plot_stress_strain(slow_shear(), label="slow")
     curve, event = ax.lines
-    np.testing.assert_allclose(curve.get_ydata(), [0, 1, np.nan, 0.5, 1.5, np.nan])
-    np.testing.assert_allclose(event.get_xydata(), [[0.1, 1], [0.2, 0.5]])
+    np.testing.assert_allclose(np.asarray(curve.get_ydata()), [0, 1, np.nan, 0.5, 1.5, np.nan])
+    np.testing.assert_allclose(np.asarray(event.get_xydata()), [[0.1, 1], [0.2, 0.5]])
     # What happened before the first strain is no event of the ramp.
     (dots,) = ax.collections
-    np.testing.assert_allclose(dots.get_offsets(), [[0.2, 0.5]])
+    np.testing.assert_allclose(np.asarray(dots.get_offsets()), [[0.2, 0.5]])
     assert ax.get_ylabel() == r"stress $\sigma_{xy}$"
     ax = plot_stress_strain(slow_shear(), component="xx-yy")
-    np.testing.assert_allclose(ax.lines[0].get_ydata(), [3, 3, np.nan, 3, 3, np.nan])
+    np.testing.assert_allclose(np.asarray(ax.lines[0].get_ydata()), [3, 3, np.nan, 3, 3, np.nan])
 
 
 def test_what_is_refused(as_a_user):

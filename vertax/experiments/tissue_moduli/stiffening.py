@@ -103,8 +103,8 @@ def stiffen(
         return {"sheared": 0}
 
     def compute(excess: float) -> dict[str, np.ndarray]:
-        numbers = [jnp.asarray(x) for x in (strains, config.zero_stress)]
-        courses = [_shear(tissue, p0 + excess, *numbers, same) for tissue, p0 in edges]
+        on, zero = jnp.asarray(strains), jnp.asarray(config.zero_stress)
+        courses = [_shear(tissue, p0 + excess, on, zero, same) for tissue, p0 in edges]
         return {name: np.stack([np.asarray(c[name]) for c in courses]) for name in courses[0]}
 
     found = scan("excess", config.excess, compute, folder, progress=progress)

@@ -105,6 +105,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     tissues = [_prepared(config, response, k) for k in range(config.replicates)]
     errors: dict[str, np.ndarray] = {}
     firsts: dict[str, np.ndarray] = {}
+    courses: list[Course] = []
     shape = (len(config.trained), config.replicates)
     for rule in config.rules:
         teacher = None
@@ -124,13 +125,13 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         errors[rule] = np.sqrt(cost / cost[:, :1]).reshape(*shape, config.fit.epochs)
         if rule != "least_squares":
             firsts[rule] = np.stack([ravel_pytree(c.first)[0] for c in courses])
-        shown = courses[-1]
-        folder.save_tissue(rule, shown.tissue)
+        folder.save_tissue(rule, courses[-1].tissue)
     folder.save_array("errors", np.stack(list(errors.values())))
     best = {rule: np.fmin.reduce(values, axis=-1) for rule, values in errors.items()}
     columns: dict[str, Any] = {"cells": config.trained}
     columns |= {rule: np.median(values, axis=1) for rule, values in best.items()}
     folder.save_table("distances", columns)
+    shown = courses[-1]
     stresses = np.asarray(cell_stress(shown.tissue, shown.energy))
     folder.save_figure("training", figures.training(shown.tissue, stresses, config.trained, errors))
     return {
