@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from vertax.experiments.rigidity_transition.figures import REFERENCE
 from vertax.plotting import INK, SERIES, house_style, new_figure
 
 if TYPE_CHECKING:
     from .stiffening import Branch
 
-REFERENCE = 3.81
-"""The transition of disordered tissues, from D. Bi et al. 2015."""
 # Of the regular hexagon, at which the ordered lattice softens.
 HEXAGON = float(np.sqrt(8 * np.sqrt(3)))
 
