@@ -161,14 +161,13 @@ def branch(
     near = slice(first, int(np.searchsorted(strains, strains[first] + config.window)) + 1)
     known = found["converged"][side][near].all() and np.isfinite(modulus[near]).all()
     x = strains[near]
-    if first == 0 or not known or not solid[near].all() or x.size < 5:
+    if first == 0 or not known or not solid[near].all() or x.size < 4:
         return None
-    # The stress is smooth beyond the onset, and 0 there.
-    zeros = np.roots(np.polyfit(x - x[0], stress[near], 2))
-    zeros = zeros[np.isreal(zeros)].real
-    if zeros.size == 0:
-        return None
-    onset = x[0] + zeros[np.argmin(np.abs(zeros))]
+    # Back from the first solid point to where the stress is 0, with the modulus there and its slope:
+    # τ = G d - G' d² / 2.
+    here, slope = modulus[first], (modulus[first + 1] - modulus[first]) / (x[1] - x[0])
+    root = np.sqrt(max(here**2 - 2 * slope * stress[first], 0.0))
+    onset = x[0] - 2 * stress[first] / (here + root)
     return Branch(x, stress[near], modulus[near], float(onset))
 
 
