@@ -41,9 +41,9 @@ class Stiffening(Section):
 
     quench: float = Field(default=3.75, gt=0)
     """Target shape factor of all cells at which tissues are quenched; solid."""
-    excess: list[float] = Field(default=[0.005, 0.02], min_length=1)
+    excess: list[float] = Field(default=[0.0025, 0.01], min_length=1)
     """How much more than at its transition the target shape factor of a tissue is."""
-    replicates: int = Field(default=10, ge=0)
+    replicates: int = Field(default=16, ge=0)
     """Independent tissues, of which those with a four-sided cell are left aside; 0 leaves all this out."""
     strain: float = Field(default=0.35, gt=0)
     """The largest shear."""
