@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import optax
 import optimistix as optx
-from jaxtyping import Float, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, Key, PRNGKeyArray, Shaped
 from pydantic import Field, model_validator
 
 from vertax import solvers
@@ -142,7 +142,7 @@ class TissueSection(Section):
     lloyd_steps: int = Field(default=0, ge=0)
     """Steps of Lloyd's algorithm, which make the first tissue more regular."""
 
-    def draw(self, keys: PRNGKeyArray) -> Tissue:
+    def draw(self, keys: Key[Array, " tissues"]) -> Tissue:
         """Random tissues.
 
         **Arguments:**
