@@ -3,7 +3,8 @@
     python benchmarks/mechanics.py [--cells 100 1000] [--modes 20]
 
 Printed are the seconds (the best of three, without compiling) of the elastic tensor, relaxed and affine,
-of its gradient with respect to all target shape factors as a share of that, and of the softest modes.
+of its gradient with respect to all target shape factors as a share of that, of the softest modes, and of the
+complex modulus at ten frequencies.
 """
 
 import argparse
@@ -25,7 +26,9 @@ def main() -> None:
     parser.add_argument("--cells", type=int, nargs="+", default=[100, 1000])
     parser.add_argument("--modes", type=int, default=20)
     chosen = parser.parse_args()
-    print("cells  tensor  affine  gradient/tensor   modes")
+    omegas = jnp.geomspace(1e-2, 1e2, 10)
+    friction = vx.dissipations.SubstrateFriction(1.0)
+    print("cells  tensor  affine  gradient/tensor   modes  oscillation")
     best = lambda *call: first_and_best(*call, repeats=3)[1]
     for n_cells in chosen.cells:
         start = vx.initialise.periodic_voronoi(n_cells=n_cells, key=0)
@@ -39,8 +42,12 @@ def main() -> None:
         affine = best(lambda e, t=tissue: mechanics.elastic_tensor(t, e, affine=True), energy)
         gradient = best(eqx.filter_jit(eqx.filter_grad(shear)), energy)
         modes = best(lambda e, t=tissue: mechanics.modes(t, e, chosen.modes).values, energy)
+        oscillation = best(
+            lambda e, t=tissue: mechanics.complex_modulus(t, e, friction, omegas), energy
+        )
         print(
-            f"{n_cells:5d}  {relaxed:6.3f}  {affine:6.3f}  {gradient / relaxed:15.2f}  {modes:6.3f}",
+            f"{n_cells:5d}  {relaxed:6.3f}  {affine:6.3f}  {gradient / relaxed:15.2f}  {modes:6.3f}  "
+            f"{oscillation:11.3f}",
             flush=True,
         )
 

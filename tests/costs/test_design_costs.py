@@ -56,6 +56,16 @@ def test_a_circle_has_no_long_axis():
     assert np.isfinite(gradient).all()
 
 
+def test_aspect_ratio_of_a_box_is_that_of_its_sides():
+    stretched = vx.mechanics.deformed(random_tissue(9, 2), jnp.diag(jnp.array([0.5, 2.0])))
+    assert aspect_ratio(stretched, "box") == pytest.approx(0.25)
+    assert AspectRatio(0.5, "box")(stretched, energy) == pytest.approx(0.25**2)
+    with pytest.raises(ValueError, match="only for a periodic tissue"):
+        aspect_ratio(cluster(5, 1), "box")
+    with pytest.raises(ValueError, match='pass measure="box"'):
+        aspect_ratio(stretched)
+
+
 def test_aspect_ratio_of_a_lens_is_that_of_its_area():
     # Points on a fine grid, for angles on both sides of where the series of arcs ends.
     for angle in (0.3, 1.0, 2.2):

@@ -49,6 +49,20 @@ SHORT = {
     ],
     "demo": ["tissue.n_cells=6", "image.pixels=48", "fit.epochs=2"],
     "design_mechanics": ["tissue.n_cells=6", "fit.epochs=2"],
+    "design_moduli": ["tissue.n_cells=6", "fit.epochs=2"],
+    "double_optimisation": [
+        "shape_factors=[3.5, 3.6, 3.7]",
+        "replicates=2",
+        "tissue.n_cells=6",
+        "fit.epochs=2",
+    ],
+    "extend_box": [
+        "n_cells=[6]",
+        "targets=[1.2]",
+        "replicates=1",
+        "start.epochs=2",
+        "fit.epochs=2",
+    ],
     "external_tensions": ["tissue.n_cells=6", "fit.epochs=2"],
     "infer_from_microscopy": ["image.pixels=96", "fit.epochs=2"],
     "infer_shape_factors": ["tissue.n_cells=6", "fit.epochs=2"],
@@ -85,7 +99,15 @@ SHORT = {
     ],
     "tensions_from_movie": ["substeps=10", "cluster.n_cells=7", "cluster.frames=3"],
     "timed_elongation": ["n_cells=5", "frames=3", "substeps=1", "knots=2", "fit.epochs=2"],
-    "tissue_moduli": ["shape_factors=[3.5, 3.7]", "replicates=2", "tissue.n_cells=9"],
+    "tissue_moduli": [
+        "shape_factors=[3.5, 3.7]",
+        "replicates=2",
+        "tissue.n_cells=9",
+        "stiffening.replicates=1",
+        "stiffening.excess=[0.01]",
+        "stiffening.tissue.n_cells=9",
+    ],
+    "trained_stresses": ["trained=[1, 4]", "replicates=1", "tissue.n_cells=4", "fit.epochs=2"],
 }
 
 

@@ -64,7 +64,9 @@ def limits(axes, kind) -> set[tuple[float, float]]:
 def test_designs_before_and_after_have_one_scale(tissue, cluster):
     observed = 3.9 + 0.1 * RNG.normal(size=(5, 9))
     shown = {"initial": (tissue, observed[0]), "designed": (tissue, observed[-1])}
-    figure = mechanics.mechanics(shown, observed, observed + 0.01, 4.1)
+    figure = mechanics.mechanics(
+        shown, observed, observed + 0.01, ("shape_factor", observed.mean(axis=1), 4.1)
+    )
     first, second, curves = panels(figure)
     ends = observed[[0, -1]]
     assert limits((first, second), PolyCollection) == {(ends.min(), ends.max())}

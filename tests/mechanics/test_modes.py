@@ -31,13 +31,18 @@ def test_values_and_vectors_against_the_dense_matrix():
 
 def test_the_sparse_matrix_is_the_dense_one():
     from vertax.mechanics._hessian import sparse_hessian
+    from vertax.mechanics._landscape import Landscape
 
     # Large enough that some pairs of vertices share a product.
     large = random_tissue(64, 3)
     energy = ShapeFactorEnergy(shape_factors(64, 3.6, 0.1))
-    matrix = sparse_hessian(large, energy)
+    matrix = sparse_hessian(Landscape(large, energy))
+    assert matrix is not None
     np.testing.assert_allclose(matrix.toarray(), dense_hessian(large, energy), atol=1e-10)
     assert matrix.nnz < 0.5 * matrix.toarray().size
+    # One spring across the tissue is seen, and refused.
+    spring = lambda t: energy(t) + jnp.sum((t.vertices[0] - t.vertices[70]) ** 2)
+    assert sparse_hessian(Landscape(large, spring)) is None
 
 
 @pytest.mark.slow

@@ -71,6 +71,24 @@ def test_viscosity_of_perimeters_against_a_dense_solution(lattice):
         assert complex(value) == pytest.approx(wanted, rel=1e-7)
 
 
+def test_sparse_factorisations_give_what_the_dense_decomposition_does():
+    # Not at rest, but under so much tension that the Hessian is positive all the same.
+    # Near enough to rest that the Hessian is positive, and nothing vanishes by symmetry.
+    tissue, energy = vx.initialise.hexagonal(6, 6), ShapeFactorEnergy(shape_factors(36, 3.5, 0.02))
+    friction = SubstrateFriction(0.7) + PerimeterViscosity(0.4)
+    omegas = jnp.array([0.0, 0.3, 2.0, 1e4])
+    found = [
+        mechanics.complex_modulus(tissue, energy, friction, omegas, method="dense"),
+        mechanics.complex_modulus(tissue, energy, friction, omegas, method="sparse"),
+    ]
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-8)
+    by = lambda p: mechanics.complex_modulus(
+        tissue, ShapeFactorEnergy(p), friction, 1.0, method="sparse"
+    )
+    with pytest.raises(TypeError, match='"sparse" only for an AbstractLocalEnergy'):
+        jax.jit(by)(3.4)
+
+
 @pytest.mark.slow
 def test_derivatives_against_differences(lattice):
     def loss(p0):

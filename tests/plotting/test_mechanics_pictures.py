@@ -1,5 +1,8 @@
-"""Stress crosses, arrows of modes, moduli and densities of states."""
+"""Stress crosses, arrows of modes, moduli, densities of states and stress over strain."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import random_tissue
@@ -7,7 +10,14 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection
 from matplotlib.quiver import Quiver
 
-from vertax.plotting import plot_density_of_states, plot_mode, plot_moduli, plot_stress
+from vertax.mechanics import Ramp
+from vertax.plotting import (
+    plot_density_of_states,
+    plot_mode,
+    plot_moduli,
+    plot_stress,
+    plot_stress_strain,
+)
 
 tissue = random_tissue(9, 2)
 
@@ -54,6 +64,28 @@ def test_moduli_and_densities():
     np.testing.assert_allclose(np.asarray(line.get_ydata()), [0.2, 0.4])
 
 
+def slow_shear():
+    stresses = np.zeros((5, 2, 2))
+    stresses[:, 0, 1] = stresses[:, 1, 0] = [0.0, 1.0, 0.5, 1.5, 2.0]
+    stresses[:, 0, 0] = 3.0
+    frames = jax.tree.map(lambda x: jnp.stack([x] * 5), eqx.filter(tissue, eqx.is_array))
+    t1, rest = jnp.array([7, 0, 4, 0, 0]), jnp.array([True, True, True, True, False])
+    return Ramp(jnp.arange(5) * 0.1, frames, jnp.zeros(5), jnp.asarray(stresses), t1, rest)
+
+
+def test_stress_over_strain_breaks_at_plastic_events():
+    ax = plot_stress_strain(slow_shear(), label="slow")
+    curve, event = ax.lines
+    np.testing.assert_allclose(np.asarray(curve.get_ydata()), [0, 1, np.nan, 0.5, 1.5, np.nan])
+    np.testing.assert_allclose(np.asarray(event.get_xydata()), [[0.1, 1], [0.2, 0.5]])
+    # What happened before the first strain is no event of the ramp.
+    (dots,) = ax.collections
+    np.testing.assert_allclose(np.asarray(dots.get_offsets()), [[0.2, 0.5]])
+    assert ax.get_ylabel() == r"stress $\sigma_{xy}$"
+    ax = plot_stress_strain(slow_shear(), component="xx-yy")
+    np.testing.assert_allclose(np.asarray(ax.lines[0].get_ydata()), [3, 3, np.nan, 3, 3, np.nan])
+
+
 def test_what_is_refused(as_a_user):
     with pytest.raises(ValueError, match="`stresses` must have shape"):
         plot_stress(tissue, np.zeros((4, 2, 2)))
@@ -61,7 +93,12 @@ def test_what_is_refused(as_a_user):
         plot_stress(tissue, np.zeros((9, 2, 2)), scale=0.0)
     with pytest.raises(ValueError, match="`displacements` must have shape"):
         plot_mode(tissue, np.zeros((4, 2)))
-    with pytest.raises(ValueError, match="one entry for each frequency"):
+    with pytest.raises(ValueError, match="one entry for each of `frequencies`"):
         plot_moduli(np.ones(2), np.ones(3, complex))
-    with pytest.raises(ValueError, match="one entry for each frequency"):
+    with pytest.raises(ValueError, match="one entry for each of `frequencies`"):
         plot_density_of_states(np.ones(2), np.ones(3))
+    with pytest.raises(ValueError, match="must be one of xy, xx-yy"):
+        plot_stress_strain(slow_shear(), component="yx")  # pyright: ignore[reportArgumentType]
+    several = jax.tree.map(lambda x: np.stack([x, x]), eqx.filter(slow_shear(), eqx.is_array))
+    with pytest.raises(ValueError, match=r"one entry for each of `ramp.strains`"):
+        plot_stress_strain(several)

@@ -1,4 +1,4 @@
-"""The elongation of a whole cluster of cells."""
+"""The elongation of a whole cluster of cells, or of a box."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 from vertax._base.checks import as_real, check_number
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
-from vertax.mesh import Free, Tissue
+from vertax.mesh import Free, Periodic, Tissue
 from vertax.mesh._arcs import arc_points, length_factor
 
-Measure = Literal["moments", "farthest"]
+Measure = Literal["moments", "farthest", "box"]
 
 # Moments are integrals along the outline (Green's theorem). On an arc of angle α the integrand has the
 # harmonics up to 4 α of a parameter from -1 to 1: this many Gauss-Legendre points leave only rounding
@@ -25,55 +25,67 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
 def aspect_ratio(tissue: Tissue, measure: Measure = "moments") -> Float[Array, ""]:
-    r"""Ratio of the long to the short axis of a free tissue, $r = L/\ell \ge 1$.
+    r"""Ratio of the long to the short axis of a free tissue, $r = L/\ell \ge 1$; or of the sides of a box.
 
     **Arguments:**
 
-    - `tissue`: a free tissue.
+    - `tissue`: a free tissue; or a periodic one, of which the box is measured.
     - `measure`: `"moments"` is $\sqrt{\lambda_1/\lambda_2}$ with the eigenvalues of the matrix of second
         moments of the area within the outline (its arcs included), the axis ratio of the ellipse of
         the same moments. Every part of the outline counts and it is smooth, but at $r = 1$, where it
         has a kink (no axis is the long one) and a derivative of 0 here. `"farthest"` is the paper's:
         $L$ is the distance of the two vertices farthest apart, and $\ell$ the width of all vertices
         across the line through them. Its derivative sees four vertices and jumps when others become
-        the outermost.
+        the outermost. `"box"` is how many times longer the first lattice vector of a periodic tissue is than
+        the second, for a box that comes to rest ([`BoxRelaxation`][vertax.mechanics.BoxRelaxation]).
 
     **Returns:** the ratio.
 
     **Raises:**
 
-    - `ValueError` for a periodic tissue or another measure.
+    - `ValueError` for a periodic tissue, a free one if it is to be `"box"`, or another measure.
     """
-    if not isinstance(tissue.boundary, Free):
+    _check_measure(measure)
+    boundary = tissue.boundary
+    if isinstance(boundary, Periodic) and measure == "box":
+        first, second = jnp.linalg.norm(boundary.lattice, axis=1)
+        return first / second
+    if measure == "box":
+        raise ValueError(
+            'Argument `measure` can be "box" only for a periodic tissue, but the boundary is '
+            f"{type(boundary).__name__}."
+        )
+    if not isinstance(boundary, Free):
         raise ValueError(
             "The aspect ratio is that of an outline, which only a free tissue has, but the boundary is "
-            f"{type(tissue.boundary).__name__}."
+            f'{type(boundary).__name__}: pass measure="box" for that of its box.'
         )
-    _check_measure(measure)
     return _from_moments(tissue) if measure == "moments" else _from_farthest(tissue)
 
 
 class AspectRatio(AbstractLeastSquaresCost):
-    r"""Squared distance of the aspect ratio of a free tissue from a target (paper, "Convergent extension").
+    r"""Squared distance of the aspect ratio of a tissue from a target (paper, "Convergent extension").
 
     $$C = \left(\frac{L}{\ell} - r_\mathrm{target}\right)^2$$
 
     **Arguments:**
 
-    - `target`: the ratio to reach, at least 1.
+    - `target`: the ratio to reach, at least 1; of a box also below.
     - `measure`: how the ratio is measured, see [`aspect_ratio`][vertax.costs.aspect_ratio].
 
     **Raises:**
 
-    - `ValueError` for a target below 1, a periodic tissue or another measure.
+    - `ValueError` for a target below 1 (of a box, not above 0), a tissue that does not go with the
+        measure, or another measure.
     """
 
     target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
     measure: Measure = eqx.field(static=True, default="moments")
 
     def __check_init__(self):
-        check_number("target", self.target, least=1, many=True)
         _check_measure(self.measure)
+        limit = {"above": 0} if self.measure == "box" else {"least": 1}
+        check_number("target", self.target, **limit, many=True)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The distance, times the root of 2: the paper's cost is the square, not half of it."""

@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vertax import mechanics
-from vertax._base.checks import as_real, check_number, check_whole
+from vertax._base.checks import as_real, check_number, check_whole, named
+from vertax._base.modules import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
+from vertax.mechanics._arguments import as_matrix
 from vertax.mechanics._elasticity import shear_part, young_part
 from vertax.mesh import Tissue
 
@@ -30,16 +32,13 @@ class Stress(AbstractLeastSquaresCost):
 
     **Raises:**
 
-    - `ValueError` for another shape.
+    - `ValueError` for another shape, or a matrix that is not symmetric.
     """
 
     target: Float[Array, "2 2"] = eqx.field(converter=partial(as_real, "target"))
 
     def __check_init__(self):
-        if self.target.shape != (2, 2):
-            raise ValueError(
-                f"Argument `target` must have shape (2, 2), but its shape is {self.target.shape}."
-            )
+        as_matrix("target", self.target, symmetric=True)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The components of the difference."""
@@ -58,7 +57,8 @@ class CellStress(AbstractLeastSquaresCost):
 
     **Raises:**
 
-    - `ValueError` if targets and cells do not match.
+    - `TypeError` for cells that are no whole numbers.
+    - `ValueError` if targets and cells do not match, or a cell is none.
     """
 
     target: Float[Array, "*cells 2 2"] = eqx.field(converter=partial(as_real, "target"))
@@ -66,10 +66,25 @@ class CellStress(AbstractLeastSquaresCost):
         default=None, converter=lambda cells: None if cells is None else jnp.asarray(cells)
     )
 
+    def __check_init__(self):
+        if self.cells is not None and not jnp.issubdtype(self.cells.dtype, jnp.integer):
+            raise TypeError(
+                f"Argument `cells` must hold whole numbers, but is {named(self.cells)}."
+            )
+
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The components of the differences over the root of their number."""
         stresses = mechanics.cell_stress(tissue, energy)
-        chosen = stresses if self.cells is None else stresses[self.cells]
+        chosen = stresses
+        if self.cells is not None:
+            within = (self.cells >= 0) & (self.cells < tissue.n_cells)
+            if is_concrete(within) and not within.all():
+                raise ValueError(
+                    f"Argument `cells` must hold numbers of cells, from 0 to {tissue.n_cells - 1}, but "
+                    f"holds {self.cells[~within][0]}."
+                )
+            # A cell that is none has no stress, and not that of the last.
+            chosen = stresses.at[self.cells].get(mode="fill", fill_value=jnp.nan)
         if self.target.shape not in ((2, 2), chosen.shape):
             raise ValueError(
                 "The target of CellStress must have the shape (2, 2) or one entry for each chosen cell, "
@@ -124,10 +139,18 @@ class Anisotropy(AbstractLeastSquaresCost):
 
     - `target`: the anisotropy to reach, between -1 and 1; 0 for a tissue as stiff along as across.
     - `angle`: the direction, in radians from the x axis.
+
+    **Raises:**
+
+    - `ValueError` for a target that cannot be.
     """
 
     target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
     angle: float = 0.0
+
+    def __check_init__(self):
+        if is_concrete(self.target) and not (abs(self.target) < 1).all():
+            raise ValueError(f"Argument `target` must be between -1 and 1, but is {self.target}.")
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The difference."""

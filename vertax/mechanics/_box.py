@@ -16,8 +16,9 @@ from vertax._base.modules import traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
+from vertax.mechanics._arguments import as_matrix, check_relaxation, check_tissue
 from vertax.mechanics._elasticity import elastic_tensor
-from vertax.mechanics._landscape import deformed, require_box
+from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue
 from vertax.responses import AbstractResponse, Equilibrium, Relaxation
@@ -41,7 +42,9 @@ def _as_stress(value: ArrayLike) -> Float[Array, "2 2"]:
         raise ValueError(
             f"Argument `stress` must be a number or have shape (2, 2), but its shape is {given.shape}."
         )
-    return given * jnp.eye(2, dtype=given.dtype) if given.shape == () else given
+    if given.shape == ():
+        return given * jnp.eye(2, dtype=given.dtype)
+    return as_matrix("stress", given, symmetric=True)
 
 
 class BoxRelaxation(AbstractResponse):
@@ -68,7 +71,9 @@ class BoxRelaxation(AbstractResponse):
 
     **Raises:**
 
-    - `ValueError` for a stress of the wrong shape, another `free`, or numbers that are not positive.
+    - `TypeError` for a relaxation that is none.
+    - `ValueError` for a stress of the wrong shape or that is not symmetric, another `free`, or numbers that
+        are not positive.
     """
 
     stress: Float[Array, "2 2"] = eqx.field(default=0.0, converter=_as_stress)
@@ -78,10 +83,11 @@ class BoxRelaxation(AbstractResponse):
     max_steps: int = eqx.field(static=True, default=50)
 
     def __check_init__(self):
-        if self.free not in _FREEDOMS:
+        if not isinstance(self.free, str) or self.free not in _FREEDOMS:
             raise ValueError(
                 f"Argument `free` must be one of {', '.join(_FREEDOMS)}, but is {self.free!r}."
             )
+        check_relaxation(self.relaxation)
         if self.tolerance is not None:
             check_number("tolerance", self.tolerance, above=0)
         check_whole("max_steps", self.max_steps, least=1)
@@ -111,7 +117,7 @@ class BoxRelaxation(AbstractResponse):
         - `ValueError` for a free tissue, or an adjoint that unrolls.
         - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and no equilibrium was reached.
         """
-        require_box(tissue, "a BoxRelaxation")
+        check_tissue(tissue, energy, box="a BoxRelaxation")
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.relaxation.check(tissue, energy, adjoint)
         self.goes_with(adjoint)

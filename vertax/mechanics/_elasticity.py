@@ -11,15 +11,14 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from vertax._base.checks import as_real
 from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
+from vertax.mechanics._arguments import as_angle, check_linear_solver, check_tissue
 from vertax.mechanics._landscape import (
     Landscape,
     area_of,
     checked,
     dot,
-    require_box,
     solve,
     stationary,
     voigt_basis,
@@ -70,11 +69,13 @@ def elastic_tensor(
 
     **Raises:**
 
-    - `ValueError` for a free tissue.
+    - `TypeError` for what is no tissue, no energy or no linear solver.
+    - `ValueError` for a free tissue, or a batch of them.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
-    require_box(tissue, "an elastic modulus")
+    check_tissue(tissue, energy, box="an elastic modulus")
     solver = MINRES() if linear_solver is None else linear_solver
+    check_linear_solver(solver)
     tensor = _elastic_tensor(*traced((tissue, energy)), _Elasticity(solver, affine))
     return checked(tensor, _REASON) if throw else tensor
 
@@ -144,7 +145,7 @@ def youngs_modulus(
 
 def young_part(tensor: Float[Array, "3 3"], angle: ArrayLike) -> Float[Array, ""]:
     """Young's modulus along a direction, of an elastic tensor."""
-    angle = as_real("angle", angle)
+    angle = as_angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     stress = jnp.stack([c**2, s**2, c * s]).astype(tensor.dtype)
     return 1 / (stress @ jnp.linalg.solve(tensor, stress))
@@ -154,7 +155,7 @@ def shear_part(tensor: Float[Array, "3 3"], angle: ArrayLike | None = None) -> F
     """The shear modulus of an elastic tensor, along a direction or the mean over all."""
     if angle is None:
         return (tensor[0, 0] + tensor[1, 1] - 2 * tensor[0, 1]) / 8 + tensor[2, 2] / 2
-    angle = as_real("angle", angle)
+    angle = as_angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     # ε = (t n + n t) / 2 with t along the direction and n to its left.
     strain = jnp.stack([-c * s, c * s, c**2 - s**2]).astype(tensor.dtype)

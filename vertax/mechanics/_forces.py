@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from vertax._base.modules import compiled_property, traced
 from vertax.energies import AbstractEnergy
+from vertax.mechanics._arguments import check_tissue
 from vertax.mesh import Tissue
 
 
@@ -46,6 +47,8 @@ def pressures(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " cells"]:
         `tissue.shape_factors`; what it has from vertices is not seen.
 
     **Returns:** one pressure a cell, positive in a cell that would expand.
+
+    **Raises:** as [`stress`][vertax.mechanics.stress].
     """
     return pressures_and_tensions(tissue, energy)[0]
 
@@ -62,6 +65,8 @@ def tensions(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " edges"]:
         `tissue.perimeters` or `tissue.shape_factors`; what it has from vertices is not seen.
 
     **Returns:** one tension an edge, positive in an edge that would contract.
+
+    **Raises:** as [`stress`][vertax.mechanics.stress].
     """
     return pressures_and_tensions(tissue, energy)[1]
 
@@ -70,6 +75,7 @@ def pressures_and_tensions(
     tissue: Tissue, energy: AbstractEnergy
 ) -> tuple[Float[Array, " cells"], Float[Array, " edges"]]:
     """Both at once."""
+    check_tissue(tissue, energy)
     return _pressures_and_tensions(*traced((tissue, energy)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,11 +12,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from scipy import sparse
+from scipy.sparse.linalg import splu
 
-from vertax.energies import AbstractLocalEnergy
 from vertax.mechanics._landscape import Landscape
 from vertax.mesh import Tissue
 
+# A dense eigenproblem of that size takes a fraction of a second.
+DENSE = 800
 # As many products at a time as memory has room for in a large tissue.
 _BATCH = 64
 
@@ -50,27 +53,42 @@ def dense_hessian(landscape: Landscape) -> Float[Array, "dofs dofs"]:
     return 0.5 * (matrix + matrix.T)
 
 
-def sparse_hessian(tissue: Tissue, energy: AbstractLocalEnergy) -> sparse.csr_array:
-    """All of the Hessian of a local energy, from a few dozen products, for the host.
+def sparse_hessian(landscape: Landscape) -> sparse.csr_array | None:
+    """All of the Hessian of a local potential, from a few dozen products, for the host.
 
     Vertices without a cell in common do not feel each other. Those so far apart that no vertex feels two of
-    them share a product (Curtis, Powell & Reid 1974, doi:10.1093/imamat/13.1.117).
+    them share a product (Curtis, Powell & Reid 1974, doi:10.1093/imamat/13.1.117). None if the potential
+    turns out not to be local.
     """
+    tissue = landscape.tissue
     owner, component = _degrees_of_freedom(tissue)
     incidence = _incidence(tissue)
     near = sparse.csr_array((incidence @ incidence.T).astype(bool))
     colour = _colours(sparse.csr_array(near @ near))
     seed = 2 * colour[owner] + component
-    # A multiple, lest each tissue compile another program.
-    seeds = np.zeros((32 * (seed.max() // 32 + 1), seed.size))
+    # A multiple, lest each tissue compile another program. The last one asks everything at once.
+    seeds = np.zeros((32 * ((seed.max() + 1) // 32 + 1), seed.size))
     seeds[seed, np.arange(seed.size)] = 1
-    products = np.asarray(
-        _products(Landscape(tissue, energy), jnp.asarray(seeds, tissue.vertices.dtype)), float
-    )
+    seeds[-1] = probe = np.cos(np.arange(seed.size) * (np.arange(seed.size) + 0.5))
+    products = np.asarray(_products(landscape, jnp.asarray(seeds, tissue.vertices.dtype)), float)
     rows, columns = sparse.csr_array(near[owner][:, owner]).nonzero()
     values = products[seed[columns], rows]
     matrix = sparse.csr_array((values, (rows, columns)), shape=(seed.size, seed.size))
+    whole, size = products[-1], abs(matrix) @ np.abs(probe)
+    rounding = 1e4 * float(jnp.finfo(tissue.vertices.dtype).eps)
+    if np.abs(matrix @ probe - whole).max() > rounding * size.max(initial=0):
+        return None
     return 0.5 * (matrix + matrix.T)
+
+
+def factorised(matrix: sparse.sparray) -> Any:
+    """A factorisation of a symmetric sparse matrix, with its method `solve`."""
+    return splu(
+        sparse.csc_array(matrix),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
 
 
 _products = eqx.filter_jit(hessian_products)

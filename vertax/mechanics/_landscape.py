@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax._base.modules import is_concrete
 from vertax.dissipations import AbstractDissipation
+from vertax.mechanics._arguments import as_matrix, check_tissue
 from vertax.mesh import Periodic, Tissue
 
 Motion: TypeAlias = tuple[Float[Array, "2 2"], PyTree[Float[Array, "..."]]]
@@ -32,7 +33,18 @@ def deformed(tissue: Tissue, gradient: Float[Array, "2 2"]) -> Tissue:
         `[[1, γ], [0, 1]]`.
 
     **Returns:** the deformed tissue.
+
+    **Raises:**
+
+    - `ValueError` for another shape, or a determinant that is not positive.
     """
+    check_tissue(tissue)
+    gradient = as_matrix("gradient", gradient)
+    if is_concrete(gradient) and not np.linalg.det(np.asarray(gradient, float)) > 0:
+        raise ValueError(
+            "Argument `gradient` must have a positive determinant, lest cells be turned inside out, but is "
+            f"{np.asarray(gradient).tolist()}."
+        )
     # Written out: a matrix product would run in reduced precision on some accelerators.
     moved = lambda x: x[:, :1] * gradient[:, 0] + x[:, 1:] * gradient[:, 1]
     boundary = tissue.boundary
@@ -153,16 +165,3 @@ def checked(value: Array, reason: str) -> Array:
     if failed:
         raise RuntimeError(reason)
     return value
-
-
-def require_box(tissue: Tissue, what: str) -> None:
-    """Refuse a tissue without a periodic box.
-
-    **Raises:**
-
-    - `ValueError` for it.
-    """
-    if not isinstance(tissue.boundary, Periodic):
-        raise ValueError(
-            f"Argument `tissue` must be periodic: {what} strains the box, and a free tissue has none."
-        )

@@ -11,17 +11,22 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 from scipy.sparse import diags_array
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, eigsh
 
-from vertax._base.checks import check_number, check_whole
+from vertax._base.checks import as_doubles, check_concrete, check_number, check_whole
 from vertax._base.modules import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
-from vertax.mechanics._hessian import dense_hessian, flat_hessian, movable, sparse_hessian
+from vertax.mechanics._arguments import check_tissue
+from vertax.mechanics._hessian import (
+    DENSE,
+    dense_hessian,
+    factorised,
+    flat_hessian,
+    movable,
+    sparse_hessian,
+)
 from vertax.mechanics._landscape import Landscape, stationary
 from vertax.mesh import Tissue
-
-# A dense eigenproblem of that size takes a fraction of a second.
-_DENSE = 800
 
 
 class Modes(eqx.Module):
@@ -76,8 +81,10 @@ def modes(
     **Raises:**
 
     - `ValueError` for more modes than degrees of freedom, or another method.
-    - `TypeError` for `"sparse"` with an energy that is not local, or inside `jax.jit`.
+    - `TypeError` for what is no tissue or no energy, and for `"sparse"` with an energy that is not local,
+        or inside `jax.jit`.
     """
+    check_tissue(tissue, energy)
     check_whole("k", k, least=1)
     if method not in (None, "dense", "sparse"):
         raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
@@ -94,9 +101,9 @@ def modes(
             'jax.vmap and jax.grad: pass method="dense".'
         )
     tissue, energy = traced((tissue, energy))
-    sparse = possible and size > max(_DENSE, 4 * k) if method is None else method == "sparse"
+    sparse = possible and size > max(DENSE, 4 * k) if method is None else method == "sparse"
     if sparse and isinstance(energy, AbstractLocalEnergy):
-        vectors = jnp.asarray(_softest(tissue, energy, k), tissue.vertices.dtype)
+        vectors = jnp.asarray(_softest(Landscape(tissue, energy), k), tissue.vertices.dtype)
         return _modes_along(tissue, energy, vectors)
     return _dense_modes(tissue, energy, k)
 
@@ -112,7 +119,13 @@ def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
     - `energy`: the energy that it is at rest under.
 
     **Returns:** the eigenvalues, energy per length squared.
+
+    **Raises:**
+
+    - `TypeError` inside `jax.jit`, and for what is no tissue or no energy.
     """
+    check_tissue(tissue, energy)
+    check_concrete("spectrum", tissue, energy)
     matrix = np.asarray(_dense(Landscape(*traced((tissue, energy)))))
     free = np.asarray(ravel_pytree(movable(tissue))[0])
     return jnp.asarray(np.linalg.eigvalsh(matrix[np.ix_(free, free)]))
@@ -130,6 +143,8 @@ def zero_modes(tissue: Tissue, energy: AbstractEnergy, *, tolerance: float = 1e-
     - `tolerance`: an eigenvalue counts as 0 if it is that much smaller than the largest one.
 
     **Returns:** their number.
+
+    **Raises:** as `spectrum`.
     """
     check_number("tolerance", tolerance, above=0)
     values = np.abs(np.asarray(spectrum(tissue, energy)))
@@ -147,12 +162,20 @@ def density_of_states(
     - `bins`: number of bins, from 0 to the largest frequency.
     - `tolerance`: eigenvalues that are that much smaller than the largest one are zero modes, and left out.
 
-    **Returns:** the middle of each bin, and the share of all modes per frequency in it: its integral is
-    the share
-        of the modes that are no zero modes.
+    **Returns:** the middle of each bin, and the share of all modes per frequency in it: its integral is the
+        share of the modes that are no zero modes.
+
+    **Raises:**
+
+    - `ValueError` for what is no list of finite eigenvalues, or no bins.
     """
     check_whole("bins", bins, least=1)
-    found = np.asarray(values, float)
+    found = as_doubles("values", values)
+    if found.ndim != 1 or found.size == 0:
+        raise ValueError(
+            f"Argument `values` must be one list of eigenvalues, but its shape is {found.shape}."
+        )
+    check_number("tolerance", tolerance, above=0)
     frequencies = np.sqrt(found[found > tolerance * np.abs(found).max()])
     counts, edges = np.histogram(frequencies, bins, (0, frequencies.max(initial=0) or 1))
     return 0.5 * (edges[1:] + edges[:-1]), counts / (found.size * np.diff(edges))
@@ -213,20 +236,20 @@ def _unravelled(
     return jax.vmap(ravel_pytree(tissue.configuration)[1])(vectors)
 
 
-def _softest(
-    tissue: Tissue, energy: AbstractLocalEnergy, k: int
-) -> Float[np.ndarray, "modes dofs"]:
+def _softest(landscape: Landscape, k: int) -> Float[np.ndarray, "modes dofs"]:
     """The eigenvectors of the eigenvalues next to 0, by shift and invert."""
+    tissue = landscape.tissue
     free = np.flatnonzero(np.asarray(ravel_pytree(movable(tissue))[0]))
-    matrix = sparse_hessian(tissue, energy)[free][:, free]
+    found = sparse_hessian(landscape)
+    if found is None:
+        raise TypeError(
+            "Argument `energy` says that it is local, but vertices without a cell in common feel each other: "
+            'pass method="dense".'
+        )
+    matrix = found[free][:, free]
     # So little below 0 that it changes no order, and far enough that zero modes can be inverted.
     shift = 1e-7 * matrix.diagonal().mean()
-    factors = splu(
-        (matrix + diags_array(np.full(free.size, shift))).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    factors = factorised(matrix + diags_array(np.full(free.size, shift)))
     # Its constructor makes one of a class that type checkers do not see.
     linear: Any = LinearOperator
     inverse = linear(matrix.shape, matvec=factors.solve, dtype=float)

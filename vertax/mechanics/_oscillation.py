@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
+from scipy.sparse import diags_array
 
 from vertax._base.checks import as_real, check_number
-from vertax._base.modules import traced
+from vertax._base.modules import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
-from vertax.energies import AbstractEnergy
+from vertax.energies import AbstractEnergy, AbstractLocalEnergy
+from vertax.mechanics._arguments import check_dissipation, check_tissue
 from vertax.mechanics._elasticity import shear_part
-from vertax.mechanics._hessian import dense_hessian
+from vertax.mechanics._hessian import DENSE, dense_hessian, factorised, movable, sparse_hessian
 from vertax.mechanics._landscape import (
     Landscape,
     area_of,
     dissipation_landscape,
     dot,
-    require_box,
     stationary,
     voigt_basis,
 )
@@ -38,6 +40,7 @@ def complex_modulus(
     frequencies: ArrayLike,
     *,
     angle: ArrayLike | None = None,
+    method: Literal["dense", "sparse"] | None = None,
 ) -> Complex[Array, " frequencies"]:
     r"""The complex shear modulus $G^*(\omega) = G' + i G''$ of a tissue at rest, for small oscillations.
 
@@ -52,9 +55,7 @@ def complex_modulus(
     with the forces $\Xi$ that an affine strain leaves and those, $Z$, that resist an affine rate of strain
     (0 for friction with a substrate that goes with the box). $G^*(0)$ is the relaxed
     [`shear_modulus`][vertax.mechanics.shear_modulus] and, with friction alone, $G^*(\infty)$ the affine
-    one (Tong et al. 2022, doi:10.1371/journal.pcbi.1010135). One decomposition of both matrices
-    serves all frequencies; they are dense, so time grows with the cube of the number of cells (1000
-    cells take about a minute).
+    one (Tong et al. 2022, doi:10.1371/journal.pcbi.1010135).
 
     **Arguments:**
 
@@ -63,6 +64,11 @@ def complex_modulus(
     - `dissipation`: what resists.
     - `frequencies`: angular frequencies $\omega$, one over time; not negative.
     - `angle`: direction of the shear, as in `shear_modulus`; by default the mean over all.
+    - `method`: `"dense"` takes one decomposition of both matrices for all frequencies, works under
+        `jax.jit`, `jax.vmap` and `jax.grad`, and its time grows with the cube of the number of cells.
+        `"sparse"` takes one sparse factorisation for each frequency, on the host: for large tissues whose
+        energy and dissipation are local. By default that, if it can be and the tissue has more than 200
+        cells or so.
 
     **Returns:** one complex number a frequency, energy per area: real part $G'$, storage; imaginary part
     $G''$,
@@ -70,12 +76,22 @@ def complex_modulus(
 
     **Raises:**
 
-    - `ValueError` for a free tissue, or a negative frequency.
+    - `TypeError` for what is no tissue, no energy or no dissipation.
+    - `TypeError` for `"sparse"` with an energy or a dissipation that is not local, or inside `jax.jit`.
+    - `ValueError` for a free tissue, a negative frequency, no list of them, or another method.
     """
-    require_box(tissue, "a complex modulus")
+    check_tissue(tissue, energy, box="a complex modulus")
+    check_dissipation(dissipation)
     check_number("frequencies", frequencies, least=0, many=True)
     omegas = jnp.atleast_1d(as_real("frequencies", frequencies)).astype(tissue.vertices.dtype)
-    real, imaginary = _tensors(*traced((tissue, energy, dissipation)), omegas)
+    if omegas.ndim != 1 or omegas.size == 0:
+        raise ValueError(
+            f"Argument `frequencies` must be a list of numbers, but its shape is {omegas.shape}."
+        )
+    if method not in (None, "dense", "sparse"):
+        raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
+    args = (*traced((tissue, energy, dissipation)), omegas)
+    real, imaginary = _tensors_of(args, method)
     part = jax.vmap(lambda tensor: shear_part(tensor, angle))
     return jax.lax.complex(part(real), part(imaginary))
 
@@ -87,10 +103,8 @@ class _Oscillation(eqx.Module):
         """Real and imaginary part of how vertices move by themselves, for each frequency and strain."""
         tissue, energy, dissipation, omegas = args
         elastic, viscous = Landscape(tissue, energy), dissipation_landscape(tissue, dissipation)
-        basis, unravel = voigt_basis(tissue), ravel_pytree(tissue.configuration)[1]
-        flat = jax.vmap(lambda x: ravel_pytree(x)[0])
-        left = flat(jax.vmap(elastic.curvature())(basis)[1])
-        resisted = flat(jax.vmap(viscous.curvature())(basis)[1])
+        unravel = ravel_pytree(tissue.configuration)[1]
+        left, resisted = _loads(elastic), _loads(viscous)
         h, g, x = _simultaneously_diagonal(dense_hessian(elastic), dense_hessian(viscous))
         denominator = h + 1j * omegas[:, None] * g
         # What neither costs energy nor is resisted does not move.
@@ -122,6 +136,64 @@ class _Oscillation(eqx.Module):
 
         tensors = jax.vmap(one)(omegas, solution)
         return jnp.moveaxis(tensors, 1, 0) / area_of(tissue)
+
+
+def _tensors_of(args: _Args, method: str | None) -> Float[Array, "2 frequencies 3 3"]:
+    """By the method given, or the one that suits."""
+    tissue, energy, *_ = args
+    large = ravel_pytree(tissue.configuration)[0].size > DENSE
+    if method == "sparse" or (method is None and large):
+        local = isinstance(energy, AbstractLocalEnergy)
+        motions = (
+            _sparse_motions(args)
+            if local and all(map(is_concrete, jax.tree.leaves(args)))
+            else None
+        )
+        if motions is not None:
+            return _tensors_along(args, motions)
+        if method == "sparse":
+            raise TypeError(
+                'Argument `method` can be "sparse" only for an AbstractLocalEnergy and a dissipation in '
+                "which vertices without a cell in common do not feel each other, and outside of jax.jit, "
+                'jax.vmap and jax.grad: pass method="dense".'
+            )
+    return _tensors(*args)
+
+
+def _sparse_motions(args: _Args) -> PyTree[Array] | None:
+    """As `_Oscillation.solve`, by a sparse factorisation for each frequency; None if that cannot be."""
+    tissue, energy, dissipation, omegas = args
+    landscapes = Landscape(tissue, energy), dissipation_landscape(tissue, dissipation)
+    found = [sparse_hessian(landscape) for landscape in landscapes]
+    if any(matrix is None for matrix in found):
+        return None
+    free = np.flatnonzero(np.asarray(ravel_pytree(movable(tissue))[0]))
+    stiff, viscous = (matrix[free][:, free] for matrix in found if matrix is not None)
+    left, resisted = (np.asarray(_loads(landscape), float)[:, free] for landscape in landscapes)
+    # What nothing holds gets a support so weak that no modulus feels it: moduli are stationary in motions, so
+    # the error is of second order.
+    sizes = [float(np.abs(matrix.diagonal()).mean()) for matrix in (stiff, viscous)]
+    parts = np.zeros((omegas.size, 3, 2, ravel_pytree(tissue.configuration)[0].size))
+    for i, omega in enumerate(np.asarray(omegas, float)):
+        support = diags_array(np.full(free.size, 1e-10 * (sizes[0] + omega * sizes[1])))
+        # At rest everything is real.
+        rate = 1j * omega if omega else 0.0
+        answer = -factorised(stiff + rate * viscous + support).solve((left + rate * resisted).T).T
+        parts[i, :, 0, free], parts[i, :, 1, free] = answer.real.T, answer.imag.T
+    unravel = ravel_pytree(tissue.configuration)[1]
+    return jax.vmap(jax.vmap(jax.vmap(unravel)))(jnp.asarray(parts, tissue.vertices.dtype))
+
+
+@eqx.filter_jit
+def _loads(landscape: Landscape) -> Float[Array, "3 dofs"]:
+    """The forces that affine strains, or rates of strain, leave."""
+    left = jax.vmap(landscape.curvature())(voigt_basis(landscape.tissue))[1]
+    return jax.vmap(lambda x: ravel_pytree(x)[0])(left)
+
+
+@eqx.filter_jit
+def _tensors_along(args: _Args, motions: PyTree[Array]) -> Float[Array, "2 frequencies 3 3"]:
+    return _Oscillation().value(args, motions)
 
 
 def _rounding(dtype: jnp.dtype) -> float:

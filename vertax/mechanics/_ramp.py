@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._base.checks import as_real
+from vertax._base.checks import as_real, named
 from vertax._base.modules import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._landscape import deformed, require_box
+from vertax.mechanics._arguments import as_matrix, check_relaxation, check_tissue
+from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue
 from vertax.responses import Relaxation
@@ -23,15 +24,25 @@ Deformation = Callable[[Float[Array, ""]], Float[Array, "2 2"]]
 
 def simple_shear(strain: ArrayLike) -> Float[Array, "2 2"]:
     r"""Simple shear along x by $\gamma$: the deformation gradient `[[1, γ], [0, 1]]`."""
-    strain = jnp.asarray(strain)
+    strain = _as_strain(strain)
     zero, one = jnp.zeros_like(strain), jnp.ones_like(strain)
     return jnp.stack([jnp.stack([one, strain]), jnp.stack([zero, one])])
 
 
 def pure_shear(strain: ArrayLike) -> Float[Array, "2 2"]:
     r"""Pure shear that stretches along x by $e^\epsilon$, at fixed area."""
-    strain = jnp.asarray(strain)
+    strain = _as_strain(strain)
     return jnp.diag(jnp.stack([jnp.exp(strain), jnp.exp(-strain)]))
+
+
+def _as_strain(strain: ArrayLike) -> Float[Array, ""]:
+    value = as_real("strain", strain)
+    if value.shape != ():
+        raise ValueError(
+            f"Argument `strain` must be one number, but its shape is {value.shape}. Take more of them "
+            "through jax.vmap."
+        )
+    return value
 
 
 class Ramp(eqx.Module):
@@ -92,17 +103,25 @@ def ramp(
 
     **Raises:**
 
-    - `ValueError` for a free tissue, or strains that are no list of numbers.
+    - `TypeError` for what is no tissue, energy, relaxation or function.
+    - `ValueError` for a free tissue, strains that are no list of numbers, or a deformation of another shape.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the tissue did not come to rest at some
         strain.
     """
-    require_box(tissue, "a ramp")
+    check_tissue(tissue, energy, box="a ramp")
     values = as_real("strains", strains).astype(tissue.vertices.dtype)
     if values.ndim != 1 or values.size == 0:
         raise ValueError(
             f"Argument `strains` must be a list of numbers, but its shape is {values.shape}."
         )
+    if not callable(deformation):
+        raise TypeError(
+            "Argument `deformation` must be a function from a strain to a deformation gradient, e.g. "
+            f"vertax.mechanics.pure_shear, but is {named(deformation)}."
+        )
+    as_matrix("deformation", jnp.zeros(jax.eval_shape(deformation, values[0]).shape))
     relaxation = Relaxation() if relaxation is None else relaxation
+    check_relaxation(relaxation)
     adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
     tissue, energy = traced((tissue, energy))
     relaxation.check(tissue, energy, adjoint)

@@ -6,12 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vertax._base.checks import check_whole
 from vertax._base.modules import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
+from vertax.mechanics._arguments import check_dissipation, check_linear_solver, check_tissue
 from vertax.mechanics._forces import tensions
 from vertax.mechanics._landscape import checked, dissipation_landscape, solve
 from vertax.mesh import Tissue
@@ -103,17 +105,21 @@ def recoil(
 
     **Raises:**
 
+    - `TypeError` for what is no tissue, energy, dissipation or linear solver, or no whole number.
     - `ValueError` for an edge that is none.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
+    check_tissue(tissue, energy)
+    check_dissipation(dissipation)
     if is_concrete(edge):
-        number = int(edge)
+        number = np.asarray(edge)[()] if isinstance(edge, jax.Array) else edge
         check_whole("edge", number, least=0)
         if number >= tissue.n_edges:
             raise ValueError(
-                f"Argument `edge` must be one of the {tissue.n_edges} edges, but is {number}."
+                f"Argument `edge` must be one of the {tissue.n_edges} edges, from 0 on, but is {number}."
             )
     solver = MINRES() if linear_solver is None else linear_solver
+    check_linear_solver(solver)
     tissue, energy, dissipation = traced((tissue, energy, dissipation))
     found = _recoil(tissue, energy, jnp.asarray(edge), dissipation, solver)
     return checked(found, _REASON) if throw else found

@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from vertax._base.checks import check_concrete, check_number
+from vertax.mechanics._arguments import check_tissue
 from vertax.mechanics._hessian import movable
 from vertax.mesh import Tissue
 
@@ -38,8 +39,9 @@ def compatibility(
 
     - `ValueError` for another kind of constraint, or none.
     """
-    names = tuple(constraints)
-    if not names or not set(names) <= set(_KINDS):
+    check_tissue(tissue)
+    names = tuple(constraints) if isinstance(constraints, Sequence) else ()
+    if isinstance(constraints, str) or not names or not set(names) <= set(_KINDS):
         raise ValueError(
             f"Argument `constraints` must name some of {', '.join(_KINDS)}, but is {constraints!r}."
         )
@@ -99,6 +101,7 @@ def self_stresses(
     - `ValueError` for another kind of constraint.
     - `TypeError` inside `jax.jit`.
     """
+    check_tissue(tissue)
     check_concrete("self_stresses", tissue)
     check_number("tolerance", tolerance, above=0)
     free = np.asarray(ravel_pytree(movable(tissue))[0])

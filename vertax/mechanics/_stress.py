@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vertax._base.checks import as_real
 from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
+from vertax.mechanics._arguments import check_tissue
 from vertax.mechanics._forces import pressures_and_tensions
 from vertax.mechanics._landscape import area_of, deformed
 from vertax.mesh import Tissue
@@ -33,7 +35,13 @@ def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
 
     **Returns:** a symmetric matrix, shape `(2, 2)` (symmetric unless the energy knows directions); positive
         where the tissue would contract. Differentiable with respect to everything.
+
+    **Raises:**
+
+    - `TypeError` for what is no tissue, or no energy.
+    - `ValueError` for a batch of tissues.
     """
+    check_tissue(tissue, energy)
     return _stress(*traced((tissue, energy)))
 
 
@@ -58,7 +66,10 @@ def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2
     - `energy`: an energy of areas and lengths, see [`pressures`][vertax.mechanics.pressures].
 
     **Returns:** one symmetric matrix a cell, energy per area, positive where it would contract.
+
+    **Raises:** as `stress`.
     """
+    check_tissue(tissue, energy)
     return _cell_stress(*traced((tissue, energy)))
 
 
@@ -104,6 +115,15 @@ def principal(
 
     **Returns:** the principal stresses, the larger one first, shape `(…, 2)`; and the unit vectors along
         them as rows, shape `(…, 2, 2)`. (Where both are equal the directions mean nothing.)
+
+    **Raises:**
+
+    - `ValueError` for another shape.
     """
+    stresses = as_real("stresses", stresses)
+    if stresses.shape[-2:] != (2, 2):
+        raise ValueError(
+            f"Argument `stresses` must have shape (…, 2, 2), but its shape is {stresses.shape}."
+        )
     values, vectors = jnp.linalg.eigh(0.5 * (stresses + jnp.swapaxes(stresses, -1, -2)))
     return values[..., ::-1], jnp.swapaxes(vectors, -1, -2)[..., ::-1, :]

@@ -12,10 +12,13 @@ with _needing("plot", "Drawing"):
         scale_bar as scale_bar,
     )
     from vertax.plotting._mechanics import (
-        plot_density_of_states as plot_density_of_states,
         plot_mode as plot_mode,
-        plot_moduli as plot_moduli,
         plot_stress as plot_stress,
+    )
+    from vertax.plotting._moduli import (
+        plot_density_of_states as plot_density_of_states,
+        plot_moduli as plot_moduli,
+        plot_stress_strain as plot_stress_strain,
     )
     from vertax.plotting._panels import plot_tissues as plot_tissues
     from vertax.plotting._recovery import plot_recovery as plot_recovery

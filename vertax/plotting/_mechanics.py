@@ -1,14 +1,13 @@
-"""Pictures of stress, modes and moduli."""
+"""Stress and motions drawn over a tissue."""
 
 from __future__ import annotations
 
 from typing import Any, SupportsFloat
 
 import numpy as np
-from jaxtyping import Array, Complex, Float, Real
+from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
 from vertax.mesh import Periodic, Tissue
 from vertax.mesh._outlines import Drawing
@@ -42,16 +41,10 @@ def plot_stress(
 
     - `ValueError` for stresses of the wrong shape, or a scale that is not positive.
     """
-    drawing, matrices = Drawing(single(tissue)), np.asarray(stresses, float)
-    if matrices.shape != (drawing.n_cells, 2, 2):
-        raise ValueError(
-            f"Argument `stresses` must have shape ({drawing.n_cells}, 2, 2), but has {matrices.shape}."
-        )
+    drawing = Drawing(single(tissue))
+    matrices = _shaped("stresses", stresses, (drawing.n_cells, 2, 2))
     values, vectors = np.linalg.eigh(0.5 * (matrices + np.swapaxes(matrices, 1, 2)))
-    longest = np.abs(values).max() if scale is None else float(scale)
-    if scale is not None and not longest > 0:
-        raise ValueError(f"Argument `scale` must be positive, but is {longest}.")
-    half = 0.5 * drawing.cell_size * np.abs(values) / (longest or 1)
+    half = 0.5 * drawing.cell_size * np.abs(values) / _unit(np.abs(values), scale)
     way = (half[:, None, :] * vectors).swapaxes(1, 2)
     centres = drawing.centroids[:, None]
     bars = np.stack([centres - way, centres + way], axis=2).reshape(-1, 2, 2)
@@ -89,21 +82,16 @@ def plot_mode(
 
     - `ValueError` for displacements of the wrong shape, or a scale that is not positive.
     """
-    places, moves = np.asarray(single(tissue).vertices, float), np.asarray(displacements, float)
-    if moves.shape != places.shape:
-        raise ValueError(
-            f"Argument `displacements` must have shape {places.shape}, but has {moves.shape}."
-        )
-    largest = np.linalg.norm(moves, axis=1).max() if scale is None else float(scale)
-    if scale is not None and not largest > 0:
-        raise ValueError(f"Argument `scale` must be positive, but is {largest}.")
+    places = np.asarray(single(tissue).vertices, float)
+    moves = _shaped("displacements", displacements, places.shape)
+    unit = _unit(np.linalg.norm(moves, axis=1), scale)
     size = float(np.sqrt(np.mean(np.abs(tissue.areas))))
     if isinstance(tissue.boundary, Periodic):
         lattice = np.asarray(tissue.boundary.lattice, float)
         fractions = places @ np.linalg.inv(lattice)
         places = (fractions - np.floor(fractions)) @ lattice
     ax = plot_tissue(tissue, **options)
-    arrows = size * moves / (largest or 1)
+    arrows = size * moves / unit
     ax.quiver(
         *places.T,
         *arrows.T,
@@ -117,91 +105,18 @@ def plot_mode(
     return ax
 
 
-def plot_moduli(
-    frequencies: Real[Array | np.ndarray, " frequencies"],
-    moduli: Complex[Array | np.ndarray, " frequencies"],
-    *,
-    ax: Axes | None = None,
-    figure: Figure | None = None,
-    label: str | None = None,
-) -> Axes:
-    """Draw storage and loss modulus over the frequency, on logarithmic axes.
-
-    Frequencies of 0 have no place there and are left out.
-
-    **Arguments:**
-
-    - `frequencies`: angular frequencies.
-    - `moduli`: the complex modulus at each, from
-        [`complex_modulus`][vertax.mechanics.complex_modulus].
-    - `ax`: the axes to draw in, also one after the other to compare; by default those of a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
-    - `label`: name of this tissue in the legend.
-
-    **Returns:** the axes.
-
-    **Raises:**
-
-    - `ValueError` if there is not one modulus for each frequency.
-    """
-    x, y = np.asarray(frequencies, float), np.asarray(moduli, complex)
-    _style.one_of(ax, figure)
-    if x.ndim != 1 or y.shape != x.shape:
-        raise ValueError(
-            f"Argument `moduli` must have one entry for each frequency, but has shape {y.shape}, and "
-            f"`frequencies` {x.shape}."
-        )
-    kept, of = x > 0, "" if label is None else f", {label}"
-    with _style.house_style():
-        if ax is None:
-            (ax,) = _style.new_axes(width=3.0, height=2.3, figure=figure)
-        colour = _style.SERIES[len(ax.lines) // 2 % len(_style.SERIES)]
-        for part, name, dashes in (
-            (np.real(y), "storage $G'$", "-"),
-            (np.imag(y), "loss $G''$", "--"),
-        ):
-            shown = kept & (part > 0)
-            ax.plot(x[shown], part[shown], dashes, color=colour, label=f"{name}{of}")
-        ax.set(xscale="log", yscale="log", xlabel=r"frequency $\omega$", ylabel="modulus")
-        ax.legend()
-    return ax
+def _shaped(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Values of the shape that goes with the tissue."""
+    found = np.asarray(values, float)
+    if found.shape != shape:
+        raise ValueError(f"Argument `{name}` must have shape {shape}, but has {found.shape}.")
+    return found
 
 
-def plot_density_of_states(
-    frequencies: Float[Array | np.ndarray, " bins"],
-    density: Float[Array | np.ndarray, " bins"],
-    *,
-    ax: Axes | None = None,
-    figure: Figure | None = None,
-    label: str | None = None,
-) -> Axes:
-    r"""Draw a density of states $D(\omega)$.
-
-    **Arguments:**
-
-    - `frequencies`, `density`: from [`density_of_states`][vertax.mechanics.density_of_states].
-    - `ax`: the axes to draw in, also one after the other to compare; by default those of a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
-    - `label`: name in the legend, which is up to the caller.
-
-    **Returns:** the axes.
-
-    **Raises:**
-
-    - `ValueError` if there is not one density for each frequency.
-    """
-    x, y = np.asarray(frequencies, float), np.asarray(density, float)
-    _style.one_of(ax, figure)
-    if x.ndim != 1 or y.shape != x.shape:
-        raise ValueError(
-            f"Argument `density` must have one entry for each frequency, but has shape {y.shape}, and "
-            f"`frequencies` {x.shape}."
-        )
-    with _style.house_style():
-        if ax is None:
-            (ax,) = _style.new_axes(width=3.0, height=2.3, figure=figure)
-        ax.step(x, y, where="mid", label=label)
-        ax.set(
-            xlabel=r"frequency $\omega$", ylabel=r"density of states $D(\omega)$", ylim=(0, None)
-        )
-    return ax
+def _unit(sizes: np.ndarray, scale: SupportsFloat | None) -> float:
+    """The size that is drawn as long as a cell: by default the largest, or 1 if there is nothing."""
+    if scale is None:
+        return float(sizes.max()) or 1.0
+    if not float(scale) > 0:
+        raise ValueError(f"Argument `scale` must be positive, but is {scale}.")
+    return float(scale)

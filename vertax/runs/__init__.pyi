@@ -15,7 +15,7 @@ from ._errors import (
 )
 from ._folder import RunFolder as RunFolder
 from ._load import load_config as load_config
-from ._pool import fit_side_by_side as fit_side_by_side, side_by_side as side_by_side
+from ._pool import fit_side_by_side as fit_side_by_side, scan as scan, side_by_side as side_by_side
 from ._registry import (
     EXPERIMENTS as EXPERIMENTS,
     Experiment as Experiment,

@@ -7,7 +7,8 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from jaxtyping import ArrayLike
+import numpy as np
+from jaxtyping import ArrayLike, Shaped
 from tqdm import tqdm
 
 from vertax.fitting import Fit, InverseProblem, Record, stack_fits
@@ -69,6 +70,35 @@ def side_by_side(
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
     return [results[index] for index in range(n)]
+
+
+def scan(
+    name: str,
+    values: Sequence[float],
+    compute: Callable[[float], Mapping[str, np.ndarray]],
+    folder: RunFolder,
+    *,
+    progress: bool = True,
+) -> dict[str, Shaped[np.ndarray, "values ..."]]:
+    """Arrays at each of some values of a number, side by side; a resumed run computes none of them again.
+
+    **Arguments:**
+
+    - `name`: of the number, as parts of the run are called.
+    - `values`: its values, no two alike.
+    - `compute`: makes the arrays at one value, by name; their shapes are the same at each.
+    - `folder`: of the run.
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** the arrays by name, with a leading axis of the values.
+    """
+
+    def one(index: int) -> dict[str, np.ndarray]:
+        value = float(values[index])
+        return folder.part(f"{name} {value:g}", lambda: compute(value))
+
+    results = side_by_side(one, len(values), folder, progress=progress, unit="value")
+    return {key: np.stack([result[key] for result in results]) for key in results[0]}
 
 
 def fit_side_by_side(

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import optax
 import optimistix as optx
-from jaxtyping import Float, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, Key, PRNGKeyArray, Shaped
 from pydantic import Field, model_validator
 
 from vertax import solvers
@@ -20,13 +20,14 @@ from vertax.adjoints import (
     ImplicitDifferentiation,
 )
 from vertax.energies import LocalSum
+from vertax.fitting import stack
 from vertax.inference import (
     Micrograph,
     Microscope as SyntheticMicroscope,
     foam_energy,
     micrograph_problem,
 )
-from vertax.initialise import Cellpose, Watershed
+from vertax.initialise import Cellpose, Watershed, periodic_voronoi
 from vertax.io import read_image
 from vertax.mesh import Tissue
 from vertax.responses import Relaxation as Response
@@ -140,6 +141,18 @@ class TissueSection(Section):
     """Number of cells."""
     lloyd_steps: int = Field(default=0, ge=0)
     """Steps of Lloyd's algorithm, which make the first tissue more regular."""
+
+    def draw(self, keys: Key[Array, " tissues"]) -> Tissue:
+        """Random tissues.
+
+        **Arguments:**
+
+        - `keys`: one key for each tissue.
+
+        **Returns:** the tissues as a batch.
+        """
+        n, steps = self.n_cells, self.lloyd_steps
+        return stack([periodic_voronoi(n, key=key, lloyd_steps=steps) for key in keys])
 
 
 class ShapeFactors(Section):

@@ -3,6 +3,9 @@
 Free clusters of the energy E2, of several sizes, get a tension for each edge. From random ones they are
 first brought to one aspect ratio, where all designs start; then the tensions are adjusted until the
 cluster has the aspect ratio asked for. Cells change neighbours on the way.
+
+With `measure = "box"` tissues are periodic, and it is their box that comes to rest, at a fixed area and
+without shear stress, and is to be elongated.
 """
 
 from __future__ import annotations
@@ -18,7 +21,8 @@ from pydantic import Field
 from vertax.costs import AspectRatio, aspect_ratio
 from vertax.fitting import Fit, InverseProblem, Record, limits, member
 from vertax.inference import foam_terms
-from vertax.initialise import free_voronoi
+from vertax.initialise import free_voronoi, periodic_voronoi
+from vertax.mechanics import BoxRelaxation
 from vertax.runs import (
     ExperimentConfig,
     Fitting,
@@ -45,8 +49,9 @@ class Config(ExperimentConfig):
     """Aspect ratios to reach."""
     start_ratio: float = Field(default=1.5, gt=1)
     """Aspect ratio at which all designs start."""
-    measure: Literal["moments", "farthest"] = "moments"
-    """How the ratio is measured: second moments of the area, or the paper's farthest vertices."""
+    measure: Literal["moments", "farthest", "box"] = "moments"
+    """How the ratio is measured: second moments of the area, or the paper's farthest vertices; or the
+    sides of the box of a periodic tissue."""
     accuracy: float = Field(default=1e-2, gt=0)
     """Distance from the target that counts as reached."""
     replicates: int = Field(default=5, ge=1)
@@ -110,15 +115,18 @@ def _members(config: Config) -> list[tuple[float, int]]:
 def _design(config: Config, n_cells: int, folder: RunFolder, progress: bool) -> tuple[Fit, Fit]:
     """The fits to the ratio at which designs start, and to the targets."""
     problems = []
+    response, make = config.relaxation.build(), free_voronoi
+    if config.measure == "box":
+        response, make = BoxRelaxation(free="shape", relaxation=response), periodic_voronoi
     for key in replicate_keys(config.seed, config.replicates):
-        cluster = free_voronoi(n_cells, key=key, lloyd_steps=2)
+        cluster = make(n_cells, key=key, lloyd_steps=2)
         problems.append(
             InverseProblem(
                 cluster,
                 config.tensions.draw(cluster, config.spread, key),
                 AspectRatio(jnp.array(config.start_ratio), config.measure),
                 adjoint=config.gradient.build(),
-                response=config.relaxation.build(),
+                response=response,
             )
         )
     options: dict[str, Any] = {"notes": _ratio, "progress": progress}

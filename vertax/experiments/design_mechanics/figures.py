@@ -18,20 +18,22 @@ def mechanics(
     panels: Mapping[str, tuple[Tissue, np.ndarray]],
     observed: Float[np.ndarray, "epochs cells"],
     targets: Float[np.ndarray, "epochs cells"],
-    wanted: float,
+    wanted: tuple[str, Float[np.ndarray, " epochs"], float],
 ) -> Figure:
-    """Tissues before and after, and shape factors over epochs.
+    """Tissues before and after, and shape factors over epochs; and what is designed, if it is another.
 
     **Arguments:**
 
     - `panels`: tissue and shape factors of its cells by the title of the panel.
     - `observed`, `targets`: shape factors in equilibrium and of the energy.
-    - `wanted`: the mean to reach.
+    - `wanted`: what is designed, its values and the one to reach.
 
     **Returns:** the figure.
     """
-    n = len(panels)
-    figure, (axes,) = new_figure(1, n + 1, width=[2.3] * n + [2.7], height=2.5, room=0.7)
+    n, (quantity, values, target) = len(panels), wanted
+    other = quantity != "shape_factor"
+    widths = [2.3] * n + [2.7] * (1 + other)
+    figure, (axes,) = new_figure(1, len(widths), width=widths, height=2.5, room=0.7)
     plot_tissues(
         {
             f"{title}: mean {values.mean():.2f}": tissue
@@ -41,15 +43,22 @@ def mechanics(
         axes=axes[:n],
         label=r"shape factor $P/\sqrt{A}$",
     )
-    _shape_factors(axes[n], observed, targets, wanted)
+    _shape_factors(axes[n], observed, targets, None if other else target)
+    if other:
+        axes[-1].plot(values, color=SERIES[2])
+        axes[-1].axhline(target, color=INK, ls=":", lw=0.8)
+        axes[-1].set(xlabel="epoch", ylabel=quantity.replace("_", " "))
     return figure
 
 
-def _shape_factors(ax: Axes, observed: np.ndarray, targets: np.ndarray, wanted: float) -> None:
+def _shape_factors(
+    ax: Axes, observed: np.ndarray, targets: np.ndarray, wanted: float | None
+) -> None:
     blue, vermilion, *_ = SERIES
     lines = ax.plot(targets, color="0.75", lw=0.5)
     lines[0].set_label("$p^0$ of a cell")
-    ax.axhline(wanted, color=INK, ls=":", lw=0.8, label="wanted")
+    if wanted is not None:
+        ax.axhline(wanted, color=INK, ls=":", lw=0.8, label="wanted")
     ax.plot(observed.mean(axis=1), color=blue, label="mean in equilibrium")
     # Where both agree, both show.
     ax.plot(targets.mean(axis=1), color=vermilion, ls=(0, (3, 3)), lw=0.8, label="mean $p^0$")

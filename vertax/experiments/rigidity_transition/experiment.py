@@ -22,9 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field
 
 from vertax.energies import ShapeFactorEnergy
-from vertax.fitting import stack
 from vertax.inference import Transition, fit_onset, fit_transition
-from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
 from vertax.responses import Relaxation as Response
 from vertax.runs import (
@@ -33,7 +31,7 @@ from vertax.runs import (
     RunFolder,
     Section,
     TissueSection,
-    side_by_side,
+    scan,
 )
 
 from . import figures
@@ -97,17 +95,12 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     """
     began = time.perf_counter()
     response = config.relaxation.build()
-    shape_factors = np.asarray(config.shape_factors)
 
-    def one(index: int) -> dict[str, np.ndarray]:
-        return folder.part(f"p0 {shape_factors[index]:g}", lambda: compute(index))
-
-    def compute(index: int) -> dict[str, np.ndarray]:
+    def compute(value: float) -> dict[str, np.ndarray]:
+        index = config.shape_factors.index(value)
         key = jax.random.fold_in(jax.random.key(config.seed), index)
         keys = jax.random.split(key, config.replicates + 1)
-        n, steps = config.tissue.n_cells, config.tissue.lloyd_steps
-        first = stack([periodic_voronoi(n, key=k, lloyd_steps=steps) for k in keys[1:]])
-        p0 = jnp.asarray(shape_factors[index])
+        first, p0 = config.tissue.draw(keys[1:]), jnp.asarray(value)
         outcome = jax.block_until_ready(
             _relax(first, p0, keys[0], response, config.driving, config.at_once)
         )
@@ -117,9 +110,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         outcomes = {name: np.asarray(getattr(outcome, name)) for name in _Outcome._fields[:-1]}
         return outcomes | {"shapes": shapes, "modes": modes}
 
-    n_values = len(shape_factors)
-    results = side_by_side(one, n_values, folder, progress=progress, unit="value")
-    found = {name: np.stack([result[name] for result in results]) for name in results[0]}
+    found = scan("p0", config.shape_factors, compute, folder, progress=progress)
     return _report(
         config,
         folder,

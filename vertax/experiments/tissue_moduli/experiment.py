@@ -5,6 +5,10 @@ Measured are the relaxed and the affine shear modulus and the bulk modulus, and 
 tissue has. The shear modulus vanishes where the tissue becomes fluid (Bi et al. 2015,
 doi:10.1038/nphys3471; Merkel & Manning 2018, doi:10.1088/1367-2630/aaaa13); the affine one does not,
 since what vanishes is the resistance to motions of the vertices.
+
+Fluid tissues are then sheared until they become solid, for a prediction without a free parameter
+(Merkel et al. 2019, doi:10.1073/pnas.1815436116): beyond the critical strain the excess of the shear
+modulus is three times the shear stress over that strain.
 """
 
 from __future__ import annotations
@@ -20,14 +24,13 @@ from jaxtyping import Array, Bool, Float
 from pydantic import Field
 
 from vertax.energies import ShapeFactorEnergy
-from vertax.fitting import stack
-from vertax.initialise import periodic_voronoi
 from vertax.mechanics import bulk_modulus, shear_modulus, stress
 from vertax.mesh import Tissue
 from vertax.responses import Relaxation as Response
-from vertax.runs import ExperimentConfig, Relaxation, RunFolder, TissueSection, side_by_side
+from vertax.runs import ExperimentConfig, Relaxation, RunFolder, TissueSection, scan
 
 from . import figures
+from .stiffening import Stiffening, stiffen
 
 
 class Config(ExperimentConfig):
@@ -45,6 +48,8 @@ class Config(ExperimentConfig):
     """The tissues."""
     relaxation: Relaxation = Relaxation(max_steps=1000, contacts=False)
     """How the tissues are relaxed. Contacts would add forces that the moduli do not know."""
+    stiffening: Stiffening = Stiffening()
+    """Fluid tissues that a strain makes solid."""
 
 
 class _Outcome(NamedTuple):
@@ -67,25 +72,20 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     - `progress`: show a progress bar (only on a terminal).
 
     **Returns:** the metrics: mean moduli at each shape factor, the share of solid tissues, and the shape
-    factor at which half of them are.
+    factor at which half of them are; and of fluid tissues that are sheared the critical strains, and the
+    factor between excess modulus and stress.
     """
     began = time.perf_counter()
     response = config.relaxation.build()
     shape_factors = np.asarray(config.shape_factors)
 
-    def one(index: int) -> dict[str, np.ndarray]:
-        return folder.part(f"p0 {shape_factors[index]:g}", lambda: compute(index))
-
-    def compute(index: int) -> dict[str, np.ndarray]:
+    def compute(p0: float) -> dict[str, np.ndarray]:
         # The same first tissues at each shape factor.
-        keys = jax.random.split(jax.random.key(config.seed), config.replicates)
-        n, steps = config.tissue.n_cells, config.tissue.lloyd_steps
-        first = stack([periodic_voronoi(n, key=k, lloyd_steps=steps) for k in keys])
-        outcome = _measure(first, jnp.asarray(shape_factors[index]), response)
+        first = config.tissue.draw(jax.random.split(jax.random.key(config.seed), config.replicates))
+        outcome = _measure(first, jnp.asarray(p0), response)
         return {name: np.asarray(value) for name, value in outcome._asdict().items()}
 
-    results = side_by_side(one, len(shape_factors), folder, progress=progress, unit="value")
-    found = {name: np.stack([result[name] for result in results]) for name in results[0]}
+    found = scan("p0", config.shape_factors, compute, folder, progress=progress)
     # Of what did not come to rest no modulus is known.
     known = found["converged"] & np.isfinite(found["shear"])
     means = {
@@ -98,7 +98,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     folder.save_array("shear", np.where(known, found["shear"], np.nan))
     shear = np.where(known, found["shear"], np.nan)
     folder.save_figure("moduli", figures.moduli(shape_factors, shear, means, solid))
-    return {
+    stiffened = stiffen(config.stiffening, config.seed, response, folder, progress=progress)
+    return stiffened | {
         "shear": means["shear"].tolist(),
         "affine": means["affine"].tolist(),
         "bulk": means["bulk"].tolist(),

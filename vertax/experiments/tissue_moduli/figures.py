@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from vertax.experiments.rigidity_transition.figures import REFERENCE
 from vertax.plotting import INK, SERIES, house_style, new_figure
 
-REFERENCE = 3.81
-"""The transition of disordered tissues, from D. Bi et al. 2015."""
+if TYPE_CHECKING:
+    from .stiffening import Branch
+
 # Of the regular hexagon, at which the ordered lattice softens.
 HEXAGON = float(np.sqrt(8 * np.sqrt(3)))
 
@@ -53,4 +56,35 @@ def moduli(
     for ax in axes:
         ax.axvline(REFERENCE, color=INK, lw=0.7, ls=":")
         ax.set_xlabel("target shape factor $p_0$")
+    return figure
+
+
+@house_style()
+def stiffening(
+    pairs: Sequence[tuple[Branch, Branch]], table: Mapping[str, Float[np.ndarray, " tissues"]]
+) -> Figure:
+    """Stress and modulus of fluid tissues beyond their critical strain, and the factor between them.
+
+    **Arguments:**
+
+    - `pairs`: both ways of each tissue.
+    - `table`: `critical_strain`, `centre` and `factor` of each tissue.
+
+    **Returns:** the figure.
+    """
+    figure, (axes,) = new_figure(1, 3, width=2.3)
+    for pair, centre in zip(pairs, table["centre"], strict=True):
+        for way, middle in zip(pair, (centre, -centre), strict=True):
+            axes[0].plot(way.strains, way.stresses, color=SERIES[0], lw=0.5, alpha=0.5)
+            over = 3 * way.stresses / (way.strains - middle)
+            excess = way.moduli - way.line(middle)[1]
+            axes[1].plot(over, excess, color=SERIES[0], lw=0.5, alpha=0.5)
+    axes[0].set(xlabel="shear strain", ylabel="shear stress", ylim=(0, None))
+    top = min(axes[1].get_xlim()[1], axes[1].get_ylim()[1])
+    axes[1].plot([0, top], [0, top], color=INK, lw=0.8, ls="--")
+    axes[1].set(xlabel=r"$3\,\tau / (\gamma - \gamma_0)$", ylabel=r"excess modulus $G - \Delta G$")
+    axes[2].plot(table["critical_strain"], table["factor"], "o", ms=3, color=SERIES[0])
+    axes[2].axhline(3, color=INK, lw=0.8, ls="--")
+    axes[2].set(xlabel=r"critical strain $\gamma_c$", ylim=(0, 6))
+    axes[2].set_ylabel(r"factor $(\gamma - \gamma_0) (G - \Delta G) / \tau$")
     return figure

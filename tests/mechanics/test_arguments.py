@@ -1,0 +1,160 @@
+"""What functions of mechanics refuse: the message names the argument and says what it must be."""
+
+# Wrong types are the point here.
+# pyright: reportArgumentType=false
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+from helpers import random_tissue
+
+import vertax as vx
+from vertax import costs, mechanics
+from vertax.mechanics import BoxRelaxation
+
+N = 9
+tissue, free = random_tissue(N, 1), cluster(4, 1)
+energy = vx.energies.ShapeFactorEnergy(3.6)
+friction = vx.dissipations.SubstrateFriction(1.0)
+batch = vx.fitting.stack([tissue, tissue])
+
+ENERGY, TISSUE = "`energy` must be an energy", "`tissue` must be a vertax.Tissue"
+PERIODIC = "`tissue` must be periodic"
+TAKE_BOTH = [
+    mechanics.stress,
+    mechanics.cell_stress,
+    mechanics.pressures,
+    mechanics.tensions,
+    mechanics.elastic_tensor,
+    mechanics.shear_modulus,
+    mechanics.bulk_modulus,
+    mechanics.youngs_modulus,
+    mechanics.spectrum,
+    mechanics.zero_modes,
+    lambda t, e: mechanics.modes(t, e, 2),
+    lambda t, e: mechanics.complex_modulus(t, e, friction, jnp.array([1.0])),
+    lambda t, e: mechanics.recoil(t, e, 1, friction),
+    lambda t, e: mechanics.ramp(t, e, np.array([0.0, 0.1])),
+    lambda t, e: BoxRelaxation()(t, e),
+]
+
+
+@pytest.mark.parametrize("function", TAKE_BOTH)
+def test_each_function_wants_one_tissue_and_an_energy(as_a_user, function):
+    for nothing in (None, 3.6, vx.energies.ShapeFactorEnergy):
+        with pytest.raises(TypeError, match=ENERGY):
+            function(tissue, nothing)
+    with pytest.raises(TypeError, match=TISSUE):
+        function(energy, tissue)
+    with pytest.raises(ValueError, match="`tissue` must be one tissue"):
+        function(batch, energy)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        *TAKE_BOTH[4:8],
+        lambda t, e: mechanics.complex_modulus(t, e, friction, jnp.array([1.0])),
+        lambda t, e: mechanics.ramp(t, e, np.array([0.0, 0.1])),
+        lambda t, e: BoxRelaxation()(t, e),
+    ],
+)
+def test_what_strains_the_box_wants_one(function):
+    with pytest.raises(ValueError, match=PERIODIC):
+        function(free, energy)
+
+
+skewed = jnp.array([[0.0, 1.0], [0.0, 0.0]])
+WRONG = {
+    "angles": (
+        lambda: mechanics.shear_modulus(tissue, energy, angle=[0, 1]),
+        "`angle` must be one",
+    ),
+    "angle": (lambda: mechanics.shear_modulus(tissue, energy, angle=np.nan), "`angle` must be fin"),
+    "solver": (lambda: mechanics.elastic_tensor(tissue, energy, linear_solver=3), "linear solver"),
+    "no modes": (lambda: mechanics.modes(tissue, energy, 0), "`k` must be at least 1"),
+    "modes": (lambda: mechanics.modes(tissue, energy, 37), "`k` must be at most"),
+    "half a mode": (lambda: mechanics.modes(tissue, energy, 2.5), "`k` must be at least 1"),
+    "tolerance": (lambda: mechanics.zero_modes(tissue, energy, tolerance=-1), "be positive"),
+    "traced": (
+        lambda: jax.jit(lambda p: mechanics.spectrum(tissue, vx.energies.ShapeFactorEnergy(p)))(
+            3.6
+        ),
+        "does not work inside jax.jit",
+    ),
+    "matrix": (lambda: mechanics.density_of_states(jnp.ones((2, 2))), "one list of eigenvalues"),
+    "no values": (lambda: mechanics.density_of_states(jnp.ones(0)), "one list of eigenvalues"),
+    "nan": (lambda: mechanics.density_of_states(jnp.array([np.nan])), "`values` must be finite"),
+    "bins": (lambda: mechanics.density_of_states(jnp.ones(3), 0), "`bins` must be at least 1"),
+    "letters": (lambda: mechanics.self_stresses(tissue, "areas"), "`constraints` must name"),
+    "none": (lambda: mechanics.compatibility(tissue, []), "`constraints` must name"),
+    "principal": (lambda: mechanics.principal(jnp.ones(3)), "`stresses` must have shape"),
+    "past": (
+        lambda: mechanics.complex_modulus(tissue, energy, friction, -1.0),
+        "`frequencies` must be at least 0",
+    ),
+    "frequencies": (
+        lambda: mechanics.complex_modulus(tissue, energy, friction, np.ones((2, 2))),
+        "`frequencies` must be a list",
+    ),
+    "no frequency": (
+        lambda: mechanics.complex_modulus(tissue, energy, friction, []),
+        "`frequencies` must be a list",
+    ),
+    "way": (
+        lambda: mechanics.complex_modulus(tissue, energy, friction, [1.0], method="fast"),
+        '`method` must be "dense" or "sparse"',
+    ),
+    "dissipation": (
+        lambda: mechanics.complex_modulus(tissue, energy, energy, [1.0]),
+        "`dissipation` must be a dissipation",
+    ),
+    "before": (lambda: mechanics.recoil(tissue, energy, -1, friction), "`edge` must be at least 0"),
+    "behind": (lambda: mechanics.recoil(tissue, energy, 999, friction), "one of the 27 edges"),
+    "part": (lambda: mechanics.recoil(tissue, energy, 1.5, friction), "`edge` must be at least 0"),
+    "two": (
+        lambda: mechanics.recoil(tissue, energy, jnp.arange(2), friction),
+        "`edge` must be at least 0",
+    ),
+    "slick": (lambda: mechanics.recoil(tissue, energy, 1, None), "must be a dissipation"),
+    "stress": (lambda: BoxRelaxation(stress=np.nan), "`stress` must be finite"),
+    "skewed": (lambda: BoxRelaxation(stress=skewed), "`stress` must be symmetric"),
+    "relaxation": (lambda: BoxRelaxation(relaxation=None), "`relaxation` must be"),
+    "free": (lambda: BoxRelaxation(free=["x"]), "`free` must be one of all"),
+    "steps": (lambda: BoxRelaxation(max_steps=0), "`max_steps` must be at least 1"),
+    "strain": (lambda: mechanics.ramp(tissue, energy, 0.1), "`strains` must be a list"),
+    "strains": (lambda: mechanics.ramp(tissue, energy, [0, np.inf]), "`strains` must be finite"),
+    "no way": (
+        lambda: mechanics.ramp(tissue, energy, [0, 0.1], deformation=3),
+        "`deformation` must be a function",
+    ),
+    "scalar": (
+        lambda: mechanics.ramp(tissue, energy, [0, 0.1], deformation=lambda s: s),
+        "`deformation` must have shape",
+    ),
+    "rest": (lambda: mechanics.ramp(tissue, energy, [0, 0.1], relaxation=3), "`relaxation` must"),
+    "shears": (lambda: mechanics.simple_shear([0.1, 0.2]), "`strain` must be one number"),
+    "pure": (lambda: mechanics.pure_shear(np.nan), "`strain` must be finite"),
+    "row": (lambda: mechanics.deformed(tissue, jnp.ones(2)), "`gradient` must have shape"),
+    "flat": (lambda: mechanics.deformed(tissue, jnp.zeros((2, 2))), "a positive determinant"),
+    "cost": (lambda: costs.Stress(skewed), "`target` must be symmetric"),
+    "far cell": (
+        lambda: costs.CellStress(jnp.zeros((2, 2)), jnp.array([3, 99]))(tissue, energy),
+        "`cells` must hold numbers of cells, from 0 to 8, but holds 99",
+    ),
+    "half cell": (
+        lambda: costs.CellStress(jnp.zeros((2, 2)), jnp.array([0.5])),
+        "`cells` must hold whole numbers",
+    ),
+    "anisotropy": (lambda: costs.Anisotropy(2.0), "`target` must be between -1 and 1"),
+    "gap": (lambda: costs.SpectralGap(0.1, below=0), "`below` must be at least 1"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_values_are_named(as_a_user, name):
+    call, message = WRONG[name]
+    with pytest.raises((ValueError, TypeError), match=message.replace("(", r"\(")):
+        call()
