@@ -102,11 +102,12 @@ def slopes(
     by_angle = np.where(seen.forward[which.junctions], -1.0, 1.0)
     row = np.broadcast_to(2 * np.arange(len(half))[:, None], half.shape)
     rows, columns, values = [], [], []
+    bends = ends + len(seen.angle) + 2 * half
     for component in range(2):
         force = pull[..., component]
-        rows.append(row + component)
-        columns.append(ends + half)
-        values.append(force * by_angle)
+        rows += [row + component] * 3
+        columns += [ends + half, bends, bends + 1]
+        values += [force * by_angle, force, -force * by_angle]
         for axis in range(2):
             for end, way in ((0, -1.0), (1, 1.0)):
                 rows.append(row + component)
@@ -123,7 +124,7 @@ def slopes(
             columns.append(2 * seen.ends[which.edges][:, end] + axis)
             values.append(way * step * unit[which.edges][:, axis])
     flat = lambda arrays: np.concatenate([np.ravel(x) for x in arrays])
-    shape = (which.n_rows, ends + len(seen.angle))
+    shape = (which.n_rows, seen.n_geometry)
     geometry = csc_array(coo_array((flat(values), (flat(rows), flat(columns))), shape=shape))
     return Slopes(geometry, pull, by_arc)
 
@@ -132,8 +133,10 @@ def _tangents(seen: Seen, which: Equations, turns: Turns) -> Float[np.ndarray, "
     """Unit vectors along the three edges of each junction, away from it."""
     chord = np.maximum(np.linalg.norm(seen.chord, axis=1), 1e-12 * seen.size)
     unit = seen.chord / chord[:, None]
-    cosine, sine = np.cos(seen.angle)[:, None], np.sin(seen.angle)[:, None]
-    first, last = cosine * unit - sine * _turned(unit), cosine * unit + sine * _turned(unit)
+    first, last = (
+        np.cos(angle)[:, None] * unit + np.sin(angle)[:, None] * _turned(unit)
+        for angle in (seen.bend[:, 0] + seen.bend[:, 1] - seen.angle, seen.bend[:, 0] - seen.bend[:, 1] + seen.angle)
+    )
     half = seen.half_edge[which.junctions]
     along = np.where(seen.forward[which.junctions][..., None], first[half], -last[half])
     turn = turns.junction[..., None]

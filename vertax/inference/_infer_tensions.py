@@ -324,7 +324,7 @@ def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
     n = 2 * tissue.n_vertices
     dtype = tissue.vertices.dtype
     vertices = tissue.vertices + jnp.asarray(change[:n].reshape(-1, 2), dtype)
-    angles = tissue.edge_angles + jnp.asarray(change[n:], dtype)
+    angles = tissue.edge_angles + jnp.asarray(change[n : n + tissue.n_edges], dtype)
     return tissue.with_vertices(vertices).with_angles(angles)
 
 

@@ -13,7 +13,7 @@ from vertax.mesh import Tissue
 
 # Standard deviations of what no point tells, such as the angle of an edge of two pixels: of a vertex in
 # cell diameters and of an angle in radians.
-_VERTEX, _ANGLE = 0.1, 0.5
+_VERTEX, _ANGLE = 2.0, 0.5
 
 
 class Seen(NamedTuple):
@@ -31,6 +31,9 @@ class Seen(NamedTuple):
     """Whether it runs in the direction of its edge."""
     chord: Float[np.ndarray, "edges 2"]
     angle: Float[np.ndarray, " edges"]
+    bend: Float[np.ndarray, "edges 2"]
+    """By how much the curve is turned from its arc: at both ends alike, and at its first end and back at its
+    last."""
     n_cells: int
     inner: Bool[np.ndarray, " vertices"]
     """Where three cells meet, and not the exterior."""
@@ -44,9 +47,18 @@ class Seen(NamedTuple):
 
     def moved(self, change: Float[np.ndarray, " geometry"]) -> Seen:
         """With vertices and angles elsewhere."""
-        shift = change[: 2 * self.n_vertices].reshape(-1, 2)
-        chord = self.chord + shift[self.ends[:, 1]] - shift[self.ends[:, 0]]
-        return self._replace(chord=chord, angle=self.angle + change[2 * self.n_vertices :])
+        angles, bends = 2 * self.n_vertices, 2 * self.n_vertices + len(self.angle)
+        shift = change[:angles].reshape(-1, 2)
+        return self._replace(
+            chord=self.chord + shift[self.ends[:, 1]] - shift[self.ends[:, 0]],
+            angle=self.angle + change[angles:bends],
+            bend=self.bend + change[bends:].reshape(-1, 2),
+        )
+
+    @property
+    def n_geometry(self) -> int:
+        """Number of coordinates, angles and bends."""
+        return 2 * self.n_vertices + 3 * len(self.angle)
 
 
 def seen(tissue: Tissue) -> Seen:
@@ -61,6 +73,7 @@ def seen(tissue: Tissue) -> Seen:
         forward=forward.reshape(-1, 3),
         chord=np.asarray(tissue.edge_vectors, float),
         angle=np.asarray(tissue.edge_angles, float),
+        bend=np.zeros((tissue.n_edges, 2)),
         n_cells=tissue.n_cells,
         inner=inner,
         size=float(np.sqrt(np.mean(np.abs(np.asarray(tissue.areas, float))))),
@@ -87,6 +100,8 @@ def fit_arcs(
     pixel_size: float,
     apart: float,
     *,
+    bending: float = 0.0,
+    noise: float | None = None,
     rounds: int = 6,
 ) -> Fitted:
     """Vertices and angles such that the arcs run through points as well as they can.
@@ -109,25 +124,28 @@ def fit_arcs(
 
     **Returns:** the [`Fitted`][vertax.inference._seen.Fitted] arcs.
     """
-    n_vertices, n = tissue.n_vertices, 2 * tissue.n_vertices + len(tissue.angle)
+    n_vertices, n = tissue.n_vertices, tissue.n_geometry
+    bends = 2 * n_vertices + len(tissue.angle)
     start, end = tissue.ends[edge].T
     n_points = np.bincount(edge, minlength=len(tissue.angle))
     length = np.linalg.norm(tissue.chord, axis=1)
     # Each edge counts as so many points as are far enough apart, and as one if it is shorter than that.
-    weight = np.maximum(length / apart, 1.0) / np.maximum(n_points, 1)
-    weight = weight[edge]
+    weight = length / apart / np.maximum(n_points, 1)
+    weight = np.where(length > 3 * pixel_size, weight, 0.0)[edge]
     # What the points leave open stays where it was seen.
-    noise = 0.4 * pixel_size
+    noise = 0.4 * pixel_size if noise is None else noise
     held = np.concatenate(
         [
-            np.full(2 * n_vertices, (noise / (_VERTEX * tissue.size)) ** 2),
+            np.full(2 * n_vertices, (noise / (_VERTEX * pixel_size)) ** 2),
             np.full(len(length), (noise / _ANGLE) ** 2),
+            np.full(2 * len(length), (noise / max(bending, 1e-6)) ** 2),
         ]
     )
     columns = np.stack(
-        [2 * start, 2 * start + 1, 2 * end, 2 * end + 1, 2 * n_vertices + edge], axis=1
+        [2 * start, 2 * start + 1, 2 * end, 2 * end + 1, 2 * n_vertices + edge,
+         bends + 2 * edge, bends + 2 * edge + 1], axis=1
     )
-    rows = np.repeat(np.arange(len(edge)), 5)
+    rows = np.repeat(np.arange(len(edge)), 7)
     change = np.zeros(n)
     rest = np.zeros(len(edge))
     normal = csc_array(diags_array(held))
@@ -142,17 +160,23 @@ def fit_arcs(
         turn = np.stack([-q[:, 1], q[:, 0], p[:, 1], -p[:, 0]], axis=1)
         slide = np.concatenate([q, p], axis=1)
         slopes = (cosine[:, None] * turn - sine[:, None] * slide) / chord[:, None]
-        bend = (cross * sine + dot * -cosine) / chord
-        values = np.column_stack([slopes, bend])
+        bulge = (cross * sine + dot * -cosine) / chord
+        wide = np.clip(np.abs(angle), 1e-3, 1.5)
+        along = np.arcsin(np.minimum(np.linalg.norm(np.stack([p,q]), axis=2) * np.sin(wide) / chord, 1))
+        u = along[0] / np.maximum(along[0] + along[1], 1e-300)
+        flat = u * (1 - u)
+        modes = -(chord * wide / np.sin(wide))[:, None] * np.stack([flat * (1 - 2 * u), flat * (1 - 14 / 3 * flat)], axis=1)
+        rest = rest + np.sum(modes * here.bend[edge], axis=1)
+        values = np.column_stack([slopes, bulge, modes])
         jacobian = csc_array(
             coo_array((values.ravel(), (rows, columns.ravel())), shape=(len(edge), n))
         )
         weighted = jacobian.T * weight
         normal = csc_array(weighted @ jacobian + diags_array(held))
         change = change - splu(normal).solve(weighted @ rest + held * change)
-        ends = 2 * n_vertices
-        change[ends:] = np.clip(tissue.angle + change[ends:], -3, 3) - tissue.angle
-    return Fitted(change, normal, float(np.sqrt(np.mean(rest**2))), rest)
+        turned = slice(2 * n_vertices, bends)
+        change[turned] = np.clip(tissue.angle + change[turned], -3, 3) - tissue.angle
+    return Fitted(change, normal, float(np.sqrt(np.sum(weight * rest**2) / np.sum(weight))), rest)
 
 
 def correlation_length(

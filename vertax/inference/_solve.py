@@ -19,6 +19,8 @@ _LOOSE, _UNKNOWN = 0.2, 10.0
 _PRESSURE, _WIDTHS = 10.0, (0.2, 3.0)
 # Least tension by which noise is judged.
 _SMALL = 0.4
+_WEAK = 0.2
+ABS = True
 _FIRST = (0.05, 0.5, 1.0)
 # How much less or more noise than pixels tell may be found, logarithms: pixels on a straight line depart from
 # it by a pattern that averages out.
@@ -94,6 +96,7 @@ def solve(
     # The direction of a short edge may be all noise. What it pulls at one end it pulls back at the other: an
     # unknown force there leaves the balance of both ends together.
     loose = _direction_deviations(fitted, which, inverse, noise) > _LOOSE
+    loose |= length * fitted.size < 8 * noise
     unknown = _pulls(fitted, which, loose)
     unknown = _UNKNOWN**2 * unknown @ unknown.T
     mean = np.append(~loose, np.zeros(n_cells, bool)) / max(1, np.sum(~loose))
@@ -110,7 +113,9 @@ def solve(
         answer = noise**2 * inverse.solve(slope.geometry.T.toarray())
         offset = -slope.geometry @ change - _turning(slope, turns)
         seen = slope.geometry @ answer
-        model = _model(slope, length)
+        soft = np.maximum(x[:n_edges], _WEAK) if ABS else np.ones(n_edges)
+        soft_j = soft[which.edge_place[fitted.half_edge[which.junctions]]]
+        model = _model(slope, length, soft, soft_j)
         if attempt in (2, 4):
             known = model_errors(
                 matrix @ basis, matrix @ expected + offset, seen, unknown, model, known, shares
@@ -136,8 +141,8 @@ def solve(
         change = -answer @ pull
         by_junction = pull[: 2 * len(which.junctions)].reshape(-1, 1, 2)
         turns = Turns(
-            -(known[0] ** 2) * np.sum(slope.junction * by_junction, axis=-1),
-            -((known[1] * length) ** 2) * slope.arc * pull[2 * len(which.junctions) :],
+            -(known[0] ** 2) / soft_j**2 * np.sum(slope.junction * by_junction, axis=-1),
+            -((known[1] * length / soft) ** 2) * slope.arc * pull[2 * len(which.junctions) :],
         )
         covariance = cho_solve((root, False), np.eye(len(x)))
         residual = solve_triangular(factor, left, lower=True)
@@ -160,11 +165,13 @@ def _direction_deviations(
     edge = np.arange(n)
     found = []
     for sign in (-1.0, 1.0):
-        turn = np.zeros((2 * seen.n_vertices + len(seen.angle), n))
+        turn = np.zeros((seen.n_geometry, n))
         for axis in range(2):
             turn[starts + axis, edge] -= across[:, axis]
             turn[ends + axis, edge] += across[:, axis]
         turn[angle, edge] = sign
+        turn[angle + len(seen.angle) + which.edges, edge] = 1.0
+        turn[angle + len(seen.angle) + which.edges + 1, edge] = -sign
         found.append(np.sum(turn * inverse.solve(turn), axis=0))
     return noise * np.sqrt(np.max(found, axis=0))
 
@@ -217,18 +224,18 @@ def _turning(slope: Slopes, turns: Turns) -> Float[np.ndarray, " rows"]:
 
 
 def _model(
-    slope: Slopes, length: Float[np.ndarray, " edges"]
+    slope: Slopes, length: Float[np.ndarray, " edges"], soft, soft_j
 ) -> tuple[Float[np.ndarray, "rows rows"], Float[np.ndarray, "rows rows"]]:
     """Covariances of forces for errors of the model of 1."""
     n_junctions, n = len(slope.junction), 2 * len(slope.junction) + len(length)
     at_junctions, along = np.zeros((n, n)), np.zeros((n, n))
-    block = np.einsum("jha,jhb->jab", slope.junction, slope.junction)
+    block = np.einsum("jha,jhb,jh->jab", slope.junction, slope.junction, soft_j**-2.0)
     row = 2 * np.arange(n_junctions)
     for a in range(2):
         for b in range(2):
             at_junctions[row + a, row + b] = block[:, a, b]
     row = np.arange(2 * n_junctions, n)
-    along[row, row] = (slope.arc * length) ** 2
+    along[row, row] = (slope.arc * length / soft) ** 2
     return at_junctions, along
 
 
