@@ -55,6 +55,7 @@ class Truth(NamedTuple):
     tissue: vx.Tissue
     tension: np.ndarray
     pressure: np.ndarray
+    foam: vx.io.Foam | None = None
 
 
 def compare(truth: Truth, found: InferredTensions) -> tuple[np.ndarray, ...]:
@@ -89,7 +90,7 @@ def row(name: str, cases: Sequence[tuple[Truth, object]]) -> None:
     parts, determined, seconds = [], [], []
     for truth, image in cases:
         began = time.perf_counter()
-        found = infer_tensions(truth.tissue if image is None else image)  # pyright: ignore[reportArgumentType]
+        found = infer_tensions((truth.foam or truth.tissue) if image is None else image)  # pyright: ignore[reportArgumentType]
         seconds.append(time.perf_counter() - began)
         asked = np.isfinite(found.tensions).sum()
         determined.append(found.determined.sum() / asked)
@@ -113,7 +114,7 @@ def row(name: str, cases: Sequence[tuple[Truth, object]]) -> None:
 def foam(path: Path) -> Truth:
     """A foam of Surface Evolver."""
     read = vx.io.read_surface_evolver(path)
-    return Truth(read.tissue, np.asarray(read.tensions), np.asarray(read.pressures))
+    return Truth(read.tissue, np.asarray(read.tensions), np.asarray(read.pressures), read)
 
 
 def cluster(n_cells: int, seed: int) -> Truth:
@@ -159,7 +160,7 @@ def main() -> None:
         truth = foam(path)
         row(f"{path.stem}, exact", [(truth, None)])
         for pixels in (1000, 500):
-            row(f"{path.stem}, {pixels} pixels", [(truth, label_image(truth.tissue, pixels))])
+            row(f"{path.stem}, {pixels} pixels", [(truth, label_image(truth.foam or truth.tissue, pixels))])
         if arguments.forsys:
             told = subprocess.run(
                 [arguments.forsys, "-c", FORSYS, str(path)], capture_output=True, text=True
