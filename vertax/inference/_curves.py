@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,9 @@ from vertax.inference._seen import Seen
 _VERTEX, _ANGLE = 2.0, 0.5
 # How much edges may bend, in radians: to begin with, and at least and at most.
 _BENDING, _BENDINGS = 0.1, (1e-4, 0.3)
+# Middles of the sides of pixels are so far from a curve, and alike along so much of it, in grains, at most
+# where nothing else is wrong with them: 0.24 and 1.45.
+_CRISP = 0.26, 1.6
 # Shorter edges, in grains, have no course: their points say nothing, and a few more nothing about bends.
 _SHORT, _STRAIGHT = 3.0, 6.0
 
@@ -59,34 +63,36 @@ def read_courses(
 ) -> Fitted:
     """Curves through the points, with the noise, its correlation and the bending that the points tell.
 
+    Edges that bend and noise that is alike along edges look the same. So bends are read only where nothing but
+    the grain of pixels is left of the points then; edges are arcs else, and all that is off is noise.
+
     **Arguments:**
 
     - `tissue`: the geometry to begin with.
     - `points`: what was seen of its edges.
     - `grain`: how exactly a point can be known: the side of a pixel.
-    - `apart`: how far points must lie apart to say something of their own; left out, how far along edges they
-        are off in the same way.
+    - `apart`: how far points lie apart that are exact; left out, how far along edges they are off in the same
+        way.
     - `noise`: standard deviation of a point; left out, that of the fit.
 
     **Returns:** the [`Fitted`][vertax.inference._curves.Fitted] curves.
     """
     length = np.linalg.norm(tissue.chord, axis=1)
     used = np.unique(points.edge)
-    fitted = fit_curves(
-        tissue,
-        points,
-        grain,
-        apart=apart or 2 * grain,
-        bending=_BENDING,
-        noise=noise or 0.4 * grain,
-    )
-    if apart is None:
-        # What a fit leaves of an edge cannot be alike along all of it.
-        apart = min(correlation_length(points, fitted.rest), 0.25 * float(np.mean(length[used])))
-    noise = noise or fitted.noise
-    flat = fit_curves(tissue, points, grain, apart=apart, bending=_BENDINGS[1], noise=noise)
-    bending = _bending(tissue, flat, used[length[used] > _STRAIGHT * grain], noise)
-    return fit_curves(tissue, points, grain, apart=apart, bending=bending, noise=noise)
+    # What a fit leaves of an edge cannot be alike along all of it.
+    longest = 0.25 * float(np.mean(length[used]))
+    fit = partial(fit_curves, tissue, points, grain)
+    for start in (_BENDING, _BENDINGS[0]):
+        first = fit(apart=apart or 2 * grain, bending=start, noise=noise or 0.4 * grain)
+        alike = apart or min(correlation_length(points, first.rest), longest)
+        if apart is not None or (first.noise < _CRISP[0] * grain and alike < _CRISP[1] * grain):
+            break
+    off, bending = noise or first.noise, start
+    if start == _BENDING:
+        flat = fit(apart=alike, bending=_BENDINGS[1], noise=off)
+        bending = _bending(tissue, flat, used[length[used] > _STRAIGHT * grain], off)
+    curves = fit(apart=alike, bending=bending, noise=off)
+    return curves._replace(noise=curves.noise if noise is None else noise)
 
 
 def fit_curves(

@@ -63,5 +63,5 @@ def model_errors(
     bounds = [(np.log(least), np.log(_MOST)) for least in LEAST] + [shares]
     first = np.clip(np.log(np.array(guess)), *np.transpose(bounds))
     options = {"xatol": 0.05, "fatol": 0.02}
-    found = minimize(loss, first, method="Nelder-Mead", bounds=bounds, options=options).x
-    return Errors(*np.exp(found).tolist())
+    found = minimize(loss, first, method="Nelder-Mead", bounds=bounds, options=options)
+    return Errors(*np.exp(found.x).tolist())

@@ -42,7 +42,7 @@ def infer_tensions(
     background: int | None = None,
     gap_width: float = 3.0,
     noise: float | None = None,
-    prior: float = 3.0,
+    prior: float | None = None,
     resamples: int = 0,
     seed: int = 0,
 ) -> InferredTensions:
@@ -76,8 +76,8 @@ def infer_tensions(
     - `noise`: standard deviation of the position of an edge, in units of length; left out, how far pixels
         (or the points of a foam) are from curves, and a five hundredth of a cell diameter for a tissue
         without either.
-    - `prior`: standard deviation of relative tensions about 1 before the shape was seen. A small one keeps
-        what is hardly determined near 1, and tensions too much alike.
+    - `prior`: standard deviation of relative tensions about 1 before the shape was seen; left out, three
+        times that of those which are known. A small one keeps tensions too much alike.
     - `resamples`: how often to turn noise and errors of the model over by chance and infer anew, as a check
         of the deviations (wild bootstrap: Wu 1986, doi:10.1214/aos/1176350142); a few dozen.
     - `seed`: of that chance.
@@ -125,7 +125,6 @@ def infer_tensions(
     points = Points(*(of[used] for of in course.points))
     noise = course.noise if noise is None else noise
     curves = read_courses(geometry, points, course.grain, apart=course.apart, noise=noise)
-    curves = curves._replace(noise=curves.noise if noise is None else noise)
     fitted = geometry.moved(curves.change)
     shape = told(fitted, curves, which)
     balance = solve(shape, which, exact=noise is not None, prior=prior)

@@ -42,7 +42,7 @@ def relative(balance: Balance, which: Equations) -> Relative:
     n = len(which.edges)
     deviation = np.sqrt(np.diag(balance.covariance)[:n])
     sure = ~balance.loose & (deviation < _UNKNOWN)
-    if not sure.any():
+    if np.sum(balance.tension[sure]) < 0.1 * np.sum(sure) + 1e-9:
         sure = ~balance.loose
     # The mean has an error too.
     scale = float(np.mean(balance.tension[sure])) if sure.any() else 1.0

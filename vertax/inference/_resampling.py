@@ -25,7 +25,7 @@ def resampled_deviations(
     shape: Told,
     balance: Balance,
     *,
-    prior: float,
+    prior: float | None,
     times: int,
     seed: int,
 ) -> Float[np.ndarray, " tensions"]:

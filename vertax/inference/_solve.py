@@ -27,6 +27,8 @@ from vertax.inference._seen import Seen
 _LOOSE, _SHORT, _UNKNOWN = 0.2, 8.0, 10.0
 # How much pressures may differ, mean tensions over a cell diameter.
 _PRESSURE = 10.0
+# How many times the spread of tensions their prior is wide; at least and at most.
+_TIMES, _WIDTHS = 3.0, (0.5, 3.0)
 # Least tension by which noise is judged.
 _SMALL = 0.4
 _FIRST = Errors(0.05, 0.5, 1.0)
@@ -107,7 +109,7 @@ def solve(
     which: Equations,
     *,
     exact: bool,
-    prior: float,
+    prior: float | None,
     errors: Errors | None = None,
     rounds: int = 8,
 ) -> Balance:
@@ -118,7 +120,7 @@ def solve(
     - `shape`: what was seen.
     - `which`: the balances that count.
     - `exact`: whether there cannot be more noise than points tell.
-    - `prior`: standard deviation of tensions about 1.
+    - `prior`: standard deviation of tensions about 1; left out, some times that of those which are known.
     - `errors`: of model and noise; left out, as large as forces tell.
     - `rounds`: of adjusting the angles.
 
@@ -129,7 +131,7 @@ def solve(
     change = np.zeros(len(shape.angle))
     # Before anything was seen: tensions about 1, and pressures of that order in a cell.
     expected = x.copy()
-    deviation = np.append(np.full(n_edges, prior), np.full(n_cells, _PRESSURE / shape.size))
+    width = prior or _WIDTHS[1]
     mean = np.append(~loose, np.zeros(n_cells, bool)) / max(1, np.sum(~loose))
     at_junctions, along = np.zeros_like(change), np.zeros_like(change)
     at_junctions[: which.n_directions] = 1.0
@@ -158,6 +160,7 @@ def solve(
         )
         answer = (slope @ spread).T
         factor = np.linalg.cholesky(slope @ answer + shape.unknown)
+        deviation = np.append(np.full(n_edges, width), np.full(n_cells, _PRESSURE / shape.size))
         white = solve_triangular(factor, np.column_stack([matrix, offset]), lower=True)
         white, given = white[:, :-1], white[:, -1]
         normal = white.T @ white + np.diag(deviation**-2.0)
@@ -172,6 +175,8 @@ def solve(
         change = -answer @ solve_triangular(factor, residual, lower=True, trans="T")
         change *= min(1.0, _REACH / max(float(np.max(np.abs(change))), 1e-300))
         covariance = cho_solve(root, np.eye(len(x)))
+        if prior is None and attempt < rounds - 2:
+            width = _varied(x[:n_edges][~loose], np.diag(covariance)[:n_edges][~loose])
         if attempt > (1 if known else 4) and np.max(np.abs(x - before)[:n_edges]) < 1e-3:
             break
     return Balance(
@@ -183,6 +188,14 @@ def solve(
         residual=residual,
         loose=loose,
     )
+
+
+def _varied(tension: Float[np.ndarray, " edges"], variance: Float[np.ndarray, " edges"]) -> float:
+    """How much tensions may differ: some times as much as those do that are known, because they may be alike
+    over many cells, and the prior takes each by itself."""
+    weight = 1 / (variance + 0.05)
+    spread = np.sum(weight * ((tension - 1) ** 2 - variance)) / max(np.sum(weight), 1e-300)
+    return float(np.clip(_TIMES * np.sqrt(max(spread, 0.0)), *_WIDTHS))
 
 
 def _not_negative(
