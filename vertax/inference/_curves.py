@@ -23,6 +23,8 @@ _BENDING, _BENDINGS = 0.1, (1e-4, 0.3)
 _CRISP = 0.26, 1.6
 # Shorter edges, in grains, have no course: their points say nothing, and a few more nothing about bends.
 _SHORT, _STRAIGHT = 3.0, 6.0
+# Mean length of edges, in grains, from which on bends are read.
+_LONG = 25.0
 
 
 class Points(NamedTuple):
@@ -51,6 +53,8 @@ class Fitted(NamedTuple):
     """How far points lie apart that say something of their own, a length."""
     bending: float
     """How much edges bend, the standard deviation in radians."""
+    crisp: bool = False
+    """Whether nothing but the grain is wrong with the points."""
 
 
 def read_courses(
@@ -82,17 +86,20 @@ def read_courses(
     # What a fit leaves of an edge cannot be alike along all of it.
     longest = 0.25 * float(np.mean(length[used]))
     fit = partial(fit_curves, tissue, points, grain)
-    for start in (_BENDING, _BENDINGS[0]):
+    # A curve through a dozen pixels hides how rough they are.
+    short = apart is None and np.mean(length[used]) < _LONG * grain
+    for start in _BENDINGS[:1] if short else (_BENDING, _BENDINGS[0]):
         first = fit(apart=apart or 2 * grain, bending=start, noise=noise or 0.4 * grain)
         alike = apart or min(correlation_length(points, first.rest), longest)
-        if apart is not None or (first.noise < _CRISP[0] * grain and alike < _CRISP[1] * grain):
+        crisp = first.noise < _CRISP[0] * grain and alike < _CRISP[1] * grain
+        if crisp or apart is not None:
             break
     off, bending = noise or first.noise, start
     if start == _BENDING:
         flat = fit(apart=alike, bending=_BENDINGS[1], noise=off)
         bending = _bending(tissue, flat, used[length[used] > _STRAIGHT * grain], off)
     curves = fit(apart=alike, bending=bending, noise=off)
-    return curves._replace(noise=curves.noise if noise is None else noise)
+    return curves._replace(noise=curves.noise if noise is None else noise, crisp=crisp)
 
 
 def fit_curves(

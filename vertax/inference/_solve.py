@@ -28,13 +28,13 @@ _LOOSE, _SHORT, _UNKNOWN = 0.2, 8.0, 10.0
 # How much pressures may differ, mean tensions over a cell diameter.
 _PRESSURE = 10.0
 # How many times the spread of tensions their prior is wide; at least and at most.
-_TIMES, _WIDTHS = 3.0, (0.5, 3.0)
+_TIMES, _WIDTHS, _START = 3.0, (0.3, 3.0), 0.5
 # Least tension by which noise is judged.
 _SMALL = 0.4
 _FIRST = Errors(0.05, 0.5, 1.0)
-# How much less or more noise than pixels tell may be found, logarithms: pixels on a straight line depart from
-# it by a pattern that averages out.
-_SHARES = (-2.3, 0.7)
+# How much less or more noise than points tell may be found, logarithms: pixels on a straight line depart from
+# it by a pattern that averages out, which what is rough does not.
+_LESS, _ROUGH_LESS, _MORE = -2.3, -0.35, 0.7
 # From this error on, in radians, arcs say little of tensions.
 _ARCS = 0.02
 # By how much angles may be adjusted, in radians.
@@ -57,6 +57,8 @@ class Told(NamedTuple):
     the balance of both ends together is left."""
     size: float
     """Root of the mean area of a cell."""
+    least_noise: float
+    """That may be found over that of points, a logarithm."""
 
 
 class Balance(NamedTuple):
@@ -91,6 +93,7 @@ def told(fitted: Seen, curves: Fitted, which: Equations) -> Told:
         loose=loose,
         unknown=_UNKNOWN**2 * unknown @ unknown.T,
         size=fitted.size,
+        least_noise=_LESS if curves.crisp else _ROUGH_LESS,
     )
 
 
@@ -131,12 +134,12 @@ def solve(
     change = np.zeros(len(shape.angle))
     # Before anything was seen: tensions about 1, and pressures of that order in a cell.
     expected = x.copy()
-    width = prior or _WIDTHS[1]
+    width = prior or _START
     mean = np.append(~loose, np.zeros(n_cells, bool)) / max(1, np.sum(~loose))
     at_junctions, along = np.zeros_like(change), np.zeros_like(change)
     at_junctions[: which.n_directions] = 1.0
     along[which.n_directions :] = shape.length**2
-    known, shares = errors is not None, (_SHARES[0], 0.0 if exact else _SHARES[1])
+    known, shares = errors is not None, (shape.least_noise, 0.0 if exact else _MORE)
     errors = _FIRST if errors is None else errors
     covariance = residual = np.zeros(0)
     for attempt in range(rounds):
