@@ -68,11 +68,22 @@ class InferredTensions(eqx.Module):
                 "pixels, or outlines too rough; take a finer image or a larger tissue"
             )
         junction, arc = self.model_errors
+        if share > 0 and np.nanmedian(self.tension_deviations[self.determined]) > 0.15:
+            found.append(
+                "half of the tensions that are determined have standard deviations above 0.15: strong edges "
+                "are told from weak ones, and no more"
+            )
         if junction > 0.1:
             found.append(
                 f"angles at junctions are {np.degrees(junction):.0f} degrees from those of a balance: the "
                 "tissue moves, or something else than tensions pulls on junctions; tensions that vary over "
                 "many cells are then smoothed out"
+            )
+        if self.bending > 0.03:
+            found.append(
+                f"edges bend by {np.degrees(self.bending):.1f} degrees beyond arcs: the tissue moves, and its "
+                "shape is in part that of older tensions; those of now differ more than these, beyond their "
+                "standard deviations"
             )
         if arc > 0.5:
             found.append(
