@@ -29,8 +29,10 @@ from vertax.inference import InferredTensions, infer_tensions, label_image, pear
 jax.config.update("jax_enable_x64", True)
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "surface_evolver"
-HEADER = f"{'what':>34} | determined | r tension | error | r pressure | "
+HEADER = (
+    f"{'what':>34} | determined | r tension | error | r pressure | "
     "within 1, 1.96 s.d., both | s | bare: r, error"
+)
 # Runs in an environment with ForSys: both sides scaled to mean 1, inner edges.
 FORSYS = """
 import sys, time

@@ -67,8 +67,8 @@ def read_courses(
 ) -> Fitted:
     """Curves through the points, with the noise, its correlation and the bending that the points tell.
 
-    Edges that bend and noise that is alike along edges look the same. So bends are read only where nothing but
-    the grain of pixels is left of the points then; edges are arcs else, and all that is off is noise.
+    Edges that bend and noise that is alike along edges look the same. So bends are read only where nothing
+    but the grain of pixels is left of the points then; edges are arcs else, and all that is off is noise.
 
     **Arguments:**
 
@@ -148,10 +148,9 @@ def fit_curves(
     held = (
         noise / np.repeat([_VERTEX * grain, _ANGLE, bending], [angles, n_edges, 2 * n_edges])
     ) ** 2
+    bent = bends + 2 * edge, bends + 2 * edge + 1
     columns = np.stack(
-        [2 * start, 2 * start + 1, 2 * end, 2 * end + 1]
-        + [angles + edge, bends + 2 * edge, bends + 2 * edge + 1],
-        axis=1,
+        (2 * start, 2 * start + 1, 2 * end, 2 * end + 1, angles + edge, *bent), axis=1
     )
     rows = np.repeat(np.arange(len(edge)), columns.shape[1])
     change = np.zeros(n)

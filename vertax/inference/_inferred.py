@@ -81,9 +81,9 @@ class InferredTensions(eqx.Module):
             )
         if self.bending > 0.03:
             found.append(
-                f"edges bend by {np.degrees(self.bending):.1f} degrees beyond arcs: the tissue moves, and its "
-                "shape is in part that of older tensions; those of now differ more than these, beyond their "
-                "standard deviations"
+                f"edges bend by {np.degrees(self.bending):.1f} degrees beyond arcs: the tissue moves, and "
+                "its shape is in part that of older tensions; those of now differ more than these, "
+                "beyond their standard deviations"
             )
         if arc > 0.5:
             found.append(
