@@ -28,9 +28,9 @@ _LOOSE, _SHORT, _UNKNOWN = 0.2, 8.0, 10.0
 # How much pressures may differ, mean tensions over a cell diameter.
 _PRESSURE = 10.0
 # How many times the spread of tensions their prior is wide; at least and at most.
-_TIMES, _WIDTHS, _START = 3.0, (0.3, 3.0), 0.5
+_TIMES, _WIDTHS, _START = 2.0, (0.3, 3.0), 0.5
 # Least tension by which noise is judged.
-_SMALL = 0.4
+_SMALL = 0.2
 _FIRST = Errors(0.05, 0.5, 1.0)
 # How much less or more noise than points tell may be found, logarithms: pixels on a straight line depart from
 # it by a pattern that averages out, which what is rough does not.
@@ -178,7 +178,8 @@ def solve(
         change = -answer @ solve_triangular(factor, residual, lower=True, trans="T")
         change *= min(1.0, _REACH / max(float(np.max(np.abs(change))), 1e-300))
         covariance = cho_solve(root, np.eye(len(x)))
-        if prior is None and attempt < rounds - 2:
+        # Before angles are adjusted by much: where noise is large, tensions could drift with the prior.
+        if prior is None and attempt < 2:
             width = _varied(x[:n_edges][~loose], np.diag(covariance)[:n_edges][~loose])
         if attempt > (1 if known else 4) and np.max(np.abs(x - before)[:n_edges]) < 1e-3:
             break
