@@ -76,8 +76,8 @@ def infer_tensions(
     - `noise`: standard deviation of the position of an edge, in units of length; left out, how far pixels
         (or the points of a foam) are from curves, and a five hundredth of a cell diameter for a tissue
         without either.
-    - `prior`: standard deviation of relative tensions about 1 before the shape was seen; left out, three
-        times that of those which are known. A small one keeps tensions too much alike.
+    - `prior`: standard deviation of relative tensions about 1 before the shape was seen; left out, twice
+        that of a first guess. A small one keeps tensions too much alike.
     - `resamples`: how often to turn noise and errors of the model over by chance and infer anew, as a check
         of the deviations (wild bootstrap: Wu 1986, doi:10.1214/aos/1176350142); a few dozen.
     - `seed`: of that chance.
