@@ -93,8 +93,8 @@ class InferredTensions(eqx.Module):
         if share > 0 and np.mean(self.tensions[self.determined] < 0.2) > 0.03:
             found.append(
                 "many tensions are near 0: where outlines are rough and edges short, the error of each "
-                "junction adds up over many cells, and a part of the tissue loses its tension to the others; take a "
-                "finer image, or a smaller `prior`"
+                "junction adds up over many cells, and a part of the tissue loses its tension to the "
+                "others; take a finer image, or a smaller `prior`"
             )
         none = int(np.sum(self.determined & (self.tensions < 1e-6)))
         if none:
