@@ -1,8 +1,10 @@
 """Tensions and pressures inferred from shapes whose tensions are known: how well, how sure, how fast.
 
 Foams of Surface Evolver (`--data`), as they are and as images of 1000 and 500 pixels, and synthetic clusters
-as images with rough outlines. With `--forsys PYTHON`, the interpreter of an environment that has ForSys
-(`pip install forsys`), its static inference of the same foams stands beside it.
+as images with rough outlines. Beside each the bare balance of forces: non-negative least squares at inner
+junctions, with the tangents of arcs. With `--forsys PYTHON`, the interpreter of an environment that has
+ForSys (`pip install forsys`), its static inference of the same foams stands beside it, and its dynamic one of
+the movie. Last real masks, of which no tensions are known: how many are determined.
 """
 
 from __future__ import annotations
@@ -14,10 +16,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.optimize import nnls
 
 import vertax as vx
 from vertax.inference import InferredTensions, infer_tensions, label_image, pearson
@@ -26,7 +30,8 @@ jax.config.update("jax_enable_x64", True)
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "surface_evolver"
 HEADER = (
-    f"{'what':>34} | determined | r tension | error | r pressure | within 1, 1.96 s.d., both | s"
+    f"{'what':>34} | determined | r tension | error | r pressure | "
+    "within 1, 1.96 s.d., both | s | bare: r, error"
 )
 # Runs in an environment with ForSys: both sides scaled to mean 1, inner edges.
 FORSYS = """
@@ -48,6 +53,28 @@ true, found = true / true.mean(), found / found.mean()
 print(len(true), np.corrcoef(true, found)[0, 1], np.mean(abs(found - true) / true), time.time() - began)
 """
 
+# The same of a movie; the frame is the second argument.
+FORSYS_MOVIE = """
+import sys, time
+import numpy as np
+import forsys as fs
+import forsys.surface_evolver
+began, when = time.time(), int(sys.argv[1])
+frames = {}
+for number, path in enumerate(sys.argv[2:]):
+    lattice = fs.surface_evolver.SurfaceEvolver(path)
+    frames[number] = fs.frames.Frame(
+        number, lattice.vertices, lattice.edges, lattice.cells, time=number, gt=True
+    )
+system = fs.ForSys(frames)
+system.build_force_matrix(when=when)
+system.solve_stress(when=when, b_matrix="velocity", velocity_normalization=0.1, method="lsq_linear")
+rows = [(e.gt, e.tension) for e in system.frames[when].big_edges.values() if not e.external]
+true, found = np.array(rows, float).T
+true, found = true / true.mean(), found / found.mean()
+print(len(true), np.corrcoef(true, found)[0, 1], np.mean(abs(found - true) / true), time.time() - began)
+"""
+
 
 class Truth(NamedTuple):
     """A tissue with its tensions and pressures."""
@@ -55,6 +82,7 @@ class Truth(NamedTuple):
     tissue: vx.Tissue
     tension: np.ndarray
     pressure: np.ndarray
+    foam: vx.io.Foam | None = None
 
 
 def compare(truth: Truth, found: InferredTensions) -> tuple[np.ndarray, ...]:
@@ -84,17 +112,38 @@ def compare(truth: Truth, found: InferredTensions) -> tuple[np.ndarray, ...]:
     )
 
 
+def bare(found: InferredTensions) -> InferredTensions:
+    """The same with the tensions of a bare balance at inner junctions: of equal weight, and not negative."""
+    tissue, m = found.tissue, found.tissue.topology
+    edge, forward = np.asarray(m.edge).reshape(-1, 3), np.asarray(m.forward).reshape(-1, 3)
+    inner = np.all(np.asarray(m.cell).reshape(-1, 3) < tissue.n_cells, axis=1)
+    chord = np.asarray(tissue.edge_vectors)
+    direction, angle = np.arctan2(chord[:, 1], chord[:, 0]), np.asarray(tissue.edge_angles)
+    away = np.where(forward, (direction - angle)[edge], (direction + angle)[edge] + np.pi)[inner]
+    asked = np.isfinite(found.tensions)
+    matrix = np.zeros((2, inner.sum(), tissue.n_edges))
+    row = np.arange(inner.sum())[:, None]
+    np.add.at(matrix[0], (row, edge[inner]), np.cos(away))
+    np.add.at(matrix[1], (row, edge[inner]), np.sin(away))
+    forces = np.concatenate([*matrix, np.full((1, tissue.n_edges), 1e3)])[:, asked]
+    given = np.append(np.zeros(2 * inner.sum()), 1e3 * asked.sum())
+    tensions = found.tensions.copy()
+    tensions[asked] = nnls(forces, given, maxiter=50 * len(given))[0]
+    return eqx.tree_at(lambda f: f.tensions, found, tensions)
+
+
 def row(name: str, cases: Sequence[tuple[Truth, object]]) -> None:
     """Infer all, and print what came out."""
-    parts, determined, seconds = [], [], []
+    parts, determined, seconds, plain = [], [], [], []
     for truth, image in cases:
         began = time.perf_counter()
-        found = infer_tensions(truth.tissue if image is None else image)  # pyright: ignore[reportArgumentType]
+        found = infer_tensions((truth.foam or truth.tissue) if image is None else image)  # pyright: ignore[reportArgumentType]
         seconds.append(time.perf_counter() - began)
         asked = np.isfinite(found.tensions).sum()
         determined.append(found.determined.sum() / asked)
         if found.determined.sum() > 2:
             parts.append(compare(truth, found))
+            plain.append(compare(truth, bare(found)))
     if not parts:
         print(f"{name:>34} | {np.mean(determined):10.0%} | nothing is determined", flush=True)
         return
@@ -105,7 +154,9 @@ def row(name: str, cases: Sequence[tuple[Truth, object]]) -> None:
     cover = [f"{np.mean(s < 1):4.0%} {np.mean(s < 1.96):4.0%}" for s in scores]
     print(
         f"{name:>34} | {np.mean(determined):10.0%} | {r:9.4f} | {error:5.1%} | {by_pressure:10.4f} | "
-        f"{cover[0]:>18} {cover[1]:>20} | {np.median(seconds):.1f}",
+        f"{cover[0]:>18} {cover[1]:>20} | {np.median(seconds):.1f} | "
+        f"{np.mean([pearson(p[0], p[1]) for p in plain]):.4f} "
+        f"{np.mean([np.mean(np.abs(p[1] - p[0]) / p[0]) for p in plain]):5.1%}",
         flush=True,
     )
 
@@ -113,7 +164,7 @@ def row(name: str, cases: Sequence[tuple[Truth, object]]) -> None:
 def foam(path: Path) -> Truth:
     """A foam of Surface Evolver."""
     read = vx.io.read_surface_evolver(path)
-    return Truth(read.tissue, np.asarray(read.tensions), np.asarray(read.pressures))
+    return Truth(read.tissue, np.asarray(read.tensions), np.asarray(read.pressures), read)
 
 
 def cluster(n_cells: int, seed: int) -> Truth:
@@ -146,12 +197,22 @@ def drawn(
     return labels
 
 
+def forsys(interpreter: str, name: str, program: str, arguments: Sequence[object]) -> None:
+    """What ForSys finds of the same."""
+    command = [interpreter, "-c", program, *map(str, arguments)]
+    told = subprocess.run(command, capture_output=True, text=True)
+    last = (told.stdout.strip() or told.stderr.strip() or "nothing").splitlines()[-1]
+    print(f"{name:>34} | edges, r, error, s: {last}", flush=True)
+
+
 def main() -> None:
     """Print one row a case."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of dumps")
-    parser.add_argument("--sizes", type=int, nargs="*", default=[20], help="cells of clusters")
-    parser.add_argument("--repeats", type=int, default=6, help="images of each cluster")
+    parser.add_argument(
+        "--sizes", type=int, nargs="*", default=[20, 100, 300], help="cells of clusters"
+    )
+    parser.add_argument("--repeats", type=int, default=3, help="images of each cluster")
     parser.add_argument("--forsys", help="interpreter that has ForSys")
     arguments = parser.parse_args()
     print(HEADER)
@@ -159,24 +220,37 @@ def main() -> None:
         truth = foam(path)
         row(f"{path.stem}, exact", [(truth, None)])
         for pixels in (1000, 500):
-            row(f"{path.stem}, {pixels} pixels", [(truth, label_image(truth.tissue, pixels))])
-        if arguments.forsys:
-            told = subprocess.run(
-                [arguments.forsys, "-c", FORSYS, str(path)], capture_output=True, text=True
+            row(
+                f"{path.stem}, {pixels} pixels",
+                [(truth, label_image(truth.foam or truth.tissue, pixels))],
             )
-            last = (told.stdout.strip() or told.stderr.strip() or "nothing").splitlines()[-1]
-            print(f"{path.stem + ', ForSys':>34} | edges, r, error, s: {last}", flush=True)
+        if arguments.forsys:
+            forsys(arguments.forsys, f"{path.stem}, ForSys", FORSYS, [path])
+    movie = sorted(arguments.data.glob("movie_[1-9].dmp"))
+    if arguments.forsys and len(movie) > 2:
+        when = len(movie) // 2
+        name = f"{movie[when].stem}, ForSys, dynamic"
+        forsys(arguments.forsys, name, FORSYS_MOVIE, [when, *movie])
     random = np.random.default_rng(0)
     for n in arguments.sizes:
         truths = [cluster(n, seed) for seed in range(max(1, 40 // n))]
         for pixels in (20, 50, 150):
-            for rough in (0.0, 0.3, 0.6):
+            for rough in (0.0, 0.3, 0.6) if pixels * n <= 50 * 100 else ():
                 cases = [
                     (truth, drawn(truth, pixels, rough, random))
                     for truth in truths
                     for _ in range(arguments.repeats)
                 ]
                 row(f"{n} cells, {pixels} px each, rough {rough}", cases)
+    for path in sorted((arguments.data.parent / "segmentations").glob("*.tif")):
+        began = time.perf_counter()
+        found = infer_tensions(path)
+        seconds = time.perf_counter() - began
+        asked = np.isfinite(found.tensions).sum()
+        print(
+            f"{path.stem:>34} | {found.determined.sum()} of {asked}, s.d. "
+            f"{np.median(found.tension_deviations[found.determined]):.2f}, {seconds:.1f} s; {found.doubts}"
+        )
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ FAMILIES = {
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
     "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tissue "
-    "plot_tissues same_limits scale_bar series_colours",
+    "plot_tissues same_limits scale_bar series_colours tension_layer",
     "responses": "AbstractResponse AbstractSimulator Edges Equilibrium Evolution Evolved External "
     "Ledger Material Relaxation Relaxed SimulatorError StepControl SurfaceEvolver Trajectory "
     "equilibrate evolve record_relaxation run_program",

@@ -4,10 +4,8 @@ from vertax.inference._foam import (
     foam_energy as foam_energy,
     foam_terms as foam_terms,
 )
-from vertax.inference._infer_tensions import (
-    InferredTensions as InferredTensions,
-    infer_tensions as infer_tensions,
-)
+from vertax.inference._infer_tensions import infer_tensions as infer_tensions
+from vertax.inference._inferred import InferredTensions as InferredTensions
 from vertax.inference._mask import read_mask as read_mask
 from vertax.inference._micrograph import (
     Micrograph as Micrograph,

@@ -1,12 +1,12 @@
-"""The balance of forces at junctions and along arcs, solved for tensions and pressures."""
+"""The balance of forces at junctions and along arcs, in terms of angles."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csc_array
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array, csr_array
 
 from vertax.inference._seen import Seen
 
@@ -20,13 +20,22 @@ class Equations(NamedTuple):
     """Those that end at one: their tensions are asked for, and each has its balance of pressures."""
     cells: Int[np.ndarray, " cells"]
     """The cells beside them, whose pressures are asked for."""
-    edge_place: Int[np.ndarray, " all_edges"]
-    cell_place: Int[np.ndarray, " all_cells"]
+    half_edge: Int[np.ndarray, "junctions 3"]
+    """The edges that meet at each junction, numbers among `edges`."""
+    sides: Int[np.ndarray, "edges 2"]
+    """The cells on the left and on the right of each edge, numbers among `cells`."""
+    chord: Float[np.ndarray, " edges"]
+    """Distance between the ends of each edge."""
 
     @property
     def n_rows(self) -> int:
         """Number of equations."""
         return 2 * len(self.junctions) + len(self.edges)
+
+    @property
+    def n_directions(self) -> int:
+        """Number of directions at junctions, which come before the angles of arcs."""
+        return 3 * len(self.junctions)
 
 
 def equations(seen: Seen) -> Equations:
@@ -34,107 +43,104 @@ def equations(seen: Seen) -> Equations:
     junctions = np.flatnonzero(seen.inner)
     edges = np.unique(seen.half_edge[junctions])
     cells = np.unique(seen.cells[edges])
-    edge_place, cell_place = np.full(len(seen.angle), -1), np.full(seen.n_cells + 1, -1)
-    edge_place[edges], cell_place[cells] = np.arange(len(edges)), np.arange(len(cells))
-    return Equations(junctions, edges, cells, edge_place, cell_place)
-
-
-def _turned(x: Float[np.ndarray, "*shape 2"]) -> Float[np.ndarray, "*shape 2"]:
-    return np.stack([-x[..., 1], x[..., 0]], axis=-1)
-
-
-class Turns(NamedTuple):
-    """By how much angles differ from those of a balance, which no noise explains: errors of the model."""
-
-    junction: Float[np.ndarray, "junctions 3"]
-    """Of the edges that meet at a junction."""
-    arc: Float[np.ndarray, " edges"]
-    """Of the arcs, for the balance of pressures."""
+    return Equations(
+        junctions=junctions,
+        edges=edges,
+        cells=cells,
+        half_edge=np.searchsorted(edges, seen.half_edge[junctions]),
+        sides=np.searchsorted(cells, seen.cells[edges]),
+        chord=np.maximum(np.linalg.norm(seen.chord[edges], axis=1), 1e-6 * seen.size),
+    )
 
 
 # At a junction the sum of γ t is zero, with the tangents t of its edges. An arc with the angle α over the
 # chord c is in balance with the pressures on its two sides if 2 γ sin α = (p_left - p_right) |c|: the law of
-# Laplace, times the length of the chord. Both are forces, and linear in tensions and pressures.
-def forces(seen: Seen, which: Equations, turns: Turns) -> Float[np.ndarray, "rows unknowns"]:
-    """The matrix that makes forces of tensions and pressures."""
+# Laplace, times the length of the chord. Both are forces, linear in tensions and pressures; and what they
+# depend on are angles: the directions of the tangents, away from their junctions, and the α.
+def angles(seen: Seen, which: Equations) -> Float[np.ndarray, " angles"]:
+    """Directions of tangents, three for each junction, and angles of arcs."""
+    edge, forward = seen.half_edge[which.junctions], seen.forward[which.junctions]
+    chord = np.arctan2(seen.chord[:, 1], seen.chord[:, 0])[edge]
+    away = chord + seen.bend[edge, 0] + seen.bend[edge, 1] - seen.angle[edge]
+    back = chord + seen.bend[edge, 0] - seen.bend[edge, 1] + seen.angle[edge] + np.pi
+    return np.concatenate([np.where(forward, away, back).ravel(), seen.angle[which.edges]])
+
+
+def angle_slopes(seen: Seen, which: Equations) -> csr_array:
+    """How these angles change with vertices, angles and bends."""
+    edge, forward = seen.half_edge[which.junctions].ravel(), seen.forward[which.junctions].ravel()
+    across = np.stack([-seen.chord[:, 1], seen.chord[:, 0]], axis=1)
+    across /= np.maximum(np.sum(seen.chord**2, axis=1), (1e-3 * seen.size) ** 2)[:, None]
+    first = 2 * seen.n_vertices
+    bends = first + len(seen.angle)
+    row = np.arange(which.n_directions)
+    way = np.where(forward, 1.0, -1.0)
+    entries = [(row, first + edge, -way), (row, bends + 2 * edge, np.ones(len(row)))]
+    entries.append((row, bends + 2 * edge + 1, way))
+    for end, sign in ((0, -1.0), (1, 1.0)):
+        for axis in range(2):
+            entries.append((row, 2 * seen.ends[edge, end] + axis, sign * across[edge, axis]))
+    arcs = which.n_directions + np.arange(len(which.edges))
+    entries.append((arcs, first + which.edges, np.ones(len(arcs))))
+    rows, columns, values = (np.concatenate(x) for x in zip(*entries, strict=True))
+    shape = (which.n_directions + len(which.edges), seen.n_geometry)
+    return csr_array(coo_array((values, (rows, columns)), shape=shape))
+
+
+def forces(
+    angle: Float[np.ndarray, " angles"], which: Equations, loose: Bool[np.ndarray, " edges"]
+) -> Float[np.ndarray, "rows unknowns"]:
+    """The matrix that makes forces of tensions and pressures.
+
+    **Arguments:**
+
+    - `angle`: directions and angles of arcs.
+    - `which`: the balances.
+    - `loose`: edges whose direction is not known, and which pull with a force of any direction.
+
+    **Returns:** the matrix.
+    """
     n_junctions, n_edges = len(which.junctions), len(which.edges)
     matrix = np.zeros((which.n_rows, n_edges + len(which.cells)))
-    tangent = _tangents(seen, which, turns)
-    column = which.edge_place[seen.half_edge[which.junctions]]
-    row = np.arange(n_junctions)[:, None]
-    for component in range(2):
-        np.add.at(matrix, (2 * row + component, column), tangent[..., component])
+    direction, arc = angle[: which.n_directions].reshape(-1, 3), angle[which.n_directions :]
+    row = 2 * np.arange(n_junctions)[:, None]
+    for component, part in enumerate((np.cos(direction), np.sin(direction))):
+        np.add.at(matrix, (row + component, which.half_edge), part)
+    matrix[:, :n_edges][:, loose] = 0
     row = 2 * n_junctions + np.arange(n_edges)
-    matrix[row, np.arange(n_edges)] = 2 * np.sin(seen.angle[which.edges] + turns.arc)
-    chord = np.linalg.norm(seen.chord[which.edges], axis=1)
-    left, right = which.cell_place[seen.cells[which.edges]].T + n_edges
-    np.add.at(matrix, (row, left), -chord)
-    np.add.at(matrix, (row, right), chord)
+    matrix[row, np.arange(n_edges)] = 2 * np.sin(arc)
+    for side, sign in enumerate((-1.0, 1.0)):
+        np.add.at(matrix, (row, n_edges + which.sides[:, side]), sign * which.chord)
     return matrix
 
 
-class Slopes(NamedTuple):
-    """How forces change."""
+def force_slopes(
+    angle: Float[np.ndarray, " angles"], which: Equations, tension: Float[np.ndarray, " edges"]
+) -> csr_array:
+    """How forces change with the angles, at some tensions."""
+    n_junctions, n_edges = len(which.junctions), len(which.edges)
+    direction, arc = angle[: which.n_directions], angle[which.n_directions :]
+    pull = tension[which.half_edge].ravel()
+    row, column = np.repeat(2 * np.arange(n_junctions), 3), np.arange(which.n_directions)
+    along = 2 * n_junctions + np.arange(n_edges), which.n_directions + np.arange(n_edges)
+    rows = np.concatenate([row, row + 1, along[0]])
+    columns = np.concatenate([column, column, along[1]])
+    values = [-pull * np.sin(direction), pull * np.cos(direction), 2 * tension * np.cos(arc)]
+    shape = (which.n_rows, len(angle))
+    return csr_array(coo_array((np.concatenate(values), (rows, columns)), shape=shape))
 
-    geometry: csc_array
-    """With vertices and angles."""
-    junction: Float[np.ndarray, "junctions 3 2"]
-    """With the direction of each edge at a junction."""
-    arc: Float[np.ndarray, " edges"]
-    """With the angle of each arc alone."""
 
-
-def slopes(
-    seen: Seen,
-    which: Equations,
-    turns: Turns,
-    tension: Float[np.ndarray, " edges"],
-    step: Float[np.ndarray, " edges"],
-) -> Slopes:
-    """How forces change, at some tensions and differences of pressure (left - right)."""
-    ends = 2 * seen.n_vertices
-    chord = np.maximum(np.linalg.norm(seen.chord, axis=1), 1e-3 * seen.size)
-    unit = seen.chord / chord[:, None]
-    half = seen.half_edge[which.junctions]
-    # A tangent turns with the chord and with the angle.
-    pull = tension[which.edge_place[half]][..., None] * _turned(_tangents(seen, which, turns))
-    by_chord = (_turned(unit) / chord[:, None])[half]
-    by_angle = np.where(seen.forward[which.junctions], -1.0, 1.0)
-    row = np.broadcast_to(2 * np.arange(len(half))[:, None], half.shape)
-    rows, columns, values = [], [], []
-    for component in range(2):
-        force = pull[..., component]
-        rows.append(row + component)
-        columns.append(ends + half)
-        values.append(force * by_angle)
+def pulls(
+    seen: Seen, which: Equations, chosen: Bool[np.ndarray, " edges"]
+) -> Float[np.ndarray, "rows forces"]:
+    """How forces along some edges enter the equations, two components each."""
+    edges = np.flatnonzero(chosen)
+    matrix = np.zeros((which.n_rows, len(edges), 2))
+    place = np.full(seen.n_vertices, -1)
+    place[which.junctions] = np.arange(len(which.junctions))
+    for end, sign in ((0, 1.0), (1, -1.0)):
+        at = place[seen.ends[which.edges[edges], end]]
+        here = np.flatnonzero(at >= 0)
         for axis in range(2):
-            for end, way in ((0, -1.0), (1, 1.0)):
-                rows.append(row + component)
-                columns.append(2 * seen.ends[half][..., end] + axis)
-                values.append(way * force * by_chord[..., axis])
-    row = 2 * len(half) + np.arange(len(which.edges))
-    by_arc = 2 * tension * np.cos(seen.angle[which.edges] + turns.arc)
-    rows.append(row)
-    columns.append(ends + which.edges)
-    values.append(by_arc)
-    for axis in range(2):
-        for end, way in ((0, 1.0), (1, -1.0)):
-            rows.append(row)
-            columns.append(2 * seen.ends[which.edges][:, end] + axis)
-            values.append(way * step * unit[which.edges][:, axis])
-    flat = lambda arrays: np.concatenate([np.ravel(x) for x in arrays])
-    shape = (which.n_rows, ends + len(seen.angle))
-    geometry = csc_array(coo_array((flat(values), (flat(rows), flat(columns))), shape=shape))
-    return Slopes(geometry, pull, by_arc)
-
-
-def _tangents(seen: Seen, which: Equations, turns: Turns) -> Float[np.ndarray, "junctions 3 2"]:
-    """Unit vectors along the three edges of each junction, away from it."""
-    chord = np.maximum(np.linalg.norm(seen.chord, axis=1), 1e-12 * seen.size)
-    unit = seen.chord / chord[:, None]
-    cosine, sine = np.cos(seen.angle)[:, None], np.sin(seen.angle)[:, None]
-    first, last = cosine * unit - sine * _turned(unit), cosine * unit + sine * _turned(unit)
-    half = seen.half_edge[which.junctions]
-    along = np.where(seen.forward[which.junctions][..., None], first[half], -last[half])
-    turn = turns.junction[..., None]
-    return np.cos(turn) * along + np.sin(turn) * _turned(along)
+            matrix[2 * at[here] + axis, here, axis] = sign
+    return matrix.reshape(which.n_rows, -1)

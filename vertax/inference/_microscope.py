@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from vertax.costs import render
+from vertax.io import Foam
 from vertax.mesh import Free, Periodic, Tissue
 from vertax.mesh._outlines import Drawing
 
@@ -131,12 +132,13 @@ class Microscope(eqx.Module):
         return waves * (1 - self.vignetting * 2 * (away[:, None] + away[None, :]))
 
 
-def label_image(tissue: Tissue, pixels: int) -> Int[np.ndarray, "rows columns"]:
+def label_image(tissue: Tissue | Foam, pixels: int) -> Int[np.ndarray, "rows columns"]:
     """The label image of a free cluster, with a margin: what a perfect segmentation of it would be.
 
     **Arguments:**
 
-    - `tissue`: a tissue with a [`Free`][vertax.Free] boundary.
+    - `tissue`: a tissue with a [`Free`][vertax.Free] boundary; or a [`Foam`][vertax.io.Foam], whose edges run
+        along their chains of pieces and not along arcs.
     - `pixels`: longer side of the image.
 
     **Returns:** for each pixel the number of its cell, from 1, or 0 outside. Rows are along y.
@@ -145,15 +147,20 @@ def label_image(tissue: Tissue, pixels: int) -> Int[np.ndarray, "rows columns"]:
 
     - `ValueError` for another boundary, or fewer than 16 pixels.
     """
-    if not isinstance(tissue.boundary, Free):
+    foam = tissue if isinstance(tissue, Foam) else None
+    seen = tissue.tissue if isinstance(tissue, Foam) else tissue
+    if not isinstance(seen.boundary, Free):
         raise ValueError(
             "Argument `tissue` must have a free boundary, but its boundary is "
-            f"{type(tissue.boundary).__name__}."
+            f"{type(seen.boundary).__name__}."
         )
     if pixels < 16:
         raise ValueError(f"Argument `pixels` must be at least 16, but is {pixels}.")
-    polygons, sizes = Drawing(tissue, 60).polygons()
-    outlines = [polygon[:size] for polygon, size in zip(polygons, sizes, strict=True)]
+    if foam is None:
+        polygons, sizes = Drawing(seen, 60).polygons()
+        outlines = [polygon[:size] for polygon, size in zip(polygons, sizes, strict=True)]
+    else:
+        outlines = _outlines(foam)
     corners = np.concatenate(outlines)
     low, extent = corners.min(axis=0), np.ptp(corners, axis=0)
     scale = 0.9 * pixels / extent.max()
@@ -163,6 +170,22 @@ def label_image(tissue: Tissue, pixels: int) -> Int[np.ndarray, "rows columns"]:
     for number, outline in enumerate(outlines, start=1):
         labels[_inside(outline * scale + offset, shape)] = number
     return labels
+
+
+def _outlines(foam: Foam) -> list[Float[np.ndarray, "_ 2"]]:
+    """The points around each cell."""
+    m = foam.tissue.topology
+    following, cell, edge, forward = (np.asarray(x) for x in (m.next, m.cell, m.edge, m.forward))
+    outlines = []
+    for number in range(foam.tissue.n_cells):
+        first = here = int(np.flatnonzero(cell == number)[0])
+        around = []
+        while not around or here != first:
+            chain = foam.chains[edge[here]]
+            around.append((chain if forward[here] else chain[::-1])[:-1])
+            here = int(following[here])
+        outlines.append(np.concatenate(around))
+    return outlines
 
 
 def _inside(

@@ -20,6 +20,7 @@ with _needing("plot", "Drawing"):
         plot_moduli as plot_moduli,
         plot_stress_strain as plot_stress_strain,
     )
+    from vertax.plotting._napari import tension_layer as tension_layer
     from vertax.plotting._panels import plot_tissues as plot_tissues
     from vertax.plotting._recovery import plot_recovery as plot_recovery
     from vertax.plotting._replicates import plot_band as plot_band, plot_boxes as plot_boxes

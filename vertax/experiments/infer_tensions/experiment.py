@@ -77,7 +77,8 @@ class Config(ExperimentConfig):
     noise: float | None = Field(default=None, gt=0)
     """Standard deviation of the position of an edge, in pixels; left out, how far pixels are from arcs."""
     prior: float | None = Field(default=None, gt=0)
-    """Standard deviation of relative tensions before the image was seen; left out, how much they differ."""
+    """Standard deviation of relative tensions before the image was seen; left out, twice as
+    much as they differ."""
 
 
 def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
@@ -186,6 +187,8 @@ def _metrics(
         "pixel_size": pixel,
         "noise_pixels": found.noise / pixel,
         "noise_correlation_pixels": found.correlation / pixel,
+        "bending_degrees": np.degrees(found.bending),
+        "doubts": found.doubts,
         "out_of_balance_degrees_junctions": np.degrees(found.model_errors[0]),
         "out_of_balance_degrees_arcs": np.degrees(found.model_errors[1]),
     }

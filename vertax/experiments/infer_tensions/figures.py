@@ -29,7 +29,7 @@ def foam(image: Real[np.ndarray, "rows columns *colours"], found: InferredTensio
     **Returns:** the figure.
     """
     rows, columns = image.shape[:2]
-    height = 3.4 * rows / columns + 0.5
+    height = max(3.4 * rows / columns + 0.5, 2.4)
     figure, ((left, right),) = new_figure(1, 2, width=3.6, height=height, room=1.2)
     plot_tissue(found.tissue, ax=left, image=image, pixel_size=found.pixel_size or 1.0)
     left.set_title("arcs over the image")

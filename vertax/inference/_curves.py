@@ -1,0 +1,251 @@
+"""Arcs that may bend, fitted to the points of edges, and how exactly they are known."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import minimize_scalar
+from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse.linalg import splu
+
+from vertax.inference._seen import Seen
+
+# Standard deviations of what no point tells, such as the angle of an edge of two pixels: of a vertex in
+# grains (it was seen in a corner of pixels) and of an angle in radians.
+_VERTEX, _ANGLE = 2.0, 0.5
+# How much edges may bend, in radians: to begin with, and at least and at most.
+_BENDING, _BENDINGS = 0.1, (1e-4, 0.3)
+# Middles of the sides of pixels are so far from a curve, and alike along so much of it, in grains, at most
+# where nothing else is wrong with them: 0.24 and 1.45.
+_CRISP = 0.26, 1.6
+# Shorter edges, in grains, have no course: their points say nothing, and a few more nothing about bends.
+_SHORT, _STRAIGHT = 3.0, 6.0
+# Mean length of edges, in grains, from which on bends are read.
+_LONG = 25.0
+
+
+class Points(NamedTuple):
+    """Where edges run."""
+
+    edge: Int[np.ndarray, " points"]
+    """The edge of each point, ascending; the points of each from its first vertex on."""
+    away: Float[np.ndarray, "points 2"]
+    """The points, each seen from the first vertex of its edge."""
+
+
+class Fitted(NamedTuple):
+    """Curves fitted to points, and the covariance of the fit, but for the square of the noise."""
+
+    change: Float[np.ndarray, " geometry"]
+    """From the geometry of the tissue to that of the fit."""
+    precision: csc_array
+    """The inverse covariance of vertices, angles and bends, where a point has the standard deviation 1."""
+    noise: float
+    """Root mean square distance of the points from the curves."""
+    rest: Float[np.ndarray, " points"]
+    """The distance of each."""
+    weighted: csc_array
+    """The slopes of the distances, transposed, times the weights of the points."""
+    apart: float
+    """How far points lie apart that say something of their own, a length."""
+    bending: float
+    """How much edges bend, the standard deviation in radians."""
+    crisp: bool = False
+    """Whether nothing but the grain is wrong with the points."""
+
+
+def read_courses(
+    tissue: Seen,
+    points: Points,
+    grain: float,
+    *,
+    apart: float | None = None,
+    noise: float | None = None,
+) -> Fitted:
+    """Curves through the points, with the noise, its correlation and the bending that the points tell.
+
+    Edges that bend and noise that is alike along edges look the same. So bends are read only where nothing
+    but the grain of pixels is left of the points then; edges are arcs else, and all that is off is noise.
+
+    **Arguments:**
+
+    - `tissue`: the geometry to begin with.
+    - `points`: what was seen of its edges.
+    - `grain`: how exactly a point can be known: the side of a pixel.
+    - `apart`: how far points lie apart that are exact; left out, how far along edges they are off in the same
+        way.
+    - `noise`: standard deviation of a point; left out, that of the fit.
+
+    **Returns:** the [`Fitted`][vertax.inference._curves.Fitted] curves.
+    """
+    length = np.linalg.norm(tissue.chord, axis=1)
+    used = np.unique(points.edge)
+    # What a fit leaves of an edge cannot be alike along all of it.
+    longest = 0.25 * float(np.mean(length[used]))
+    fit = partial(fit_curves, tissue, points, grain)
+    # A curve through a dozen pixels hides how rough they are.
+    short = apart is None and np.mean(length[used]) < _LONG * grain
+    for start in _BENDINGS[:1] if short else (_BENDING, _BENDINGS[0]):
+        first = fit(apart=apart or 2 * grain, bending=start, noise=noise or 0.4 * grain)
+        alike = apart or min(correlation_length(points, first.rest), longest)
+        crisp = first.noise < _CRISP[0] * grain and alike < _CRISP[1] * grain
+        if crisp or apart is not None:
+            break
+    off, bending = noise or first.noise, start
+    if start == _BENDING:
+        flat = fit(apart=alike, bending=_BENDINGS[1], noise=off)
+        bending = _bending(tissue, flat, used[length[used] > _STRAIGHT * grain], off)
+    curves = fit(apart=alike, bending=bending, noise=off)
+    return curves._replace(noise=curves.noise if noise is None else noise, crisp=crisp)
+
+
+def fit_curves(
+    tissue: Seen,
+    points: Points,
+    grain: float,
+    *,
+    apart: float,
+    bending: float,
+    noise: float,
+    rounds: int = 6,
+) -> Fitted:
+    r"""Vertices, angles and bends such that the curves run through points as well as they can.
+
+    An arc from 0 with the chord $c$ whose tangent there is turned by $\varphi$ from it has a distance from a
+    point $p$ of
+
+    $$d = \frac{p \cdot (p - c)\, \sin\varphi + (c \times p) \cos\varphi}{|c|}$$
+
+    to first order in $d$, for every angle. From there a curve of the length $L$ departs, at the share $u$ of
+    it, by $L\,(b_1\,u(1 - u)(1 - 2u) + b_2\,u(1 - u)(1 - \tfrac{14}{3} u(1 - u)))$: two shapes that turn its
+    ends and change neither chord nor, to first order, the arc that fits best.
+
+    **Arguments:**
+
+    - `tissue`: the geometry to begin with.
+    - `points`: the points.
+    - `grain`: their grain.
+    - `apart`: how far points must lie apart to say something of their own, a length.
+    - `bending`: standard deviation of the bends.
+    - `noise`: that of the points, by which it is weighed.
+    - `rounds`: steps of Gauss and Newton.
+
+    **Returns:** the [`Fitted`][vertax.inference._curves.Fitted] curves.
+    """
+    edge, away = points
+    n_vertices, n_edges, n = tissue.n_vertices, len(tissue.angle), tissue.n_geometry
+    angles, bends = 2 * n_vertices, 2 * n_vertices + n_edges
+    start, end = tissue.ends[edge].T
+    n_points = np.bincount(edge, minlength=n_edges)
+    length = np.linalg.norm(tissue.chord, axis=1)
+    # Each edge counts as so many points as are far enough apart.
+    weight = length / apart / np.maximum(n_points, 1)
+    weight = np.where(length > _SHORT * grain, weight, 0.0)[edge]
+    # What the points leave open stays where it was seen.
+    held = (
+        noise / np.repeat([_VERTEX * grain, _ANGLE, bending], [angles, n_edges, 2 * n_edges])
+    ) ** 2
+    bent = bends + 2 * edge, bends + 2 * edge + 1
+    columns = np.stack(
+        (2 * start, 2 * start + 1, 2 * end, 2 * end + 1, angles + edge, *bent), axis=1
+    )
+    rows = np.repeat(np.arange(len(edge)), columns.shape[1])
+    change = np.zeros(n)
+    rest = np.zeros(len(edge))
+    normal, weighted = csc_array(diags_array(held)), csc_array((n, len(edge)))
+    for _ in range(rounds):
+        here = tissue.moved(change)
+        p = away - change[:angles].reshape(-1, 2)[start]
+        c, angle = here.chord[edge], here.angle[edge]
+        chord = np.maximum(np.linalg.norm(c, axis=1), 0.1 * grain)
+        q, sine, cosine = p - c, -np.sin(angle), np.cos(angle)
+        dot, cross = np.sum(p * q, axis=1), c[:, 0] * p[:, 1] - c[:, 1] * p[:, 0]
+        turn = np.stack([-q[:, 1], q[:, 0], p[:, 1], -p[:, 0]], axis=1)
+        slide = np.concatenate([q, p], axis=1)
+        slopes = (cosine[:, None] * turn - sine[:, None] * slide) / chord[:, None]
+        bulge = (cross * sine - dot * cosine) / chord
+        modes = _modes(p, q, chord, angle)
+        rest = (dot * sine + cross * cosine) / chord - np.sum(modes * here.bend[edge], axis=1)
+        values = np.column_stack([slopes, bulge, -modes])
+        jacobian = csc_array(
+            coo_array((values.ravel(), (rows, columns.ravel())), shape=(len(edge), n))
+        )
+        weighted = jacobian.T * weight
+        normal = csc_array(weighted @ jacobian + diags_array(held))
+        step = splu(normal).solve(weighted @ rest + held * change)
+        change = change - step
+        change[angles:bends] = np.clip(tissue.angle + change[angles:bends], -3, 3) - tissue.angle
+        if np.max(np.abs(step[angles:])) < 1e-4:
+            break
+    noise = float(np.sqrt(np.sum(weight * rest**2) / max(np.sum(weight), 1e-300)))
+    noise = max(noise, 1e-12 * tissue.size)
+    return Fitted(change, normal, noise, rest, csc_array(weighted), apart, bending)
+
+
+def _modes(
+    p: Float[np.ndarray, "points 2"],
+    q: Float[np.ndarray, "points 2"],
+    chord: Float[np.ndarray, " points"],
+    angle: Float[np.ndarray, " points"],
+) -> Float[np.ndarray, "points 2"]:
+    """How far a point of an arc moves with the two bends; its ends are at -p and -q from it."""
+    # Seen from an end of an arc of the half angle α, a point at the share u is 2 R sin(u α) away.
+    wide = np.clip(np.abs(angle), 1e-3, 1.5)
+    scale = np.sin(wide) / chord
+    first, last = (np.arcsin(np.minimum(np.linalg.norm(x, axis=1) * scale, 1.0)) for x in (p, q))
+    u = first / np.maximum(first + last, 1e-300)
+    flat = u * (1 - u)
+    shapes = np.stack([flat * (1 - 2 * u), flat * (1 - 14 / 3 * flat)], axis=1)
+    return (wide / scale)[:, None] * shapes
+
+
+def _bending(tissue: Seen, flat: Fitted, edges: Int[np.ndarray, " some"], noise: float) -> float:
+    """How much edges bend, by maximum likelihood from bends that were left next to free."""
+    if len(edges) < 3:
+        return _BENDINGS[0]
+    first = 2 * tissue.n_vertices + len(tissue.angle)
+    place = np.concatenate([first + 2 * edges, first + 2 * edges + 1])
+    unit = np.zeros((tissue.n_geometry, len(place)))
+    unit[place, np.arange(len(place))] = 1.0
+    variance = noise**2 * np.sum(unit * splu(flat.precision).solve(unit), axis=0)
+    # As if nothing had held them.
+    share = np.minimum(variance / _BENDINGS[1] ** 2, 0.95)
+    bend, variance = flat.change[place] / (1 - share), variance / (1 - share)
+
+    def loss(log: float) -> float:
+        total = variance + np.exp(2 * log)
+        return float(np.sum(np.log(total) + bend**2 / total))
+
+    found = minimize_scalar(loss, bounds=np.log(_BENDINGS).tolist(), method="bounded")
+    return float(np.exp(found.x))
+
+
+def correlation_length(points: Points, rest: Float[np.ndarray, " points"]) -> float:
+    """How far points must lie apart for their distances from curves to be independent.
+
+    The integral of the correlation along edges, up to where it is first lost.
+
+    **Arguments:**
+
+    - `points`: the points.
+    - `rest`: their distances.
+
+    **Returns:** the length.
+    """
+    edge, away = points
+    same = edge[1:] == edge[:-1]
+    spacing = float(np.mean(np.linalg.norm(np.diff(away, axis=0), axis=1)[same]))
+    total, lag = 1.0, 1
+    while lag < 50:
+        pair = edge[lag:] == edge[:-lag]
+        if np.sum(pair) < 20:
+            break
+        here, there = rest[lag:][pair], rest[:-lag][pair]
+        share = np.sum(here * there) / np.sqrt(np.sum(here**2) * np.sum(there**2) + 1e-300)
+        if share <= 0.05:
+            break
+        total, lag = total + 2 * share, lag + 1
+    return total * spacing

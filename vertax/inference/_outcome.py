@@ -1,0 +1,147 @@
+"""From what balances forces to what is reported: relative numbers, and which of them are determined."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from vertax.inference._balance import Equations
+from vertax.inference._curves import Fitted
+from vertax.inference._inferred import InferredTensions
+from vertax.inference._solve import Balance
+from vertax.mesh import Tissue
+
+# From this standard deviation on, relative to the mean, a tension is not determined.
+_UNKNOWN = 0.3
+
+
+class Relative(NamedTuple):
+    """Tensions relative to the mean of what is known, and pressures to theirs."""
+
+    tension: Float[np.ndarray, " tensions"]
+    pressure: Float[np.ndarray, " pressures"]
+    tension_deviation: Float[np.ndarray, " tensions"]
+    pressure_deviation: Float[np.ndarray, " pressures"]
+    beside: Bool[np.ndarray, " pressures"]
+    """Whether a cell has an edge of known tension."""
+
+
+def relative(balance: Balance, which: Equations) -> Relative:
+    """What balances forces, in units of its mean.
+
+    **Arguments:**
+
+    - `balance`: what balances forces.
+    - `which`: the balances.
+
+    **Returns:** the [`Relative`][vertax.inference._outcome.Relative] numbers.
+    """
+    n = len(which.edges)
+    deviation = np.sqrt(np.diag(balance.covariance)[:n])
+    sure = ~balance.loose & (deviation < _UNKNOWN)
+    if np.sum(balance.tension[sure]) < 0.1 * np.sum(sure) + 1e-9:
+        sure = ~balance.loose
+    # The mean has an error too.
+    scale = float(np.mean(balance.tension[sure])) if sure.any() else 1.0
+    values = np.concatenate([balance.tension, balance.pressure]) / scale
+    slope = np.eye(len(values))
+    if sure.any():
+        slope[:, :n] -= np.outer(values, sure / np.sum(sure))
+    beside = np.isin(np.arange(len(which.cells)), which.sides[sure])
+    if beside.any():
+        values[n:] -= np.mean(values[n:][beside])
+        slope[n:] -= slope[n:][beside].mean(axis=0)
+    variance = np.sum((slope @ balance.covariance) * slope, axis=1) / scale**2
+    deviations = np.sqrt(np.maximum(variance, 0))
+    return Relative(values[:n], values[n:], deviations[:n], deviations[n:], beside)
+
+
+def outcome(
+    tissue: Tissue,
+    curves: Fitted,
+    which: Equations,
+    balance: Balance,
+    labels: Int[np.ndarray, " cells"],
+    pixel_size: float | None,
+    resampled: Float[np.ndarray, " edges"] | None,
+) -> InferredTensions:
+    """What is reported.
+
+    **Arguments:**
+
+    - `tissue`: as it was seen.
+    - `curves`: its edges, fitted.
+    - `which`, `balance`: what balances forces.
+    - `labels`, `pixel_size`: of the mask.
+    - `resampled`: standard deviations of tensions by resampling.
+
+    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions].
+    """
+    tissue = _moved(tissue, curves.change)
+    found = relative(balance, which)
+
+    def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
+        everywhere = np.full(size, fill)
+        everywhere[place] = of
+        return everywhere
+
+    nan, edges = float("nan"), (tissue.n_edges, which.edges)
+    tensions = spread(*edges, found.tension, nan)
+    sure = ~balance.loose & (found.tension_deviation < _UNKNOWN)
+    determined = spread(*edges, sure, False)
+    cells = (tissue.n_cells, which.cells)
+    pressures = spread(*cells, found.pressure, nan)
+    return InferredTensions(
+        tissue=tissue,
+        tensions=tensions,
+        tension_deviations=spread(*edges, found.tension_deviation, nan),
+        determined=determined,
+        pressures=pressures,
+        pressure_deviations=spread(*cells, found.pressure_deviation, nan),
+        pressures_determined=spread(*cells, found.beside, False),
+        stresses=_stresses(tissue, tensions, pressures, determined),
+        labels=np.asarray(labels),
+        noise=float(curves.noise * balance.errors.noise),
+        correlation=float(curves.apart),
+        bending=curves.bending,
+        model_errors=(float(balance.errors.junction), float(balance.errors.arc)),
+        pixel_size=pixel_size,
+        resampled_deviations=None if resampled is None else spread(*edges, resampled, nan),
+    )
+
+
+def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
+    """The tissue with the vertices and angles of the fit."""
+    n = 2 * tissue.n_vertices
+    dtype = tissue.vertices.dtype
+    vertices = tissue.vertices + jnp.asarray(change[:n].reshape(-1, 2), dtype)
+    angles = tissue.edge_angles + jnp.asarray(change[n : n + tissue.n_edges], dtype)
+    return tissue.with_vertices(vertices).with_angles(angles)
+
+
+def _stresses(
+    tissue: Tissue,
+    tensions: Float[np.ndarray, " edges"],
+    pressures: Float[np.ndarray, " cells"],
+    determined: Bool[np.ndarray, " edges"],
+) -> Float[np.ndarray, "cells 2 2"]:
+    """Half the tension of its edges, less the pressure, in each cell (Batchelor 1970,
+    doi:10.1017/S0022112070000745)."""
+    # Along an arc the tangent turns from -α to α: the integral of t t over its length, along and across.
+    chord, angle = np.asarray(tissue.edge_vectors, float), np.asarray(tissue.edge_angles, float)
+    length = np.asarray(tissue.edge_lengths, float)
+    unit = chord / np.maximum(np.linalg.norm(chord, axis=1), 1e-300)[:, None]
+    aside = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+    share = 0.5 * (1 + np.sinc(2 * angle / np.pi))
+    outer = lambda x: x[:, :, None] * x[:, None, :]
+    fabric = share[:, None, None] * outer(unit) + (1 - share)[:, None, None] * outer(aside)
+    known = np.where(determined, tensions, np.nan)
+    pulled = 0.5 * (known * length)[:, None, None] * fabric
+    total = np.zeros((tissue.n_cells + 1, 2, 2))
+    for side in np.asarray(tissue.topology.edge_cells).T:
+        np.add.at(total, side, pulled)
+    areas = np.asarray(tissue.areas, float)[:, None, None]
+    return total[:-1] / areas - pressures[:, None, None] * np.eye(2)

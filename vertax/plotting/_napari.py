@@ -1,0 +1,89 @@
+"""Tensions as a layer of napari (https://napari.org), from a layer of labels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import Normalize
+
+from vertax.inference import InferredTensions, infer_tensions
+
+_POINTS = 13
+_UNKNOWN = (0.5, 0.5, 0.5, 1.0)
+
+
+def tension_layer(found: InferredTensions, *, colours: str = "viridis") -> tuple[Any, dict, str]:
+    """The edges of an image, coloured by their tension, as a layer for napari.
+
+    ```python
+    data, options, kind = vx.plotting.tension_layer(found)
+    viewer.add_shapes(data, **options)
+    ```
+
+    **Arguments:**
+
+    - `found`: what was inferred of an image.
+    - `colours`: name of a map of colours. What is not determined is grey.
+
+    **Returns:** the course of each edge in pixels, row and column; options of the layer, among them the table
+    of edges as `features`; and its kind, `"shapes"`.
+
+    **Raises:**
+
+    - `ValueError` for tensions of a tissue without an image.
+    """
+    if found.pixel_size is None:
+        raise ValueError(
+            "Argument `found` must have been inferred of an image, but it has no pixels. "
+            "vx.plot_tissue draws it."
+        )
+    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=found.tissue.vertices.dtype)
+    course = np.asarray(found.tissue.edge_points(fractions), float) / found.pixel_size
+    known = found.tensions[found.determined]
+    scale = Normalize(*(known.min(), known.max()) if known.size else (0.0, 1.0))
+    colour = colormaps[colours](scale(np.where(found.determined, found.tensions, 0.0)))
+    colour[~found.determined] = _UNKNOWN
+    # To napari the middle of a pixel is a whole number, to us its corner; and rows come first.
+    options = {
+        "name": "tensions",
+        "shape_type": "path",
+        "edge_color": colour,
+        "face_color": "transparent",
+        "edge_width": 2,
+        "features": found.edge_table(),
+        "metadata": {"vertax": found},
+    }
+    return list(course[..., ::-1] - 0.5), options, "shapes"
+
+
+def napari_tensions(
+    cells: "napari.layers.Labels",
+) -> "list[napari.types.LayerDataTuple]":
+    """Tensions of the edges between labels: the widget of napari.
+
+    **Arguments:**
+
+    - `cells`: a layer of labels.
+
+    **Returns:** a layer of edges, and one of labels with the table of cells.
+    """
+    import napari.utils.notifications as notifications
+
+    mask = np.asarray(cells.data)
+    found = infer_tensions(mask, kind="labels")
+    for doubt in found.doubts:
+        notifications.show_warning(doubt)
+    placed = {"scale": cells.scale, "translate": cells.translate}
+    edges, options, kind = tension_layer(found)
+    # Row 0 of the table of a layer of labels is the background.
+    table = found.cell_table()
+    column = {"index": np.append(0, found.labels)}
+    column |= {
+        name: np.concatenate([[np.nan], np.asarray(table[name], float)])
+        for name in ("pressure", "pressure_deviation", "area")
+    }
+    pressures = {"name": "pressures", "features": column, "opacity": 0.3, "visible": False}
+    return [(mask, pressures | placed, "labels"), (edges, options | placed, kind)]
