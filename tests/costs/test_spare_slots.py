@@ -74,10 +74,10 @@ def test_costs_do_not_see_spare_slots(name):
     value, slope = value_and_slope(COSTS[name](target, N), tissue)
     roomy = target.with_capacity(ROOM)
     other, other_slope = value_and_slope(COSTS[name](roomy, ROOM), tissue.with_capacity(ROOM))
-    assert value > 1e-4
+    assert value > 1e-6
     assert other == pytest.approx(float(value), rel=1e-9)
     np.testing.assert_allclose(other_slope[: len(slope)], slope, atol=1e-9)
-    np.testing.assert_array_equal(other_slope[len(slope) :], 0)
+    np.testing.assert_allclose(other_slope[len(slope) :], 0, atol=1e-15)
 
 
 def test_structures_of_tissues_with_different_cells():
@@ -88,7 +88,9 @@ def test_structures_of_tissues_with_different_cells():
     assert same == pytest.approx(0, abs=1e-3)
     assert more > 0.1
     # Seen from the other side it is the same.
-    back = float(eqx.filter_jit(IndexAwareStructural(divided, cost.interface_length))(target, ENERGY))
+    back = float(
+        eqx.filter_jit(IndexAwareStructural(divided, cost.interface_length))(target, ENERGY)
+    )
     assert back == pytest.approx(more, rel=0.1)
     assert mismatched_neighbours(target, target) == 0
     assert mismatched_neighbours(divided, target) > 2

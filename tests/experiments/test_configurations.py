@@ -69,6 +69,7 @@ SHORT = {
         "tissue.n_cells=7",
         "fit.epochs=2",
     ],
+    "proliferation": ["duration=4", "frames=4", "room=12", "divisions=2", "animation=false"],
     "tensions_from_movie": ["substeps=10", "cluster.n_cells=7", "cluster.frames=3"],
     "tissue_moduli": ["shape_factors=[3.5, 3.7]", "replicates=2", "tissue.n_cells=9"],
 }

@@ -91,7 +91,9 @@ class IndexAwareStructural(AbstractCost):
         columns = structure(adjacency(self.target, length))
         if tissue.topology.spare or self.target.topology.spare:
             none, gone = ~tissue.alive, ~self.target.alive
-            rows, columns = (jnp.where(x[:, None], 0, y) for x, y in ((none, rows), (gone, columns)))
+            rows, columns = (
+                jnp.where(x[:, None], 0, y) for x, y in ((none, rows), (gone, columns))
+            )
         squared = _squared_distances(rows, columns)
         distances = jnp.sqrt(squared + self.softening**2) - self.softening
         if not (tissue.topology.spare or self.target.topology.spare):
