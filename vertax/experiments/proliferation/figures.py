@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from vertax import Tissue
 from vertax.growth import Lineage
@@ -45,16 +46,29 @@ def classes(
     axes[0].plot(
         list(EPITHELIA), list(EPITHELIA.values()), "D", color=INK, label="epithelia, about"
     )
-    axes[0].set(xlabel="sides", ylabel="share of cells", xticks=sides)
-    axes[0].legend()
+    axes[0].set(xlabel="sides", ylabel="share of cells", xticks=sides, ylim=(0, 0.75))
+    axes[0].legend(loc="upper right")
     enough = inner >= 10
     for k, n in enumerate((5, 6, 7)):
         at = counts[:, list(sides).index(n)][enough] / inner[enough]
         axes[1].plot(n_cells[enough], at, color=SERIES[k], label=f"{n} sides")
         axes[1].axhline(EPITHELIA[n], color=SERIES[k], lw=0.7, ls=":")
-    axes[1].set(xlabel="cells", ylabel="share of inner cells", ylim=(0, None), xscale="log")
-    axes[1].legend()
+    axes[1].set(xlabel="cells", ylabel="share of inner cells", ylim=(0, 0.75), xscale="log")
+    axes[1].xaxis.set_minor_formatter(NullFormatter())
+    axes[1].legend(loc="upper right")
     return figure
+
+
+def sides_of(tissue: Tissue) -> Float[np.ndarray, " cells"]:
+    """How many sides each cell has; NaN for spare slots.
+
+    **Arguments:**
+
+    - `tissue`: the tissue.
+
+    **Returns:** the numbers, as values to draw.
+    """
+    return np.where(np.asarray(tissue.alive), np.asarray(tissue.neighbour_counts), np.nan)
 
 
 @house_style()
@@ -71,7 +85,7 @@ def growth(frames: Sequence[Tissue], times: Float[np.ndarray, " frames"]) -> Fig
     figure, (axes,) = new_figure(1, 4, width=2.2, room=0.6)
     picked = np.unique(np.linspace(0, len(frames) - 1, 4).round().astype(int))
     tissues = {f"time {times[k]:g}": frames[k] for k in picked}
-    values = [np.asarray(frames[k].neighbour_counts, float) for k in picked]
+    values = [sides_of(frames[k]) for k in picked]
     plot_tissues(
         tissues,
         values,
