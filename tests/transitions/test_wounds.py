@@ -59,7 +59,10 @@ def test_a_purse_string_closes_a_round_wound():
     wounded, left = ablate(rest, energy, cells=killed)
     hole = np.flatnonzero(np.asarray(killed & wounded.alive))
     assert hole.size == 1
-    assert wounded.areas[hole[0]] == pytest.approx(float(rest.areas[np.asarray(killed)].sum()))
+    # (Corners of its outline at which only dead cells met are gone, so that its sides are longer.)
+    lost = float(rest.areas[np.asarray(killed)].sum())
+    assert wounded.areas[hole[0]] == pytest.approx(lost, rel=0.3)
+    assert wounded.areas.sum() == pytest.approx(n)
     response = vx.Relaxation(transitions=vx.T1() + vx.T2())
     times = np.linspace(0, 40, 41)
     closed = {}

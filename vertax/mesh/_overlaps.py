@@ -84,7 +84,11 @@ def find_overlaps(topology: Topology, sides: Sides, areas: Float[Array, " cells"
 
 
 def crossed_sides(
-    sides: Sides, following: Int[Array, " halfedges"], last: Int[Array, " halfedges"], **how: bool
+    sides: Sides,
+    following: Int[Array, " halfedges"],
+    last: Int[Array, " halfedges"],
+    *,
+    few_long: bool = False,
 ) -> Int[Array, " halfedges"]:
     """For each side another one of its face that it crosses, or itself.
 
@@ -92,14 +96,14 @@ def crossed_sides(
 
     - `following`: the next side of the face.
     - `last`: two less than the number of its sides.
-    - `how`: `few_long` as for `around`.
+    - `few_long`: as for `around`.
     """
 
     def compare(pair: Pairs, crossed: Array) -> Array:
         return jnp.where(_crosses(pair), pair.other, crossed)
 
     start = jnp.arange(len(sides), dtype=following.dtype)
-    return around(sides, following, last, compare, start, **how)
+    return around(sides, following, last, compare, start, few_long=few_long)
 
 
 def overlaps_and_nearest(
