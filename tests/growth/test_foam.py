@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 import vertax as vx
 from vertax.growth import AbstractLifeCycle, grow
 
-TENSION, STIFFNESS, DIFFUSION = 0.1, 20.0, 0.3
+TENSION, STIFFNESS, DIFFUSION = 0.1, 20.0, 3.0
 
 
 def flux(tissue, gas):

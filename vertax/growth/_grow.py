@@ -181,11 +181,9 @@ def grow(
     check_whole("divisions", divisions, least=1)
     records = 8 * tissue.n_cells if records is None else records
     check_whole("records", records, least=1)
-    if is_concrete(tissue.topology.cell) and records < int(jnp.sum(tissue.alive)):
-        raise ValueError(
-            f"Argument `records` must be at least {int(jnp.sum(tissue.alive))}, the number of cells that "
-            f"there are, but is {records}."
-        )
+    if is_concrete(tissue.topology.cell):
+        labels = np.unique(np.asarray(tissue.topology.cell))
+        check_whole("records", records, least=int(np.sum(labels < tissue.n_cells)))
     adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
     relaxation = Relaxation(transitions=T1() + T2()) if relaxation is None else relaxation
     times = increasing(times)
