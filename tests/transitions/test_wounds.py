@@ -52,7 +52,7 @@ class PurseString(vx.AbstractLocalEnergy):
 def test_a_purse_string_closes_a_round_wound():
     n = 25
     tissue = random_tissue(n, 4, lloyd_steps=20).with_capacity(n)
-    energy = vx.energies.ShapeFactorEnergy(3.8)
+    energy = vx.energies.ShapeFactorEnergy(3.8, 1.4)  # cells that would spread over the wound
     rest = vx.equilibrate(tissue, energy).tissue
     m = rest.topology
     around = np.asarray(m.cell)[np.asarray(m.twin)][np.asarray(m.cell) == 0]
@@ -67,7 +67,7 @@ def test_a_purse_string_closes_a_round_wound():
     response = vx.Relaxation(transitions=vx.T1() + vx.T2())
     times = np.linspace(0, 40, 41)
     closed = {}
-    for tension in (1.5, 3.0):
+    for tension in (0.5, 1.5):
         cable = PurseString(killed, jnp.asarray(tension))
         course = vx.evolve(wounded, left + cable, FRICTION, times, relaxation=response)
         areas = np.asarray(eqx.filter_vmap(lambda t: t.areas)(course.frames))[:, hole[0]]
@@ -79,4 +79,4 @@ def test_a_purse_string_closes_a_round_wound():
         course.tissue.topology.validate()
         closed[tension] = times[np.argmax(areas == 0)]
         print(tension, closed[tension], areas[:12].round(2))
-    assert 0 < closed[3.0] < closed[1.5]
+    assert 0 < closed[1.5] < closed[0.5]
