@@ -59,7 +59,7 @@ def test_divisions_and_transitions_without_room(plain, as_a_user):
         with pytest.raises(ValueError, match="with_capacity"):
             vx.equilibrate(plain, ENERGY, transitions=rule)
     with pytest.raises(TypeError):
-        T1() + 1  # pyright: ignore[reportOperatorIssue]
+        _ = T1() + 1  # pyright: ignore[reportOperatorIssue]
     for threshold in (-1, 0, np.nan):
         with pytest.raises(ValueError, match="`threshold`"):
             T2(threshold)

@@ -89,14 +89,15 @@ class IndexAwareStructural(AbstractCost):
             length = 0.1 * cell_size(self.target)
         rows = structure(adjacency(tissue, length))
         columns = structure(adjacency(self.target, length))
-        if tissue.topology.spare or self.target.topology.spare:
-            none, gone = ~tissue.alive, ~self.target.alive
+        spare = tissue.topology.spare or self.target.topology.spare
+        none, gone = ~tissue.alive, ~self.target.alive
+        if spare:
             rows, columns = (
                 jnp.where(x[:, None], 0, y) for x, y in ((none, rows), (gone, columns))
             )
         squared = _squared_distances(rows, columns)
         distances = jnp.sqrt(squared + self.softening**2) - self.softening
-        if not (tissue.topology.spare or self.target.topology.spare):
+        if not spare:
             return distances
         # The first spare slot belongs to the first, and so on, so that there is nothing to choose.
         same = jnp.cumsum(none)[:, None] == jnp.cumsum(gone)

@@ -83,8 +83,8 @@ def divide(
 
 def check_cell(tissue: Tissue, cell: int | Int[Array, ""]) -> None:
     """Refuse what is no cell, or one that is not there, if that can be seen."""
-    one = isinstance(cell, jax.Array | np.ndarray) and cell.ndim == 0
-    if not (one and jnp.issubdtype(cell.dtype, jnp.integer)):
+    array = isinstance(cell, jax.Array | np.ndarray) and cell.ndim == 0
+    if not (array and jnp.issubdtype(jnp.result_type(cell), jnp.integer)):
         check_whole("cell", cell)
     if not is_concrete(cell) or not is_concrete(tissue.topology.cell):
         return
