@@ -53,6 +53,7 @@ def classes(
         at = counts[:, list(sides).index(n)][enough] / inner[enough]
         axes[1].plot(n_cells[enough], at, color=SERIES[k], label=f"{n} sides")
         axes[1].axhline(EPITHELIA[n], color=SERIES[k], lw=0.7, ls=":")
+    axes[1].set_xlim(n_cells[0], n_cells[-1] + 1)  # (there may be no line)
     axes[1].set(xlabel="cells", ylabel="share of inner cells", ylim=(0, 0.75), xscale="log")
     axes[1].xaxis.set_minor_formatter(NullFormatter())
     axes[1].legend(loc="upper right")
