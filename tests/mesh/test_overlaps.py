@@ -10,6 +10,7 @@ from hypothesis import given, settings, strategies as st
 from tilings import faces_that_overlap
 
 import vertax as vx
+from vertax.mesh._overlaps import _last, around, crossed_sides
 
 overlaps_of = eqx.filter_jit(lambda tissue: tissue.overlaps)
 PERIODIC = vx.initialise.periodic_voronoi(n_cells=12, key=1)
@@ -102,3 +103,33 @@ def test_first_tissues_do_not_overlap(dtype):
     for tissue in (PERIODIC, FREE):
         cast = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tissue)
         assert not overlaps_of(cast).any
+
+
+@pytest.mark.parametrize("spare", [0, 3])
+def test_walking_in_pieces_is_walking(spare):
+    """Faces with very many sides are walked to their end by themselves."""
+    tissue = cluster(30, seed=2).with_capacity(30 + spare)
+    shaken = tissue.vertices + 0.25 * jax.random.normal(jax.random.key(0), tissue.vertices.shape)
+    tissue = tissue.with_vertices(shaken)
+    m, n = tissue.topology, tissue.topology.n_half_edges
+    last = _last(m)
+    assert n > 2 * 64  # the size of a piece
+    assert last.max() > 12
+
+    def visited(few_long):
+        def body(pair, carry):
+            met, total = carry
+            apart = pair.other != pair.here
+            seen = jnp.sum(pair.mine[:, :2] * pair.theirs[:, 2:4], axis=-1)
+            return met + apart, total + jnp.where(apart, pair.k * pair.other + seen, 0.0)
+
+        start = (jnp.zeros(n, int), jnp.zeros(n))
+        return around(tissue.sides, m.next, last, body, start, few_long=few_long)
+
+    both = [jax.jit(visited, static_argnums=0)(few_long) for few_long in (False, True)]
+    np.testing.assert_array_equal(both[0][0], jnp.maximum(last, 0))
+    np.testing.assert_array_equal(both[0][0], both[1][0])
+    np.testing.assert_allclose(both[0][1], both[1][1], rtol=1e-12)
+    crossed = [crossed_sides(tissue.sides, m.next, last, few_long=x) for x in (False, True)]
+    assert (crossed[0] != jnp.arange(n)).any()
+    np.testing.assert_array_equal(crossed[0], crossed[1])

@@ -44,6 +44,34 @@ def test_cells_are_extruded_at_the_outline_too(inner_arcs):
 
 
 @pytest.mark.slow
+def test_a_cell_loses_sides_before_it_goes():
+    tissue = random_tissue(9, 1, lloyd_steps=2).with_capacity(9)
+    cell = int(jnp.argmax(tissue.neighbour_counts))
+    assert tissue.neighbour_counts[cell] >= 6
+    energy = shrinking(9, [cell])
+
+    def course(rule, throw):
+        return vx.evolve(
+            tissue,
+            energy,
+            vx.dissipations.SubstrateFriction(1.0),
+            jnp.linspace(0, 20, 41),
+            relaxation=vx.Relaxation(transitions=rule, contact_range=None),
+            throw=throw,
+        )
+
+    # With six sides it cannot become a vertex.
+    assert course(vx.T2(), throw=False).tissue.alive[cell]
+    moved = course(BOTH, throw=True)
+    assert not moved.tissue.alive[cell]
+    assert moved.tissue.alive.sum() == 8
+    sides = [int(frame.neighbour_counts[cell]) for frame in moved.trajectory]
+    gone = sides.index(0)
+    assert (np.diff(sides[: gone + 1]) <= 0).all(), sides
+    assert moved.transitions.sum() >= sides[0] - 3 + 1  # T1s, and the T2
+
+
+@pytest.mark.slow
 def test_gradients_where_slots_are_spare():
     tissue = random_tissue(9, 1, lloyd_steps=2)
     energy = lambda a, n: (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,6 +13,7 @@ from vertax.costs._cost import AbstractCost
 from vertax.costs._positions import check_equal, check_target
 from vertax.costs._transport import entropic_transport
 from vertax.energies import AbstractEnergy
+from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
 
@@ -37,6 +39,9 @@ class IndexAwareStructural(AbstractCost):
     The first derivatives are those of the envelope theorem, $\partial L / \partial C = P$, and need no
     derivative of the solver; second derivatives are right too (implicit differentiation of the
     transport potentials).
+
+    Spare slots count for nothing. A cell that only one of the tissues has costs as much as a cell without
+    neighbours would.
 
     Paper: M. Cuturi (2013), "Sinkhorn distances", for the entropic transport.
 
@@ -69,17 +74,35 @@ class IndexAwareStructural(AbstractCost):
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Cost of the optimal transport between the structures."""
         distances = self.distances(tissue)
-        return entropic_transport(distances, jnp.asarray(self.epsilon, distances.dtype))
+        cost = entropic_transport(distances, jnp.asarray(self.epsilon, distances.dtype))
+        if not (tissue.topology.spare or self.target.topology.spare):
+            return cost
+        # Spare slots are transported to spare slots for nothing: what they add is weight alone.
+        living = jnp.maximum(jnp.sum(tissue.alive), jnp.sum(self.target.alive))
+        return cost * tissue.n_cells / living
 
     def distances(self, tissue: Tissue) -> Float[Array, "cells cells"]:
         """Distance of each cell's structure (first axis) from that of each cell of the target."""
         check_equal(type(self).__name__, tissue, self.target, "cells")
         length = self.interface_length
         if length is None:
-            length = 0.1 * jnp.sqrt(jnp.mean(self.target.areas))
+            length = 0.1 * cell_size(self.target)
         rows = structure(adjacency(tissue, length))
         columns = structure(adjacency(self.target, length))
-        return jnp.sqrt(_squared_distances(rows, columns) + self.softening**2) - self.softening
+        spare = tissue.topology.spare or self.target.topology.spare
+        none, gone = ~tissue.alive, ~self.target.alive
+        if spare:
+            rows, columns = (
+                jnp.where(x[:, None], 0, y) for x, y in ((none, rows), (gone, columns))
+            )
+        squared = _squared_distances(rows, columns)
+        distances = jnp.sqrt(squared + self.softening**2) - self.softening
+        if not spare:
+            return distances
+        # The first spare slot belongs to the first, and so on, so that there is nothing to choose.
+        same = jnp.cumsum(none)[:, None] == jnp.cumsum(gone)
+        far = jax.lax.stop_gradient(jnp.max(distances))
+        return jnp.where(none[:, None] & gone, jnp.where(same, 0, far), distances)
 
 
 def adjacency(

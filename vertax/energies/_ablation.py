@@ -5,16 +5,23 @@ from __future__ import annotations
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from vertax._base.checks import as_real
+from vertax._base.checks import named
 from vertax.energies._energy import AbstractLocalEnergy
 from vertax.mesh import Tissue
 
 
 def _as_mask(name: str, value: ArrayLike | None) -> Bool[Array, "..."] | None:
-    return None if value is None else as_real(name, jnp.asarray(value)) != 0
+    if value is None:
+        return None
+    array = value if isinstance(value, jax.Array) else np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"Argument `{name}` must be a mask of booleans, but is {named(value)}.")
+    return jnp.asarray(array) != 0
 
 
 class Ablated(AbstractLocalEnergy):

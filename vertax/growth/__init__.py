@@ -7,3 +7,4 @@ from vertax.growth._life_cycle import (
     GrowAndDivide as GrowAndDivide,
 )
 from vertax.growth._lineage import Lineage as Lineage
+from vertax.growth._score import score_function as score_function

@@ -49,6 +49,9 @@ class Grown(eqx.Module):
     """Whether all steps up to a frame came to an end, in tissues without overlaps."""
     full: Bool[Array, "*batch"]
     """Whether a cell could not divide for want of a spare slot."""
+    log_likelihood: Float[Array, "*batch"]
+    """The logarithm of how likely the choices of the cycle were, see
+    [`score_function`][vertax.growth.score_function]."""
 
     @property
     def n_alive(self) -> Int[Array, "*batch times"]:
@@ -106,7 +109,7 @@ def grow(
     *,
     key: PRNGKeyArray | int,
     substeps: int = 1,
-    divisions: int = 4,
+    divisions: int | None = None,
     records: int | None = None,
     dissipation: AbstractDissipation | None = None,
     relaxation: Relaxation | None = None,
@@ -128,7 +131,8 @@ def grow(
     In each step cells age by the rules of the cycle, those whose time has come divide, and then the tissue
     comes to rest; or, if there is a dissipation, it moves for the length of the step as in
     [`evolve`][vertax.evolve]. Works under `jax.jit` and `jax.vmap`. A gradient tells how the course changes
-    as long as the same events happen in the same steps; it does not see that rates change which happen.
+    as long as the same events happen in the same steps; it does not see that rates change which happen, for
+    which there is [`score_function`][vertax.growth.score_function].
 
     **Arguments:**
 
@@ -139,7 +143,8 @@ def grow(
     - `times`: when there is to be a frame; they increase, and the first is that of the start.
     - `key`: for random numbers, a key or a seed.
     - `substeps`: steps from one frame to the next.
-    - `divisions`: most divisions in a step; what is due beyond that waits for the next one.
+    - `divisions`: most divisions in a step, by default four and a twentieth of the capacity; what is due
+        beyond that waits for the next one.
     - `records`: room in the lineage; by default for eight times as many cells as the tissue has slots.
     - `dissipation`: what resists the motion; by default the tissue is at rest at the end of each step.
     - `relaxation`: how each step is found, by default with T1 and T2 transitions.
@@ -172,9 +177,13 @@ def grow(
             "Argument `tissue` must have room for cells to come: pass tissue.with_capacity(...)."
         )
     check_whole("substeps", substeps, least=1)
+    divisions = 4 + tissue.n_cells // 20 if divisions is None else divisions
     check_whole("divisions", divisions, least=1)
     records = 8 * tissue.n_cells if records is None else records
     check_whole("records", records, least=1)
+    if is_concrete(tissue.topology.cell):
+        labels = np.unique(np.asarray(tissue.topology.cell))
+        check_whole("records", records, least=int(np.sum(labels < tissue.n_cells)))
     adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
     relaxation = Relaxation(transitions=T1() + T2()) if relaxation is None else relaxation
     times = increasing(times)
@@ -194,6 +203,7 @@ class _State(eqx.Module):
     lineage: Lineage
     sound: Bool[Array, ""]
     full: Bool[Array, ""]
+    log_likelihood: Float[Array, ""]
 
 
 @eqx.filter_jit
@@ -222,13 +232,17 @@ def _grow(
         cells = jax.tree.map(lambda a, b: jnp.where(change.done, a, b), cells, state.cells)
         lineage, number = divided_at(state.lineage, state.number, pair, time, change.done)
         full = state.full | (jnp.any(due) & jnp.all(state.tissue.alive))
-        after = _State(change.tissue, cells, number, lineage, state.sound, full)
+        after = _State(
+            change.tissue, cells, number, lineage, state.sound, full, state.log_likelihood
+        )
         return after, due & (jnp.arange(due.size) != cell)
 
     def step(state: _State, start: Array, end: Array, key: Array) -> _State:
         aging, *dividing = jax.random.split(key, 1 + divisions)
         cells, due = cycle.advance(state.cells, state.tissue, end - start, aging)
-        state = eqx.tree_at(lambda s: s.cells, state, cells)
+        likely = cycle.log_likelihood(state.cells, cells, state.tissue, end - start)
+        parts = lambda s: (s.cells, s.log_likelihood)
+        state = eqx.tree_at(parts, state, (cells, state.log_likelihood + likely))
         due &= state.tissue.alive
 
         def one(carry: tuple, key: Array) -> tuple:
@@ -245,7 +259,9 @@ def _grow(
         gone = before.alive & ~moved.tissue.alive
         lineage, number = died_at(state.lineage, state.number, gone, end)
         sound = state.sound & (moved.result == optx.RESULTS.successful) & moved.valid
-        return _State(moved.tissue, state.cells, number, lineage, sound, state.full)
+        return _State(
+            moved.tissue, state.cells, number, lineage, sound, state.full, state.log_likelihood
+        )
 
     def interval(arrays: _State, inputs: tuple) -> tuple[_State, tuple]:
         (start, end), key = inputs
@@ -261,7 +277,8 @@ def _grow(
     first, rest = jax.random.split(key)
     lineage, number = founded(tissue, times[0], records)
     no, yes = jnp.array(False), jnp.array(True)
-    begin = _State(tissue, cycle.init(tissue, first), number, lineage, yes, no)
+    certain = jnp.zeros((), tissue.vertices.dtype)
+    begin = _State(tissue, cycle.init(tissue, first), number, lineage, yes, no, certain)
     arrays, static = eqx.partition(begin, eqx.is_array)
     whole = lambda arrays: eqx.combine(arrays, static)
     keys = jax.random.split(rest, times.shape[0] - 1)
@@ -280,6 +297,7 @@ def _grow(
         lineage=last.lineage,
         sound=sound,
         full=last.full,
+        log_likelihood=last.log_likelihood,
     )
 
 

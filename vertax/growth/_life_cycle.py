@@ -37,6 +37,20 @@ class AbstractLifeCycle(eqx.Module):
     ) -> PyTree[Array]:
         """What two daughters know, who have begun with what their mother knew."""
 
+    def log_likelihood(
+        self,
+        before: PyTree[Array],
+        after: PyTree[Array],
+        tissue: Tissue,
+        dt: Float[Array, ""],
+    ) -> Float[Array, ""]:
+        """The logarithm of how likely `advance` made the choices that it made, for `score_function`.
+
+        Of choices that are discrete alone: what is drawn from a distribution and goes on as a number, such as
+        a size, is differentiated as such. By default 0, that of a cycle without choices.
+        """
+        return jnp.zeros((), tissue.vertices.dtype)
+
     def axis(
         self, cells: PyTree[Array], tissue: Tissue, cell: Int[Array, ""], key: PRNGKeyArray
     ) -> Float[Array, "2"] | None:
@@ -129,6 +143,17 @@ class GrowAndDivide(AbstractLifeCycle):
         target = jnp.where(dying, fading, cells.target_area + self.growth_rate * dt)
         divides = ~dying & (target >= cells.division_area)
         return Cells(target, cells.division_area, cells.age + dt, dying), divides
+
+    def log_likelihood(
+        self, before: Cells, after: Cells, tissue: Tissue, dt: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """That of those cells to die that did, and of the others not to."""
+        spent = self.death_rate * dt
+        certain = spent == 0  # where the logarithm has no derivative, nobody dies
+        dies = jnp.log(-jnp.expm1(-jnp.where(certain, 1, spent)))
+        each = jnp.where(after.dying & ~certain, dies, -spent)
+        could = tissue.alive & ~before.dying
+        return jnp.sum(jnp.where(could, each, 0)).astype(tissue.vertices.dtype)
 
     def born(self, cells: Cells, tissue: Tissue, pair: Int[Array, "2"], key: PRNGKeyArray) -> Cells:
         """Two cells of half the size."""

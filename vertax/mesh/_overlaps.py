@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -76,11 +76,19 @@ class Overlaps(eqx.Module):
 
 def find_overlaps(topology: Topology, sides: Sides, areas: Float[Array, " cells"]) -> Overlaps:
     """Compare each side with all others of its face."""
-    return _overlaps(topology, areas, crossed_sides(sides, topology.next, _last(topology)))
+    return _overlaps(
+        topology,
+        areas,
+        crossed_sides(sides, topology.next, _last(topology), few_long=topology.exterior),
+    )
 
 
 def crossed_sides(
-    sides: Sides, following: Int[Array, " halfedges"], last: Int[Array, " halfedges"]
+    sides: Sides,
+    following: Int[Array, " halfedges"],
+    last: Int[Array, " halfedges"],
+    *,
+    few_long: bool = False,
 ) -> Int[Array, " halfedges"]:
     """For each side another one of its face that it crosses, or itself.
 
@@ -88,12 +96,14 @@ def crossed_sides(
 
     - `following`: the next side of the face.
     - `last`: two less than the number of its sides.
+    - `few_long`: as for `around`.
     """
 
-    def compare(k: Int[Array, ""], other: Int[Array, " halfedges"], crossed: Array) -> Array:
-        return jnp.where(_crosses(k, other, sides, take(sides, other)), other, crossed)
+    def compare(pair: Pairs, crossed: Array) -> Array:
+        return jnp.where(_crosses(pair), pair.other, crossed)
 
-    return around(following, last, compare, jnp.arange(len(sides), dtype=following.dtype))
+    start = jnp.arange(len(sides), dtype=following.dtype)
+    return around(sides, following, last, compare, start, few_long=few_long)
 
 
 def overlaps_and_nearest(
@@ -115,32 +125,33 @@ def overlaps_and_nearest(
     here = _numbers(m)
     before_last = take(m.previous, m.previous)
 
-    def both(k: Int[Array, ""], other: Int[Array, " halfedges"], carry: tuple) -> tuple:
+    def both(pair: Pairs, carry: tuple) -> tuple:
         crossed, nearest, gaps, least = carry
-        theirs = take(sides, other)
-        after, before = jnp.broadcast_to(k == 1, here.shape), other == before_last
-        gap = jnp.where(other == here, jnp.inf, measure(sides, theirs, after, before))
+        after = jnp.broadcast_to(pair.k == 1, pair.here.shape)
+        before = pair.other == take(before_last, pair.here)
+        gap = measure(pair.mine, pair.theirs, after, before)
+        gap = jnp.where(pair.other == pair.here, jnp.inf, gap)
         closest = gap < gaps[0]
         second = ~closest & (gap < gaps[1])
         insert = lambda x, best: (
             jnp.where(closest, x, best[0]),
             jnp.where(closest, best[0], jnp.where(second, x, best[1])),
         )
-        crossed = jnp.where(_crosses(k, other, sides, theirs), other, crossed)
+        crossed = jnp.where(_crosses(pair), pair.other, crossed)
         least = jnp.minimum(least, jnp.where(after | before, jnp.inf, gap))
-        return crossed, insert(other, nearest), insert(gap, gaps), least
+        return crossed, insert(pair.other, nearest), insert(gap, gaps), least
 
     none = jnp.full(here.size, jnp.inf, sides.dtype)
     start = (here, (here, here), (none, none), none)
-    crossed, nearest, gaps, least = around(m.next, _last(m), both, start)
+    crossed, nearest, gaps, least = around(
+        sides, m.next, _last(m), both, start, few_long=m.exterior
+    )
     nearest, gaps = jnp.stack(nearest, axis=-1), jnp.stack(gaps, axis=-1)
     return _overlaps(m, areas, crossed), nearest, gaps, jnp.min(least)
 
 
-def _crosses(
-    k: Int[Array, ""], other: Int[Array, " halfedges"], sides: Sides, theirs: Sides
-) -> Bool[Array, " halfedges"]:
-    return sides_cross(sides, theirs, k == 1) & (other != jnp.arange(other.size))
+def _crosses(pair: Pairs) -> Bool[Array, " pairs"]:
+    return sides_cross(pair.mine, pair.theirs, pair.k == 1) & (pair.other != pair.here)
 
 
 def _overlaps(
@@ -164,23 +175,76 @@ def _last(topology: Topology) -> Int[Array, " halfedges"]:
     return take(n_sides, topology.cell) - 2
 
 
+class Pairs(NamedTuple):
+    """Some half-edges, and for each the one that comes k sides later in its face, or itself."""
+
+    k: Int[Array, ""]
+    here: Int[Array, " pairs"]
+    other: Int[Array, " pairs"]
+    mine: Sides
+    theirs: Sides
+
+
 def around(
+    sides: Sides,
     following: Int[Array, " halfedges"],
     last: Int[Array, " halfedges"],
-    body: Callable[[Int[Array, ""], Int[Array, " halfedges"], Carry], Carry],
+    body: Callable[[Pairs, Carry], Carry],
     start: Carry,
+    *,
+    few_long: bool = False,
 ) -> Carry:
     """Walk around all faces at once: `body` sees each half-edge with the one k sides further.
 
     k goes from 1 to `last`, which may differ from face to face; half-edges that are through are paired with
     themselves. With two less than the number of sides each corner meets all sides that it does not end.
+
+    **Arguments:**
+
+    - `sides`: a row for each half-edge.
+    - `following`: the next half-edge of the face.
+    - `last`: how far to go.
+    - `body`: takes pairs, and the rows of what is carried that belong to them; returns these rows anew.
+    - `start`: arrays with a row for each half-edge.
+    - `few_long`: whether some faces have far more sides than most, as the exterior has. Then those that
+        still have some way to go are walked with in pieces.
+
+    **Returns:** what is carried, at the end.
     """
-    here = jnp.arange(following.size, dtype=following.dtype)
+    n = following.size
+    here = jnp.arange(n, dtype=following.dtype)
+    size = min(n, max(64, int(4 * n**0.5))) if few_long else n
+    # Those with the longest way come first, so that what is left to do is at the beginning. (The last piece
+    # is filled up with what has no way to go.)
+    order = here
+    if size < n:
+        filling = jnp.zeros(-n % size, here.dtype)
+        order = jnp.append(jnp.argsort(-last).astype(here.dtype), filling)
+        last = jnp.append(take(last, order[:n]), filling.astype(last.dtype))
+        start = jax.tree.map(lambda x: take(x, order), start)
+    mine = take(sides, order)
+
+    def piece(k: Int[Array, ""], at: Int[Array, ""], carry: tuple) -> tuple:
+        cut = lambda x: jax.lax.dynamic_slice_in_dim(x, at * size, size) if size < n else x
+        others, inner = carry
+        other = take(following, cut(others))
+        me = cut(order)
+        partner = jnp.where(k <= cut(last), other, me)
+        pairs = Pairs(k, me, partner, cut(mine), take(sides, partner))
+        new = other, body(pairs, jax.tree.map(cut, inner))
+        if size == n:
+            return new
+        put = lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, at * size, 0)
+        return jax.tree.map(put, carry, new)
 
     def one(k: Int[Array, ""], carry: tuple) -> tuple:
-        other, inner = carry
-        other = take(following, other)
-        return other, body(k, jnp.where(k <= last, other, here), inner)
+        if size == n:
+            return piece(k, k, carry)
+        pieces = (jnp.sum(last >= k) + size - 1) // size
+        return jax.lax.fori_loop(0, pieces, lambda at, carry: piece(k, at, carry), carry)
 
-    _, end = jax.lax.fori_loop(1, jnp.max(last) + 1, one, (here, start))
-    return end
+    _, end = jax.lax.fori_loop(1, jnp.max(last) + 1, one, (order, start))
+    if size == n:
+        return end
+    back = jnp.zeros_like(here).at[order[:n]].set(here)
+    return jax.tree.map(lambda x: take(x, back), end)

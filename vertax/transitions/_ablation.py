@@ -44,20 +44,25 @@ def ablate(
     **Raises:**
 
     - `TypeError` for an energy that is no sum over cells and edges.
-    - `ValueError` for masks of the wrong length, or a tissue without a place for spare slots.
+    - `ValueError` for masks of the wrong length, none at all, or a tissue without a place for spare slots.
     """
     if not isinstance(energy, AbstractLocalEnergy):
         raise TypeError(
             "Argument `energy` must be a sum over cells and edges, an AbstractLocalEnergy, but is "
             f"{named(energy)}."
         )
+    if edges is None and cells is None:
+        raise ValueError("Argument `edges` or `cells` must say what is ablated, but both are None.")
     left = Ablated(energy, cells, edges)
     for name, mask, size in (
         ("edges", left.edges, tissue.n_edges),
         ("cells", left.cells, tissue.n_cells),
     ):
         if mask is not None and mask.shape != (size,):
-            raise ValueError(f"Argument `{name}` must have shape ({size},), but has {mask.shape}.")
+            raise ValueError(
+                f"Argument `{name}` must be a mask of booleans of shape ({size},), but has {mask.shape}. "
+                f"For one of them by its number: {name}=jnp.arange({size}) == 7."
+            )
     if left.cells is None:
         return tissue, left
     if not tissue.topology.spare:

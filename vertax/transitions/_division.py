@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._base.checks import as_real
+from vertax._base.checks import as_real, check_whole
 from vertax._base.modules import is_concrete
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import arc_points
@@ -82,7 +82,10 @@ def divide(
 
 
 def check_cell(tissue: Tissue, cell: int | Int[Array, ""]) -> None:
-    """Refuse a cell that is not there, if that can be seen."""
+    """Refuse what is no cell, or one that is not there, if that can be seen."""
+    array = isinstance(cell, jax.Array | np.ndarray) and cell.ndim == 0
+    if not (array and jnp.issubdtype(jnp.result_type(cell), jnp.integer)):
+        check_whole("cell", cell)
     if not is_concrete(cell) or not is_concrete(tissue.topology.cell):
         return
     there = 0 <= int(cell) < tissue.n_cells and int(cell) in np.asarray(tissue.topology.cell)

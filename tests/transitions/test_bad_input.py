@@ -1,0 +1,135 @@
+"""What cannot be is named, with the remedy."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_tissue
+
+import vertax as vx
+from vertax.growth import GrowAndDivide, grow
+from vertax.transitions import T1, T2, ablate, divide, remove
+
+ENERGY = vx.energies.AreaElasticity(1.0, 1.0) + vx.energies.LineTension(0.1)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return random_tissue(6, 3)
+
+
+@pytest.fixture(scope="module")
+def roomy(plain):
+    return plain.with_capacity(7)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (5, "room for"),
+        (-1, "room for"),
+        (7.0, "whole number"),
+        ("7", "whole number"),
+        (True, "whole number"),
+    ],
+)
+def test_capacities(plain, as_a_user, wrong, message):
+    with pytest.raises((TypeError, ValueError), match=f"`n_cells`.*{message}"):
+        plain.with_capacity(wrong)
+
+
+@pytest.mark.parametrize("change", [divide, remove])
+@pytest.mark.parametrize("cell", [6, 7, -1, 1.5, None, jnp.arange(2)])
+def test_cells_that_are_none(roomy, as_a_user, change, cell):
+    with pytest.raises((TypeError, ValueError), match="`cell`"):
+        change(roomy, cell)
+
+
+@pytest.mark.parametrize("axis", [[0.0, 0.0], [1.0], [np.nan, 1.0], [np.inf, 0.0], "long"])
+def test_axes_that_are_none(roomy, as_a_user, axis):
+    with pytest.raises((TypeError, ValueError), match="`axis`"):
+        divide(roomy, 0, axis)
+
+
+def test_divisions_and_transitions_without_room(plain, as_a_user):
+    with pytest.raises(RuntimeError, match=r"capacity of 6 cells.*with_capacity"):
+        divide(plain, 0)
+    with pytest.raises(ValueError, match="with_capacity"):
+        remove(plain, 0)
+    for rule in (T2(), T1() + T2()):
+        with pytest.raises(ValueError, match="with_capacity"):
+            vx.equilibrate(plain, ENERGY, transitions=rule)
+    with pytest.raises(TypeError):
+        _ = T1() + 1  # pyright: ignore[reportOperatorIssue]
+    for threshold in (-1, 0, np.nan):
+        with pytest.raises(ValueError, match="`threshold`"):
+            T2(threshold)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"edges": 999},
+        {"edges": [999]},
+        {"edges": jnp.arange(3)},
+        {"cells": 2},
+        {"cells": [2, 3]},
+        {"edges": np.array(["all"])},
+        {},
+    ],
+)
+def test_ablations_of_what_is_none(roomy, as_a_user, wrong):
+    name = next(iter(wrong), "edges")
+    with pytest.raises((TypeError, ValueError), match=f"`{name}`"):
+        ablate(roomy, ENERGY, **wrong)
+
+
+def test_ablations_that_do_not_go_together(plain, as_a_user):
+    with pytest.raises(TypeError, match="`energy`"):
+        ablate(plain, lambda tissue: 0.0, edges=jnp.zeros(18, bool))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="with_capacity"):
+        ablate(plain, ENERGY, cells=jnp.arange(6) == 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("growth_rate", -0.1),
+        ("division_area", 0.0),
+        ("variation", -1.0),
+        ("death_rate", -0.1),
+        ("death_rate", jnp.nan),
+        ("shrinking_time", 0.0),
+        ("orientation", "short"),
+    ],
+)
+def test_rates_that_are_none(as_a_user, name, wrong):
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        GrowAndDivide(**{"growth_rate": 0.1, "division_area": 1.5, name: wrong})
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("energy", ENERGY),
+        ("cycle", 0.1),
+        ("times", [0.0]),
+        ("times", [1.0, 0.0]),
+        ("substeps", 0),
+        ("divisions", 0),
+        ("records", 2),
+        ("relaxation", T1()),
+        ("dissipation", 1.0),
+        ("tissue", None),
+        ("key", "seed"),
+    ],
+)
+def test_growth_that_cannot_be(plain, roomy, as_a_user, name, wrong):
+    arguments = {
+        "tissue": roomy,
+        "energy": lambda cells: ENERGY,
+        "cycle": GrowAndDivide(0.1, 1.5),
+        "times": [0.0, 1.0],
+        "key": 0,
+    } | {name: plain if name == "tissue" else wrong}
+    with pytest.raises((TypeError, ValueError), match=f"`{name}`"):
+        grow(**arguments)
