@@ -380,6 +380,8 @@ def _(
 
     def phase(pull: PyTree[Array], strength: Array) -> tuple[PyTree[Array], Array, Array]:
         vertices, torques = pull if isinstance(pull, tuple) else (pull, None)
+        if torques is not None:
+            torques = -torques * tissue.angle_length
         request = Request(tissue, frozen(energy), -vertices, torques)
         answer = response.ask(request, adjoint.throw)
         there = tissue.with_vertices(answer.vertices)

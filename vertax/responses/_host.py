@@ -53,12 +53,14 @@ class Job(NamedTuple):
 
     def __call__(self) -> Answer:
         tissue, energy, forces, torques = self.request
-        if torques is not None and np.any(torques != 0):
+        bends = torques is not None and np.any(torques != 0)
+        if bends and not self.simulator.bends:
             raise SimulatorError(
-                "The cost depends on the angles of arcs, on which no program can be told to pull. Use a cost "
-                "of the vertices."
+                "The cost depends on the angles of arcs, and this program cannot be told to pull on them. "
+                "Use a cost of the vertices, or let `relax` take `torques` and say so by `bends = True`."
             )
-        said = self.simulator.relax(tissue, energy, forces)
+        relax: Any = self.simulator.relax
+        said = relax(tissue, energy, forces, *([torques] if bends else []))
         said = said if isinstance(said, Relaxed) else Relaxed(said)
         vertices = _array("vertices", said.vertices, np.shape(tissue.vertices))
         angles = None if tissue.arcs is None else tissue.arcs.angles
