@@ -296,24 +296,24 @@ class Shape(vx.costs.AbstractLeastSquaresCost):
 @needs_evolver
 @pytest.mark.parametrize("areas", ["elastic", "fixed"])
 def test_gradient_through_arcs_is_that_of_differences(areas):
-    tissue = FOAM
     program = SurfaceEvolver(areas=areas, pieces=3)
     response = vx.External(program, slope="program", stiffness=1.0)
-    tension = energies(tissue)["foam"].terms[1].tension
+    tension = energies(FOAM)["foam"].terms[1].tension
     energy_of = lambda tension: (
-        vx.energies.AreaElasticity(10.0, tissue.areas) + vx.energies.LineTension(tension)
+        vx.energies.AreaElasticity(10.0, FOAM.areas) + vx.energies.LineTension(tension)
     )
-    tissue = response(tissue, energy_of(tension)).tissue
+    # (From where it rests, for the program lets a foam turn a little on its way there.)
+    tissue = response(FOAM, energy_of(tension)).tissue
     away = 0.03 * np.cos(np.arange(tissue.vertices.size)).reshape(-1, 2)
     target = tissue.with_vertices(tissue.vertices + away).with_angles(0.9 * tissue.angles)
-    adjoint = vx.EquilibriumPropagation(beta=1e-4)
+    adjoint = vx.EquilibriumPropagation()
     problem = vx.InverseProblem(
         tissue, energy_of(tension), Shape(target), response=response, adjoint=adjoint
     )
     gradient = eqx.filter_jit(lambda p: p.value_and_gradient().gradient)(problem).terms[1].tension
     direction = np.cos(np.arange(tension.size))
     cost = eqx.filter_jit(lambda tension: problem(energy_of(tension))[0])
-    slope = central_difference(cost, tension, direction, step=1e-4)
+    slope = central_difference(cost, tension, direction, step=1e-5)
     assert gradient @ direction == pytest.approx(float(slope), rel=1e-5)
 
 

@@ -170,7 +170,7 @@ class SurfaceEvolver(AbstractSimulator):
         if self.newton_steps and self.tolerance < 1e-10:
             # The energy cannot tell steps below the root of its rounding: last ones in full.
             last = 2 if not strings.chains.any() else 3 if near else 5
-            lines.append(f"{'level; hessian; ' * last}steps_done += {last};")
+            lines.append(f"weaken; {'level; hessian; ' * last}steps_done += {last};")
         return "\n".join([*lines, ""])
 
 

@@ -13,7 +13,7 @@ from vertax.responses._evolver_strings import Strings
 # Points of a chain may slide along it at next to no cost of energy. Springs between them, whose rest length
 # is the mean length of the pieces of their edge, keep these equal: where chains are at rest, the springs are
 # slack. They lag behind while an edge grows, so they lose strength as the relaxation goes on.
-_WEAKER, _WEAKEST = 0.6, 0.01
+_WEAKER, _WEAKEST = 0.6, 1e-3
 _OF_POINTS = ("pull_x", "pull_y", "arm_x", "arm_y")
 _OF_PIECES = ("gam", "soft", "spring", "rest", "chain", "along")
 # (`chain` is the first piece of the same edge, 0 if there is no other; `along` is for adding up.)
@@ -79,14 +79,14 @@ def datafile(
 def leveller(strings: Strings, *, near: bool) -> str:
     """A command `level` that gives the springs along chains new rest lengths, and less strength.
 
-    Where a tissue is `near` to rest they are weak to begin with.
+    Where a tissue is `near` to rest they are weak to begin with, and all are after `weaken`.
     """
     if not strings.chains.any():
-        return "level := { recalc; };\n"
+        return "level := { recalc; };\nweaken := {};\n"
     per = int(strings.parts.max())
     each = "foreach edge ee where ee.chain > 0 do"
     return (
-        f"spacing.modulus := {_WEAKEST if near else 1};\n"
+        f"weaken := {{ spacing.modulus := {_WEAKEST}; }};\n{'weaken' if near else ''};\n"
         f"level := {{ {each} {{ edge[ee.chain].along := 0; }};\n"
         f"{each} {{ edge[ee.chain].along := edge[ee.chain].along + ee.length; }};\n"
         f"{each} {{ ee.rest := edge[ee.chain].along/{per}; }};\n"

@@ -111,7 +111,11 @@ class Strings(NamedTuple):
     def angles(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " edges"]:
         """The angle of each edge; 0 where it is straight."""
         chords, bulges, _ = self._bulges(points)
-        return angle_of_area(bulges, np.hypot(*chords.T))
+        enclosed = bulges / np.sum(chords**2, axis=1)
+        angles = angle_of_area(bulges, np.hypot(*chords.T))
+        for _ in range(2):  # the first guess is exact to half of its digits
+            angles = angles - (_enclosed(angles) - enclosed) / _enclosed_slope(angles)
+        return angles
 
     def pulls(
         self,
@@ -127,13 +131,8 @@ class Strings(NamedTuple):
         # From S = c² g(α) follows dα = (dS - 2 g c dc) / (c² g').
         chords, bulges, vectors = self._bulges(self.points)
         squared = np.sum(chords**2, axis=1)
-        a = self.angles(self.points)
-        near = np.abs(a) < 1e-2
-        sine, cosine = np.sin(np.where(near, 1, a)), np.cos(np.where(near, 1, a))
-        slope = 0.5 - cosine / sine * (a - sine * cosine) / (2 * sine**2)
-        share = np.where(self.chains, torques, 0) / (
-            squared * np.where(near, 1 / 6 + a**2 / 15, slope)
-        )
+        slope = _enclosed_slope(self.angles(self.points))
+        share = np.where(self.chains, torques, 0) / (squared * slope)
         # S is half the sum of cross(p, next p), with places p counted from the first end.
         places = self._places(self.points)
         turned = lambda x: np.stack([x[:, 1], -x[:, 0]], axis=-1)
@@ -203,14 +202,13 @@ def _between(
 ) -> Float[np.ndarray, "arcs inner 2"]:
     """The points inside of chains of `n` equal pieces that enclose what arcs do."""
     a = np.minimum(np.abs(angle), LARGEST_FREE_ANGLE)
-    wanted = _over_circle(a, np.inf)
-    low, high = a, np.full_like(a, 0.999 * np.pi)
-    for _ in range(60):
+    wanted = _enclosed(a)
+    low, high = a, np.minimum(1.5 * a, 0.999 * np.pi)
+    for _ in range(54):
         middle = 0.5 * (low + high)
-        more = _over_circle(middle, n) < wanted
+        more = _enclosed(middle, n) < wanted
         low, high = np.where(more, middle, low), np.where(more, high, middle)
-    # (Near 0 what is enclosed is all rounding; there n - 1/n times the angle is n times the other.)
-    a = np.where(a < 1e-3, angle / (1 - 1 / n**2), np.sign(angle) * low)[:, None]
+    a = (np.sign(angle) * low)[:, None]
     # In units of half the chord, from its middle: sin(α s) / sin α along it, and as far to its right as
     # (cos(α s) - cos α) / sin α.
     s = (2 * np.arange(1, n) / n - 1)[None, :]
@@ -224,8 +222,26 @@ def _between(
     return start[:, None, :] + half + along[..., None] * half + aside[..., None] * right
 
 
-def _over_circle(a: Float[np.ndarray, " arcs"], n: int | float) -> Float[np.ndarray, " arcs"]:
-    """What a chain on a circle encloses over its chord, in units of the square of the chord."""
-    a = np.maximum(a, 1e-12)
-    turned = 2 * a if np.isinf(n) else n * np.sin(2 * a / n)
-    return (turned - np.sin(2 * a)) / (8 * np.sin(a) ** 2)
+def _enclosed(a: Float[np.ndarray, " arcs"], n: int | None = None) -> Float[np.ndarray, " arcs"]:
+    """What a chain on a circle, or the circle, encloses over its chord, by the square of the chord."""
+    area = _beyond_sine(2 * a)
+    if n is not None:
+        area = area - n * _beyond_sine(2 * a / n)
+    straight = a == 0
+    return np.where(straight, 0, area / (8 * np.sin(np.where(straight, 1, a)) ** 2))
+
+
+def _enclosed_slope(a: Float[np.ndarray, " arcs"]) -> Float[np.ndarray, " arcs"]:
+    """Its derivative, of the circle."""
+    straight = np.abs(a) < 1e-8
+    tangent = np.tan(np.where(straight, 1, a))
+    return np.where(straight, 1 / 6, 0.5 - 2 * _enclosed(a) / tangent)
+
+
+def _beyond_sine(x: Float[np.ndarray, " arcs"]) -> Float[np.ndarray, " arcs"]:
+    """x - sin(x), to all digits."""
+    squared = np.where(np.abs(x) < 1, x, 0) ** 2
+    total = np.zeros_like(x)
+    for k in range(19, 1, -2):  # x³/3! - x⁵/5! + …
+        total = squared / (k * (k - 1)) * (1 - total) if k > 3 else (1 - total) / 6
+    return np.where(np.abs(x) < 1, x**3 * total, x - np.sin(x))
