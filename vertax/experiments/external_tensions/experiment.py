@@ -129,7 +129,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     fits, metrics = {}, {"n_edges": target.n_edges}
     for name, (response, adjoint) in ways.items():
         guess = case.energy(jnp.full_like(true, case.mean))
-        fitted = eqx.tree_at(_tensions, jax.tree.map(lambda _: False, guess), True)
+        fixed = jax.tree.map(lambda _: False, guess)
+        fitted = eqx.tree_at(lambda e: e.terms[1].tension, fixed, True)
         problem = InverseProblem(
             target, guess, case.cost, fitted, response=response, adjoint=adjoint
         )
