@@ -13,7 +13,7 @@ is then the program alone.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -179,7 +179,7 @@ class Case(NamedTuple):
     energy: Callable[[Float[Array, " edges"]], AbstractEnergy]
     """The energy with some tensions."""
     cost: AbstractLeastSquaresCost
-    ways: dict[str, tuple[Any, AbstractAdjoint]]
+    ways: Mapping[str, tuple[Any, AbstractAdjoint]]
     """Forward models, and how to differentiate through them."""
 
 
