@@ -14,9 +14,11 @@ import pytest
 from helpers import central_difference
 
 import vertax as vx
+from vertax.mesh._topology import flip_edges
 from vertax.responses import SimulatorError, SurfaceEvolver, run_program
 from vertax.responses._evolver_model import Terms, slope_of
 from vertax.responses._evolver_strings import Strings
+from vertax.responses._evolver_t1 import can_flip, flipped
 
 needs_evolver = pytest.mark.skipif(
     shutil.which("evolver") is None,
@@ -147,7 +149,7 @@ def test_energies_that_cannot_be_told_are_refused():
         SurfaceEvolver().relax(on_host(PERIODIC), Odd(), None)
 
 
-@pytest.mark.parametrize("settings", [{"timeout": 0.0}, {"steps": -1}])
+@pytest.mark.parametrize("settings", [{"timeout": 0.0}, {"steps": -1}, {"pieces": 1}, {"t1": 0.0}])
 def test_settings_are_checked(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         SurfaceEvolver(**settings)
@@ -294,7 +296,7 @@ class Shape(vx.costs.AbstractLeastSquaresCost):
 
 
 @needs_evolver
-@pytest.mark.parametrize("areas", ["elastic", "fixed"])
+@pytest.mark.parametrize("areas", [pytest.param("elastic", marks=pytest.mark.thorough), "fixed"])
 def test_gradient_through_arcs_is_that_of_differences(areas):
     program = SurfaceEvolver(areas=areas, pieces=3)
     response = vx.External(program, slope="program", stiffness=1.0)
@@ -315,6 +317,44 @@ def test_gradient_through_arcs_is_that_of_differences(areas):
     cost = eqx.filter_jit(lambda tension: problem(energy_of(tension))[0])
     slope = central_difference(cost, tension, direction, step=1e-5)
     assert gradient @ direction == pytest.approx(float(slope), rel=1e-5)
+
+
+@pytest.mark.parametrize("tissue", [PERIODIC, CLUSTER], ids=["periodic", "free"])
+def test_flips_are_those_of_vertax(tissue):
+    topology = on_host(tissue).topology
+    flip = jax.jit(flip_edges)
+    edges = np.flatnonzero(can_flip(topology))
+    assert len(edges) > 0
+    for edge in edges:
+        found = flipped(topology, int(edge))
+        wanted = flip(tissue.topology, np.arange(tissue.n_edges) == edge)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@needs_evolver
+def test_t1_transitions_of_it_lower_the_energy():
+    tissue = vx.initialise.periodic_voronoi(9, key=jax.random.key(2))
+    tension = vx.energies.LineTension(0.3 + 0.15 * jnp.sin(7.0 * jnp.arange(tissue.n_edges)))
+    energy = vx.energies.AreaElasticity(10.0, 1.0) + tension
+    kept, changed = (
+        vx.External(SurfaceEvolver(t1=t1), tolerance=1e-6)(tissue, energy, throw=False)
+        for t1 in (None, 0.15)
+    )
+    assert kept.num_t1 == 0
+    assert changed.num_t1 > 0
+    assert changed.energy < kept.energy - 1e-3
+    assert changed.converged  # and valid, by the energy of vertax
+    changed.tissue.topology.validate()
+    assert changed.energy == pytest.approx(float(energy(changed.tissue)), rel=1e-12)
+    again = vx.External(SurfaceEvolver(t1=0.15), tolerance=1e-6)(changed.tissue, energy)
+    assert again.num_t1 == 0
+
+
+@needs_evolver
+def test_t1_transitions_of_it_are_for_straight_edges():
+    with pytest.raises(SimulatorError, match="are for straight edges"):
+        SurfaceEvolver(t1=0.1).relax(on_host(FOAM), on_host(energies(FOAM)["foam"]), None)
 
 
 @needs_evolver

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import ClassVar, Literal
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -16,8 +18,9 @@ from vertax.mesh import Tissue
 from vertax.responses._evolver_datafile import datafile, leveller
 from vertax.responses._evolver_model import Terms, slope_of
 from vertax.responses._evolver_strings import Strings
+from vertax.responses._evolver_t1 import can_flip, shortest, swapped
 from vertax.responses._program import run_program, tail
-from vertax.responses._simulator import AbstractSimulator, Relaxed, SimulatorError
+from vertax.responses._simulator import AbstractSimulator, Edges, Relaxed, SimulatorError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +51,8 @@ class SurfaceEvolver(AbstractSimulator):
     - `steps`: of conjugate gradients to begin with, where a tissue is far from rest.
     - `newton_steps`: at most; 0 for conjugate gradients only, until the tolerance ends them.
     - `timeout`: seconds after which a run is ended.
+    - `t1`: a length; shorter edges flip by the program's `t1_edgeswap`, one after another, if the tissue then
+        comes to rest with a lower energy. Of straight edges, and not at the outline. None for no transitions.
 
     **Raises:**
 
@@ -63,6 +68,7 @@ class SurfaceEvolver(AbstractSimulator):
     steps: int = 20
     newton_steps: int = 40
     timeout: float = 60.0
+    t1: float | None = None
 
     def __post_init__(self) -> None:
         if self.areas not in ("elastic", "fixed"):
@@ -71,6 +77,8 @@ class SurfaceEvolver(AbstractSimulator):
             )
         for name in ("tolerance", "timeout"):
             check_number(name, getattr(self, name), above=0)
+        if self.t1 is not None:
+            check_number("t1", self.t1, above=0)
         check_whole("pieces", self.pieces, least=2)
         check_whole("steps", self.steps, least=0)
         check_whole("newton_steps", self.newton_steps, least=0)
@@ -89,6 +97,41 @@ class SurfaceEvolver(AbstractSimulator):
         - [`SimulatorError`][vertax.responses.SimulatorError], with the tail of the log, if the program fails,
             and for an energy that it cannot be told of.
         """
+        if self.t1 is None or forces is not None:
+            return self._at_rest(tissue, energy, forces, torques)
+        if tissue.arcs is not None:
+            raise SimulatorError(
+                "T1 transitions by Surface Evolver are for straight edges: `t1=None`."
+            )
+        found, there, refused = self._at_rest(tissue, energy, None, None), tissue, set()
+        number = 0
+        while True:
+            there = eqx.tree_at(lambda t: t.vertices, there, found.vertices)
+            allowed = can_flip(there.topology)
+            allowed[list(refused)] = False
+            lengths = np.hypot(*Edges.of(there).vectors(found.vertices).T)
+            edge = shortest(lengths, self.t1, allowed)
+            if edge is None:
+                return found._replace(tissue=there, num_t1=number)
+            other = swapped(there, edge, 0.5 * self.t1, self._ask)
+            trial = None
+            if other is not None:
+                with suppress(SimulatorError):  # it comes to no rest that way
+                    trial = self._at_rest(other, energy, None, None)
+            # (The energy falls each time, so this ends.)
+            if trial is not None and trial.energy < found.energy - 1e-9 * abs(found.energy):
+                found, there, refused, number = trial, other, set(), number + 1
+            else:
+                refused.add(edge)
+
+    def _at_rest(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        forces: Float[np.ndarray, "vertices 2"] | None,
+        torques: Float[np.ndarray, " edges"] | None,
+    ) -> Relaxed:
+        """Where a tissue rests in its topology."""
         strings = Strings.of(tissue, self.pieces)
         terms = Terms.of(energy, strings.pieces.n_cells, len(strings.parts))
         given, held = terms, ()
@@ -135,6 +178,13 @@ class SurfaceEvolver(AbstractSimulator):
             # The box holds the area of the last cell, once it holds the others.
             targets, held = targets * _share(strings, terms), range(n - 1)
         return terms._replace(area_stiffness=np.zeros(n), area=targets), held
+
+    def _ask(self, text: str, commands: str) -> str:
+        """What the program writes, given a datafile and commands."""
+        command = [self.command, "-i", "-frelax.cmd", "tissue.fe"]
+        files = {"tissue.fe": text, "relax.cmd": commands}
+        found, _ = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
+        return found["result"]
 
     def _run(
         self, text: str, commands: str, strings: Strings
