@@ -5,11 +5,16 @@
 A random tissue relaxes against friction, first in T1 transitions and then slowly, in so many steps over five
 units of time. Printed are steps a second, the time of one step as a share of a whole relaxation from the
 same start, the time of a gradient (with respect to all target shape factors and the friction) as a share of
-the way forward, and what the gradient keeps in memory for each step, as XLA counts it.
+the way forward, and what the gradient keeps in memory for each step, as XLA counts it. And what explicit
+steps are: evaluations of the velocities a second (`vx.mechanics.velocities`; the steps of Diffrax with the
+explicit Euler method are one each, of which the rate is shown too), and the most units of time that they may
+cover in a second without becoming unstable, 2 ζ / λ with the largest eigenvalue λ of the Hessian, beside
+those of implicit steps as long as here.
 """
 
 import argparse
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,7 +31,10 @@ def main() -> None:
     parser.add_argument("--cells", type=int, nargs="+", default=[100, 1000])
     parser.add_argument("--steps", type=int, default=20)
     chosen = parser.parse_args()
-    print("cells  steps/s  step/relaxation  gradient/forward  kB a step  T1s")
+    print(
+        "cells  steps/s  step/relaxation  gradient/forward  kB a step  T1s  velocities/s  explicit steps/s  "
+        "time/s implicit  explicit"
+    )
     best = lambda *call: first_and_best(*call, repeats=3)[1]
     for n_cells in chosen.cells:
         tissue = vx.initialise.periodic_voronoi(n_cells=n_cells, key=0)
@@ -60,11 +68,41 @@ def main() -> None:
             sizes.append(analysis.temp_size_in_bytes if analysis else float("nan"))
         kept = (sizes[0] - sizes[1]) / (chosen.steps - chosen.steps // 2)
         num_t1 = movie(parameters, times).num_t1
+        explicit, velocity, stable = _explicit(movie(parameters, times).tissue, parameters, best)
         print(
             f"{n_cells:5d}  {1 / step:7.1f}  {step / rest:15.2f}  {back / step:16.2f}  {kept / 1e3:9.1f}  "
-            f"{num_t1:3d}",
+            f"{num_t1:3d}  {1 / velocity:12.0f}  {1 / explicit:16.0f}  "
+            f"{5 / chosen.steps / step:15.2f}  {stable / explicit:8.2f}",
             flush=True,
         )
+
+
+def _explicit(tissue, parameters, best, n_steps=100):
+    """Seconds of an explicit Euler step of Diffrax and of one velocity, and the longest stable step."""
+    energy = vx.energies.ShapeFactorEnergy(parameters[0])
+    friction = vx.dissipations.SubstrateFriction(parameters[1])
+    slope = jax.grad(lambda x: energy(tissue.with_vertices(x)))
+
+    @jax.jit
+    def stiffest(v):
+        push = lambda v: jax.jvp(slope, (tissue.vertices,), (v,))[1]
+        turn = lambda _, v: push(v) / jnp.linalg.norm(push(v))
+        return jnp.vdot(v := jax.lax.fori_loop(0, 200, turn, v), push(v))
+
+    start = jax.random.normal(jax.random.key(0), tissue.vertices.shape)
+    stable = float(2 * parameters[1] / stiffest(start / jnp.linalg.norm(start)))
+    dt = 0.5 * stable
+    at = lambda x: vx.mechanics.velocities(tissue.with_vertices(x), energy, friction, throw=False)
+
+    @jax.jit
+    def march(x):
+        term = diffrax.ODETerm(lambda t, x, args: at(x))
+        solution = diffrax.diffeqsolve(
+            term, diffrax.Euler(), 0.0, n_steps * dt, dt, x, max_steps=n_steps + 1
+        )
+        return solution.ys
+
+    return best(march, tissue.vertices) / n_steps, best(jax.jit(at), tissue.vertices), stable
 
 
 if __name__ == "__main__":

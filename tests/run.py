@@ -31,7 +31,7 @@ TOGETHER = (
     ("fitting",),
     ("adjoints", "responses/test_external.py", "responses/test_evolver.py"),
     ("responses",),
-    ("responses/test_evolution.py", "activities"),
+    ("responses/test_evolution.py", "responses/test_long_runs.py", "activities"),
     ("responses/test_free_equilibrium.py", "responses/test_relaxation.py"),
     ("experiments",),
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),

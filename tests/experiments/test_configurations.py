@@ -26,6 +26,12 @@ SHORT = {
         "scaling.sizes=[8]",
         "scaling.epochs=1",
     ],
+    "cell_diffusion": [
+        "shape_factors=[3.4, 3.9]",
+        "speeds=[0.5]",
+        "tissue.n_cells=9",
+        "duration=5",
+    ],
     "compare_conditions": [
         "images=1",
         "tissue.n_cells=49",
@@ -54,6 +60,14 @@ SHORT = {
         "fit.epochs=2",
         f"methods={ONE_METHOD}",
     ],
+    "movement_checks": [
+        "tissue.n_cells=9",
+        "quenched.n_cells=9",
+        "halvings=2",
+        "noise_steps=100",
+        "tolerances=[1e-2, 1e-3]",
+    ],
+    "oscillatory_shear": ["frequencies=[1, 10]", "steps=8", "cycles=1", "n_cells=0"],
     "paper_benchmark": ["tissue.n_cells=6", "fit.epochs=2"],
     "rigidity_transition": [
         "shape_factors=[3.4, 4.1]",
@@ -70,6 +84,7 @@ SHORT = {
         "fit.epochs=2",
     ],
     "tensions_from_movie": ["substeps=10", "cluster.n_cells=7", "cluster.frames=3"],
+    "timed_elongation": ["n_cells=5", "frames=3", "substeps=1", "knots=2", "fit.epochs=2"],
     "tissue_moduli": ["shape_factors=[3.5, 3.7]", "replicates=2", "tissue.n_cells=9"],
 }
 

@@ -121,7 +121,7 @@ def test_a_killed_fit_goes_on_from_its_last_checkpoint(path):
 
 def test_a_short_fit_is_written_once(path, monkeypatch):
     written = []
-    monkeypatch.setattr("vertax.fitting._checkpoint._save", lambda *_: written.append(1))
+    monkeypatch.setattr("vertax._base.checkpoints._save", lambda *_: written.append(1))
     run("adam", checkpoint=path)
     assert len(written) == 1
 

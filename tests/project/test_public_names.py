@@ -24,7 +24,7 @@ FAMILIES = {
     "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
     "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts "
-    "fit limits member stack stack_fits uncertainty",
+    "fit for_each limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow",
     "inference": "EdgeMotion InferredTensions Micrograph Microscope MovingTensions PinnedEnergy "
     "RecoveryWatch Scene Transition fit_onset fit_transition foam_energy foam_terms "
@@ -39,14 +39,14 @@ FAMILIES = {
     "mechanics": "BoxRelaxation Modes Ramp SelfStress bulk_modulus cell_stress compatibility "
     "complex_modulus deformed density_of_states elastic_tensor modes pressures "
     "principal pure_shear ramp recoil self_stresses shear_modulus simple_shear "
-    "spectrum stress tensions youngs_modulus zero_modes",
+    "spectrum stress tensions velocities youngs_modulus zero_modes",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
     "plot_mode plot_moduli plot_recovery plot_stress plot_tissue plot_tissues "
     "same_limits scale_bar series_colours",
     "responses": "AbstractResponse AbstractSimulator Edges Equilibrium Evolution Evolved External "
-    "Ledger Material Relaxation Relaxed SimulatorError SurfaceEvolver Trajectory "
+    "Ledger Material Relaxation Relaxed SimulatorError StepControl SurfaceEvolver Trajectory "
     "equilibrate evolve record_relaxation run_program",
     "solvers": "AbstractSolver FIRE GradientDescent LBFGS MINRES NewtonCG Optax Wrapped",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",

@@ -22,6 +22,7 @@ from vertax.adjoints._adjoint import (
     settle,
 )
 from vertax.solvers import MINRES
+from vertax.solvers._elastic_minres import ElasticMINRES
 
 
 class ImplicitDifferentiation(AbstractAdjoint):
@@ -68,9 +69,14 @@ class ImplicitDifferentiation(AbstractAdjoint):
         inputs: PyTree,
         tags: frozenset[object],
     ) -> PyTree[Any]:
-        root, residual = frozen(Minimisation.of(primal_fn, inputs)).run()
+        minimisation = frozen(Minimisation.of(primal_fn, inputs))
+        root, residual = minimisation.run()
         root, residual = frozen(root), jax.tree.map(eqxi.nondifferentiable_backward, residual)
         adjoint = cast(ImplicitDifferentiation, self.without_outcome())
+        waves = minimisation.options.get("long_waves")
+        if waves is not None and isinstance(self.linear_solver, MINRES):
+            solver = ElasticMINRES(self.linear_solver, waves, minimisation.options["stiffness"])
+            adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
         system = _System(adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag})
         if self.outcome is None:
             return _follow(inputs, root, system), residual

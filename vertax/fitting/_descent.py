@@ -13,8 +13,9 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from vertax._base.checkpoints import without_addresses
 from vertax._base.modules import choose
-from vertax.fitting._checkpoint import without_addresses
+from vertax.fitting._batch import over_members
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
@@ -110,7 +111,7 @@ def _start(
         best = unbeaten(problem, parameters)
         return State(parameters, optimiser.init(fitted), problem.tissue, best, jnp.array(True))
 
-    return (eqx.filter_vmap(start) if batched else start)(problem, parameters)
+    return (over_members(start, problem) if batched else start)(problem, parameters)
 
 
 @eqx.filter_jit
@@ -165,7 +166,7 @@ def _epoch(
         return choose(going, moved, eqx.tree_at(lambda s: s.going, state, going)), record
 
     arguments = (problem, constants, true, state)
-    return (eqx.filter_vmap(one) if batched else one)(*arguments)
+    return (over_members(one, problem) if batched else one)(*arguments)
 
 
 def _record(

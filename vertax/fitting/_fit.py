@@ -17,10 +17,18 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Int, PyTree
 from tqdm import tqdm
 
+from vertax._base.checkpoints import (
+    Checkpoint,
+    Keeper,
+    Progress,
+    Row,
+    columns_of,
+    digest,
+    without_addresses,
+)
 from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._arguments import check_arguments
-from vertax.fitting._checkpoint import Checkpoint, Keeper, Progress, Row, columns_of, identity_of
 from vertax.fitting._descent import Descent
 from vertax.fitting._epoch import AbstractMethod
 from vertax.fitting._history import Fit, FitError, History, Record
@@ -125,9 +133,7 @@ def fit(
         method = LeastSquares(optimiser, problem, parameters, constants, true, batched)
     else:
         method = Descent(optimiser, problem, parameters, constants, true, batched, guidance)
-    if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
-        checkpoint = Checkpoint(checkpoint)
-    keeper = Keeper(checkpoint, lambda: identity_of(given, true, method.description(), batched))
+    keeper = Keeper(checkpoint, lambda: _identity_of(given, true, method.description(), batched))
     done, stopped, interrupted = _run(method, keeper, epochs, progress, callback)
     complaint = given.response.complaint()
     if stopped is not None and complaint is not None:
@@ -177,6 +183,17 @@ def _with_numbers_as_data(
     )
     old = dataclasses.replace(problem, trainable=fitted)
     return jax.tree.map(spread, data, old)
+
+
+def _identity_of(problem: PyTree, truth: PyTree, optimiser: str, batched: bool) -> dict[str, str]:
+    """What makes a fit another one than others, by what it is called in messages."""
+    layout = eqx.tree_pformat((problem, truth), short_arrays=True, width=100)
+    return {
+        "problem (sizes, classes or settings)": without_addresses(layout),
+        "problem (numbers in its arrays)": digest((problem, truth)),
+        "optimiser": optimiser,
+        "setting of `batched`": str(batched),
+    }
 
 
 def _check_batch(tree: PyTree) -> None:

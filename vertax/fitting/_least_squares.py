@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.checkpoints import without_addresses
 from vertax._base.modules import choose
 from vertax.adjoints import ImplicitDifferentiation
-from vertax.fitting._checkpoint import without_addresses
+from vertax.fitting._batch import over_members
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
@@ -196,7 +197,7 @@ def _start(
         return State(fitted, leaves, *tissues, facts, scale, best, still, going)
 
     arguments = (problem, constants, true, parameters)
-    return (eqx.filter_vmap(start) if batched else start)(*arguments)
+    return (over_members(start, problem) if batched else start)(*arguments)
 
 
 @eqx.filter_jit
@@ -228,7 +229,7 @@ def _epoch(
         return state, _record(state)
 
     arguments = (problem, constants, true, state)
-    return (eqx.filter_vmap(one) if batched else one)(*arguments)
+    return (over_members(one, problem) if batched else one)(*arguments)
 
 
 def _record(state: State) -> Record:

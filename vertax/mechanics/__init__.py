@@ -23,7 +23,7 @@ from vertax.mechanics._ramp import (
     ramp as ramp,
     simple_shear as simple_shear,
 )
-from vertax.mechanics._recoil import recoil as recoil
+from vertax.mechanics._recoil import recoil as recoil, velocities as velocities
 from vertax.mechanics._self_stress import (
     SelfStress as SelfStress,
     compatibility as compatibility,

@@ -1,4 +1,4 @@
-"""Recoil after an edge is cut."""
+"""How fast vertices move now: of their own, and after an edge is cut."""
 
 from __future__ import annotations
 
@@ -16,6 +16,60 @@ from vertax.mechanics._forces import tensions
 from vertax.mechanics._landscape import checked, dissipation_landscape, solve
 from vertax.mesh import Tissue
 from vertax.solvers import MINRES
+
+
+def velocities(
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    dissipation: AbstractDissipation,
+    *,
+    linear_solver: lx.AbstractLinearSolver | None = None,
+    throw: bool = True,
+) -> Float[Array, "vertices 2"]:
+    r"""Velocities of vertices, $\Gamma\,\dot x = - \nabla_X E$ with the matrix $\Gamma$ of the dissipation.
+
+    This is what [`evolve`][vertax.evolve] integrates, in a fixed topology: the right-hand side of an ordinary
+    differential equation for any other solver, such as those of Diffrax.
+
+    ```python
+    move = lambda t, x, args: vx.mechanics.velocities(tissue.with_vertices(x), energy, friction)
+    diffrax.diffeqsolve(diffrax.ODETerm(move), diffrax.Tsit5(), 0, 1, 0.01, tissue.vertices)
+    ```
+
+    **Arguments:**
+
+    - `tissue`: where it is.
+    - `energy`: what pulls.
+    - `dissipation`: what resists.
+    - `linear_solver`: for systems with $\Gamma$, [`MINRES`][vertax.MINRES] by default. Motions that nothing
+        resists do not take place.
+    - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
+
+    **Returns:** velocities, length per time. (Those of the angles of arcs are solved for, but not
+    returned.)
+
+    **Raises:**
+
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
+    """
+    solver = MINRES() if linear_solver is None else linear_solver
+    found = _velocities(*traced((tissue, energy, dissipation)), solver)
+    return checked(found, _REASON) if throw else found
+
+
+@eqx.filter_jit
+def _velocities(
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    dissipation: AbstractDissipation,
+    solver: lx.AbstractLinearSolver,
+) -> Float[Array, "vertices 2"]:
+    pulls = jax.grad(lambda configuration: energy(tissue.with_configuration(configuration)))
+    forces = jax.tree.map(jnp.negative, pulls(tissue.configuration))
+    resistance = dissipation_landscape(tissue, dissipation).curvature()
+    still = jnp.zeros((2, 2), tissue.vertices.dtype)
+    velocity = solve(lambda v: resistance((still, v))[1], forces, solver)
+    return velocity if tissue.arcs is None else velocity[0]
 
 
 def recoil(
@@ -61,8 +115,8 @@ def recoil(
             )
     solver = MINRES() if linear_solver is None else linear_solver
     tissue, energy, dissipation = traced((tissue, energy, dissipation))
-    velocities = _recoil(tissue, energy, jnp.asarray(edge), dissipation, solver)
-    return checked(velocities, _REASON) if throw else velocities
+    found = _recoil(tissue, energy, jnp.asarray(edge), dissipation, solver)
+    return checked(found, _REASON) if throw else found
 
 
 @eqx.filter_jit
@@ -75,18 +129,21 @@ def _recoil(
 ) -> Float[Array, "vertices 2"]:
     tension = tensions(tissue, energy)[edge]
 
-    def after(configuration: Array) -> Float[Array, ""]:
-        there = tissue.with_configuration(configuration)
-        return energy(there) - tension * there.edge_lengths[edge]
+    return _velocities(tissue, _Without(energy, edge, tension), dissipation, solver)
 
-    released = jax.tree.map(jnp.negative, jax.grad(after)(tissue.configuration))
-    resistance = dissipation_landscape(tissue, dissipation).curvature()
-    still = jnp.zeros((2, 2), tissue.vertices.dtype)
-    velocity = solve(lambda v: resistance((still, v))[1], released, solver)
-    return velocity if tissue.arcs is None else velocity[0]
+
+class _Without(AbstractEnergy):
+    """An energy without the tension that an edge has now."""
+
+    energy: AbstractEnergy
+    edge: Int[Array, ""]
+    tension: Float[Array, ""]
+
+    def __call__(self, tissue: Tissue) -> Float[Array, ""]:
+        return self.energy(tissue) - self.tension * tissue.edge_lengths[self.edge]
 
 
 _REASON = (
-    "The recoil is not known: the linear solve with the dissipation failed. Give another `linear_solver`, "
-    "add some friction, or pass throw=False to get NaN."
+    "The velocities are not known: the linear solve with the dissipation failed. Give another "
+    "`linear_solver`, add some friction, or pass throw=False to get NaN."
 )

@@ -19,4 +19,5 @@ from vertax.responses._simulator import (
     Relaxed as Relaxed,
     SimulatorError as SimulatorError,
 )
+from vertax.responses._step_control import StepControl as StepControl
 from vertax.responses._trajectory import Trajectory as Trajectory

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,24 +11,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
+from vertax._base.checkpoints import Checkpoint
 from vertax._base.checks import as_key, check_whole, increasing, named
 from vertax._base.memory_maps import spare_memory_maps
 from vertax._base.modules import is_concrete, traced
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
-from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import cell_size
-from vertax.mesh import AbstractBoundary, Periodic, Tissue
+from vertax.mesh import AbstractBoundary, Tissue
 from vertax.responses._evolved import Evolved
+from vertax.responses._long_run import evolve_by_frames
+from vertax.responses._marching import evolve_at_once
 from vertax.responses._material import Material
 from vertax.responses._relaxation import Relaxation
-from vertax.responses._response import AbstractResponse, Equilibrium
-from vertax.responses._step import Incremental
+from vertax.responses._response import AbstractResponse
+from vertax.responses._step_control import StepControl
 
 
 class Evolution(AbstractResponse):
@@ -50,6 +52,8 @@ class Evolution(AbstractResponse):
     - `key`: for the random numbers of the activity, a key or a seed. Steps draw from it one after the other.
     - `drive`: in place of a key, that of an [`Evolved`][vertax.responses.Evolved] which is to go on.
     - `substeps`: steps from one frame to the next.
+    - `control`: in place of `substeps`, [`StepControl`][vertax.responses.StepControl]: as many steps as a
+        tolerance of their error asks for.
     - `order`: 1, or 2 for two stages a step (an SDIRK method, which is stable for every step, but of which
         the energy may rise). The dissipation must be a sum of squares for that.
     - `boundary`: a function of time that returns the space at that time, such as a box that is sheared; the
@@ -71,6 +75,7 @@ class Evolution(AbstractResponse):
     key: PRNGKeyArray | None
     drive: PyTree[Array]
     substeps: int = eqx.field(static=True)
+    control: StepControl | None
     order: int = eqx.field(static=True)
     boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None
     pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None
@@ -85,6 +90,7 @@ class Evolution(AbstractResponse):
         key: PRNGKeyArray | int | None = None,
         drive: PyTree[Array] = None,
         substeps: int = 1,
+        control: StepControl | None = None,
         order: int = 1,
         boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None = None,
         pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None = None,
@@ -126,7 +132,22 @@ class Evolution(AbstractResponse):
                 "Argument `order` can be 2 only for a dissipation that is half a sum of squares, an "
                 f"AbstractViscosity, which {type(dissipation).__name__} is not."
             )
-        self.dissipation = dissipation
+        if not isinstance(control, StepControl | None):
+            raise TypeError(
+                "Argument `control` must be a vertax.responses.StepControl, e.g. StepControl(1e-3), but is "
+                f"{named(control)}."
+            )
+        if control is not None and (substeps != 1 or activity is not None):
+            wrong = "`substeps`" if activity is None else "`activity`"
+            raise ValueError(
+                f"Argument `control` does not go with {wrong}: "
+                + (
+                    "it says itself how many steps there are."
+                    if activity is None
+                    else "random numbers must not depend on which steps are refused. Take `substeps`."
+                )
+            )
+        self.dissipation, self.control = dissipation, control
         self.times = increasing(times)
         self.substeps, self.order = substeps, order
         self.boundary, self.pins = boundary, pins
@@ -138,6 +159,8 @@ class Evolution(AbstractResponse):
         *,
         adjoint: AbstractAdjoint | None = None,
         throw: bool = True,
+        progress: bool = False,
+        checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
     ) -> Evolved:
         """Let a tissue move.
 
@@ -155,8 +178,11 @@ class Evolution(AbstractResponse):
         response._check(tissue)
         response._check_drive(tissue)
         spare_memory_maps()
-        response = response.traced()
-        evolved = _evolve(*traced((tissue, energy)), response, adjoint)
+        given = (*traced((tissue, energy)), response.traced(), adjoint)
+        if progress or checkpoint is not None:
+            evolved = evolve_by_frames(*given, checkpoint, progress=progress, throw=throw)
+        else:
+            evolved = evolve_at_once(*given)
         return evolved.checked() if throw else evolved
 
     def goes_with(
@@ -197,8 +223,8 @@ class Evolution(AbstractResponse):
 
     def traced(self) -> Evolution:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""
-        new = (traced(self.dissipation), traced(self.activity), self.relaxation.traced())
-        parts = lambda e: (e.dissipation, e.activity, e.relaxation)
+        new = (*traced((self.dissipation, self.activity, self.control)), self.relaxation.traced())
+        parts = lambda e: (e.dissipation, e.activity, e.control, e.relaxation)
         return eqx.tree_at(parts, self, new, is_leaf=lambda x: x is None)
 
     def finer(self, tolerance: Float[Array, ""]) -> Evolution:
@@ -254,6 +280,8 @@ def evolve(
     *,
     adjoint: AbstractAdjoint | None = None,
     throw: bool = True,
+    progress: bool = False,
+    checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
     **settings: Any,
 ) -> Evolved:
     r"""Let a tissue move in time, overdamped: $\partial R / \partial \dot x = - \partial E / \partial x$.
@@ -279,143 +307,26 @@ def evolve(
     - `adjoint`: how to differentiate each step, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation]
         by default.
     - `throw`: raise an error if a step finds no end. If False, look at `converged`.
+    - `progress`: show a progress bar (only on a terminal).
+    - `checkpoint`: a file, or a [`Checkpoint`][vertax.Checkpoint], to write down the frames so far, and to go
+        on from if it is there, to the same bits as if it had not stopped. With either of these two each frame
+        is a call of its own of a compiled function, which is no part of a larger one.
     - `settings`: those of [`Evolution`][vertax.Evolution], whose convenient form this is: `activity`, `key`,
-        `drive`, `substeps`, `order`, `boundary`, `pins`, `relaxation`.
+        `drive`, `substeps`, `control`, `order`, `boundary`, `pins`, `relaxation`.
 
     **Returns:** an [`Evolved`][vertax.responses.Evolved]: `tissue` at the end, and `frames`.
 
     **Raises:**
 
     - `TypeError` for arguments of the wrong kind.
-    - `ValueError` for times that do not increase, or a dissipation that leaves vertices without any
-        resistance, which are named.
+    - `ValueError` for times that do not increase, a dissipation that leaves vertices without any
+        resistance, which are named, or a checkpoint that is broken or of another movement.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a step did not converge, or cells overlap.
     """
-    return Evolution(dissipation, times, **settings)(tissue, energy, adjoint=adjoint, throw=throw)
-
-
-class _State(eqx.Module):
-    """How far an evolution has come."""
-
-    tissue: Tissue
-    drive: PyTree[Array]
-    max_force: Float[Array, ""]
-    num_steps: Int[Array, ""]
-    num_t1: Int[Array, ""]
-    valid: Bool[Array, ""]
-    arrived: Bool[Array, ""]
-
-    def after(self, step: Equilibrium) -> _State:
-        """What is known when one more step is done."""
-        return _State(
-            step.tissue,
-            self.drive,
-            jnp.maximum(self.max_force, frozen(step.max_force)),
-            self.num_steps + step.num_steps,
-            self.num_t1 + step.num_t1,
-            self.valid & step.valid & _right_handed(step.tissue.boundary),
-            self.arrived & (step.result == optx.RESULTS.successful),
-        )
-
-    @property
-    def result(self) -> optx.RESULTS:
-        """The outcome of all steps."""
-        reached = optx.RESULTS.where(
-            self.arrived, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
-        )
-        return optx.RESULTS.where(jnp.isfinite(self.max_force), reached, optx.RESULTS.nonfinite)
-
-
-# Of a method of second order with two stages of this share of a step each (SDIRK: Alexander 1977,
-# doi:10.1137/0714068), which damps what is fast as the implicit Euler method does.
-_SHARE = 1 - 0.5**0.5
-
-
-@eqx.filter_jit
-def _evolve(tissue: Tissue, energy: Any, evolution: Evolution, adjoint: AbstractAdjoint) -> Evolved:
-    times = evolution.times.astype(tissue.vertices.dtype)
-
-    def energy_at(time: Any) -> AbstractEnergy:
-        found = energy if isinstance(energy, AbstractEnergy) else energy(time)
-        if not isinstance(found, AbstractEnergy):
-            raise TypeError(
-                "Argument `energy` must be an energy, or a function of time that returns one, but returned "
-                f"{named(found)}."
-            )
-        return found
-
-    def stage(
-        state: _State, before: Tissue, acts: Any, start: Any, end: Any, strained: Any
-    ) -> _State:
-        """A relaxation of the energy at the end, and what the way there from `before` dissipates."""
-        there = evolution.placed(state.tissue, end)
-        pulls = energy_at(end) if acts is None else energy_at(end) + acts
-        potential = Incremental(pulls, evolution.dissipation, before, end - start, strained)
-        return state.after(evolution.relaxation.solve(there, potential, adjoint, thrifty=True))
-
-    def step(state: _State, start: Any, end: Any) -> _State:
-        before, acts, dt = state.tissue, None, end - start
-        if evolution.activity is not None:
-            inner, key = state.drive
-            key, now = jax.random.split(key)
-            acts, inner = evolution.activity.drive(
-                inner, before, evolution.dissipation, start, dt, now
-            )
-            state = eqx.tree_at(lambda s: s.drive, state, (inner, key))
-        if evolution.order == 1:
-            return stage(state, before, acts, start, end, None)
-        middle = stage(state, before, acts, start, start + _SHARE * dt, None)
-        assert isinstance(evolution.dissipation, AbstractViscosity)
-        strained = evolution.dissipation.strains(middle.tissue, before) * (1 - _SHARE) / _SHARE
-        return stage(middle, before, acts, end - _SHARE * dt, end, strained)
-
-    def interval(arrays: _State, ends: tuple[Array, Array]) -> tuple[_State, tuple]:
-        shares = jnp.linspace(0, 1, evolution.substeps + 1, dtype=times.dtype)
-        marks = ends[0] + shares * (ends[1] - ends[0])
-
-        def substep(arrays: _State, ends: tuple[Array, Array]) -> tuple[_State, None]:
-            return eqx.filter(step(whole(arrays), *ends), eqx.is_array), None
-
-        before = arrays.num_t1
-        arrays, _ = jax.lax.scan(substep, arrays, (marks[:-1], marks[1:]))
-        tissue = whole(arrays).tissue
-        sound = arrays.arrived & arrays.valid
-        frame = (arrays.tissue, energy_at(ends[1])(tissue), arrays.num_t1 - before, sound)
-        return arrays, frame
-
-    yes, none = jnp.array(True), jnp.array(0)
-    drive = evolution.drive
-    if drive is None and evolution.activity is not None:
-        assert evolution.key is not None
-        first, rest = jax.random.split(evolution.key)
-        drive = (evolution.activity.init(tissue, first), rest)
-    begin = _State(tissue, drive, jnp.zeros((), times.dtype), none, none, yes, yes)
-    arrays, static = eqx.partition(begin, eqx.is_array)
-    whole = lambda arrays: eqx.combine(arrays, static)
-    end, (frames, energies, flips, sound) = jax.lax.scan(interval, arrays, (times[:-1], times[1:]))
-    join = lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest])
-    end = whole(end)
-    energies = join(energy_at(times[0])(tissue), energies)
-    return Evolved(
-        tissue=end.tissue,
-        energy=energies[-1],
-        max_force=end.max_force,
-        num_steps=end.num_steps,
-        num_t1=end.num_t1,
-        valid=end.valid,
-        result=end.result,
-        times=times,
-        frames=eqx.combine(jax.tree.map(join, arrays.tissue, frames), static.tissue),
-        energies=energies,
-        transitions=join(none, flips),
-        drive=end.drive,
-        sound=join(yes, sound),
+    evolution = Evolution(dissipation, times, **settings)
+    return evolution(
+        tissue, energy, adjoint=adjoint, throw=throw, progress=progress, checkpoint=checkpoint
     )
-
-
-def _right_handed(boundary: AbstractBoundary) -> Bool[Array, ""]:
-    """Whether a box that depends on time has not folded over."""
-    return boundary.area > 0 if isinstance(boundary, Periodic) else jnp.array(True)
 
 
 @eqx.filter_jit

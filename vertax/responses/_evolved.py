@@ -38,6 +38,10 @@ class Evolved(Equilibrium):
     goes on as if it had not stopped, to rounding. None without an activity."""
     sound: Bool[Array, "*batch times"]
     """Whether all steps up to a frame came to an end, in tissues without overlaps."""
+    steps: Float[Array, "*batch times steps"]
+    """Lengths in time of the steps to each frame from the one before; 0 where there were no more."""
+    refused: Int[Array, "*batch times"]
+    """How many more were tried and were too long, see [`StepControl`][vertax.responses.StepControl]."""
 
     @property
     def flipped(self) -> Bool[Array, "*batch times edges"]:
@@ -105,6 +109,6 @@ def _is_key(x: Any) -> bool:
 
 
 _REMEDY = (
-    "Take shorter steps (more `substeps`), raise `max_steps` of its relaxation or loosen its `tolerance`, or "
-    "pass throw=False and look at `sound`."
+    "Take shorter steps (more `substeps`, or a greater `most` of their control), raise `max_steps` of its "
+    "relaxation or loosen its `tolerance`, or pass throw=False and look at `sound`."
 )

@@ -94,6 +94,11 @@ class AbstractResponse(eqx.Module):
         """Whether the next epoch of a fit may begin where this one ended, as it may at rest."""
         return True
 
+    @property
+    def side_by_side(self) -> bool:
+        """Whether many answer sooner together than one after another, whatever the device."""
+        return False
+
     @abc.abstractmethod
     def __call__(
         self,

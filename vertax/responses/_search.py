@@ -14,6 +14,7 @@ from vertax._base.modules import choose
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.responses._contact import Contacts, no_contacts
+from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._patience import Patient, PatientState
 from vertax.transitions import AbstractTransitions
 
@@ -120,10 +121,11 @@ class Search(eqx.Module):
         """A step of the minimiser (not the first time), then transitions."""
         before = state.tissue
         args = (before, energy, state.contacts)
+        options = self.options | {"long_waves": LongWaves.of(before)}
 
         def step() -> tuple[PyTree, PatientState]:
             y, new, _ = self.minimiser.step(
-                objective, before.configuration, args, self.options, state.minimiser, _TAGS
+                objective, before.configuration, args, options, state.minimiser, _TAGS
             )
             return y, new
 

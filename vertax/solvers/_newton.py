@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
+from vertax.solvers._long_waves import LongWaves, Medium
 from vertax.solvers._solver import AbstractSolver, Rows, value_and_gradient
 
 
@@ -129,8 +130,10 @@ class NewtonCG(AbstractSolver):
         stiffness = options.get("stiffness", 1.0)
         # Forces are measured in that which moves a vertex by the length scale.
         force = stiffness * options.get("length_scale", 1.0)
-        forcing = jnp.minimum(0.1, jnp.sqrt(tree.norm(g) / force))
+        forcing = jnp.minimum(_COARSEST, jnp.sqrt(tree.norm(g) / force))
         zero = tree.zeros_like(g)
+        # Far from rest steps are short, and what is soft may have negative curvature.
+        waves = _Waves.of(options, hessian, g, forcing < _COARSEST)
 
         def residual(p: PyTree, hp: PyTree, shift: Rows) -> tuple[PyTree, PyTree]:
             """What is left of the gradient, and the same preconditioned."""
@@ -138,7 +141,8 @@ class NewtonCG(AbstractSolver):
             return r, _preconditioned(r, shift)
 
         def _preconditioned(r: PyTree, shift: Rows) -> PyTree:
-            return jax.tree.map(lambda r, s: _times(1 / (stiffness + s), r), r, shift)
+            near = jax.tree.map(lambda r, s: _times(1 / (stiffness + s), r), r, shift)
+            return near if waves is None else waves.added(near, r, shift)
 
         first = jax.tree.map(lambda g, radius: _size(g) / radius, g, radii)
         r, z = residual(zero, zero, first)
@@ -195,6 +199,39 @@ class NewtonCG(AbstractSolver):
 
 
 _ROUNDS = 8
+# How far conjugate gradients go at least.
+_COARSEST = 0.1
+
+
+class _Waves(eqx.Module):
+    """The long waves of a large tissue, where they are of use."""
+
+    medium: Medium
+    stiffness: Float[Array, ""]
+    used: Bool[Array, ""]
+
+    @classmethod
+    def of(
+        cls, options: dict[str, Any], hessian: Any, like: PyTree, used: Bool[Array, ""]
+    ) -> _Waves | None:
+        waves: LongWaves | None = options.get("long_waves")
+        if waves is None:
+            return None
+        stiffness = options["stiffness"]
+        fitted = lambda: waves.fitted(hessian, like, waves.floor(stiffness))
+        nothing = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), eqx.filter_eval_shape(fitted))
+        return cls(jax.lax.cond(used, fitted, lambda: nothing), stiffness, used)
+
+    def added(self, near: PyTree, r: PyTree, shift: Rows) -> PyTree:
+        """A residual that was preconditioned near by, and its long waves."""
+        (first, *rest), structure = jax.tree.flatten(near)
+        # A place that is held tightly must not hold all others.
+        held = jnp.mean(jnp.minimum(jax.tree.leaves(shift)[0], self.stiffness))
+        forces = jax.tree.leaves(r)[0]
+        first = jax.lax.cond(
+            self.used, lambda: first + self.medium.yields(forces, held), lambda: first
+        )
+        return jax.tree.unflatten(structure, [first, *rest])
 
 
 def _dot(a: PyTree, b: PyTree) -> Float[Array, ""]:

@@ -1,4 +1,4 @@
-"""A fit in the middle of its way, in a file."""
+"""What takes long, in the middle of its way, in a file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Row = Mapping[str, Any]
 
 
 class Checkpoint(eqx.Module):
-    """Where, and how often, [`fit`][vertax.fit] writes down how far it has come.
+    """Where, and how often, [`fit`][vertax.fit] or [`evolve`][vertax.evolve] writes how far it has come.
 
     ```python
     fit = vx.fit(problem, optax.adam(1e-2), epochs=5000, checkpoint="fit.npz")
@@ -34,18 +34,18 @@ class Checkpoint(eqx.Module):
 
     If the file is there, the same call goes on from it, and ends at the same numbers, bit for bit on one
     machine, as if it had never stopped; a fit that has come to its end is not repeated. Delete the file to
-    start anew. A greater number of `epochs` continues a fit that is done.
+    start anew. A greater number of `epochs` continues a fit that is done, and further `times` a movement.
 
-    The file is a NumPy `.npz` archive without pickles: the state of the optimiser, the parameters, the
-    tissue, the best point so far and the history. It is written at the end of the fit, at an
-    interrupt from the keyboard, and between epochs, atomically: a process that is killed while it writes
-    leaves the last one.
+    The file is a NumPy `.npz` archive without pickles: of a fit the state of the optimiser, the parameters,
+    the tissue, the best point so far and the history; of a movement all frames, and the state that the next
+    one begins with. It is written at the end, at an interrupt from the keyboard, and between epochs or
+    frames, atomically: a process that is killed while it writes leaves the last one.
 
     **Arguments:**
 
     - `path`: the file, by custom with the ending `.npz`.
-    - `every`: least number of seconds from one to the next; 0 is after each epoch, unless writing takes
-        more than 2 % of the time.
+    - `every`: least number of seconds from one to the next; 0 is after each epoch or frame, unless writing
+        takes more than 2 % of the time.
 
     **Raises:**
 
@@ -61,7 +61,7 @@ class Checkpoint(eqx.Module):
 
 
 class Progress(NamedTuple):
-    """How far a fit has come: a new one after each epoch, so that an interrupt finds a whole one."""
+    """How far it has come: a new one after each epoch or frame, so that an interrupt finds a whole one."""
 
     state: PyTree
     rows: tuple[Row, ...] = ()
@@ -69,16 +69,25 @@ class Progress(NamedTuple):
 
 
 class Keeper:
-    """Reads and writes the checkpoints of one fit.
+    """Reads and writes the checkpoints of one fit, or of one movement in time.
 
     **Arguments:**
 
-    - `checkpoint`: where and how often; None for not at all.
-    - `identity`: what makes this fit another one than others, see `identity_of`; only called if there
-        is something to read or to write.
+    - `checkpoint`: where and how often, a path or a `Checkpoint`; None for not at all.
+    - `identity`: what makes this one another than others, by what it is called in messages; only called if
+        there is something to read or to write.
+    - `what`: what messages call it.
     """
 
-    def __init__(self, checkpoint: Checkpoint | None, identity: Callable[[], dict[str, str]]):
+    def __init__(
+        self,
+        checkpoint: str | os.PathLike[str] | Checkpoint | None,
+        identity: Callable[[], dict[str, str]],
+        what: str = "fit",
+    ):
+        if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
+            checkpoint = Checkpoint(checkpoint)
+        self._what = what
         if checkpoint is not None and not checkpoint.path.absolute().parent.is_dir():
             # Said now, and not when hours of work are to be written.
             raise FileNotFoundError(
@@ -93,7 +102,7 @@ class Keeper:
         """The progress in the file, or that of a fit which starts now."""
         if self._checkpoint is None or not self._checkpoint.path.exists():
             return Progress(start)
-        return _load(self._checkpoint.path, self._identity, start)
+        return _load(self._checkpoint.path, self._identity, start, self._what)
 
     def note(self, progress: Progress) -> None:
         """Write it, if it is time to."""
@@ -110,23 +119,13 @@ class Keeper:
             _save(self._checkpoint.path, self._identity, progress)
 
 
-def identity_of(problem: PyTree, truth: PyTree, optimiser: str, batched: bool) -> dict[str, str]:
-    """What makes a fit another one than others, by what it is called in messages."""
-    layout = eqx.tree_pformat((problem, truth), short_arrays=True, width=100)
-    return {
-        "problem (sizes, classes or settings)": without_addresses(layout),
-        "problem (numbers in its arrays)": _digest((problem, truth)),
-        "optimiser": optimiser,
-        "setting of `batched`": str(batched),
-    }
-
-
 def without_addresses(text: str) -> str:
     """A text in which no address of an object in memory is left, so that two processes write the same."""
     return re.sub(r" at 0x[0-9a-f]+", "", text)
 
 
-def _digest(tree: PyTree) -> str:
+def digest(tree: PyTree) -> str:
+    """A number that tells the arrays of one pytree from those of another."""
     numbers = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
         if eqx.is_array_like(leaf):
@@ -146,29 +145,28 @@ def _save(path: Path, identity: Mapping[str, str], progress: Progress) -> None:
     write_archive(path, "checkpoint", _VERSION, arrays)
 
 
-def _load(path: Path, identity: Mapping[str, str], start: PyTree) -> Progress:
-    name = os.fspath(path)
+def _load(path: Path, identity: Mapping[str, str], start: PyTree, what: str) -> Progress:
+    name, remedy = os.fspath(path), f"Delete the file to start this {what} anew."
     try:
         arrays = read_archive(path, "checkpoint", _VERSION)
     except ValueError as error:
-        raise ValueError(f"{error} {_REMEDY}") from error
-    _check_identity(name, str(arrays.get("identity", "{}")), identity)
+        raise ValueError(f"{error} {remedy}") from error
+    _check_identity(name, str(arrays.get("identity", "{}")), identity, what, remedy)
     n = arrays.get("epochs", np.asarray(-1))
     rows, notes = (_rows(arrays, prefix) for prefix in ("row_", "note_"))
     fresh = _arrays(start)
     stored = [arrays.get(f"state_{i}", np.zeros(0, bool)) for i in range(len(fresh))]
     if n.shape or n != len(rows) or len(notes) not in (0, n) or not all(map(_alike, stored, fresh)):
-        raise ValueError(f"{name} is broken: its state does not go with the fit. {_REMEDY}")
+        raise ValueError(f"{name} is broken: its state does not go with the {what}. {remedy}")
     restored = [_restored(x, like, name) for x, like in zip(stored, fresh, strict=True)]
     dynamic, static = eqx.partition(start, eqx.is_array)
     state = eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), restored), static)
     return Progress(state, rows, notes)
 
 
-_REMEDY = "Delete the file to start this fit anew."
-
-
-def _check_identity(name: str, text: str, wanted: Mapping[str, str]) -> None:
+def _check_identity(
+    name: str, text: str, wanted: Mapping[str, str], what: str, remedy: str
+) -> None:
     try:
         stored = json.loads(text)
     except json.JSONDecodeError:
@@ -176,8 +174,9 @@ def _check_identity(name: str, text: str, wanted: Mapping[str, str]) -> None:
     for part, value in wanted.items():
         if stored.get(part) != value:
             raise ValueError(
-                f"{name} is the checkpoint of a fit with another {part}{_difference(stored, part, value)}. "
-                f"Give the same one again, or choose another file as `checkpoint`. {_REMEDY}"
+                f"{name} is the checkpoint of a {what} with another {part}"
+                f"{_difference(stored, part, value)}. Give the same one again, or choose another file as "
+                f"`checkpoint`. {remedy}"
             )
 
 

@@ -1,0 +1,3 @@
+"""Diffusion of cells that propel themselves, against target shape factor and force."""
+
+from .experiment import Config as Config, run as run

@@ -1,0 +1,180 @@
+r"""Oscillatory shear of the hexagonal lattice, and of a disordered tissue.
+
+The box is sheared to and fro by a small strain and the vertices follow against friction, step by step.
+What the stress has in phase with the strain is the storage modulus $G'$, what it has a quarter of a
+period ahead the loss modulus $G''$. The lattice is a standard linear solid, with the plateaus $2\sqrt3
+K_P (1 - p_0/c)$ and $3\sqrt3 K_P (1 - p_0/c)$, $c = \sqrt{8\sqrt3}$ (Tong et al. 2022,
+doi:10.1371/journal.pcbi.1010135); of the disordered tissue $G^*$ is known from its Hessian.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+from pydantic import Field, field_validator
+
+from vertax.dissipations import SubstrateFriction
+from vertax.energies import AbstractEnergy, AreaElasticity, PerimeterElasticity
+from vertax.initialise import hexagonal, periodic_voronoi
+from vertax.mechanics import complex_modulus, stress
+from vertax.mesh import Periodic, Tissue
+from vertax.responses import Evolution
+from vertax.runs import ExperimentConfig, Relaxation, RunFolder, side_by_side
+
+from . import figures
+
+HEXAGON = float(np.sqrt(8 * np.sqrt(3)))
+"""The perimeter of a regular hexagon of area 1."""
+
+
+class Config(ExperimentConfig):
+    """Configuration of this experiment."""
+
+    frequencies: list[float] = Field(
+        default_factory=lambda: [round(float(w), 3) for w in np.geomspace(0.1, 100, 13)],
+        min_length=2,
+    )
+    """Angular frequencies."""
+    shape_factor: float = Field(default=3.4, gt=0, lt=HEXAGON)
+    """Target perimeter of cells of area 1; the lattice is solid below 3.722."""
+    stiffness: float = Field(default=0.7, gt=0)
+    """Stiffness of perimeters; that of areas is 1."""
+    friction: float = Field(default=1.3, gt=0)
+    """Friction of a vertex with the substrate."""
+    strain: float = Field(default=1e-4, gt=0)
+    """Amplitude of the shear strain."""
+    steps: int = Field(default=64, ge=8)
+    """Steps of second order in a period."""
+    cycles: int = Field(default=4, ge=1)
+    """Periods, of which the last one is measured."""
+    n_cells: int = Field(default=25, ge=0)
+    """Cells of the disordered tissue; 0 for none."""
+    relaxation: Relaxation = Relaxation(transitions=False, contacts=False, tolerance=1e-11)
+    """How each step is found."""
+
+    @field_validator("frequencies")
+    @classmethod
+    def _positive(cls, value: list[float]) -> list[float]:
+        if min(value) <= 0:
+            raise ValueError(f"must all be positive, but the least is {min(value)}")
+        return value
+
+
+class _Sheared(eqx.Module):
+    """A box that is sheared to and fro, at fixed area and without rotation."""
+
+    lattice: Float[Array, "2 2"]
+    strain: Float[Array, ""]
+    frequency: Float[Array, ""]
+
+    def __call__(self, time: Float[Array, ""]) -> Periodic:
+        half = 0.5 * self.strain * jnp.sin(self.frequency * time)
+        cosh, sinh = jnp.cosh(half), jnp.sinh(half)
+        return Periodic(self.lattice @ jnp.array([[cosh, sinh], [sinh, cosh]]))
+
+
+class _Sample(NamedTuple):
+    """A tissue at rest, and what its moduli should be."""
+
+    tissue: Tissue
+    expected: Complex[np.ndarray, " frequencies"]
+
+
+def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str, Any]:
+    """Run the experiment.
+
+    **Arguments:**
+
+    - `config`: its configuration.
+    - `folder`: where the results go.
+    - `progress`: show a progress bar (only on a terminal).
+
+    **Returns:** the metrics: for each tissue the largest error of $G'$ and $G''$, each relative to itself and
+    to $|G^*|$.
+    """
+    began = time.perf_counter()
+    energy = AreaElasticity(1.0, 1.0) + PerimeterElasticity(config.stiffness, config.shape_factor)
+    frequencies = np.asarray(config.frequencies)
+    samples = _samples(config, energy, frequencies)
+    measured: dict[str, np.ndarray] = {}
+    for name, sample in samples.items():
+
+        def one(index: int, name: str = name, sample: _Sample = sample) -> dict[str, np.ndarray]:
+            compute = lambda: {
+                "modulus": _modulus(config, sample.tissue, energy, frequencies[index])
+            }
+            return folder.part(f"{name} {frequencies[index]:g}", compute)
+
+        parts = side_by_side(one, len(frequencies), folder, progress=progress, unit="frequency")
+        measured[name] = np.stack([part["modulus"] for part in parts])
+    columns: dict[str, Any] = {"frequency": frequencies}
+    metrics: dict[str, Any] = {}
+    for name, sample in samples.items():
+        found: Any = measured[name]
+        expected: Any = sample.expected
+        for what, values in (("measured", found), ("expected", expected)):
+            columns |= {f"{name}_storage_{what}": values.real, f"{name}_loss_{what}": values.imag}
+        metrics[name] = {
+            "storage_error": np.max(np.abs(found.real / expected.real - 1)),
+            "loss_error": np.max(np.abs(found.imag / expected.imag - 1)),
+            "error": np.max(np.abs(found - expected) / np.abs(expected)),
+        }
+    folder.save_table("moduli", columns)
+    known = {name: sample.expected for name, sample in samples.items()}
+    folder.save_figure("moduli", figures.moduli(frequencies, measured, known))
+    return metrics | {"seconds": time.perf_counter() - began}
+
+
+def _samples(
+    config: Config, energy: AbstractEnergy, frequencies: Float[np.ndarray, " frequencies"]
+) -> dict[str, _Sample]:
+    friction = SubstrateFriction(config.friction)
+    # (The lattice is at rest as it is. Of ever so little softening the plateaus know.)
+    lattice = hexagonal(2, 2, softening=0.0)
+    unit = config.stiffness * (1 - config.shape_factor / HEXAGON)
+    low, high = 2 * 3**0.5 * unit, 3 * 3**0.5 * unit
+    # Shear pulls at vertices along one mode, whose eigenvalue follows from the difference of the plateaus.
+    area = lattice.areas.sum()
+    tension = lambda vertices: stress(lattice.with_vertices(vertices), energy)[0, 1]
+    pull = jax.grad(tension)(lattice.vertices) * area
+    relaxing = config.friction * (high - low) * area / jnp.sum(pull**2)
+    x = 1j * frequencies * float(relaxing)
+    samples = {"lattice": _Sample(lattice, low + (high - low) * x / (1 + x))}
+    if config.n_cells:
+        first = periodic_voronoi(config.n_cells, key=jax.random.key(config.seed), lloyd_steps=2)
+        tissue = Relaxation(contacts=False).build()(first, energy).tissue
+        known = complex_modulus(tissue, energy, friction, jnp.asarray(frequencies), angle=0.0)
+        samples["disordered"] = _Sample(tissue, np.asarray(known))
+    return samples
+
+
+def _modulus(
+    config: Config, tissue: Tissue, energy: AbstractEnergy, frequency: float
+) -> np.ndarray:
+    """The complex modulus, of the last period."""
+    assert isinstance(tissue.boundary, Periodic)
+    steps = config.steps
+    times = 2 * np.pi / frequency * np.arange(config.cycles * steps + 1) / steps
+    sheared = _Sheared(tissue.boundary.lattice, jnp.asarray(config.strain), jnp.asarray(frequency))
+    evolution = Evolution(
+        SubstrateFriction(config.friction),
+        times,
+        order=2,
+        boundary=sheared,
+        relaxation=config.relaxation.build(),
+    )
+    movie = evolution(tissue, energy)
+    stresses = np.asarray(_stresses(movie.frames, energy) - stress(tissue, energy))[-steps:, 0, 1]
+    phase = frequency * times[-steps:]
+    return np.asarray(2 * np.mean(stresses * (np.sin(phase) + 1j * np.cos(phase))) / config.strain)
+
+
+@eqx.filter_jit
+def _stresses(frames: Tissue, energy: AbstractEnergy) -> Float[Array, "times 2 2"]:
+    return eqx.filter_vmap(lambda frame: stress(frame, energy))(frames)

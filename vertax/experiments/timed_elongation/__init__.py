@@ -1,0 +1,3 @@
+"""Tensions in time that elongate a cluster along a prescribed course."""
+
+from .experiment import Config as Config, run as run

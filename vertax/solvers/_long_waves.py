@@ -1,0 +1,182 @@
+"""A preconditioner that knows what a tissue is in the large: an elastic medium."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from vertax.mesh import Periodic, Tissue
+from vertax.mesh._topology import take
+
+# Smaller tissues have no waves that are long enough to be slow, and pay more than they gain.
+FEWEST_CELLS = 300
+
+
+class LongWaves(eqx.Module):
+    r"""An approximate inverse of the Hessian of a tissue, for conjugate gradients and MINRES.
+
+    Krylov methods take as many steps as the wave length of the softest motion is long, in cells: in a tissue
+    of $10^4$ cells a thousand. Long waves are those of an elastic medium, though, which Fourier transforms
+    solve. So the residual goes to a grid of about a point a cell, is divided there by
+
+    $$a + \mu k^2 \text{ (transverse waves)}, \qquad a + \lambda k^2 \text{ (longitudinal waves)},$$
+
+    and comes back; to this is added the residual over the mean stiffness, for all that is as small as
+    cells. Stiffnesses $a, \mu, \lambda$ are those of waves in this tissue, from four products with its
+    Hessian. It is symmetric and positive definite whatever the Hessian is, so it changes the number of steps
+    and not where they lead.
+
+    (Additive two-level method: Bramble, Pasciak & Xu 1990, doi:10.1090/S0025-5718-1990-1023042-6, with the
+    coarse level solved by Fourier transforms.)
+    """
+
+    indices: Int[Array, "vertices 4"]
+    """The points of the grid around each vertex,"""
+    weights: Float[Array, "vertices 4"]
+    """and how much each of them counts; 0 for vertices that do not move."""
+    places: Float[Array, "vertices 2"]
+    """Vertices in units of the box."""
+    reciprocal: Float[Array, "2 2"]
+    """The reciprocal lattice vectors, as rows."""
+    filled: Float[Array, ""]
+    """Vertices for each point of the grid."""
+    size: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, tissue: Tissue) -> LongWaves | None:
+        """Those of a tissue as it is now; None if it is small."""
+        if tissue.n_cells < FEWEST_CELLS:
+            return None
+        size = _good_size(tissue.n_cells)
+        lattice, origin = _box(tissue)
+        places = (tissue.vertices - origin) @ jnp.linalg.inv(lattice)
+        scaled = size * places
+        corner = jnp.floor(scaled)
+        beyond, corner = scaled - corner, corner.astype(int)
+        near = jnp.stack([corner, corner + 1], axis=-1) % size
+        shares = jnp.stack([1 - beyond, beyond], axis=-1)
+        indices = size * near[:, 0, :, None] + near[:, 1, None, :]
+        weights = shares[:, 0, :, None] * shares[:, 1, None, :]
+        moves = jnp.ones(tissue.n_vertices) if tissue.held is None else ~tissue.held
+        moves = moves.astype(weights.dtype)
+        # Of an open tissue's box a part is empty.
+        fill = jnp.sum(tissue.areas) / jnp.abs(jnp.linalg.det(lattice))
+        return cls(
+            indices=indices.reshape(-1, 4),
+            weights=moves[:, None] * weights.reshape(-1, 4),
+            places=places,
+            reciprocal=2 * jnp.pi * jnp.linalg.inv(lattice).T,
+            filled=jnp.sum(moves) / (fill * size**2),
+            size=size,
+        )
+
+    def floor(self, stiffness: Float[Array, ""]) -> Float[Array, ""]:
+        """The least stiffness of waves that there is to reckon with, if that of a vertex is given."""
+        shortest = jnp.max(jnp.sum(self.reciprocal**2, axis=-1)) * (self.size / 2) ** 2
+        return 1e-4 * stiffness / shortest
+
+    def fitted(
+        self, hessian: Callable[[PyTree], PyTree], like: PyTree, floor: Float[Array, ""]
+    ) -> Medium:
+        """The medium with the stiffness of waves in a tissue.
+
+        **Arguments:**
+
+        - `hessian`: its products with vectors.
+        - `like`: a configuration, or its shapes.
+        - `floor`: no wave as long as cells is taken to be softer than this (energy per area).
+        """
+        squares = jnp.sum(self.reciprocal**2, axis=-1)
+        directions = self.reciprocal / jnp.sqrt(squares)[:, None]
+        across = jnp.stack([-directions[:, 1], directions[:, 0]], axis=-1)
+        moves = jnp.sum(self.weights, axis=-1, keepdims=True)
+        shapes = jax.tree.leaves(like)[1:]
+
+        def stiffness(number: int, polarisations: Float[Array, "2 2"]) -> Float[Array, ""]:
+            # One product for waves along both axes, which hardly feel each other.
+            phases = 2 * jnp.pi * number * self.places + jnp.array([0.3, 1.1])
+            wave = moves * (jnp.cos(phases) @ polarisations)
+            rest = [jnp.zeros(x.shape, x.dtype) for x in shapes]
+            leaves = [wave, *rest]
+            product = hessian(jax.tree.unflatten(jax.tree.structure(like), leaves))
+            return jnp.vdot(wave, jax.tree.leaves(product)[0]) / jnp.vdot(wave, wave)
+
+        long, short = 1, max(2, self.size // 8)
+        mean = jnp.mean(squares)
+
+        def law(polarisations: Float[Array, "2 2"], least: Array) -> tuple[Array, Array]:
+            far, near = stiffness(long, polarisations), stiffness(short, polarisations)
+            slope = jnp.maximum((near - far) / (mean * (short**2 - long**2)), least)
+            return jnp.maximum(far - slope * mean * long**2, 0), slope
+
+        offset, compression = law(directions, floor)
+        other, shear = law(across, jnp.maximum(floor, 1e-3 * compression))
+        return Medium(self, jnp.minimum(offset, other), shear, compression)
+
+
+class Medium(eqx.Module):
+    """The elastic medium that a tissue is in the large; see `LongWaves`."""
+
+    waves: LongWaves
+    offset: Float[Array, ""]
+    shear: Float[Array, ""]
+    compression: Float[Array, ""]
+
+    def yields(
+        self, force: Float[Array, "vertices 2"], shift: Float[Array, ""]
+    ) -> Float[Array, "vertices 2"]:
+        """How it gives way to forces on vertices, each held by a spring of stiffness `shift` besides."""
+        w = self.waves
+        shape = (w.size, w.size)
+        spread = w.weights[:, :, None] * force[:, None, :]
+        on_grid = jnp.zeros((w.size**2, 2), force.dtype).at[w.indices].add(spread)
+        modes = jnp.fft.rfft2(on_grid.reshape(*shape, 2), axes=(0, 1))
+        numbers = np.stack(
+            np.meshgrid(
+                np.fft.fftfreq(w.size, 1 / w.size),
+                np.fft.rfftfreq(w.size, 1 / w.size),
+                indexing="ij",
+            ),
+            axis=-1,
+        )
+        k = jnp.asarray(numbers, force.dtype) @ w.reciprocal
+        squared = jnp.sum(k**2, axis=-1, keepdims=True)
+        whole = squared == 0
+        squared = jnp.where(whole, 1, squared)
+        along = jnp.sum(modes * k, axis=-1, keepdims=True) * k / squared
+        held = self.offset + shift
+        modes = along / (held + self.compression * squared) + (modes - along) / (
+            held + self.shear * squared
+        )
+        moved = jnp.fft.irfft2(jnp.where(whole, 0, modes), s=shape, axes=(0, 1)).reshape(-1, 2)
+        there = jnp.sum(w.weights[:, :, None] * take(moved, w.indices), axis=1)
+        return (there / w.filled).astype(force.dtype)
+
+
+def _box(tissue: Tissue) -> tuple[Float[Array, "2 2"], Float[Array, "2"]]:
+    """The box of a periodic tissue, or one around an open tissue with some room; and its origin."""
+    if isinstance(tissue.boundary, Periodic):
+        return tissue.boundary.lattice, jnp.zeros(2, tissue.vertices.dtype)
+    points = tissue.gathered(tissue.vertices)
+    least, most = jnp.min(points, axis=0), jnp.max(points, axis=0)
+    return jnp.diag(1.2 * (most - least)), least - 0.1 * (most - least)
+
+
+def _good_size(n_cells: int) -> int:
+    """An odd number with small factors near √n: without a highest wave, which is its own mirror image."""
+    size = int(np.ceil(np.sqrt(n_cells))) | 1
+    while _rest(size) > 1:
+        size += 2
+    return size
+
+
+def _rest(number: int) -> int:
+    for factor in (3, 5, 7, 11, 13):
+        while number % factor == 0:
+            number //= factor
+    return number
