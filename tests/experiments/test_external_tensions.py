@@ -77,5 +77,6 @@ def test_tensions_of_a_foam_from_a_file(tmp_path):
     assert metrics["relative_error_evolver"] < 1e-4
     true = np.array(table(folder / "edges.csv")["true"], float)
     np.testing.assert_allclose(np.sort(true), [0.9, 1.0, 1.1])
+    assert 0 < metrics["moved_to_rest"] < 1
     # The program is the only forward model.
     assert "relative_error_vertax" not in metrics

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -109,7 +110,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     - `progress`: show a progress bar (only on a terminal).
 
     **Returns:** the metrics: for both forward models the relative error of the tensions before and after,
-    their correlation with the true ones, and seconds; of the program also its runs, and the seconds in them.
+    their correlation with the true ones, and seconds; of the program also its runs, and the seconds in them;
+    and how far the vertices of a foam from a file went on their way to rest (root mean square).
 
     **Raises:**
 
@@ -126,7 +128,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     external = ways["Surface Evolver"][0]
     # (Where the program has run before: in a test, say, or to bring the foam to rest.)
     runs, seconds = external.ledger.runs, external.ledger.seconds
-    fits, metrics = {}, {"n_edges": target.n_edges}
+    fits, metrics = {}, {"n_edges": target.n_edges, **case.metrics}
     for name, (response, adjoint) in ways.items():
         guess = case.energy(jnp.full_like(true, case.mean))
         fixed = jax.tree.map(lambda _: False, guess)
@@ -181,6 +183,8 @@ class Case(NamedTuple):
     cost: AbstractLeastSquaresCost
     ways: Mapping[str, tuple[Any, AbstractAdjoint]]
     """Forward models, and how to differentiate through them."""
+    metrics: Mapping[str, float] = MappingProxyType({})
+    """What else there is to say of it."""
 
 
 def _drawn(config: Config) -> Case:
@@ -221,13 +225,15 @@ def _of_file(config: Config) -> Case:
         # The areas are held, so their stiffness does not matter.
         return AreaElasticity(1.0, foam.target_areas) + LineTension(tensions)
 
-    target = foam.tissue
+    target, moved = foam.tissue, {}
     if config.foam.at_rest:
         target = external(target, energy(foam.tensions)).tissue
+        way = jnp.sum((target.vertices - foam.tissue.vertices) ** 2, axis=1)
+        moved = {"moved_to_rest": float(jnp.sqrt(jnp.mean(way)))}
     # A gradient that is one-sided is as good for a step, and takes half the runs.
     ways = {"Surface Evolver": (external, EquilibriumPropagation(centred=False))}
     cost = Shape(target, jnp.asarray(size), jnp.asarray(mean))
-    return Case(target, foam.tensions, mean, energy, cost, ways)
+    return Case(target, foam.tensions, mean, energy, cost, ways, moved)
 
 
 class Shape(AbstractLeastSquaresCost):
