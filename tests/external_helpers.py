@@ -1,6 +1,7 @@
 """Shared by the tests of external programs: one in NumPy and SciPy."""
 
 import os
+import time
 
 import equinox as eqx
 import numpy as np
@@ -68,8 +69,12 @@ class Foam(AbstractSimulator):
         return Relaxed(x.reshape(-1, 2), energy=unpulled, num_steps=found.nit)
 
     def go_wrong(self, energy, forces):
-        if self.mood == "dies":
+        if self.mood == "dies" or (self.mood == "ill" and energy.terms[1].tension[0] < 0.1):
             os._exit(3)
+        if self.mood == "hangs" or (self.mood == "ill" and energy.terms[1].tension[0] < 0.2):
+            time.sleep(600)
+        if self.mood == "times out":
+            raise TimeoutError("the reactor does not answer")
         if self.mood == "raises" or (self.mood == "when pulled" and forces is not None):
             raise OSError("the reactor is too hot")
         if energy.terms[1].tension[0] < 0:
@@ -81,5 +86,7 @@ class Foam(AbstractSimulator):
         return eqx.tree_at(lambda e: e.terms[1].tension, energy, lengths)
 
     def energy(self, tissue, energy):
+        if self.mood == "endless":
+            return np.nan
         forces = np.zeros_like(tissue.vertices)
         return self.value_and_slope(tissue.vertices, Edges.of(tissue), energy, forces)[0]

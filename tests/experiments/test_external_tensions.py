@@ -32,3 +32,51 @@ def test_both_forward_models_lead_the_same_way(tmp_path):
     edges = table(folder / "edges.csv")
     found = [np.array(edges[f"found_{name}"], float) for name in ("evolver", "vertax")]
     np.testing.assert_allclose(*found, rtol=1e-6)
+
+
+# Two bubbles side by side.
+DOUBLET = """SPACE_DIMENSION 2
+STRING
+vertices
+ 1 0 -1
+ 2 0.1 0
+ 3 0 1
+ 4 1.5 0
+ 5 -1.5 0
+edges
+ 1 1 2 density 1.1
+ 2 2 3 density 1.1
+ 3 1 4 density 0.9
+ 4 4 3 density 0.9
+ 5 3 5 density 1
+ 6 5 1 density 1
+faces
+ 1 3 4 -2 -1
+ 2 1 2 5 6
+bodies
+ 1 1 volume 1.9
+ 2 2 volume 2.1
+read
+"""
+
+
+@pytest.mark.slow  # compiles for a minute
+@pytest.mark.skipif(
+    shutil.which("evolver") is None,
+    reason="Surface Evolver is not installed: apt-get install evolver-nox",
+)
+def test_tensions_of_a_foam_from_a_file(tmp_path):
+    (tmp_path / "doublet.dmp").write_text(DOUBLET, encoding="utf-8")
+    folder, metrics = run(
+        CONFIG,
+        tmp_path / "run",
+        f"foam.file={tmp_path / 'doublet.dmp'}",
+        "fit.epochs=8",
+    )
+    assert metrics["relative_error_initial_evolver"] > 0.05
+    assert metrics["relative_error_evolver"] < 1e-4
+    true = np.array(table(folder / "edges.csv")["true"], float)
+    np.testing.assert_allclose(np.sort(true), [0.9, 1.0, 1.1])
+    assert 0 < metrics["moved_to_rest"] < 1
+    # The program is the only forward model.
+    assert "relative_error_vertax" not in metrics

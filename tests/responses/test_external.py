@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import time
 
 import equinox as eqx
 import jax
@@ -161,6 +162,13 @@ def test_what_goes_wrong_is_an_error_with_its_reason(case, mood, says):
     assert re.search(says, str(reason))
 
 
+def test_an_energy_that_is_not_finite_has_no_differences(case):
+    job = Job(Foam(mood="endless"), numpy_request(case), "differences", 1e-4)
+    answers, reason = ask([job], 1, False, True)
+    assert answers == [None]
+    assert "The energy by the program is nan" in str(reason)
+
+
 def test_what_is_not_finite_is_not_asked(case):
     request = numpy_request(case, forces=np.full_like(case[0].vertices, np.nan))
     answers, reason = ask([Job(FOAM, request, "energy", 1e-4)], 1, False, True)
@@ -235,19 +243,55 @@ def test_batches_run_side_by_side_and_fail_one_by_one(case):
 
 
 @pytest.mark.slow
-def test_processes_do_as_threads_do_and_may_die(case):
+def test_processes_do_as_threads_do(case):
     jobs = [Job(FOAM, numpy_request(case), "program", 1e-4)] * 2
     here, _ = ask(jobs, 2, False, True)
     there, reason = ask(jobs, 2, True, True)
     assert reason is None
     for a, b in zip(jax.tree.leaves(here), jax.tree.leaves(there), strict=True):
         np.testing.assert_array_equal(a, b)
-    fatal = Job(Foam(mood="dies"), numpy_request(case), "energy", 1e-4)
-    answers, reason = ask([fatal], 2, True, True)
-    assert answers == [None]
-    assert "process that ran the program died" in str(reason)
-    (again,), _ = ask(jobs[:1], 2, True, True)
-    np.testing.assert_array_equal(jax.tree.leaves(again)[0], jax.tree.leaves(here)[0])
+
+
+@pytest.mark.slow
+def test_processes_hang_and_die_one_by_one(case):
+    tissue, energy, _ = numpy_request(case)[:3]
+    first = [0.05, 0.15, 0.3, 0.3]
+    energies = [
+        eqx.tree_at(lambda e: e.terms[1].tension, energy, energy.terms[1].tension.copy())
+        for _ in first
+    ]
+    for number, value in enumerate(first):
+        energies[number].terms[1].tension[0] = value
+    jobs = [Job(Foam(mood="ill"), Request(tissue, e, None, None), "energy", 1e-4) for e in energies]
+    began = time.perf_counter()
+    answers, _ = ask(jobs, 4, True, True, 60.0)
+    assert [answer is None for answer in answers] == [True, True, False, False]
+    assert time.perf_counter() - began < 300
+    for job, says in zip(jobs, ("ran the program died", "not done after 2 s"), strict=False):
+        assert says in str(ask([job], 1, True, True, 2.0)[1])
+    # What a simulator raises is its own, and its process goes on.
+    moody = Job(Foam(mood="times out"), numpy_request(case), "energy", 1e-4)
+    _, reason = ask([moody], 1, True, True, 60.0)
+    assert "TimeoutError: the reactor does not answer" in str(reason)
+    # The next one has a process again.
+    (again,), _ = ask(jobs[2:3], 1, True, True, 60.0)
+    assert again is not None
+
+
+@pytest.mark.slow
+def test_a_fit_in_processes(case):
+    tissue, energy, cost = case
+    response = vx.External(Foam(), workers=2, processes=True, timeout=120.0)
+    adjoint = vx.EquilibriumPropagation()
+    inverse = vx.InverseProblem(tissue, energy, cost, response=response, adjoint=adjoint)
+    beside = problem(case)
+    fits = [vx.fit(p, ADAM, 2, progress=False) for p in (inverse, beside)]
+    np.testing.assert_allclose(fits[0].history.cost, fits[1].history.cost, rtol=1e-12)
+    hangs = dataclasses.replace(
+        inverse, response=vx.External(Foam(mood="hangs"), processes=True, timeout=1.0)
+    )
+    with pytest.raises(vx.FitError, match="not done after 1 s"):
+        vx.fit(hangs, ADAM, 2, progress=False)
 
 
 @pytest.mark.slow
@@ -287,11 +331,22 @@ def test_no_guidance(case):
         ({"slope": "program"}, ValueError, "`stiffness` is missing"),
         ({"tolerance": 0.0}, ValueError, "`tolerance` must be positive"),
         ({"workers": 0}, ValueError, "`workers` must be at least 1"),
+        ({"simulator": Foam}, TypeError, "simulator"),
+        ({"timeout": 0.0, "processes": True}, ValueError, "`timeout` must be positive"),
+        ({"timeout": 5.0}, ValueError, "`timeout` needs processes=True"),
     ],
 )
 def test_settings_are_checked(settings, kind, says):
     with pytest.raises(kind, match=says):
         vx.External(**({"simulator": FOAM} | settings))
+
+
+def test_arcs_are_pulled_by_programs_that_can(case):
+    tissue, energy, _ = numpy_request(case)[:3]
+    torques = np.ones(len(energy.terms[1].tension))
+    job = Job(FOAM, Request(tissue, energy, 0 * tissue.vertices, torques), "energy", 1e-4)
+    _, reason = ask([job], 1, False, True)
+    assert "this program cannot be told to pull on them" in str(reason)
 
 
 def test_what_a_simulator_lacks_is_named(case):

@@ -5,17 +5,22 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Sequence
-from typing import Literal
+from contextlib import suppress
+from typing import ClassVar, Literal
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from vertax._base.checks import check_number, check_whole
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.responses._evolver_model import Strings, Terms, slope_of
+from vertax.responses._evolver_datafile import datafile, leveller
+from vertax.responses._evolver_model import Terms, slope_of
+from vertax.responses._evolver_strings import Strings
+from vertax.responses._evolver_t1 import can_flip, shortest, swapped
 from vertax.responses._program import run_program, tail
-from vertax.responses._simulator import AbstractSimulator, Relaxed, SimulatorError
+from vertax.responses._simulator import AbstractSimulator, Edges, Relaxed, SimulatorError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +30,12 @@ class SurfaceEvolver(AbstractSimulator):
     A tissue is written as a datafile: its edges in the string model, its energy as named quantities, and the
     nudge as one more of them. The program relaxes it by its own commands, and prints where the vertices are.
     Energies may consist of `LineTension`, `BoundedTension`, `AreaElasticity`, `PerimeterElasticity` and
-    `ShapeFactorEnergy`; tissues may be periodic or free.
+    `ShapeFactorEnergy`. Tissues may be periodic or free.
+
+    Arcs are chains of straight pieces, all of whose points relax. Their angles are those of arcs that enclose
+    as much, so areas are exact; lengths, and with them energies, are those of chains, shorter by parts in
+    $n^2$ with $n$ pieces. So the program, and not the energy, says what the derivatives are: use
+    `External(..., slope="program", stiffness=...)` for tissues with arcs.
 
     The Debian package `evolver-nox` has the program. It takes some milliseconds to begin.
 
@@ -33,24 +43,32 @@ class SurfaceEvolver(AbstractSimulator):
 
     - `command`: the program.
     - `areas`: `"elastic"`, as the energy says, or `"fixed"` at the `target_area` of its `AreaElasticity`,
-        whose stiffness is infinite then, as in a foam; of free tissues only. Then the energy does not
-        describe the program: use `External(..., slope="program", stiffness=...)`.
+        whose stiffness is infinite then, as in a foam. (In a periodic box the targets are scaled such that
+        they fill it.) Then the energy does not describe the program: use
+        `External(..., slope="program", stiffness=...)`.
+    - `pieces`: of each arc.
     - `tolerance`: the program has relaxed when a step lowers the energy by less than this share.
     - `steps`: of conjugate gradients to begin with, where a tissue is far from rest.
     - `newton_steps`: at most; 0 for conjugate gradients only, until the tolerance ends them.
     - `timeout`: seconds after which a run is ended.
+    - `t1`: a length; shorter edges flip by the program's `t1_edgeswap`, one after another, if the tissue then
+        comes to rest with a lower energy. Of straight edges, and not at the outline. None for no transitions.
 
     **Raises:**
 
     - `ValueError` for numbers that are not positive, and other settings of `areas`.
     """
 
+    bends: ClassVar[bool] = True
+
     command: str = "evolver"
     areas: Literal["elastic", "fixed"] = "elastic"
     tolerance: float = 1e-14
+    pieces: int = 8
     steps: int = 20
     newton_steps: int = 40
     timeout: float = 60.0
+    t1: float | None = None
 
     def __post_init__(self) -> None:
         if self.areas not in ("elastic", "fixed"):
@@ -59,6 +77,9 @@ class SurfaceEvolver(AbstractSimulator):
             )
         for name in ("tolerance", "timeout"):
             check_number(name, getattr(self, name), above=0)
+        if self.t1 is not None:
+            check_number("t1", self.t1, above=0)
+        check_whole("pieces", self.pieces, least=2)
         check_whole("steps", self.steps, least=0)
         check_whole("newton_steps", self.newton_steps, least=0)
 
@@ -67,6 +88,7 @@ class SurfaceEvolver(AbstractSimulator):
         tissue: Tissue,
         energy: AbstractEnergy,
         forces: Float[np.ndarray, "vertices 2"] | None,
+        torques: Float[np.ndarray, " edges"] | None = None,
     ) -> Relaxed:
         """Bring a tissue to rest, see [`AbstractSimulator`][vertax.responses.AbstractSimulator].
 
@@ -75,33 +97,59 @@ class SurfaceEvolver(AbstractSimulator):
         - [`SimulatorError`][vertax.responses.SimulatorError], with the tail of the log, if the program fails,
             and for an energy that it cannot be told of.
         """
-        strings = Strings.of(tissue)
-        terms = Terms.of(energy, strings.edges.n_cells, len(strings.edges.cells))
-        fixed = self.areas == "fixed"
-        held = range(strings.edges.n_cells) if fixed else ()
-        if fixed and strings.periodic:
+        if self.t1 is None or forces is not None:
+            return self._at_rest(tissue, energy, forces, torques)
+        if tissue.arcs is not None:
             raise SimulatorError(
-                "Fixed areas are for free tissues: those of a periodic one add up to its box."
+                "T1 transitions by Surface Evolver are for straight edges: `t1=None`."
             )
-        if fixed and not terms.area_stiffness.any():
-            raise SimulatorError(
-                "Areas that are fixed need targets: add an AreaElasticity to the energy, of any stiffness."
-            )
-        if fixed:
-            terms = terms._replace(area_stiffness=np.zeros(strings.edges.n_cells))
-        text = datafile(strings, terms, forces, fixed=fixed)
-        points, pressures, numbers = self._run(text, self._commands() + _report(held), strings)
-        vertices = points + strings.images @ strings.lattice
-        measures = (
-            strings.lengths(points),
-            strings.edges.areas(points),
-            strings.perimeters(points),
+        found, there, refused = self._at_rest(tissue, energy, None, None), tissue, set()
+        number = 0
+        while True:
+            there = eqx.tree_at(lambda t: t.vertices, there, found.vertices)
+            allowed = can_flip(there.topology)
+            allowed[list(refused)] = False
+            lengths = np.hypot(*Edges.of(there).vectors(found.vertices).T)
+            edge = shortest(lengths, self.t1, allowed)
+            if edge is None:
+                return found._replace(tissue=there, num_t1=number)
+            other = swapped(there, edge, 0.5 * self.t1, self._ask)
+            trial = None
+            if other is not None:
+                with suppress(SimulatorError):  # it comes to no rest that way
+                    trial = self._at_rest(other, energy, None, None)
+            # (The energy falls each time, so this ends.)
+            if trial is not None and trial.energy < found.energy - 1e-9 * abs(found.energy):
+                found, there, refused, number = trial, other, set(), number + 1
+            else:
+                refused.add(edge)
+
+    def _at_rest(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        forces: Float[np.ndarray, "vertices 2"] | None,
+        torques: Float[np.ndarray, " edges"] | None,
+    ) -> Relaxed:
+        """Where a tissue rests in its topology."""
+        strings = Strings.of(tissue, self.pieces)
+        terms = Terms.of(energy, strings.pieces.n_cells, len(strings.parts))
+        given, held = terms, ()
+        if self.areas == "fixed":
+            terms, held = self._fixed(strings, given)
+        text = datafile(strings, terms, forces, torques, held=held)
+        points, pressures, numbers = self._run(
+            text, self._commands(strings, near=forces is not None) + _report(held), strings
         )
+        measures = (strings.lengths(points), strings.areas(points), strings.perimeters(points))
         return Relaxed(
-            vertices,
+            points[: strings.n_vertices] + strings.images @ strings.lattice,
+            angles=_angles(strings, points, tissue),
             energy=numbers["energy"],
             num_steps=int(numbers["steps"]),
-            slope=slope_of(energy, *measures, pressures if fixed else None),
+            slope=slope_of(
+                energy, *measures, _by_targets(strings, given, pressures) if held else None
+            ),
         )
 
     def energy(self, tissue: Tissue, energy: AbstractEnergy) -> float:
@@ -113,10 +161,30 @@ class SurfaceEvolver(AbstractSimulator):
 
         **Returns:** its energy.
         """
-        strings = Strings.of(tissue)
-        terms = Terms.of(energy, strings.edges.n_cells, len(strings.edges.cells))
-        text = datafile(strings, terms, None, fixed=False)
+        strings = Strings.of(tissue, self.pieces)
+        terms = Terms.of(energy, strings.pieces.n_cells, len(strings.parts))
+        text = datafile(strings, terms)
         return self._run(text, "steps_done := 0;\nrecalc;\n" + _report(), strings)[2]["energy"]
+
+    def _fixed(self, strings: Strings, terms: Terms) -> tuple[Terms, Sequence[int]]:
+        """The terms of an energy whose areas are fixed, and the cells to hold."""
+        if not terms.area_stiffness.any():
+            raise SimulatorError(
+                "Areas that are fixed need targets: add an AreaElasticity to the energy, of any stiffness."
+            )
+        n = strings.pieces.n_cells
+        targets, held = terms.area, range(n)
+        if strings.periodic:
+            # The box holds the area of the last cell, once it holds the others.
+            targets, held = targets * _share(strings, terms), range(n - 1)
+        return terms._replace(area_stiffness=np.zeros(n), area=targets), held
+
+    def _ask(self, text: str, commands: str) -> str:
+        """What the program writes, given a datafile and commands."""
+        command = [self.command, "-i", "-frelax.cmd", "tissue.fe"]
+        files = {"tissue.fe": text, "relax.cmd": commands}
+        found, _ = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
+        return found["result"]
 
     def _run(
         self, text: str, commands: str, strings: Strings
@@ -126,25 +194,58 @@ class SurfaceEvolver(AbstractSimulator):
         found, log = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
         return _read(found["result"], strings, log)
 
-    def _commands(self) -> str:
-        """How it relaxes: conjugate gradients, and then Newton's method with a search along each step."""
-        # (With this toggle on, as it is, the index of the Hessian is wrong and its steps stall.)
-        lines = ["function_quantity_sparse off;", "hessian_normal off;"]
-        lines += ["steps_done := 0;", "recalc;"]
-        if self.steps:
-            lines += [f"U; g {self.steps}; U;", f"steps_done := {self.steps};"]
+    def _commands(self, strings: Strings, *, near: bool) -> str:
+        """How it relaxes: conjugate gradients, and then Newton's method with a search along each step.
+
+        A tissue that is `near` to rest needs no first steps.
+        """
+        # (With the first toggle on, as it is, the index of the Hessian is wrong and its steps stall; so do
+        # they with areas that are held if the last one is off.)
+        lines = ["function_quantity_sparse off;", "hessian_normal off;", "augmented_hessian on;"]
+        lines += [leveller(strings, near=near), "steps_done := 0;", "recalc;"]
+        first = 0 if near and self.newton_steps else self.steps
+        if first:
+            # (Areas that are held are reached by steps along the gradient.)
+            lines += [f"g 5; U; g {first}; U;", f"steps_done := {first + 5};"]
+        elif self.areas == "fixed":
+            lines.append("g 1;")  # which the multipliers of areas that are held take to be known
         step = "hessian_seek" if self.newton_steps else "g 5"
-        most = self.steps + (self.newton_steps or 100000)
+        most = first + (self.newton_steps or 100000)
         lines += [
             "gain := 1;",
             f"while (gain > {self.tolerance:.3g}*abs(total_energy) and steps_done < {most}) do "
-            f"{{ before := total_energy; {step}; gain := abs(before - total_energy); "
+            f"{{ level; before := total_energy; {step}; gain := abs(before - total_energy); "
             "steps_done += 1; };",
         ]
         if self.newton_steps and self.tolerance < 1e-10:
-            # The energy cannot tell steps below the root of its rounding: two last ones in full.
-            lines.append("hessian; hessian; steps_done += 2;")
+            # The energy cannot tell steps below the root of its rounding: last ones in full.
+            last = 2 if not strings.chains.any() else 3 if near else 5
+            lines.append(f"weaken; {'level; hessian; ' * last}steps_done += {last};")
         return "\n".join([*lines, ""])
+
+
+def _angles(
+    strings: Strings, points: Float[np.ndarray, "points 2"], tissue: Tissue
+) -> Float[np.ndarray, " edges"] | None:
+    """The angles of arcs; those of straight edges stay as they were."""
+    if tissue.arcs is None:
+        return None
+    return np.where(strings.chains, strings.angles(points), np.asarray(tissue.arcs.angles))
+
+
+def _share(strings: Strings, terms: Terms) -> float:
+    """By how much target areas are too small for a periodic box."""
+    return float(abs(np.linalg.det(strings.lattice)) / np.sum(terms.area))
+
+
+def _by_targets(
+    strings: Strings, terms: Terms, pressures: Float[np.ndarray, " cells"]
+) -> Float[np.ndarray, " cells"]:
+    """Derivatives of the energy with respect to the targets of areas that are held."""
+    if not strings.periodic:
+        return pressures
+    mean = pressures @ terms.area / np.sum(terms.area)
+    return _share(strings, terms) * (pressures - mean)
 
 
 INSTALL = (
@@ -156,7 +257,7 @@ INSTALL = (
 def _report(held: Sequence[int] = ()) -> str:
     """Commands that write where all points are, and the multipliers of areas held; and end the program."""
     lines = [
-        'printf "energy %.17g\\n", total_energy-nudge.value >> "result";',
+        'printf "energy %.17g\\n", total_energy-nudge.value-spacing.value >> "result";',
         'printf "steps %g\\n", steps_done >> "result";',
         'foreach vertex vv do printf "point %d %.17g %.17g\\n", vv.id, vv.x, vv.y >> "result";',
         *(f'printf "pressure {c} %.17g\\n", keep_{c}.pressure >> "result";' for c in held),
@@ -164,151 +265,10 @@ def _report(held: Sequence[int] = ()) -> str:
     return "\n".join([*lines, 'printf "end\\n" >> "result";', "quit", "quit", ""])
 
 
-_OF_VERTICES = ("pull_x", "pull_y", "arm_x", "arm_y")
-
-
-def datafile(
-    strings: Strings, terms: Terms, forces: Float[np.ndarray, "vertices 2"] | None, *, fixed: bool
-) -> str:
-    """A tissue, its energy and a nudge in the language of Surface Evolver."""
-    lines = ["STRING", "SPACE_DIMENSION 2", "KEEP_ORIGINALS"]
-    if strings.periodic:
-        lines += ["TORUS", "PERIODS", *(f"{a:.17g} {b:.17g}" for a, b in strings.lattice)]
-    lines += [f"define vertex attribute {name} real" for name in _OF_VERTICES]
-    lines.append("define edge attribute gam real")
-    length = f"sqrt(x3^2+x4^2+{strings.softening**2:.17g})"
-    lines.append(
-        f"quantity tensions energy method edge_general_integral scalar_integrand: gam*{length}"
-    )
-    of_edge: list[list[str]] = [["tensions"] for _ in strings.edges.ends]
-    _areas(lines, of_edge, strings, terms, fixed)
-    _perimeters(lines, of_edge, strings, terms, length)
-    points, arms = strings.points, np.zeros_like(strings.points)
-    pulls = np.zeros_like(points)
-    if forces is not None:
-        pulls[:] = forces
-    lines.append(
-        "quantity nudge energy method vertex_scalar_integral scalar_integrand: -(pull_x*x+pull_y*y)"
-    )
-    held = _springs(lines, strings, terms, arms)
-    lines.append("vertices")
-    names = " ".join(["nudge", *held])
-    pinned = set(strings.fixed.tolist())
-    for i, ((x, y), (px, py), (ax, ay)) in enumerate(zip(points, pulls, arms, strict=True)):
-        fix = " fixed" if i in pinned else ""
-        lines.append(
-            f"{i + 1} {x:.17g} {y:.17g}{fix} pull_x {px:.17g} pull_y {py:.17g} arm_x {ax:.17g} "
-            f"arm_y {ay:.17g} {names}"
-        )
-    lines.append("edges")
-    sign = {0: "*", 1: "+", -1: "-"}
-    for i, ((a, b), wrap) in enumerate(zip(strings.edges.ends, strings.wraps, strict=True)):
-        around = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
-        gamma = terms.tension[i]
-        lines.append(
-            f"{i + 1} {a + 1} {b + 1}{around} density 0 gam {gamma:.17g} {' '.join(of_edge[i])}"
-        )
-    return "\n".join([*lines, "read", ""])
-
-
-def _areas(
-    lines: list[str], of_edge: list[list[str]], strings: Strings, terms: Terms, fixed: bool
-) -> None:
-    """A quantity for the area of each cell that wants one."""
-    wanted = np.full(strings.edges.n_cells, True) if fixed else terms.area_stiffness != 0
-    instances: dict[tuple, str] = {}
-    parts: dict[int, list[str]] = {}
-    for e in range(len(strings.edges.ends)):
-        for side, sign in ((0, 1), (1, -1)):
-            cell = int(strings.edges.cells[e, side])
-            if cell == strings.edges.n_cells or not wanted[cell]:
-                continue
-            x, y = strings.edges.shifts[e, side]
-            key = (cell, sign, round(float(x), 9), round(float(y), 9))
-            if key not in instances:
-                # Half the integral of x dy - y dx, as the cell sees the edge.
-                name = instances[key] = f"surface_{cell}_{len(parts.get(cell, []))}"
-                parts.setdefault(cell, []).append(name)
-                lines.append(
-                    f"method_instance {name} method edge_vector_integral vector_integrand: "
-                    f"q1: {-0.5 * sign:g}*(y+({y:.17g})) q2: {0.5 * sign:g}*(x+({x:.17g}))"
-                )
-            of_edge[e].append(instances[key])
-    for cell, some in parts.items():
-        area = "+".join(f"{name}.value" for name in some)
-        target = terms.area[cell]
-        if fixed:
-            # (Not as a function of the instances: its Hessian would be dense, for each cell.)
-            parts_of = " ".join(f"method {name}" for name in some)
-            lines.append(f"quantity keep_{cell} fixed = {target:.17g} {parts_of}")
-            continue
-        k = terms.area_stiffness[cell]
-        lines.append(
-            f"quantity swell_{cell} energy function {0.5 * k:.17g}*({area}-({target:.17g}))^2"
-        )
-
-
-def _perimeters(
-    lines: list[str], of_edge: list[list[str]], strings: Strings, terms: Terms, length: str
-) -> None:
-    """A quantity for the perimeter of each cell that wants one."""
-    for cell in np.flatnonzero(terms.perimeter_stiffness):
-        lines.append(
-            f"method_instance around_{cell} method edge_general_integral scalar_integrand: {length}"
-        )
-        k, target = terms.perimeter_stiffness[cell], terms.perimeter[cell]
-        lines.append(
-            f"quantity tighten_{cell} energy function "
-            f"{0.5 * k:.17g}*(around_{cell}.value-({target:.17g}))^2"
-        )
-    wanted = set(np.flatnonzero(terms.perimeter_stiffness).tolist())
-    for e in range(len(strings.edges.ends)):
-        of_edge[e] += [f"around_{c}" for c in strings.edges.cells[e].tolist() if c in wanted]
-
-
-def _springs(
-    lines: list[str], strings: Strings, terms: Terms, arms: Float[np.ndarray, "points 2"]
-) -> list[str]:
-    """Springs that hold the whole where it is; they change no shape, and make the Hessian regular."""
-    points, n = strings.points, len(strings.points)
-    k = _stiffness(strings, terms)
-    modes = {}
-    if len(strings.fixed) == 0:
-        modes |= {"x": "x", "y": "y"}
-    centre = points.mean(axis=0) if len(strings.fixed) == 0 else points[strings.fixed[0]]
-    if not strings.periodic and len(strings.fixed) <= 1:
-        arms[:] = (points - centre) / np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1)))
-        modes |= {"turn": "arm_x*y-arm_y*x"}
-    at = {
-        "x": points[:, 0].sum(),
-        "y": points[:, 1].sum(),
-        "turn": np.sum(arms[:, 0] * points[:, 1] - arms[:, 1] * points[:, 0]),
-    }
-    for name, integrand in modes.items():
-        lines.append(
-            f"method_instance sum_{name} method vertex_scalar_integral scalar_integrand: {integrand}"
-        )
-        lines.append(
-            f"quantity hold_{name} energy function "
-            f"{0.5 * k / n:.17g}*(sum_{name}.value-({at[name]:.17g}))^2"
-        )
-    return [f"sum_{name}" for name in modes]
-
-
-def _stiffness(strings: Strings, terms: Terms) -> float:
-    """A typical second derivative of the energy."""
-    size = np.abs(strings.edges.areas(strings.points)).mean()
-    return max(
-        float(np.mean(np.abs(terms.tension))) / np.sqrt(size),
-        float(np.mean(terms.area_stiffness)) * size,
-        float(np.mean(terms.perimeter_stiffness)),
-    )
-
-
 def _read(text: str, strings: Strings, log: str) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Points, pressures (of areas that are held) and numbers that the program wrote."""
     points = np.full_like(strings.points, np.nan)
-    pressures = np.zeros(strings.edges.n_cells)
+    pressures = np.zeros(strings.pieces.n_cells)
     numbers: dict[str, float] = {}
     lines = text.splitlines()
     try:

@@ -1,4 +1,4 @@
-"""Tissues and energies as Surface Evolver knows them: points, strings, and named quantities."""
+"""Energies as Surface Evolver knows them: named quantities of edges and cells."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from vertax.energies import (
     AbstractEnergy,
@@ -16,67 +16,7 @@ from vertax.energies import (
     PerimeterElasticity,
     ShapeFactorEnergy,
 )
-from vertax.mesh import Periodic, Tissue
-from vertax.responses._simulator import Edges, SimulatorError
-
-
-class Strings(NamedTuple):
-    """A tissue as points and straight strings between them; in a periodic one, in the home box."""
-
-    points: Float[np.ndarray, "vertices 2"]
-    images: Int[np.ndarray, "vertices 2"]
-    """In which image of the box each vertex is."""
-    edges: Edges
-    """The strings, seen from these points."""
-    wraps: Int[np.ndarray, "edges 2"]
-    """How often each goes around the box."""
-    lattice: Float[np.ndarray, "2 2"]
-    periodic: bool
-    softening: float
-    fixed: Int[np.ndarray, " _"]
-
-    @classmethod
-    def of(cls, tissue: Tissue) -> Strings:
-        """Those of a tissue."""
-        if tissue.arcs is not None:
-            raise SimulatorError(
-                "Surface Evolver is given straight edges only, and this tissue has arcs. Make one without: "
-                "vertax.Tissue(tissue.vertices, tissue.topology, tissue.boundary)."
-            )
-        edges = Edges.of(tissue)
-        vertices = np.asarray(tissue.vertices, float)
-        periodic = isinstance(tissue.boundary, Periodic)
-        lattice = np.zeros((2, 2))
-        images = np.zeros((len(vertices), 2), int)
-        if isinstance(tissue.boundary, Periodic):
-            lattice = np.asarray(tissue.boundary.lattice, float)
-            images = np.floor(vertices @ np.linalg.inv(lattice)).astype(int)
-        home = vertices - images @ lattice
-        across = np.zeros(edges.ends.shape, int)
-        if periodic:
-            across = np.rint(edges.across @ np.linalg.inv(lattice)).astype(int)
-        first, last = edges.ends.T
-        wraps = across + images[last] - images[first]
-        shifts = edges.shifts + (images[first] @ lattice)[:, None]
-        if np.abs(wraps).max(initial=0) > 1:
-            raise SimulatorError(
-                "An edge is longer than the periodic box, which Surface Evolver's datafiles cannot say."
-            )
-        pinned = () if tissue.pinned is None else np.flatnonzero(np.asarray(tissue.pinned))
-        edges = edges._replace(across=wraps @ lattice, shifts=shifts)
-        softening = float(np.asarray(tissue.softening))
-        return cls(
-            home, images, edges, wraps, lattice, periodic, softening, np.asarray(pinned, int)
-        )
-
-    def lengths(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, " edges"]:
-        """Length of each edge."""
-        d = self.edges.vectors(points)
-        return np.sqrt(np.sum(d**2, axis=1) + self.softening**2)
-
-    def perimeters(self, points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, " cells"]:
-        """Perimeter of each cell."""
-        return self.edges.sums(np.repeat(self.lengths(points), 2))
+from vertax.responses._simulator import SimulatorError
 
 
 class Terms(NamedTuple):

@@ -11,16 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float
 
 from vertax._base.checks import check_number, check_whole, named
 from vertax._base.modules import is_concrete, traced
-from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, GradientOutcome
-from vertax.adjoints._adjoint import differentiable, frozen, materialise, settle
-from vertax.adjoints._propagation import two_phases
+from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
+from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units, cell_size, units_of
 from vertax.mesh import Tissue
+from vertax.responses._external_gradient import Rest, at_rest, force_of
 from vertax.responses._host import Answer, Job, Request, ask, stacked
 from vertax.responses._relaxation import free_motions
 from vertax.responses._response import AbstractResponse, Equilibrium
@@ -61,6 +61,9 @@ class External(AbstractResponse):
         other waiting otherwise, and for those that may crash. The simulator must be one that can be pickled,
         and a script needs `if __name__ == "__main__":` as always then.
     - `step`: of the differences, relative to the parameter.
+    - `timeout`: seconds after which a run is ended, and has failed; of processes only, for a thread cannot be
+        ended. Programs that a simulator runs by [`run_program`][vertax.responses.run_program] have a limit of
+        their own.
 
     **Raises:**
 
@@ -75,6 +78,7 @@ class External(AbstractResponse):
     workers: int | None = eqx.field(static=True, default=None)
     processes: bool = eqx.field(static=True, default=False)
     step: float = eqx.field(static=True, default=1e-4)
+    timeout: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         if not isinstance(self.simulator, AbstractSimulator):
@@ -93,11 +97,15 @@ class External(AbstractResponse):
                 "JAX can differentiate nobody knows it. Pass a typical second derivative of the energy, e.g. "
                 "stiffness=1.0; the `beta` of the adjoint multiplies it."
             )
-        for name in ("tolerance", "stiffness", "step"):
+        for name in ("tolerance", "stiffness", "step", "timeout"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0, many=True)
         if self.workers is not None:
             check_whole("workers", self.workers, least=1)
+        if self.timeout is not None and not self.processes:
+            raise ValueError(
+                "Argument `timeout` needs processes=True: a simulator that hangs in a thread cannot be ended."
+            )
 
     def __call__(
         self,
@@ -231,7 +239,7 @@ class External(AbstractResponse):
                 for i in range(n)
             ]
             jobs = [Job(self.simulator, r, self.slope, self.step) for r in requests]
-            answers, reason = ask(jobs, workers, self.processes, throw)
+            answers, reason = ask(jobs, workers, self.processes, throw, self.timeout)
             if throw and reason is not None:
                 raise reason
             return stacked(answers, requests, wanted, batch)
@@ -243,11 +251,6 @@ class External(AbstractResponse):
 _AT_REST = (
     "Its energy may not be the one given here; or it stops too early: then let it go on, or raise the "
     "`tolerance` of External."
-)
-_REASON = (
-    "The gradient by equilibrium propagation cannot be trusted: the program failed, or left a force that is "
-    "not small beside the nudge. Let it relax further, raise `beta`, or allow it with "
-    "EquilibriumPropagation(throw=False)."
 )
 
 
@@ -275,11 +278,11 @@ def _answered(
         settled = there.settled(start)
         there = there.with_vertices(jnp.where(jnp.all(free), settled.vertices, there.vertices))
     slots = (energy, tissue.boundary, adjoint.outcome)
-    rest = _Rest(there, answer.slope, free, units)
-    configuration = _at_rest(slots, rest, response, adjoint.without_outcome())
+    rest = Rest(there, answer.slope, free, units)
+    configuration = at_rest(slots, rest, response, adjoint.without_outcome())
     whole = eqx.tree_at(lambda t: t.boundary, there, tissue.boundary)
     final = whole.with_configuration(configuration)
-    force = optx.max_norm(_force(there, constant)) if known else answer.max_force
+    force = optx.max_norm(force_of(there, constant)) if known else answer.max_force
     return Equilibrium(
         tissue=final,
         energy=energy(final) if known else answer.energy,
@@ -294,109 +297,19 @@ def _answered(
 def _result(
     tissue: Tissue, force: Float[Array, ""], response: External, units: Units
 ) -> optx.RESULTS:
-    at_rest = jnp.array(True)
+    still = jnp.array(True)
     if response.slope == "energy":
         tolerance = response.tolerance
         if tolerance is None:
             precise = tissue.vertices.dtype == jnp.float64
             tolerance = (1e-6 if precise else 1e-3) * units.force
-        at_rest = force <= tolerance
+        still = force <= tolerance
     result = optx.RESULTS.where(
-        at_rest, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+        still, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
     )
     finite = jnp.all(jnp.isfinite(tissue.vertices))
     return optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
 
 
-def _force(tissue: Tissue, energy: AbstractEnergy) -> PyTree[Array]:
-    return jax.grad(lambda y: energy(tissue.with_configuration(y)))(tissue.configuration)
-
-
 def _n_motions(tissue: Tissue) -> int:
     return jax.eval_shape(lambda x: tissue.boundary.motions(x, x[0, 0]), tissue.vertices).shape[0]
-
-
-class _Rest(eqx.Module):
-    """What is known of a tissue at rest."""
-
-    tissue: Tissue
-    slope: PyTree[Array]
-    free: Bool[Array, " motions"]
-    units: Units
-
-    def balanced(self, pull: PyTree[Array]) -> PyTree[Array]:
-        """A nudge less what would only carry the whole away."""
-        vertices, rest = pull if isinstance(pull, tuple) else (pull, None)
-        tissue = self.tissue
-        if tissue.pinned is not None:
-            vertices = jnp.where(tissue.pinned[:, None], 0, vertices)
-        drift = lambda x: tissue.boundary.drift(x, tissue.vertices, tissue.pinned)
-        modes = jax.jacobian(drift)(tissue.vertices)
-        shares = self.free * jnp.sum(modes * vertices, axis=(1, 2))
-        vertices = vertices - jnp.sum(shares[:, None, None] * modes, axis=0)
-        return vertices if rest is None else (vertices, rest)
-
-
-@eqx.filter_custom_vjp
-def _at_rest(
-    vjp_arg: tuple[Any, Any, GradientOutcome | None],
-    rest: _Rest,
-    response: External,
-    adjoint: EquilibriumPropagation,
-) -> PyTree[Array]:
-    return rest.tissue.configuration
-
-
-@_at_rest.def_fwd
-def _(perturbed: Any, vjp_arg: Any, rest: _Rest, *args: Any) -> tuple:
-    return rest.tissue.configuration, None
-
-
-@_at_rest.def_bwd
-def _(
-    residuals: None,
-    cotangent: PyTree,
-    perturbed: Any,
-    vjp_arg: Any,
-    rest: _Rest,
-    response: External,
-    adjoint: EquilibriumPropagation,
-) -> Any:
-    energy, boundary, slot = vjp_arg
-    tissue = rest.tissue
-    moving, fixed = differentiable((energy, boundary))
-    known = response.slope == "energy"
-
-    def slope(there: Tissue) -> PyTree[Array]:
-        def value(m: PyTree[Array]) -> Array:
-            energy, boundary = eqx.combine(m, fixed)
-            return energy(eqx.tree_at(lambda t: t.boundary, there, boundary))
-
-        return jax.grad(value)(moving)
-
-    def by_program(slope: PyTree[Array]) -> PyTree[Array]:
-        # (What the energy does with the box is not known: its derivative is none.)
-        return slope, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), moving[1])
-
-    def phase(pull: PyTree[Array], strength: Array) -> tuple[PyTree[Array], Array, Array]:
-        vertices, torques = pull if isinstance(pull, tuple) else (pull, None)
-        request = Request(tissue, frozen(energy), -vertices, torques)
-        answer = response.ask(request, adjoint.throw)
-        there = tissue.with_vertices(answer.vertices)
-        if answer.angles is not None:
-            there = there.with_angles(answer.angles)
-        finite = jnp.all(jnp.isfinite(answer.vertices))
-        if not known:
-            left = jnp.where(jnp.isnan(answer.max_force) & finite, 0, answer.max_force)
-            return by_program(answer.slope), left, answer.num_steps
-        left = jax.tree.map(jnp.add, _force(there, frozen(energy)), pull)
-        return slope(there), optx.max_norm(left), answer.num_steps
-
-    pull = rest.balanced(materialise(cotangent, tissue.configuration))
-    at_rest = None
-    if not adjoint.centred:
-        at_rest = slope(tissue) if known else by_program(rest.slope)
-    sizes = {"stiffness": rest.units.stiffness, "length_scale": rest.units.length}
-    gradient, outcome = two_phases(adjoint, pull, sizes, phase, at_rest)
-    (d_energy, d_boundary), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
-    return d_energy, d_boundary, outcome

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
-import multiprocessing
-import threading
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,6 +13,7 @@ from jaxtyping import PyTree, Shaped
 
 from vertax.mesh import Tissue
 from vertax.responses._simulator import AbstractSimulator, Relaxed, SimulatorError, ledger_of
+from vertax.responses._workers import elsewhere
 
 
 class Request(NamedTuple):
@@ -53,12 +50,14 @@ class Job(NamedTuple):
 
     def __call__(self) -> Answer:
         tissue, energy, forces, torques = self.request
-        if torques is not None and np.any(torques != 0):
+        bends = torques is not None and np.any(torques != 0)
+        if bends and not self.simulator.bends:
             raise SimulatorError(
-                "The cost depends on the angles of arcs, on which no program can be told to pull. Use a cost "
-                "of the vertices."
+                "The cost depends on the angles of arcs, and this program cannot be told to pull on them. "
+                "Use a cost of the vertices, or let `relax` take `torques` and say so by `bends = True`."
             )
-        said = self.simulator.relax(tissue, energy, forces)
+        relax: Any = self.simulator.relax
+        said = relax(tissue, energy, forces, *([torques] if bends else []))
         said = said if isinstance(said, Relaxed) else Relaxed(said)
         vertices = _array("vertices", said.vertices, np.shape(tissue.vertices))
         angles = None if tissue.arcs is None else tissue.arcs.angles
@@ -91,15 +90,22 @@ class Job(NamedTuple):
 
 
 def ask(
-    requests: Sequence[Job], workers: int, processes: bool, throw: bool
+    requests: Sequence[Job],
+    workers: int,
+    processes: bool,
+    throw: bool,
+    timeout: float | None = None,
 ) -> tuple[list[Answer | None], SimulatorError | None]:
-    """The answers to some questions, side by side; None, and the first reason, where there is none."""
+    """The answers to some questions, side by side; None, and the first reason, where there is none.
+
+    In processes of their own they may take `timeout` seconds each.
+    """
     reasons: list[SimulatorError] = []
 
     def one(job: Job) -> Answer | None:
         try:
             with ledger_of(job.simulator).run():
-                return _elsewhere(job, workers) if processes else job()
+                return elsewhere(job, timeout) if processes else job()
         except Exception as error:
             reasons.append(_as_error(error))
             return None
@@ -181,7 +187,10 @@ def _differences(job: Job, tissue: Tissue, energy: Any) -> PyTree[np.ndarray]:
         moved = [np.array(x) for x in leaves]
         moved[number].flat[place] += step
         there = eqx.combine(jax.tree.unflatten(structure, moved), constants)
-        return float(job.simulator.energy(tissue, there))
+        energy = float(job.simulator.energy(tissue, there))
+        if not np.isfinite(energy):
+            raise SimulatorError(f"The energy by the program is {energy}.")
+        return energy
 
     slopes = []
     for number, x in enumerate(leaves):
@@ -227,39 +236,3 @@ def _floating(x: Any) -> bool:
 
 def _finite(x: Any) -> bool:
     return not _floating(x) or bool(np.isfinite(x).all())
-
-
-_POOLS: dict[int, ProcessPoolExecutor] = {}
-_LOCK = threading.Lock()
-
-
-def _elsewhere(job: Job, workers: int) -> Answer:
-    """The answer from another process."""
-    with _LOCK:
-        pool = _POOLS.get(workers)
-        if pool is None:
-            # Forking a process in which JAX has threads may deadlock.
-            context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(workers, context, initializer=_prepare)
-            _POOLS[workers] = pool
-    try:
-        return pool.submit(job).result()
-    except BrokenProcessPool as error:
-        with _LOCK:
-            if _POOLS.get(workers) is pool:
-                del _POOLS[workers]
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise SimulatorError("The process that ran the program died.") from error
-
-
-def _prepare() -> None:
-    """Leave the accelerator to the process that asks."""
-    jax.config.update("jax_platforms", "cpu")
-
-
-def _close() -> None:
-    for pool in _POOLS.values():
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
-atexit.register(_close)

@@ -9,7 +9,7 @@ import weakref
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, PyTree, Shaped
@@ -45,13 +45,19 @@ class Relaxed(NamedTuple):
 
 
 class AbstractSimulator(abc.ABC):
-    """A program that brings a tissue to rest, for [`External`][vertax.External].
+    r"""A program that brings a tissue to rest, for [`External`][vertax.External].
 
     Subclass it and write `relax`, in NumPy, or by running a program. All arrays that it is given are NumPy
     arrays, those of `tissue` and `energy` too; [`Edges`][vertax.responses.Edges] says who is where. It is
     called from within a compiled program, in which nothing can be computed by JAX: so use no property of the
     tissue beyond its fields.
+
+    A program that can pull at arcs says so by `bends = True`; then its `relax` takes a fourth argument,
+    `torques`, of shape `(edges,)`: minimise $E(X) - \sum_v f_v \cdot x_v - \sum_e \tau_e \alpha_e$ with the
+    angles $\alpha$ of the arcs.
     """
+
+    bends: ClassVar[bool] = False
 
     @abc.abstractmethod
     def relax(
