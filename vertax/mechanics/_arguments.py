@@ -16,7 +16,7 @@ from vertax.mesh import Periodic, Tissue
 from vertax.responses import Relaxation
 
 
-def check_tissue(tissue: Any, energy: Any = abs, *, box: str | None = None) -> None:
+def check_system(tissue: Any, energy: Any, *, box: str | None = None) -> None:
     """Refuse what is no tissue, or no energy.
 
     **Arguments:**
@@ -30,13 +30,18 @@ def check_tissue(tissue: Any, energy: Any = abs, *, box: str | None = None) -> N
     - `TypeError` for another object in the place of either.
     - `ValueError` for a batch of tissues, or a free tissue where a box is needed.
     """
-    if not isinstance(tissue, Tissue):
-        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {named(tissue)}.")
+    check_tissue(tissue, box=box)
     if not callable(energy) or isinstance(energy, type):
         raise TypeError(
             f"Argument `energy` must be an energy, e.g. vertax.energies.ShapeFactorEnergy(3.7), but is "
             f"{named(energy)}."
         )
+
+
+def check_tissue(tissue: Any, *, box: str | None = None) -> None:
+    """Refuse what is no tissue; see `check_system`."""
+    if not isinstance(tissue, Tissue):
+        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {named(tissue)}.")
     if np.ndim(tissue.vertices) != 2:
         raise ValueError(
             "Argument `tissue` must be one tissue, but its vertices have shape "

@@ -16,7 +16,7 @@ from vertax._base.modules import traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import as_matrix, check_relaxation, check_tissue
+from vertax.mechanics._arguments import as_matrix, check_relaxation, check_system
 from vertax.mechanics._elasticity import elastic_tensor
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
@@ -117,7 +117,7 @@ class BoxRelaxation(AbstractResponse):
         - `ValueError` for a free tissue, or an adjoint that unrolls.
         - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and no equilibrium was reached.
         """
-        check_tissue(tissue, energy, box="a BoxRelaxation")
+        check_system(tissue, energy, box="a BoxRelaxation")
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.relaxation.check(tissue, energy, adjoint)
         self.goes_with(adjoint)

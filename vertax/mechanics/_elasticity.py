@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import as_angle, check_linear_solver, check_tissue
+from vertax.mechanics._arguments import as_angle, check_linear_solver, check_system
 from vertax.mechanics._landscape import (
     Landscape,
     area_of,
@@ -73,7 +73,7 @@ def elastic_tensor(
     - `ValueError` for a free tissue, or a batch of them.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
-    check_tissue(tissue, energy, box="an elastic modulus")
+    check_system(tissue, energy, box="an elastic modulus")
     solver = MINRES() if linear_solver is None else linear_solver
     check_linear_solver(solver)
     tensor = _elastic_tensor(*traced((tissue, energy)), _Elasticity(solver, affine))

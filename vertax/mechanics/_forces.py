@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from vertax._base.modules import compiled_property, traced
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import check_tissue
+from vertax.mechanics._arguments import check_system
 from vertax.mesh import Tissue
 
 
@@ -75,7 +75,7 @@ def pressures_and_tensions(
     tissue: Tissue, energy: AbstractEnergy
 ) -> tuple[Float[Array, " cells"], Float[Array, " edges"]]:
     """Both at once."""
-    check_tissue(tissue, energy)
+    check_system(tissue, energy)
     return _pressures_and_tensions(*traced((tissue, energy)))
 
 

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from vertax._base.checks import as_doubles, check_concrete, check_number, check_whole
 from vertax._base.modules import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
-from vertax.mechanics._arguments import check_tissue
+from vertax.mechanics._arguments import check_system
 from vertax.mechanics._hessian import (
     DENSE,
     dense_hessian,
@@ -84,7 +84,7 @@ def modes(
     - `TypeError` for what is no tissue or no energy, and for `"sparse"` with an energy that is not local,
         or inside `jax.jit`.
     """
-    check_tissue(tissue, energy)
+    check_system(tissue, energy)
     check_whole("k", k, least=1)
     if method not in (None, "dense", "sparse"):
         raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
@@ -124,7 +124,7 @@ def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
 
     - `TypeError` inside `jax.jit`, and for what is no tissue or no energy.
     """
-    check_tissue(tissue, energy)
+    check_system(tissue, energy)
     check_concrete("spectrum", tissue, energy)
     matrix = np.asarray(_dense(Landscape(*traced((tissue, energy)))))
     free = np.asarray(ravel_pytree(movable(tissue))[0])

@@ -17,7 +17,7 @@ from vertax._base.checks import as_real, check_number
 from vertax._base.modules import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
-from vertax.mechanics._arguments import check_dissipation, check_tissue
+from vertax.mechanics._arguments import check_dissipation, check_system
 from vertax.mechanics._elasticity import shear_part
 from vertax.mechanics._hessian import DENSE, dense_hessian, factorised, movable, sparse_hessian
 from vertax.mechanics._landscape import (
@@ -80,7 +80,7 @@ def complex_modulus(
     - `TypeError` for `"sparse"` with an energy or a dissipation that is not local, or inside `jax.jit`.
     - `ValueError` for a free tissue, a negative frequency, no list of them, or another method.
     """
-    check_tissue(tissue, energy, box="a complex modulus")
+    check_system(tissue, energy, box="a complex modulus")
     check_dissipation(dissipation)
     check_number("frequencies", frequencies, least=0, many=True)
     omegas = jnp.atleast_1d(as_real("frequencies", frequencies)).astype(tissue.vertices.dtype)

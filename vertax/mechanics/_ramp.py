@@ -13,7 +13,7 @@ from vertax._base.checks import as_real, named
 from vertax._base.modules import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import as_matrix, check_relaxation, check_tissue
+from vertax.mechanics._arguments import as_matrix, check_relaxation, check_system
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue
@@ -108,7 +108,7 @@ def ramp(
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the tissue did not come to rest at some
         strain.
     """
-    check_tissue(tissue, energy, box="a ramp")
+    check_system(tissue, energy, box="a ramp")
     values = as_real("strains", strains).astype(tissue.vertices.dtype)
     if values.ndim != 1 or values.size == 0:
         raise ValueError(

@@ -13,7 +13,7 @@ from vertax._base.checks import check_whole
 from vertax._base.modules import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import check_dissipation, check_linear_solver, check_tissue
+from vertax.mechanics._arguments import check_dissipation, check_linear_solver, check_system
 from vertax.mechanics._forces import tensions
 from vertax.mechanics._landscape import checked, dissipation_landscape, solve
 from vertax.mesh import Tissue
@@ -109,7 +109,7 @@ def recoil(
     - `ValueError` for an edge that is none.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
-    check_tissue(tissue, energy)
+    check_system(tissue, energy)
     check_dissipation(dissipation)
     if is_concrete(edge):
         number = np.asarray(edge)[()] if isinstance(edge, jax.Array) else edge

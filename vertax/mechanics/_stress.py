@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from vertax._base.checks import as_real
 from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import check_tissue
+from vertax.mechanics._arguments import check_system
 from vertax.mechanics._forces import pressures_and_tensions
 from vertax.mechanics._landscape import area_of, deformed
 from vertax.mesh import Tissue
@@ -41,7 +41,7 @@ def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
     - `TypeError` for what is no tissue, or no energy.
     - `ValueError` for a batch of tissues.
     """
-    check_tissue(tissue, energy)
+    check_system(tissue, energy)
     return _stress(*traced((tissue, energy)))
 
 
@@ -69,7 +69,7 @@ def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2
 
     **Raises:** as `stress`.
     """
-    check_tissue(tissue, energy)
+    check_system(tissue, energy)
     return _cell_stress(*traced((tissue, energy)))
 
 

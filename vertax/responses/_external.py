@@ -107,6 +107,11 @@ class External(AbstractResponse):
                 "Argument `timeout` needs processes=True: a simulator that hangs in a thread cannot be ended."
             )
 
+    @property
+    def side_by_side(self) -> bool:
+        """Yes: each run of the program is a thread of its own."""
+        return True
+
     def __call__(
         self,
         tissue: Tissue,
