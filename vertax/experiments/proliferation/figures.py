@@ -56,7 +56,7 @@ def classes(
     axes[1].set_xlim(n_cells[0], n_cells[-1] + 1)  # (there may be no line)
     axes[1].set(xlabel="cells", ylabel="share of inner cells", ylim=(0, 0.75), xscale="log")
     axes[1].xaxis.set_minor_formatter(NullFormatter())
-    axes[1].legend(loc="upper right")
+    axes[1].legend(loc="upper left")
     return figure
 
 
