@@ -88,12 +88,14 @@ def read_courses(
     fit = partial(fit_curves, tissue, points, grain)
     # A curve through a dozen pixels hides how rough they are.
     short = apart is None and np.mean(length[used]) < _LONG * grain
+    start, alike, crisp, first = _BENDING, 0.0, False, None
     for start in _BENDINGS[:1] if short else (_BENDING, _BENDINGS[0]):
         first = fit(apart=apart or 2 * grain, bending=start, noise=noise or 0.4 * grain)
         alike = apart or min(correlation_length(points, first.rest), longest)
         crisp = first.noise < _CRISP[0] * grain and alike < _CRISP[1] * grain
         if crisp or apart is not None:
             break
+    assert first is not None
     off, bending = noise or first.noise, start
     if start == _BENDING:
         flat = fit(apart=alike, bending=_BENDINGS[1], noise=off)

@@ -175,7 +175,7 @@ def solve(
         if np.any(x[:n_edges] < 0):
             x = _not_negative(normal, right, n_edges)
         residual = white @ x + given
-        change = -answer @ solve_triangular(factor, residual, lower=True, trans="T")
+        change = -answer @ solve_triangular(factor, residual, lower=True, trans=1)
         change *= min(1.0, _REACH / max(float(np.max(np.abs(change))), 1e-300))
         covariance = cho_solve(root, np.eye(len(x)))
         # Before angles are adjusted by much: where noise is large, tensions could drift with the prior.

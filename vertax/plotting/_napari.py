@@ -60,8 +60,8 @@ def tension_layer(found: InferredTensions, *, colours: str = "viridis") -> tuple
 
 
 def napari_tensions(
-    cells: "napari.layers.Labels",
-) -> "list[napari.types.LayerDataTuple]":
+    cells: "napari.layers.Labels",  # pyright: ignore[reportUndefinedVariable]
+) -> "list[napari.types.LayerDataTuple]":  # pyright: ignore[reportUndefinedVariable]
     """Tensions of the edges between labels: the widget of napari.
 
     **Arguments:**
@@ -70,7 +70,7 @@ def napari_tensions(
 
     **Returns:** a layer of edges, and one of labels with the table of cells.
     """
-    import napari.utils.notifications as notifications
+    import napari.utils.notifications as notifications  # pyright: ignore[reportMissingImports]
 
     mask = np.asarray(cells.data)
     found = infer_tensions(mask, kind="labels")
