@@ -108,6 +108,7 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
         noise=0.1,
         correlation=0.1,
         model_errors=(0.0, 0.0),
+        bending=0.0,
         pixel_size=0.4,
     )
     left, right = panels(tensions.foam(picture, found))

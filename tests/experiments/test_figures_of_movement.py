@@ -76,5 +76,7 @@ def test_a_course_is_shown_with_what_was_reached():
         {"constant": 1 + 0 * times, "timed": 1 + times},
     )
     figure.canvas.draw()
-    labels = [text.get_text() for text in figure.axes[2].get_legend().get_texts()]
+    legend = figure.axes[2].get_legend()
+    assert legend is not None
+    labels = [text.get_text() for text in legend.get_texts()]
     assert labels == ["asked for", "constant tensions", "timed tensions"]

@@ -115,6 +115,7 @@ def test_turning_the_noise_over_gives_deviations_like_those_of_laplace(foam):
     ratio = found.resampled_deviations[sure] / found.tension_deviations[sure]
     assert 0.4 < np.median(ratio) < 1.6
     again = infer_tensions(label_image(foam[0], 400), resamples=24)
+    assert again.resampled_deviations is not None
     np.testing.assert_array_equal(
         found.resampled_deviations[sure], again.resampled_deviations[sure]
     )

@@ -307,6 +307,7 @@ def test_gradient_through_arcs_is_that_of_differences(areas):
     # (From where it rests, for the program lets a foam turn a little on its way there.)
     tissue = response(FOAM, energy_of(tension)).tissue
     away = 0.03 * np.cos(np.arange(tissue.vertices.size)).reshape(-1, 2)
+    assert tissue.angles is not None
     target = tissue.with_vertices(tissue.vertices + away).with_angles(0.9 * tissue.angles)
     adjoint = vx.EquilibriumPropagation()
     problem = vx.InverseProblem(

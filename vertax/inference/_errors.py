@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -48,7 +48,8 @@ def model_errors(
 
     **Returns:** the [`Errors`][vertax.inference._errors.Errors].
     """
-    orthogonal, upper, _ = qr(matrix, pivoting=True)
+    factors: Any = qr(matrix, pivoting=True)  # (of SciPy's overloads none says so)
+    orthogonal, upper, _ = factors
     size = np.abs(np.diag(upper))
     free = orthogonal[:, int(np.sum(size > 1e-9 * size[0])) :]
     z = free.T @ given
