@@ -111,6 +111,18 @@ def test_an_edge_that_vanishes_along_another_side_has_a_moderate_curvature(offse
     assert np.abs(curvature).max() < 1e5 * contacts.strength
 
 
+@pytest.mark.parametrize("reach", [1e-6, 0.01, 0.2])
+def test_few_contacts_of_a_large_tissue_are_looked_at_alone(reach):
+    tissue = vx.initialise.periodic_voronoi(520, key=0)
+    units = {"length_scale": jnp.asarray(1.0), "stiffness": jnp.asarray(6.0)}
+    contacts, _ = no_contacts(reach, units, tissue).found(tissue)
+    there = int(jnp.sum(contacts.pairs[:, 0] != contacts.pairs[:, 1]))
+    few = len(contacts.pairs) // 16
+    assert {1e-6: there == 0, 0.01: 0 < there <= few, 0.2: there > few}[reach], there
+    everything = contacts._energy(tissue, contacts.pairs)
+    np.testing.assert_allclose(contacts(tissue), everything, rtol=1e-12)
+
+
 def test_a_negative_range_is_refused():
     with pytest.raises(ValueError, match="contact_range"):
         vx.Relaxation(contact_range=-0.1)

@@ -46,7 +46,7 @@ class Contacts(eqx.Module):
     - `slope`: the range over the distance to the common end, between sides that are next to each other.
     - `strength`: energy per length squared.
     - `pairs`: half-edges whose source is near another side of their face, and that side; the same twice
-        where there are fewer pairs.
+        after the last one.
     - `slack`: how far the vertices may move until something else may come into range.
     """
 
@@ -60,12 +60,18 @@ class Contacts(eqx.Module):
         """The energy of the barrier."""
         nothing = lambda: jnp.zeros((), tissue.vertices.dtype)
         # Most tissues are free of contacts most of the time, and arcs take thirty times as long with them.
-        some = jnp.any(self.pairs[:, 0] != self.pairs[:, 1])
-        return jax.lax.cond(some, lambda: self._energy(tissue), nothing)
+        # Large ones are never free of them, but have few.
+        sizes = [len(self.pairs)]
+        if len(self.pairs) >= _MANY and tissue.arcs is None:
+            sizes.insert(0, len(self.pairs) // 16)
+        count = jnp.sum(self.pairs[:, 0] != self.pairs[:, 1])
+        enough = sum(count > size for size in (0, *sizes[:-1]))
+        some = [lambda size=size: self._energy(tissue, self.pairs[:size]) for size in sizes]
+        return jax.lax.switch(enough, [nothing, *some])
 
-    def _energy(self, tissue: Tissue) -> Float[Array, ""]:
+    def _energy(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
         following, sides = tissue.topology.next, tissue.sides
-        corner, side = self.pairs[:, 0], self.pairs[:, 1]
+        corner, side = pairs[:, 0], pairs[:, 1]
         after = take(following, corner) == side
         before = take(following, take(following, side)) == corner
         values = jnp.zeros(corner.shape, sides.dtype)
@@ -139,6 +145,8 @@ class Contacts(eqx.Module):
         return eqx.tree_at(lambda c: (c.pairs, c.slack), self, (0 * self.pairs, slack)), clear
 
 
+# From so many places for a contact on it pays to look whether a few would do.
+_MANY = 1000
 # What is less than so many ranges away may come into range in the next step.
 _MARGIN = 2
 
