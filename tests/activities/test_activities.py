@@ -87,6 +87,7 @@ class TestThermalNoise:
         assert energies[fast].mean() == pytest.approx(temperature, rel=0.04)
         assert energies[slow].mean() == pytest.approx(temperature, rel=0.15)
 
+    @pytest.mark.thorough
     def test_the_same_key_gives_the_same_course_and_it_can_go_on(self):
         times = 0.1 * jnp.arange(9)
         whole = evolve(ThermalNoise(1e-4), times)

@@ -176,6 +176,7 @@ class TotalCubes(vx.AbstractCost):
         return jnp.sum(tissue.areas**3) + jnp.sum(tissue.perimeters**3)
 
 
+@pytest.mark.thorough
 @adjoints("propagation")
 def test_parameters_of_every_kind(adjoint, response, rtol):
     tissue, _, _ = start_and_cost()

@@ -359,6 +359,7 @@ def test_an_interrupt_keeps_what_there_is(hidden):
     assert fit.interrupted
 
 
+@pytest.mark.thorough
 def test_an_interrupt_ends_a_least_squares_fit_too(hidden):
     target, truth, guess, start = hidden
 

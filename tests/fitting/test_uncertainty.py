@@ -142,6 +142,7 @@ def test_a_position_that_the_cost_does_not_see_makes_no_difference(hidden):
     assert 1 < ratio < 1.2
 
 
+@pytest.mark.thorough
 def test_data_without_noise_leave_nothing_open(hidden):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, OneNumber(jnp.full(20, 3.6, float)))

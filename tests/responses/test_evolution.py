@@ -66,6 +66,7 @@ class TestDecay:
 
 
 class TestWithoutActivity:
+    @pytest.mark.thorough
     @pytest.mark.parametrize(
         "make",
         [random_tissue, pytest.param(cluster, marks=pytest.mark.slow)],

@@ -104,6 +104,7 @@ def test_asymmetric_doublet_and_the_neumann_triangle():
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, 1])
 def test_triplets(seed):
     target = jnp.array([0.6, 1.0, 1.5])
@@ -114,6 +115,7 @@ def test_triplets(seed):
     assert imbalance(tissue, tension, target) < 1e-8
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("inner_arcs", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_young_laplace_and_force_balance_in_random_clusters(inner_arcs):
     n, target, num_t1 = 12, jnp.linspace(0.7, 1.3, 12), 0

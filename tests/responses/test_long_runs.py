@@ -59,6 +59,7 @@ class Interrupt:
         monkeypatch.setattr(vx._base.checkpoints.Keeper, "note", note)
 
 
+@pytest.mark.thorough
 def test_what_was_interrupted_goes_on_to_the_same_bits(tmp_path, monkeypatch):
     whole = driven(checkpoint=tmp_path / "whole.npz")
     assert whole.num_t1 > 0
