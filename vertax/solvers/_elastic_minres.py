@@ -28,8 +28,7 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Medium]]):
         self, operator: lx.AbstractLinearOperator, options: dict[str, Any]
     ) -> tuple[Any, Medium]:
         linear = self.plain.init(operator, options)
-        floor = self.waves.floor(self.stiffness)
-        return linear, self.waves.fitted(linear.mv, operator.in_structure(), floor)
+        return linear, self.waves.fitted(linear.mv, operator.in_structure(), self.stiffness)
 
     def compute(
         self, state: tuple[Any, Medium], vector: PyTree[Array], options: dict[str, Any]
@@ -37,11 +36,8 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Medium]]):
         linear, medium = state
 
         def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
-            first, *rest = jax.tree.leaves(r)
-            shift = jnp.zeros((), first.dtype)
-            first = first / self.stiffness + medium.yields(first, shift)
-            leaves = [first, *(x / self.stiffness for x in rest)]
-            return jax.tree.unflatten(jax.tree.structure(r), leaves)
+            near = jax.tree.map(lambda x: x / self.stiffness, r)
+            return medium.added(near, r, jnp.zeros_like(self.stiffness))
 
         preconditioner = lx.FunctionLinearOperator(
             approximate_inverse, linear.in_structure(), lx.positive_semidefinite_tag

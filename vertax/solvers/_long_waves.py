@@ -75,13 +75,8 @@ class LongWaves(eqx.Module):
             size=size,
         )
 
-    def floor(self, stiffness: Float[Array, ""]) -> Float[Array, ""]:
-        """The least stiffness of waves that there is to reckon with, if that of a vertex is given."""
-        shortest = jnp.max(jnp.sum(self.reciprocal**2, axis=-1)) * (self.size / 2) ** 2
-        return 1e-4 * stiffness / shortest
-
     def fitted(
-        self, hessian: Callable[[PyTree], PyTree], like: PyTree, floor: Float[Array, ""]
+        self, hessian: Callable[[PyTree], PyTree], like: PyTree, mean: Float[Array, ""]
     ) -> Medium:
         """The medium with the stiffness of waves in a tissue.
 
@@ -89,9 +84,10 @@ class LongWaves(eqx.Module):
 
         - `hessian`: its products with vectors.
         - `like`: a configuration, or its shapes.
-        - `floor`: no wave as long as cells is taken to be softer than this (energy per area).
+        - `mean`: the mean stiffness of a vertex; no wave is taken to be much softer.
         """
         squares = jnp.sum(self.reciprocal**2, axis=-1)
+        floor = 1e-4 * mean / (jnp.max(squares) * (self.size / 2) ** 2)
         directions = self.reciprocal / jnp.sqrt(squares)[:, None]
         across = jnp.stack([-directions[:, 1], directions[:, 0]], axis=-1)
         moves = jnp.sum(self.weights, axis=-1, keepdims=True)
@@ -107,12 +103,12 @@ class LongWaves(eqx.Module):
             return jnp.vdot(wave, jax.tree.leaves(product)[0]) / jnp.vdot(wave, wave)
 
         long, short = 1, max(2, self.size // 8)
-        mean = jnp.mean(squares)
+        square = jnp.mean(squares)
 
         def law(polarisations: Float[Array, "2 2"], least: Array) -> tuple[Array, Array]:
             far, near = stiffness(long, polarisations), stiffness(short, polarisations)
-            slope = jnp.maximum((near - far) / (mean * (short**2 - long**2)), least)
-            return jnp.maximum(far - slope * mean * long**2, 0), slope
+            slope = jnp.maximum((near - far) / (square * (short**2 - long**2)), least)
+            return jnp.maximum(far - slope * square * long**2, 0), slope
 
         offset, compression = law(directions, floor)
         other, shear = law(across, jnp.maximum(floor, 1e-3 * compression))
@@ -126,6 +122,12 @@ class Medium(eqx.Module):
     offset: Float[Array, ""]
     shear: Float[Array, ""]
     compression: Float[Array, ""]
+
+    def added(self, near: PyTree, force: PyTree, shift: Float[Array, ""]) -> PyTree:
+        """How vertices give way near by, as parts of a configuration, and how the medium does besides."""
+        first, *rest = jax.tree.leaves(near)
+        first = first + self.yields(jax.tree.leaves(force)[0], shift)
+        return jax.tree.unflatten(jax.tree.structure(near), [first, *rest])
 
     def yields(
         self, force: Float[Array, "vertices 2"], shift: Float[Array, ""]

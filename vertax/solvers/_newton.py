@@ -218,20 +218,15 @@ class _Waves(eqx.Module):
         if waves is None:
             return None
         stiffness = options["stiffness"]
-        fitted = lambda: waves.fitted(hessian, like, waves.floor(stiffness))
+        fitted = lambda: waves.fitted(hessian, like, stiffness)
         nothing = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), eqx.filter_eval_shape(fitted))
         return cls(jax.lax.cond(used, fitted, lambda: nothing), stiffness, used)
 
     def added(self, near: PyTree, r: PyTree, shift: Rows) -> PyTree:
         """A residual that was preconditioned near by, and its long waves."""
-        (first, *rest), structure = jax.tree.flatten(near)
         # A place that is held tightly must not hold all others.
         held = jnp.mean(jnp.minimum(jax.tree.leaves(shift)[0], self.stiffness))
-        forces = jax.tree.leaves(r)[0]
-        first = jax.lax.cond(
-            self.used, lambda: first + self.medium.yields(forces, held), lambda: first
-        )
-        return jax.tree.unflatten(structure, [first, *rest])
+        return jax.lax.cond(self.used, lambda: self.medium.added(near, r, held), lambda: near)
 
 
 def _dot(a: PyTree, b: PyTree) -> Float[Array, ""]:
