@@ -19,7 +19,7 @@ def faces_that_overlap(tissue: vx.Tissue, points: int = 48) -> list[int]:
         first = h = int(np.flatnonzero(cell == face)[0])
         outline = []
         while True:
-            outline.append(_piece(start[h], start[following[h]], angles[h], points))
+            outline.append(piece(start[h], start[following[h]], angles[h], points))
             h = int(following[h])
             if h == first:
                 break
@@ -31,7 +31,7 @@ def faces_that_overlap(tissue: vx.Tissue, points: int = 48) -> list[int]:
     return bad
 
 
-def _piece(p: np.ndarray, q: np.ndarray, angle: float, points: int) -> np.ndarray:
+def piece(p: np.ndarray, q: np.ndarray, angle: float, points: int) -> np.ndarray:
     """Points from p on, without q, on an arc that bulges to the right of the way."""
     if abs(angle) < 1e-9:
         return p[None]

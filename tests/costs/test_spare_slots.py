@@ -39,7 +39,7 @@ COSTS = {
     "areas": lambda target, n: CellAreas(jnp.linspace(0.5, 1.5, ROOM)[:n]),
     "interfaces": lambda target, n: HomotypicLength(TYPES[:n]),
     "relative interfaces": lambda target, n: HomotypicLength(TYPES[:n], relative=True),
-    "image": lambda target, n: MeshImage(jnp.ones((8, 8)), 1.5),
+    "image": lambda target, n: MeshImage(np.eye(8), 1.5),
     "stress": lambda target, n: Stress(jnp.eye(2)),
     "cell stress": lambda target, n: CellStress(jnp.eye(2), cells=[0, 2]),
     "moments": lambda target, n: AspectRatio(1.2),

@@ -409,7 +409,7 @@ def test_shape_factors_in_float32(hidden):
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     target, truth, guess, start = jax.tree.map(to32, hidden)
     problem = inverse_problem(start, guess, VertexDistance(target))
-    fit = vx.fit(problem, ADAM, 80, truth=truth, progress=False)
+    fit = vx.fit(problem, ADAM, 120, truth=truth, progress=False)
     assert fit.energy.target_shape_factor.dtype == jnp.float32
     assert fit.history.relative_error[-1] < 0.1 * fit.history.relative_error[0]
 

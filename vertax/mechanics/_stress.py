@@ -79,13 +79,16 @@ def _cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 
     cells = tissue.topology.edge_cells
     # An edge whose other side is the exterior belongs to its one cell.
     inside = cells < tissue.n_cells
-    share = tension / jnp.sum(inside, axis=1)
+    share = tension / jnp.maximum(jnp.sum(inside, axis=1), 1)
     pull = share[:, None, None] * _directed_lengths(tissue)
     sums = jax.ops.segment_sum(
         jnp.concatenate([pull, pull]), jnp.concatenate([cells[:, 0], cells[:, 1]]), tissue.n_cells
     )
     isotropic = pressure[:, None, None] * jnp.eye(2, dtype=pull.dtype)
-    return sums / tissue.areas[:, None, None] - isotropic
+    areas = tissue.areas
+    if tissue.topology.spare:
+        areas = jnp.where(tissue.alive, areas, 1)
+    return sums / areas[:, None, None] - isotropic
 
 
 def _directed_lengths(tissue: Tissue) -> Float[Array, "edges 2 2"]:

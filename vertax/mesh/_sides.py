@@ -141,29 +141,33 @@ def squared_distance_to_arc(
 
 
 def bulge_gap(
-    one: Sides, other: Sides, circles: tuple[Circle, Circle]
+    one: Sides, other: Sides, circles: tuple[Circle, Circle], reach: Float[Array, ""]
 ) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
-    """Distance from an arc that bulges into the face to another one, and how much that counts.
+    """Distance from an arc that bulges into the face to another side, and how much that counts.
 
-    That one bulges in as well, towards the first, or out, around it. The gap is where both circles are
-    nearest to each other. Where this comes to the end of an arc, or an arc is flat, its corners are as near,
-    and the weight goes smoothly from 1 to 0. (The gap is infinite where the weight is 0.)
+    The gap is where its circle is nearest to that of the other one, which may be a line. Where this comes
+    within `reach` of the end of a side, or the arc is flat, its corners are as near, and the weight goes
+    smoothly from 1 to 0. (The gap is infinite where it is 0.)
     """
-    bulge = jnp.minimum(-one[:, 4], jnp.abs(other[:, 4]))
+    bulge = -one[:, 4]
     bulging = bulge > _FLAT
-    r1, r2 = (1 / jnp.where(bulging, c.curvature, 1) for c in circles)  # negative: bulging in
-    inward = jnp.where(other[:, 4] < 0, 1, -1)
-    to_centre = tuple(r[:, None] * c.normal for r, c in zip((r1, r2), circles, strict=True))
-    way = other[:, :2] + to_centre[1] - one[:, :2] - to_centre[0]
-    squared = dot(way, way)
-    distance = jnp.sqrt(jnp.where(squared > 0, squared, 1))
-    unit = way / distance[:, None]
-    x = to_centre[0] - (inward * r1)[:, None] * unit
-    y = to_centre[1] - jnp.abs(r2)[:, None] * unit
-    gap = inward * distance + r1 + r2
+    radius = -1 / jnp.where(bulging, circles[0].curvature, -1)
+    to_centre = -radius[:, None] * circles[0].normal
+    curvature, g = circles[1]
+    way = one[:, :2] + to_centre - other[:, :2]
+    value = 0.5 * curvature * dot(way, way) - dot(g, way)
+    squared = 1 + 2 * curvature * value
+    root = jnp.sqrt(jnp.where(squared > 0, squared, 1))
+    # How far the centre is from the other circle, on its inner side, and the direction there.
+    distance = -2 * value / (1 + root)
+    unit = (curvature[:, None] * way - g) / root[:, None]
+    x = to_centre + radius[:, None] * unit
+    y = way + distance[:, None] * unit
+    gap = distance - radius
     x, y, gap = jax.lax.optimization_barrier((x, y, gap))
     facing = bulging & (squared > 0) & (gap > 0) & _on_arc(one, x) & _on_arc(other, y)
-    weight = _rise(bulge / _FLAT - 1) * _inner(one, x, facing) * _inner(other, y, facing)
+    inner = _inner(one, x, facing, reach) * _inner(other, y, facing, reach)
+    weight = _rise(bulge / _FLAT - 1) * inner
     return jnp.where(facing, gap, jnp.inf), jnp.where(facing, weight, 0)
 
 
@@ -171,12 +175,13 @@ _FLAT = 0.01
 
 
 def _inner(
-    side: Sides, x: Float[Array, "sides 2"], where: Bool[Array, " sides"]
+    side: Sides, x: Float[Array, "sides 2"], where: Bool[Array, " sides"], reach: Float[Array, ""]
 ) -> Float[Array, " sides"]:
     """1 for a point on the inner part of an arc, and less near its ends."""
     x, chord = jnp.where(where[:, None], x, 1), jnp.where(where[:, None], side[:, 2:4], 3)
-    last = x - chord
-    return _rise(10 * jnp.sqrt(dot(x, x) * dot(last, last)) / dot(chord, chord))
+    last, squared = x - chord, dot(chord, chord)
+    near = jnp.minimum(0.1 * jnp.sqrt(squared), reach)
+    return _rise(jnp.sqrt(dot(x, x) * dot(last, last) / squared) / near)
 
 
 def _rise(x: Float[Array, " n"]) -> Float[Array, " n"]:

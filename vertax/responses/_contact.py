@@ -88,17 +88,16 @@ class Contacts(eqx.Module):
         The distance is that of the start of one side from the other; of arcs also that between the two, or
         the angle if one follows on the other.
         """
-        adjacent = after | before
-        range_ = jnp.broadcast_to(self.distance**2, adjacent.shape)
+        range_ = jnp.broadcast_to(self.distance**2, after.shape)
 
-        def limited(arm: Float[Array, " n"]) -> Float[Array, " n"]:
+        def limited(arm: Float[Array, " n"], where: Bool[Array, " n"]) -> Float[Array, " n"]:
             short = self.slope**2 * arm
             short = range_ * short / (range_ + short)
-            return jnp.where(adjacent, jnp.where(short > 0, short, 1), range_)
+            return jnp.where(where, jnp.where(short > 0, short, 1), range_)
 
         first = one[:, :2] - other[:, :2]
         last = first - other[:, 2:4]
-        limit = limited(jnp.minimum(dot(first, first), dot(last, last)))
+        limit = limited(jnp.minimum(dot(first, first), dot(last, last)), after | before)
         if one.shape[-1] == 4:
             return [(squared_distance_to_segment(one[:, :2], other) / limit, limit)]
         circles = circle_of(one), circle_of(other)
@@ -106,12 +105,13 @@ class Contacts(eqx.Module):
         sine, cosine = wedge(one, circles)
         acute = after & (cosine > 0) & (sine > 0)
         arms = dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])
-        limit = limited(jnp.minimum(*arms))
+        # (The corner's other side is next to the one before. This one is not, and may come near anywhere.)
+        limit = limited(jnp.minimum(*arms), after)
         angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
-        gap, weight = bulge_gap(one, other, circles)
+        gap, weight = bulge_gap(one, other, circles, self.distance)
         far = jnp.isinf(gap)
         gap = jnp.where(far, jnp.inf, jnp.where(far, 1, gap) ** 2 / limit)
-        near.append((jnp.where(adjacent, angle, gap), limit * jnp.where(adjacent, 1, weight)))
+        near.append((jnp.where(after, angle, gap), limit * jnp.where(after, 1, weight)))
         return near
 
     def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, " vertices"]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
@@ -69,7 +70,9 @@ class Wrapped(AbstractSolver):
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _WrappedState, tags: Any
     ) -> tuple[Any, _WrappedState, Any]:
-        y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
+        old = (y, state.inner)
+        *new, aux = self.solver.step(fn, y, args, options, state.inner, tags)
+        y, inner = _as_precise_as(old, tuple(new))
         if isinstance(self.solver, optx.AbstractQuasiNewton):
             gradient = inner.f_info.grad  # of the last accepted point, which is the one returned
         else:
@@ -78,3 +81,12 @@ class Wrapped(AbstractSolver):
 
     def gradient(self, state: _WrappedState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
+
+
+def _as_precise_as(old: PyTree, new: PyTree) -> PyTree:
+    """New values in the precision of the old ones: some minimisers turn float32 into float64."""
+
+    def cast(a: Any, b: Any) -> Any:
+        return b.astype(a.dtype) if eqx.is_inexact_array(a) and eqx.is_inexact_array(b) else b
+
+    return jax.tree.map(cast, old, new)

@@ -80,8 +80,15 @@ class T1(AbstractTransitions):
         """Try every candidate once; returns the new tissue and the updated counts."""
         threshold = self.threshold * cell_size(tissue)
 
+        def may(corner: EdgeFrames, counts: Int[Array, " edges"]) -> tuple[Array, Array]:
+            """Which edges may flip, and which may turn upright."""
+            short = corner.length < threshold
+            flip = corner.can_flip & (counts < self.max_flips) & (short | corner.inside_out)
+            return flip, corner.inside_out & short & corner.free
+
         # Rounds of candidates that share no cell, until all were tried: one that is refused must not
-        # keep its neighbours from being tried. `todo` loses at least one edge a round.
+        # keep its neighbours from being tried. `todo` loses at least one edge a round. Mostly there is
+        # none, and no round.
         def unfinished(carry: tuple) -> Bool[Array, ""]:
             *_, todo = carry
             return jnp.any(todo)
@@ -89,10 +96,8 @@ class T1(AbstractTransitions):
         def one_round(carry: tuple) -> tuple:
             tissue, counts, todo = carry
             corner = EdgeFrames(tissue)
-            short = corner.length < threshold
-            may_flip = corner.can_flip & (counts < self.max_flips)
-            may_turn = corner.inside_out & short & corner.free
-            todo &= may_turn | (may_flip & (short | corner.inside_out))
+            may_flip, may_turn = may(corner, counts)
+            todo &= may_flip | may_turn
             chosen = _independent(todo, corner, tissue.n_cells)
 
             def flip_where_it_helps() -> tuple[Tissue, Bool[Array, " edges"]]:
@@ -142,7 +147,8 @@ class T1(AbstractTransitions):
             )
             return new, counts + accepted, todo & ~chosen
 
-        start = (tissue, counts, jnp.ones(tissue.n_edges, bool))
+        candidates = jnp.logical_or(*may(EdgeFrames(tissue), counts))
+        start = (tissue, counts, candidates)
         tissue, counts, _ = jax.lax.while_loop(unfinished, one_round, start)
         return tissue, counts
 
