@@ -6,8 +6,11 @@ What overlaps is judged by brute force, with the check of the tests.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import time
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -23,6 +26,7 @@ from tilings import faces_that_overlap  # pyright: ignore[reportMissingImports]
 
 jax.config.update("jax_enable_x64", True)
 
+Cases = Iterator[tuple[vx.Tissue, vx.AbstractEnergy]]
 BOXES = {
     "square": np.eye(2),
     "sheared": np.array([[1.0, 0.0], [0.5, 1.0]]),
@@ -60,44 +64,51 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tissues", type=int, default=100)
     parser.add_argument("--cells", type=int, default=64)
-    parser.add_argument("--means", type=float, nargs="*")
+    parser.add_argument(
+        "--only", default="", help="a regular expression that the names of rows match"
+    )
     chosen = parser.parse_args()
     n, n_cells = chosen.tissues, chosen.cells
-    means = chosen.means or [3.0, 3.5, 3.7, 3.8, 3.9, 4.0, 4.1, 4.5]
     print(f"{n} tissues of {n_cells} cells each; max_steps=2000")
     columns = f"{'at rest':>7} {'overlap':>7} {'steps':>5} {'most':>5}"
     print(f"{'':>34} | {'without contacts':^27} | {'with':^27} | times")
     print(f"{'':>34} | {columns} | {columns} | as long")
     side = n_cells**0.5
-    voronoi = {
-        box: [
-            vx.initialise.periodic_voronoi(n_cells, key=s, lattice=side * lattice) for s in range(n)
-        ]
-        for box, lattice in BOXES.items()
-    }
 
     def shapes(seed: int, mean: float, spread: float) -> vx.AbstractEnergy:
         p0 = np.random.default_rng(seed).normal(mean, spread, n_cells)
         return vx.energies.ShapeFactorEnergy(jnp.asarray(p0))
-
-    for spread in (0.0, 0.1):
-        for mean in means:
-            cases = [(t, shapes(s, mean, spread)) for s, t in enumerate(voronoi["square"])]
-            row(f"p0 = {mean}, s.d. {spread}", cases)
-    for box in ("sheared", "3 : 1"):
-        for mean in (3.8, 4.1):
-            cases = [(t, shapes(s, mean, 0.1)) for s, t in enumerate(voronoi[box])]
-            row(f"p0 = {mean}, s.d. 0.1, {box} box", cases)
 
     def tension(tissue: vx.Tissue, seed: int) -> vx.AbstractEnergy:
         gamma = np.random.default_rng(seed).uniform(0.06, 0.6, tissue.n_edges)
         lines = vx.energies.LineTension(jnp.asarray(gamma))
         return vx.energies.AreaElasticity(2.0, 1.0) + lines
 
-    cases = [(t, tension(t, s)) for s, t in enumerate(voronoi["square"])]
-    row("line tensions of ratio 10", cases)
-    clusters = [vx.initialise.free_voronoi(max(n_cells // 2, 2), key=s) for s in range(n)]
-    row("the same, free, half as many cells", [(t, tension(t, s)) for s, t in enumerate(clusters)])
+    def periodic(box: str) -> Iterator[vx.Tissue]:
+        lattice = side * BOXES[box]
+        return (vx.initialise.periodic_voronoi(n_cells, key=s, lattice=lattice) for s in range(n))
+
+    def shaped(mean: float, spread: float, box: str) -> Cases:
+        return ((t, shapes(s, mean, spread)) for s, t in enumerate(periodic(box)))
+
+    def tense(tissues: Iterator[vx.Tissue]) -> Cases:
+        return ((t, tension(t, s)) for s, t in enumerate(tissues))
+
+    rows: dict[str, Callable[[], Cases]] = {}
+    for spread in (0.0, 0.1):
+        for mean in (3.0, 3.5, 3.7, 3.8, 3.9, 4.0, 4.1, 4.5):
+            rows[f"p0 = {mean}, s.d. {spread}"] = partial(shaped, mean, spread, "square")
+    for box in ("sheared", "3 : 1"):
+        for mean in (3.8, 4.1):
+            rows[f"p0 = {mean}, s.d. 0.1, {box} box"] = partial(shaped, mean, 0.1, box)
+    rows["line tensions of ratio 10"] = lambda: tense(periodic("square"))
+    few = max(n_cells // 2, 2)
+    rows["the same, free, half as many cells"] = lambda: tense(
+        vx.initialise.free_voronoi(few, key=s) for s in range(n)
+    )
+    for name, cases in rows.items():
+        if re.search(chosen.only, name):
+            row(name, list(cases()))
 
 
 if __name__ == "__main__":
