@@ -66,19 +66,38 @@ class Contacts(eqx.Module):
             sizes.insert(0, len(self.pairs) // 16)
         count = jnp.sum(self.pairs[:, 0] != self.pairs[:, 1])
         enough = sum(count > size for size in (0, *sizes[:-1]))
-        some = [lambda size=size: self._energy(tissue, self.pairs[:size]) for size in sizes]
+        energy = Contacts._energy
+        if tissue.arcs is None:
+            # What is near need not be in range; if nothing is, all derivatives vanish as well.
+            there = jax.lax.stop_gradient(tissue)
+            none = lambda: jnp.array(False)
+            some = [lambda size=size: self._in_range(there, self.pairs[:size]) for size in sizes]
+            enough = jnp.where(jax.lax.switch(enough, [none, *some]), enough, 0)
+            # Derivatives start anew, or without contacts they would hand on a hundred arrays of zeros.
+            energy = jax.checkpoint(Contacts._energy)
+        some = [lambda size=size: energy(self, tissue, self.pairs[:size]) for size in sizes]
         return jax.lax.switch(enough, [nothing, *some])
 
     def _energy(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
+        values = jnp.zeros(len(pairs), tissue.vertices.dtype)
+        for near, squared in self._between(tissue, pairs):
+            near = jnp.where(near < 1, near, 1)
+            values -= squared * (1 - near) ** 2 * jnp.log((near + FLOOR) / (1 + FLOOR))
+        return self.strength * jnp.sum(values)
+
+    def _in_range(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Bool[Array, ""]:
+        return jnp.any(jnp.stack([near < 1 for near, _ in self._between(tissue, pairs)]))
+
+    def _between(
+        self, tissue: Tissue, pairs: Int[Array, "some 2"]
+    ) -> list[tuple[Float[Array, " some"], Float[Array, " some"]]]:
+        """How near the corners and sides of pairs are, see `_nearness`."""
         following, sides = tissue.topology.next, tissue.sides
         corner, side = pairs[:, 0], pairs[:, 1]
         after = take(following, corner) == side
         before = take(following, take(following, side)) == corner
-        values = jnp.zeros(corner.shape, sides.dtype)
-        for near, squared in self._nearness(take(sides, corner), take(sides, side), after, before):
-            near = jnp.where((near < 1) & (corner != side), near, 1)
-            values -= squared * (1 - near) ** 2 * jnp.log((near + FLOOR) / (1 + FLOOR))
-        return self.strength * jnp.sum(values)
+        nearness = self._nearness(take(sides, corner), take(sides, side), after, before)
+        return [(jnp.where(corner != side, near, 1), squared) for near, squared in nearness]
 
     def _nearness(
         self, one: Sides, other: Sides, after: Bool[Array, " n"], before: Bool[Array, " n"]
