@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +21,7 @@ from vertax.mesh._sides import (
     squared_distance_to_segment,
     wedge,
 )
-from vertax.mesh._topology import take
+from vertax.mesh._topology import source, take
 
 # A face comes to overlap itself where a corner reaches a side that it does not end. A barrier holds it off
 # (Li et al. 2020, doi:10.1145/3386569.3392425), with s = (D/d)² for the distance D and a range d:
@@ -154,6 +156,17 @@ class Contacts(eqx.Module):
             tissue.topology
         )
 
+    def crushed(self, before: Tissue, tissue: Tissue) -> Bool[Array, " vertices"]:
+        """The vertices of contacts that a step has brought behind the crest of their barrier."""
+        corner, side = self.pairs[:, 0], self.pairs[:, 1]
+        steps = zip(
+            self._between(before, self.pairs), self._between(tissue, self.pairs), strict=True
+        )
+        worse = [(new < _CREST) & (new < old) for (old, _), (new, _) in steps]
+        behind = functools.reduce(jnp.logical_or, worse)
+        ends = jnp.stack([corner, side, take(tissue.topology.next, side)])
+        return jnp.zeros(tissue.n_vertices, bool).at[source(ends)].max(behind)
+
     def moved(self, before: Tissue, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
         """The contacts after vertices moved, if there are none, and whether that is certain."""
         steps = jnp.sum((tissue.vertices - before.vertices) ** 2, axis=-1)
@@ -166,6 +179,8 @@ class Contacts(eqx.Module):
 
 # From so many places for a contact on it pays to look whether a few would do.
 _MANY = 1000
+# Nearer than this (squared, over the range) the barrier ceases to push; only too long a step leads there.
+_CREST = 4 * FLOOR
 # What is less than so many ranges away may come into range in the next step.
 _MARGIN = 2
 

@@ -214,7 +214,13 @@ class Search(eqx.Module):
             return None, nowhere
         contacts, clear = last.contacts.moved(last.tissue, tissue)
         clear &= ~anew & ~last.overlaps
-        return jax.lax.cond(clear, lambda: (contacts, nowhere), lambda: contacts.found(tissue))
+
+        def looked_at() -> tuple[Contacts, Bool[Array, " vertices"]]:
+            found, overlapping = contacts.found(tissue)
+            crushed = found.crushed(last.tissue.with_topology(tissue.topology), tissue)
+            return found, overlapping | (crushed & ~anew)
+
+        return jax.lax.cond(clear, lambda: (contacts, nowhere), looked_at)
 
     def _restarted(
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None

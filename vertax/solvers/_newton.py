@@ -109,6 +109,9 @@ class NewtonCG(AbstractSolver):
             )
 
         radii = jax.tree.map(adapted, state.radii, p, g, hp, gradient)
+        # Where nothing can move any more, a fresh start may find another way.
+        collapsed = jnp.asarray(tree.max(radii)) < _COLLAPSED * reach
+        radii = jax.tree.map(lambda radius: jnp.where(collapsed, reach, radius), radii)
         kept = (y, state.value, g, state.aux)
         y, value, g, aux = tree.where(accept, (trial, value, gradient, aux), kept)
         return y, _NewtonState(value, g, radii, state.num_products + products, aux), aux
@@ -199,6 +202,7 @@ class NewtonCG(AbstractSolver):
 
 
 _ROUNDS = 8
+_COLLAPSED = 1e-5
 # How far conjugate gradients go at least.
 _COARSEST = 0.1
 
