@@ -42,9 +42,8 @@ def test_a_random_tissue_stays_valid(seed, low, spread):
 @pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10**6), inner_arcs=st.booleans())
-@example(
-    seed=11, inner_arcs=True
-)  # a bulge meets a flat side, and the arcs of a cell with four sides
+# A bulge meets a flat side, and the arcs of a cell with four sides meet.
+@example(seed=11, inner_arcs=True)
 def test_a_random_cluster_stays_valid(seed, inner_arcs):
     tissue = cluster(12, seed % 100, inner_arcs=inner_arcs)
     tension = np.random.default_rng(seed).uniform(0.06, 0.6, tissue.n_edges)

@@ -179,7 +179,8 @@ class Contacts(eqx.Module):
 
 # From so many places for a contact on it pays to look whether a few would do.
 _MANY = 1000
-# Nearer than this (squared, over the range) the barrier ceases to push; only too long a step leads there.
+# The barrier pushes hardest at FLOOR (squared distance over range) and not at all at 0. Only too long a step
+# leads nearer than this.
 _CREST = 4 * FLOOR
 # What is less than so many ranges away may come into range in the next step.
 _MARGIN = 2

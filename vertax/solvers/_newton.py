@@ -202,6 +202,7 @@ class NewtonCG(AbstractSolver):
 
 
 _ROUNDS = 8
+# If no region is larger than this, in units of the largest, nothing moves.
 _COLLAPSED = 1e-5
 # How far conjugate gradients go at least.
 _COARSEST = 0.1
