@@ -356,6 +356,21 @@ class TestBadInput:
         with pytest.raises(TypeError, match="`boundary` must be a function of time"):
             vx.Evolution(FRICTION, [0.0, 1.0], boundary=vx.Free())  # pyright: ignore[reportArgumentType]
 
+    def test_what_does_not_go_with_the_tissue(self, as_a_user):
+        tissue, energy = solid()
+        still = lambda time: tissue.vertices
+        with pytest.raises(ValueError, match=r"`pins` .*the tissue has none"):
+            vx.evolve(tissue, energy, FRICTION, [0.0, 1.0], pins=still)
+        two = jnp.arange(tissue.n_vertices) < 2
+        held = vx.Tissue(tissue.vertices, tissue.topology, tissue.boundary, pinned=two)
+        with pytest.raises(ValueError, match="`pins` must return one position for each vertex"):
+            vx.evolve(held, energy, FRICTION, [0.0, 1.0], pins=lambda time: still(time)[:3])
+        with pytest.raises(TypeError, match="`energy` must be one of"):
+            vx.evolve(tissue, 3.0, FRICTION, [0.0, 1.0])  # pyright: ignore[reportArgumentType]
+        flat = lambda time: tissue.boundary.lattice
+        with pytest.raises(TypeError, match="Periodic boundary needs another such"):
+            vx.evolve(tissue, energy, FRICTION, [0.0, 1.0], boundary=flat)  # pyright: ignore[reportArgumentType]
+
     def test_a_step_that_does_not_converge_is_refused(self):
         tissue = random_tissue(CELLS, 3)
         with pytest.raises(RuntimeError, match=r"time 0\.5 \(frame 1\)"):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
+from vertax._base.checks import named
 from vertax._base.modules import is_concrete
 
 
@@ -214,7 +215,8 @@ class Free(AbstractBoundary):
 
 def _of_another_kind(one: AbstractBoundary, other: AbstractBoundary) -> TypeError:
     return TypeError(
-        f"A tissue in a {type(one).__name__} boundary cannot go to a {type(other).__name__} one."
+        f"A tissue in a {type(one).__name__} boundary needs another such boundary to go to, not "
+        f"{named(other) if not isinstance(other, AbstractBoundary) else type(other).__name__}."
     )
 
 

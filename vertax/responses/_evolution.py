@@ -255,7 +255,19 @@ class Evolution(AbstractResponse):
             )
 
     def _check(self, tissue: Tissue) -> None:
-        """Refuse a dissipation that lets some vertices go without any resistance."""
+        """Refuse pins without pinned vertices, and a dissipation that resists no motion of some vertices."""
+        if self.pins is not None:
+            if tissue.pinned is None:
+                raise ValueError(
+                    "Argument `pins` says where pinned vertices are, but the tissue has none: name them, "
+                    "vertax.Tissue(..., pinned=mask)."
+                )
+            shape = jax.eval_shape(self.pins, self.times[0]).shape
+            if shape != tissue.vertices.shape:
+                raise ValueError(
+                    "Argument `pins` must return one position for each vertex, shape "
+                    f"{tissue.vertices.shape}, but its result has the shape {shape}."
+                )
         if not all(map(is_concrete, jax.tree.leaves((tissue, self.dissipation)))):
             return
         with jax.ensure_compile_time_eval():

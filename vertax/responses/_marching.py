@@ -111,8 +111,14 @@ def march(
         """A relaxation of the energy at the end, and what the way there from `before` dissipates."""
         there = evolution.placed(state.tissue, end)
         pulls = _energy_at(energy, end)
-        pulls = pulls if acts is None else pulls + acts
-        potential = Incremental(pulls, evolution.dissipation, before, end - start, strained, flips)
+        pressed = None
+        if acts is not None:
+            pulls += acts
+            forces = jax.grad(lambda x: acts(before.with_vertices(x)))(before.vertices)
+            pressed = frozen(jnp.max(jnp.linalg.norm(forces, axis=-1)))
+        potential = Incremental(
+            pulls, evolution.dissipation, before, end - start, strained, flips, pressed
+        )
         return state.after(evolution.relaxation.solve(there, potential, adjoint, thrifty=True))
 
     def step(state: State, start: Any, end: Any) -> State:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.checks import check_number
+from vertax._base.checks import check_number, named
 from vertax._base.memory_maps import spare_memory_maps
 from vertax._base.modules import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
@@ -120,9 +120,14 @@ class Relaxation(AbstractResponse):
 
         **Raises:**
 
-        - `TypeError` for an adjoint that is none.
+        - `TypeError` for an energy that is no function, or an adjoint that is none.
         - `ValueError` for one that does not go with the solver, or a `jax.shard_map` that this does not.
         """
+        if not callable(energy):
+            raise TypeError(
+                "Argument `energy` must be one of vertax.energies, e.g. ShapeFactorEnergy(3.8), or a "
+                f"function, but is {named(energy)}."
+            )
         _check_adjoint(adjoint, self.minimiser)
         _check_sharding((tissue, energy))
 

@@ -33,9 +33,9 @@ class T1(AbstractTransitions):
     shortest first: with another one, 3 to 5 % of the edges of a sweep may end otherwise where candidates
     are neighbours.
 
-    An edge that flipped before in the same relaxation must also want to grow in its new place: where
-    four cells meet in one point because its tension is too high for either configuration, it would
-    otherwise flip to and fro for ever.
+    An edge that flipped before in the same relaxation must also want to grow in its new place, from a
+    quarter of that length on: where four cells meet in one point because its tension is too high for
+    either configuration, it would otherwise flip to and fro for ever.
 
     Where a flipped edge would make cells overlap it is made shorter, and if that does not help it does not
     flip. An edge below the threshold that is inside out, and does not flip, is put upright.
@@ -112,9 +112,14 @@ class T1(AbstractTransitions):
                     flipped = flip_edges(tissue.topology, which)
                     return straightened(placed, which).with_topology(flipped)
 
-                trials = lambda which: (stretch(which), flip(which), flip(which, 0.5))
-                stretched, flipped, shorter = _judge(energy, chosen, corner, trials)
-                grows = flipped < shorter
+                trials = lambda which: (
+                    stretch(which),
+                    flip(which),
+                    flip(which, 0.5),
+                    flip(which, 0.25),
+                )
+                stretched, flipped, short, shorter = _judge(energy, chosen, corner, trials)
+                grows = short < shorter
                 accepted = chosen & may_flip & (flipped < stretched) & (grows | (counts == 0))
 
                 # Where there is no room for the new edge it is made shorter; then it is refused. The
@@ -185,23 +190,16 @@ class EdgeFrames(eqx.Module):
         self.cells = take(m.cell, jnp.stack([h, t, a, c], axis=-1))
         self.edges = take(m.edge, jnp.stack([h, a, b, c, d], axis=-1))
         forward = tissue.edge_vectors
-        # Half-edge vectors: an edge's own vector or its opposite.
-        outward = take(forward, m.edge)
-        outward = jnp.where(m.forward[:, None], outward, -outward)
         self.vector = forward
         chord = jnp.sqrt(jnp.sum(forward**2, axis=-1))
         self.stretch = jnp.ones_like(chord)
-        leaving = outward
+        leaving = _outward(tissue)
         if tissue.angles is not None:
             self.stretch = length_factor(tissue.edge_angles)
             first, last = (take(tangent, m.edge) for tangent in tissue.edge_tangents)
             leaving = jnp.where(m.forward[:, None], first, -last)
         self.length = chord * self.stretch
-        # At a short edge the far ends of the four neighbours show which way the edge ought to point;
-        # its own vector may have shrunk to nothing or turned around.
-        ahead = take(outward, c) + take(outward, d)
-        behind = take(outward, a) + take(outward, b)
-        axis = ahead - behind + 2 * forward
+        axis = edge_axes(tissue)
         upright = jnp.sum(axis * forward, axis=-1) >= 0
         direction = jnp.where((chord > 0)[:, None], forward, axis)
         direction = jnp.where(upright[:, None], direction, -direction)
@@ -239,6 +237,25 @@ class EdgeFrames(eqx.Module):
         )
 
 
+def edge_axes(tissue: Tissue) -> Float[Array, "edges 2"]:
+    """Which way each edge ought to point, of no special length, as the far ends of its neighbours show.
+
+    A short edge's own vector may have shrunk to nothing or turned around; it has no influence here.
+    """
+    _, a, b, c, d = edge_neighbourhood(tissue.topology)
+    outward = _outward(tissue)
+    ahead = take(outward, c) + take(outward, d)
+    behind = take(outward, a) + take(outward, b)
+    return ahead - behind + 2 * tissue.edge_vectors
+
+
+def _outward(tissue: Tissue) -> Float[Array, "half_edges 2"]:
+    """Half-edge vectors: an edge's own vector or its opposite."""
+    m = tissue.topology
+    outward = take(tissue.edge_vectors, m.edge)
+    return jnp.where(m.forward[:, None], outward, -outward)
+
+
 def _spare_sides(tissue: Tissue) -> Int[Array, "edges 2"]:
     """How many sides more than it needs the cell left, and right, of each edge has without its arc."""
     m = tissue.topology
@@ -274,13 +291,13 @@ def _independent(
     return candidates & jnp.all(first | (corner.cells == n_cells), axis=-1)
 
 
-# The tissue with the marked edges stretched, flipped, and flipped with half the length.
-_Trials = Callable[[Bool[Array, " edges"]], tuple[Tissue, Tissue, Tissue]]
+# The tissue with the marked edges stretched, flipped, and flipped with a half and a quarter of the length.
+_Trials = Callable[[Bool[Array, " edges"]], tuple[Tissue, ...]]
 
 
 def _judge(
     energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
-) -> Float[Array, "3 edges"]:
+) -> Float[Array, "trials edges"]:
     """What the trials of each chosen edge cost."""
     if isinstance(energy, AbstractLocalEnergy):
         return _judge_local(energy, chosen, corner, trials)
@@ -289,7 +306,7 @@ def _judge(
 
 def _judge_local(
     energy: AbstractLocalEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
-) -> Float[Array, "3 edges"]:
+) -> Float[Array, "trials edges"]:
     """The same for a local energy: all at once, each by the terms of its own cells and edges."""
     by_cell, by_edge = _of_each(
         lambda t: (energy.cell_terms(t), energy.edge_terms(t)), trials(chosen)
@@ -306,16 +323,16 @@ def _judge_local(
 
 def _judge_total(
     energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
-) -> Float[Array, "3 edges"]:
+) -> Float[Array, "trials edges"]:
     """The same for an arbitrary energy: one edge after the other."""
     edges = jnp.arange(chosen.shape[0])
     order = jnp.argsort(jnp.where(chosen, corner.length, jnp.inf))
 
-    def body(i: Array, costs: Float[Array, "3 edges"]) -> Float[Array, "3 edges"]:
+    def body(i: Array, costs: Float[Array, "trials edges"]) -> Float[Array, "trials edges"]:
         # Chosen edges share no cell, so others need not be flipped to judge one.
         return costs.at[:, order[i]].set(_of_each(energy, trials(edges == order[i])))
 
-    nothing = jnp.zeros((3, chosen.shape[0]), corner.length.dtype)
+    nothing = jnp.zeros((4, chosen.shape[0]), corner.length.dtype)
     return jax.lax.fori_loop(0, jnp.sum(chosen), body, nothing)
 
 

@@ -26,7 +26,8 @@ def diffusion(
     - `config`: of the experiment.
     - `lags`: times between two places of a cell.
     - `squared`: mean squared displacements.
-    - `coefficients`: of diffusion, relative to that of a free cell.
+    - `coefficients`: of diffusion, relative to that of a free cell; those below a tenth of the threshold,
+        also negative ones, are drawn there.
     - `rate`: transitions per cell and time.
 
     **Returns:** the figure.
@@ -45,10 +46,11 @@ def diffusion(
         xscale="log", yscale="log", xlabel="time", title=f"$v_0 = {speed:g}$",
         ylabel="mean squared displacement",
     )  # fmt: skip
-    axes[0].legend(fontsize=6)
+    axes[0].set_ylim(0.1 * np.nanmin(squared[middle]))
+    axes[0].legend(fontsize=6, ncol=2, loc="lower right")
     for number, own in enumerate(config.speeds):
         style: Any = {"color": SERIES[number % len(SERIES)], "ms": 3, "label": f"$v_0 = {own:g}$"}
-        shown = np.maximum(coefficients[number], 1e-5)
+        shown = np.maximum(coefficients[number], 0.1 * config.threshold)
         axes[1].plot(config.shape_factors, shown, "o-", **style)
         axes[2].plot(config.shape_factors, rate[number], "o-", **style)
     axes[1].axhline(config.threshold, color=INK, lw=0.7, ls=":")

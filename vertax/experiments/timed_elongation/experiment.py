@@ -60,11 +60,11 @@ class Config(ExperimentConfig):
     """Friction of a vertex with the substrate."""
     tensions: TensionRange = TensionRange()
     """Range of the tensions of edges, and stiffness of the cells."""
-    fit: Fitting = Fitting(learning_rate=0.2, epochs=80)
+    fit: Fitting = Fitting(learning_rate=0.1, epochs=120)
     """How the tensions (their logits) are fitted."""
     gradient: Gradient = Gradient()
     """How gradients through each step are taken."""
-    relaxation: Relaxation = Relaxation(contacts=False, max_steps=500)
+    relaxation: Relaxation = Relaxation(max_steps=500)
     """How the tissue is relaxed in each step."""
 
 
