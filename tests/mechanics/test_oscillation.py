@@ -135,6 +135,14 @@ def test_recoil_at_rest_is_the_first_motion_of_a_tissue_without_that_tension():
     np.testing.assert_allclose(moved, velocity, atol=2e-3 * np.abs(velocity).max())
 
 
+def test_a_tissue_on_a_summit_has_no_modulus():
+    tissue = random_tissue(9, 1)
+    # The energy falls in all directions, and perimeters resist some.
+    energy = PerimeterElasticity(jnp.array(-1.0), jnp.zeros(9))
+    found = mechanics.complex_modulus(tissue, energy, PerimeterViscosity(1.0), jnp.ones(1))
+    assert np.isnan(found).all()
+
+
 def test_what_is_refused(lattice):
     with pytest.raises(ValueError, match="at least 0"):
         mechanics.complex_modulus(lattice, elastic(jnp.array(3.0)), FRICTION, jnp.array([-1.0]))

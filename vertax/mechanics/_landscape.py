@@ -128,13 +128,16 @@ def solve(
     product: Callable[[PyTree[Array]], PyTree[Array]],
     rhs: PyTree[Array],
     solver: lx.AbstractLinearSolver,
+    otherwise: lx.AbstractLinearSolver | None = None,
 ) -> PyTree[Array]:
-    """A symmetric system, of which each product is given; NaN where the solver failed."""
+    """A symmetric system, of which each product is given; NaN where the solver failed, and the other too."""
     structure = jax.eval_shape(lambda: rhs)
     operator = lx.FunctionLinearOperator(product, structure, tags=lx.symmetric_tag)
     solution = lx.linear_solve(operator, rhs, solver, throw=False)
     good = solution.result == lx.RESULTS.successful
-    return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), solution.value)
+    unknown = lambda: jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rhs)
+    again = unknown if otherwise is None else lambda: solve(product, rhs, otherwise)
+    return jax.lax.cond(good, lambda: solution.value, again)
 
 
 # Moduli are minima of a quadratic form over motions u, and eigenvalues stationary values of one. Their

@@ -72,7 +72,8 @@ def complex_modulus(
 
     **Returns:** one complex number a frequency, energy per area: real part $G'$, storage; imaginary part
     $G''$,
-        loss. Differentiable as `elastic_tensor` is, with respect to the dissipation too.
+        loss. Differentiable as `elastic_tensor` is, with respect to the dissipation too. NaN (`"dense"`) if
+        the energy falls along a motion that nothing resists: such a tissue is not at rest.
 
     **Raises:**
 
@@ -196,6 +197,9 @@ def _tensors_along(args: _Args, motions: PyTree[Array]) -> Float[Array, "2 frequ
     return _Oscillation().value(args, motions)
 
 
+_FALLING = 1e-6
+
+
 def _rounding(dtype: jnp.dtype) -> float:
     """What is nothing but rounding, next to 1."""
     return 1e3 * float(jnp.finfo(dtype).eps)
@@ -206,15 +210,18 @@ def _simultaneously_diagonal(
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"], Float[Array, "dofs dofs"]]:
     r"""Numbers h and g, and columns X with $X^T H X = h$ and $X^T \Gamma X = g$, both diagonal.
 
-    Either matrix may have null vectors. Common ones are left out: their columns are 0.
+    Either matrix may have null vectors. Common ones are left out: their columns are 0. NaN if the energy falls
+    along a motion that nothing resists.
     """
     scale = lambda a: jnp.maximum(jnp.max(jnp.sum(jnp.abs(a), axis=1)), jnp.finfo(a.dtype).tiny)
     of_h, of_g = scale(hessian), scale(resistance)
     sizes, vectors = jnp.linalg.eigh(hessian / of_h + resistance / of_g)
     kept = sizes > _rounding(sizes.dtype) * sizes[-1]
+    # (The Hessian of a tissue that is fluid has small eigenvalues of any sign.)
+    falls = sizes[0] < -_FALLING * sizes[-1]
     whitening = vectors * jnp.where(kept, 1 / jnp.sqrt(jnp.where(kept, sizes, 1)), 0)
     g, rotation = jnp.linalg.eigh(whitening.T @ (resistance / of_g) @ whitening)
-    x = whitening @ rotation
+    x = jnp.where(falls, jnp.nan, whitening @ rotation)
     # Where g is nearly 1, h is what is left of 1, and known better from H itself.
     h = jnp.sum(x * (hessian @ x), axis=0)
     return h, of_g * g, x

@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.optimize
 from jaxtyping import Array, Complex, Float
 from pydantic import Field, field_validator
 
@@ -43,6 +44,8 @@ class Config(ExperimentConfig):
     """Angular frequencies."""
     shape_factor: float = Field(default=3.4, gt=0, lt=HEXAGON)
     """Target perimeter of cells of area 1; the lattice is solid below 3.722."""
+    fluid_shape_factor: float = Field(default=3.9, gt=HEXAGON, lt=5)
+    """Target perimeter of the cells of a fluid lattice."""
     stiffness: float = Field(default=0.7, gt=0)
     """Stiffness of perimeters; that of areas is 1."""
     friction: float = Field(default=1.3, gt=0)
@@ -55,7 +58,7 @@ class Config(ExperimentConfig):
     """Periods, of which the last one is measured."""
     n_cells: int = Field(default=25, ge=0)
     """Cells of the disordered tissue; 0 for none."""
-    relaxation: Relaxation = Relaxation(transitions=False, contacts=False, tolerance=1e-11)
+    relaxation: Relaxation = Relaxation(transitions=False, contacts=False, tolerance=1e-10)
     """How each step is found."""
 
     @field_validator("frequencies")
@@ -83,6 +86,7 @@ class _Sample(NamedTuple):
     """A tissue at rest, and what its moduli should be."""
 
     tissue: Tissue
+    energy: AbstractEnergy
     expected: Complex[np.ndarray, " frequencies"]
 
 
@@ -99,15 +103,14 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     to $|G^*|$.
     """
     began = time.perf_counter()
-    energy = AreaElasticity(1.0, 1.0) + PerimeterElasticity(config.stiffness, config.shape_factor)
     frequencies = np.asarray(config.frequencies)
-    samples = _samples(config, energy, frequencies)
+    samples = _samples(config, frequencies)
     measured: dict[str, np.ndarray] = {}
     for name, sample in samples.items():
 
         def one(index: int, name: str = name, sample: _Sample = sample) -> dict[str, np.ndarray]:
             compute = lambda: {
-                "modulus": _modulus(config, sample.tissue, energy, frequencies[index])
+                "modulus": _modulus(config, sample.tissue, sample.energy, frequencies[index])
             }
             return folder.part(f"{name} {frequencies[index]:g}", compute)
 
@@ -131,9 +134,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     return metrics | {"seconds": time.perf_counter() - began}
 
 
-def _samples(
-    config: Config, energy: AbstractEnergy, frequencies: Float[np.ndarray, " frequencies"]
-) -> dict[str, _Sample]:
+def _samples(config: Config, frequencies: Float[np.ndarray, " frequencies"]) -> dict[str, _Sample]:
+    energy = AreaElasticity(1.0, 1.0) + PerimeterElasticity(config.stiffness, config.shape_factor)
     friction = SubstrateFriction(config.friction)
     # (The lattice is at rest as it is. Of ever so little softening the plateaus know.)
     lattice = hexagonal(2, 2, softening=0.0)
@@ -145,13 +147,54 @@ def _samples(
     pull = jax.grad(tension)(lattice.vertices) * area
     relaxing = config.friction * (high - low) * area / jnp.sum(pull**2)
     x = 1j * frequencies * float(relaxing)
-    samples = {"lattice": _Sample(lattice, low + (high - low) * x / (1 + x))}
+    samples = {
+        "lattice": _Sample(lattice, energy, low + (high - low) * x / (1 + x)),
+        "fluid lattice": _fluid(config, lattice, frequencies),
+    }
     if config.n_cells:
         first = periodic_voronoi(config.n_cells, key=jax.random.key(config.seed), lloyd_steps=2)
         tissue = Relaxation(contacts=False).build()(first, energy).tissue
         known = complex_modulus(tissue, energy, friction, jnp.asarray(frequencies), angle=0.0)
-        samples["disordered"] = _Sample(tissue, np.asarray(known))
+        samples["disordered"] = _Sample(tissue, energy, np.asarray(known))
     return samples
+
+
+def _fluid(
+    config: Config, lattice: Tissue, frequencies: Float[np.ndarray, " frequencies"]
+) -> _Sample:
+    r"""Hexagons that are not regular, and have the area and the perimeter they want; and a Maxwell fluid.
+
+    Every other vertex is shifted, all by the same: areas stay and perimeters grow. A shear strain and more
+    such shift change perimeters by $a \gamma + b \cdot u$, and each cell has two vertices, which move by
+    half the shift: so all that resists is $K_P a^2$, until it has relaxed at the rate $2 K_P b^2 / \zeta$.
+    """
+    assert isinstance(lattice.boundary, Periodic)
+    box = lattice.boundary.lattice
+    other = np.zeros((lattice.n_vertices, 1))
+    # (Neighbours are of different kinds, and each vertex comes after one of its neighbours or is the first.)
+    ends, kinds = np.asarray(lattice.topology.edge_vertices), {0: 0}
+    while len(kinds) < lattice.n_vertices:
+        kinds |= {b: 1 - kinds[a] for a, b in np.r_[ends, ends[:, ::-1]].tolist() if a in kinds}
+    other[[vertex for vertex, kind in kinds.items() if kind]] = 1
+
+    @jax.jit
+    def perimeter(strain: Float[Array, ""], shift: Float[Array, "2"]) -> Float[Array, ""]:
+        half = 0.5 * strain
+        turn = jnp.array([[jnp.cosh(half), jnp.sinh(half)], [jnp.sinh(half), jnp.cosh(half)]])
+        shifted = lattice.with_vertices(lattice.vertices + other * shift)
+        return shifted.carried(Periodic(box @ turn)).perimeters[0]
+
+    aim = config.fluid_shape_factor
+    along = jnp.array([np.cos(0.4), np.sin(0.4)])
+    zero = jnp.zeros(())
+    length = scipy.optimize.brentq(lambda x: float(perimeter(zero, x * along)) - aim, 0.0, 2.0)
+    shift = length * along
+    a, b = jax.grad(perimeter, argnums=(0, 1))(zero, shift)
+    rate = 2 * config.stiffness * float(b @ b) / config.friction
+    tissue = lattice.with_vertices(lattice.vertices + other * shift)
+    energy = AreaElasticity(1.0, 1.0) + PerimeterElasticity(config.stiffness, aim)
+    x = 1j * frequencies / rate
+    return _Sample(tissue, energy, config.stiffness * float(a) ** 2 * x / (1 + x))
 
 
 def _modulus(
