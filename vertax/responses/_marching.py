@@ -115,7 +115,8 @@ def march(
         if acts is not None:
             pulls += acts
             forces = jax.grad(lambda x: acts(before.with_vertices(x)))(before.vertices)
-            pressed = frozen(jnp.max(jnp.linalg.norm(forces, axis=-1)))
+            largest = jnp.max(jnp.sum(forces**2, axis=-1))
+            pressed = jnp.sqrt(jnp.maximum(largest, jnp.finfo(largest.dtype).tiny))
         potential = Incremental(
             pulls, evolution.dissipation, before, end - start, strained, flips, pressed
         )
