@@ -235,7 +235,7 @@ def main() -> None:
     for n in arguments.sizes:
         truths = [cluster(n, seed) for seed in range(max(1, 40 // n))]
         for pixels in (20, 50, 150):
-            for rough in (0.0, 0.3, 0.6) if pixels * n <= 50 * 100 else ():
+            for rough in (0.0, 0.3, 0.6) if pixels * n <= 50 * 300 else ():
                 cases = [
                     (truth, drawn(truth, pixels, rough, random))
                     for truth in truths

@@ -19,7 +19,7 @@ def _outputs(path: Path) -> list[dict]:
 
 
 def test_there_are_notebooks():
-    assert len(NOTEBOOKS) == 10
+    assert len(NOTEBOOKS) == 11
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/notebooks.md", "mkdocs.yml"])

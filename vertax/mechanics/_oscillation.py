@@ -210,8 +210,8 @@ def _simultaneously_diagonal(
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"], Float[Array, "dofs dofs"]]:
     r"""Numbers h and g, and columns X with $X^T H X = h$ and $X^T \Gamma X = g$, both diagonal.
 
-    Either matrix may have null vectors. Common ones are left out: their columns are 0. NaN if the energy falls
-    along a motion that nothing resists.
+    Either matrix may have null vectors. Common ones are left out: their columns are 0. NaN if the energy
+    falls along a motion that nothing resists.
     """
     scale = lambda a: jnp.maximum(jnp.max(jnp.sum(jnp.abs(a), axis=1)), jnp.finfo(a.dtype).tiny)
     of_h, of_g = scale(hessian), scale(resistance)
