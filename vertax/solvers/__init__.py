@@ -1,5 +1,6 @@
 """Solvers: minimisers that relax a tissue, and the linear solver behind implicit gradients."""
 
+from vertax.solvers._direct import Direct as Direct
 from vertax.solvers._first_order import (
     FIRE as FIRE,
     LBFGS as LBFGS,

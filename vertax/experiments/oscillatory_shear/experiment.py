@@ -187,7 +187,8 @@ def _fluid(
     aim = config.fluid_shape_factor
     along = jnp.array([np.cos(0.4), np.sin(0.4)])
     zero = jnp.zeros(())
-    length = scipy.optimize.brentq(lambda x: float(perimeter(zero, x * along)) - aim, 0.0, 2.0)
+    excess = lambda x: float(perimeter(zero, x * along)) - aim
+    length = scipy.optimize.root_scalar(excess, bracket=(0.0, 2.0)).root
     shift = length * along
     a, b = jax.grad(perimeter, argnums=(0, 1))(zero, shift)
     rate = 2 * config.stiffness * float(b @ b) / config.friction

@@ -1,0 +1,49 @@
+"""One factorisation for many right-hand sides."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+from helpers import STILL, random_tissue, shape_factors
+
+import vertax as vx
+from vertax.energies import ShapeFactorEnergy
+from vertax.solvers import Direct
+
+N = 9
+
+
+def test_a_singular_indefinite_matrix():
+    basis = jnp.linalg.qr(jax.random.normal(jax.random.key(0), (8, 8)))[0]
+    values = jnp.array([-2.0, -0.1, 0.0, 0.0, 0.3, 1.0, 5.0, 20.0])
+    matrix = (basis * values) @ basis.T
+    many = matrix @ jax.random.normal(jax.random.key(1), (8, 5))
+    operator = lx.MatrixLinearOperator(matrix, lx.symmetric_tag)
+    solve = lambda b: lx.linear_solve(operator, b, Direct()).value
+    found = jax.jit(jax.vmap(solve, in_axes=1, out_axes=1))(many)
+    np.testing.assert_allclose(found, jnp.linalg.pinv(matrix) @ many, atol=2e-6)
+
+
+def test_what_has_no_solution_is_told():
+    operator = lx.MatrixLinearOperator(jnp.diag(jnp.array([1.0, 0.0])), lx.symmetric_tag)
+    told = lx.linear_solve(operator, jnp.ones(2), Direct(), throw=False)
+    assert told.result == lx.RESULTS.singular
+    with pytest.raises(ValueError, match="must be symmetric"):
+        lx.linear_solve(lx.MatrixLinearOperator(jnp.eye(2)), jnp.ones(2), Direct())
+
+
+def test_sensitivities_are_those_of_minres():
+    tissue, p0 = random_tissue(N, 2), shape_factors(N, 3.6, 0.05)
+
+    def perimeters(p0, solver):
+        adjoint = vx.ImplicitDifferentiation(linear_solver=solver)
+        return STILL(tissue, ShapeFactorEnergy(p0), adjoint=adjoint).tissue.perimeters
+
+    jacobian = eqx.filter_jit(lambda solver: jax.jacfwd(lambda p: perimeters(p, solver))(p0))
+    expected = jacobian(vx.MINRES())
+    found = jacobian(Direct())
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+    gradient = eqx.filter_jit(jax.grad(lambda p: perimeters(p, Direct()).sum()))
+    np.testing.assert_allclose(gradient(p0), expected.sum(axis=0), atol=1e-6)
