@@ -13,6 +13,7 @@ from vertax._base.modules import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue
+from vertax.mesh._boundary import inverse_of
 
 
 # The paper convolves the mesh, a measure carried by its edges, with a Gaussian point spread function in
@@ -77,7 +78,7 @@ def render(
     points = tissue.edge_points(nodes)
     mass = (tissue.edge_lengths[:, None] * weights).reshape(-1)
     # Rows of `inverse` are the reciprocal vectors: fraction = inverse @ position.
-    inverse = jnp.linalg.inv(lattice).T
+    inverse = inverse_of(lattice).T
     fractions = points.reshape(-1, 2) @ inverse.T
     if isinstance(tissue.boundary, Free):
         # What is further from the image than half its size would come back in from the other side.

@@ -116,7 +116,7 @@ class Periodic(AbstractBoundary):
         """
         # Rounding the fractions finds the image within the parallelogram around 0; in a leaning box one
         # of its neighbours may still be closer.
-        inverse = jnp.linalg.inv(self.lattice)
+        inverse = inverse_of(self.lattice)
         nearest = jax.lax.stop_gradient(jnp.round(displacement @ inverse))
         steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         images = nearest[..., None, :] + jnp.asarray(steps, nearest.dtype)
@@ -130,9 +130,9 @@ class Periodic(AbstractBoundary):
         if not isinstance(other, Periodic):
             raise _of_another_kind(self, other)
         # As a displacement, so that a box that stays as it is leaves the vertices alone to the last bit.
-        (a, b), (c, d) = self.lattice
+        (p, q), (r, s) = inverse_of(self.lattice)
         x, y = vertices[:, :1], vertices[:, 1:]
-        first, second = (x * d - y * c) / (a * d - b * c), (y * a - x * b) / (a * d - b * c)
+        first, second = p * x + r * y, q * x + s * y
         deformation = other.lattice - self.lattice
         return vertices + first * deformation[0] + second * deformation[1]
 
@@ -247,3 +247,9 @@ def _translation_drift(
 ) -> Float[Array, "2"]:
     drift = jnp.mean(displacement, axis=0) * jnp.sqrt(1.0 * displacement.shape[0])
     return drift if pinned is None else jnp.where(jnp.any(pinned), 0, drift)
+
+
+def inverse_of(lattice: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
+    """The inverse of two lattice vectors, written out: that of larger matrices takes long to compile."""
+    (a, b), (c, d) = lattice
+    return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)

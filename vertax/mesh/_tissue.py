@@ -296,11 +296,21 @@ class Tissue(eqx.Module):
 
         If there are arcs, followed by its angle: positive where it bulges to its right, out of that cell.
         """
-        m, corners = self.topology, self.corners
-        parts = [corners, take(corners, m.next) - corners]
+        return self.sides_of(jnp.arange(self.topology.n_half_edges))
+
+    def sides_of(self, half_edges: Int[Array, " some"]) -> Float[Array, "some parts"]:
+        """The rows of `sides` of some half-edges; no others are looked at."""
+        m = self.topology
+
+        def corner(half_edge: Int[Array, " some"]) -> Float[Array, "some 2"]:
+            image = self.boundary.translation(take(m.frame, half_edge))
+            return take(self.vertices, source(half_edge)) + image
+
+        start = corner(half_edges)
+        parts = [start, corner(take(m.next, half_edges)) - start]
         if self.arcs is not None:
-            angles = take(self.edge_angles, m.edge)
-            parts.append(jnp.where(m.forward, angles, -angles)[:, None])
+            angles = take(self.edge_angles, take(m.edge, half_edges))
+            parts.append(jnp.where(take(m.forward, half_edges), angles, -angles)[:, None])
         return jnp.concatenate(parts, axis=-1)
 
     @compiled_property

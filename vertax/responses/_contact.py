@@ -94,11 +94,12 @@ class Contacts(eqx.Module):
         self, tissue: Tissue, pairs: Int[Array, "some 2"]
     ) -> list[tuple[Float[Array, " some"], Float[Array, " some"]]]:
         """How near the corners and sides of pairs are, see `_nearness`."""
-        following, sides = tissue.topology.next, tissue.sides
+        following = tissue.topology.next
         corner, side = pairs[:, 0], pairs[:, 1]
         after = take(following, corner) == side
         before = take(following, take(following, side)) == corner
-        nearness = self._nearness(take(sides, corner), take(sides, side), after, before)
+        one, other = tissue.sides_of(corner), tissue.sides_of(side)
+        nearness = self._nearness(one, other, after, before)
         return [(jnp.where(corner != side, near, 1), squared) for near, squared in nearness]
 
     def _nearness(

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax.solvers._long_waves import LongWaves, Medium
 from vertax.solvers._minres import MINRES
+
+
+class _Attempt(NamedTuple):
+    """What came of solving a system with the long waves' help or, the second time, without."""
+
+    solution: PyTree[Array]
+    result: lx.RESULTS
+    stats: dict[str, Array]
+    helped: Bool[Array, ""]
+    again: Bool[Array, ""]
 
 
 class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Medium]]):
@@ -35,32 +45,27 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Medium]]):
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         linear, medium = state
 
-        def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
-            near = jax.tree.map(lambda x: x / self.stiffness, r)
-            return medium.added(near, r, jnp.zeros_like(self.stiffness))
+        def attempt(last: _Attempt) -> _Attempt:
+            def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
+                near = jax.tree.map(lambda x: x / self.stiffness, r)
+                helped = lambda: medium.added(near, r, jnp.zeros_like(self.stiffness))
+                return jax.lax.cond(last.helped, helped, lambda: near)
 
-        preconditioner = lx.FunctionLinearOperator(
-            approximate_inverse, linear.in_structure(), lx.positive_semidefinite_tag
-        )
-        helped = self.plain.compute(linear, vector, options | {"preconditioner": preconditioner})
-        taken = helped[2]["num_steps"]
+            preconditioner = lx.FunctionLinearOperator(
+                approximate_inverse, linear.in_structure(), lx.positive_semidefinite_tag
+            )
+            helped = options | {"preconditioner": preconditioner}
+            solution, result, stats = self.plain.compute(linear, vector, helped)
+            stats = stats | {"num_steps": stats["num_steps"] + last.stats["num_steps"]}
+            doubtful = stats["inconsistent"] | (result != lx.RESULTS.successful)
+            again = last.helped & doubtful
+            return _Attempt(solution, result, jax.tree.map(jnp.asarray, stats), ~again, again)
 
-        def plainly(last: tuple) -> tuple:
-            solution, result, stats = self.plain.compute(linear, vector, options)
-            return solution, result, stats | {"num_steps": stats["num_steps"] + taken}, False
-
-        def unsolved(last: tuple) -> Any:
-            *_, doubtful = last
-            return doubtful
-
-        arrays = lambda x: jax.tree.map(jnp.asarray, x)
-        value, result, stats = helped
-        doubtful = stats["inconsistent"] | (result != lx.RESULTS.successful)
-        # (A loop and not a branch, of which `vmap` would make both.)
-        *solved, _ = jax.lax.while_loop(
-            unsolved, lambda x: arrays(plainly(x)), arrays((value, result, stats, doubtful))
-        )
-        return tuple(solved)  # pyright: ignore[reportReturnType]
+        outcome = jax.eval_shape(lambda: self.plain.compute(linear, vector, options))
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), outcome)
+        start = _Attempt(*nothing, jnp.array(True), jnp.array(True))
+        end = jax.lax.while_loop(lambda last: last.again, attempt, start)
+        return end.solution, end.result, end.stats
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options

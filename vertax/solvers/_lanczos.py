@@ -22,6 +22,7 @@ class Krylov(NamedTuple):
 
     step: Int[Array, ""]
     status: Int[Array, ""]
+    norm_rhs: Float[Array, ""]  # β_1
     u: Float[Array, "n"]  # u_{k-1}
     q_old: Float[Array, "n"]  # q_{k-1}
     q: Float[Array, "n"]  # q_k
@@ -136,6 +137,7 @@ def solve_in_krylov_space(
     initial = Krylov(
         step=step,
         status=status,
+        norm_rhs=beta_1,
         u=zeros,
         q_old=zeros,
         q=over(rhs, beta_1),
@@ -210,6 +212,7 @@ def solve_in_krylov_space(
         return Krylov(
             step=last.step + 1,
             status=status,
+            norm_rhs=last.norm_rhs,
             u=jnp.where(take, u, last.u),
             q_old=last.q,
             q=over(z, beta),

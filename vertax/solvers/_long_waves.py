@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax.mesh import Periodic, Tissue
+from vertax.mesh._boundary import inverse_of
 from vertax.mesh._topology import take
 
 # Smaller tissues have no waves that are long enough to be slow, and pay more than they gain.
@@ -54,7 +55,8 @@ class LongWaves(eqx.Module):
             return None
         size = _good_size(tissue.n_cells)
         lattice, origin = _box(tissue)
-        places = (tissue.vertices - origin) @ jnp.linalg.inv(lattice)
+        inverse = inverse_of(lattice)
+        places = (tissue.vertices - origin) @ inverse
         scaled = size * places
         corner = jnp.floor(scaled)
         beyond, corner = scaled - corner, corner.astype(int)
@@ -70,7 +72,7 @@ class LongWaves(eqx.Module):
             indices=indices.reshape(-1, 4),
             weights=moves[:, None] * weights.reshape(-1, 4),
             places=places,
-            reciprocal=2 * jnp.pi * jnp.linalg.inv(lattice).T,
+            reciprocal=2 * jnp.pi * inverse.T,
             filled=jnp.sum(moves) / (fill * size**2),
             size=size,
         )
@@ -93,8 +95,11 @@ class LongWaves(eqx.Module):
         moves = jnp.sum(self.weights, axis=-1, keepdims=True)
         shapes = jax.tree.leaves(like)[1:]
 
-        def stiffness(number: int, polarisations: Float[Array, "2 2"]) -> Float[Array, ""]:
+        long, short = 1, max(2, self.size // 8)
+
+        def stiffness(wave: tuple[Int[Array, ""], Float[Array, "2 2"]]) -> Float[Array, ""]:
             # One product for waves along both axes, which hardly feel each other.
+            number, polarisations = wave
             phases = 2 * jnp.pi * number * self.places + jnp.array([0.3, 1.1])
             wave = moves * (jnp.cos(phases) @ polarisations)
             rest = [jnp.zeros(x.shape, x.dtype) for x in shapes]
@@ -102,16 +107,18 @@ class LongWaves(eqx.Module):
             product = hessian(jax.tree.unflatten(jax.tree.structure(like), leaves))
             return jnp.vdot(wave, jax.tree.leaves(product)[0]) / jnp.vdot(wave, wave)
 
-        long, short = 1, max(2, self.size // 8)
+        # (One after the other, so that the Hessian is compiled once.)
+        numbers = jnp.array([long, short, long, short])
+        polarisations = jnp.stack([directions, directions, across, across])
+        far, near, far_across, near_across = jax.lax.map(stiffness, (numbers, polarisations))
         square = jnp.mean(squares)
 
-        def law(polarisations: Float[Array, "2 2"], least: Array) -> tuple[Array, Array]:
-            far, near = stiffness(long, polarisations), stiffness(short, polarisations)
+        def law(far: Array, near: Array, least: Array) -> tuple[Array, Array]:
             slope = jnp.maximum((near - far) / (square * (short**2 - long**2)), least)
             return jnp.maximum(far - slope * square * long**2, 0), slope
 
-        offset, compression = law(directions, floor)
-        other, shear = law(across, jnp.maximum(floor, 1e-3 * compression))
+        offset, compression = law(far, near, floor)
+        other, shear = law(far_across, near_across, jnp.maximum(floor, 1e-3 * compression))
         return Medium(self, jnp.minimum(offset, other), shear, compression)
 
 

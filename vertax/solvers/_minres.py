@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.modules import choose
 from vertax._base.probe import probe
 from vertax.solvers._lanczos import (
     BREAKDOWN,
@@ -30,19 +31,31 @@ _SLACK = 2
 
 
 class _Solve(NamedTuple):
-    """What one of the at most three solves in Krylov spaces hands to the next."""
+    """What one of the solves in Krylov spaces, four at most, hands to the next."""
 
     number: Int[Array, ""]
     more: Bool[Array, ""]
     rhs: Float[Array, "n"]
     target: Float[Array, ""]
-    u: Float[Array, "n"]
-    r: Float[Array, "n"]  # r_0 - A P u
-    a_r: Float[Array, "n"]  # A P r
+    last: "_Looks"
     step: Int[Array, ""]
     status: Int[Array, ""]
     operator_norm: Float[Array, ""]
     negative_curvature: Bool[Array, ""]
+
+
+class _Looks(NamedTuple):
+    """What is looked at after a solve, each with a product or what the preconditioner makes of it."""
+
+    rest: Float[Array, "n"]  # of this solve, rhs - A P end.u
+    norm_rest: Float[Array, ""]
+    u: Float[Array, "n"]
+    p_u: Float[Array, "n"]
+    r: Float[Array, "n"]  # r_0 - A P u
+    p_r: Float[Array, "n"]
+    a_r: Float[Array, "n"]  # A P r
+    norm_a_r: Float[Array, ""]
+    status: Int[Array, ""]
 
 
 class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
@@ -202,16 +215,15 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         # error, and this shows only in comparison with |A|. With no pattern in g, the mean square
         # of |A g|/|g| is that of the eigenvalues.
         g = probe(b)
-        p_g = precondition(g)
-        a_g = a(p_g)
-        operator_norm = over(norm(a_g, precondition(a_g)), norm(g, p_g))
+        norm_g = norm(g, precondition(g))
 
-        # Solve 0 is the system itself. If that has only a least-squares solution, two more follow:
+        # Solve 0 is the system itself; solve -1 solves nothing, and has A P g looked at instead. If the
+        # system has only a least-squares solution, two more follow:
         #     solve 1, A P y = A P r, makes y the part of r in the range of A,
         #     solve 2, A P d = y,     makes A⁺ r to be added to u.
         # Both are consistent, and so do not blow up. Without rounding, A P r and y would be zero.
         def one_solve(solve: _Solve) -> _Solve:
-            first, second = solve.number == 0, solve.number == 1
+            probing, first, second = (solve.number == k for k in (-1, 0, 1))
             null = jnp.where(first & coarse, rtol, ROUNDING_UNITS * rounding).astype(b.dtype)
             end = solve_in_krylov_space(
                 a,
@@ -225,64 +237,86 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
                 step=solve.step,
                 max_steps=max_steps,
             )
-            # The level of rounding grows with u, so a u that blows up at one stroke reaches it. It
-            # shows in the recomputed residual, which is that of the suspect or larger.
-            r = solve.rhs - a(precondition(end.u))
-            norm_r, norm_rhs = norm(r, precondition(r)), norm(solve.rhs, precondition(solve.rhs))
-            no_gain = (end.residual_suspect > 0) & (norm_r > 0.5 * end.residual_suspect)
-            blown_up = (
-                (end.status == CONVERGED)
-                & (norm_r > _SLACK * solve.target)
-                & (no_gain | (norm_r > hardly_solved * norm_rhs))
-            )
-            # The test for LEAST_SQUARES, too, can be late, when u has already grown.
-            least_squares = blown_up | (end.status == LEAST_SQUARES)
-            change = jnp.where(least_squares, end.u_suspect, end.u)
+            norm_rhs = end.norm_rhs
 
-            u = jnp.where(second, solve.u, solve.u + change)
-            r = r_0 - a(precondition(u))
-            p_r = precondition(r)
-            a_r = a(p_r)
-            ended = least_squares | (end.status == CONVERGED)
+            # The looks, one in a turn of a loop: what takes long to compile is the operator, and it stands
+            # here once.
+            def look(turn: Int[Array, ""], seen: _Looks) -> _Looks:
+                begin = jnp.where(probing, g, end.u)
+                v = lax.select_n(turn, begin, seen.rest, seen.u, seen.r, seen.a_r)
+                p_v = precondition(v)
+                turns = [turn == k for k in range(5)]
+                a_v = lax.cond(turns[1] | turns[4], lambda: v, lambda: a(p_v))
+
+                # The level of rounding grows with u, so a u that blows up at one stroke reaches it. It
+                # shows in the recomputed residual, which is that of the suspect or larger.
+                norm_v = norm(v, p_v)
+                no_gain = (end.residual_suspect > 0) & (norm_v > 0.5 * end.residual_suspect)
+                blown_up = (
+                    (end.status == CONVERGED)
+                    & (norm_v > _SLACK * solve.target)
+                    & (no_gain | (norm_v > hardly_solved * norm_rhs))
+                )
+                # The test for LEAST_SQUARES, too, can be late, when u has already grown.
+                least_squares = blown_up | (end.status == LEAST_SQUARES)
+                change = jnp.where(least_squares, end.u_suspect, end.u)
+                u = jnp.where(second, seen.u, seen.u + change)
+                new = _Looks(
+                    rest=solve.rhs - a_v,
+                    norm_rest=norm_v,
+                    u=u,
+                    p_u=p_v,
+                    r=r_0 - a_v,
+                    p_r=p_v,
+                    a_r=a_v,
+                    norm_a_r=norm_v,
+                    status=jnp.where(least_squares, LEAST_SQUARES, end.status),
+                )
+                when = _Looks(0, 1, 1, 2, 2, 3, 3, 4, 1)
+                return jax.tree.map(lambda k, x, y: jnp.where(turns[k], x, y), when, new, seen)
+
+            seen = lax.fori_loop(0, jnp.where(probing, 2, 5), look, solve.last)
+            least_squares = seen.status == LEAST_SQUARES
+            change = jnp.where(least_squares, end.u_suspect, end.u)
+            ended = least_squares | (seen.status == CONVERGED)
             more = jnp.where(first, least_squares & (not coarse), second & ended)
+            operator_norm = jnp.where(probing, over(seen.norm_rest, norm_g), end.operator_norm)
             # Solve 1 goes as far as A P r means anything.
-            finest = rounding * end.operator_norm * norm(r, p_r)
+            finest = rounding * operator_norm * norm(seen.r, seen.p_r)
             return _Solve(
                 number=solve.number + 1,
-                more=more,
-                rhs=jnp.where(first, a_r, change),
+                more=more | probing,
+                rhs=jnp.where(probing, r_0, jnp.where(first, seen.a_r, change)),
                 target=jnp.where(first, finest, target),
-                u=u,
-                r=r,
-                a_r=a_r,
+                last=choose(probing, solve.last, seen),
                 step=end.step,
-                status=jnp.where(least_squares, LEAST_SQUARES, end.status),
-                operator_norm=end.operator_norm,
+                status=seen.status,
+                operator_norm=operator_norm,
                 negative_curvature=end.negative_curvature,
             )
 
+        zero, zeros, running = jnp.zeros_like(norm_g), jnp.zeros_like(b), jnp.array(RUNNING)
         start = _Solve(
-            number=jnp.array(0),
+            number=jnp.array(-1),
             more=jnp.array(True),
-            rhs=r_0,
-            target=target,
-            u=jnp.zeros_like(b),
-            r=r_0,
-            a_r=jnp.zeros_like(b),
+            rhs=zeros,
+            target=zero,
+            last=_Looks(zeros, zero, zeros, zeros, zeros, zeros, zeros, zero, running),
             step=jnp.array(0),
-            status=jnp.array(RUNNING),
-            operator_norm=operator_norm,
+            status=running,
+            operator_norm=zero,
             negative_curvature=jnp.array(False),
         )
         solve = lax.while_loop(lambda solve: solve.more, one_solve, start)
 
-        r, p_r, p_u = solve.r, precondition(solve.r), precondition(solve.u)
-        norm_r, norm_a_r = norm(r, p_r), norm(solve.a_r, precondition(solve.a_r))
+        seen = solve.last
+        u, r, p_u, p_r, norm_a_r = seen.u, seen.r, seen.p_u, seen.p_r, seen.norm_a_r
+        norm_r = norm(r, p_r)
         x = x_0 + p_u
         # With a preconditioner this is the lower bound of |x| by Cauchy and Schwarz, for x_0 is not
         # known in the form P u.
         size_x = jnp.sqrt(dot(x, x)) if p is None else over(jnp.abs(dot(x, b)), norm_b)
-        size_x = jnp.maximum(size_x, norm(solve.u, p_u))
+        size_x = jnp.maximum(size_x, norm(u, p_u))
         reach = solve.operator_norm * size_x + norm_b
         # The recomputed r has errors of this size, and A P r those times |A|.
         noise = ROUNDING_UNITS * rounding * reach

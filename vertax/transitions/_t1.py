@@ -87,8 +87,8 @@ class T1(AbstractTransitions):
             return flip, corner.inside_out & short & corner.free
 
         # Rounds of candidates that share no cell, until all were tried: one that is refused must not
-        # keep its neighbours from being tried. `todo` loses at least one edge a round. Mostly there is
-        # none, and no round.
+        # keep its neighbours from being tried. `todo` are all edges at first, and candidates after the
+        # first round; it loses at least one of them a round. Mostly there is none, and no second round.
         def unfinished(carry: tuple) -> Bool[Array, ""]:
             *_, todo = carry
             return jnp.any(todo)
@@ -98,62 +98,56 @@ class T1(AbstractTransitions):
             corner = EdgeFrames(tissue)
             may_flip, may_turn = may(corner, counts)
             todo &= may_flip | may_turn
-            chosen = _independent(todo, corner, tissue.n_cells)
 
-            def flip_where_it_helps() -> tuple[Tissue, Bool[Array, " edges"]]:
+            def flip_where_it_helps() -> tuple[Tissue, Array, Array]:
+                chosen = _independent(todo, corner, tissue.n_cells)
                 length = jnp.maximum(corner.length, threshold)
                 chord = length / corner.stretch
-                stretch = lambda which: corner.place(tissue, which, corner.along, chord)
 
-                def flip(
-                    which: Bool[Array, " edges"], share: float | Float[Array, " edges"] = 1.0
-                ) -> Tissue:
-                    placed = corner.place(tissue, which, corner.across, share * length)
-                    flipped = flip_edges(tissue.topology, which)
-                    return straightened(placed, which).with_topology(flipped)
+                def trials(which: Bool[Array, " edges"]) -> tuple[Tissue, ...]:
+                    stretched = corner.place(tissue, which, corner.along, chord)
+                    turned = _flipped(tissue, which)
+                    across = lambda share: corner.place(
+                        turned, which, corner.across, share * length
+                    )
+                    return stretched, across(1), across(0.5), across(0.25)
 
-                trials = lambda which: (
-                    stretch(which),
-                    flip(which),
-                    flip(which, 0.5),
-                    flip(which, 0.25),
-                )
                 stretched, flipped, short, shorter = _judge(energy, chosen, corner, trials)
                 grows = short < shorter
                 accepted = chosen & may_flip & (flipped < stretched) & (grows | (counts == 0))
 
                 # Where there is no room for the new edge it is made shorter; then it is refused. The
-                # first round, without any flip, finds what overlaps already.
+                # first turn, without any flip, finds what overlaps already; the last one finds nothing.
                 def crowded(carry: tuple) -> Bool[Array, ""]:
                     i, accepted, *_, blamed = carry
-                    again = (i < 2) | ((i <= _SHORTENED) & jnp.any(blamed))
-                    return again & jnp.any(accepted)
+                    return jnp.any(blamed) | ((i < 2) & jnp.any(accepted))
 
                 def make_room(carry: tuple) -> tuple:
-                    i, accepted, share, before, _ = carry
-                    faces = overlapping_faces(flip(accepted & (i > 0), share).overlaps)
+                    i, accepted, share, before, *_ = carry
+                    flip = accepted & (i > 0)
+                    placed = _flipped(
+                        corner.place(tissue, flip, corner.across, share * length), flip
+                    )
+                    faces = overlapping_faces(placed.overlaps)
                     before = jnp.where(i == 0, faces, before)
                     blamed = accepted & jnp.any(take(faces & ~before, corner.cells), axis=-1)
-                    refused = blamed & (i == _SHORTENED)
+                    refused = blamed & (i >= _SHORTENED)
                     share = jnp.where(blamed, 0.25 * share, share)
-                    return i + 1, accepted & ~refused, share, before, blamed
+                    return i + 1, accepted & ~refused, share, before, placed, blamed
 
                 none = jnp.zeros_like(accepted)
                 nowhere = jnp.zeros(tissue.n_cells + 1, bool)
-                start = (jnp.array(0), accepted, jnp.ones_like(length), nowhere, none)
-                _, accepted, share, *_ = jax.lax.while_loop(crowded, make_room, start)
+                start = (jnp.array(0), accepted, jnp.ones_like(length), nowhere, tissue, none)
+                _, accepted, *_, placed, _ = jax.lax.while_loop(crowded, make_room, start)
                 # What is inside out and stays so little that nobody would notice is put right.
                 back = chosen & ~accepted & may_turn
                 upright = corner.length / corner.stretch
-                return corner.place(flip(accepted, share), back, corner.along, upright), accepted
+                upright = corner.place(placed, back, corner.along, upright)
+                return upright, counts + accepted, todo & ~chosen
 
-            new, accepted = jax.lax.cond(
-                jnp.any(chosen), flip_where_it_helps, lambda: (tissue, jnp.zeros_like(chosen))
-            )
-            return new, counts + accepted, todo & ~chosen
+            return jax.lax.cond(jnp.any(todo), flip_where_it_helps, lambda: (tissue, counts, todo))
 
-        candidates = jnp.logical_or(*may(EdgeFrames(tissue), counts))
-        start = (tissue, counts, candidates)
+        start = (tissue, counts, jnp.ones(tissue.n_edges, bool))
         tissue, counts, _ = jax.lax.while_loop(unfinished, one_round, start)
         return tissue, counts
 
@@ -269,6 +263,10 @@ def _spare_sides(tissue: Tissue) -> Int[Array, "edges 2"]:
     return sides - jnp.where(arcs > m.on_outline[:, None], 2, 3)
 
 
+def _flipped(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
+    return straightened(tissue, which).with_topology(flip_edges(tissue.topology, which))
+
+
 def straightened(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
     if tissue.angles is None:
         return tissue
@@ -281,14 +279,21 @@ def _independent(
     """The candidates that are the shortest of all candidates at each of their four cells."""
     # Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute. (An
     # edge lies between two faces, so sharing the exterior alone is no harm.)
-    n = candidates.shape[0]
-    rank = (
-        jnp.zeros(n, jnp.int32).at[jnp.argsort(corner.length)].set(jnp.arange(n, dtype=jnp.int32))
-    )
-    rank = jnp.where(candidates, rank, n)
-    best = jnp.full(n_cells, n, jnp.int32).at[corner.cells].min(rank[:, None], mode="drop")
-    first = best.at[corner.cells].get(mode="fill", fill_value=0) == rank[:, None]
-    return candidates & jnp.all(first | (corner.cells == n_cells), axis=-1)
+    cells = corner.cells
+    number = jnp.arange(len(candidates), dtype=cells.dtype)
+
+    def least(values: Array, among: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
+        """Those among some that have the least value at each of their cells."""
+        most = (
+            jnp.inf if jnp.issubdtype(values.dtype, jnp.floating) else jnp.iinfo(values.dtype).max
+        )
+        values = jnp.where(among, values, most)[:, None]
+        best = jnp.full(n_cells, most, values.dtype).at[cells].min(values, mode="drop")
+        first = best.at[cells].get(mode="fill", fill_value=0) == values
+        return among & jnp.all(first | (cells == n_cells), axis=-1)
+
+    # (Of those of one length the first.)
+    return least(number, least(corner.length, candidates))
 
 
 # The tissue with the marked edges stretched, flipped, and flipped with a half and a quarter of the length.
