@@ -74,13 +74,20 @@ class Overlaps(eqx.Module):
         return ", ".join(where)
 
 
-def find_overlaps(topology: Topology, sides: Sides, areas: Float[Array, " cells"]) -> Overlaps:
-    """Compare each side with all others of its face."""
-    return _overlaps(
-        topology,
-        areas,
-        crossed_sides(sides, topology.next, _last(topology), few_long=topology.exterior),
+def find_overlaps(
+    topology: Topology,
+    sides: Sides,
+    areas: Float[Array, " cells"],
+    faces: Bool[Array, " faces"] | None = None,
+) -> Overlaps:
+    """Compare each side with all others of its face; of some faces only, if they are named."""
+    last = _last(topology)
+    if faces is not None:
+        last = jnp.where(take(faces, topology.cell), last, 0)
+    crossed = crossed_sides(
+        sides, topology.next, last, few_long=topology.exterior, few=faces is not None
     )
+    return _overlaps(topology, areas, crossed)
 
 
 def crossed_sides(
@@ -89,6 +96,7 @@ def crossed_sides(
     last: Int[Array, " halfedges"],
     *,
     few_long: bool = False,
+    few: bool = False,
 ) -> Int[Array, " halfedges"]:
     """For each side another one of its face that it crosses, or itself.
 
@@ -96,14 +104,14 @@ def crossed_sides(
 
     - `following`: the next side of the face.
     - `last`: two less than the number of its sides.
-    - `few_long`: as for `around`.
+    - `few_long`, `few`: as for `around`.
     """
 
     def compare(pair: Pairs, crossed: Array) -> Array:
         return jnp.where(_crosses(pair), pair.other, crossed)
 
     start = jnp.arange(len(sides), dtype=following.dtype)
-    return around(sides, following, last, compare, start, few_long=few_long)
+    return around(sides, following, last, compare, start, few_long=few_long, few=few)
 
 
 def overlaps_and_nearest(
@@ -193,6 +201,7 @@ def around(
     start: Carry,
     *,
     few_long: bool = False,
+    few: bool = False,
 ) -> Carry:
     """Walk around all faces at once: `body` sees each half-edge with the one k sides further.
 
@@ -208,18 +217,21 @@ def around(
     - `start`: arrays with a row for each half-edge.
     - `few_long`: whether some faces have far more sides than most, as the exterior has. Then those that
         still have some way to go are walked with in pieces.
+    - `few`: whether only few may have any way to go. In a large tissue these are walked with in pieces.
 
     **Returns:** what is carried, at the end.
     """
     n = following.size
     here = jnp.arange(n, dtype=following.dtype)
-    size = min(n, max(64, int(4 * n**0.5))) if few_long else n
-    # Those with the longest way come first, so that what is left to do is at the beginning. (The last piece
-    # is filled up with what has no way to go.)
+    in_pieces = few_long or (few and n >= _MANY)
+    size = min(n, max(64, int(4 * n**0.5))) if in_pieces else n
+    # Those with the longest way come first, or those with any, so that what is left to do is at the
+    # beginning. (The last piece is filled up with what has no way to go.)
     order = here
     if size < n:
         filling = jnp.zeros(-n % size, here.dtype)
-        order = jnp.append(jnp.argsort(-last).astype(here.dtype), filling)
+        order = jnp.argsort(-last).astype(here.dtype) if few_long else _first(last > 0, here)
+        order = jnp.append(order, filling)
         last = jnp.append(take(last, order[:n]), filling.astype(last.dtype))
         start = jax.tree.map(lambda x: take(x, order), start)
     mine = take(sides, order)
@@ -240,7 +252,7 @@ def around(
     def one(k: Int[Array, ""], carry: tuple) -> tuple:
         if size == n:
             return piece(k, k, carry)
-        pieces = (jnp.sum(last >= k) + size - 1) // size
+        pieces = (jnp.sum(last >= (k if few_long else 1)) + size - 1) // size
         return jax.lax.fori_loop(0, pieces, lambda at, carry: piece(k, at, carry), carry)
 
     _, end = jax.lax.fori_loop(1, jnp.max(last) + 1, one, (order, start))
@@ -248,3 +260,14 @@ def around(
         return end
     back = jnp.zeros_like(here).at[order[:n]].set(here)
     return jax.tree.map(lambda x: take(x, back), end)
+
+
+# From so many half-edges on it pays to look for the few of them that matter.
+_MANY = 5000
+
+
+def _first(some: Bool[Array, " n"], here: Int[Array, " n"]) -> Int[Array, " n"]:
+    """Numbers in the order in which some come first."""
+    one, others = jnp.cumsum(some, dtype=here.dtype), jnp.cumsum(~some, dtype=here.dtype)
+    place = jnp.where(some, one - 1, one[-1] + others - 1)
+    return jnp.zeros_like(here).at[place].set(here)

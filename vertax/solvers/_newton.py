@@ -205,7 +205,7 @@ _ROUNDS = 8
 # If no region is larger than this, in units of the largest, nothing moves.
 _COLLAPSED = 1e-5
 # How far conjugate gradients go at least.
-_COARSEST = 0.1
+_COARSEST = 0.35
 
 
 class _Waves(eqx.Module):

@@ -14,7 +14,7 @@ from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
-from vertax.mesh._overlaps import Overlaps
+from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import edge_neighbourhood, flip_edges, source, take
 from vertax.transitions._transitions import AbstractTransitions
 
@@ -128,7 +128,11 @@ class T1(AbstractTransitions):
                     placed = _flipped(
                         corner.place(tissue, flip, corner.across, share * length), flip
                     )
-                    faces = overlapping_faces(placed.overlaps)
+                    touched = jnp.zeros(placed.topology.n_faces, bool)
+                    touched = touched.at[corner.cells].max(accepted[:, None])
+                    faces = overlapping_faces(
+                        find_overlaps(placed.topology, placed.sides, placed.areas, touched)
+                    )
                     before = jnp.where(i == 0, faces, before)
                     blamed = accepted & jnp.any(take(faces & ~before, corner.cells), axis=-1)
                     refused = blamed & (i >= _SHORTENED)
