@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -138,67 +138,106 @@ class NewtonCG(AbstractSolver):
         # Far from rest steps are short, and what is soft may have negative curvature.
         waves = _Waves.of(options, hessian, g, forcing < _COARSEST)
 
-        def residual(p: PyTree, hp: PyTree, shift: Rows) -> tuple[PyTree, PyTree]:
-            """What is left of the gradient, and the same preconditioned."""
-            r = jax.tree.map(lambda g, h, s, p: g + h + _times(s, p), g, hp, shift, p)
-            return r, _preconditioned(r, shift)
-
-        def _preconditioned(r: PyTree, shift: Rows) -> PyTree:
+        def preconditioned(r: PyTree, shift: Rows) -> PyTree:
             near = jax.tree.map(lambda r, s: _times(1 / (stiffness + s), r), r, shift)
             return near if waves is None else waves.added(near, r, shift)
 
-        first = jax.tree.map(lambda g, radius: _size(g) / radius, g, radii)
-        r, z = residual(zero, zero, first)
-        whole = _dot(r, z)
+        def unfinished(system: _System) -> Bool[Array, ""]:
+            return ~system.done & (system.k < self.max_products)
 
-        def unfinished(carry: tuple) -> Bool[Array, ""]:
-            *_, done, k = carry
-            return ~done & (k < self.max_products)
+        def solved(system: _System) -> _System:
+            """A system solved, or so far that it needs another shift."""
+            shift = system.shift
+            left = lambda g, h, s, p: g + h + _times(s, p)
+            r = jax.tree.map(left, g, system.hp, shift, system.p)
+            z = preconditioned(r, shift)
+            rz = _dot(r, z)
+            whole = jnp.where(system.k == 0, rz, system.whole)
+            solved = (system.k == 0) & (rz <= 0)
 
-        def iterate(carry: tuple) -> tuple:
-            p, hp, r, d, shift, rz, rounds, _, k = carry
-            hd = hessian(d)
-            damped = jax.tree.map(lambda hd, s, d: hd + _times(s, d), hd, shift, d)
-            curvature = _dot(d, damped)
-            along = jax.tree.map(_row_dot, d, hd)
-            squared = jax.tree.map(_row_dot, d, d)
-            convex = curvature > 0
-            alpha = jnp.where(convex, rz / jnp.where(convex, curvature, 1), 0)
-            p, hp, r = (
-                tree.add_scale(p, alpha, d),
-                tree.add_scale(hp, alpha, hd),
-                tree.add_scale(r, alpha, damped),
-            )
-            z = _preconditioned(r, shift)
-            new = _dot(r, z)
-            beta = new / rz
-            small = convex & (new <= forcing**2 * whole)
-            # Once it is solved: what goes too far is damped more. That is a new system, which goes on
-            # from here, as does one that is made convex.
-            ratio = jax.tree.map(lambda p, b: _size(p) / b, p, bounds)
-            limit = jnp.where(small, 1.5, 4)
-            far = (jnp.asarray(tree.max(ratio)) > limit) & (rounds < _ROUNDS)
-            typical = jnp.abs(_dot(g, p)) / _dot(p, p)
+            def proceed(last: _Directions) -> Bool[Array, ""]:
+                going = last.convex & ~last.small & ~last.far
+                return going & ~solved & (last.k < self.max_products)
 
-            def tighter(shift: Array, ratio: Array, along: Array, squared: Array) -> Array:
-                more = jnp.maximum(ratio - 1, 0) * (shift + typical)
+            def iterate(last: _Directions) -> _Directions:
+                d = tree.sub(tree.scale(last.beta, last.d), last.z)
+                hd = hessian(d)
+                damped = jax.tree.map(lambda hd, s, d: hd + _times(s, d), hd, shift, d)
+                curvature = _dot(d, damped)
+                convex = curvature > 0
+                alpha = jnp.where(convex, last.rz / jnp.where(convex, curvature, 1), 0)
+                p = tree.add_scale(last.p, alpha, d)
+                hp = tree.add_scale(last.hp, alpha, hd)
+                r = tree.add_scale(last.r, alpha, damped)
+                z = preconditioned(r, shift)
+                rz = _dot(r, z)
+                small = convex & (rz <= forcing**2 * whole)
+                # Once it is solved: what goes too far is damped more.
+                squared = lambda p, b: _row_dot(p, p) / b**2
+                furthest = jnp.asarray(tree.max(jax.tree.map(squared, p, bounds)))
+                limit = jnp.where(small, 1.5, 4) ** 2
+                far = (furthest > limit) & (system.rounds < _ROUNDS)
+                beta = rz / last.rz
+                return _Directions(p, hp, r, z, rz, beta, d, hd, convex, small, far, last.k + 1)
+
+            yes, no = jnp.array(True), jnp.array(False)
+            begin = (system.p, system.hp, r, z, rz, jnp.zeros_like(rz), zero, zero)
+            end = _Directions(*begin, convex=yes, small=no, far=no, k=system.k)
+            end = jax.lax.while_loop(proceed, iterate, end)
+
+            # That is a new system, which goes on from here, as does one that is made convex.
+            typical = jnp.abs(_dot(g, end.p)) / _dot(end.p, end.p)
+
+            def tighter(
+                shift: Array, p: Array, bound: Array, d: Array, hd: Array
+            ) -> Float[Array, " rows"]:
+                more = jnp.maximum(_size(p) / bound - 1, 0) * (shift + typical)
+                along, squared = _row_dot(d, hd), _row_dot(d, d)
                 concave = jnp.where(along < 0, -2 * along / jnp.where(squared > 0, squared, 1), 0)
-                return shift + jnp.where(convex, more, concave)
+                return shift + jnp.where(end.convex, jnp.where(end.far, more, 0), concave)
 
-            def another() -> tuple:
-                new_shift = jax.tree.map(tighter, shift, ratio, along, squared)
-                r, z = residual(p, hp, new_shift)
-                return r, z, new_shift, _dot(r, z), jnp.zeros_like(beta)
+            shift = jax.tree.map(tighter, shift, end.p, bounds, end.d, end.hd)
+            done = solved | (end.small & ~end.far)
+            rounds = system.rounds + end.far
+            return _System(end.p, end.hp, shift, rounds, done, end.k, whole)
 
-            same = (r, z, shift, new, beta)
-            r, z, shift, rz, beta = jax.lax.cond(far | ~convex, another, lambda: same)
-            d = tree.sub(tree.scale(beta, d), z)
-            return p, hp, r, d, shift, rz, rounds + far, small & ~far, k + 1
-
+        first = jax.tree.map(lambda g, radius: _size(g) / radius, g, radii)
         nothing = jnp.array(0)
-        start = (zero, zero, r, tree.scale(-1, z), first, whole, nothing, whole <= 0, nothing)
-        p, hp, *_, products = jax.lax.while_loop(unfinished, iterate, start)
-        return p, hp, products
+        unknown = jnp.zeros_like(forcing)
+        start = _System(zero, zero, first, nothing, jnp.array(False), nothing, unknown)
+        end = jax.lax.while_loop(unfinished, solved, start)
+        return end.p, end.hp, end.k
+
+
+class _System(NamedTuple):
+    """How far the step is, and the damping `shift` with which it goes on."""
+
+    p: PyTree[Array]
+    hp: PyTree[Array]
+    shift: Rows
+    rounds: Int[Array, ""]
+    done: Bool[Array, ""]
+    k: Int[Array, ""]
+    whole: Float[Array, ""]
+
+
+class _Directions(NamedTuple):
+    """Conjugate gradients for one system."""
+
+    p: PyTree[Array]
+    hp: PyTree[Array]
+    r: PyTree[Array]
+    z: PyTree[Array]
+    rz: Float[Array, ""]
+    beta: Float[Array, ""]
+    d: PyTree[Array]
+    """The last direction,"""
+    hd: PyTree[Array]
+    """and its product with the Hessian."""
+    convex: Bool[Array, ""]
+    small: Bool[Array, ""]
+    far: Bool[Array, ""]
+    k: Int[Array, ""]
 
 
 _ROUNDS = 8
