@@ -1,10 +1,11 @@
-"""One factorisation for many right-hand sides."""
+"""Many right-hand sides: one factorisation for all, or none at all."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import optimistix as optx
 import pytest
 from helpers import STILL, random_tissue, shape_factors
 
@@ -47,3 +48,21 @@ def test_sensitivities_are_those_of_minres():
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
     gradient = eqx.filter_jit(jax.grad(lambda p: perimeters(p, Direct()).sum()))
     np.testing.assert_allclose(gradient(p0), expected.sum(axis=0), atol=1e-6)
+
+
+@pytest.mark.thorough
+def test_gauss_newton_without_a_jacobian():
+    start = STILL(random_tissue(N, 2), ShapeFactorEnergy(3.6)).tissue
+    truth = ShapeFactorEnergy(shape_factors(N, 3.6, 0.05))
+    target = STILL(start, truth).tissue
+    problem = vx.InverseProblem(
+        start,
+        ShapeFactorEnergy(jnp.full(N, 3.6)),
+        vx.costs.VertexDistance(target),
+        response=STILL,
+        adjoint=vx.ImplicitDifferentiation(),
+    )
+    products = lx.Normal(lx.CG(rtol=1e-3, atol=1e-12))
+    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10, linear_solver=products)
+    fit = vx.fit(problem, solver, 7, truth=truth, progress=False)
+    assert fit.history.relative_error[-1] < 1e-8
