@@ -1,7 +1,7 @@
 """What the first call waits for: seconds of tracing, of lowering to StableHLO and of XLA.
 
-For parts of an epoch, each compiled by itself, without a cache. Kernels are what XLA compiles one by one, after
-fusion.
+For parts of an epoch, each compiled by itself, without a cache. Kernels are what XLA compiles one by one,
+after fusion.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +36,7 @@ def transitions(vertices: jax.Array, tissue: vx.Tissue, energy: vx.AbstractEnerg
     return rule.sweep(tissue.with_vertices(vertices), energy, rule.init(tissue))[0].vertices
 
 
-def _relaxation(**options: None) -> Callable[..., jax.Array]:
+def _relaxation(**options: Any) -> Callable[..., jax.Array]:
     def relaxed(vertices: jax.Array, tissue: vx.Tissue, energy: vx.AbstractEnergy) -> jax.Array:
         start = tissue.with_vertices(vertices)
         return vx.equilibrate(start, energy, throw=False, **options).tissue.vertices
@@ -42,7 +44,7 @@ def _relaxation(**options: None) -> Callable[..., jax.Array]:
     return relaxed
 
 
-def _gradient(**options: None) -> Callable[..., jax.Array]:
+def _gradient(**options: Any) -> Callable[..., jax.Array]:
     relaxed = _relaxation(**options)
 
     def gradient(vertices: jax.Array, tissue: vx.Tissue, energy: vx.AbstractEnergy) -> jax.Array:
@@ -83,7 +85,7 @@ def main() -> None:
             times.append(time.perf_counter())
             program = lowered.compile()
             times.append(time.perf_counter())
-            trace, lower, xla = (b - a for a, b in zip(times, times[1:], strict=False))
+            trace, lower, xla = (b - a for a, b in pairwise(times))
             kernels = (program.as_text() or "").count(" fusion(")
             print(
                 f"{part:>20} {n_cells:6d} {trace:7.2f} {lower:7.2f} {xla:7.2f} {kernels:8d}",

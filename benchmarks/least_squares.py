@@ -3,8 +3,8 @@
     python benchmarks/least_squares.py [--cells 100 1000] [--epochs 5] [--solver direct]
 
 The target shape factors of all cells are fitted to the vertices of a tissue. Printed are the seconds of each
-epoch, of which the first two compile, and the relative error of the parameters after each. `matrix-free` never
-has the Jacobian: conjugate gradients multiply by it and by its transpose, with a linear solve each.
+epoch, of which the first two compile, and the relative error of the parameters after each. `matrix-free`
+never has the Jacobian: conjugate gradients multiply by it and by its transpose, with a linear solve each.
 """
 
 import argparse
@@ -39,10 +39,9 @@ def main() -> None:
             vx.costs.VertexDistance(target),
             adjoint=vx.ImplicitDifferentiation(linear_solver=solver),
         )
-        inner = {}
-        if chosen.solver == "matrix-free":
-            inner = {"linear_solver": lx.Normal(lx.CG(rtol=1e-3, atol=1e-12))}
-        method = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8, **inner)
+        products = lx.Normal(lx.CG(rtol=1e-3, atol=1e-12))
+        inner = products if chosen.solver == "matrix-free" else lx.QR()
+        method = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8, linear_solver=inner)
         history = vx.fit(problem, method, chosen.epochs, truth=truth, progress=False).history
         print(f"{n_cells} cells, seconds: {np.round(history.seconds, 2)}", flush=True)
         print("  relative error:", *(f"{error:.0e}" for error in history.relative_error))

@@ -62,8 +62,8 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Medium]]):
             return _Attempt(solution, result, jax.tree.map(jnp.asarray, stats), ~again, again)
 
         outcome = jax.eval_shape(lambda: self.plain.compute(linear, vector, options))
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), outcome)
-        start = _Attempt(*nothing, jnp.array(True), jnp.array(True))
+        solution, result, stats = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), outcome)
+        start = _Attempt(solution, result, stats, jnp.array(True), jnp.array(True))
         end = jax.lax.while_loop(lambda last: last.again, attempt, start)
         return end.solution, end.result, end.stats
 

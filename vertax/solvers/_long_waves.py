@@ -97,9 +97,9 @@ class LongWaves(eqx.Module):
 
         long, short = 1, max(2, self.size // 8)
 
-        def stiffness(wave: tuple[Int[Array, ""], Float[Array, "2 2"]]) -> Float[Array, ""]:
+        def stiffness(kind: tuple[Int[Array, ""], Float[Array, "2 2"]]) -> Float[Array, ""]:
             # One product for waves along both axes, which hardly feel each other.
-            number, polarisations = wave
+            number, polarisations = kind
             phases = 2 * jnp.pi * number * self.places + jnp.array([0.3, 1.1])
             wave = moves * (jnp.cos(phases) @ polarisations)
             rest = [jnp.zeros(x.shape, x.dtype) for x in shapes]

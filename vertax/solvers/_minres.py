@@ -272,8 +272,9 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
                     norm_a_r=norm_v,
                     status=jnp.where(least_squares, LEAST_SQUARES, end.status),
                 )
-                when = _Looks(0, 1, 1, 2, 2, 3, 3, 4, 1)
-                return jax.tree.map(lambda k, x, y: jnp.where(turns[k], x, y), when, new, seen)
+                when = (0, 1, 1, 2, 2, 3, 3, 4, 1)
+                each = zip(when, new, seen, strict=True)
+                return _Looks(*(jnp.where(turns[k], now, before) for k, now, before in each))
 
             seen = lax.fori_loop(0, jnp.where(probing, 2, 5), look, solve.last)
             least_squares = seen.status == LEAST_SQUARES
