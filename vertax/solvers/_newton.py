@@ -153,11 +153,11 @@ class NewtonCG(AbstractSolver):
             z = preconditioned(r, shift)
             rz = _dot(r, z)
             whole = jnp.where(system.k == 0, rz, system.whole)
-            solved = (system.k == 0) & (rz <= 0)
+            nothing_left = (system.k == 0) & (rz <= 0)
 
             def proceed(last: _Directions) -> Bool[Array, ""]:
                 going = last.convex & ~last.small & ~last.far
-                return going & ~solved & (last.k < self.max_products)
+                return going & ~nothing_left & (last.k < self.max_products)
 
             def iterate(last: _Directions) -> _Directions:
                 d = tree.sub(tree.scale(last.beta, last.d), last.z)
@@ -197,7 +197,7 @@ class NewtonCG(AbstractSolver):
                 return shift + jnp.where(end.convex, jnp.where(end.far, more, 0), concave)
 
             shift = jax.tree.map(tighter, shift, end.p, bounds, end.d, end.hd)
-            done = solved | (end.small & ~end.far)
+            done = nothing_left | (end.small & ~end.far)
             rounds = system.rounds + end.far
             return _System(end.p, end.hp, shift, rounds, done, end.k, whole)
 
