@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
+from vertax._base.modules import choose
 from vertax.solvers._long_waves import LongWaves, Medium
 from vertax.solvers._solver import AbstractSolver, Rows, value_and_gradient
 
@@ -60,34 +61,73 @@ class NewtonCG(AbstractSolver):
         self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
     ) -> tuple[Any, _NewtonState, Any]:
         reach = self.max_displacement * options.get("length_scale", 1.0)
-        g = state.gradient
-        _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], y)
         bounds = jax.tree.map(lambda radius: jnp.minimum(radius, reach), state.radii)
-        p, hp, products = self._conjugate_gradients(hessian, g, state.radii, bounds, options)
-        # Vertices may go somewhat further than they should, but none by much.
-        furthest = jnp.asarray(tree.max(jax.tree.map(lambda p, b: _size(p) / b, p, bounds)))
-        shrink = jnp.minimum(1.0, 2 / jnp.where(furthest > 0, furthest, 1))
-        p, hp = tree.scale(shrink, p), tree.scale(shrink, hp)
-        predicted = -(_dot(g, p) + 0.5 * _dot(p, hp))
+        force = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
+        g = state.gradient
+        forcing = jnp.minimum(_COARSEST, jnp.sqrt(tree.norm(g) / force))
+        near = forcing < _COARSEST
 
-        trial = tree.add(y, p)
-        value, gradient, aux = value_and_gradient(fn, trial, args)
+        def attempt(last: _Trial) -> _Trial:
+            """A step, or the correction of one."""
+            first = last.count == 0
+            _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], last.y)
+            tolerance = jnp.where(first, forcing, _LOOSE)
+            solution = self._conjugate_gradients(
+                hessian, last.gradient, last.shift, bounds, tolerance, first & near, options
+            )
+            p, hp = solution.p, solution.hp
+            # Vertices may go somewhat further than they should, but none by much.
+            furthest = jnp.asarray(tree.max(jax.tree.map(lambda p, b: _size(p) / b, p, bounds)))
+            shrink = jnp.minimum(1.0, 2 / jnp.where(furthest > 0, furthest, 1))
+            p, hp = tree.scale(shrink, p), tree.scale(shrink, hp)
+            predicted = -(_dot(last.gradient, p) + 0.5 * _dot(p, hp))
+            y = tree.add(last.y, p)
+            value, gradient, aux = value_and_gradient(fn, y, args)
+            finite = jnp.isfinite(value) & jnp.isfinite(_dot(gradient, gradient))
+            better = first | (finite & (value < last.value))
+            predicted = jnp.where(first, predicted, last.predicted)
+            wanting = state.value - value < _FINE * predicted
+            again = near & finite & better & wanting & (predicted > _rounding(value))
+            there = _Trial(
+                y,
+                value,
+                gradient,
+                aux,
+                foreseen=tree.add(last.gradient, hp),
+                shift=solution.shift,
+                predicted=predicted,
+                products=last.products + solution.k,
+                count=last.count + 1,
+                again=again & (last.count < _CORRECTIONS),
+                uncorrected=choose(first, (p, hp, gradient), last.uncorrected),
+            )
+            same = last._replace(products=there.products, count=there.count, again=jnp.array(False))
+            return choose(better, there, same)
+
+        shift = jax.tree.map(lambda g, radius: _size(g) / radius, g, state.radii)
+        begin = (y, state.value, g, state.aux, g, shift, jnp.zeros_like(state.value))
+        none, yes = jnp.array(0), jnp.array(True)
+        trial = _Trial(*begin, products=none, count=none, again=yes, uncorrected=(y, g, g))
+        trial = jax.lax.while_loop(lambda trial: trial.again, attempt, trial)
+        value, gradient, predicted = trial.value, trial.gradient, trial.predicted
         actual = state.value - value
         # Near equilibrium the gain drowns in the rounding of E; there a step is good if it lowers the
         # force.
-        noise = 20 * jnp.finfo(value.dtype).eps * jnp.abs(value)
-        lost = predicted <= noise
+        lost = predicted <= _rounding(value)
         lower_force = _dot(gradient, gradient) < _dot(g, g)
         ratio = actual / jnp.where(predicted > 0, predicted, 1)
         finite = jnp.isfinite(value) & jnp.isfinite(_dot(gradient, gradient))
         accept = finite & jnp.where(lost, lower_force, ratio > 1e-4)
 
         fine = accept & (lost | (ratio > 0.75))
+        # What a correction has not mended is to be blamed on the step.
+        corrected = (tree.sub(trial.y, y), tree.sub(trial.foreseen, g), gradient)
+        moved = choose(fine, corrected, trial.uncorrected)
         # What each row may be wrong about the energy, on average.
         due = jnp.maximum(predicted, 0) / sum(r.shape[0] for r in jax.tree.leaves(state.radii))
 
         def adapted(
-            radius: Array, step: Array, old: Array, change: Array, new: Array
+            radius: Array, old: Array, step: Array, change: Array, new: Array
         ) -> Float[Array, " rows"]:
             scale, length = jnp.maximum(_size(old), _size(change)), _size(step)
             # How far the force is from what the model said, and who is to blame if a step is no good.
@@ -108,13 +148,13 @@ class NewtonCG(AbstractSolver):
                 jnp.where(grows, 2 * radius, kept), jnp.finfo(kept.dtype).eps * reach
             )
 
-        radii = jax.tree.map(adapted, state.radii, p, g, hp, gradient)
+        radii = jax.tree.map(adapted, state.radii, g, *moved)
         # Where nothing can move any more, a fresh start may find another way.
         collapsed = jnp.asarray(tree.max(radii)) < _COLLAPSED * reach
         radii = jax.tree.map(lambda radius: jnp.where(collapsed, reach, radius), radii)
         kept = (y, state.value, g, state.aux)
-        y, value, g, aux = tree.where(accept, (trial, value, gradient, aux), kept)
-        return y, _NewtonState(value, g, radii, state.num_products + products, aux), aux
+        y, value, g, aux = choose(accept, (trial.y, value, gradient, trial.aux), kept)
+        return y, _NewtonState(value, g, radii, state.num_products + trial.products, aux), aux
 
     def resumed(
         self, fresh: _NewtonState, old: _NewtonState, share: Rows, flipped: Bool[Array, ""]
@@ -127,16 +167,20 @@ class NewtonCG(AbstractSolver):
         return state.gradient
 
     def _conjugate_gradients(
-        self, hessian: Any, g: PyTree, radii: Rows, bounds: Rows, options: dict[str, Any]
-    ) -> tuple[PyTree, PyTree, Int[Array, ""]]:
+        self,
+        hessian: Any,
+        g: PyTree,
+        shift: Rows,
+        bounds: Rows,
+        forcing: Float[Array, ""],
+        waving: Bool[Array, ""],
+        options: dict[str, Any],
+    ) -> _System:
         """A step `p`, and `H p`."""
         stiffness = options.get("stiffness", 1.0)
-        # Forces are measured in that which moves a vertex by the length scale.
-        force = stiffness * options.get("length_scale", 1.0)
-        forcing = jnp.minimum(_COARSEST, jnp.sqrt(tree.norm(g) / force))
         zero = tree.zeros_like(g)
         # Far from rest steps are short, and what is soft may have negative curvature.
-        waves = _Waves.of(options, hessian, g, forcing < _COARSEST)
+        waves = _Waves.of(options, hessian, g, waving)
 
         def preconditioned(r: PyTree, shift: Rows) -> PyTree:
             near = jax.tree.map(lambda r, s: _times(1 / (stiffness + s), r), r, shift)
@@ -201,12 +245,29 @@ class NewtonCG(AbstractSolver):
             rounds = system.rounds + end.far
             return _System(end.p, end.hp, shift, rounds, done, end.k, whole)
 
-        first = jax.tree.map(lambda g, radius: _size(g) / radius, g, radii)
         nothing = jnp.array(0)
         unknown = jnp.zeros_like(forcing)
-        start = _System(zero, zero, first, nothing, jnp.array(False), nothing, unknown)
-        end = jax.lax.while_loop(unfinished, solved, start)
-        return end.p, end.hp, end.k
+        start = _System(zero, zero, shift, nothing, jnp.array(False), nothing, unknown)
+        return jax.lax.while_loop(unfinished, solved, start)
+
+
+class _Trial(NamedTuple):
+    """Where a step leads, corrected so many times."""
+
+    y: PyTree[Array]
+    value: Float[Array, ""]
+    gradient: PyTree[Array]
+    aux: PyTree
+    foreseen: PyTree[Array]
+    """The gradient that the model had there."""
+    shift: Rows
+    predicted: Float[Array, ""]
+    """The gain of the step itself."""
+    products: Int[Array, ""]
+    count: Int[Array, ""]
+    again: Bool[Array, ""]
+    uncorrected: tuple[PyTree[Array], PyTree[Array], PyTree[Array]]
+    """The step itself, what it should do to the gradient, and the gradient where it leads."""
 
 
 class _System(NamedTuple):
@@ -245,6 +306,10 @@ _ROUNDS = 8
 _COLLAPSED = 1e-5
 # How far conjugate gradients go at least.
 _COARSEST = 0.35
+# A step that gains less than this share of what it should is corrected, so many times at most, so well.
+_FINE = 0.9
+_CORRECTIONS = 3
+_LOOSE = 0.5
 
 
 class _Waves(eqx.Module):
@@ -271,6 +336,10 @@ class _Waves(eqx.Module):
         # A place that is held tightly must not hold all others.
         held = jnp.mean(jnp.minimum(jax.tree.leaves(shift)[0], self.stiffness))
         return jax.lax.cond(self.used, lambda: self.medium.added(near, r, held), lambda: near)
+
+
+def _rounding(value: Float[Array, ""]) -> Float[Array, ""]:
+    return 20 * jnp.finfo(value.dtype).eps * jnp.abs(value)
 
 
 def _dot(a: PyTree, b: PyTree) -> Float[Array, ""]:
