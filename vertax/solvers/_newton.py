@@ -309,7 +309,7 @@ _COARSEST = 0.35
 # A step that gains less than this share of what it should is corrected, so many times at most, so well.
 _FINE = 0.9
 _CORRECTIONS = 3
-_LOOSE = 0.5
+_LOOSE = 0.3
 
 
 class _Waves(eqx.Module):
