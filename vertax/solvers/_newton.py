@@ -186,6 +186,11 @@ class NewtonCG(AbstractSolver):
             near = jax.tree.map(lambda r, s: _times(1 / (stiffness + s), r), r, shift)
             return near if waves is None else waves.added(near, r, shift)
 
+        def distance(p: PyTree) -> Float[Array, ""]:
+            """How far a step goes where it goes furthest, in units of the bounds there."""
+            squared = lambda p, b: _row_dot(p, p) / b**2
+            return jnp.sqrt(jnp.asarray(tree.max(jax.tree.map(squared, p, bounds))))
+
         def unfinished(system: _System) -> Bool[Array, ""]:
             return ~system.done & (system.k < self.max_products)
 
@@ -210,22 +215,27 @@ class NewtonCG(AbstractSolver):
                 curvature = _dot(d, damped)
                 convex = curvature > 0
                 alpha = jnp.where(convex, last.rz / jnp.where(convex, curvature, 1), 0)
-                p = tree.add_scale(last.p, alpha, d)
-                hp = tree.add_scale(last.hp, alpha, hd)
                 r = tree.add_scale(last.r, alpha, damped)
                 z = preconditioned(r, shift)
                 rz = _dot(r, z)
                 small = convex & (rz <= forcing**2 * whole)
                 # Once it is solved: what goes too far is damped more.
-                squared = lambda p, b: _row_dot(p, p) / b**2
-                furthest = jnp.asarray(tree.max(jax.tree.map(squared, p, bounds)))
-                limit = jnp.where(small, 1.5, 4) ** 2
-                far = (furthest > limit) & (system.rounds < _ROUNDS)
+                furthest = distance(tree.add_scale(last.p, alpha, d))
+                far = (furthest > jnp.where(small, 1.5, _FURTHEST)) & (system.rounds < _ROUNDS)
+                # (Where there is hardly any curvature it may be far too far: it goes on from the limit.)
+                room = (_FURTHEST - last.furthest) / (furthest - last.furthest)
+                alpha *= jnp.where(far & (furthest > _FURTHEST), room, 1)
+                p = tree.add_scale(last.p, alpha, d)
+                hp = tree.add_scale(last.hp, alpha, hd)
                 beta = rz / last.rz
-                return _Directions(p, hp, r, z, rz, beta, d, hd, convex, small, far, last.k + 1)
+                k = last.k + 1
+                return _Directions(
+                    p, hp, r, z, rz, beta, d, hd, furthest, convex, small, far, k
+                )
 
             yes, no = jnp.array(True), jnp.array(False)
             begin = (system.p, system.hp, r, z, rz, jnp.zeros_like(rz), zero, zero)
+            begin += (distance(system.p),)
             end = _Directions(*begin, convex=yes, small=no, far=no, k=system.k)
             end = jax.lax.while_loop(proceed, iterate, end)
 
@@ -295,6 +305,7 @@ class _Directions(NamedTuple):
     """The last direction,"""
     hd: PyTree[Array]
     """and its product with the Hessian."""
+    furthest: Float[Array, ""]
     convex: Bool[Array, ""]
     small: Bool[Array, ""]
     far: Bool[Array, ""]
@@ -302,6 +313,8 @@ class _Directions(NamedTuple):
 
 
 _ROUNDS = 8
+# How far a step may go before it is solved, in units of the bounds.
+_FURTHEST = 4.0
 # If no region is larger than this, in units of the largest, nothing moves.
 _COLLAPSED = 1e-5
 # How far conjugate gradients go at least.
