@@ -157,16 +157,21 @@ class Contacts(eqx.Module):
             tissue.topology
         )
 
-    def crushed(self, before: Tissue, tissue: Tissue) -> Bool[Array, " vertices"]:
-        """The vertices of contacts that a step has brought behind the crest of their barrier."""
+    def crushed(
+        self, before: Tissue, tissue: Tissue, known: Bool[Array, " vertices"]
+    ) -> Bool[Array, " vertices"]:
+        """The vertices of contacts that a step has brought behind the crest of their barrier.
+
+        That is said only of contacts between `known` vertices, which are what they were before.
+        """
         corner, side = self.pairs[:, 0], self.pairs[:, 1]
         steps = zip(
             self._between(before, self.pairs), self._between(tissue, self.pairs), strict=True
         )
         worse = [(new < _CREST) & (new < old) for (old, _), (new, _) in steps]
-        behind = functools.reduce(jnp.logical_or, worse)
-        ends = jnp.stack([corner, side, take(tissue.topology.next, side)])
-        return jnp.zeros(tissue.n_vertices, bool).at[source(ends)].max(behind)
+        ends = source(jnp.stack([corner, side, take(tissue.topology.next, side)]))
+        behind = functools.reduce(jnp.logical_or, worse) & jnp.all(take(known, ends), axis=0)
+        return jnp.zeros(tissue.n_vertices, bool).at[ends].max(behind)
 
     def moved(self, before: Tissue, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
         """The contacts after vertices moved, if there are none, and whether that is certain."""

@@ -181,8 +181,10 @@ class Search(eqx.Module):
             tissue, counts = there, state.counts
             if self.transitions is not None:
                 tissue, counts = self.transitions.sweep(there, energy, state.counts)
-            swept = jnp.any(tissue.vertices != there.vertices) | jnp.any(counts != state.counts)
-            contacts, overlapping = self._near(tissue, state, swept | ~state.started)
+            swept = jnp.any(tissue.vertices != there.vertices, axis=-1)
+            twins = tissue.topology.twin != there.topology.twin
+            swept |= jnp.any(twins.reshape(-1, 3), axis=-1) | ~state.started
+            contacts, overlapping = self._near(tissue, state, swept)
             return _Arrival(tissue, contacts, counts, share, overlapping, last.tries + 1)
 
         everywhere = jnp.ones(goal.n_vertices, goal.vertices.dtype)
@@ -206,19 +208,22 @@ class Search(eqx.Module):
         return choose(stuck, _Arrival(*same), arrived)
 
     def _near(
-        self, tissue: Tissue, last: SearchState, anew: Bool[Array, ""]
+        self, tissue: Tissue, last: SearchState, swept: Bool[Array, " vertices"]
     ) -> tuple[Contacts | None, Bool[Array, " vertices"]]:
-        """The contacts of a tissue, and the vertices of what overlaps, if that matters."""
+        """The contacts of a tissue, and the vertices of what overlaps, if that matters.
+
+        Vertices that transitions have placed, or given other neighbours, come from nowhere.
+        """
         nowhere = jnp.zeros(tissue.n_vertices, bool)
         if last.contacts is None:
             return None, nowhere
         contacts, clear = last.contacts.moved(last.tissue, tissue)
-        clear &= ~anew & ~last.overlaps
+        clear &= ~jnp.any(swept) & ~last.overlaps
 
         def looked_at() -> tuple[Contacts, Bool[Array, " vertices"]]:
             found, overlapping = contacts.found(tissue)
-            crushed = found.crushed(last.tissue.with_topology(tissue.topology), tissue)
-            return found, overlapping | (crushed & ~anew)
+            before = last.tissue.with_topology(tissue.topology)
+            return found, overlapping | found.crushed(before, tissue, ~swept)
 
         return jax.lax.cond(clear, lambda: (contacts, nowhere), looked_at)
 
