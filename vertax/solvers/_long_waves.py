@@ -130,10 +130,20 @@ class Medium(eqx.Module):
     shear: Float[Array, ""]
     compression: Float[Array, ""]
 
-    def added(self, near: PyTree, force: PyTree, shift: Float[Array, ""]) -> PyTree:
-        """How vertices give way near by, as parts of a configuration, and how the medium does besides."""
+    def added(
+        self,
+        near: PyTree,
+        force: PyTree,
+        shift: Float[Array, ""],
+        share: Float[Array, " vertices"] | float = 1.0,
+    ) -> PyTree:
+        """How vertices give way near by, as parts of a configuration, and how the medium does besides.
+
+        Vertices hand on a `share` of their force to the medium, and go with it as much.
+        """
         first, *rest = jax.tree.leaves(near)
-        first = first + self.yields(jax.tree.leaves(force)[0], shift)
+        share = jnp.broadcast_to(share, first.shape[:1])[:, None]
+        first = first + share * self.yields(share * jax.tree.leaves(force)[0], shift)
         return jax.tree.unflatten(jax.tree.structure(near), [first, *rest])
 
     def yields(

@@ -346,9 +346,13 @@ class _Waves(eqx.Module):
 
     def added(self, near: PyTree, r: PyTree, shift: Rows) -> PyTree:
         """A residual that was preconditioned near by, and its long waves."""
-        # A place that is held tightly must not hold all others.
-        held = jnp.mean(jnp.minimum(jax.tree.leaves(shift)[0], self.stiffness))
-        return jax.lax.cond(self.used, lambda: self.medium.added(near, r, held), lambda: near)
+        # A place that is held tightly must not hold all others, nor drag them along.
+        damping = jax.tree.leaves(shift)[0]
+        held = jnp.mean(jnp.minimum(damping, self.stiffness))
+        share = self.stiffness / (self.stiffness + damping)
+        return jax.lax.cond(
+            self.used, lambda: self.medium.added(near, r, held, share), lambda: near
+        )
 
 
 def _rounding(value: Float[Array, ""]) -> Float[Array, ""]:
