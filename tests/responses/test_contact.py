@@ -70,13 +70,13 @@ def test_steps_of_any_solver_are_undone_where_cells_would_overlap(solver):
 def test_without_contact_cells_overlap_and_that_is_refused():
     response = vx.Relaxation(contact_range=None)
     energy = shapes(np.full(N, 4.7))
-    equilibrium = response(tissue_of(1), energy, throw=False)
+    equilibrium = response(tissue_of(3), energy, throw=False)
     bad = faces_that_overlap(equilibrium.tissue)
     assert bad
     assert not equilibrium.valid
     assert not equilibrium.converged
     with pytest.raises(RuntimeError, match=rf"overlap: cell {bad[0]}\b.*contact_range"):
-        response(tissue_of(1), energy)
+        response(tissue_of(3), energy)
 
 
 def test_a_tissue_that_overlaps_from_the_start_is_named():

@@ -33,17 +33,22 @@ class NewtonCG(AbstractSolver):
     vanishes with the force, and convergence is quadratic: the way to a *true* equilibrium. (Steihaug 1983,
     doi:10.1137/0720042; Nocedal & Wright 2006, alg. 4.1 and 7.2, doi:10.1007/978-0-387-40065-5.)
 
+    Soft motions follow curved valleys: a step along one climbs its side, and gains little or nothing. Such a
+    step is corrected: a few products with the Hessian where it leads bring it back to the floor, and it is
+    accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6).
+
     Where a step gains less energy than the model promised, the regions shrink of those vertices whose
     forces it did not foresee, and of no others: so one difficult place does not hold back a large tissue.
     What the error at a vertex does to the energy must matter, though: a vertex that hardly moves is not to
     blame for what its neighbours do. Where a step was good, small regions grow again, even of vertices that
-    moved little: damped too much, soft collective motions would not come out of it.
+    moved little: damped too much, soft collective motions would not come out of it. What a correction has
+    mended was good.
 
     **Arguments:**
 
     - `max_displacement`: about the furthest that one vertex moves in a step, in units of the length scale
         (in [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
-    - `max_products`: most Hessian-vector products in one step.
+    - `max_products`: most Hessian-vector products in one step, and in each correction.
     """
 
     max_displacement: float = 0.2
@@ -176,7 +181,15 @@ class NewtonCG(AbstractSolver):
         waving: Bool[Array, ""],
         options: dict[str, Any],
     ) -> _System:
-        """A step `p`, and `H p`."""
+        """A step `p`, `H p`, and the damping with which it is solved.
+
+        **Arguments:**
+
+        - `shift`: the damping to begin with.
+        - `bounds`: about how far each vertex may go.
+        - `forcing`: the residual to come to, in units of the first one.
+        - `waving`: whether long waves precondition it.
+        """
         stiffness = options.get("stiffness", 1.0)
         zero = tree.zeros_like(g)
         # Far from rest steps are short, and what is soft may have negative curvature.
@@ -229,9 +242,7 @@ class NewtonCG(AbstractSolver):
                 hp = tree.add_scale(last.hp, alpha, hd)
                 beta = rz / last.rz
                 k = last.k + 1
-                return _Directions(
-                    p, hp, r, z, rz, beta, d, hd, furthest, convex, small, far, k
-                )
+                return _Directions(p, hp, r, z, rz, beta, d, hd, furthest, convex, small, far, k)
 
             yes, no = jnp.array(True), jnp.array(False)
             begin = (system.p, system.hp, r, z, rz, jnp.zeros_like(rz), zero, zero)
