@@ -74,7 +74,7 @@ class NewtonCG(AbstractSolver):
 
         def attempt(last: _Trial) -> _Trial:
             """A step, or the correction of one."""
-            first = last.count == 0
+            first = last.tries == 0
             _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], last.y)
             tolerance = jnp.where(first, forcing, _LOOSE)
             solution = self._conjugate_gradients(
@@ -102,17 +102,17 @@ class NewtonCG(AbstractSolver):
                 shift=solution.shift,
                 predicted=predicted,
                 products=last.products + solution.k,
-                count=last.count + 1,
-                again=again & (last.count < _CORRECTIONS),
+                tries=last.tries + 1,
+                again=again & (last.tries < _CORRECTIONS),
                 uncorrected=choose(first, (p, hp, gradient), last.uncorrected),
             )
-            same = last._replace(products=there.products, count=there.count, again=jnp.array(False))
+            same = last._replace(products=there.products, tries=there.tries, again=jnp.array(False))
             return choose(better, there, same)
 
         shift = jax.tree.map(lambda g, radius: _size(g) / radius, g, state.radii)
         begin = (y, state.value, g, state.aux, g, shift, jnp.zeros_like(state.value))
         none, yes = jnp.array(0), jnp.array(True)
-        trial = _Trial(*begin, products=none, count=none, again=yes, uncorrected=(y, g, g))
+        trial = _Trial(*begin, products=none, tries=none, again=yes, uncorrected=(y, g, g))
         trial = jax.lax.while_loop(lambda trial: trial.again, attempt, trial)
         value, gradient, predicted = trial.value, trial.gradient, trial.predicted
         actual = state.value - value
@@ -285,7 +285,7 @@ class _Trial(NamedTuple):
     predicted: Float[Array, ""]
     """The gain of the step itself."""
     products: Int[Array, ""]
-    count: Int[Array, ""]
+    tries: Int[Array, ""]
     again: Bool[Array, ""]
     uncorrected: tuple[PyTree[Array], PyTree[Array], PyTree[Array]]
     """The step itself, what it should do to the gradient, and the gradient where it leads."""
