@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ import optimistix as optx
 import pytest
 
 import vertax as vx
+from vertax.solvers import _newton
 
 N = 30
 PLACES = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (N, 2)))
@@ -61,3 +63,35 @@ def test_the_unit_of_energy_does_not_matter(scale):
     y, _ = steps(scaled, start, 1.0, 5, stiffness=scale)
     expected, _ = steps(landscape, start, 1.0, 5, stiffness=1.0)
     np.testing.assert_allclose(y, expected, atol=1e-9)
+
+
+def test_steps_follow_a_curved_valley(monkeypatch):
+    """The floor is a circle, and falls gently around it."""
+    tilt = 1e-4
+
+    def valley(y, _):
+        radius = jnp.sqrt(jnp.sum(y**2, axis=-1))
+        return jnp.sum(0.5 * (radius - 1) ** 2 - tilt * y[:, 0]), None
+
+    angles = jnp.linspace(1.0, 2.5, N)
+    start = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+
+    def needed():
+        solver = vx.solvers.NewtonCG(atol=1e-10)
+        found = optx.minimise(valley, solver, start, has_aux=True, max_steps=300)
+        np.testing.assert_allclose(found.value[:, 0], 1 + tilt, atol=1e-6)
+        return int(found.stats["num_steps"])
+
+    corrected = needed()
+    monkeypatch.setattr(_newton, "_CORRECTIONS", 0)
+    jax.clear_caches()
+    assert corrected < 0.75 * needed()
+
+
+@pytest.mark.thorough
+def test_fluid_tissues_come_to_rest_without_creeping():
+    relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=600))
+    for seed in (22, 49, 66, 71, 105, 106):  # 170 to 560 steps each without corrections
+        tissue = vx.initialise.periodic_voronoi(64, key=jax.random.key(1000 + seed))
+        factors = 3.9 + 0.1 * jax.random.normal(jax.random.key(2000 + seed), (64,))
+        assert relax(tissue, vx.energies.ShapeFactorEnergy(factors)).num_steps < 160
