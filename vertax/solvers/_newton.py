@@ -67,6 +67,7 @@ class NewtonCG(AbstractSolver):
     ) -> tuple[Any, _NewtonState, Any]:
         reach = self.max_displacement * options.get("length_scale", 1.0)
         bounds = jax.tree.map(lambda radius: jnp.minimum(radius, reach), state.radii)
+        # Forces are measured in that which moves a vertex by the length scale.
         force = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
         g = state.gradient
         forcing = jnp.minimum(_COARSEST, jnp.sqrt(tree.norm(g) / force))
@@ -82,7 +83,7 @@ class NewtonCG(AbstractSolver):
             )
             p, hp = solution.p, solution.hp
             # Vertices may go somewhat further than they should, but none by much.
-            furthest = jnp.asarray(tree.max(jax.tree.map(lambda p, b: _size(p) / b, p, bounds)))
+            furthest = _furthest(p, bounds)
             shrink = jnp.minimum(1.0, 2 / jnp.where(furthest > 0, furthest, 1))
             p, hp = tree.scale(shrink, p), tree.scale(shrink, hp)
             predicted = -(_dot(last.gradient, p) + 0.5 * _dot(p, hp))
@@ -199,11 +200,6 @@ class NewtonCG(AbstractSolver):
             near = jax.tree.map(lambda r, s: _times(1 / (stiffness + s), r), r, shift)
             return near if waves is None else waves.added(near, r, shift)
 
-        def distance(p: PyTree) -> Float[Array, ""]:
-            """How far a step goes where it goes furthest, in units of the bounds there."""
-            squared = lambda p, b: _row_dot(p, p) / b**2
-            return jnp.sqrt(jnp.asarray(tree.max(jax.tree.map(squared, p, bounds))))
-
         def unfinished(system: _System) -> Bool[Array, ""]:
             return ~system.done & (system.k < self.max_products)
 
@@ -233,7 +229,7 @@ class NewtonCG(AbstractSolver):
                 rz = _dot(r, z)
                 small = convex & (rz <= forcing**2 * whole)
                 # Once it is solved: what goes too far is damped more.
-                furthest = distance(tree.add_scale(last.p, alpha, d))
+                furthest = _furthest(tree.add_scale(last.p, alpha, d), bounds)
                 far = (furthest > jnp.where(small, 1.5, _FURTHEST)) & (system.rounds < _ROUNDS)
                 # (Where there is hardly any curvature it may be far too far: it goes on from the limit.)
                 room = (_FURTHEST - last.furthest) / (furthest - last.furthest)
@@ -246,7 +242,7 @@ class NewtonCG(AbstractSolver):
 
             yes, no = jnp.array(True), jnp.array(False)
             begin = (system.p, system.hp, r, z, rz, jnp.zeros_like(rz), zero, zero)
-            begin += (distance(system.p),)
+            begin += (_furthest(system.p, bounds),)
             end = _Directions(*begin, convex=yes, small=no, far=no, k=system.k)
             end = jax.lax.while_loop(proceed, iterate, end)
 
@@ -376,6 +372,11 @@ def _dot(a: PyTree, b: PyTree) -> Float[Array, ""]:
 
 def _row_dot(a: Float[Array, "rows ..."], b: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
     return jnp.sum(a * b, axis=tuple(range(1, a.ndim)))
+
+
+def _furthest(p: PyTree, bounds: Rows) -> Float[Array, ""]:
+    """How far a step goes where it goes furthest, in units of the bounds there."""
+    return jnp.asarray(tree.max(jax.tree.map(lambda p, b: _size(p) / b, p, bounds)))
 
 
 def _size(x: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
