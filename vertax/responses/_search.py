@@ -49,6 +49,8 @@ class _Arrival(eqx.Module):
     counts: Int[Array, "*rules edges"]
     share: Float[Array, " vertices"]
     """Which share of the step each vertex has taken."""
+    blamed: Bool[Array, " vertices"]
+    """Those that overlapped on the way here."""
     overlapping: Bool[Array, " vertices"]
     tries: Int[Array, ""]
 
@@ -145,7 +147,7 @@ class Search(eqx.Module):
 
         def restart() -> PatientState:
             fresh = self._restarted(tissue, energy, contacts)
-            share = before.by_row(arrived.share)
+            share = before.by_row(jnp.where(arrived.blamed, arrived.share, 1))
             resumed = self.minimiser.resumed(fresh, minimiser, share, flipped)
             return choose(state.started, resumed, fresh)
 
@@ -172,8 +174,13 @@ class Search(eqx.Module):
             return jnp.where(rows < 1, a + rows * (b - a), b)
 
         def attempt(last: _Arrival) -> _Arrival:
-            less = jnp.where(last.tries < _TRIES - 2, 0.25, 0) * last.share
-            share = jnp.where(last.overlapping | (last.tries == _TRIES - 1), less, last.share)
+            less = jnp.where(last.tries <= _SHORTER, 0.25, 0) * last.share
+            share = jnp.where(last.overlapping, less, last.share)
+            # Where that does not help, more and more around it stays as well: elsewhere all go on.
+            around = _around(before, last.overlapping | (last.share == 0))
+            stays = (last.tries > _SHORTER + 1) & (around | (last.tries == _TRIES - 1))
+            share = jnp.where(stays, 0, share)
+            blamed = last.blamed | last.overlapping
             on_the_way = jax.tree.map(
                 partway, before.configuration, goal.configuration, before.by_row(share)
             )
@@ -185,11 +192,11 @@ class Search(eqx.Module):
             twins = tissue.topology.twin != there.topology.twin
             swept |= jnp.any(twins.reshape(-1, 3), axis=-1) | ~state.started
             contacts, overlapping = self._near(tissue, state, swept)
-            return _Arrival(tissue, contacts, counts, share, overlapping, last.tries + 1)
+            return _Arrival(tissue, contacts, counts, share, blamed, overlapping, last.tries + 1)
 
-        everywhere = jnp.ones(goal.n_vertices, goal.vertices.dtype)
-        nowhere = jnp.zeros(goal.n_vertices, bool)
-        start = _Arrival(goal, state.contacts, state.counts, everywhere, nowhere, jnp.array(0))
+        whole = jnp.ones(goal.n_vertices, goal.vertices.dtype)
+        none = jnp.zeros(goal.n_vertices, bool)
+        start = _Arrival(goal, state.contacts, state.counts, whole, none, none, jnp.array(0))
         arrays, static = eqx.partition(start, eqx.is_array)
         # What overlapped from the start is not mended in this way.
         guarded = state.started & ~state.overlaps
@@ -204,7 +211,7 @@ class Search(eqx.Module):
         arrived = eqx.combine(jax.lax.while_loop(unfinished, iterate, arrays), static)
         # Not even a sweep of transitions from where it was leads to a valid tissue.
         stuck = guarded & jnp.any(arrived.overlapping)
-        same = (before, state.contacts, state.counts, 0 * arrived.share, nowhere, arrived.tries)
+        same = (before, state.contacts, state.counts, 0 * whole, ~none, none, arrived.tries)
         return choose(stuck, _Arrival(*same), arrived)
 
     def _near(
@@ -238,8 +245,9 @@ class Search(eqx.Module):
 
 
 _TAGS: frozenset[object] = frozenset()
-# After so many attempts nothing moves.
-_TRIES = 6
+# So often what overlaps goes less far before it stays where it is; and after so many attempts nothing moves.
+_SHORTER = 3
+_TRIES = 9
 
 
 # A relaxation evaluates it in five places: so it is traced once.
@@ -252,6 +260,15 @@ def objective(
     there = tissue.with_configuration(configuration)
     value = energy(there)
     return value if contacts is None else value + contacts(there), None
+
+
+def _around(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:
+    """The vertices of all faces that have one of these."""
+    m = tissue.topology
+    corners = jnp.repeat(vertices, 3)
+    cells = jnp.zeros(m.n_cells, bool).at[m.cell].max(corners, mode="drop")
+    there = cells.at[m.cell].get(mode="fill", fill_value=False)
+    return vertices | jnp.any(there.reshape(-1, 3), axis=-1)
 
 
 def _empty(tree: PyTree) -> PyTree:

@@ -82,10 +82,6 @@ class NewtonCG(AbstractSolver):
                 hessian, last.gradient, last.shift, bounds, tolerance, first & near, options
             )
             p, hp = solution.p, solution.hp
-            # Vertices may go somewhat further than they should, but none by much.
-            furthest = _furthest(p, bounds)
-            shrink = jnp.minimum(1.0, 2 / jnp.where(furthest > 0, furthest, 1))
-            p, hp = tree.scale(shrink, p), tree.scale(shrink, hp)
             predicted = -(_dot(last.gradient, p) + 0.5 * _dot(p, hp))
             y = tree.add(last.y, p)
             value, gradient, aux = value_and_gradient(fn, y, args)
@@ -201,11 +197,11 @@ class NewtonCG(AbstractSolver):
             return near if waves is None else waves.added(near, r, shift)
 
         def unfinished(system: _System) -> Bool[Array, ""]:
-            return ~system.done & (system.k < self.max_products)
+            return ~system.done & (system.cuts | (system.k < self.max_products))
 
         def solved(system: _System) -> _System:
             """A system solved, or so far that it needs another shift."""
-            shift = system.shift
+            shift, cuts = system.shift, system.cuts
             left = lambda g, h, s, p: g + h + _times(s, p)
             r = jax.tree.map(left, g, system.hp, shift, system.p)
             z = preconditioned(r, shift)
@@ -215,22 +211,24 @@ class NewtonCG(AbstractSolver):
 
             def proceed(last: _Directions) -> Bool[Array, ""]:
                 going = last.convex & ~last.small & ~last.far
-                return going & ~nothing_left & (last.k < self.max_products)
+                return going & ~nothing_left & (cuts | (last.k < self.max_products))
 
             def iterate(last: _Directions) -> _Directions:
                 d = tree.sub(tree.scale(last.beta, last.d), last.z)
                 hd = hessian(d)
                 damped = jax.tree.map(lambda hd, s, d: hd + _times(s, d), hd, shift, d)
                 curvature = _dot(d, damped)
-                convex = curvature > 0
+                convex = cuts | (curvature > 0)
                 alpha = jnp.where(convex, last.rz / jnp.where(convex, curvature, 1), 0)
+                alpha = jnp.where(cuts, 1, alpha)
                 r = tree.add_scale(last.r, alpha, damped)
                 z = preconditioned(r, shift)
                 rz = _dot(r, z)
-                small = convex & (rz <= forcing**2 * whole)
+                small = cuts | (convex & (rz <= forcing**2 * whole))
                 # Once it is solved: what goes too far is damped more.
                 furthest = _furthest(tree.add_scale(last.p, alpha, d), bounds)
                 far = (furthest > jnp.where(small, 1.5, _FURTHEST)) & (system.rounds < _ROUNDS)
+                far &= ~cuts
                 # (Where there is hardly any curvature it may be far too far: it goes on from the limit.)
                 room = (_FURTHEST - last.furthest) / (furthest - last.furthest)
                 alpha *= jnp.where(far & (furthest > _FURTHEST), room, 1)
@@ -241,7 +239,10 @@ class NewtonCG(AbstractSolver):
                 return _Directions(p, hp, r, z, rz, beta, d, hd, furthest, convex, small, far, k)
 
             yes, no = jnp.array(True), jnp.array(False)
-            begin = (system.p, system.hp, r, z, rz, jnp.zeros_like(rz), zero, zero)
+            # A cut is a step back, to what no vertex goes beyond: so there is but one product to compile.
+            back = jax.tree.map(_cut, system.p, bounds)
+            d, z = choose(cuts, (back, zero), (zero, z))
+            begin = (system.p, system.hp, r, z, rz, jnp.where(cuts, jnp.ones_like(rz), 0), d, zero)
             begin += (_furthest(system.p, bounds),)
             end = _Directions(*begin, convex=yes, small=no, far=no, k=system.k)
             end = jax.lax.while_loop(proceed, iterate, end)
@@ -259,12 +260,15 @@ class NewtonCG(AbstractSolver):
 
             shift = jax.tree.map(tighter, shift, end.p, bounds, end.d, end.hd)
             done = nothing_left | (end.small & ~end.far)
+            # Vertices may go somewhat further than they should, but none by much.
+            over = ~cuts & (end.furthest > _OVER) & (done | (end.k >= self.max_products))
             rounds = system.rounds + end.far
-            return _System(end.p, end.hp, shift, rounds, done, end.k, whole)
+            return _System(end.p, end.hp, shift, rounds, done & ~over, end.k, whole, over)
 
         nothing = jnp.array(0)
         unknown = jnp.zeros_like(forcing)
-        start = _System(zero, zero, shift, nothing, jnp.array(False), nothing, unknown)
+        no = jnp.array(False)
+        start = _System(zero, zero, shift, nothing, no, nothing, unknown, no)
         return jax.lax.while_loop(unfinished, solved, start)
 
 
@@ -297,6 +301,8 @@ class _System(NamedTuple):
     done: Bool[Array, ""]
     k: Int[Array, ""]
     whole: Float[Array, ""]
+    cuts: Bool[Array, ""]
+    """Whether all that is left to do is to cut what goes too far."""
 
 
 class _Directions(NamedTuple):
@@ -322,6 +328,8 @@ class _Directions(NamedTuple):
 _ROUNDS = 8
 # How far a step may go before it is solved, in units of the bounds.
 _FURTHEST = 4.0
+# Further no vertex goes in the end.
+_OVER = 2.0
 # If no region is larger than this, in units of the largest, nothing moves.
 _COLLAPSED = 1e-5
 # How far conjugate gradients go at least.
@@ -377,6 +385,13 @@ def _row_dot(a: Float[Array, "rows ..."], b: Float[Array, "rows ..."]) -> Float[
 def _furthest(p: PyTree, bounds: Rows) -> Float[Array, ""]:
     """How far a step goes where it goes furthest, in units of the bounds there."""
     return jnp.asarray(tree.max(jax.tree.map(lambda p, b: _size(p) / b, p, bounds)))
+
+
+def _cut(p: Float[Array, "rows ..."], bound: Float[Array, " rows"]) -> Float[Array, "rows ..."]:
+    """From a step back to one that goes nowhere beyond its bounds by much."""
+    size = _size(p)
+    share = jnp.minimum(1, _OVER * bound / jnp.where(size > 0, size, 1))
+    return _times(share - 1, p)
 
 
 def _size(x: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
