@@ -67,6 +67,40 @@ def test_steps_of_any_solver_are_undone_where_cells_would_overlap(solver):
         assert faces_that_overlap(equilibrium.tissue) == []
 
 
+class _Spoiler(vx.transitions.AbstractTransitions):
+    """Where a cell has moved at all, one of its corners ends up far away."""
+
+    start: jax.Array
+    cell: int = eqx.field(static=True)
+
+    def init(self, tissue):
+        return jnp.zeros(tissue.n_edges, jnp.int32)
+
+    def sweep(self, tissue, energy, counts):
+        corners = (tissue.topology.cell == self.cell).reshape(-1, 3).any(axis=1)
+        moved = (tissue.vertices != self.start).any(axis=1)
+        far = jnp.where((corners & moved).any(), 2.0, 0.0)
+        return tissue.with_vertices(tissue.vertices.at[jnp.argmax(corners)].add(far)), counts
+
+
+def test_what_cannot_go_on_holds_back_only_what_is_around():
+    tissue = vx.initialise.periodic_voronoi(60, key=jax.random.key(2), lloyd_steps=3)
+    response = vx.Relaxation(transitions=_Spoiler(tissue.vertices, 7))
+    energy = shapes(np.full(60, 3.6))
+
+    @eqx.filter_jit
+    def step(tissue, energy):
+        search = response.search(tissue, energy)
+        return search.advance(search.begin(tissue, energy), energy, 1)
+
+    state = step(tissue, energy)
+    moved = np.asarray((state.tissue.vertices != tissue.vertices).any(axis=1))
+    corners = np.asarray((tissue.topology.cell == 7).reshape(-1, 3).any(axis=1))
+    assert not moved[corners].any()
+    assert moved.mean() > 0.5
+    assert state.minimiser.inner.value < energy(tissue)
+
+
 def test_without_contact_cells_overlap_and_that_is_refused():
     response = vx.Relaxation(contact_range=None)
     energy = shapes(np.full(N, 4.7))

@@ -56,6 +56,26 @@ def test_no_row_goes_far_in_a_step():
     assert hill(y, None)[0] < hill(start, None)[0]
 
 
+def test_what_goes_too_far_is_cut_and_nothing_else(monkeypatch):
+    """A long lever, whose end goes a hundred times as far as what is pushed."""
+    monkeypatch.setattr(_newton, "_ROUNDS", 0)
+    monkeypatch.setattr(_newton, "_COARSEST", 1e-6)
+
+    def lever(y, _):
+        bent = y[1] - 100 * y[0]
+        wells = 0.5 * jnp.sum((y[2:] - PLACES[2:]) ** 2)
+        return wells + 0.1 * y[0, 0] + 0.5e-4 * jnp.sum(bent**2), None
+
+    start = jnp.zeros((N, 2))
+    y, state = steps(lever, start, None, 1)
+    far = jnp.sqrt(jnp.sum(y**2, axis=-1))
+    assert 0.3 < far[1] <= 2 * 0.2 * 1.001
+    np.testing.assert_allclose(state.gradient, jax.grad(lambda y: lever(y, None)[0])(y), atol=1e-12)
+    # As far as their own damping lets them.
+    damped = PLACES[2:] / (1 + jnp.linalg.norm(PLACES[2:], axis=-1, keepdims=True) / 0.2)
+    np.testing.assert_allclose(y[2:], damped, atol=1e-4)
+
+
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
 def test_the_unit_of_energy_does_not_matter(scale):
     start = jnp.zeros((N, 2))

@@ -347,30 +347,29 @@ def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
     # What hung on a moves to b, b to c, c to d and d to a, taking twin, cell and edge along. `roll` is
     # that permutation of half-edges and `unroll` its inverse, so a mesh relabelled by it is
     # twin' = roll ∘ twin ∘ unroll, which stays an involution even if two of the four are twins.
-    t, a, b, c, d = edge_neighbourhood(topology)
-    h = topology.half_edge
-    n = topology.n_half_edges
-    identity = jnp.arange(n, dtype=h.dtype)
-
-    def put(array: Array, index: tuple[Array, ...], values: tuple[Array, ...]) -> Array:
-        # Only at flipped edges: the other indices point outside, and are dropped.
-        where = jnp.concatenate([jnp.where(flip, i, n) for i in index])
-        return array.at[where].set(jnp.concatenate(values), mode="drop")
-
-    roll = put(identity, (a, b, c, d), (b, c, d, a))
-    unroll = put(identity, (b, c, d, a), (a, b, c, d))
-    at = lambda array, index: take(array, index)
-    cell = at(topology.cell, unroll)
-    cell = put(cell, (h, t), (at(topology.cell, c), at(topology.cell, a)))
+    #
+    # Every half-edge looks for itself whether it flips, or which of its two neighbours around the vertex
+    # does: after a flipped one comes an a or a c, before it a b or a d.
+    twin, frame, h = topology.twin, topology.frame, topology.half_edge
+    here = jnp.arange(topology.n_half_edges, dtype=h.dtype)
+    left, right = counter_clockwise(here), clockwise(here)
+    flips = take(flip, topology.edge)
+    follows, leads = take(flips, right), take(flips, left)
+    beside = lambda neighbour, turn: turn(take(twin, neighbour))
+    roll = jnp.where(leads, beside(left, counter_clockwise), here)
+    roll = jnp.where(follows, left, roll)
+    unroll = jnp.where(follows, beside(right, clockwise), here)
+    unroll = jnp.where(leads, right, unroll)
+    ahead = counter_clockwise(twin)
+    cell = take(topology.cell, jnp.where(flips, ahead, unroll))
     # Corners: v stays a corner of L and V and becomes one of W; w stays one of R and W and becomes one
     # of V. A new corner is one step of the flipped edge away from the other end's.
-    fh, ft, fa, fc, fd = (at(topology.frame, slot) for slot in (h, t, a, c, d))
-    step = fd - fh
-    frame = put(topology.frame, (h, a, b, t, c, d), (fc - step, fh, fa, fa + step, ft, fc))
-    twin, half_edge = at(roll, at(topology.twin, unroll)), at(roll, h)
+    step = (take(frame, clockwise(twin)) - frame) * flips[:, None]
+    frame = take(frame, jnp.where(flips, ahead, jnp.where(follows | leads, right, here))) - step
+    twin, half_edge = take(roll, take(twin, unroll)), take(roll, h)
     if topology.exterior:  # which stays on the right of edges
-        outside = at(cell, half_edge) == topology.n_cells
-        half_edge = jnp.where(outside, at(twin, half_edge), half_edge)
+        outside = take(cell, half_edge) == topology.n_cells
+        half_edge = jnp.where(outside, take(twin, half_edge), half_edge)
     return eqx.tree_at(
         lambda m: (m.twin, m.cell, m.frame, m.edge, m.half_edge),
         topology,
@@ -378,7 +377,7 @@ def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
             twin,
             cell,
             frame,
-            at(topology.edge, unroll),
+            take(topology.edge, unroll),
             half_edge,
         ),
     )

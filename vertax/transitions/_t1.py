@@ -7,9 +7,9 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.modules import is_concrete
+from vertax._base.modules import choose, is_concrete
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
@@ -102,29 +102,30 @@ class T1(AbstractTransitions):
             def flip_where_it_helps() -> tuple[Tissue, Array, Array]:
                 chosen = _independent(todo, corner, tissue.n_cells)
                 length = jnp.maximum(corner.length, threshold)
-                chord = length / corner.stretch
+                shares = jnp.array([1, 1, 0.5, 0.25], length.dtype)
 
-                def trials(which: Bool[Array, " edges"]) -> tuple[Tissue, ...]:
-                    stretched = corner.place(tissue, which, corner.along, chord)
-                    turned = _flipped(tissue, which)
-                    across = lambda share: corner.place(
-                        turned, which, corner.across, share * length
-                    )
-                    return stretched, across(1), across(0.5), across(0.25)
+                def trial(k: Int[Array, ""], which: Bool[Array, " edges"]) -> Tissue:
+                    # Stretched, flipped, and flipped with a half and a quarter of the length.
+                    direction = jnp.where(k > 0, corner.across, corner.along)
+                    chord = length / jnp.where(k > 0, 1, corner.stretch)
+                    turned = _flipped(tissue, which & (k > 0))
+                    return corner.place(turned, which, direction, shares[k] * chord)
 
-                stretched, flipped, short, shorter = _judge(energy, chosen, corner, trials)
-                grows = short < shorter
-                accepted = chosen & may_flip & (flipped < stretched) & (grows | (counts == 0))
+                again = chosen & (counts > 0)
+                n_trials = jnp.where(jnp.any(again), 4, 2)
+                costs = _judge(energy, chosen, corner, trial, n_trials)
+                stretched, flipped, short, shorter = costs
+                accepted = chosen & may_flip & (flipped < stretched) & (~again | (short < shorter))
 
-                # Where there is no room for the new edge it is made shorter; then it is refused. The
-                # first turn, without any flip, finds what overlaps already; the last one finds nothing.
+                # Where there is no room for the new edge it is made shorter; then it is refused. If there
+                # seems to be none, a turn without any flip shows what overlaps already.
                 def crowded(carry: tuple) -> Bool[Array, ""]:
                     i, accepted, *_, blamed = carry
-                    return jnp.any(blamed) | ((i < 2) & jnp.any(accepted))
+                    return jnp.any(blamed) | ((i == 0) & jnp.any(accepted))
 
                 def make_room(carry: tuple) -> tuple:
-                    i, accepted, share, before, *_ = carry
-                    flip = accepted & (i > 0)
+                    i, accepted, share, before, crossed, last, _ = carry
+                    flip = accepted & (i != 1)
                     placed = _flipped(
                         corner.place(tissue, flip, corner.across, share * length), flip
                     )
@@ -133,15 +134,18 @@ class T1(AbstractTransitions):
                     faces = overlapping_faces(
                         find_overlaps(placed.topology, placed.sides, placed.areas, touched)
                     )
-                    before = jnp.where(i == 0, faces, before)
-                    blamed = accepted & jnp.any(take(faces & ~before, corner.cells), axis=-1)
+                    before = jnp.where(i == 1, faces, before)
+                    crossed = jnp.where(i == 1, crossed, faces)
+                    blamed = accepted & jnp.any(take(crossed & ~before, corner.cells), axis=-1)
                     refused = blamed & (i >= _SHORTENED)
-                    share = jnp.where(blamed, 0.25 * share, share)
-                    return i + 1, accepted & ~refused, share, before, placed, blamed
+                    share = jnp.where(blamed & (i > 0), 0.25 * share, share)
+                    placed = choose(i == 1, last, placed)
+                    return i + 1, accepted & ~refused, share, before, crossed, placed, blamed
 
                 none = jnp.zeros_like(accepted)
                 nowhere = jnp.zeros(tissue.n_cells + 1, bool)
-                start = (jnp.array(0), accepted, jnp.ones_like(length), nowhere, tissue, none)
+                share = jnp.ones_like(length)
+                start = (jnp.array(0), accepted, share, nowhere, nowhere, tissue, none)
                 _, accepted, *_, placed, _ = jax.lax.while_loop(crowded, make_room, start)
                 # What is inside out and stays so little that nobody would notice is put right.
                 back = chosen & ~accepted & may_turn
@@ -230,9 +234,10 @@ class EdgeFrames(eqx.Module):
         """Lay the marked edges in a direction, about their midpoint, with a given length."""
         half = 0.5 * (direction * length[:, None] - self.vector)
         half = jnp.where(which[:, None], half, 0)
-        return tissue.with_vertices(
-            tissue.vertices.at[self.start].add(-half).at[self.end].add(half)
-        )
+        edge = tissue.topology.edge
+        starts = take(self.start, edge) == source(jnp.arange(edge.size, dtype=edge.dtype))
+        shifts = jnp.where(starts[:, None], -1, 1) * take(half, edge)
+        return tissue.with_vertices(tissue.vertices + jnp.sum(shifts.reshape(-1, 3, 2), axis=1))
 
 
 def edge_axes(tissue: Tissue) -> Float[Array, "edges 2"]:
@@ -300,53 +305,47 @@ def _independent(
     return least(number, least(corner.length, candidates))
 
 
-# The tissue with the marked edges stretched, flipped, and flipped with a half and a quarter of the length.
-_Trials = Callable[[Bool[Array, " edges"]], tuple[Tissue, ...]]
+# The tissue with the marked edges changed in a way that has a number.
+_Trial = Callable[[Int[Array, ""], Bool[Array, " edges"]], Tissue]
 
 
 def _judge(
-    energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
-) -> Float[Array, "trials edges"]:
-    """What the trials of each chosen edge cost."""
+    energy: AbstractEnergy,
+    chosen: Bool[Array, " edges"],
+    corner: EdgeFrames,
+    trial: _Trial,
+    n_trials: Int[Array, ""],
+) -> Float[Array, "4 edges"]:
+    """What the first trials of each chosen edge cost."""
+    costs = jnp.zeros((4, chosen.size), corner.length.dtype)
     if isinstance(energy, AbstractLocalEnergy):
-        return _judge_local(energy, chosen, corner, trials)
-    return _judge_total(energy, chosen, corner, trials)
+        all_at_once = lambda k, costs: costs.at[k].set(
+            _local_costs(energy, trial(k, chosen), corner)
+        )
+        return jax.lax.fori_loop(0, n_trials, all_at_once, costs)
+
+    # Any other: one edge after the other. (As they share no cell, the rest may stay as it is.)
+    edges = jnp.arange(chosen.size)
+    order = jnp.argsort(jnp.where(chosen, corner.length, jnp.inf))
+
+    def one(i: Int[Array, ""], costs: Float[Array, "4 edges"]) -> Float[Array, "4 edges"]:
+        edge, k = order[i // n_trials], i % n_trials
+        return costs.at[k, edge].set(energy(trial(k, edges == edge)))
+
+    return jax.lax.fori_loop(0, n_trials * jnp.sum(chosen), one, costs)
 
 
-def _judge_local(
-    energy: AbstractLocalEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
-) -> Float[Array, "trials edges"]:
-    """The same for a local energy: all at once, each by the terms of its own cells and edges."""
-    by_cell, by_edge = _of_each(
-        lambda t: (energy.cell_terms(t), energy.edge_terms(t)), trials(chosen)
-    )
+def _local_costs(
+    energy: AbstractLocalEnergy, tissue: Tissue, corner: EdgeFrames
+) -> Float[Array, " edges"]:
+    """The energy of the cells and edges around each edge."""
     # In a very small tissue one cell can be two of the four: count it once.
     cells = corner.cells
     repeated = [jnp.zeros(cells.shape[0], bool)]
     for k in range(1, 4):
         repeated.append(jnp.any(cells[:, :k] == cells[:, k : k + 1], axis=-1))
-    by_cell = by_cell.at[:, cells].get(mode="fill", fill_value=0)  # the exterior has no energy
+    by_cell = energy.cell_terms(tissue).at[cells].get(mode="fill", fill_value=0)
+    # (The exterior has no energy.)
     by_cell = jnp.where(jnp.stack(repeated, axis=-1), 0, by_cell)
-    return jnp.sum(by_cell, axis=-1) + jnp.sum(by_edge[:, corner.edges], axis=-1)
-
-
-def _judge_total(
-    energy: AbstractEnergy, chosen: Bool[Array, " edges"], corner: EdgeFrames, trials: _Trials
-) -> Float[Array, "trials edges"]:
-    """The same for an arbitrary energy: one edge after the other."""
-    edges = jnp.arange(chosen.shape[0])
-    order = jnp.argsort(jnp.where(chosen, corner.length, jnp.inf))
-
-    def body(i: Array, costs: Float[Array, "trials edges"]) -> Float[Array, "trials edges"]:
-        # Chosen edges share no cell, so others need not be flipped to judge one.
-        return costs.at[:, order[i]].set(_of_each(energy, trials(edges == order[i])))
-
-    nothing = jnp.zeros((4, chosen.shape[0]), corner.length.dtype)
-    return jax.lax.fori_loop(0, jnp.sum(chosen), body, nothing)
-
-
-def _of_each(function: Callable[[Tissue], PyTree], tissues: tuple[Tissue, ...]) -> PyTree:
-    """What a function returns for each of some tissues; it is compiled once."""
-    arrays, static = eqx.partition(tissues, eqx.is_array)
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *arrays)
-    return jax.vmap(lambda x: function(eqx.combine(x, static[0])))(stacked)
+    by_edge = take(energy.edge_terms(tissue), corner.edges)
+    return jnp.sum(by_cell, axis=-1) + jnp.sum(by_edge, axis=-1)
