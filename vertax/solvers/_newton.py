@@ -30,7 +30,8 @@ class NewtonCG(AbstractSolver):
     Hessian-vector products only. $\Lambda$ is diagonal, one number for each vertex: $|g_v| / \Delta_v$,
     so that no vertex means to leave its region of radius $\Delta_v$ (and more where one still does), and
     more where the Hessian has negative curvature, so that the model is convex. Near equilibrium it
-    vanishes with the force, and convergence is quadratic: the way to a *true* equilibrium. (Steihaug 1983,
+    vanishes with the force, and convergence is quadratic: the way to a *true* equilibrium. What would still
+    go beyond twice its region is cut back to that, and nothing else. (Steihaug 1983,
     doi:10.1137/0720042; Nocedal & Wright 2006, alg. 4.1 and 7.2, doi:10.1007/978-0-387-40065-5.)
 
     Soft motions follow curved valleys: a step along one climbs its side, and gains little or nothing. Such a
