@@ -110,15 +110,31 @@ def circle_of(side: Sides) -> Circle:
     return Circle(curvature[:, 0], sine * unit + cosine * left)
 
 
+@jax.custom_jvp
 def squared_distance_to_segment(
     point: Float[Array, "sides 2"], side: Sides
 ) -> Float[Array, " sides"]:
     """Squared distance of a point from each straight side."""
+    way, _ = _way_to_segment(point, side)
+    return dot(way, way)
+
+
+# Where on the side the nearest point is does not matter in first order.
+@squared_distance_to_segment.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
+    (way, share), (change, moved) = _way_to_segment(*primals), tangents
+    change = change - moved[:, :2] - share[:, None] * moved[:, 2:4]
+    return dot(way, way), 2 * dot(way, change)
+
+
+def _way_to_segment(
+    point: Float[Array, "sides 2"], side: Sides
+) -> tuple[Float[Array, "sides 2"], Float[Array, " sides"]]:
+    """The way from the nearest point of each side, and at which share of it that is."""
     first, chord = point - side[:, :2], side[:, 2:4]
     squared = dot(chord, chord)
-    share = dot(first, chord) / jnp.where(squared > 0, squared, 1)
-    way = first - jnp.clip(share, 0, 1)[:, None] * chord
-    return dot(way, way)
+    share = jnp.clip(dot(first, chord) / jnp.where(squared > 0, squared, 1), 0, 1)
+    return first - share[:, None] * chord, share
 
 
 def squared_distance_to_arc(

@@ -167,12 +167,8 @@ class Tissue(eqx.Module):
     @compiled_property
     def edge_segments(self) -> tuple[Float[Array, "edges 2"], Float[Array, "edges 2"]]:
         """First vertex of each edge, and the edge as a vector from there across periodic boundaries."""
-        m = self.topology
-        twin, _, _, _, following = edge_neighbourhood(m)
-        offset = take(m.frame, following) - take(m.frame, m.half_edge)
-        first = take(self.vertices, source(m.half_edge))
-        last = take(self.vertices, source(twin))
-        return first, last + self.boundary.translation(offset) - first
+        x, y, dx, dy = self._segments()
+        return jnp.stack([x, y], axis=-1), jnp.stack([dx, dy], axis=-1)
 
     @compiled_property
     def edge_vectors(self) -> Float[Array, "edges 2"]:
@@ -217,7 +213,7 @@ class Tissue(eqx.Module):
         In equilibrium under a line tension $\gamma$ this is the difference of the pressures on its left
         and right over $\gamma$ (Young–Laplace).
         """
-        chord = self._lengths(self.edge_vectors)
+        chord = self._chords()
         return 2 * jnp.sin(self.edge_angles) / jnp.where(chord > 0, chord, 1)
 
     @compiled_property
@@ -233,7 +229,7 @@ class Tissue(eqx.Module):
     @compiled_property
     def edge_lengths(self) -> Float[Array, " edges"]:
         """Length of each edge (softened, see the class)."""
-        lengths = self._lengths(self.edge_vectors)
+        lengths = self._chords()
         if self.topology.spare:
             lengths = jnp.where(self.topology.alive_edges, lengths, 0)
         return lengths if self.arcs is None else lengths * length_factor(self.edge_angles)
@@ -262,6 +258,11 @@ class Tissue(eqx.Module):
         The corners of one cell, in the order of `topology.next`, are its polygon drawn whole.
         """
         return jnp.repeat(self.vertices, 3, axis=0) + self.boundary.translation(self.topology.frame)
+
+    def corners_of(self, half_edges: Int[Array, "*some"]) -> Float[Array, "*some 2"]:
+        """The rows of `corners` of some half-edges; no others are looked at."""
+        image = self.boundary.translation(take(self.topology.frame, half_edges))
+        return take(self.vertices, source(half_edges)) + image
 
     @compiled_property
     def centroids(self) -> Float[Array, "cells 2"]:
@@ -301,13 +302,8 @@ class Tissue(eqx.Module):
     def sides_of(self, half_edges: Int[Array, " some"]) -> Float[Array, "some parts"]:
         """The rows of `sides` of some half-edges; no others are looked at."""
         m = self.topology
-
-        def corner(half_edge: Int[Array, " some"]) -> Float[Array, "some 2"]:
-            image = self.boundary.translation(take(m.frame, half_edge))
-            return take(self.vertices, source(half_edge)) + image
-
-        start = corner(half_edges)
-        parts = [start, corner(take(m.next, half_edges)) - start]
+        start = self.corners_of(half_edges)
+        parts = [start, self.corners_of(take(m.next, half_edges)) - start]
         if self.arcs is not None:
             angles = take(self.edge_angles, take(m.edge, half_edges))
             parts.append(jnp.where(take(m.forward, half_edges), angles, -angles)[:, None])
@@ -477,8 +473,21 @@ class Tissue(eqx.Module):
     ) -> tuple[Float[Array, "vertices 2"], Float[Array, " edges"] | None]:
         return (configuration, None) if self.arcs is None else configuration
 
-    def _lengths(self, vectors: Float[Array, "edges 2"]) -> Float[Array, " edges"]:
-        squared = vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + self.softening**2
+    def _segments(self) -> tuple[Float[Array, " edges"], ...]:
+        """The first vertex of each edge, x and y, and the edge as a vector from there."""
+        # Apart, from here to areas and lengths: pairs would be taken apart and put together again in every
+        # product with a Hessian.
+        m = self.topology
+        twin, _, _, _, following = edge_neighbourhood(m)
+        offset = self.boundary.translation(take(m.frame, following) - take(m.frame, m.half_edge))
+        ends = source(jnp.stack([m.half_edge, twin]))
+        (x, to_x), (y, to_y) = (take(self.vertices[:, axis], ends) for axis in (0, 1))
+        return x, y, to_x + offset[:, 0] - x, to_y + offset[:, 1] - y
+
+    def _chords(self) -> Float[Array, " edges"]:
+        """How far the ends of each edge are from each other (softened)."""
+        _, _, dx, dy = self._segments()
+        squared = dx**2 + dy**2 + self.softening**2
         # An edge of length exactly 0 without softening has no direction; the inner `where` keeps the
         # derivative of the square root finite there (0, the middle of all its one-sided slopes).
         at_zero = squared == 0
@@ -487,15 +496,18 @@ class Tissue(eqx.Module):
     def _area_shares(self) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
         """What each edge contributes to the areas of its left and right cell (shoelace formula)."""
         m = self.topology
-        first, vector = self.edge_segments
-        left = first + self.boundary.translation(take(m.frame, m.half_edge))
+        x, y, dx, dy = self._segments()
+
+        def swept(corner: Int[Array, " edges"]) -> Float[Array, " edges"]:
+            image = self.boundary.translation(take(m.frame, corner))
+            return 0.5 * ((x + image[:, 0]) * dy - (y + image[:, 1]) * dx)
+
         # The right cell's corner at the first vertex is one slot clockwise.
-        right = first + self.boundary.translation(take(m.frame, clockwise(m.half_edge)))
-        area_left, area_right = 0.5 * _cross(left, vector), -0.5 * _cross(right, vector)
+        left, right = swept(m.half_edge), -swept(clockwise(m.half_edge))
         if self.arcs is None:
-            return area_left, area_right
-        bulge = (vector[:, 0] ** 2 + vector[:, 1] ** 2) * area_factor(self.edge_angles)
-        return area_left + bulge, area_right - bulge
+            return left, right
+        bulge = (dx**2 + dy**2) * area_factor(self.edge_angles)
+        return left + bulge, right - bulge
 
     def _cell_sums(
         self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]

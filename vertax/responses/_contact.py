@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -68,24 +69,33 @@ class Contacts(eqx.Module):
             sizes.insert(0, len(self.pairs) // 16)
         count = jnp.sum(self.pairs[:, 0] != self.pairs[:, 1])
         enough = sum(count > size for size in (0, *sizes[:-1]))
-        energy = Contacts._energy
+        energies = [Contacts._energy for _ in sizes]
         if tissue.arcs is None:
             # What is near need not be in range; if nothing is, all derivatives vanish as well.
             there = jax.lax.stop_gradient(tissue)
             none = lambda: jnp.array(False)
             some = [lambda size=size: self._in_range(there, self.pairs[:size]) for size in sizes]
             enough = jnp.where(jax.lax.switch(enough, [none, *some]), enough, 0)
-            # Derivatives start anew, or without contacts they would hand on a hundred arrays of zeros.
-            energy = jax.checkpoint(Contacts._energy)
-        some = [lambda size=size: energy(self, tissue, self.pairs[:size]) for size in sizes]
+            # Without contacts derivatives would still hand on arrays of zeros: many of them, or long ones.
+            energies = [Contacts._energy_of_few, jax.checkpoint(Contacts._energy)]
+        some = [
+            lambda size=size, energy=energy: energy(self, tissue, self.pairs[:size])
+            for size, energy in zip(sizes, energies, strict=False)
+        ]
         return jax.lax.switch(enough, [nothing, *some])
 
     def _energy(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
-        values = jnp.zeros(len(pairs), tissue.vertices.dtype)
-        for near, squared in self._between(tissue, pairs):
-            near = jnp.where(near < 1, near, 1)
-            values -= squared * (1 - near) ** 2 * jnp.log((near + FLOOR) / (1 + FLOOR))
-        return self.strength * jnp.sum(values)
+        corner, side = pairs.T
+        one, other = tissue.sides_of(corner), tissue.sides_of(side)
+        return self.strength * jnp.sum(self._heights(_kinds(tissue, pairs), one, other))
+
+    def _energy_of_few(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
+        corner, side = pairs.T
+        # (At once: the derivative of every look at the vertices is as long as all of them.)
+        ends = jnp.stack([corner, side, take(tissue.topology.next, side)])
+        corner, start, end = tissue.corners_of(ends)
+        places = jnp.concatenate([corner - start, end - start], axis=-1)
+        return _barrier(self, _kinds(tissue, pairs), places)
 
     def _in_range(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Bool[Array, ""]:
         return jnp.any(jnp.stack([near < 1 for near, _ in self._between(tissue, pairs)]))
@@ -93,14 +103,22 @@ class Contacts(eqx.Module):
     def _between(
         self, tissue: Tissue, pairs: Int[Array, "some 2"]
     ) -> list[tuple[Float[Array, " some"], Float[Array, " some"]]]:
-        """How near the corners and sides of pairs are, see `_nearness`."""
-        following = tissue.topology.next
-        corner, side = pairs[:, 0], pairs[:, 1]
-        after = take(following, corner) == side
-        before = take(following, take(following, side)) == corner
-        one, other = tissue.sides_of(corner), tissue.sides_of(side)
-        nearness = self._nearness(one, other, after, before)
-        return [(jnp.where(corner != side, near, 1), squared) for near, squared in nearness]
+        """How near the corners and sides of pairs are, see `_nearness`; those of no pair are far away."""
+        corner, side = pairs.T
+        after, before, apart = _kinds(tissue, pairs)
+        nearness = self._nearness(tissue.sides_of(corner), tissue.sides_of(side), after, before)
+        return [(jnp.where(apart, near, 1), squared) for near, squared in nearness]
+
+    def _heights(
+        self, kinds: Bool[Array, "3 some"], one: Sides, other: Sides
+    ) -> Float[Array, " some"]:
+        """How high the barrier is for each pair, in units of its strength."""
+        after, before, apart = kinds
+        heights = jnp.zeros(len(one), one.dtype)
+        for near, squared in self._nearness(one, other, after, before):
+            near = jnp.where(apart & (near < 1), near, 1)
+            heights -= squared * (1 - near) ** 2 * jnp.log((near + FLOOR) / (1 + FLOOR))
+        return heights
 
     def _nearness(
         self, one: Sides, other: Sides, after: Bool[Array, " n"], before: Bool[Array, " n"]
@@ -181,6 +199,63 @@ class Contacts(eqx.Module):
         straight = jnp.array(tissue.arcs is None)
         clear = straight & (slack > 0) & _angles_are_open(tissue, _MARGIN * self.slope)
         return eqx.tree_at(lambda c: (c.pairs, c.slack), self, (0 * self.pairs, slack)), clear
+
+
+def _kinds(tissue: Tissue, pairs: Int[Array, "some 2"]) -> Bool[Array, "3 some"]:
+    """Whether one side of each pair comes after the other, or before it; and whether they are two."""
+    following = tissue.topology.next
+    corner, side = pairs.T
+    after = take(following, corner) == side
+    before = take(following, take(following, side)) == corner
+    return jnp.stack([after, before, corner != side])
+
+
+# A corner and a straight side have four degrees of freedom: where the corner is from the start of the side,
+# and the chord. So forces are worked out in forward mode, and second derivatives as a block for each pair:
+# once, and not again in every product with the Hessian.
+@jax.custom_jvp
+def _barrier(
+    contacts: Contacts, kinds: Bool[Array, "3 some"], places: Float[Array, "some 4"]
+) -> Float[Array, ""]:
+    """The energy of straight sides that are so near."""
+    return jnp.sum(_energies(contacts, kinds, places))
+
+
+@_barrier.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    return _barrier(*primals), jnp.sum(_slopes(*primals) * tangents[-1].T)
+
+
+@jax.custom_jvp
+def _slopes(
+    contacts: Contacts, kinds: Bool[Array, "3 some"], places: Float[Array, "some 4"]
+) -> Float[Array, "4 some"]:
+    return _along_each(lambda x: _energies(contacts, kinds, x), places)
+
+
+@_slopes.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[Float[Array, "4 some"], Float[Array, "4 some"]]:
+    contacts, kinds, places = primals
+    blocks = _along_each(lambda x: _slopes.fun(contacts, kinds, x), places)
+    change = sum(block * row for block, row in zip(blocks, tangents[-1].T, strict=True))
+    return _slopes(*primals), change
+
+
+def _energies(
+    contacts: Contacts, kinds: Bool[Array, "3 some"], places: Float[Array, "some 4"]
+) -> Float[Array, " some"]:
+    first, chord = places[:, :2], places[:, 2:]
+    zero = jnp.zeros_like(first)
+    one, other = jnp.concatenate([first, zero], axis=-1), jnp.concatenate([zero, chord], axis=-1)
+    return contacts.strength * contacts._heights(kinds, one, other)
+
+
+def _along_each(
+    function: Callable[[Array], Array], places: Float[Array, "some 4"]
+) -> Float[Array, "4 ..."]:
+    """How a function of places, row by row, changes with each of their four parts."""
+    along = lambda unit: jax.jvp(function, (places,), (jnp.broadcast_to(unit, places.shape),))[1]
+    return jax.vmap(along)(jnp.eye(4, dtype=places.dtype))
 
 
 # From so many places for a contact on it pays to look whether a few would do.
