@@ -213,7 +213,7 @@ class Tissue(eqx.Module):
         In equilibrium under a line tension $\gamma$ this is the difference of the pressures on its left
         and right over $\gamma$ (Young–Laplace).
         """
-        chord = self._chords()
+        chord = self._chords(self._segments())
         return 2 * jnp.sin(self.edge_angles) / jnp.where(chord > 0, chord, 1)
 
     @compiled_property
@@ -229,21 +229,18 @@ class Tissue(eqx.Module):
     @compiled_property
     def edge_lengths(self) -> Float[Array, " edges"]:
         """Length of each edge (softened, see the class)."""
-        lengths = self._chords()
-        if self.topology.spare:
-            lengths = jnp.where(self.topology.alive_edges, lengths, 0)
-        return lengths if self.arcs is None else lengths * length_factor(self.edge_angles)
+        return self.lengths_and_areas()[0]
 
     @compiled_property
     def areas(self) -> Float[Array, " cells"]:
         """Signed area of each cell, positive for an upright (counter-clockwise) cell."""
-        return self._cell_sums(self._area_shares())
+        return self.lengths_and_areas()[1]
 
     @compiled_property
     def perimeters(self) -> Float[Array, " cells"]:
         """Perimeter of each cell (softened, see the class)."""
         lengths = self.edge_lengths
-        return self._cell_sums((lengths, lengths))
+        return self.cell_sums((lengths, lengths))
 
     @compiled_property
     def shape_factors(self) -> Float[Array, " cells"]:
@@ -484,19 +481,21 @@ class Tissue(eqx.Module):
         (x, to_x), (y, to_y) = (take(self.vertices[:, axis], ends) for axis in (0, 1))
         return x, y, to_x + offset[:, 0] - x, to_y + offset[:, 1] - y
 
-    def _chords(self) -> Float[Array, " edges"]:
+    def _chords(self, segments: tuple[Float[Array, " edges"], ...]) -> Float[Array, " edges"]:
         """How far the ends of each edge are from each other (softened)."""
-        _, _, dx, dy = self._segments()
+        _, _, dx, dy = segments
         squared = dx**2 + dy**2 + self.softening**2
         # An edge of length exactly 0 without softening has no direction; the inner `where` keeps the
         # derivative of the square root finite there (0, the middle of all its one-sided slopes).
         at_zero = squared == 0
         return jnp.where(at_zero, 0, jnp.sqrt(jnp.where(at_zero, 1, squared)))
 
-    def _area_shares(self) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
+    def _area_shares(
+        self, segments: tuple[Float[Array, " edges"], ...]
+    ) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
         """What each edge contributes to the areas of its left and right cell (shoelace formula)."""
         m = self.topology
-        x, y, dx, dy = self._segments()
+        x, y, dx, dy = segments
 
         def swept(corner: Int[Array, " edges"]) -> Float[Array, " edges"]:
             image = self.boundary.translation(take(m.frame, corner))
@@ -509,9 +508,20 @@ class Tissue(eqx.Module):
         bulge = (dx**2 + dy**2) * area_factor(self.edge_angles)
         return left + bulge, right - bulge
 
-    def _cell_sums(
+    def lengths_and_areas(self) -> tuple[Float[Array, " edges"], Float[Array, " cells"]]:
+        """`edge_lengths` and `areas`, from one look at the vertices."""
+        segments = self._segments()
+        lengths = self._chords(segments)
+        if self.topology.spare:
+            lengths = jnp.where(self.topology.alive_edges, lengths, 0)
+        if self.arcs is not None:
+            lengths = lengths * length_factor(self.edge_angles)
+        return lengths, self.cell_sums(self._area_shares(segments))
+
+    def cell_sums(
         self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]
     ) -> Float[Array, " cells"]:
+        """Sums over the edges of each cell of what they contribute to it on their left and right."""
         # The exterior, number n_cells, is out of range and dropped.
         cells = self.topology.edge_cells
         ids = jnp.concatenate([cells[:, 0], cells[:, 1]])

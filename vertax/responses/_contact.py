@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.sums import total
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
 from vertax.mesh._sides import (
@@ -237,7 +238,7 @@ def _slopes(
 def _(primals: tuple, tangents: tuple) -> tuple[Float[Array, "4 some"], Float[Array, "4 some"]]:
     contacts, kinds, places = primals
     blocks = _along_each(lambda x: _slopes.fun(contacts, kinds, x), places)
-    change = sum(block * row for block, row in zip(blocks, tangents[-1].T, strict=True))
+    change = total(block * row for block, row in zip(blocks, tangents[-1].T, strict=True))
     return _slopes(*primals), change
 
 

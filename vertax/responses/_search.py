@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from vertax._base.modules import choose
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
+from vertax.mesh._measured import Measured
 from vertax.responses._contact import Contacts, no_contacts
 from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._patience import Patient, PatientState
@@ -258,7 +259,7 @@ def objective(
     """The energy of a configuration and of its contacts, as Optimistix wants it."""
     tissue, energy, contacts = args
     there = tissue.with_configuration(configuration)
-    value = energy(there)
+    value = energy(Measured(there))
     return value if contacts is None else value + contacts(there), None
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from vertax._base.sums import total
 from vertax.mesh import Periodic, Tissue
 from vertax.mesh._boundary import inverse_of
 from vertax.mesh._topology import take
@@ -171,8 +172,7 @@ class Medium(eqx.Module):
             held + self.shear * squared
         )
         moved = jnp.fft.irfft2(jnp.where(whole, 0, modes), s=shape, axes=(0, 1)).reshape(-1, 2)
-        # (Written out: sums along short axes take several times as long.)
-        there = sum(w.weights[:, i, None] * take(moved, w.indices[:, i]) for i in range(4))
+        there = total(w.weights[:, i, None] * take(moved, w.indices[:, i]) for i in range(4))
         return (there / w.filled).astype(force.dtype)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
 from vertax._base.modules import choose
+from vertax._base.sums import total
 from vertax.solvers._long_waves import LongWaves, Medium
 from vertax.solvers._solver import AbstractSolver, Rows, value_and_gradient
 
@@ -380,9 +381,8 @@ def _dot(a: PyTree, b: PyTree) -> Float[Array, ""]:
 
 
 def _row_dot(a: Float[Array, "rows ..."], b: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
-    # (Written out: sums along short axes take several times as long.)
     columns = (x.reshape(len(x), -1).T for x in (a, b))
-    return sum(x * y for x, y in zip(*columns, strict=True))
+    return total(x * y for x, y in zip(*columns, strict=True))
 
 
 def _furthest(p: PyTree, bounds: Rows) -> Float[Array, ""]:

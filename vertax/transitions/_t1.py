@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.modules import choose, is_concrete
+from vertax._base.sums import total
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
@@ -351,4 +352,4 @@ def _local_costs(
     # (The exterior has no energy.)
     by_cell = jnp.where(jnp.stack(repeated, axis=-1), 0, by_cell)
     by_edge = take(energy.edge_terms(tissue), corner.edges)
-    return sum(terms[:, k] for terms in (by_cell, by_edge) for k in range(terms.shape[1]))
+    return total(terms[:, k] for terms in (by_cell, by_edge) for k in range(terms.shape[1]))
