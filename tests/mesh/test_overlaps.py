@@ -123,8 +123,8 @@ def test_walking_in_pieces_is_walking(spare):
             seen = jnp.sum(pair.mine[:, :2] * pair.theirs[:, 2:4], axis=-1)
             return met + apart, total + jnp.where(apart, pair.k * pair.other + seen, 0.0)
 
-        start = (jnp.zeros(n, int), jnp.zeros(n))
-        return around(tissue.sides, m.next, last, body, start, few_long=few_long)
+        start, here = (jnp.zeros(n, int), jnp.zeros(n)), jnp.arange(n, dtype=m.next.dtype)
+        return around(tissue.sides_of, m.next, here, last, body, start, few_long=few_long)
 
     both = [jax.jit(visited, static_argnums=0)(few_long) for few_long in (False, True)]
     np.testing.assert_array_equal(both[0][0], jnp.maximum(last, 0))

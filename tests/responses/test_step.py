@@ -14,7 +14,7 @@ from vertax.initialise import periodic_voronoi
 from vertax.mesh._topology import flip_edges
 from vertax.responses import Relaxation, evolve
 from vertax.responses._step import Incremental, flipped_as
-from vertax.transitions._t1 import EdgeFrames
+from vertax.transitions._edge_frames import EdgeFrames
 
 
 def turned(tissue, number):

@@ -10,8 +10,8 @@ from hypothesis import given, settings, strategies as st
 
 import vertax as vx
 from vertax.transitions import divide, remove
+from vertax.transitions._edge_frames import EdgeFrames
 from vertax.transitions._removal import flipped, removed
-from vertax.transitions._t1 import EdgeFrames
 
 
 def cluster(**options):

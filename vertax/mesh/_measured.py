@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 from jaxtyping import Array, Float
 
-from vertax.mesh._tissue import Tissue
+from vertax.mesh._tissue import Known, Tissue
 
 
 class Measured(Tissue):
@@ -16,32 +16,36 @@ class Measured(Tissue):
 
     What is known counts for the very arrays that it was made of. With others in their place, as after
     `with_vertices` or as arguments of another program, it is a tissue like any other.
+
+    **Arguments:**
+
+    - `tissue`: the tissue.
+    - `known`: what is known of it; None to work it out.
     """
 
-    known: tuple[Float[Array, " edges"], Float[Array, " cells"]]
+    known: Known
     of: list[Array]
 
-    def __init__(self, tissue: Tissue):
+    def __init__(self, tissue: Tissue, known: Known | None = None):
         for name in Tissue.__dataclass_fields__:
             setattr(self, name, getattr(tissue, name))
-        self.known = tissue.lengths_and_areas()
+        self.known = tissue.measured() if known is None else known
         self.of = jax.tree.leaves(tissue)
 
     @property
     def edge_lengths(self) -> Float[Array, " edges"]:
         """Length of each edge."""
-        return self.known[0] if self._is_known else super().edge_lengths
+        return self.known.lengths if self._is_known else super().edge_lengths
 
     @property
     def areas(self) -> Float[Array, " cells"]:
         """Area of each cell."""
-        return self.known[1] if self._is_known else super().areas
+        return self.known.areas if self._is_known else super().areas
 
     @property
     def perimeters(self) -> Float[Array, " cells"]:
         """Perimeter of each cell."""
-        lengths = self.edge_lengths
-        return self.cell_sums((lengths, lengths))
+        return self.known.perimeters if self._is_known else super().perimeters
 
     @property
     def _is_known(self) -> bool:

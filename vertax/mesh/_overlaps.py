@@ -74,20 +74,36 @@ class Overlaps(eqx.Module):
         return ", ".join(where)
 
 
-def find_overlaps(
-    topology: Topology,
-    sides: Sides,
-    areas: Float[Array, " cells"],
-    faces: Bool[Array, " faces"] | None = None,
-) -> Overlaps:
-    """Compare each side with all others of its face; of some faces only, if they are named."""
-    last = _last(topology)
-    if faces is not None:
-        last = jnp.where(take(faces, topology.cell), last, 0)
-    crossed = crossed_sides(
-        sides, topology.next, last, few_long=topology.exterior, few=faces is not None
-    )
+def find_overlaps(topology: Topology, sides: Sides, areas: Float[Array, " cells"]) -> Overlaps:
+    """Compare each side with all others of its face."""
+    crossed = crossed_sides(sides, topology.next, _last(topology), few_long=topology.exterior)
     return _overlaps(topology, areas, crossed)
+
+
+def faces_crossed(
+    m: Topology,
+    sides_of: Callable[[Int[Array, " some"]], Sides],
+    here: Int[Array, " some"],
+    there: Bool[Array, " some"],
+) -> Bool[Array, " faces"]:
+    """The faces in which some sides cross any other; no others are looked at.
+
+    **Arguments:**
+
+    - `m`: the topology.
+    - `sides_of`: the sides that half-edges are, see `Tissue.sides_of`.
+    - `here`: half-edges.
+    - `there`: which of them count.
+    """
+    cell = take(m.cell, here)
+    last = jnp.where(there, take(_number_of_sides(m), cell) - 2, 0)
+    crosses = jnp.zeros_like(there)
+    mine = sides_of(here)
+    if mine.shape[-1] > 4:  # an arc may cross even the one that it follows on
+        crosses = there & sides_cross(sides_of(take(m.previous, here)), mine, jnp.array(True))
+    body = lambda pair, crosses: crosses | _crosses(pair)
+    crosses = around(sides_of, m.next, here, last, body, crosses, few_long=m.exterior)
+    return jnp.zeros(m.n_faces, bool).at[cell].max(crosses, mode="drop")
 
 
 def crossed_sides(
@@ -96,7 +112,6 @@ def crossed_sides(
     last: Int[Array, " halfedges"],
     *,
     few_long: bool = False,
-    few: bool = False,
 ) -> Int[Array, " halfedges"]:
     """For each side another one of its face that it crosses, or itself.
 
@@ -104,14 +119,15 @@ def crossed_sides(
 
     - `following`: the next side of the face.
     - `last`: two less than the number of its sides.
-    - `few_long`, `few`: as for `around`.
+    - `few_long`: as for `around`.
     """
 
     def compare(pair: Pairs, crossed: Array) -> Array:
         return jnp.where(_crosses(pair), pair.other, crossed)
 
-    start = jnp.arange(len(sides), dtype=following.dtype)
-    return around(sides, following, last, compare, start, few_long=few_long, few=few)
+    here = jnp.arange(len(sides), dtype=following.dtype)
+    rows = lambda half_edges: take(sides, half_edges)
+    return around(rows, following, here, last, compare, here, few_long=few_long)
 
 
 def overlaps_and_nearest(
@@ -151,8 +167,9 @@ def overlaps_and_nearest(
 
     none = jnp.full(here.size, jnp.inf, sides.dtype)
     start = (here, (here, here), (none, none), none)
+    rows = lambda half_edges: take(sides, half_edges)
     crossed, nearest, gaps, least = around(
-        sides, m.next, _last(m), both, start, few_long=m.exterior
+        rows, m.next, here, _last(m), both, start, few_long=m.exterior
     )
     nearest, gaps = jnp.stack(nearest, axis=-1), jnp.stack(gaps, axis=-1)
     return _overlaps(m, areas, crossed), nearest, gaps, jnp.min(least)
@@ -177,10 +194,12 @@ def _numbers(topology: Topology) -> Int[Array, " halfedges"]:
 
 
 def _last(topology: Topology) -> Int[Array, " halfedges"]:
+    return take(_number_of_sides(topology), topology.cell) - 2
+
+
+def _number_of_sides(topology: Topology) -> Int[Array, " faces"]:
     n_sides = jax.ops.segment_sum(jnp.ones_like(topology.cell), topology.cell, topology.n_faces)
-    if topology.spare:
-        n_sides = n_sides.at[topology.nowhere].set(0)
-    return take(n_sides, topology.cell) - 2
+    return n_sides.at[topology.nowhere].set(0) if topology.spare else n_sides
 
 
 class Pairs(NamedTuple):
@@ -194,80 +213,65 @@ class Pairs(NamedTuple):
 
 
 def around(
-    sides: Sides,
+    sides_of: Callable[[Int[Array, " some"]], Sides],
     following: Int[Array, " halfedges"],
-    last: Int[Array, " halfedges"],
+    here: Int[Array, " some"],
+    last: Int[Array, " some"],
     body: Callable[[Pairs, Carry], Carry],
     start: Carry,
     *,
     few_long: bool = False,
-    few: bool = False,
 ) -> Carry:
-    """Walk around all faces at once: `body` sees each half-edge with the one k sides further.
+    """Walk around faces, all at once: `body` sees each half-edge with the one k sides further.
 
     k goes from 1 to `last`, which may differ from face to face; half-edges that are through are paired with
     themselves. With two less than the number of sides each corner meets all sides that it does not end.
 
     **Arguments:**
 
-    - `sides`: a row for each half-edge.
-    - `following`: the next half-edge of the face.
-    - `last`: how far to go.
+    - `sides_of`: the sides that half-edges are.
+    - `following`: of each half-edge the next one of its face.
+    - `here`: from where to walk, half-edges.
+    - `last`: how far to go from each.
     - `body`: takes pairs, and the rows of what is carried that belong to them; returns these rows anew.
-    - `start`: arrays with a row for each half-edge.
+    - `start`: arrays with a row for each of `here`.
     - `few_long`: whether some faces have far more sides than most, as the exterior has. Then those that
-        still have some way to go are walked with in pieces.
-    - `few`: whether only few may have any way to go. In a large tissue these are walked with in pieces.
+        still have some way to go are walked with by themselves.
 
     **Returns:** what is carried, at the end.
     """
-    n = following.size
-    here = jnp.arange(n, dtype=following.dtype)
-    in_pieces = few_long or (few and n >= _MANY)
-    size = min(n, max(64, int(4 * n**0.5))) if in_pieces else n
-    # Those with the longest way come first, or those with any, so that what is left to do is at the
-    # beginning. (The last piece is filled up with what has no way to go.)
-    order = here
-    if size < n:
-        filling = jnp.zeros(-n % size, here.dtype)
-        order = jnp.argsort(-last).astype(here.dtype) if few_long else _first(last > 0, here)
-        order = jnp.append(order, filling)
-        last = jnp.append(take(last, order[:n]), filling.astype(last.dtype))
-        start = jax.tree.map(lambda x: take(x, order), start)
-    mine = take(sides, order)
+    n = here.size
 
-    def piece(k: Int[Array, ""], at: Int[Array, ""], carry: tuple) -> tuple:
-        cut = lambda x: jax.lax.dynamic_slice_in_dim(x, at * size, size) if size < n else x
-        others, inner = carry
-        other = take(following, cut(others))
-        me = cut(order)
-        partner = jnp.where(k <= cut(last), other, me)
-        pairs = Pairs(k, me, partner, cut(mine), take(sides, partner))
-        new = other, body(pairs, jax.tree.map(cut, inner))
-        if size == n:
-            return new
-        put = lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, at * size, 0)
-        return jax.tree.map(put, carry, new)
+    def walk(here: Int[Array, " some"], last: Int[Array, " some"], start: Carry) -> Carry:
+        mine = sides_of(here)
 
-    def one(k: Int[Array, ""], carry: tuple) -> tuple:
-        if size == n:
-            return piece(k, k, carry)
-        pieces = (jnp.sum(last >= (k if few_long else 1)) + size - 1) // size
-        return jax.lax.fori_loop(0, pieces, lambda at, carry: piece(k, at, carry), carry)
+        def one(k: Int[Array, ""], carry: tuple) -> tuple:
+            other, inner = carry
+            other = take(following, other)
+            partner = jnp.where(k <= last, other, here)
+            return other, body(Pairs(k, here, partner, mine, sides_of(partner)), inner)
 
-    _, end = jax.lax.fori_loop(1, jnp.max(last) + 1, one, (order, start))
+        return jax.lax.fori_loop(1, jnp.max(last) + 1, one, (here, start))[1]
+
+    size = min(n, max(64, int(4 * n**0.5)) if few_long else _PIECE)
     if size == n:
-        return end
-    back = jnp.zeros_like(here).at[order[:n]].set(here)
-    return jax.tree.map(lambda x: take(x, back), end)
+        return walk(here, last, start)
+    # Those with the longest way come first, so that the others are soon through. (The last piece is filled
+    # up with what has no way to go.)
+    order = jnp.argsort(-last) if few_long else None
+    sort = lambda x: x if order is None else take(x, order)
+    filled = lambda x: jnp.append(sort(x), jnp.zeros(-n % size, x.dtype))
+    here, last, start = jax.tree.map(filled, (here, last, start))
+
+    def piece(i: Int[Array, ""], carry: Carry) -> Carry:
+        cut = lambda x: jax.lax.dynamic_slice_in_dim(x, i * size, size)
+        put = lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, i * size, 0)
+        return jax.tree.map(put, carry, walk(cut(here), cut(last), jax.tree.map(cut, carry)))
+
+    end = jax.lax.fori_loop(0, here.size // size, piece, start)
+    end = jax.tree.map(lambda x: x[:n], end)
+    return end if order is None else jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x), end)
 
 
-# From so many half-edges on it pays to look for the few of them that matter.
-_MANY = 5000
-
-
-def _first(some: Bool[Array, " n"], here: Int[Array, " n"]) -> Int[Array, " n"]:
-    """Numbers in the order in which some come first."""
-    one, others = jnp.cumsum(some, dtype=here.dtype), jnp.cumsum(~some, dtype=here.dtype)
-    place = jnp.where(some, one - 1, one[-1] + others - 1)
-    return jnp.zeros_like(here).at[place].set(here)
+# What is walked with at once: so much stays at hand.
+_PIECE = 16384

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,6 +17,14 @@ from vertax.mesh._boundary import AbstractBoundary, Free
 from vertax.mesh._capacity import with_slots, without_slots
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
+
+
+class Known(NamedTuple):
+    """What most energies ask of a tissue."""
+
+    lengths: Float[Array, " edges"]
+    areas: Float[Array, " cells"]
+    perimeters: Float[Array, " cells"]
 
 
 class Tissue(eqx.Module):
@@ -229,18 +238,17 @@ class Tissue(eqx.Module):
     @compiled_property
     def edge_lengths(self) -> Float[Array, " edges"]:
         """Length of each edge (softened, see the class)."""
-        return self.lengths_and_areas()[0]
+        return self.measured().lengths
 
     @compiled_property
     def areas(self) -> Float[Array, " cells"]:
         """Signed area of each cell, positive for an upright (counter-clockwise) cell."""
-        return self.lengths_and_areas()[1]
+        return self.measured().areas
 
     @compiled_property
     def perimeters(self) -> Float[Array, " cells"]:
         """Perimeter of each cell (softened, see the class)."""
-        lengths = self.edge_lengths
-        return self.cell_sums((lengths, lengths))
+        return self.measured().perimeters
 
     @compiled_property
     def shape_factors(self) -> Float[Array, " cells"]:
@@ -508,17 +516,18 @@ class Tissue(eqx.Module):
         bulge = (dx**2 + dy**2) * area_factor(self.edge_angles)
         return left + bulge, right - bulge
 
-    def lengths_and_areas(self) -> tuple[Float[Array, " edges"], Float[Array, " cells"]]:
-        """`edge_lengths` and `areas`, from one look at the vertices."""
+    def measured(self) -> Known:
+        """`edge_lengths`, `areas` and `perimeters`, from one look at the vertices."""
         segments = self._segments()
         lengths = self._chords(segments)
         if self.topology.spare:
             lengths = jnp.where(self.topology.alive_edges, lengths, 0)
         if self.arcs is not None:
             lengths = lengths * length_factor(self.edge_angles)
-        return lengths, self.cell_sums(self._area_shares(segments))
+        areas = self._cell_sums(self._area_shares(segments))
+        return Known(lengths, areas, self._cell_sums((lengths, lengths)))
 
-    def cell_sums(
+    def _cell_sums(
         self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]
     ) -> Float[Array, " cells"]:
         """Sums over the edges of each cell of what they contribute to it on their left and right."""

@@ -383,12 +383,14 @@ def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
     )
 
 
-def edge_neighbourhood(topology: Topology) -> tuple[Int[Array, " edges"], ...]:
+def edge_neighbourhood(
+    topology: Topology, edges: Int[Array, " edges"] | None = None
+) -> tuple[Int[Array, " edges"], ...]:
     """The twin `t` of each edge's half-edge and the four half-edges `a, b, c, d` around it.
 
-    Counter-clockwise: `a`, `b` leave the source of the edge, `c`, `d` its target.
+    Counter-clockwise: `a`, `b` leave the source of the edge, `c`, `d` its target. Of all edges, or of some.
     """
-    h = topology.half_edge
+    h = topology.half_edge if edges is None else take(topology.half_edge, edges)
     t = take(topology.twin, h)
     return t, counter_clockwise(h), clockwise(h), counter_clockwise(t), clockwise(t)
 

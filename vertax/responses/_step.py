@@ -13,7 +13,7 @@ from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._topology import edge_neighbourhood, source, take
 from vertax.responses._contact import FLOOR
-from vertax.transitions._t1 import edge_axes
+from vertax.transitions._edge_frames import edge_axes
 
 
 class Incremental(AbstractEnergy):

@@ -9,10 +9,10 @@ from jaxtyping import Array, Bool, Int
 
 from vertax._base.modules import choose
 from vertax.mesh import Tissue
-from vertax.mesh._topology import flip_edges
 from vertax.transitions._change import Change, raised_if, unchanged
 from vertax.transitions._division import check_cell
-from vertax.transitions._t1 import EdgeFrames, overlapping_faces, straightened
+from vertax.transitions._edge_frames import EdgeFrames
+from vertax.transitions._t1 import overlapping_faces
 from vertax.transitions._t2 import can_vanish, vanished
 
 # A flipped edge is at first so long, compared with what it was; and shorter where there is no room.
@@ -101,12 +101,11 @@ def flipped(
 ) -> tuple[Tissue, Bool[Array, ""]]:
     """The tissue with an edge flipped where there is room for it, and whether it is."""
     before = overlapping_faces(tissue.overlaps)
-    topology = flip_edges(tissue.topology, which)
     shares = jnp.asarray(_SHARES, frames.length.dtype)
 
     def with_share(k: Int[Array, ""]) -> Tissue:
         placed = frames.place(tissue, which, frames.across, shares[k] * frames.length)
-        return straightened(placed, which).with_topology(topology)
+        return frames.flip(placed, which)
 
     def crowded(carry: tuple) -> tuple:
         k, _ = carry

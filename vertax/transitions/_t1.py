@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -14,10 +13,11 @@ from vertax._base.sums import total
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
-from vertax.mesh._arcs import length_factor
-from vertax.mesh._overlaps import Overlaps, find_overlaps
-from vertax.mesh._sides import cross, dot
-from vertax.mesh._topology import edge_neighbourhood, flip_edges, source, take
+from vertax.mesh._measured import Measured
+from vertax.mesh._overlaps import Overlaps, faces_crossed
+from vertax.mesh._tissue import Known
+from vertax.mesh._topology import take
+from vertax.transitions._edge_frames import EdgeFrames, suspects
 from vertax.transitions._transitions import AbstractTransitions
 
 
@@ -81,43 +81,59 @@ class T1(AbstractTransitions):
     ) -> tuple[Tissue, Int[Array, " edges"]]:
         """Try every candidate once; returns the new tissue and the updated counts."""
         threshold = self.threshold * cell_size(tissue)
-
-        def may(corner: EdgeFrames, counts: Int[Array, " edges"]) -> tuple[Array, Array]:
-            """Which edges may flip, and which may turn upright."""
-            short = corner.length < threshold
-            flip = corner.can_flip & (counts < self.max_flips) & (short | corner.inside_out)
-            return flip, corner.inside_out & short & corner.free
+        n_rows = _number_of_rows(tissue)
 
         # Rounds of candidates that share no cell, until all were tried: one that is refused must not
-        # keep its neighbours from being tried. `todo` are all edges at first, and candidates after the
+        # keep its neighbours from being tried. `todo` are all suspects at first, and candidates after the
         # first round; it loses at least one of them a round. Mostly there is none, and no second round.
+        # (So many at once as are looked at together: others wait.)
         def unfinished(carry: tuple) -> Bool[Array, ""]:
             *_, todo = carry
             return jnp.any(todo)
 
         def one_round(carry: tuple) -> tuple:
             tissue, counts, todo = carry
-            corner = EdgeFrames(tissue)
-            may_flip, may_turn = may(corner, counts)
-            todo &= may_flip | may_turn
+            edges = jnp.nonzero(todo, size=n_rows, fill_value=0)[0].astype(
+                tissue.topology.edge.dtype
+            )
+            there = jnp.arange(n_rows) < jnp.sum(todo)
+            corner = EdgeFrames(tissue, edges)
+            short = corner.length < threshold
+            may_flip = there & corner.can_flip & (take(counts, edges) < self.max_flips)
+            may_flip &= short | corner.inside_out
+            may_turn = there & corner.inside_out & short & corner.free
+            candidates = may_flip | may_turn
+            chosen = _independent(candidates, corner, tissue.n_cells)
 
-            def flip_where_it_helps() -> tuple[Tissue, Array, Array]:
-                chosen = _independent(todo, corner, tissue.n_cells)
+            def flip_where_it_helps() -> tuple[Tissue, Array]:
                 length = jnp.maximum(corner.length, threshold)
                 shares = jnp.array([1, 1, 0.5, 0.25], length.dtype)
+                known = tissue.measured()
 
-                def trial(k: Int[Array, ""], which: Bool[Array, " edges"]) -> Tissue:
+                def laid(
+                    which: Bool[Array, " rows"],
+                    flips: Bool[Array, ""],
+                    direction: Float[Array, "rows 2"],
+                    length: Float[Array, " rows"],
+                ) -> tuple[Tissue, Known]:
+                    there = corner.place(tissue, which, direction, length)
+                    there = corner.flip(there, which & flips)
+                    if tissue.n_cells < _FEW_CELLS:
+                        return there, there.measured()
+                    return there, corner.measures(tissue, known, which, flips, direction, length)
+
+                def trial(k: Int[Array, ""], which: Bool[Array, " rows"]) -> Tissue:
                     # Stretched, flipped, and flipped with a half and a quarter of the length.
                     direction = jnp.where(k > 0, corner.across, corner.along)
                     chord = length / jnp.where(k > 0, 1, corner.stretch)
-                    turned = _flipped(tissue, which & (k > 0))
-                    return corner.place(turned, which, direction, shares[k] * chord)
+                    return Measured(*laid(which, k > 0, direction, shares[k] * chord))
 
-                again = chosen & (counts > 0)
+                again = chosen & (take(counts, edges) > 0)
                 n_trials = jnp.where(jnp.any(again), 4, 2)
                 costs = _judge(energy, chosen, corner, trial, n_trials)
-                stretched, flipped, short, shorter = costs
-                accepted = chosen & may_flip & (flipped < stretched) & (~again | (short < shorter))
+                stretched, flipped, shorter, shortest = costs
+                better = (flipped < stretched) & (~again | (shorter < shortest))
+                accepted = chosen & may_flip & better
 
                 # Where there is no room for the new edge it is made shorter; then it is refused. If there
                 # seems to be none, a turn without any flip shows what overlaps already.
@@ -128,14 +144,9 @@ class T1(AbstractTransitions):
                 def make_room(carry: tuple) -> tuple:
                     i, accepted, share, before, crossed, last, _ = carry
                     flip = accepted & (i != 1)
-                    placed = _flipped(
-                        corner.place(tissue, flip, corner.across, share * length), flip
-                    )
-                    touched = jnp.zeros(placed.topology.n_faces, bool)
-                    touched = touched.at[corner.cells].max(accepted[:, None])
-                    faces = overlapping_faces(
-                        find_overlaps(placed.topology, placed.sides, placed.areas, touched)
-                    )
+                    yes = jnp.array(True)
+                    placed, measures = laid(flip, yes, corner.across, share * length)
+                    faces = _crowded_faces(placed, measures.areas, corner, accepted)
                     before = jnp.where(i == 1, faces, before)
                     crossed = jnp.where(i == 1, crossed, faces)
                     blamed = accepted & jnp.any(take(crossed & ~before, corner.cells), axis=-1)
@@ -153,15 +164,23 @@ class T1(AbstractTransitions):
                 back = chosen & ~accepted & may_turn
                 upright = corner.length / corner.stretch
                 upright = corner.place(placed, back, corner.along, upright)
-                return upright, counts + accepted, todo & ~chosen
+                return upright, counts.at[edges].add(accepted)
 
-            return jax.lax.cond(jnp.any(todo), flip_where_it_helps, lambda: (tissue, counts, todo))
+            tissue, counts = jax.lax.cond(
+                jnp.any(candidates), flip_where_it_helps, lambda: (tissue, counts)
+            )
+            waits = candidates & ~chosen
+            return tissue, counts, todo.at[edges].min(waits | ~there)
 
-        start = (tissue, counts, jnp.ones(tissue.n_edges, bool))
+        start = (tissue, counts, suspects(tissue, threshold))
         tissue, counts, _ = jax.lax.while_loop(unfinished, one_round, start)
         return tissue, counts
 
 
+# So many edges are looked at together at least, and this share of all.
+_FEWEST, _SHARE = 512, 1 / 32
+# In smaller tissues the ends of an edge may be neighbours of its neighbours.
+_FEW_CELLS = 16
 _SHORTENED = 3
 
 
@@ -170,132 +189,49 @@ def overlapping_faces(overlaps: Overlaps) -> Bool[Array, " faces"]:
     return jnp.append(overlaps.cells, overlaps.exterior)
 
 
-class EdgeFrames(eqx.Module):
-    """The surroundings of every edge: its cells, its length and the directions a T1 places it in."""
-
-    start: Int[Array, " edges"]
-    end: Int[Array, " edges"]
-    cells: Int[Array, "edges 4"]  # left, right, at the start, at the end
-    edges: Int[Array, "edges 5"]  # the edge itself and its four neighbours
-    vector: Float[Array, "edges 2"]
-    stretch: Float[Array, " edges"]  # length over distance of the ends
-    length: Float[Array, " edges"]
-    along: Float[Array, "edges 2"]
-    across: Float[Array, "edges 2"]
-    inside_out: Bool[Array, " edges"]
-    free: Bool[Array, " edges"]  # neither end is pinned
-    can_flip: Bool[Array, " edges"]
-
-    def __init__(self, tissue: Tissue):
-        m = tissue.topology
-        h = m.half_edge
-        t, a, b, c, d = edge_neighbourhood(m)
-        self.start, self.end = source(h), source(t)
-        self.cells = take(m.cell, jnp.stack([h, t, a, c], axis=-1))
-        self.edges = take(m.edge, jnp.stack([h, a, b, c, d], axis=-1))
-        forward = tissue.edge_vectors
-        self.vector = forward
-        chord = jnp.sqrt(dot(forward, forward))
-        self.stretch = jnp.ones_like(chord)
-        leaving = _outward(tissue)
-        if tissue.angles is not None:
-            self.stretch = length_factor(tissue.edge_angles)
-            first, last = (take(tangent, m.edge) for tangent in tissue.edge_tangents)
-            leaving = jnp.where(m.forward[:, None], first, -last)
-        self.length = chord * self.stretch
-        axis = edge_axes(tissue)
-        upright = dot(axis, forward) >= 0
-        direction = jnp.where((chord > 0)[:, None], forward, axis)
-        direction = jnp.where(upright[:, None], direction, -direction)
-        norm = jnp.sqrt(dot(direction, direction))[:, None]
-        self.along = direction / jnp.where(norm > 0, norm, 1)
-        # A flipped half-edge has turned clockwise, see `flip_edges`.
-        self.across = jnp.stack([self.along[:, 1], -self.along[:, 0]], axis=-1)
-        # Three directions are in counter-clockwise order if at least two of their consecutive cross
-        # products are positive. An edge that passed through length 0 spoils that order at both ends.
-        u = leaving.reshape(-1, 3, 2)
-        v = jnp.roll(u, -1, axis=1)
-        disordered = jnp.sum(cross(u, v) < 0, axis=1) >= 2
-        self.inside_out = take(disordered, self.start) & take(disordered, self.end) & ~upright
-        left, right, at_start, at_end = (self.cells[:, k] for k in range(4))
-        spare = jnp.min(_spare_sides(tissue), axis=-1)
-        losses = jnp.where(left == right, 2, 1)
-        self.can_flip = (spare >= losses) & (at_start != at_end) & (self.start != self.end)
-        self.free = jnp.ones_like(upright)
-        if tissue.held is not None:
-            self.free = ~take(tissue.held, self.start) & ~take(tissue.held, self.end)
-        self.can_flip &= self.free
-
-    def place(
-        self,
-        tissue: Tissue,
-        which: Bool[Array, " edges"],
-        direction: Float[Array, "edges 2"],
-        length: Float[Array, " edges"],
-    ) -> Tissue:
-        """Lay the marked edges in a direction, about their midpoint, with a given length."""
-        half = 0.5 * (direction * length[:, None] - self.vector)
-        half = jnp.where(which[:, None], half, 0)
-        edge = tissue.topology.edge
-        starts = take(self.start, edge) == source(jnp.arange(edge.size, dtype=edge.dtype))
-        shifts = jnp.where(starts[:, None], -1, 1) * take(half, edge)
-        # (Written out, as below: sums along short axes take several times as long.)
-        first, second, third = shifts[::3], shifts[1::3], shifts[2::3]
-        return tissue.with_vertices(tissue.vertices + first + second + third)
+def _number_of_rows(tissue: Tissue) -> int:
+    return min(tissue.n_edges, max(_FEWEST, int(_SHARE * tissue.n_edges)))
 
 
-def edge_axes(tissue: Tissue) -> Float[Array, "edges 2"]:
-    """Which way each edge ought to point, of no special length, as the far ends of its neighbours show.
+def _crowded_faces(
+    placed: Tissue,
+    areas: Float[Array, " cells"],
+    corner: EdgeFrames,
+    which: Bool[Array, " rows"],
+) -> Bool[Array, " faces"]:
+    """The faces that overlap themselves with what the marked edges have moved, the exterior last."""
+    m = placed.topology
+    ends = jnp.stack([corner.start, corner.end], axis=-1)
+    moved = (3 * ends[:, :, None] + jnp.arange(3, dtype=ends.dtype)).reshape(-1, 6)
+    moved = jnp.concatenate([moved, take(m.twin, moved)], axis=-1)
+    # In pieces: mostly there are few.
+    count, n = jnp.sum(which), len(which)
+    size = min(n, max(64, n // 16))
+    order = jnp.nonzero(which, size=n + -n % size, fill_value=0)[0]
 
-    A short edge's own vector may have shrunk to nothing or turned around; it has no influence here.
-    """
-    _, a, b, c, d = edge_neighbourhood(tissue.topology)
-    outward = _outward(tissue)
-    ahead = take(outward, c) + take(outward, d)
-    behind = take(outward, a) + take(outward, b)
-    return ahead - behind + 2 * tissue.edge_vectors
+    def piece(i: Int[Array, ""], faces: Bool[Array, " faces"]) -> Bool[Array, " faces"]:
+        rows = jax.lax.dynamic_slice_in_dim(order, i * size, size)
+        there = i * size + jnp.arange(size) < count
+        here = take(moved, rows).reshape(-1)
+        return faces | faces_crossed(m, placed.sides_of, here, jnp.repeat(there, 12))
 
-
-def _outward(tissue: Tissue) -> Float[Array, "half_edges 2"]:
-    """Half-edge vectors: an edge's own vector or its opposite."""
-    m = tissue.topology
-    outward = take(tissue.edge_vectors, m.edge)
-    return jnp.where(m.forward[:, None], outward, -outward)
-
-
-def _spare_sides(tissue: Tissue) -> Int[Array, "edges 2"]:
-    """How many sides more than it needs the cell left, and right, of each edge has without its arc."""
-    m = tissue.topology
-    face_sums = lambda values: jax.ops.segment_sum(values, m.cell, m.n_faces)
-    sides = take(face_sums(jnp.ones_like(m.cell)), m.edge_cells)
-    if not m.exterior or tissue.angles is None:
-        return sides - 3
-    # Two sides bound a cell if one is an arc on the outline, other than the edge that leaves; two arcs
-    # bound the exterior.
-    arcs = take(face_sums(take(m.on_outline, m.edge).astype(m.cell.dtype)), m.edge_cells)
-    return sides - jnp.where(arcs > m.on_outline[:, None], 2, 3)
-
-
-def _flipped(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
-    return straightened(tissue, which).with_topology(flip_edges(tissue.topology, which))
-
-
-def straightened(tissue: Tissue, which: Bool[Array, " edges"]) -> Tissue:
-    if tissue.angles is None:
-        return tissue
-    return tissue.with_angles(jnp.where(which, 0, tissue.angles))
+    none = jnp.zeros(m.n_faces, bool)
+    faces = jax.lax.fori_loop(0, (count + size - 1) // size, piece, none)
+    outside = faces[m.n_cells] if m.exterior else jnp.array(False)
+    touched = jnp.zeros(m.n_cells, bool).at[corner.cells].max(which[:, None], mode="drop")
+    return jnp.append(faces[: m.n_cells] | (touched & ~(areas > 0)), outside)
 
 
 def _independent(
-    candidates: Bool[Array, " edges"], corner: EdgeFrames, n_cells: int
-) -> Bool[Array, " edges"]:
+    candidates: Bool[Array, " rows"], corner: EdgeFrames, n_cells: int
+) -> Bool[Array, " rows"]:
     """The candidates that are the shortest of all candidates at each of their four cells."""
     # Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute. (An
     # edge lies between two faces, so sharing the exterior alone is no harm.)
     cells = corner.cells
     number = jnp.arange(len(candidates), dtype=cells.dtype)
 
-    def least(values: Array, among: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
+    def least(values: Array, among: Bool[Array, " rows"]) -> Bool[Array, " rows"]:
         """Those among some that have the least value at each of their cells."""
         most = (
             jnp.inf if jnp.issubdtype(values.dtype, jnp.floating) else jnp.iinfo(values.dtype).max
@@ -310,16 +246,16 @@ def _independent(
 
 
 # The tissue with the marked edges changed in a way that has a number.
-_Trial = Callable[[Int[Array, ""], Bool[Array, " edges"]], Tissue]
+_Trial = Callable[[Int[Array, ""], Bool[Array, " rows"]], Tissue]
 
 
 def _judge(
     energy: AbstractEnergy,
-    chosen: Bool[Array, " edges"],
+    chosen: Bool[Array, " rows"],
     corner: EdgeFrames,
     trial: _Trial,
     n_trials: Int[Array, ""],
-) -> Float[Array, "4 edges"]:
+) -> Float[Array, "4 rows"]:
     """What the first trials of each chosen edge cost."""
     costs = jnp.zeros((4, chosen.size), corner.length.dtype)
     if isinstance(energy, AbstractLocalEnergy):
@@ -332,7 +268,7 @@ def _judge(
     edges = jnp.arange(chosen.size)
     order = jnp.argsort(jnp.where(chosen, corner.length, jnp.inf))
 
-    def one(i: Int[Array, ""], costs: Float[Array, "4 edges"]) -> Float[Array, "4 edges"]:
+    def one(i: Int[Array, ""], costs: Float[Array, "4 rows"]) -> Float[Array, "4 rows"]:
         edge, k = order[i // n_trials], i % n_trials
         return costs.at[k, edge].set(energy(trial(k, edges == edge)))
 
@@ -341,7 +277,7 @@ def _judge(
 
 def _local_costs(
     energy: AbstractLocalEnergy, tissue: Tissue, corner: EdgeFrames
-) -> Float[Array, " edges"]:
+) -> Float[Array, " rows"]:
     """The energy of the cells and edges around each edge."""
     # In a very small tissue one cell can be two of the four: count it once.
     cells = corner.cells

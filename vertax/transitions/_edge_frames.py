@@ -1,0 +1,224 @@
+"""Edges that may flip: their surroundings, and what becomes of those."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax.mesh import Tissue
+from vertax.mesh._arcs import area_factor, length_factor
+from vertax.mesh._sides import Sides, cross, dot
+from vertax.mesh._tissue import Known
+from vertax.mesh._topology import edge_neighbourhood, flip_edges, source, take
+
+
+class EdgeFrames(eqx.Module):
+    """The surroundings of edges: their cells, their lengths and the directions a T1 places them in.
+
+    **Arguments:**
+
+    - `tissue`: the tissue.
+    - `edges`: numbers of the edges, one for each row; None for all of them.
+    """
+
+    start: Int[Array, " rows"]
+    end: Int[Array, " rows"]
+    cells: Int[Array, "rows 4"]  # left, right, at the start, at the end
+    edges: Int[Array, "rows 5"]  # the edge itself and its four neighbours, see `edge_neighbourhood`
+    vector: Float[Array, "rows 2"]
+    neighbours: tuple[Sides, Sides, Sides, Sides]
+    angle: Float[Array, " rows"]
+    stretch: Float[Array, " rows"]  # length over distance of the ends
+    length: Float[Array, " rows"]
+    along: Float[Array, "rows 2"]
+    across: Float[Array, "rows 2"]
+    inside_out: Bool[Array, " rows"]
+    free: Bool[Array, " rows"]  # neither end is pinned
+    can_flip: Bool[Array, " rows"]
+
+    def __init__(self, tissue: Tissue, edges: Int[Array, " rows"] | None = None):
+        m = tissue.topology
+        h = m.half_edge if edges is None else take(m.half_edge, edges)
+        t, a, b, c, d = edge_neighbourhood(m, edges)
+        self.start, self.end = source(h), source(t)
+        self.cells = take(m.cell, jnp.stack([h, t, a, c], axis=-1))
+        self.edges = take(m.edge, jnp.stack([h, a, b, c, d], axis=-1))
+        # (All at once: a tissue is looked at in one place.)
+        n = h.size
+        sides = tissue.sides_of(jnp.concatenate([h, t, a, b, c, d]))
+        here, there, p, q, r, s = (sides[k * n : (k + 1) * n] for k in range(6))
+        self.neighbours = (p, q, r, s)
+        self.vector = forward = here[:, 2:4]
+        chord = jnp.sqrt(dot(forward, forward))
+        self.angle, self.stretch = _angles(here), _stretches(here)
+        self.length = chord * self.stretch
+        axis = _axis(forward, *(side[:, 2:4] for side in self.neighbours))
+        upright = dot(axis, forward) >= 0
+        direction = jnp.where((chord > 0)[:, None], forward, axis)
+        direction = jnp.where(upright[:, None], direction, -direction)
+        norm = jnp.sqrt(dot(direction, direction))[:, None]
+        self.along = direction / jnp.where(norm > 0, norm, 1)
+        # A flipped half-edge has turned clockwise, see `flip_edges`.
+        self.across = jnp.stack([self.along[:, 1], -self.along[:, 0]], axis=-1)
+        self.inside_out = _disordered(here, p, q) & _disordered(there, r, s) & ~upright
+        left, right, at_start, at_end = (self.cells[:, k] for k in range(4))
+        spare = jnp.min(_spare_sides(tissue, self.edges[:, 0], self.cells[:, :2]), axis=-1)
+        losses = jnp.where(left == right, 2, 1)
+        self.can_flip = (spare >= losses) & (at_start != at_end) & (self.start != self.end)
+        self.free = jnp.ones_like(upright)
+        if tissue.held is not None:
+            self.free = ~take(tissue.held, self.start) & ~take(tissue.held, self.end)
+        self.can_flip &= self.free
+
+    def place(
+        self,
+        tissue: Tissue,
+        which: Bool[Array, " rows"],
+        direction: Float[Array, "rows 2"],
+        length: Float[Array, " rows"],
+    ) -> Tissue:
+        """Lay the marked edges in a direction, about their midpoint, with a given length."""
+        half = self._half(which, direction, length)
+        vertices = tissue.vertices.at[self.start].add(-half).at[self.end].add(half)
+        return tissue.with_vertices(vertices)
+
+    def flip(self, tissue: Tissue, which: Bool[Array, " rows"]) -> Tissue:
+        """Give the marked edges their new neighbours; arcs among them become straight."""
+        number = self.edges[:, 0]
+        marked = jnp.zeros(tissue.n_edges, bool).at[number].max(which)
+        if tissue.angles is not None:
+            tissue = tissue.with_angles(jnp.where(marked, 0, tissue.angles))
+        return tissue.with_topology(flip_edges(tissue.topology, marked))
+
+    def measures(
+        self,
+        tissue: Tissue,
+        known: Known,
+        which: Bool[Array, " rows"],
+        flips: Bool[Array, ""],
+        direction: Float[Array, "rows 2"],
+        length: Float[Array, " rows"],
+    ) -> Known:
+        """What is known of a tissue, after the marked edges were laid in a direction, and flipped or not.
+
+        No two of them may share a cell.
+        """
+        half = self._half(which, direction, length)
+        nowhere = jnp.zeros_like(half)
+        start, end = nowhere - half, self.vector + half
+        bulge = lambda vector, angle: dot(vector, vector) * area_factor(angle)
+
+        def size(vector: Float[Array, "rows 2"], angle: Float[Array, " rows"]) -> Array:
+            return jnp.sqrt(dot(vector, vector) + tissue.softening**2) * length_factor(angle)
+
+        # With the letters of `flip_edges`: from where the four leave, before and after.
+        before = (nowhere, nowhere, self.vector, self.vector)
+        after = (start, jnp.where(flips, end, start), end, jnp.where(flips, start, end))
+        areas, lengths = [], []
+        for side, old, new in zip(self.neighbours, before, after, strict=True):
+            vector, angle = side[:, 2:4], _angles(side)
+            far = old + vector
+            swept = 0.5 * (cross(new, far) - cross(old, far))
+            areas.append(swept + bulge(far - new, angle) - bulge(vector, angle))
+            lengths.append(size(far - new, angle) - size(vector, angle))
+        (a, b, c, d), (p, q, r, s) = areas, lengths
+        # The edge itself counts for the cells at its sides, and if it flips for those at its ends.
+        vector, angle = end - start, jnp.where(flips, 0, self.angle)
+        area, length = 0.5 * cross(start, end) + bulge(vector, angle), size(vector, angle)
+        old_area, old_length = bulge(self.vector, self.angle), size(self.vector, self.angle)
+        e, f = jnp.where(flips, 0, area) - old_area, jnp.where(flips, area, 0)
+        t, u = jnp.where(flips, 0, length) - old_length, jnp.where(flips, length, 0)
+        marked = lambda *parts: jnp.where(which[:, None], jnp.stack(parts, axis=-1), 0)
+        added = lambda values, where, change: values.at[where].add(change, mode="drop")
+        return Known(
+            lengths=added(known.lengths, self.edges, marked(t + u, p, q, r, s)),
+            areas=added(
+                known.areas, self.cells, marked(d - a + e, b - c - e, a - b - f, c - d + f)
+            ),
+            perimeters=added(
+                known.perimeters, self.cells, marked(s + p + t, q + r + t, p + q + u, r + s + u)
+            ),
+        )
+
+    def _half(
+        self,
+        which: Bool[Array, " rows"],
+        direction: Float[Array, "rows 2"],
+        length: Float[Array, " rows"],
+    ) -> Float[Array, "rows 2"]:
+        return jnp.where(which[:, None], 0.5 * (direction * length[:, None] - self.vector), 0)
+
+
+def suspects(tissue: Tissue, threshold: Float[Array, ""]) -> Bool[Array, " edges"]:
+    """Edges that are short, or at whose ends edges are out of order: among others all that may flip."""
+    m, sides = tissue.topology, tissue.sides
+    short = jnp.sqrt(dot(sides[:, 2:4], sides[:, 2:4])) * _stretches(sides) < threshold
+    disordered = _disordered(*(sides[k::3] for k in range(3)))
+    ends = (take(disordered, source(h)) for h in (m.half_edge, take(m.twin, m.half_edge)))
+    start, end = ends
+    return take(short, m.half_edge) | (start & end)
+
+
+def edge_axes(tissue: Tissue) -> Float[Array, "edges 2"]:
+    """Which way each edge ought to point, of no special length, as the far ends of its neighbours show.
+
+    A short edge's own vector may have shrunk to nothing or turned around; it has no influence here.
+    """
+    m = tissue.topology
+    _, *neighbours = edge_neighbourhood(m)
+    outward = take(tissue.edge_vectors, m.edge)
+    outward = jnp.where(m.forward[:, None], outward, -outward)
+    return _axis(tissue.edge_vectors, *(take(outward, h) for h in neighbours))
+
+
+def _axis(
+    vector: Float[Array, "rows 2"],
+    a: Float[Array, "rows 2"],
+    b: Float[Array, "rows 2"],
+    c: Float[Array, "rows 2"],
+    d: Float[Array, "rows 2"],
+) -> Float[Array, "rows 2"]:
+    return c + d - a - b + 2 * vector
+
+
+def _angles(sides: Sides) -> Float[Array, " sides"]:
+    return sides[:, 4] if sides.shape[-1] > 4 else jnp.zeros_like(sides[:, 0])
+
+
+def _stretches(sides: Sides) -> Float[Array, " sides"]:
+    return length_factor(sides[:, 4]) if sides.shape[-1] > 4 else jnp.ones_like(sides[:, 0])
+
+
+def _disordered(first: Sides, second: Sides, third: Sides) -> Bool[Array, " sides"]:
+    """Whether three sides that leave one vertex are not in counter-clockwise order."""
+    # They are if at least two of their consecutive cross products are positive. An edge that passed
+    # through length 0 spoils that order at both ends.
+    p, q, r = (_leaving(side) for side in (first, second, third))
+    backwards = [(cross(u, v) < 0).astype(jnp.int32) for u, v in ((p, q), (q, r), (r, p))]
+    return sum(backwards, start=jnp.array(0)) >= 2
+
+
+def _leaving(sides: Sides) -> Float[Array, "sides 2"]:
+    """In which direction sides leave."""
+    chord = sides[:, 2:4]
+    if sides.shape[-1] == 4:
+        return chord
+    sine, cosine = jnp.sin(sides[:, 4:]), jnp.cos(sides[:, 4:])
+    return cosine * chord + sine * jnp.stack([chord[:, 1], -chord[:, 0]], axis=-1)
+
+
+def _spare_sides(
+    tissue: Tissue, edges: Int[Array, " rows"], cells: Int[Array, "rows 2"]
+) -> Int[Array, "rows 2"]:
+    """How many sides more than it needs the cell left, and right, of each edge has without its arc."""
+    m = tissue.topology
+    face_sums = lambda values: jax.ops.segment_sum(values, m.cell, m.n_faces)
+    sides = take(face_sums(jnp.ones_like(m.cell)), cells)
+    if not m.exterior or tissue.angles is None:
+        return sides - 3
+    # Two sides bound a cell if one is an arc on the outline, other than the edge that leaves; two arcs
+    # bound the exterior.
+    arcs = take(face_sums(take(m.on_outline, m.edge).astype(m.cell.dtype)), cells)
+    return sides - jnp.where(arcs > take(m.on_outline, edges)[:, None], 2, 3)
