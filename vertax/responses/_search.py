@@ -51,7 +51,7 @@ class _Arrival(eqx.Module):
     share: Float[Array, " vertices"]
     """Which share of the step each vertex has taken."""
     blamed: Bool[Array, " vertices"]
-    """Those that overlapped on the way here."""
+    """Those that overlapped on the way here, or stay because of them."""
     overlapping: Bool[Array, " vertices"]
     tries: Int[Array, ""]
 
@@ -178,10 +178,11 @@ class Search(eqx.Module):
             less = jnp.where(last.tries <= _SHORTER, 0.25, 0) * last.share
             share = jnp.where(last.overlapping, less, last.share)
             # Where that does not help, more and more around it stays as well: elsewhere all go on.
+            # (To be blamed as well: it may be what comes to those that stay.)
             around = _around(before, last.overlapping | (last.share == 0))
-            stays = (last.tries > _SHORTER + 1) & (around | (last.tries == _TRIES - 1))
-            share = jnp.where(stays, 0, share)
-            blamed = last.blamed | last.overlapping
+            around &= last.tries > _SHORTER + 1
+            blamed = last.blamed | last.overlapping | around
+            share = jnp.where(around | (last.tries == _TRIES - 1), 0, share)
             on_the_way = jax.tree.map(
                 partway, before.configuration, goal.configuration, before.by_row(share)
             )

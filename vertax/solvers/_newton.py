@@ -229,8 +229,7 @@ class NewtonCG(AbstractSolver):
                 small = cuts | (convex & (rz <= forcing**2 * whole))
                 # Once it is solved: what goes too far is damped more.
                 furthest = _furthest(tree.add_scale(last.p, alpha, d), bounds)
-                far = (furthest > jnp.where(small, 1.5, _FURTHEST)) & (system.rounds < _ROUNDS)
-                far &= ~cuts
+                far = ~cuts & (furthest > jnp.where(small, 1.5, _FURTHEST))
                 # (Where there is hardly any curvature it may be far too far: it goes on from the limit.)
                 room = (_FURTHEST - last.furthest) / (furthest - last.furthest)
                 alpha *= jnp.where(far & (furthest > _FURTHEST), room, 1)
@@ -261,7 +260,8 @@ class NewtonCG(AbstractSolver):
                 return shift + jnp.where(end.convex, jnp.where(end.far, more, 0), concave)
 
             shift = jax.tree.map(tighter, shift, end.p, bounds, end.d, end.hd)
-            done = nothing_left | (end.small & ~end.far)
+            # (Not for ever: then what goes too far is cut.)
+            done = nothing_left | jnp.where(end.far, system.rounds >= _ROUNDS, end.small)
             # Vertices may go somewhat further than they should, but none by much.
             over = ~cuts & (end.furthest > _OVER) & (done | (end.k >= self.max_products))
             rounds = system.rounds + end.far
