@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vertax._base.modules import compiled_property, traced
+from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import check_system
 from vertax.mesh import Tissue
+from vertax.mesh._tissue import Known
 
 
 class _Slackened(Tissue):
@@ -26,15 +27,15 @@ class _Slackened(Tissue):
             setattr(self, name, getattr(tissue, name))
         self.more_area, self.more_length = area, length
 
-    @compiled_property
-    def areas(self) -> Float[Array, " cells"]:
-        """Area of each cell, and more."""
-        return super().areas + self.more_area
-
-    @compiled_property
-    def edge_lengths(self) -> Float[Array, " edges"]:
-        """Length of each edge, and more; perimeters follow."""
-        return super().edge_lengths + self.more_length
+    def measured(self) -> Known:
+        """Areas and edge lengths, and more; perimeters follow."""
+        known = super().measured()
+        around = self.cell_sums((self.more_length, self.more_length))
+        return Known(
+            known.lengths + self.more_length,
+            known.areas + self.more_area,
+            known.perimeters + around,
+        )
 
 
 def pressures(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " cells"]:

@@ -524,10 +524,10 @@ class Tissue(eqx.Module):
             lengths = jnp.where(self.topology.alive_edges, lengths, 0)
         if self.arcs is not None:
             lengths = lengths * length_factor(self.edge_angles)
-        areas = self._cell_sums(self._area_shares(segments))
-        return Known(lengths, areas, self._cell_sums((lengths, lengths)))
+        areas = self.cell_sums(self._area_shares(segments))
+        return Known(lengths, areas, self.cell_sums((lengths, lengths)))
 
-    def _cell_sums(
+    def cell_sums(
         self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]
     ) -> Float[Array, " cells"]:
         """Sums over the edges of each cell of what they contribute to it on their left and right."""
