@@ -104,6 +104,18 @@ def test_what_cannot_go_on_holds_back_only_what_is_around():
     assert moved[~around(around(held))].all()
     assert 0.2 < moved.mean() < 0.8
     assert state.minimiser.inner.value < energy(tissue)
+    # What stays because of others is to be shorter next time as well.
+    radii = np.asarray(state.minimiser.inner.radii)
+    assert radii[~moved].max() < radii[moved].min()
+
+
+@pytest.mark.thorough
+def test_what_stays_does_not_stay_for_ever():
+    """A vertex that nothing blamed came to those that stayed, again and again."""
+    tissue = vx.initialise.periodic_voronoi(1000, key=jax.random.key(1001))
+    factors = 3.5 + 0.1 * jax.random.normal(jax.random.key(2001), (1000,))
+    response = vx.Relaxation(tolerance=1e-8, max_steps=150)
+    assert eqx.filter_jit(response)(tissue, shapes(factors), throw=False).converged
 
 
 def test_without_contact_cells_overlap_and_that_is_refused():
