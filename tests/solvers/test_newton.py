@@ -10,7 +10,7 @@ import optimistix as optx
 import pytest
 
 import vertax as vx
-from vertax.solvers import _newton
+from vertax.solvers import _bounded_step, _newton
 
 N = 30
 PLACES = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (N, 2)))
@@ -58,7 +58,7 @@ def test_no_row_goes_far_in_a_step():
 
 def test_what_goes_too_far_is_cut_and_nothing_else(monkeypatch):
     """A long lever, whose end goes a hundred times as far as what is pushed."""
-    monkeypatch.setattr(_newton, "_ROUNDS", 0)
+    monkeypatch.setattr(_bounded_step, "_ROUNDS", 0)
     monkeypatch.setattr(_newton, "_COARSEST", 1e-6)
 
     def lever(y, _):

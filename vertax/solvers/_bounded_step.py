@@ -1,0 +1,215 @@
+"""A step of Newton's method within bounds: conjugate gradients, damped where they go too far."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+from optax import tree
+
+from vertax._base.modules import choose
+from vertax.solvers._long_waves import LongWaves, Medium
+from vertax.solvers._rows import inner, row_inner, sizes, times
+from vertax.solvers._solver import Rows
+
+
+class System(NamedTuple):
+    """How far the step is, and the damping `shift` with which it goes on."""
+
+    p: PyTree[Array]
+    hp: PyTree[Array]
+    shift: Rows
+    rounds: Int[Array, ""]
+    done: Bool[Array, ""]
+    k: Int[Array, ""]
+    whole: Float[Array, ""]
+    cuts: Bool[Array, ""]
+    """Whether all that is left to do is to cut what goes too far."""
+
+
+def bounded_step(
+    hessian: Callable[[PyTree], PyTree],
+    g: PyTree,
+    shift: Rows,
+    bounds: Rows,
+    *,
+    start: tuple[PyTree, PyTree],
+    resumes: Bool[Array, ""],
+    forcing: Float[Array, ""],
+    waving: Bool[Array, ""],
+    max_products: int,
+    options: dict[str, Any],
+) -> System:
+    """A step that goes downhill, and nowhere much beyond its bounds.
+
+    **Arguments:**
+
+    - `hessian`: multiplies by it.
+    - `g`: the gradient.
+    - `shift`: the damping to begin with.
+    - `bounds`: about how far each row may go.
+    - `start`: the step to begin with, and its product with the Hessian.
+    - `resumes`: whether that is more than nothing, and may go too far.
+    - `forcing`: the residual to come to, in units of the first one.
+    - `waving`: whether long waves precondition it.
+    - `max_products`: most products with the Hessian.
+    - `options`: of the minimiser: typical sizes.
+    """
+    stiffness = options.get("stiffness", 1.0)
+    zero = tree.zeros_like(g)
+    # Far from rest steps are short, and what is soft may have negative curvature.
+    waves = _Waves.of(options, hessian, g, waving)
+
+    def preconditioned(r: PyTree, shift: Rows) -> PyTree:
+        near = jax.tree.map(lambda r, s: times(1 / (stiffness + s), r), r, shift)
+        return near if waves is None else waves.added(near, r, shift)
+
+    def unfinished(system: System) -> Bool[Array, ""]:
+        return ~system.done & (system.cuts | (system.k < max_products))
+
+    def solved(system: System) -> System:
+        """A system solved, or so far that it needs another shift."""
+        shift, cuts = system.shift, system.cuts
+        left = lambda g, h, s, p: g + h + times(s, p)
+        r = jax.tree.map(left, g, system.hp, shift, system.p)
+        z = preconditioned(r, shift)
+        rz = inner(r, z)
+        whole = jnp.where(system.k == 0, rz, system.whole)
+        nothing_left = (system.k == 0) & (rz <= 0)
+
+        def proceed(last: _Directions) -> Bool[Array, ""]:
+            going = last.convex & ~last.small & ~last.far
+            return going & ~nothing_left & (cuts | (last.k < max_products))
+
+        def iterate(last: _Directions) -> _Directions:
+            d = tree.sub(tree.scale(last.beta, last.d), last.z)
+            hd = hessian(d)
+            damped = jax.tree.map(lambda hd, s, d: hd + times(s, d), hd, shift, d)
+            curvature = inner(d, damped)
+            convex = cuts | (curvature > 0)
+            alpha = jnp.where(convex, last.rz / jnp.where(convex, curvature, 1), 0)
+            alpha = jnp.where(cuts, 1, alpha)
+            r = tree.add_scale(last.r, alpha, damped)
+            z = preconditioned(r, shift)
+            rz = inner(r, z)
+            small = cuts | (convex & (rz <= forcing**2 * whole))
+            # Once it is solved: what goes too far is damped more.
+            furthest = _furthest(tree.add_scale(last.p, alpha, d), bounds)
+            far = ~cuts & (furthest > jnp.where(small, 1.5, _FURTHEST))
+            # (Where there is hardly any curvature it may be far too far: it goes on from the limit.)
+            room = (_FURTHEST - last.furthest) / (furthest - last.furthest)
+            alpha *= jnp.where(far & (furthest > _FURTHEST), room, 1)
+            p = tree.add_scale(last.p, alpha, d)
+            hp = tree.add_scale(last.hp, alpha, hd)
+            beta = rz / last.rz
+            k = last.k + 1
+            return _Directions(p, hp, r, z, rz, beta, d, hd, furthest, convex, small, far, k)
+
+        yes, no = jnp.array(True), jnp.array(False)
+        # A cut is a step back, to what no vertex goes beyond: so there is but one product to compile.
+        back = jax.tree.map(_cut, system.p, bounds)
+        d, z = choose(cuts, (back, zero), (zero, z))
+        begin = (system.p, system.hp, r, z, rz, jnp.where(cuts, jnp.ones_like(rz), 0), d, zero)
+        begin += (_furthest(system.p, bounds),)
+        end = _Directions(*begin, convex=yes, small=no, far=no, k=system.k)
+        end = jax.lax.while_loop(proceed, iterate, end)
+
+        # That is a new system, which goes on from here, as does one that is made convex.
+        typical = jnp.abs(inner(g, end.p)) / inner(end.p, end.p)
+
+        def tighter(
+            shift: Array, p: Array, bound: Array, d: Array, hd: Array
+        ) -> Float[Array, " rows"]:
+            more = jnp.maximum(sizes(p) / bound - 1, 0) * (shift + typical)
+            along, squared = row_inner(d, hd), row_inner(d, d)
+            concave = jnp.where(along < 0, -2 * along / jnp.where(squared > 0, squared, 1), 0)
+            return shift + jnp.where(end.convex, jnp.where(end.far, more, 0), concave)
+
+        shift = jax.tree.map(tighter, shift, end.p, bounds, end.d, end.hd)
+        # (Not for ever: then what goes too far is cut.)
+        done = nothing_left | jnp.where(end.far, system.rounds >= _ROUNDS, end.small)
+        # Vertices may go somewhat further than they should, but none by much.
+        over = ~cuts & (end.furthest > _OVER) & (done | (end.k >= max_products))
+        # A step that goes on from another one is cut first, and solved then.
+        cut_first = system.rounds < 0
+        rounds = system.rounds + (end.far | cut_first)
+        return System(end.p, end.hp, shift, rounds, done & ~over & ~cut_first, end.k, whole, over)
+
+    rounds, unsolved = jnp.where(resumes, -1, 0), jnp.array(False)
+    unknown = jnp.zeros_like(forcing)
+    begin = System(*start, shift, rounds, unsolved, jnp.array(0), unknown, resumes)
+    return jax.lax.while_loop(unfinished, solved, begin)
+
+
+# So often what goes too far is damped more; then it is cut.
+_ROUNDS = 8
+# How far a step may go before it is solved, in units of the bounds.
+_FURTHEST = 4.0
+# Further no vertex goes in the end.
+_OVER = 2.0
+
+
+class _Directions(NamedTuple):
+    """Conjugate gradients for one system."""
+
+    p: PyTree[Array]
+    hp: PyTree[Array]
+    r: PyTree[Array]
+    z: PyTree[Array]
+    rz: Float[Array, ""]
+    beta: Float[Array, ""]
+    d: PyTree[Array]
+    """The last direction,"""
+    hd: PyTree[Array]
+    """and its product with the Hessian."""
+    furthest: Float[Array, ""]
+    convex: Bool[Array, ""]
+    small: Bool[Array, ""]
+    far: Bool[Array, ""]
+    k: Int[Array, ""]
+
+
+class _Waves(eqx.Module):
+    """The long waves of a large tissue, where they are of use."""
+
+    medium: Medium
+    stiffness: Float[Array, ""]
+    used: Bool[Array, ""]
+
+    @classmethod
+    def of(
+        cls, options: dict[str, Any], hessian: Any, like: PyTree, used: Bool[Array, ""]
+    ) -> _Waves | None:
+        waves: LongWaves | None = options.get("long_waves")
+        if waves is None:
+            return None
+        stiffness = options["stiffness"]
+        fitted = lambda: waves.fitted(hessian, like, stiffness)
+        nothing = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), eqx.filter_eval_shape(fitted))
+        return cls(jax.lax.cond(used, fitted, lambda: nothing), stiffness, used)
+
+    def added(self, near: PyTree, r: PyTree, shift: Rows) -> PyTree:
+        """A residual that was preconditioned near by, and its long waves."""
+        # A place that is held tightly must not hold all others, nor drag them along.
+        damping = jax.tree.leaves(shift)[0]
+        held = jnp.mean(jnp.minimum(damping, self.stiffness))
+        share = self.stiffness / (self.stiffness + damping)
+        return jax.lax.cond(
+            self.used, lambda: self.medium.added(near, r, held, share), lambda: near
+        )
+
+
+def _furthest(p: PyTree, bounds: Rows) -> Float[Array, ""]:
+    """How far a step goes where it goes furthest, in units of the bounds there."""
+    return jnp.asarray(tree.max(jax.tree.map(lambda p, b: sizes(p) / b, p, bounds)))
+
+
+def _cut(p: Float[Array, "rows ..."], bound: Float[Array, " rows"]) -> Float[Array, "rows ..."]:
+    """From a step back to one that goes nowhere beyond its bounds by much."""
+    size = sizes(p)
+    share = jnp.minimum(1, _OVER * bound / jnp.where(size > 0, size, 1))
+    return times(share - 1, p)
