@@ -99,9 +99,10 @@ def bounded_step(
             small = cuts | (convex & (rz <= forcing**2 * whole))
             # Once it is solved: what goes too far is damped more.
             furthest = _furthest(tree.add_scale(last.p, alpha, d), bounds)
-            far = ~cuts & (furthest > jnp.where(small, 1.5, _FURTHEST))
+            far = ~cuts & convex & (furthest > jnp.where(small, 1.5, _FURTHEST))
             # (Where there is hardly any curvature it may be far too far: it goes on from the limit.)
-            room = (_FURTHEST - last.furthest) / (furthest - last.furthest)
+            room, gone = _FURTHEST - last.furthest, furthest - last.furthest
+            room = jnp.clip(room / jnp.where(gone > 0, gone, 1), 0, 1)
             alpha *= jnp.where(far & (furthest > _FURTHEST), room, 1)
             p = tree.add_scale(last.p, alpha, d)
             hp = tree.add_scale(last.hp, alpha, hd)

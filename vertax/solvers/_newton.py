@@ -146,7 +146,8 @@ class NewtonCG(AbstractSolver):
             ) -> Float[Array, " rows"]:
                 length = sizes(step)
                 shrunk = jnp.maximum(0.25 * radius, jnp.minimum(0.5 * length, radius))
-                shrunk = jnp.where(accepted, shrunk, 0.25 * jnp.minimum(length, radius))
+                # (A step without end has no length.)
+                shrunk = jnp.where(accepted, shrunk, 0.25 * jnp.fmin(length, radius))
                 grows = accepted & (fine | foreseen) & (length > 0.3 * radius)
                 grows |= fine & foreseen & (radius < reach)
                 # An error grows with the length of the step.
