@@ -11,7 +11,7 @@ N = 12
 
 
 def model(key, concave=0.25):
-    """A gradient, a Hessian of which a share of all eigenvalues is negative, and bounds of different sizes."""
+    """A gradient, a Hessian with a share of negative eigenvalues, and bounds of different sizes."""
     keys = jax.random.split(key, 4)
     basis = jnp.linalg.qr(jax.random.normal(keys[0], (2 * N, 2 * N)))[0]
     values = 10 ** jax.random.uniform(keys[1], (2 * N,), minval=-3, maxval=3)

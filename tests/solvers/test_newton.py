@@ -47,6 +47,64 @@ def test_one_difficult_place_does_not_hold_back_the_others():
     np.testing.assert_allclose(found.value, PLACES, atol=1e-8)
 
 
+def test_a_step_that_gains_nothing_is_tried_again_without_what_is_to_blame(monkeypatch):
+    """Wells, and a wall in the way of one of so many."""
+    many = 2 * N
+    places = jnp.concatenate([PLACES, PLACES])
+
+    def wall(y, _):
+        wells = 0.5 * jnp.sum((y[1:] - places[1:]) ** 2)
+        return wells - y[0, 0] + 0.5e4 * jnp.maximum(y[0, 0] - 0.01, 0) ** 2, None
+
+    def first_step():
+        jax.clear_caches()
+        y, state = steps(wall, jnp.zeros((many, 2)), None, 1)
+        return jnp.linalg.norm(y, axis=-1), state
+
+    moved, state = first_step()
+    assert 0 < moved[0] < 0.02
+    assert jnp.all(moved[1:] > 0)
+    assert state.radii[0] < 0.1
+    np.testing.assert_allclose(state.radii[1:].min(), 0.2)
+    monkeypatch.setattr(_newton, "_RETRIES", 0)
+    moved, state = first_step()
+    assert jnp.all(moved == 0)
+    assert state.radii.max() < 0.2
+
+
+def test_regions_grow_fast_where_steps_are_foreseen():
+    start = jnp.zeros((N, 2))
+
+    def needed(radius):
+        solver = vx.solvers.NewtonCG()
+        fn = lambda y, _: landscape(y, 0.0)
+        value, aux = jax.eval_shape(fn, start, None)
+        state = solver.init(fn, start, None, {}, value, aux, frozenset())
+        state = eqx.tree_at(lambda s: s.radii, state, jnp.full(N, radius))
+        y, n = start, 0
+        while jnp.max(jnp.abs(state.gradient)) > 1e-8:
+            y, state, _ = solver.step(fn, y, None, {}, state, frozenset())
+            n += 1
+        return n
+
+    assert needed(1e-4) <= needed(0.2) + 5  # 11 doublings
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_copies_side_by_side_go_as_one_alone(n):
+    """How far a step is solved does not depend on the size of a tissue."""
+    springs = jnp.logspace(0, 3, N)[:, None]
+
+    def energy(y):
+        return 0.5 * jnp.sum(springs * (y - PLACES) ** 2 + (y - jnp.roll(y, 1, 0)) ** 2)
+
+    start = 1.001 * PLACES
+    alone, _ = steps(lambda y, _: (energy(y), None), start, None, n)
+    copies = lambda y, _: (jnp.sum(jax.vmap(energy)(y.reshape(4, N, 2))), None)
+    together, _ = steps(copies, jnp.tile(start, (4, 1)), None, n)
+    np.testing.assert_allclose(together.reshape(4, N, 2), jnp.stack(4 * [alone]), atol=1e-12)
+
+
 def test_no_row_goes_far_in_a_step():
     hill = lambda y, _: (jnp.sum(jnp.cos(y)), None)  # concave where it starts
     start = 0.05 * jnp.ones((N, 2))
