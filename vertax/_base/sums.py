@@ -4,9 +4,9 @@ import functools
 import operator
 from collections.abc import Iterable
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Inexact
 
 
-def total(terms: Iterable[Float[Array, "*shape"]]) -> Float[Array, "*shape"]:
+def total(terms: Iterable[Inexact[Array, "*shape"]]) -> Inexact[Array, "*shape"]:
     """The sum of at least one array, written out: XLA takes several times as long along a short axis."""
     return functools.reduce(operator.add, terms)

@@ -15,6 +15,7 @@ from vertax._base.modules import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free
 from vertax.mesh._capacity import with_slots, without_slots
+from vertax.mesh._ends import at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
 
@@ -483,10 +484,9 @@ class Tissue(eqx.Module):
         # Apart, from here to areas and lengths: pairs would be taken apart and put together again in every
         # product with a Hessian.
         m = self.topology
-        twin, _, _, _, following = edge_neighbourhood(m)
+        following = edge_neighbourhood(m)[-1]
         offset = self.boundary.translation(take(m.frame, following) - take(m.frame, m.half_edge))
-        ends = source(jnp.stack([m.half_edge, twin]))
-        (x, to_x), (y, to_y) = (take(self.vertices[:, axis], ends) for axis in (0, 1))
+        (x, to_x), (y, to_y) = at_ends(m, self.vertices)
         return x, y, to_x + offset[:, 0] - x, to_y + offset[:, 1] - y
 
     def _chords(self, segments: tuple[Float[Array, " edges"], ...]) -> Float[Array, " edges"]:

@@ -295,8 +295,7 @@ def _angles_are_open(tissue: Tissue, least: Float[Array, ""]) -> Bool[Array, ""]
     forward = take(tissue.edge_vectors, m.edge)
     u = jnp.where(m.forward[:, None], forward, -forward).reshape(-1, 3, 2)
     v = jnp.roll(u, -1, axis=1)
-    sine, cosine = cross(u, v), jnp.sum(u * v, axis=-1)
-    squared = jnp.sum(u**2, axis=-1)
+    sine, cosine, squared = cross(u, v), dot(u, v), dot(u, u)
     narrow = (cosine > 0) & (sine**2 < least**2 * squared * jnp.roll(squared, -1, axis=1))
     # In order at least two of the three angles are less than π.
     ordered = jnp.sum(sine > 0, axis=1) >= 2

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
 from vertax._base.modules import choose
-from vertax.solvers._long_waves import LongWaves, Medium
+from vertax.solvers._long_waves import LongWaves, Stiffness
 from vertax.solvers._rows import inner, row_inner, sizes, times
 from vertax.solvers._solver import Rows
 
@@ -55,18 +55,35 @@ def bounded_step(
     - `start`: the step to begin with, and its product with the Hessian.
     - `resumes`: whether that is more than nothing, and may go too far.
     - `forcing`: the residual to come to, in units of the first one.
-    - `waving`: whether long waves precondition it.
+    - `waving`: whether the long waves of a large tissue precondition it.
     - `max_products`: most products with the Hessian.
     - `options`: of the minimiser: typical sizes.
     """
     stiffness = options.get("stiffness", 1.0)
+    waves: LongWaves | None = options.get("long_waves")
     zero = tree.zeros_like(g)
-    # Far from rest steps are short, and what is soft may have negative curvature.
-    waves = _Waves.of(options, hessian, g, waving)
+    one = jnp.ones_like(forcing)
+    medium = Stiffness(one, one, one)
+    if waves is not None:
+        # Far from rest steps are short, and what is soft may have negative curvature.
+        measure = lambda: waves.measured(hessian, g, stiffness)
+        medium = jax.lax.cond(waving, measure, lambda: medium)
 
-    def preconditioned(r: PyTree, shift: Rows) -> PyTree:
-        near = jax.tree.map(lambda r, s: times(1 / (stiffness + s), r), r, shift)
-        return near if waves is None else waves.added(near, r, shift)
+    def preconditioner(shift: Rows) -> Callable[[PyTree], PyTree]:
+        yielding = jax.tree.map(lambda s: 1 / (stiffness + s), shift)
+        near = lambda r: jax.tree.map(times, yielding, r)
+        if waves is None:
+            return near
+        # A place that is held tightly must not hold all others, nor drag them along.
+        first = jax.tree.leaves(shift)[0]
+        held = jnp.mean(jnp.minimum(first, stiffness))
+        yields = waves.compliance(medium, held, stiffness / (stiffness + first))
+
+        def both(r: PyTree) -> PyTree:
+            z = near(r)
+            return jax.lax.cond(waving, lambda: yields.added(z, r), lambda: z)
+
+        return both
 
     def unfinished(system: System) -> Bool[Array, ""]:
         return ~system.done & (system.cuts | (system.k < max_products))
@@ -76,7 +93,8 @@ def bounded_step(
         shift, cuts = system.shift, system.cuts
         left = lambda g, h, s, p: g + h + times(s, p)
         r = jax.tree.map(left, g, system.hp, shift, system.p)
-        z = preconditioned(r, shift)
+        preconditioned = preconditioner(shift)
+        z = preconditioned(r)
         rz = inner(r, z)
         whole = jnp.where(system.k == 0, rz, system.whole)
         nothing_left = (system.k == 0) & (rz <= 0)
@@ -94,7 +112,7 @@ def bounded_step(
             alpha = jnp.where(convex, last.rz / jnp.where(convex, curvature, 1), 0)
             alpha = jnp.where(cuts, 1, alpha)
             r = tree.add_scale(last.r, alpha, damped)
-            z = preconditioned(r, shift)
+            z = preconditioned(r)
             rz = inner(r, z)
             small = cuts | (convex & (rz <= forcing**2 * whole))
             # Once it is solved: what goes too far is damped more.
@@ -174,39 +192,15 @@ class _Directions(NamedTuple):
     k: Int[Array, ""]
 
 
-class _Waves(eqx.Module):
-    """The long waves of a large tissue, where they are of use."""
-
-    medium: Medium
-    stiffness: Float[Array, ""]
-    used: Bool[Array, ""]
-
-    @classmethod
-    def of(
-        cls, options: dict[str, Any], hessian: Any, like: PyTree, used: Bool[Array, ""]
-    ) -> _Waves | None:
-        waves: LongWaves | None = options.get("long_waves")
-        if waves is None:
-            return None
-        stiffness = options["stiffness"]
-        fitted = lambda: waves.fitted(hessian, like, stiffness)
-        nothing = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), eqx.filter_eval_shape(fitted))
-        return cls(jax.lax.cond(used, fitted, lambda: nothing), stiffness, used)
-
-    def added(self, near: PyTree, r: PyTree, shift: Rows) -> PyTree:
-        """A residual that was preconditioned near by, and its long waves."""
-        # A place that is held tightly must not hold all others, nor drag them along.
-        damping = jax.tree.leaves(shift)[0]
-        held = jnp.mean(jnp.minimum(damping, self.stiffness))
-        share = self.stiffness / (self.stiffness + damping)
-        return jax.lax.cond(
-            self.used, lambda: self.medium.added(near, r, held, share), lambda: near
-        )
-
-
 def _furthest(p: PyTree, bounds: Rows) -> Float[Array, ""]:
     """How far a step goes where it goes furthest, in units of the bounds there."""
-    return jnp.asarray(tree.max(jax.tree.map(lambda p, b: sizes(p) / b, p, bounds)))
+    squares = jax.tree.map(lambda p, b: row_inner(p, p) / b**2, p, bounds)
+    return jnp.sqrt(jnp.asarray(tree.max(jax.tree.map(_largest, squares))))
+
+
+def _largest(x: Float[Array, " n"]) -> Float[Array, ""]:
+    # (XLA takes ten times as long for what it knows as a maximum, of many numbers on a CPU.)
+    return jax.lax.reduce(x, np.zeros((), x.dtype), lambda a, b: jnp.where(b > a, b, a), (0,))
 
 
 def _cut(p: Float[Array, "rows ..."], bound: Float[Array, " rows"]) -> Float[Array, "rows ..."]:

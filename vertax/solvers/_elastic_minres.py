@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from vertax.solvers._long_waves import LongWaves, Medium
+from vertax.solvers._long_waves import Compliance, LongWaves
 from vertax.solvers._minres import MINRES
 
 
@@ -23,7 +23,7 @@ class _Attempt(NamedTuple):
     again: Bool[Array, ""]
 
 
-class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Medium]]):
+class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance]]):
     """MINRES for the Hessian of a large tissue, preconditioned by its long waves.
 
     Where the system has no solution, as if there are zero modes that the right-hand side sees, the result
@@ -36,19 +36,20 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Medium]]):
 
     def init(
         self, operator: lx.AbstractLinearOperator, options: dict[str, Any]
-    ) -> tuple[Any, Medium]:
+    ) -> tuple[Any, Compliance]:
         linear = self.plain.init(operator, options)
-        return linear, self.waves.fitted(linear.mv, operator.in_structure(), self.stiffness)
+        stiffness = self.waves.measured(linear.mv, operator.in_structure(), self.stiffness)
+        return linear, self.waves.compliance(stiffness)
 
     def compute(
-        self, state: tuple[Any, Medium], vector: PyTree[Array], options: dict[str, Any]
+        self, state: tuple[Any, Compliance], vector: PyTree[Array], options: dict[str, Any]
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         linear, medium = state
 
         def attempt(last: _Attempt) -> _Attempt:
             def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
                 near = jax.tree.map(lambda x: x / self.stiffness, r)
-                helped = lambda: medium.added(near, r, jnp.zeros_like(self.stiffness))
+                helped = lambda: medium.added(near, r)
                 return jax.lax.cond(last.helped, helped, lambda: near)
 
             preconditioner = lx.FunctionLinearOperator(

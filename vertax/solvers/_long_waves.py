@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Complex, Float, Int, PyTree
 
 from vertax._base.sums import total
 from vertax.mesh import Periodic, Tissue
@@ -45,8 +46,8 @@ class LongWaves(eqx.Module):
     """Vertices in units of the box."""
     reciprocal: Float[Array, "2 2"]
     """The reciprocal lattice vectors, as rows."""
-    vectors: Float[Array, "size half 2"]
-    """The wave vectors that the grid knows, without those that follow from others."""
+    vectors: Float[Array, "size size 2"]
+    """The wave vectors that the grid knows."""
     filled: Float[Array, ""]
     """Vertices for each point of the grid."""
     size: int = eqx.field(static=True)
@@ -59,7 +60,8 @@ class LongWaves(eqx.Module):
         size = _good_size(tissue.n_cells)
         lattice, origin = _box(tissue)
         inverse = inverse_of(lattice)
-        places = (tissue.vertices - origin) @ inverse
+        x, y = (tissue.vertices - origin).T
+        places = x[:, None] * inverse[0] + y[:, None] * inverse[1]
         scaled = size * places
         corner = jnp.floor(scaled)
         beyond, corner = scaled - corner, corner.astype(int)
@@ -69,9 +71,9 @@ class LongWaves(eqx.Module):
         weights = shares[:, 0, :, None] * shares[:, 1, None, :]
         moves = jnp.ones(tissue.n_vertices) if tissue.held is None else ~tissue.held
         moves = moves.astype(weights.dtype)
-        numbers = np.fft.fftfreq(size, 1 / size), np.fft.rfftfreq(size, 1 / size)
+        numbers = np.fft.fftfreq(size, 1 / size)[:, None]
         reciprocal = 2 * jnp.pi * inverse.T
-        first, second = (n[:, None] * row for n, row in zip(numbers, reciprocal, strict=True))
+        first, second = (numbers * row for row in reciprocal)
         # Of an open tissue's box a part is empty.
         fill = jnp.sum(tissue.areas) / jnp.abs(jnp.linalg.det(lattice))
         return cls(
@@ -84,10 +86,10 @@ class LongWaves(eqx.Module):
             size=size,
         )
 
-    def fitted(
+    def measured(
         self, hessian: Callable[[PyTree], PyTree], like: PyTree, mean: Float[Array, ""]
-    ) -> Medium:
-        """The medium with the stiffness of waves in a tissue.
+    ) -> Stiffness:
+        """The stiffness of waves in a tissue.
 
         **Arguments:**
 
@@ -104,20 +106,21 @@ class LongWaves(eqx.Module):
 
         long, short = 1, max(2, self.size // 8)
 
-        def stiffness(kind: tuple[Int[Array, ""], Float[Array, "2 2"]]) -> Float[Array, ""]:
-            # One product for waves along both axes, which hardly feel each other.
-            number, polarisations = kind
-            phases = 2 * jnp.pi * number * self.places + jnp.array([0.3, 1.1])
-            wave = moves * (jnp.cos(phases) @ polarisations)
+        def waves(number: int, polarisations: Float[Array, "2 2"]) -> Float[Array, "vertices 2"]:
+            # Those along both axes in one product: they hardly feel each other.
+            phases = number * self.places + jnp.array([0.05, 0.18])
+            return moves * total(_wave(phases[:, i, None]) * polarisations[i] for i in (0, 1))
+
+        def stiffness(wave: Float[Array, "vertices 2"]) -> Float[Array, ""]:
             rest = [jnp.zeros(x.shape, x.dtype) for x in shapes]
             leaves = [wave, *rest]
             product = hessian(jax.tree.unflatten(jax.tree.structure(like), leaves))
             return jnp.vdot(wave, jax.tree.leaves(product)[0]) / jnp.vdot(wave, wave)
 
         # (One after the other, so that the Hessian is compiled once.)
-        numbers = jnp.array([long, short, long, short])
-        polarisations = jnp.stack([directions, directions, across, across])
-        far, near, far_across, near_across = jax.lax.map(stiffness, (numbers, polarisations))
+        kinds = ((n, way) for way in (directions, across) for n in (long, short))
+        each = jnp.stack([waves(*kind) for kind in kinds])
+        far, near, far_across, near_across = jax.lax.map(stiffness, each)
         square = jnp.mean(squares)
 
         def law(far: Array, near: Array, least: Array) -> tuple[Array, Array]:
@@ -126,54 +129,73 @@ class LongWaves(eqx.Module):
 
         offset, compression = law(far, near, floor)
         other, shear = law(far_across, near_across, jnp.maximum(floor, 1e-3 * compression))
-        return Medium(self, jnp.minimum(offset, other), shear, compression)
+        return Stiffness(jnp.minimum(offset, other), shear, compression)
+
+    def compliance(
+        self,
+        stiffness: Stiffness,
+        shift: Float[Array, ""] | float = 0.0,
+        share: Float[Array, " vertices"] | None = None,
+    ) -> Compliance:
+        """How the medium gives way if a spring of stiffness `shift` holds each vertex besides.
+
+        Vertices hand on a `share` of their force to the medium, and go with it as much; all by default.
+        """
+        # Vectors are complex numbers, so half the transforms do. If Z(k) is a transform, the part of the
+        # vectors' transform along k is (Z(k) + κ/κ* Z*(-k)) / 2 with κ = k_x + i k_y, the rest across.
+        offset, shear, compression = stiffness
+        x, y = self.vectors[..., 0], self.vectors[..., 1]
+        squared = x**2 + y**2
+        whole = squared == 0
+        squared = jnp.where(whole, 1, squared)
+        along, across = (1 / (offset + shift + c * squared) for c in (compression, shear))
+        scale = jnp.where(whole, 0, 0.5 / self.filled)
+        turned = jax.lax.complex(x**2 - y**2, 2 * x * y) / squared
+        weights = self.weights if share is None else share[:, None] * self.weights
+        mirrored = scale * (along - across) * turned
+        return Compliance(self.indices, weights, scale * (along + across), mirrored)
 
 
-class Medium(eqx.Module):
-    """The elastic medium that a tissue is in the large; see `LongWaves`."""
+class Stiffness(NamedTuple):
+    """What waves in a tissue resist with; see `LongWaves`."""
 
-    waves: LongWaves
     offset: Float[Array, ""]
     shear: Float[Array, ""]
     compression: Float[Array, ""]
 
-    def added(
-        self,
-        near: PyTree,
-        force: PyTree,
-        shift: Float[Array, ""],
-        share: Float[Array, " vertices"] | float = 1.0,
-    ) -> PyTree:
-        """How vertices give way near by, as parts of a configuration, and how the medium does besides.
 
-        Vertices hand on a `share` of their force to the medium, and go with it as much.
-        """
+class Compliance(eqx.Module):
+    """How a medium gives way to forces on vertices."""
+
+    indices: Int[Array, "vertices 4"]
+    weights: Float[Array, "vertices 4"]
+    direct: Float[Array, "size size"]
+    """What comes of each wave along its own wave vector,"""
+    mirrored: Complex[Array, "size size"]
+    """and of the one in the opposite direction."""
+
+    def added(self, near: PyTree, force: PyTree) -> PyTree:
+        """How vertices give way near by, as parts of a configuration, and how the medium does besides."""
         first, *rest = jax.tree.leaves(near)
-        share = jnp.broadcast_to(share, first.shape[:1])[:, None]
-        first = first + share * self.yields(share * jax.tree.leaves(force)[0], shift)
+        first = first + self(jax.tree.leaves(force)[0])
         return jax.tree.unflatten(jax.tree.structure(near), [first, *rest])
 
-    def yields(
-        self, force: Float[Array, "vertices 2"], shift: Float[Array, ""]
-    ) -> Float[Array, "vertices 2"]:
-        """How it gives way to forces on vertices, each held by a spring of stiffness `shift` besides."""
-        w = self.waves
-        shape = (w.size, w.size)
-        spread = w.weights[:, :, None] * force[:, None, :]
-        on_grid = jnp.zeros((w.size**2, 2), force.dtype).at[w.indices].add(spread)
-        modes = jnp.fft.rfft2(on_grid.reshape(*shape, 2), axes=(0, 1))
-        k = w.vectors
-        squared = jnp.sum(k**2, axis=-1, keepdims=True)
-        whole = squared == 0
-        squared = jnp.where(whole, 1, squared)
-        along = jnp.sum(modes * k, axis=-1, keepdims=True) * k / squared
-        held = self.offset + shift
-        modes = along / (held + self.compression * squared) + (modes - along) / (
-            held + self.shear * squared
-        )
-        moved = jnp.fft.irfft2(jnp.where(whole, 0, modes), s=shape, axes=(0, 1)).reshape(-1, 2)
-        there = total(w.weights[:, i, None] * take(moved, w.indices[:, i]) for i in range(4))
-        return (there / w.filled).astype(force.dtype)
+    def __call__(self, force: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
+        """How it gives way to forces on vertices."""
+        spread = self.weights[:, :, None] * force[:, None, :]
+        grid = jnp.zeros((self.direct.size, 2), force.dtype).at[self.indices].add(spread)
+        grid = jax.lax.complex(grid[:, 0], grid[:, 1]).reshape(self.direct.shape)
+        modes = jnp.fft.fft2(grid)
+        opposite = jnp.roll(modes[::-1, ::-1], 1, axis=(0, 1)).conj()
+        moved = jnp.fft.ifft2(self.direct * modes + self.mirrored * opposite).ravel()
+        there = total(self.weights[:, i] * take(moved, self.indices[:, i]) for i in range(4))
+        return jnp.stack([there.real, there.imag], axis=-1).astype(force.dtype)
+
+
+def _wave(phase: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """A cosine to one part in a hundred, of a phase in turns: the cosine itself takes ten times as long."""
+    t = 2 * jnp.abs(phase - jnp.round(phase))
+    return 1 - t**2 * (6 - 4 * t)
 
 
 def _box(tissue: Tissue) -> tuple[Float[Array, "2 2"], Float[Array, "2"]]:

@@ -13,7 +13,7 @@ from vertax.solvers._solver import Rows
 
 def inner(a: PyTree, b: PyTree) -> Float[Array, ""]:
     """The inner product of two points."""
-    return jnp.asarray(tree.vdot(a, b))
+    return jnp.asarray(tree.sum(jax.tree.map(jnp.multiply, a, b)))
 
 
 def row_inner(a: Float[Array, "rows ..."], b: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
