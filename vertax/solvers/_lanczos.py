@@ -24,6 +24,7 @@ class Krylov(NamedTuple):
     status: Int[Array, ""]
     norm_rhs: Float[Array, ""]  # β_1
     u: Float[Array, "n"]  # u_{k-1}
+    size: Float[Array, ""]  # and its length
     q_old: Float[Array, "n"]  # q_{k-1}
     q: Float[Array, "n"]  # q_k
     v: Float[Array, "n"]  # v_k = P q_k
@@ -60,8 +61,9 @@ def over(a: Array, b: Array) -> Array:
 
 def _not_definite(z: Float[Array, "n"], p_z: Float[Array, "n"]) -> Bool[Array, ""]:
     """Whether z·P z is negative by more than rounding."""
-    rounding = ROUNDING_UNITS * jnp.finfo(z.dtype).eps
-    return dot(z, p_z) < -rounding * jnp.sqrt(dot(z, z) * dot(p_z, p_z))
+    rounding, product = ROUNDING_UNITS * jnp.finfo(z.dtype).eps, dot(z, p_z)
+    beyond = lambda: product < -rounding * jnp.sqrt(dot(z, z) * dot(p_z, p_z))
+    return lax.cond(product < 0, beyond, lambda: jnp.array(False))
 
 
 # Paige & Saunders (1975), with a preconditioner P ≈ A⁻¹. The unknown is u with x = P u, residuals
@@ -121,11 +123,7 @@ def solve_in_krylov_space(
     def size(u: Float[Array, "n"]) -> Float[Array, ""]:
         return jnp.sqrt(dot(u, u))
 
-    def rounding_level(operator_norm: Float[Array, ""], u: Float[Array, "n"]) -> Float[Array, ""]:
-        # No residual can be told from zero below eps (|A| |x| + |b|). With a preconditioner the
-        # size of x is known only from below, by Cauchy and Schwarz: |u·P b| ≤ |u| |b|.
-        size_x = size(u) if p is None else over(jnp.abs(dot(u, p_rhs)), beta_1)
-        return eps * (operator_norm * size_x + beta_1)
+    size_rhs = size(rhs)
 
     # A right-hand side that is not zero, but whose norm is, shows that P is not definite.
     indefinite = (dot(rhs, p_rhs) <= 0) & (dot(rhs, rhs) > 0)
@@ -139,6 +137,7 @@ def solve_in_krylov_space(
         status=status,
         norm_rhs=beta_1,
         u=zeros,
+        size=zero,
         q_old=zeros,
         q=over(rhs, beta_1),
         v=over(p_rhs, beta_1),
@@ -179,7 +178,11 @@ def solve_in_krylov_space(
         c, s = over(gamma_bar, gamma), over(beta, gamma)
         w = over(last.q - last.epsilon * last.w_old - delta * last.w, gamma)
         u = last.u + c * last.residual * w
-        residual = s * last.residual
+        size_u, residual = size(u), s * last.residual
+        # No residual can be told from zero below eps (|A| |x| + |b|). With a preconditioner the
+        # size of x is known only from below, by Cauchy and Schwarz: |u·P b| ≤ |u| |b|.
+        size_x = size_u if p is None else over(jnp.abs(dot(u, p_rhs)), beta_1)
+        rounding_level = eps * (operator_norm * size_x + beta_1)
 
         # The test on A P r concerns the u before this step, and comes before the step is taken:
         # along a null direction γ is rounding error, and u would grow by its inverse.
@@ -189,15 +192,15 @@ def solve_in_krylov_space(
         suspect = (residual_suspect == 0) & (a_r <= nearly_null * operator_norm)
         residual_suspect = jnp.where(suspect, last.residual, residual_suspect)
         # To solve for b at all takes a size of |b| / |A|.
-        size_last = jnp.maximum(size(last.u), over(size(rhs), operator_norm))
+        size_last = jnp.maximum(last.size, over(size_rhs, operator_norm))
         size_suspect = jnp.where(suspect, size_last, last.size_suspect)
         blown_up = (
             (residual_suspect > 0)
             & (residual >= 0.5 * residual_suspect)
-            & (size(u) > eps**-0.5 * size_suspect)
+            & (size_u > eps**-0.5 * size_suspect)
         )
 
-        status = jnp.where(residual <= rounding_level(operator_norm, u), CONVERGED, last.status)
+        status = jnp.where(residual <= rounding_level, CONVERGED, last.status)
         status = jnp.where(blown_up, LEAST_SQUARES, status)
         status = jnp.where(residual <= target, CONVERGED, status)
         status = jnp.where(a_r <= null * operator_norm, LEAST_SQUARES, status)
@@ -214,6 +217,7 @@ def solve_in_krylov_space(
             status=status,
             norm_rhs=last.norm_rhs,
             u=jnp.where(take, u, last.u),
+            size=jnp.where(take, size_u, last.size),
             q_old=last.q,
             q=over(z, beta),
             v=over(p_z, beta),

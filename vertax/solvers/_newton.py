@@ -21,6 +21,8 @@ class _NewtonState(eqx.Module):
     gradient: PyTree[Float[Array, "..."]]
     radii: Rows
     num_products: Int[Array, ""]
+    mean_force: Float[Array, ""]
+    """Where the last step began; infinity before the first one."""
     aux: PyTree
 
 
@@ -63,7 +65,8 @@ class NewtonCG(AbstractSolver):
         value, gradient, aux = value_and_gradient(fn, y, args)
         reach = self.max_displacement * options.get("length_scale", 1.0)
         radii = jax.tree.map(lambda x: jnp.full_like(sizes(x), reach), y)
-        return _NewtonState(value, gradient, radii, jnp.array(0), aux)
+        never = jnp.full_like(value, jnp.inf)
+        return _NewtonState(value, gradient, radii, jnp.array(0), never, aux)
 
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
@@ -73,8 +76,13 @@ class NewtonCG(AbstractSolver):
         # place with large forces keep all others waiting.)
         force = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
         g, zero = state.gradient, tree.zeros_like(y)
-        forcing = jnp.minimum(_COARSEST, jnp.sqrt(_TYPICAL * mean_size(g) / force))
-        near = forcing < _COARSEST
+        mean_force = mean_size(g)
+        finest = jnp.sqrt(_TYPICAL * mean_force / force)
+        near = finest < _COARSEST
+        # Where forces do not fall as they would near a minimum, exact steps are of no use (Eisenstat &
+        # Walker 1996, doi:10.1137/0917003, their second choice).
+        useful = jnp.minimum(_ROUGH, _USEFUL * (mean_force / state.mean_force) ** 2)
+        forcing = jnp.minimum(_COARSEST, jnp.maximum(finest, useful))
         no, yes, none = jnp.array(False), jnp.array(True), jnp.array(0)
 
         def attempt(last: _Trial) -> _Trial:
@@ -197,14 +205,16 @@ class NewtonCG(AbstractSolver):
         radii = jax.tree.map(lambda radius: jnp.where(collapsed, reach, radius), end.radii)
         here = (y, state.value, g, state.aux)
         y, value, g, aux = choose(end.accepted, (end.y, end.value, end.gradient, end.aux), here)
-        return y, _NewtonState(value, g, radii, state.num_products + end.products, aux), aux
+        products = state.num_products + end.products
+        return y, _NewtonState(value, g, radii, products, mean_force, aux), aux
 
     def resumed(
         self, fresh: _NewtonState, old: _NewtonState, share: Rows, flipped: Bool[Array, ""]
     ) -> _NewtonState:
         # Elsewhere the regions are as good as they were.
         radii = jax.tree.map(lambda r, s: jnp.where(s < 1, 0.25 * r, r), old.radii, share)
-        return eqx.tree_at(lambda s: (s.radii, s.num_products), fresh, (radii, old.num_products))
+        kept = lambda s: (s.num_products, s.mean_force)
+        return eqx.tree_at(lambda s: (s.radii, *kept(s)), fresh, (radii, *kept(old)))
 
     def gradient(self, state: _NewtonState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
@@ -238,6 +248,9 @@ class _Trial(NamedTuple):
 _TYPICAL = 14.0
 # How far conjugate gradients go at least.
 _COARSEST = 0.35
+# How far they go where the last step has not brought the mean force down by much more.
+_ROUGH = 0.1
+_USEFUL = 0.9
 # A step that gains less than this share of what it should is corrected, so many times at most, so well.
 _FINE = 0.9
 _CORRECTIONS = 3
