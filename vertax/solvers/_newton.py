@@ -37,6 +37,9 @@ class NewtonCG(AbstractSolver):
     go beyond twice its region is cut back to that, and nothing else. (Steihaug 1983,
     doi:10.1137/0720042; Nocedal & Wright 2006, alg. 4.1 and 7.2, doi:10.1007/978-0-387-40065-5.)
 
+    How exactly a step is solved follows from the mean force, and from how much the last step has lowered it
+    (Eisenstat & Walker 1996, doi:10.1137/0917003).
+
     Soft motions follow curved valleys: a step along one climbs its side, and gains little or nothing. Such a
     step is corrected: a few products with the Hessian where it leads bring it back to the floor, and it is
     accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6).
@@ -79,8 +82,8 @@ class NewtonCG(AbstractSolver):
         mean_force = mean_size(g)
         finest = jnp.sqrt(_TYPICAL * mean_force / force)
         near = finest < _COARSEST
-        # Where forces do not fall as they would near a minimum, exact steps are of no use (Eisenstat &
-        # Walker 1996, doi:10.1137/0917003, their second choice).
+        # Where forces do not fall as they would near a minimum, exact steps are of no use (the second choice
+        # of Eisenstat & Walker).
         useful = jnp.minimum(_ROUGH, _USEFUL * (mean_force / state.mean_force) ** 2)
         forcing = jnp.minimum(_COARSEST, jnp.maximum(finest, useful))
         no, yes, none = jnp.array(False), jnp.array(True), jnp.array(0)
