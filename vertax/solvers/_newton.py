@@ -84,7 +84,8 @@ class NewtonCG(AbstractSolver):
         near = finest < _COARSEST
         # Where forces do not fall as they would near a minimum, exact steps are of no use (the second choice
         # of Eisenstat & Walker).
-        useful = jnp.minimum(_ROUGH, _USEFUL * (mean_force / state.mean_force) ** 2)
+        before = jnp.where(state.mean_force > 0, state.mean_force, jnp.inf)
+        useful = jnp.minimum(_ROUGH, _USEFUL * (mean_force / before) ** 2)
         forcing = jnp.minimum(_COARSEST, jnp.maximum(finest, useful))
         no, yes, none = jnp.array(False), jnp.array(True), jnp.array(0)
 
