@@ -16,8 +16,12 @@ TISSUES = {
 of_each_tissue = pytest.mark.parametrize("tissue", TISSUES.values(), ids=TISSUES)
 
 
+def looked_up(topology: vx.mesh.Topology, values: jax.Array) -> jax.Array:
+    return jnp.stack(at_ends(topology, values))
+
+
 def indexed(tissue: vx.Tissue, values: jax.Array) -> jax.Array:
-    return values.T[:, tissue.topology.edge_vertices.T]
+    return jnp.concatenate([values[ends].T for ends in tissue.topology.edge_vertices.T])
 
 
 def random(seed: int, *shape: int) -> jax.Array:
@@ -27,13 +31,13 @@ def random(seed: int, *shape: int) -> jax.Array:
 @of_each_tissue
 def test_it_is_indexing(tissue):
     values = random(0, tissue.n_vertices, 2)
-    np.testing.assert_array_equal(at_ends(tissue.topology, values), indexed(tissue, values))
+    np.testing.assert_array_equal(looked_up(tissue.topology, values), indexed(tissue, values))
 
 
 @of_each_tissue
 def test_its_transpose_is_that_of_indexing_and_is_no_scatter(tissue):
-    values, parts = random(0, tissue.n_vertices, 2), random(1, 2, 2, tissue.n_edges)
-    look = lambda x: at_ends(tissue.topology, x)
+    values, parts = random(0, tissue.n_vertices, 2), random(1, 4, tissue.n_edges)
+    look = lambda x: looked_up(tissue.topology, x)
     (back,) = jax.linear_transpose(look, values)(parts)
     (expected,) = jax.linear_transpose(lambda x: indexed(tissue, x), values)(parts)
     np.testing.assert_allclose(back, expected, atol=1e-14)
@@ -48,7 +52,7 @@ def test_its_transpose_is_that_of_indexing_and_is_no_scatter(tissue):
 def test_derivatives_of_every_kind_are_those_of_indexing(tissue):
     x, v = random(2, tissue.n_vertices, 2), random(3, tissue.n_vertices, 2)
     bent = lambda look: lambda x: jnp.sum(jnp.sin(look(x)) * jnp.cos(look(x)[::-1]))
-    ours, plain = bent(lambda x: at_ends(tissue.topology, x)), bent(lambda x: indexed(tissue, x))
+    ours, plain = bent(lambda x: looked_up(tissue.topology, x)), bent(lambda x: indexed(tissue, x))
     for derivative in (
         jax.grad,
         jax.jacfwd,
@@ -63,19 +67,35 @@ def test_batches_of_values_and_of_tissues():
     tissues = [vx.initialise.periodic_voronoi(12, key=k) for k in range(3)]
     topologies = vx.fitting.stack([t.topology for t in tissues])
     values = random(4, 3, tissues[0].n_vertices, 2)
-    forces = jax.grad(lambda x, m: jnp.sum(at_ends(m, x) ** 3))
+    forces = jax.grad(lambda x, m: jnp.sum(looked_up(m, x) ** 3))
     together = jax.vmap(forces)(values, topologies)
     for k, tissue in enumerate(tissues):
         np.testing.assert_allclose(together[k], forces(values[k], tissue.topology), rtol=1e-12)
     shared = jax.vmap(forces, in_axes=(0, None))(values, tissues[0].topology)
     np.testing.assert_allclose(shared[1], forces(values[1], tissues[0].topology), rtol=1e-12)
     # The derivative of a batch, too.
-    total = lambda x: jnp.sum(jax.vmap(lambda x: jnp.sum(at_ends(tissues[0].topology, x) ** 3))(x))
+    total = lambda x: jnp.sum(
+        jax.vmap(lambda x: jnp.sum(looked_up(tissues[0].topology, x) ** 3))(x)
+    )
     np.testing.assert_allclose(jax.grad(total)(values), shared, rtol=1e-12)
+
+
+def test_what_uses_one_part_alone_has_derivatives_as_well():
+    tissue = TISSUES["periodic"]
+    x, v = random(6, tissue.n_vertices, 2), random(7, tissue.n_vertices, 2)
+    first = lambda look: lambda x: jnp.sum(look(x)[0] ** 3)
+    ours = first(lambda x: at_ends(tissue.topology, x))
+    plain = first(lambda x: indexed(tissue, x))
+    for derivative in (
+        jax.grad,
+        lambda f: lambda x: jax.jvp(jax.grad(f), (x,), (v,))[1],
+        lambda f: lambda x: jax.grad(lambda x: jnp.vdot(jax.grad(f)(x), v))(x),
+    ):
+        np.testing.assert_allclose(derivative(ours)(x), derivative(plain)(x), atol=1e-12)
 
 
 def test_single_precision_stays():
     tissue = TISSUES["periodic"]
     values = random(5, tissue.n_vertices, 2).astype(jnp.float32)
-    gradient = jax.grad(lambda x: jnp.sum(at_ends(tissue.topology, x) ** 2))(values)
+    gradient = jax.grad(lambda x: jnp.sum(looked_up(tissue.topology, x) ** 2))(values)
     assert gradient.dtype == jnp.float32

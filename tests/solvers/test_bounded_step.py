@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vertax.solvers import _bounded_step
 from vertax.solvers._bounded_step import bounded_step
 
 N = 12
@@ -83,3 +84,16 @@ def test_within_wide_bounds_it_is_the_step_of_newton(forcing):
     system, _ = step(g, matrix, jnp.full(N, 1e9), forcing=jnp.array(forcing))
     exact = -jnp.linalg.solve(matrix, g.reshape(-1)).reshape(g.shape)
     assert jnp.max(jnp.abs(system.p - exact)) < forcing * jnp.max(jnp.abs(exact))
+
+
+def test_what_is_stiff_is_not_torn(monkeypatch):
+    """A rigid body that wants to go far, and one row of it that may not."""
+    monkeypatch.setattr(_bounded_step, "_ROUNDS", 0)
+    link = 1e3 * (2 * jnp.eye(N) - jnp.roll(jnp.eye(N), 1, 0) - jnp.roll(jnp.eye(N), -1, 0))
+    matrix = jnp.kron(link + 1e-3 * jnp.eye(N), jnp.eye(2))
+    g, bounds = -1e-3 * jnp.ones((N, 2)), jnp.full(N, 0.5).at[3].set(0.2)
+    system, product = step(g, matrix, bounds)
+    downhill, far, wrong = judged(g, system, product, bounds)
+    assert downhill + 0.5 * jnp.vdot(system.p, product) < 0  # the model gains energy
+    assert 1 < far <= 2 * (1 + 1e-9)
+    np.testing.assert_allclose(wrong, 0, atol=1e-9)

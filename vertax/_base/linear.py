@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -11,50 +12,74 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+Several = tuple[Array, ...]
+
 
 def linear_pair(
-    name: str, there: Callable[..., Array], back: Callable[..., Array]
-) -> Callable[..., Array]:
+    name: str, there: Callable[..., Several], back: Callable[..., Several]
+) -> Callable[..., Several]:
     """The first of two functions that are each other's transpose, as JAX is to know it.
 
     The transpose of a look at an array, `x[indices]`, is a scatter to JAX, which takes twice as long on a CPU
-    and adds up in any order on a GPU. Where it can be a look as well, here is how to say so.
+    and adds up in any order on a GPU. Where it can be a look as well, here is how to say so. (And what comes
+    apart need not be put together for it.)
 
     **Arguments:**
 
     - `name`: what it is called in a program.
-    - `there`: a function of an array, in which it is linear, and of others, in which it is not
-        differentiated.
-    - `back`: its transpose: of the cotangent, and of the same others.
+    - `there`: a function of several arrays, in which it is linear, and of other arguments, in which it is not
+        differentiated; it returns several arrays.
+    - `back`: its transpose: of the cotangents, and of the same others.
     """
     one, other = Primitive(name), Primitive(f"{name}_transposed")
     _define(one, there, other)
     _define(other, back, one)
-    return one.bind
+    return lambda parts, *others: tuple(one.bind(*parts, *others, number=len(parts)))
 
 
-def _define(primitive: Primitive, function: Callable[..., Array], transposed: Primitive) -> None:
-    def outcome(*operands: Any) -> jax.core.ShapedArray:
-        out = jax.eval_shape(function, *operands)
-        return jax.core.ShapedArray(out.shape, out.dtype)
+def _define(primitive: Primitive, function: Callable[..., Several], transposed: Primitive) -> None:
+    primitive.multiple_results = True
 
-    def jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-        value, (tangent, *_) = primitive.bind(*primals), tangents
-        if type(tangent) is ad.Zero:
-            return value, ad.Zero(jax.typeof(value).to_tangent_aval())
-        return value, primitive.bind(tangent, *primals[1:])
+    def flat(*operands: Any, number: int) -> list[Array]:
+        return list(function(operands[:number], *operands[number:]))
 
-    def transpose(cotangent: Any, x: Any, *others: Any) -> list[Any]:
-        zero = type(cotangent) is ad.Zero
-        result = ad.Zero(x.aval) if zero else transposed.bind(cotangent, *others)
-        return [result, *(None for _ in others)]
+    def outcome(*operands: Any, number: int) -> list[jax.core.ShapedArray]:
+        out = jax.eval_shape(functools.partial(flat, number=number), *operands)
+        return [jax.core.ShapedArray(x.shape, x.dtype) for x in out]
 
-    def batched(operands: Any, axes: Any) -> tuple[Array, int]:
-        return jax.vmap(function, in_axes=axes)(*operands), 0
+    def jvp(primals: Any, tangents: Any, number: int) -> tuple[Any, Any]:
+        values = primitive.bind(*primals, number=number)
+        parts = tangents[:number]
+        if all(type(part) is ad.Zero for part in parts):
+            return values, [ad.Zero(jax.typeof(value).to_tangent_aval()) for value in values]
+        parts = map(ad.instantiate_zeros, parts)
+        return values, primitive.bind(*parts, *primals[number:], number=number)
 
-    primitive.def_impl(jax.jit(function))
+    def transpose(cotangents: Any, *operands: Any, number: int) -> list[Any]:
+        parts, others = operands[:number], operands[number:]
+        # (A part that is known is one that was filled up with zeros.)
+        linear = [ad.is_undefined_primal(part) for part in parts]
+        if all(type(part) is ad.Zero for part in cotangents):
+            zeros = lambda part: ad.Zero(part.aval)
+            result = [
+                zeros(part) if is_linear else None
+                for part, is_linear in zip(parts, linear, strict=True)
+            ]
+        else:
+            cotangents = [ad.instantiate_zeros(part) for part in cotangents]
+            result = transposed.bind(*cotangents, *others, number=len(cotangents))
+            result = [
+                part if is_linear else None for part, is_linear in zip(result, linear, strict=True)
+            ]
+        return [*result, *(None for _ in others)]
+
+    def batched(operands: Any, axes: Any, number: int) -> tuple[list[Array], list[int]]:
+        out = jax.vmap(functools.partial(flat, number=number), in_axes=axes)(*operands)
+        return out, [0] * len(out)
+
+    primitive.def_impl(jax.jit(flat, static_argnames="number"))
     primitive.def_abstract_eval(outcome)
     ad.primitive_jvps[primitive] = jvp
     ad.primitive_transposes[primitive] = transpose
     batching.primitive_batchers[primitive] = batched
-    mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=False))
+    mlir.register_lowering(primitive, mlir.lower_fun(flat, multiple_results=True))

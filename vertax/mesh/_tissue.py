@@ -486,7 +486,7 @@ class Tissue(eqx.Module):
         m = self.topology
         following = edge_neighbourhood(m)[-1]
         offset = self.boundary.translation(take(m.frame, following) - take(m.frame, m.half_edge))
-        (x, to_x), (y, to_y) = at_ends(m, self.vertices)
+        x, y, to_x, to_y = at_ends(m, self.vertices)
         return x, y, to_x + offset[:, 0] - x, to_y + offset[:, 1] - y
 
     def _chords(self, segments: tuple[Float[Array, " edges"], ...]) -> Float[Array, " edges"]:

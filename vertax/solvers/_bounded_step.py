@@ -91,6 +91,8 @@ def bounded_step(
     def solved(system: System) -> System:
         """A system solved, or so far that it needs another shift."""
         shift, cuts = system.shift, system.cuts
+        # A step that goes on from another one is cut first, and solved then.
+        cut_first = system.rounds < 0
         left = lambda g, h, s, p: g + h + times(s, p)
         r = jax.tree.map(left, g, system.hp, shift, system.p)
         preconditioned = preconditioner(shift)
@@ -136,6 +138,13 @@ def bounded_step(
         begin += (_furthest(system.p, bounds),)
         end = _Directions(*begin, convex=yes, small=no, far=no, k=system.k)
         end = jax.lax.while_loop(proceed, iterate, end)
+        # (A cut must not tear what is stiff, or nothing is gained: then the whole step is shortened.)
+        shorter = jnp.minimum(1, _OVER / jnp.where(begin[-1] > 0, begin[-1], 1))
+        shortened = tree.scale(shorter, system.p), tree.scale(shorter, system.hp)
+        gain = lambda p, hp: -(inner(g, p) + 0.5 * inner(p, hp))
+        torn = cuts & ~cut_first & (gain(end.p, end.hp) < gain(*shortened))
+        p, hp = choose(torn, shortened, (end.p, end.hp))
+        end = end._replace(p=p, hp=hp)
 
         # That is a new system, which goes on from here, as does one that is made convex.
         typical = jnp.abs(inner(g, end.p)) / inner(end.p, end.p)
@@ -153,8 +162,6 @@ def bounded_step(
         done = nothing_left | jnp.where(end.far, system.rounds >= _ROUNDS, end.small)
         # Vertices may go somewhat further than they should, but none by much.
         over = ~cuts & (end.furthest > _OVER) & (done | (end.k >= max_products))
-        # A step that goes on from another one is cut first, and solved then.
-        cut_first = system.rounds < 0
         rounds = system.rounds + (end.far | cut_first)
         return System(end.p, end.hp, shift, rounds, done & ~over & ~cut_first, end.k, whole, over)
 

@@ -18,6 +18,8 @@ from vertax.mesh._topology import take
 
 # Smaller tissues have no waves that are long enough to be slow, and pay more than they gain.
 FEWEST_CELLS = 300
+# A finer grid finds the same in no fewer steps, and a coarser one takes more of them.
+_CELLS_A_POINT = 4
 
 
 class LongWaves(eqx.Module):
@@ -25,7 +27,7 @@ class LongWaves(eqx.Module):
 
     Krylov methods take as many steps as the wave length of the softest motion is long, in cells: in a tissue
     of $10^4$ cells a thousand. Long waves are those of an elastic medium, though, which Fourier transforms
-    solve. So the residual goes to a grid of about a point a cell, is divided there by
+    solve. So the residual goes to a grid of about a point for four cells, is divided there by
 
     $$a + \mu k^2 \text{ (transverse waves)}, \qquad a + \lambda k^2 \text{ (longitudinal waves)},$$
 
@@ -208,8 +210,11 @@ def _box(tissue: Tissue) -> tuple[Float[Array, "2 2"], Float[Array, "2"]]:
 
 
 def _good_size(n_cells: int) -> int:
-    """An odd number with small factors near √n: without a highest wave, which is its own mirror image."""
-    size = int(np.ceil(np.sqrt(n_cells))) | 1
+    """How many points a side has: an odd number with small factors.
+
+    (Without a highest wave, which is its own mirror image.)
+    """
+    size = int(np.ceil(np.sqrt(n_cells / _CELLS_A_POINT))) | 1
     while _rest(size) > 1:
         size += 2
     return size
