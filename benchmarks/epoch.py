@@ -5,8 +5,8 @@ And how much longer than without contacts an epoch takes, from several fits of b
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,10 @@ import vertax as vx
 jax.config.update("jax_enable_x64", True)
 # One object, so that fits share what is compiled.
 OPTIMISER = optax.adam(1e-2)
+ADJOINTS = {
+    "implicit": vx.ImplicitDifferentiation(),
+    "propagation": vx.EquilibriumPropagation(),
+}
 
 
 def run(problem: vx.InverseProblem, truth: vx.AbstractEnergy, epochs: int) -> vx.fitting.History:
@@ -30,13 +34,18 @@ def epoch_of(history: vx.fitting.History) -> float:
     return 1e3 * float(np.median(history.seconds[1:]))
 
 
-def main(sizes: tuple[int, ...] = (20, 100, 1000), epochs: int = 60) -> None:
+def main() -> None:
     """Print one row a size."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cells", type=int, nargs="*", default=[20, 100, 1000])
+    parser.add_argument("--adjoint", choices=list(ADJOINTS), default="implicit")
+    parser.add_argument("--epochs", type=int, default=60)
+    chosen = parser.parse_args()
     print(
         f"{'cells':>6} {'first epoch s':>14} {'ms/epoch':>9} {'Newton steps':>13} {'T1s':>4} "
         f"{'relative error':>24} {'over without contacts':>22}"
     )
-    for n in sizes:
+    for n in chosen.cells:
         tissue = vx.initialise.periodic_voronoi(n, key=jax.random.key(0))
         p0 = 3.7 + 0.1 * jax.random.normal(jax.random.key(1), (n,))
         truth = vx.energies.ShapeFactorEnergy(p0)
@@ -45,10 +54,12 @@ def main(sizes: tuple[int, ...] = (20, 100, 1000), epochs: int = 60) -> None:
             tissue=target,
             energy=vx.energies.ShapeFactorEnergy(jnp.full(n, 3.7)),
             cost=vx.costs.VertexDistance(target),
-            adjoint=vx.ImplicitDifferentiation(),
+            adjoint=ADJOINTS[chosen.adjoint],
         )
         free = dataclasses.replace(problem, response=vx.Relaxation(contact_range=None))
-        pairs = [(run(problem, truth, epochs), run(free, truth, epochs)) for _ in range(3)]
+        pairs = [
+            (run(problem, truth, chosen.epochs), run(free, truth, chosen.epochs)) for _ in range(3)
+        ]
         ratio = np.median([epoch_of(held) / epoch_of(without) for held, without in pairs])
         h = pairs[0][0]
         print(
@@ -59,4 +70,4 @@ def main(sizes: tuple[int, ...] = (20, 100, 1000), epochs: int = 60) -> None:
 
 
 if __name__ == "__main__":
-    main(tuple(int(x) for x in sys.argv[1:]) or (20, 100, 1000))
+    main()
