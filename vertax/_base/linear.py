@@ -48,30 +48,22 @@ def _define(primitive: Primitive, function: Callable[..., Several], transposed: 
         return [jax.core.ShapedArray(x.shape, x.dtype) for x in out]
 
     def jvp(primals: Any, tangents: Any, number: int) -> tuple[Any, Any]:
-        values = primitive.bind(*primals, number=number)
-        parts = tangents[:number]
-        if all(type(part) is ad.Zero for part in parts):
-            return values, [ad.Zero(jax.typeof(value).to_tangent_aval()) for value in values]
-        parts = map(ad.instantiate_zeros, parts)
-        return values, primitive.bind(*parts, *primals[number:], number=number)
+        # (JAX does not ask where all tangents are zero.)
+        parts = map(ad.instantiate_zeros, tangents[:number])
+        changes = primitive.bind(*parts, *primals[number:], number=number)
+        return primitive.bind(*primals, number=number), changes
 
     def transpose(cotangents: Any, *operands: Any, number: int) -> list[Any]:
         parts, others = operands[:number], operands[number:]
-        # (A part that is known is one that was filled up with zeros.)
-        linear = [ad.is_undefined_primal(part) for part in parts]
         if all(type(part) is ad.Zero for part in cotangents):
-            zeros = lambda part: ad.Zero(part.aval)
-            result = [
-                zeros(part) if is_linear else None
-                for part, is_linear in zip(parts, linear, strict=True)
-            ]
+            back = [ad.Zero(part.aval) for part in parts]
         else:
             cotangents = [ad.instantiate_zeros(part) for part in cotangents]
-            result = transposed.bind(*cotangents, *others, number=len(cotangents))
-            result = [
-                part if is_linear else None for part, is_linear in zip(result, linear, strict=True)
-            ]
-        return [*result, *(None for _ in others)]
+            back = transposed.bind(*cotangents, *others, number=len(cotangents))
+        # (A part that is known is one that was filled up with zeros.)
+        unknown = [ad.is_undefined_primal(part) for part in parts]
+        wanted = [x if is_unknown else None for x, is_unknown in zip(back, unknown, strict=True)]
+        return [*wanted, *(None for _ in others)]
 
     def batched(operands: Any, axes: Any, number: int) -> tuple[list[Array], list[int]]:
         out = jax.vmap(functools.partial(flat, number=number), in_axes=axes)(*operands)

@@ -135,14 +135,13 @@ def bounded_step(
         back = jax.tree.map(_cut, system.p, bounds)
         d, z = choose(cuts, (back, zero), (zero, z))
         begin = (system.p, system.hp, r, z, rz, jnp.where(cuts, jnp.ones_like(rz), 0), d, zero)
-        begin += (_furthest(system.p, bounds),)
-        end = _Directions(*begin, convex=yes, small=no, far=no, k=system.k)
+        furthest = _furthest(system.p, bounds)
+        end = _Directions(*begin, furthest, convex=yes, small=no, far=no, k=system.k)
         end = jax.lax.while_loop(proceed, iterate, end)
         # (A cut must not tear what is stiff, or nothing is gained: then the whole step is shortened.)
-        shorter = jnp.minimum(1, _OVER / jnp.where(begin[-1] > 0, begin[-1], 1))
-        shortened = tree.scale(shorter, system.p), tree.scale(shorter, system.hp)
-        gain = lambda p, hp: -(inner(g, p) + 0.5 * inner(p, hp))
-        torn = cuts & ~cut_first & (gain(end.p, end.hp) < gain(*shortened))
+        share = jnp.minimum(1, _OVER / jnp.where(furthest > 0, furthest, 1))
+        shortened = tree.scale(share, system.p), tree.scale(share, system.hp)
+        torn = cuts & ~cut_first & (gain(g, end.p, end.hp) < gain(g, *shortened))
         p, hp = choose(torn, shortened, (end.p, end.hp))
         end = end._replace(p=p, hp=hp)
 
@@ -197,6 +196,11 @@ class _Directions(NamedTuple):
     small: Bool[Array, ""]
     far: Bool[Array, ""]
     k: Int[Array, ""]
+
+
+def gain(g: PyTree, p: PyTree, hp: PyTree) -> Float[Array, ""]:
+    """The energy that a step gains in the quadratic model, from its product with the Hessian."""
+    return -(inner(g, p) + 0.5 * inner(p, hp))
 
 
 def _furthest(p: PyTree, bounds: Rows) -> Float[Array, ""]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
 from vertax._base.modules import choose
-from vertax.solvers._bounded_step import bounded_step
+from vertax.solvers._bounded_step import bounded_step, gain
 from vertax.solvers._rows import inner, mean_size, number_of, row_inner, sizes
 from vertax.solvers._solver import AbstractSolver, Rows, value_and_gradient
 
@@ -106,8 +106,7 @@ class NewtonCG(AbstractSolver):
                 options=options,
             )
             p, hp = solution.p, solution.hp
-            predicted = -(inner(last.gradient, p) + 0.5 * inner(p, hp))
-            predicted = jnp.where(first, predicted, last.predicted)
+            predicted = jnp.where(first, gain(last.gradient, p, hp), last.predicted)
             there = tree.add(last.y, p)
             value, gradient, aux = value_and_gradient(fn, there, args)
             better = first | (_finite(value, gradient) & (value < last.value))
@@ -130,12 +129,12 @@ class NewtonCG(AbstractSolver):
             # Near equilibrium the gain drowns in the rounding of E; there a step is good if it lowers the
             # force.
             lost = jnp.abs(predicted) <= _rounding(now.value)
-            gain, finite = state.value - now.value, _finite(now.value, now.gradient)
-            ratio = gain / jnp.where(predicted > 0, predicted, 1)
+            gained, finite = state.value - now.value, _finite(now.value, now.gradient)
+            ratio = gained / jnp.where(predicted > 0, predicted, 1)
             lower_force = inner(now.gradient, now.gradient) < inner(g, g)
             accepted = finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
-            wanting = near & finite & better & ~lost & (gain < _FINE * predicted)
+            wanting = near & finite & better & ~lost & (gained < _FINE * predicted)
             corrects = wanting & (now.corrections < _CORRECTIONS)
 
             # What a correction has not mended is to be blamed on the step.
