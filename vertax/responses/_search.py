@@ -15,6 +15,7 @@ from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._measured import Measured
 from vertax.responses._contact import Contacts, no_contacts
+from vertax.solvers._edge_blocks import EdgeBlocks
 from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._patience import Patient, PatientState
 from vertax.transitions import AbstractTransitions
@@ -124,7 +125,10 @@ class Search(eqx.Module):
         """A step of the minimiser (not the first time), then transitions."""
         before = state.tissue
         args = (before, energy, state.contacts)
-        options = self.options | {"long_waves": LongWaves.of(before)}
+        options = self.options | {
+            "long_waves": LongWaves.of(before),
+            "edge_blocks": EdgeBlocks.of(before, energy),
+        }
 
         def step() -> tuple[PyTree, PatientState]:
             y, new, _ = self.minimiser.step(

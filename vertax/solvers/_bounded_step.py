@@ -72,6 +72,15 @@ def bounded_step(
     def preconditioner(shift: Rows) -> Callable[[PyTree], PyTree]:
         yielding = jax.tree.map(lambda s: 1 / (stiffness + s), shift)
         near = lambda r: jax.tree.map(times, yielding, r)
+        blocks = options.get("edge_blocks")
+        if blocks is not None:
+            edges = blocks.compliance(jax.tree.leaves(shift)[0])
+
+            def near(r: PyTree) -> PyTree:
+                first, *rest = jax.tree.leaves(r)
+                others = [times(y, x) for y, x in zip(jax.tree.leaves(yielding)[1:], rest, strict=True)]
+                return jax.tree.unflatten(jax.tree.structure(r), [edges(first), *others])
+
         if waves is None:
             return near
         # A place that is held tightly must not hold all others, nor drag them along.
