@@ -178,7 +178,8 @@ class EdgeCompliance(eqx.Module):
         return out if self.moves is None else jnp.where(self.moves[:, None], out, 0)
 
 
-_SOFTEST = 1e-2
+import os
+_SOFTEST = float(os.environ.get("SOFT","1e-2"))
 
 
 def _direct(tissue: Tissue, energy: AbstractEnergy, known: Known) -> Float[Array, ""]:
