@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vertax as vx
+from vertax.solvers._edge_blocks import EdgeBlocks
 from vertax.solvers._elastic_minres import ElasticMINRES
 from vertax.solvers._long_waves import FEWEST_CELLS, LongWaves
 
@@ -77,7 +78,8 @@ def crystal():
     energy = vx.energies.ShapeFactorEnergy(3.6)
     force = lambda y, _: jax.grad(lambda y: energy(tissue.with_configuration(y)))(y)
     plain = vx.solvers.MINRES()
-    elastic = ElasticMINRES(plain, waves_of(tissue), STIFFNESS)
+    edges = EdgeBlocks.of(tissue, energy)
+    elastic = ElasticMINRES(plain, edges, waves_of(tissue), STIFFNESS)
 
     @eqx.filter_jit
     def solve(rhs, solver):

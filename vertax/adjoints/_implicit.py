@@ -73,9 +73,10 @@ class ImplicitDifferentiation(AbstractAdjoint):
         root, residual = minimisation.run()
         root, residual = frozen(root), jax.tree.map(eqxi.nondifferentiable_backward, residual)
         adjoint = cast(ImplicitDifferentiation, self.without_outcome())
-        waves = minimisation.options.get("long_waves")
-        if waves is not None and isinstance(self.linear_solver, MINRES):
-            solver = ElasticMINRES(self.linear_solver, waves, minimisation.options["stiffness"])
+        known = minimisation.options
+        if known.get("long_waves") is not None and isinstance(self.linear_solver, MINRES):
+            parts = (known[name] for name in ("edge_blocks", "long_waves", "stiffness"))
+            solver = ElasticMINRES(self.linear_solver, *parts)
             adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
         system = _System(adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag})
         if self.outcome is None:

@@ -23,6 +23,7 @@ from vertax.responses._contact import Contacts
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._search import Search, SearchState, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
+from vertax.solvers._edge_blocks import EdgeBlocks
 from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._optimistix import check_solver
 from vertax.solvers._patience import AtRest, Patient
@@ -257,6 +258,7 @@ def conclude(
         "relaxation": search.minimiser,
         "start": state.origin,
         "max_steps": jnp.asarray(max_steps),
+        "edge_blocks": frozen(EdgeBlocks.of(settled, energy)),
         "long_waves": frozen(LongWaves.of(settled)),
     }
     # This solve starts at rest and takes no step: it is there to be differentiated.

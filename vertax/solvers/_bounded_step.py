@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
 from vertax._base.modules import choose
+from vertax.solvers._edge_blocks import EdgeBlocks
 from vertax.solvers._long_waves import LongWaves, Stiffness
 from vertax.solvers._rows import inner, row_inner, sizes, times
 from vertax.solvers._solver import Rows
@@ -57,9 +58,10 @@ def bounded_step(
     - `forcing`: the residual to come to, in units of the first one.
     - `waving`: whether the long waves of a large tissue precondition it.
     - `max_products`: most products with the Hessian.
-    - `options`: of the minimiser: typical sizes.
+    - `options`: of the minimiser: typical sizes, and what preconditions it.
     """
     stiffness = options.get("stiffness", 1.0)
+    blocks: EdgeBlocks | None = options.get("edge_blocks")
     waves: LongWaves | None = options.get("long_waves")
     zero = tree.zeros_like(g)
     one = jnp.ones_like(forcing)
@@ -71,16 +73,10 @@ def bounded_step(
 
     def preconditioner(shift: Rows) -> Callable[[PyTree], PyTree]:
         yielding = jax.tree.map(lambda s: 1 / (stiffness + s), shift)
-        near = lambda r: jax.tree.map(times, yielding, r)
-        blocks = options.get("edge_blocks")
+        near = alone = lambda r: jax.tree.map(times, yielding, r)
         if blocks is not None:
             edges = blocks.compliance(jax.tree.leaves(shift)[0])
-
-            def near(r: PyTree) -> PyTree:
-                first, *rest = jax.tree.leaves(r)
-                others = [times(y, x) for y, x in zip(jax.tree.leaves(yielding)[1:], rest, strict=True)]
-                return jax.tree.unflatten(jax.tree.structure(r), [edges(first), *others])
-
+            near = lambda r: edges.of(r, alone(r))
         if waves is None:
             return near
         # A place that is held tightly must not hold all others, nor drag them along.

@@ -1,4 +1,4 @@
-"""A preconditioner that knows what a tissue is in the small: edges, with the cells around them."""
+"""A preconditioner that knows what a tissue is in the small: each edge with its two ends."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax._base.probe import probe
 from vertax._base.sums import total
@@ -16,7 +16,11 @@ from vertax.mesh import Tissue
 from vertax.mesh._ends import Ends
 from vertax.mesh._measured import Measured
 from vertax.mesh._tissue import Known
-from vertax.mesh._topology import source, take
+from vertax.mesh._topology import Topology, take
+
+# What a block resists with at least, in units of the mean of all. (From a tenth to three times of that the
+# steps are as many.)
+_SOFTEST = 1e-2
 
 
 class Symmetric(NamedTuple):
@@ -26,11 +30,13 @@ class Symmetric(NamedTuple):
     xy: Float[Array, " n"]
     yy: Float[Array, " n"]
 
-    def with_diagonal(self, more: Float[Array, " n"]) -> Symmetric:
+    def stiffened(self, more: Float[Array, "*n"]) -> Symmetric:
+        """With more on the diagonal."""
         return Symmetric(self.xx + more, self.xy, self.yy + more)
 
     @property
     def inverse(self) -> Symmetric:
+        """Their inverses."""
         determinant = self.xx * self.yy - self.xy**2
         return Symmetric(self.yy / determinant, -self.xy / determinant, self.xx / determinant)
 
@@ -45,145 +51,210 @@ class Square(NamedTuple):
 
 
 class EdgeBlocks(eqx.Module):
-    r"""The Hessian of a tissue as the two ends of each edge know it, all other vertices held.
+    r"""The Hessian of a tissue, as far as the two ends of each edge feel it while all others stay.
 
-    Of an energy of lengths $l$, areas $A$ and perimeters $P$ it takes
+    Conjugate gradients and MINRES take many steps where neighbouring vertices resist very differently: a
+    short edge under tension resists a turn a thousand times as much as a cell a change of its shape. So each
+    edge gives way on its own, its two ends together, and what all edges say of a vertex is added. (Additive
+    Schwarz method: Xu 1992, doi:10.1137/1034116, with subspaces of two vertices that overlap.)
 
-    $$\sum_c K_c \text{ in } (\nabla A_c, \nabla P_c) + \sum_e T_e \nabla^2 l_e + l''_e \nabla l_e \nabla l_e^T$$
+    Blocks are those of the energy as a function of lengths $l$, areas $A$ and perimeters $P$,
 
+    $$\sum_c \begin{pmatrix} \nabla A_c & \nabla P_c \end{pmatrix} K_c
+    \begin{pmatrix} \nabla A_c & \nabla P_c \end{pmatrix}^T
+    + \sum_e \left( T_e \nabla^2 l_e + l''_e \nabla l_e \nabla l_e^T \right),$$
+
+    with the second derivatives $K_c$ and $l''_e$ of the energy and the tensions $T_e$, each made positive
+    (and without pressures). What an energy says of vertices directly, as friction does, counts by its
+    mean. So blocks are positive definite whatever the Hessian is, and change the number of steps and not
+    where they lead.
     """
 
     ends: Ends
     first: Symmetric
+    """How each first end resists if it moves alone,"""
     second: Symmetric
+    """and the second one;"""
     between: Square
+    """which force on the first end comes of the second one's motion."""
     moves: Bool[Array, " vertices"] | None
     softest: Float[Array, ""]
 
     @classmethod
     def of(cls, tissue: Tissue, energy: AbstractEnergy) -> EdgeBlocks:
-        m = tissue.topology
-        known = tissue.measured()
-        slopes = jax.grad(lambda known: energy(Measured(tissue, known)))
-        slope, change = jax.linearize(slopes, known)
-        ones, zeros = jax.tree.map(jnp.ones_like, known), jax.tree.map(jnp.zeros_like, known)
-        along = lambda name: change(zeros._replace(**{name: getattr(ones, name)}))
-        by_area, by_perimeter = along("areas"), along("perimeters")
-        sound = lambda x: jnp.where(jnp.isfinite(x), jnp.maximum(x, 0), 0)
-        a, p = sound(by_area.areas), sound(by_perimeter.perimeters)
-        most = jnp.sqrt(a * p)
-        b = jnp.clip(jnp.where(jnp.isfinite(by_area.perimeters), by_area.perimeters, 0), -most, most)
-        of_cell = lambda x, h: x.at[take(m.cell, h)].get(mode="fill", fill_value=0)
-        h = jnp.arange(m.n_half_edges, dtype=m.twin.dtype)
-        stretch = sound(along("lengths").lengths)
-        tension = slope.lengths + total(
-            slope.perimeters.at[m.edge_cells[:, k]].get(mode="fill", fill_value=0) for k in (0, 1)
-        )
-        # Half-edges
-        vectors = tissue.edge_vectors
-        length = jnp.sqrt(jnp.sum(vectors**2, axis=-1) + tissue.softening**2)
-        unit = vectors / length[:, None]
-        stiff = sound(tension) / length
-        forward = lambda x: jnp.where(m.forward, x, -x)
-        vx, vy = (forward(take(vectors[:, k], m.edge)) for k in (0, 1))
-        ux, uy = (forward(take(unit[:, k], m.edge)) for k in (0, 1))
-        before = lambda x: take(x, m.previous)
-        area = 0.5 * (vy + before(vy)), -0.5 * (vx + before(vx))
-        perimeter = before(ux) - ux, before(uy) - uy
-        aa, ab, pp = (of_cell(x, h) for x in (a, b, p))
-        left = [aa * area[k] + ab * perimeter[k] for k in (0, 1)]
-        right = [ab * area[k] + pp * perimeter[k] for k in (0, 1)]
-
-        def corners(i: Array, j: Array, r: int, s: int) -> Array:
-            return take(left[r], i) * take(area[s], j) + take(right[r], i) * take(perimeter[s], j)
-
-        own = [
-            stiff * (1 - unit[:, 0] ** 2) + stretch * unit[:, 0] ** 2,
-            (stretch - stiff) * unit[:, 0] * unit[:, 1],
-            stiff * (1 - unit[:, 1] ** 2) + stretch * unit[:, 1] ** 2,
-        ]
-        pairs = ((0, 0), (0, 1), (1, 1))
-        diagonal = [
-            left[r] * area[s] + right[r] * perimeter[s] + take(own[k], m.edge)
-            for k, (r, s) in enumerate(pairs)
-        ]
-        diagonal = [jnp.sum(x.reshape(-1, 3), axis=1) for x in diagonal]
-        mean = 0.5 * jnp.mean(diagonal[0] + diagonal[2])
-        direct = _direct(tissue, energy, known)
-        first_end, second_end = m.half_edge, take(m.twin, m.half_edge)
-        i, j = source(first_end), source(second_end)
-        nexts = take(m.next, first_end), take(m.next, second_end)
-        between = [
-            corners(first_end, nexts[0], r, s) + corners(nexts[1], second_end, r, s) - own[k]
-            for (r, s), k in (((0, 0), 0), ((0, 1), 1), ((1, 0), 1), ((1, 1), 2))
-        ]
-        eps = 20 * jnp.finfo(mean.dtype).eps
-
-        def end(v: Array) -> Symmetric:
-            block = Symmetric(*(take(x, v) for x in diagonal))
-            return block.with_diagonal(eps * (block.xx + block.yy) + direct)
-
+        """Those of a tissue as it is now."""
+        m, known = tissue.topology, tissue.measured()
+        response = _Response.of(energy, tissue, known)
+        diagonal, between = _resistances(tissue, response)
+        mean = 0.5 * jnp.mean(diagonal.xx + diagonal.yy)
+        softest = _SOFTEST * mean + _directly(tissue, energy, known)
+        softest = jnp.where(softest > 0, softest, 1)
+        # (Rounding must not make a block indefinite, however stiff the edge.)
+        rounding = 20 * jnp.finfo(mean.dtype).eps * (diagonal.xx + diagonal.yy)
+        diagonal = diagonal.stiffened(rounding)
+        ends = Ends.of(m)
+        first, second = (Symmetric(*(take(x, end) for x in diagonal)) for end in ends.vertices)
         moves = None if tissue.held is None else ~tissue.held
-        return cls(Ends.of(m), end(i), end(j), Square(*between), moves, _SOFTEST * mean)
+        return cls(ends, first, second, between, moves, softest)
 
-    def compliance(self, shift: Float[Array, " vertices"]) -> EdgeCompliance:
-        x, y, b = self.first, self.second, self.between
-        i, j = (take(shift, end) for end in self.ends.vertices)
-        p = x.with_diagonal(i + self.softest).inverse
-        # P B
+    def compliance(self, shift: Float[Array, " vertices"] | float = 0.0) -> EdgeCompliance:
+        """How edges give way if a spring of stiffness `shift` holds each vertex besides."""
+        shift = jnp.broadcast_to(shift, self.ends.slots.shape[1:])
+        one, other = (take(shift, end) + self.softest for end in self.ends.vertices)
+        b, p = self.between, self.first.stiffened(one).inverse
+        # With the Schur complement of the first end.
         q = Square(
             p.xx * b.xx + p.xy * b.yx,
             p.xx * b.xy + p.xy * b.yy,
             p.xy * b.xx + p.yy * b.yx,
             p.xy * b.xy + p.yy * b.yy,
         )
-        y = y.with_diagonal(j + self.softest)
+        rest = self.second.stiffened(other)
         second = Symmetric(
-            y.xx - (b.xx * q.xx + b.yx * q.yx),
-            y.xy - (b.xx * q.xy + b.yx * q.yy),
-            y.yy - (b.xy * q.xy + b.yy * q.yy),
+            rest.xx - (b.xx * q.xx + b.yx * q.yx),
+            rest.xy - (b.xx * q.xy + b.yx * q.yy),
+            rest.yy - (b.xy * q.xy + b.yy * q.yy),
         ).inverse
-        s = second
-        c = Square(
-            -(q.xx * s.xx + q.xy * s.xy),
-            -(q.xx * s.xy + q.xy * s.yy),
-            -(q.yx * s.xx + q.yy * s.xy),
-            -(q.yx * s.xy + q.yy * s.yy),
+        between = Square(
+            -(q.xx * second.xx + q.xy * second.xy),
+            -(q.xx * second.xy + q.xy * second.yy),
+            -(q.yx * second.xx + q.yy * second.xy),
+            -(q.yx * second.xy + q.yy * second.yy),
         )
         first = Symmetric(
-            p.xx - (c.xx * q.xx + c.xy * q.xy),
-            p.xy - (c.xx * q.yx + c.xy * q.yy),
-            p.yy - (c.yx * q.yx + c.yy * q.yy),
+            p.xx - (between.xx * q.xx + between.xy * q.xy),
+            p.xy - (between.xx * q.yx + between.xy * q.yy),
+            p.yy - (between.yx * q.yx + between.yy * q.yy),
         )
-        return EdgeCompliance(self.ends, first, second, c, self.moves)
+        return EdgeCompliance(self.ends, first, second, between, self.moves)
 
 
 class EdgeCompliance(eqx.Module):
+    """How edges give way to forces on vertices."""
+
     ends: Ends
     first: Symmetric
     second: Symmetric
     between: Square
     moves: Bool[Array, " vertices"] | None
 
+    def of(self, force: PyTree, others: PyTree) -> PyTree:
+        """How vertices give way, as a part of a configuration; its other parts are those of `others`."""
+        _, *rest = jax.tree.leaves(others)
+        moved = self(jax.tree.leaves(force)[0])
+        return jax.tree.unflatten(jax.tree.structure(others), [moved, *rest])
+
     def __call__(self, force: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
+        """How they give way to forces on vertices."""
         x, y, to_x, to_y = self.ends.look(force)
         a, b, c = self.first, self.second, self.between
-        out = self.ends.back(
+        moved = self.ends.back(
             a.xx * x + a.xy * y + c.xx * to_x + c.xy * to_y,
             a.xy * x + a.yy * y + c.yx * to_x + c.yy * to_y,
             c.xx * x + c.yx * y + b.xx * to_x + b.xy * to_y,
             c.xy * x + c.yy * y + b.xy * to_x + b.yy * to_y,
         )
-        out = out / 3
-        return out if self.moves is None else jnp.where(self.moves[:, None], out, 0)
+        # Three edges speak of each vertex.
+        moved = moved / 3
+        return moved if self.moves is None else jnp.where(self.moves[:, None], moved, 0)
 
 
-import os
-_SOFTEST = float(os.environ.get("SOFT","1e-2"))
+class _Response(NamedTuple):
+    """How an energy answers to changes of what it asks of a tissue, nowhere softer than nothing."""
+
+    tension: Float[Array, " edges"]
+    stretch: Float[Array, " edges"]
+    area: Float[Array, " cells"]
+    mixed: Float[Array, " cells"]
+    perimeter: Float[Array, " cells"]
+
+    @classmethod
+    def of(cls, energy: AbstractEnergy, tissue: Tissue, known: Known) -> _Response:
+        slope, change = jax.linearize(
+            jax.grad(lambda known: energy(Measured(tissue, known))), known
+        )
+        none = jax.tree.map(jnp.zeros_like, known)
+        # All areas at once, and so on: the terms of an energy are those of single cells and edges.
+        along = lambda **one: change(none._replace(**one))
+        by_length = along(lengths=jnp.ones_like(known.lengths))
+        by_area = along(areas=jnp.ones_like(known.areas))
+        by_perimeter = along(perimeters=jnp.ones_like(known.perimeters))
+        finite = lambda x: jnp.where(jnp.isfinite(x), x, 0)
+        positive = lambda x: jnp.maximum(finite(x), 0)
+        area, perimeter = positive(by_area.areas), positive(by_perimeter.perimeters)
+        most = jnp.sqrt(area * perimeter)
+        mixed = jnp.clip(finite(by_area.perimeters), -most, most)
+        sides = tissue.topology.edge_cells.T
+        tension = slope.lengths + total(_of_cells(slope.perimeters, side) for side in sides)
+        return cls(positive(tension), positive(by_length.lengths), area, mixed, perimeter)
 
 
-def _direct(tissue: Tissue, energy: AbstractEnergy, known: Known) -> Float[Array, ""]:
+def _resistances(tissue: Tissue, response: _Response) -> tuple[Symmetric, Square]:
+    """The blocks of single vertices, and those between the two ends of each edge."""
+    m = tissue.topology
+    vectors = tissue.edge_vectors.T
+    length = jnp.sqrt(total(vectors**2) + tissue.softening**2)
+    length = jnp.where(length > 0, length, 1)
+    unit = vectors / length
+    stiff = response.tension / length
+    own = Symmetric(
+        *(
+            (stiff if i == j else 0) + (response.stretch - stiff) * unit[i] * unit[j]
+            for i, j in _PAIRS
+        )
+    )
+    # Of each corner of a cell: the gradients of its area and perimeter, and those times K.
+    areas, perimeters = _corners(m, vectors, unit)
+    by_area, mixed, by_perimeter = (
+        _of_cells(x, m.cell) for x in (response.area, response.mixed, response.perimeter)
+    )
+    pull = [by_area * a + mixed * p for a, p in zip(areas, perimeters, strict=True)]
+    drag = [mixed * a + by_perimeter * p for a, p in zip(areas, perimeters, strict=True)]
+
+    def around(i: int, j: int, edges: Float[Array, " edges"]) -> Float[Array, " vertices"]:
+        each = pull[i] * areas[j] + drag[i] * perimeters[j] + take(edges, m.edge)
+        return total(each[slot::3] for slot in range(3))
+
+    diagonal = Symmetric(*(around(*pair, x) for pair, x in zip(_PAIRS, own, strict=True)))
+    here, there = m.half_edge, take(m.twin, m.half_edge)
+    # (A cell's corner at the second end comes after the one at the first, or before it.)
+    sides = ((here, take(m.next, here)), (take(m.next, there), there))
+    both = [
+        total(
+            take(pull[i], one) * take(areas[j], other)
+            + take(drag[i], one) * take(perimeters[j], other)
+            for one, other in sides
+        )
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))
+    ]
+    xx, xy, yx, yy = both
+    return diagonal, Square(xx - own.xx, xy - own.xy, yx - own.xy, yy - own.yy)
+
+
+_PAIRS = ((0, 0), (0, 1), (1, 1))
+
+
+def _corners(
+    m: Topology, vectors: Float[Array, "2 edges"], unit: Float[Array, "2 edges"]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """The gradients of a cell's area, and of its perimeter, where each half-edge begins."""
+    half_edges = lambda x: jnp.where(m.forward, take(x, m.edge), -take(x, m.edge))
+    (x, y), (ux, uy) = map(half_edges, vectors), map(half_edges, unit)
+    before = lambda x: take(x, m.previous)
+    area = 0.5 * (y + before(y)), -0.5 * (x + before(x))
+    return area, (before(ux) - ux, before(uy) - uy)
+
+
+def _of_cells(values: Float[Array, " cells"], cells: Array) -> Array:
+    # (The exterior has no energy.)
+    return values.at[cells].get(mode="fill", fill_value=0)
+
+
+def _directly(tissue: Tissue, energy: AbstractEnergy, known: Known) -> Float[Array, ""]:
+    """The mean resistance to motions of vertices that change nothing else that is known."""
+    # (Mostly there is none, and JAX knows it.)
     slope = jax.grad(lambda vertices: energy(Measured(tissue.with_vertices(vertices), known)))
     direction = probe(tissue.vertices)
     _, response = jax.jvp(slope, (tissue.vertices,), (direction,))
-    return jnp.maximum(jnp.sum(direction * response) / jnp.sum(direction**2), 0)
+    mean = jnp.sum(direction * response) / jnp.sum(direction**2)
+    return jnp.where(jnp.isfinite(mean), jnp.maximum(mean, 0), 0)

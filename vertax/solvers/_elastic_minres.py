@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from vertax.solvers._edge_blocks import EdgeBlocks, EdgeCompliance
 from vertax.solvers._long_waves import Compliance, LongWaves
 from vertax.solvers._minres import MINRES
 
 
 class _Attempt(NamedTuple):
-    """What came of solving a system with the long waves' help or, the second time, without."""
+    """What came of solving a system with such help or, the second time, without."""
 
     solution: PyTree[Array]
     result: lx.RESULTS
@@ -23,34 +24,38 @@ class _Attempt(NamedTuple):
     again: Bool[Array, ""]
 
 
-class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance]]):
-    """MINRES for the Hessian of a large tissue, preconditioned by its long waves.
+class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance, EdgeCompliance]]):
+    """MINRES for the Hessian of a large tissue, preconditioned by its edges and its long waves.
 
     Where the system has no solution, as if there are zero modes that the right-hand side sees, the result
     would depend on the preconditioner: such a system is solved again without.
     """
 
     plain: MINRES
+    edges: EdgeBlocks
     waves: LongWaves
     stiffness: Float[Array, ""]
 
     def init(
         self, operator: lx.AbstractLinearOperator, options: dict[str, Any]
-    ) -> tuple[Any, Compliance]:
+    ) -> tuple[Any, Compliance, EdgeCompliance]:
         linear = self.plain.init(operator, options)
         stiffness = self.waves.measured(linear.mv, operator.in_structure(), self.stiffness)
-        return linear, self.waves.compliance(stiffness)
+        return linear, self.waves.compliance(stiffness), self.edges.compliance()
 
     def compute(
-        self, state: tuple[Any, Compliance], vector: PyTree[Array], options: dict[str, Any]
+        self,
+        state: tuple[Any, Compliance, EdgeCompliance],
+        vector: PyTree[Array],
+        options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        linear, medium = state
+        linear, medium, edges = state
 
         def attempt(last: _Attempt) -> _Attempt:
             def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
-                near = jax.tree.map(lambda x: x / self.stiffness, r)
-                helped = lambda: medium.added(near, r)
-                return jax.lax.cond(last.helped, helped, lambda: near)
+                alone = jax.tree.map(lambda x: x / self.stiffness, r)
+                helped = lambda: medium.added(edges.of(r, alone), r)
+                return jax.lax.cond(last.helped, helped, lambda: alone)
 
             preconditioner = lx.FunctionLinearOperator(
                 approximate_inverse, linear.in_structure(), lx.positive_semidefinite_tag

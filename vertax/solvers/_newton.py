@@ -88,16 +88,18 @@ class NewtonCG(AbstractSolver):
         useful = jnp.minimum(_ROUGH, _USEFUL * (mean_force / before) ** 2)
         forcing = jnp.minimum(_COARSEST, jnp.maximum(finest, useful))
         no, yes, none = jnp.array(False), jnp.array(True), jnp.array(0)
+        whole = jnp.ones_like(state.value)
 
         def attempt(last: _Trial) -> _Trial:
             """A step, or the correction of one."""
             first, resumes = ~last.corrects, ~last.corrects & (last.refusals > 0)
+            bound = last.room * reach
             _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], last.y)
             solution = bounded_step(
                 hessian,
                 last.gradient,
                 last.shift,
-                jax.tree.map(lambda radius: jnp.minimum(radius, reach), last.radii),
+                jax.tree.map(lambda radius: jnp.minimum(radius, bound), last.radii),
                 start=choose(resumes, last.uncorrected[:2], (zero, zero)),
                 resumes=resumes,
                 forcing=jnp.where(first, forcing, _LOOSE),
@@ -121,6 +123,7 @@ class NewtonCG(AbstractSolver):
                 corrections=last.corrections + ~first,
                 refusals=last.refusals,
                 corrects=yes,
+                room=jnp.where(first, _NARROW, jnp.where(better, 1, _NARROWER) * last.room),
                 again=no,
                 accepted=no,
                 uncorrected=choose(first, (p, hp, gradient), last.uncorrected),
@@ -134,7 +137,7 @@ class NewtonCG(AbstractSolver):
             lower_force = inner(now.gradient, now.gradient) < inner(g, g)
             accepted = finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
-            wanting = near & finite & better & ~lost & (gained < _FINE * predicted)
+            wanting = near & finite & ~lost & (gained < _FINE * predicted)
             corrects = wanting & (now.corrections < _CORRECTIONS)
 
             # What a correction has not mended is to be blamed on the step.
@@ -184,6 +187,7 @@ class NewtonCG(AbstractSolver):
                 refusals=now.refusals + 1,
                 corrections=none,
                 corrects=no,
+                room=whole,
             )
             return choose(retries & ~corrects, refused, now)
 
@@ -198,6 +202,7 @@ class NewtonCG(AbstractSolver):
             corrections=none,
             refusals=none,
             corrects=no,
+            room=whole,
             again=yes,
             accepted=no,
             uncorrected=(zero, zero, g),
@@ -240,6 +245,8 @@ class _Trial(NamedTuple):
     corrections: Int[Array, ""]
     refusals: Int[Array, ""]
     corrects: Bool[Array, ""]
+    room: Float[Array, ""]
+    """How far the next attempt may go, in units of the furthest that a vertex may."""
     """Whether the next attempt corrects this one."""
     again: Bool[Array, ""]
     accepted: Bool[Array, ""]
@@ -256,8 +263,11 @@ _ROUGH = 0.1
 _USEFUL = 0.9
 # A step that gains less than this share of what it should is corrected, so many times at most, so well.
 _FINE = 0.9
-_CORRECTIONS = 3
+_CORRECTIONS = 6
 _LOOSE = 0.3
+# A correction goes no further than this share of what steps may; after one that gains nothing, of that.
+_NARROW = 0.3
+_NARROWER = 0.1
 # A step that gains nothing is tried again so often, if less than this share of the vertices are to blame.
 _RETRIES = 3
 _FEW = 0.02
