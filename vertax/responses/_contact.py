@@ -24,6 +24,7 @@ from vertax.mesh._sides import (
     wedge,
 )
 from vertax.mesh._topology import source, take
+from vertax.solvers._edge_blocks import Symmetric
 
 # A face comes to overlap itself where a corner reaches a side that it does not end. A barrier holds it off
 # (Li et al. 2020, doi:10.1145/3386569.3392425), with s = (D/d)² for the distance D and a range d:
@@ -91,12 +92,46 @@ class Contacts(eqx.Module):
         return self.strength * jnp.sum(self._heights(_kinds(tissue, pairs), one, other))
 
     def _energy_of_few(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
+        _, places = self._places(tissue, pairs)
+        return _barrier(self, _kinds(tissue, pairs), places)
+
+    def resistance(self, tissue: Tissue) -> Symmetric | None:
+        """How the barrier resists where one vertex moves alone, nowhere softer than nothing.
+
+        Of so many contacts as there mostly are, for a preconditioner; None for arcs.
+        """
+        if tissue.arcs is not None:
+            return None
+        pairs = self.pairs[: max(_FEW, len(self.pairs) // 16)]
+        ends, places = self._places(tissue, pairs)
+        kinds = _kinds(tissue, pairs)
+        rows = _along_each(lambda x: _slopes.fun(self, kinds, x), places)
+        # The corner moves the first vector, the end of the side its chord, and its start both.
+        part = lambda i, j: Symmetric(rows[i][j], rows[i][j + 1], rows[i + 1][j + 1])
+        corner, chord = part(0, 0), part(2, 2)
+        start = Symmetric(
+            *(
+                rows[i][j] + rows[i][j + 2] + rows[i + 2][j] + rows[i + 2][j + 2]
+                for i, j in ((0, 0), (0, 1), (1, 1))
+            )
+        )
+        nothing = jnp.zeros(tissue.n_vertices, tissue.vertices.dtype)
+
+        def gathered(*blocks: Float[Array, " some"]) -> Float[Array, " vertices"]:
+            return nothing.at[source(ends)].add(jnp.stack(blocks))
+
+        blocks = (block.positive for block in (corner, start, chord))
+        return Symmetric(*(gathered(*each) for each in zip(*blocks, strict=True)))
+
+    def _places(
+        self, tissue: Tissue, pairs: Int[Array, "some 2"]
+    ) -> tuple[Int[Array, "3 some"], Float[Array, "some 4"]]:
+        """The half-edges that begin at corners, and at the ends of sides; and where those are."""
         corner, side = pairs.T
         # (At once: the derivative of every look at the vertices is as long as all of them.)
         ends = jnp.stack([corner, side, take(tissue.topology.next, side)])
         corner, start, end = tissue.corners_of(ends)
-        places = jnp.concatenate([corner - start, end - start], axis=-1)
-        return _barrier(self, _kinds(tissue, pairs), places)
+        return ends, jnp.concatenate([corner - start, end - start], axis=-1)
 
     def _in_range(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Bool[Array, ""]:
         return jnp.any(jnp.stack([near < 1 for near, _ in self._between(tissue, pairs)]))
@@ -259,6 +294,8 @@ def _along_each(
     return jax.vmap(along)(jnp.eye(4, dtype=places.dtype))
 
 
+# So many contacts count for a preconditioner at least.
+_FEW = 64
 # From so many places for a contact on it pays to look whether a few would do.
 _MANY = 1000
 # The barrier pushes hardest at FLOOR (squared distance over range) and not at all at 0. Only too long a step

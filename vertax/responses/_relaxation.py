@@ -21,9 +21,8 @@ from vertax.energies._units import Units, units_of
 from vertax.mesh import Tissue
 from vertax.responses._contact import Contacts
 from vertax.responses._response import AbstractResponse, Equilibrium
-from vertax.responses._search import Search, SearchState, objective
+from vertax.responses._search import Search, SearchState, blocks_of, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
-from vertax.solvers._edge_blocks import EdgeBlocks
 from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._optimistix import check_solver
 from vertax.solvers._patience import AtRest, Patient
@@ -258,7 +257,7 @@ def conclude(
         "relaxation": search.minimiser,
         "start": state.origin,
         "max_steps": jnp.asarray(max_steps),
-        "edge_blocks": frozen(EdgeBlocks.of(settled, energy)),
+        "edge_blocks": frozen(blocks_of(settled, energy, state.contacts)),
         "long_waves": frozen(LongWaves.of(settled)),
     }
     # This solve starts at rest and takes no step: it is there to be differentiated.

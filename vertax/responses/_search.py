@@ -127,7 +127,7 @@ class Search(eqx.Module):
         args = (before, energy, state.contacts)
         options = self.options | {
             "long_waves": LongWaves.of(before),
-            "edge_blocks": EdgeBlocks.of(before, energy),
+            "edge_blocks": blocks_of(before, energy, state.contacts),
         }
 
         def step() -> tuple[PyTree, PatientState]:
@@ -266,6 +266,12 @@ def objective(
     there = tissue.with_configuration(configuration)
     value = energy(Measured(there))
     return value if contacts is None else value + contacts(there), None
+
+
+def blocks_of(tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None) -> EdgeBlocks:
+    """How edges resist, and contacts."""
+    more = None if contacts is None else contacts.resistance(tissue)
+    return EdgeBlocks.of(tissue, energy, more)
 
 
 def _around(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:

@@ -35,6 +35,17 @@ class Symmetric(NamedTuple):
         return Symmetric(self.xx + more, self.xy, self.yy + more)
 
     @property
+    def positive(self) -> Symmetric:
+        """Without what is negative in them."""
+        mean = 0.5 * (self.xx + self.yy)
+        half = jnp.sqrt(0.25 * (self.xx - self.yy) ** 2 + self.xy**2)
+        least, most = mean - half, mean + half
+        # Of two eigenvalues of different sign only the larger one stays, with its own direction.
+        share = jnp.maximum(most, 0) / jnp.where(half > 0, 2 * half, 1)
+        part = Symmetric(share * (self.xx - least), share * self.xy, share * (self.yy - least))
+        return Symmetric(*(jnp.where(least >= 0, x, y) for x, y in zip(self, part, strict=True)))
+
+    @property
     def inverse(self) -> Symmetric:
         """Their inverses."""
         determinant = self.xx * self.yy - self.xy**2
@@ -81,14 +92,25 @@ class EdgeBlocks(eqx.Module):
     softest: Float[Array, ""]
 
     @classmethod
-    def of(cls, tissue: Tissue, energy: AbstractEnergy) -> EdgeBlocks:
-        """Those of a tissue as it is now."""
+    def of(
+        cls, tissue: Tissue, energy: AbstractEnergy, more: Symmetric | None = None
+    ) -> EdgeBlocks:
+        """Those of a tissue as it is now.
+
+        **Arguments:**
+
+        - `tissue`: the tissue.
+        - `energy`: its energy.
+        - `more`: how vertices resist besides, each on its own.
+        """
         m, known = tissue.topology, tissue.measured()
         response = _Response.of(energy, tissue, known)
         diagonal, between = _resistances(tissue, response)
         mean = 0.5 * jnp.mean(diagonal.xx + diagonal.yy)
         softest = _SOFTEST * mean + _directly(tissue, energy, known)
         softest = jnp.where(softest > 0, softest, 1)
+        if more is not None:
+            diagonal = Symmetric(*(x + y for x, y in zip(diagonal, more, strict=True)))
         # (Rounding must not make a block indefinite, however stiff the edge.)
         rounding = 20 * jnp.finfo(mean.dtype).eps * (diagonal.xx + diagonal.yy)
         diagonal = diagonal.stiffened(rounding)
