@@ -9,10 +9,15 @@ from hypothesis import given, settings, strategies as st
 
 import vertax as vx
 from vertax.responses._search import objective
-from vertax.solvers._edge_blocks import EdgeBlocks
+from vertax.solvers._edge_blocks import EdgeBlocks, EdgeCompliance, Symmetric
 from vertax.solvers._solver import value_and_gradient
 
-blocks_of = eqx.filter_jit(EdgeBlocks.of)
+
+@eqx.filter_jit
+def blocks_of(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> EdgeBlocks:
+    blocks = EdgeBlocks.of(tissue, energy)
+    assert blocks is not None
+    return blocks
 
 
 def foam(n: int = 36, seed: int = 0) -> vx.Tissue:
@@ -30,7 +35,7 @@ def dense_hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> np.ndarray:
     return np.asarray(jax.jit(jax.hessian(at))(tissue.vertices)).reshape(2 * n, 2 * n)
 
 
-def both_ends(blocks: EdgeBlocks, edge: int) -> np.ndarray:
+def both_ends(blocks: EdgeBlocks | EdgeCompliance, edge: int) -> np.ndarray:
     """The block of an edge, four rows."""
     x, y, b = blocks.first, blocks.second, blocks.between
     off = np.array([[b.xx[edge], b.xy[edge]], [b.yx[edge], b.yy[edge]]])
@@ -86,7 +91,7 @@ def test_they_give_way_symmetrically_and_in_the_direction_of_a_force(seed, low, 
 
 @eqx.filter_jit
 def _compliance(tissue, energy, shift):
-    return EdgeBlocks.of(tissue, energy).compliance(shift)
+    return blocks_of(tissue, energy).compliance(shift)
 
 
 def test_the_inverse_is_that_of_each_block():
@@ -94,7 +99,6 @@ def test_the_inverse_is_that_of_each_block():
     blocks = blocks_of(tissue, tense(tissue))
     shift = jnp.linspace(0.1, 2.0, tissue.n_vertices)
     compliance = blocks.compliance(shift)
-    # (It has the fields of blocks.)
     for edge, ends in enumerate(np.asarray(tissue.topology.edge_vertices)):
         more = np.repeat(np.asarray(shift)[ends] + float(blocks.softest), 2)
         expected = np.linalg.inv(both_ends(blocks, edge) + np.diag(more))
@@ -136,6 +140,58 @@ def test_what_an_energy_says_of_vertices_directly_counts_by_its_mean():
     energy = tense(tissue)
     without, with_friction = blocks_of(tissue, energy), blocks_of(tissue, energy + Friction())
     np.testing.assert_allclose(with_friction.softest - without.softest, 7.0, rtol=1e-9)
+
+
+def test_arcs_have_none():
+    start = vx.initialise.free_voronoi(30, key=0)
+    bent = vx.Tissue(start.vertices, start.topology, vx.Free(), angles=jnp.full(start.n_edges, 0.1))
+    assert EdgeBlocks.of(bent, vx.energies.AreaElasticity(1.0, 1.0)) is None
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-10, 10), min_size=3, max_size=3))
+def test_of_a_symmetric_matrix_only_what_is_positive_stays(entries):
+    xx, xy, yy = entries
+    found = Symmetric(*(jnp.array([x]) for x in entries)).positive
+    values, vectors = np.linalg.eigh([[xx, xy], [xy, yy]])
+    expected = (vectors * np.maximum(values, 0)) @ vectors.T
+    np.testing.assert_allclose(
+        [found.xx[0], found.xy[0], found.yy[0]],
+        [expected[0, 0], expected[0, 1], expected[1, 1]],
+        atol=1e-9,
+    )
+
+
+def test_contacts_count_as_their_hessian_does():
+    # Of a corner that comes near a side: three vertices, each with a block on the diagonal.
+    tissue = foam(100, seed=2)
+    energy = vx.energies.ShapeFactorEnergy(4.3)
+    search = vx.Relaxation(contact_range=0.05).search(tissue, energy)
+    state = search.advance(search.begin(tissue, energy), energy, 12)
+    contacts, there = state.contacts, state.tissue
+    assert contacts is not None
+    assert contacts(there) > 0
+    hessian = jax.jit(jax.hessian(lambda x: contacts(there.with_vertices(x))))(there.vertices)
+    found = contacts.resistance(there)
+    several = np.bincount(_vertices_of(contacts, there), minlength=there.n_vertices)
+    checked = 0
+    for vertex in np.flatnonzero(several == 1):
+        values, vectors = np.linalg.eigh(hessian[vertex, :, vertex])
+        block = (vectors * np.maximum(values, 0)) @ vectors.T
+        mine = [found.xx[vertex], found.xy[vertex], found.yy[vertex]]
+        expected = [block[0, 0], block[0, 1], block[1, 1]]
+        np.testing.assert_allclose(mine, expected, atol=1e-8 * float(jnp.abs(hessian).max()))
+        checked += np.abs(block).max() > 0
+    assert checked > 0
+    untouched = several == 0
+    assert not jnp.any(jnp.where(untouched, found.xx + found.yy, 0))
+
+
+def _vertices_of(contacts, tissue) -> np.ndarray:
+    corner, side = (np.asarray(x) for x in contacts.pairs.T)
+    real = corner != side
+    after = np.asarray(tissue.topology.next)[side]
+    return np.concatenate([corner[real], side[real], after[real]]) // 3
 
 
 def test_conjugate_gradients_take_far_fewer_steps_under_tensions():

@@ -95,13 +95,11 @@ class Contacts(eqx.Module):
         _, places = self._places(tissue, pairs)
         return _barrier(self, _kinds(tissue, pairs), places)
 
-    def resistance(self, tissue: Tissue) -> Symmetric | None:
+    def resistance(self, tissue: Tissue) -> Symmetric:
         """How the barrier resists where one vertex moves alone, nowhere softer than nothing.
 
-        Of so many contacts as there mostly are, for a preconditioner; None for arcs.
+        For a preconditioner: of straight sides, and of so many contacts as there mostly are.
         """
-        if tissue.arcs is not None:
-            return None
         pairs = self.pairs[: max(_FEW, len(self.pairs) // 16)]
         ends, places = self._places(tissue, pairs)
         kinds = _kinds(tissue, pairs)

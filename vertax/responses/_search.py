@@ -268,10 +268,13 @@ def objective(
     return value if contacts is None else value + contacts(there), None
 
 
-def blocks_of(tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None) -> EdgeBlocks:
-    """How edges resist, and contacts."""
-    more = None if contacts is None else contacts.resistance(tissue)
-    return EdgeBlocks.of(tissue, energy, more)
+def blocks_of(
+    tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
+) -> EdgeBlocks | None:
+    """How edges resist, and contacts; None if edges are arcs."""
+    if contacts is None or tissue.arcs is not None:
+        return EdgeBlocks.of(tissue, energy)
+    return EdgeBlocks.of(tissue, energy, contacts.resistance(tissue))
 
 
 def _around(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:

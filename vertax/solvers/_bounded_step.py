@@ -73,10 +73,9 @@ def bounded_step(
 
     def preconditioner(shift: Rows) -> Callable[[PyTree], PyTree]:
         yielding = jax.tree.map(lambda s: 1 / (stiffness + s), shift)
-        near = alone = lambda r: jax.tree.map(times, yielding, r)
+        near = lambda r: jax.tree.map(times, yielding, r)
         if blocks is not None:
-            edges = blocks.compliance(jax.tree.leaves(shift)[0])
-            near = lambda r: edges.of(r, alone(r))
+            near = blocks.compliance(jax.tree.leaves(shift)[0])
         if waves is None:
             return near
         # A place that is held tightly must not hold all others, nor drag them along.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from vertax._base.probe import probe
 from vertax._base.sums import total
@@ -94,8 +94,8 @@ class EdgeBlocks(eqx.Module):
     @classmethod
     def of(
         cls, tissue: Tissue, energy: AbstractEnergy, more: Symmetric | None = None
-    ) -> EdgeBlocks:
-        """Those of a tissue as it is now.
+    ) -> EdgeBlocks | None:
+        """Those of a tissue as it is now; None if edges are arcs, which give way with their angles.
 
         **Arguments:**
 
@@ -103,6 +103,8 @@ class EdgeBlocks(eqx.Module):
         - `energy`: its energy.
         - `more`: how vertices resist besides, each on its own.
         """
+        if tissue.arcs is not None:
+            return None
         m, known = tissue.topology, tissue.measured()
         response = _Response.of(energy, tissue, known)
         diagonal, between = _resistances(tissue, response)
@@ -159,12 +161,6 @@ class EdgeCompliance(eqx.Module):
     second: Symmetric
     between: Square
     moves: Bool[Array, " vertices"] | None
-
-    def of(self, force: PyTree, others: PyTree) -> PyTree:
-        """How vertices give way, as a part of a configuration; its other parts are those of `others`."""
-        _, *rest = jax.tree.leaves(others)
-        moved = self(jax.tree.leaves(force)[0])
-        return jax.tree.unflatten(jax.tree.structure(others), [moved, *rest])
 
     def __call__(self, force: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
         """How they give way to forces on vertices."""

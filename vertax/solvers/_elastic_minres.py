@@ -24,7 +24,7 @@ class _Attempt(NamedTuple):
     again: Bool[Array, ""]
 
 
-class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance, EdgeCompliance]]):
+class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance, EdgeCompliance | None]]):
     """MINRES for the Hessian of a large tissue, preconditioned by its edges and its long waves.
 
     Where the system has no solution, as if there are zero modes that the right-hand side sees, the result
@@ -32,20 +32,21 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance, EdgeComplianc
     """
 
     plain: MINRES
-    edges: EdgeBlocks
+    edges: EdgeBlocks | None
     waves: LongWaves
     stiffness: Float[Array, ""]
 
     def init(
         self, operator: lx.AbstractLinearOperator, options: dict[str, Any]
-    ) -> tuple[Any, Compliance, EdgeCompliance]:
+    ) -> tuple[Any, Compliance, EdgeCompliance | None]:
         linear = self.plain.init(operator, options)
         stiffness = self.waves.measured(linear.mv, operator.in_structure(), self.stiffness)
-        return linear, self.waves.compliance(stiffness), self.edges.compliance()
+        edges = None if self.edges is None else self.edges.compliance()
+        return linear, self.waves.compliance(stiffness), edges
 
     def compute(
         self,
-        state: tuple[Any, Compliance, EdgeCompliance],
+        state: tuple[Any, Compliance, EdgeCompliance | None],
         vector: PyTree[Array],
         options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
@@ -54,7 +55,7 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance, EdgeComplianc
         def attempt(last: _Attempt) -> _Attempt:
             def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
                 alone = jax.tree.map(lambda x: x / self.stiffness, r)
-                helped = lambda: medium.added(edges.of(r, alone), r)
+                helped = lambda: medium.added(alone if edges is None else edges(r), r)
                 return jax.lax.cond(last.helped, helped, lambda: alone)
 
             preconditioner = lx.FunctionLinearOperator(
