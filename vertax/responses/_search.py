@@ -16,7 +16,7 @@ from vertax.mesh import Tissue
 from vertax.mesh._measured import Measured
 from vertax.responses._contact import Contacts, no_contacts
 from vertax.solvers._edge_blocks import EdgeBlocks
-from vertax.solvers._long_waves import LongWaves
+from vertax.solvers._long_waves import FEWEST_CELLS, LongWaves
 from vertax.solvers._patience import Patient, PatientState
 from vertax.transitions import AbstractTransitions
 
@@ -271,7 +271,9 @@ def objective(
 def blocks_of(
     tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
 ) -> EdgeBlocks | None:
-    """How edges resist, and contacts; None if edges are arcs."""
+    """How edges resist, and contacts; None if edges are arcs, or few: they would cost more than they save."""
+    if tissue.n_cells < FEWEST_CELLS:
+        return None
     if contacts is None or tissue.arcs is not None:
         return EdgeBlocks.of(tissue, energy)
     return EdgeBlocks.of(tissue, energy, contacts.resistance(tissue))
