@@ -42,7 +42,8 @@ class NewtonCG(AbstractSolver):
 
     Soft motions follow curved valleys: a step along one climbs its side, and gains little or nothing. Such a
     step is corrected: a few products with the Hessian where it leads bring it back to the floor, and it is
-    accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6).
+    accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6). A
+    correction stays near, the nearer if the last one has gained nothing.
 
     Where a step gains less energy than the model promised, the regions shrink of those vertices whose
     forces it did not foresee, and of no others; a step that gains nothing is tried again with them, if they
