@@ -246,9 +246,9 @@ class _Trial(NamedTuple):
     corrections: Int[Array, ""]
     refusals: Int[Array, ""]
     corrects: Bool[Array, ""]
+    """Whether the next attempt corrects this one."""
     room: Float[Array, ""]
     """How far the next attempt may go, in units of the furthest that a vertex may."""
-    """Whether the next attempt corrects this one."""
     again: Bool[Array, ""]
     accepted: Bool[Array, ""]
     uncorrected: tuple[PyTree[Array], PyTree[Array], PyTree[Array]]
