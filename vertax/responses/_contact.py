@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.sums import total
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
 from vertax.mesh._sides import (
@@ -24,6 +22,8 @@ from vertax.mesh._sides import (
     wedge,
 )
 from vertax.mesh._topology import source, take
+from vertax.responses._local import FLOOR, local_blocks, local_sum
+from vertax.responses._upheld import REACH, Upheld
 from vertax.solvers._edge_blocks import Symmetric
 
 # A face comes to overlap itself where a corner reaches a side that it does not end. A barrier holds it off
@@ -37,7 +37,6 @@ from vertax.solvers._edge_blocks import Symmetric
 #
 # Corners that share a short edge are near each other and not in contact. So for a side next to one of the
 # corner's own the range is a share of the distance r to their common end: what counts there is the angle.
-FLOOR = 1e-4
 SLOPE = 5.0
 """That share over the range in cells: both are the same at a fifth of a cell from the end."""
 
@@ -53,6 +52,7 @@ class Contacts(eqx.Module):
     - `pairs`: half-edges whose source is near another side of their face, and that side; the same twice
         after the last one.
     - `slack`: how far the vertices may move until something else may come into range.
+    - `upheld`: short edges that would turn inside out.
     """
 
     distance: Float[Array, ""]
@@ -60,6 +60,7 @@ class Contacts(eqx.Module):
     strength: Float[Array, ""]
     pairs: Int[Array, "contacts 2"]
     slack: Float[Array, ""]
+    upheld: Upheld
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The energy of the barrier."""
@@ -80,11 +81,18 @@ class Contacts(eqx.Module):
             enough = jnp.where(jax.lax.switch(enough, [none, *some]), enough, 0)
             # Without contacts derivatives would still hand on arrays of zeros: many of them, or long ones.
             energies = [Contacts._energy_of_few, jax.checkpoint(Contacts._energy)]
+        enough = jnp.maximum(enough, jnp.any(self.upheld.edges < tissue.n_edges))
         some = [
-            lambda size=size, energy=energy: energy(self, tissue, self.pairs[:size])
+            lambda size=size, energy=energy: (
+                energy(self, tissue, self.pairs[:size]) + self.upheld(tissue)
+            )
             for size, energy in zip(sizes, energies, strict=False)
         ]
         return jax.lax.switch(enough, [nothing, *some])
+
+    def differ(self, other: Contacts) -> Bool[Array, ""]:
+        """Whether these are others."""
+        return jnp.any(self.pairs != other.pairs) | jnp.any(self.upheld.edges != other.upheld.edges)
 
     def _energy(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
         corner, side = pairs.T
@@ -93,7 +101,7 @@ class Contacts(eqx.Module):
 
     def _energy_of_few(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
         _, places = self._places(tissue, pairs)
-        return _barrier(self, _kinds(tissue, pairs), places)
+        return local_sum(_energies, (self, _kinds(tissue, pairs)), places)
 
     def resistance(self, tissue: Tissue) -> Symmetric:
         """How the barrier resists where one vertex moves alone, nowhere softer than nothing.
@@ -103,7 +111,7 @@ class Contacts(eqx.Module):
         pairs = self.pairs[: max(_FEW, len(self.pairs) // 16)]
         ends, places = self._places(tissue, pairs)
         kinds = _kinds(tissue, pairs)
-        rows = _along_each(lambda x: _slopes.fun(self, kinds, x), places)
+        rows = local_blocks(_energies, (self, kinds), places)
         # The corner moves the first vector, the end of the side its chord, and its start both.
         part = lambda i, j: Symmetric(rows[i][j], rows[i][j + 1], rows[i + 1][j + 1])
         corner, chord = part(0, 0), part(2, 2)
@@ -245,51 +253,15 @@ def _kinds(tissue: Tissue, pairs: Int[Array, "some 2"]) -> Bool[Array, "3 some"]
 
 
 # A corner and a straight side have four degrees of freedom: where the corner is from the start of the side,
-# and the chord. So forces are worked out in forward mode, and second derivatives as a block for each pair:
-# once, and not again in every product with the Hessian.
-@jax.custom_jvp
-def _barrier(
-    contacts: Contacts, kinds: Bool[Array, "3 some"], places: Float[Array, "some 4"]
-) -> Float[Array, ""]:
-    """The energy of straight sides that are so near."""
-    return jnp.sum(_energies(contacts, kinds, places))
-
-
-@_barrier.defjvp
-def _(primals: tuple, tangents: tuple) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    return _barrier(*primals), jnp.sum(_slopes(*primals) * tangents[-1].T)
-
-
-@jax.custom_jvp
-def _slopes(
-    contacts: Contacts, kinds: Bool[Array, "3 some"], places: Float[Array, "some 4"]
-) -> Float[Array, "4 some"]:
-    return _along_each(lambda x: _energies(contacts, kinds, x), places)
-
-
-@_slopes.defjvp
-def _(primals: tuple, tangents: tuple) -> tuple[Float[Array, "4 some"], Float[Array, "4 some"]]:
-    contacts, kinds, places = primals
-    blocks = _along_each(lambda x: _slopes.fun(contacts, kinds, x), places)
-    change = total(block * row for block, row in zip(blocks, tangents[-1].T, strict=True))
-    return _slopes(*primals), change
-
-
+# and the chord.
 def _energies(
-    contacts: Contacts, kinds: Bool[Array, "3 some"], places: Float[Array, "some 4"]
+    args: tuple[Contacts, Bool[Array, "3 some"]], places: Float[Array, "some 4"]
 ) -> Float[Array, " some"]:
+    contacts, kinds = args
     first, chord = places[:, :2], places[:, 2:]
     zero = jnp.zeros_like(first)
     one, other = jnp.concatenate([first, zero], axis=-1), jnp.concatenate([zero, chord], axis=-1)
     return contacts.strength * contacts._heights(kinds, one, other)
-
-
-def _along_each(
-    function: Callable[[Array], Array], places: Float[Array, "some 4"]
-) -> Float[Array, "4 ..."]:
-    """How a function of places, row by row, changes with each of their four parts."""
-    along = lambda unit: jax.jvp(function, (places,), (jnp.broadcast_to(unit, places.shape),))[1]
-    return jax.vmap(along)(jnp.eye(4, dtype=places.dtype))
 
 
 # So many contacts count for a preconditioner at least.
@@ -321,7 +293,8 @@ def no_contacts(
     strength = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0)) / slope
     nothing = jnp.zeros((tissue.n_vertices, 2), tissue.topology.twin.dtype)
     slack = jnp.zeros_like(length)
-    return Contacts(reach * length, slope, strength, nothing, slack)
+    upheld = Upheld.none(tissue, jnp.minimum(reach, REACH) * length, strength * slope * length)
+    return Contacts(reach * length, slope, strength, nothing, slack, upheld)
 
 
 def _angles_are_open(tissue: Tissue, least: Float[Array, ""]) -> Bool[Array, ""]:

@@ -14,6 +14,7 @@ from vertax._base.modules import choose
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._measured import Measured
+from vertax.mesh._sides import dot
 from vertax.responses._contact import Contacts, no_contacts
 from vertax.solvers._edge_blocks import EdgeBlocks
 from vertax.solvers._long_waves import FEWEST_CELLS, LongWaves
@@ -148,7 +149,7 @@ class Search(eqx.Module):
         )
         changed = flipped | jnp.any(jnp.stack(jax.tree.leaves(elsewhere)))
         if contacts is not None and state.contacts is not None:
-            changed |= jnp.any(contacts.pairs != state.contacts.pairs)
+            changed |= contacts.differ(state.contacts)
 
         def restart() -> PatientState:
             fresh = self._restarted(tissue, energy, contacts)
@@ -198,6 +199,12 @@ class Search(eqx.Module):
             twins = tissue.topology.twin != there.topology.twin
             swept |= jnp.any(twins.reshape(-1, 3), axis=-1) | ~state.started
             contacts, overlapping = self._near(tissue, state, swept)
+            if contacts is not None and self.transitions is not None:
+                # What turned around, and has not flipped, was put upright.
+                turned = dot(there.edge_vectors, tissue.edge_vectors) < 0
+                turned &= jnp.all(counts == state.counts, axis=tuple(range(counts.ndim - 1)))
+                upheld = contacts.upheld.updated(tissue, turned)
+                contacts = eqx.tree_at(lambda c: c.upheld, contacts, upheld)
             return _Arrival(tissue, contacts, counts, share, blamed, overlapping, last.tries + 1)
 
         whole = jnp.ones(goal.n_vertices, goal.vertices.dtype)

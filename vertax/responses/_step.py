@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,7 +11,7 @@ from vertax.energies import AbstractEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._topology import edge_neighbourhood, source, take
-from vertax.responses._contact import FLOOR
+from vertax.responses._upheld import REACH, turned_height
 from vertax.transitions._edge_frames import edge_axes
 
 
@@ -43,37 +42,13 @@ class Incremental(AbstractEnergy):
         before = flipped_as(self.before, tissue) if self.flips else self.before
         value = self.energy(tissue)
         if self.pressed is not None:
-            value += upheld(tissue, _REACH * cell_size(self.before), self.pressed)
+            reach = REACH * cell_size(self.before)
+            edges = tissue.edge_vectors, edge_axes(tissue)
+            value += jnp.sum(turned_height(*edges, reach, self.pressed))
         if self.strained is None or not isinstance(self.dissipation, AbstractViscosity):
             return value + self.dissipation(tissue, before, self.dt)
         strains = self.dissipation.strains(tissue, before) - self.strained
         return value + 0.5 * jnp.sum(strains**2) / self.dt
-
-
-def upheld(tissue: Tissue, reach: Float[Array, ""], force: Float[Array, ""]) -> Float[Array, ""]:
-    """What keeps short edges from turning inside out.
-
-    Where an energy presses the ends of an edge together, the edge opens once it has flipped. Forces on
-    vertices can press from all sides: then four cells meet in a point for a while. A barrier holds that
-    point, as of contacts, where the share of an edge that points the way it ought to is below the reach.
-    """
-    edge, axis = tissue.edge_vectors, edge_axes(tissue)
-    squared = jnp.sum(edge**2, axis=-1)
-    near = jax.lax.stop_gradient(squared < (_FADE * reach) ** 2)
-    # (What is said of others does not matter, and must have a derivative.)
-    axis = jnp.where(near[:, None], axis, 1)
-    norm = jnp.sqrt(jnp.maximum(jnp.sum(axis**2, axis=-1), jnp.finfo(axis.dtype).tiny))
-    length = jnp.sqrt(squared + (FLOOR * reach) ** 2)
-    upright = (length + jnp.sum(edge * axis, axis=-1) / norm) / (2 * reach)
-    upright = jnp.where(near & (upright < 1), upright, 1)
-    fade = jnp.maximum(1 - squared / (_FADE * reach) ** 2, 0) ** 3
-    barrier = -((1 - upright) ** 2) * jnp.log((upright + FLOOR) / (1 + FLOOR))
-    return force * reach * jnp.sum(fade * barrier)
-
-
-# The range of that barrier in cells, and in units of it the length from which on it is nothing at all.
-_REACH = 2e-3
-_FADE = 8.0
 
 
 def flipped_as(before: Tissue, tissue: Tissue) -> Tissue:

@@ -54,7 +54,7 @@ class EdgeFrames(eqx.Module):
         chord = jnp.sqrt(dot(forward, forward))
         self.angle, self.stretch = _angles(here), _stretches(here)
         self.length = chord * self.stretch
-        axis = _axis(forward, *(side[:, 2:4] for side in self.neighbours))
+        axis = edge_axis(forward, *(side[:, 2:4] for side in self.neighbours))
         upright = dot(axis, forward) >= 0
         direction = jnp.where((chord > 0)[:, None], forward, axis)
         direction = jnp.where(upright[:, None], direction, -direction)
@@ -170,16 +170,17 @@ def edge_axes(tissue: Tissue) -> Float[Array, "edges 2"]:
     _, *neighbours = edge_neighbourhood(m)
     outward = take(tissue.edge_vectors, m.edge)
     outward = jnp.where(m.forward[:, None], outward, -outward)
-    return _axis(tissue.edge_vectors, *(take(outward, h) for h in neighbours))
+    return edge_axis(tissue.edge_vectors, *(take(outward, h) for h in neighbours))
 
 
-def _axis(
+def edge_axis(
     vector: Float[Array, "rows 2"],
     a: Float[Array, "rows 2"],
     b: Float[Array, "rows 2"],
     c: Float[Array, "rows 2"],
     d: Float[Array, "rows 2"],
 ) -> Float[Array, "rows 2"]:
+    """The same of edges whose vectors are given, and those of their neighbours as they leave."""
     return c + d - a - b + 2 * vector
 
 

@@ -1,0 +1,114 @@
+"""Edges that a relaxation puts upright again and again are held, and four cells rest around a point."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+from helpers import fine_difference, random_tissue
+
+import vertax as vx
+from vertax.responses._upheld import _FADE, _OFTEN, REACH, Upheld, _heights
+from vertax.transitions._edge_frames import EdgeFrames, edge_axes
+
+NUMBER = 4
+
+
+def with_edge(tissue: vx.Tissue, length: float, across: float = 0.0) -> vx.Tissue:
+    """The tissue with one edge of that length, turned from the way it ought to point by `across`."""
+    corner = EdgeFrames(tissue)
+    which = jnp.arange(tissue.n_edges) == NUMBER
+    way = corner.along + across * corner.across
+    return corner.place(tissue, which, way, jnp.full(tissue.n_edges, length))
+
+
+def held(tissue: vx.Tissue, times: int = _OFTEN) -> Upheld:
+    """Its edge of that number put upright so often."""
+    upheld = Upheld.none(tissue, jnp.asarray(REACH), jnp.asarray(2.0))
+    for _ in range(times):
+        upheld = upheld.updated(tissue, jnp.arange(tissue.n_edges) == NUMBER)
+    return upheld
+
+
+def numbers(upheld: Upheld, tissue: vx.Tissue) -> list[int]:
+    """The edges that are held."""
+    return [e for e in upheld.edges.tolist() if e < tissue.n_edges]
+
+
+def test_an_edge_is_held_from_so_many_times_until_it_has_grown():
+    short = with_edge(random_tissue(12, 3), REACH)
+    assert numbers(held(short, _OFTEN - 1), short) == []
+    upheld = held(short)
+    assert numbers(upheld, short) == [NUMBER]
+    nothing = jnp.zeros(short.n_edges, bool)
+    assert numbers(upheld.updated(short, nothing), short) == [NUMBER]
+    grown = with_edge(short, 1.01 * _FADE * REACH)
+    let_go = upheld.updated(grown, nothing)
+    assert numbers(let_go, grown) == []
+    # It is known of old, and held at once when it turns again.
+    again = let_go.updated(short, jnp.arange(short.n_edges) == NUMBER)
+    assert numbers(again, short) == [NUMBER]
+
+
+def test_of_more_edges_than_there_is_room_for_some_are_held():
+    tissue = random_tissue(12, 3)
+    upheld = Upheld.none(tissue, jnp.asarray(REACH), jnp.asarray(2.0))
+    for _ in range(_OFTEN):
+        upheld = upheld.updated(tissue, jnp.ones(tissue.n_edges, bool))
+    assert len(numbers(upheld, tissue)) == len(upheld.edges) < tissue.n_edges
+    assert np.isfinite(upheld(tissue))
+
+
+@pytest.mark.parametrize("arcs", [False, True], ids=["straight", "arcs"])
+@pytest.mark.parametrize("across", [0.0, 0.5])
+def test_its_derivatives(across, arcs):
+    tissue = cluster(12, 3, inner_arcs=True) if arcs else random_tissue(12, 3)
+    there = with_edge(tissue, 0.4 * REACH, across)
+    upheld = held(there)
+    assert numbers(upheld, there) == [NUMBER]
+    way = np.random.default_rng(0).normal(size=there.vertices.shape)
+
+    def plain(x):
+        tissue = there.with_vertices(x)
+        places = jnp.concatenate([tissue.edge_vectors, edge_axes(tissue)], axis=-1)
+        which = jnp.arange(there.n_edges) == NUMBER
+        return jnp.sum(_heights((upheld, which), places))
+
+    energy = lambda x: upheld(there.with_vertices(x))
+    both = lambda f: jax.jvp(jax.value_and_grad(f), (there.vertices,), (jnp.asarray(way),))
+    for one, other in zip(*map(jax.tree.leaves, (both(energy), both(plain))), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * float(jnp.abs(other).max()))
+    at = lambda x: energy(jnp.asarray(x))
+    scale = REACH * way
+    slope = jnp.sum(jax.grad(energy)(there.vertices) * scale)
+    np.testing.assert_allclose(slope, fine_difference(at, there.vertices, scale), rtol=1e-6)
+
+
+class Turning(vx.AbstractEnergy):
+    """An edge is pressed to point the other way, however its neighbours lie and whether it flips."""
+
+    force: jax.Array
+
+    def __call__(self, tissue):
+        edge, axis = tissue.edge_vectors[NUMBER], edge_axes(tissue)[NUMBER]
+        return self.force * jnp.dot(edge, axis) / jnp.linalg.norm(axis)
+
+
+def test_an_edge_that_is_pressed_to_turn_comes_to_rest():
+    tissue = random_tissue(20, 0)
+    energy = vx.energies.ShapeFactorEnergy(jnp.full(20, 3.7)) + Turning(jnp.asarray(1.0))
+    found = vx.equilibrate(tissue, energy, tolerance=1e-8, max_steps=150)
+    assert found.valid
+    edge, axis = found.tissue.edge_vectors[NUMBER], edge_axes(found.tissue)[NUMBER]
+    length = jnp.linalg.norm(edge)
+    share = (length + edge @ axis / jnp.linalg.norm(axis)) / 2
+    assert length < _FADE * REACH
+    assert 0 < share < REACH
+
+
+@pytest.mark.parametrize("seed", [35, 170])
+def test_a_fluid_tissue_comes_to_rest_around_such_points(seed):
+    tissue = vx.initialise.periodic_voronoi(100, key=seed)
+    noise = jax.random.normal(jax.random.key(1 + seed), (100,))
+    energy = vx.energies.ShapeFactorEnergy(3.9 + 0.1 * noise)
+    assert vx.equilibrate(tissue, energy, tolerance=1e-8, max_steps=300).valid
