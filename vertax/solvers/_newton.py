@@ -42,8 +42,9 @@ class NewtonCG(AbstractSolver):
 
     Soft motions follow curved valleys: a step along one climbs its side, and gains little or nothing. Such a
     step is corrected: a few products with the Hessian where it leads bring it back to the floor, and it is
-    accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6). A
-    correction stays near, the nearer if the last one has gained nothing.
+    accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6). So is
+    a step of few products that leaves much of the force, which is then in a few places, such as a contact
+    that was hit. A correction stays near, the nearer if the last one has gained nothing.
 
     Where a step gains less energy than the model promised, the regions shrink of those vertices whose
     forces it did not foresee, and of no others; a step that gains nothing is tried again with them, if they
@@ -138,7 +139,10 @@ class NewtonCG(AbstractSolver):
             lower_force = inner(now.gradient, now.gradient) < inner(g, g)
             accepted = finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
-            wanting = near & finite & ~lost & (gained < _FINE * predicted)
+            # A place that a cheap step has left with large forces needs no new step of all others.
+            residual = mean_size(now.gradient) > _DOWN * mean_force
+            short = (gained < _FINE * predicted) | (residual & (solution.k < _CHEAP))
+            wanting = near & finite & ~lost & short
             corrects = wanting & (now.corrections < _CORRECTIONS)
 
             # What a correction has not mended is to be blamed on the step.
@@ -265,6 +269,9 @@ _USEFUL = 0.9
 # A step that gains less than this share of what it should is corrected, so many times at most, so well.
 _FINE = 0.9
 _CORRECTIONS = 6
+# So is one of fewer products than this that leaves more than this share of the mean force.
+_CHEAP = 20
+_DOWN = 0.1
 _LOOSE = 0.3
 # A correction goes no further than this share of what steps may; after one that gains nothing, of that.
 _NARROW = 0.3
