@@ -141,7 +141,8 @@ class NewtonCG(AbstractSolver):
             fine = accepted & (lost | (ratio > 0.75))
             # A place that a cheap step has left with large forces needs no new step of all others.
             residual = mean_size(now.gradient) > _DOWN * mean_force
-            short = (gained < _FINE * predicted) | (residual & (solution.k < _CHEAP))
+            residual &= (solution.k < _CHEAP) & (n_rows >= _MANY)
+            short = (gained < _FINE * predicted) | residual
             wanting = near & finite & ~lost & short
             corrects = wanting & (now.corrections < _CORRECTIONS)
 
@@ -269,9 +270,11 @@ _USEFUL = 0.9
 # A step that gains less than this share of what it should is corrected, so many times at most, so well.
 _FINE = 0.9
 _CORRECTIONS = 6
-# So is one of fewer products than this that leaves more than this share of the mean force.
+# So is one of fewer products than this that leaves more than this share of the mean force. (Where there are
+# no more vertices than that there are no others to spare.)
 _CHEAP = 20
 _DOWN = 0.1
+_MANY = 32
 _LOOSE = 0.3
 # A correction goes no further than this share of what steps may; after one that gains nothing, of that.
 _NARROW = 0.3
