@@ -274,7 +274,7 @@ _CORRECTIONS = 6
 # no more vertices than that there are no others to spare.)
 _CHEAP = 20
 _DOWN = 0.1
-_MANY = 32
+_MANY = 16
 _LOOSE = 0.3
 # A correction goes no further than this share of what steps may; after one that gains nothing, of that.
 _NARROW = 0.3
