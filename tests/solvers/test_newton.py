@@ -72,22 +72,22 @@ def test_a_step_that_gains_nothing_is_tried_again_without_what_is_to_blame(monke
     assert state.radii.max() < 0.2
 
 
+def needed(fn, start, radius=0.2):
+    """How many steps it takes to come to rest, with regions of that radius at first."""
+    solver = vx.solvers.NewtonCG()
+    value, aux = jax.eval_shape(fn, start, None)
+    state = solver.init(fn, start, None, {}, value, aux, frozenset())
+    state = eqx.tree_at(lambda s: s.radii, state, jnp.full(N, radius))
+    y, n = start, 0
+    while jnp.max(jnp.abs(state.gradient)) > 1e-8:
+        y, state, _ = solver.step(fn, y, None, {}, state, frozenset())
+        n += 1
+    return n
+
+
 def test_regions_grow_fast_where_steps_are_foreseen():
-    start = jnp.zeros((N, 2))
-
-    def needed(radius):
-        solver = vx.solvers.NewtonCG()
-        fn = lambda y, _: landscape(y, 0.0)
-        value, aux = jax.eval_shape(fn, start, None)
-        state = solver.init(fn, start, None, {}, value, aux, frozenset())
-        state = eqx.tree_at(lambda s: s.radii, state, jnp.full(N, radius))
-        y, n = start, 0
-        while jnp.max(jnp.abs(state.gradient)) > 1e-8:
-            y, state, _ = solver.step(fn, y, None, {}, state, frozenset())
-            n += 1
-        return n
-
-    assert needed(1e-4) <= needed(0.2) + 5  # 11 doublings
+    fn, start = lambda y, _: landscape(y, 0.0), jnp.zeros((N, 2))
+    assert needed(fn, start, 1e-4) <= needed(fn, start) + 5  # 11 doublings
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -103,6 +103,19 @@ def test_copies_side_by_side_go_as_one_alone(n):
     copies = lambda y, _: (jnp.sum(jax.vmap(energy)(y.reshape(4, N, 2))), None)
     together, _ = steps(copies, jnp.tile(start, (4, 1)), None, n)
     np.testing.assert_allclose(together.reshape(4, N, 2), jnp.stack(4 * [alone]), atol=1e-12)
+
+
+def test_one_place_that_newton_halves_takes_few_steps(monkeypatch):
+    """A wall that begins with the cube of the distance, as a contact, and others at rest."""
+
+    def wall(y, _):
+        others = 0.5 * jnp.sum((y[1:] - PLACES[1:]) ** 2) + 0.5 * y[0, 1] ** 2
+        return others + 0.05 * jnp.maximum(1 - y[0, 0], 0) ** 3, None
+
+    start = PLACES.at[0].set(0.0)
+    corrected = needed(wall, start)
+    monkeypatch.setattr(_newton, "_CHEAP", 0)
+    assert corrected < 0.75 * needed(wall, start)
 
 
 def test_no_row_goes_far_in_a_step():

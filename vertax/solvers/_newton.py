@@ -270,12 +270,12 @@ _USEFUL = 0.9
 # A step that gains less than this share of what it should is corrected, so many times at most, so well.
 _FINE = 0.9
 _CORRECTIONS = 6
-# So is one of fewer products than this that leaves more than this share of the mean force. (Where there are
-# no more vertices than that there are no others to spare.)
+_LOOSE = 0.3
+# So is one of fewer products than this that leaves more than this share of the mean force. (With fewer
+# vertices than that there are no others to spare.)
 _CHEAP = 20
 _DOWN = 0.1
 _MANY = 16
-_LOOSE = 0.3
 # A correction goes no further than this share of what steps may; after one that gains nothing, of that.
 _NARROW = 0.3
 _NARROWER = 0.1
