@@ -118,6 +118,16 @@ def test_what_stays_does_not_stay_for_ever():
     assert eqx.filter_jit(response)(tissue, shapes(factors), throw=False).converged
 
 
+@pytest.mark.thorough
+def test_what_cannot_go_on_is_not_tried_as_far_again():
+    """Steps that are foreseen well, and lead to overlaps: their regions grew again as fast as they shrank."""
+    relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=600))
+    for seed in (6, 218):  # neither was at rest after 600 steps
+        tissue = vx.initialise.periodic_voronoi(64, key=jax.random.key(seed))
+        factors = 4.1 + 0.1 * jax.random.normal(jax.random.key(1 + seed), (64,))
+        assert relax(tissue, shapes(factors)).num_steps < 100
+
+
 def test_without_contact_cells_overlap_and_that_is_refused():
     response = vx.Relaxation(contact_range=None)
     energy = shapes(np.full(N, 4.7))

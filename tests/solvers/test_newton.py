@@ -90,6 +90,21 @@ def test_regions_grow_fast_where_steps_are_foreseen():
     assert needed(fn, start, 1e-4) <= needed(fn, start) + 5  # 11 doublings
 
 
+def test_regions_do_not_grow_where_steps_were_cut_short():
+    """The model foresaw those steps well, and would have had them again for ever."""
+    solver: Any = vx.solvers.NewtonCG()
+    far = lambda y, _: (0.5 * jnp.sum((y - 9.0) ** 2), None)
+    start = jnp.zeros((N, 2))
+    _, before = steps(far, start, None, 0)
+    small = eqx.tree_at(lambda s: s.radii, before, 1e-3 * before.radii)
+    _, after, _ = solver.step(far, start, None, {}, small, frozenset())
+    assert (after.radii > 2 * small.radii).all()
+    share = jnp.where(jnp.arange(N) < 3, 0.0, 1.0)
+    resumed = solver.resumed(after, after, share, jnp.array(False))
+    np.testing.assert_allclose(resumed.radii[:3], 0.25 * small.radii[:3])
+    np.testing.assert_array_equal(resumed.radii[3:], after.radii[3:])
+
+
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_copies_side_by_side_go_as_one_alone(n):
     """How far a step is solved does not depend on the size of a tissue."""

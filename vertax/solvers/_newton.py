@@ -20,6 +20,8 @@ class _NewtonState(eqx.Module):
     value: Float[Array, ""]
     gradient: PyTree[Float[Array, "..."]]
     radii: Rows
+    tried: Rows
+    """The regions of the last step, before they grew."""
     num_products: Int[Array, ""]
     mean_force: Float[Array, ""]
     """Where the last step began; infinity before the first one."""
@@ -71,7 +73,7 @@ class NewtonCG(AbstractSolver):
         reach = self.max_displacement * options.get("length_scale", 1.0)
         radii = jax.tree.map(lambda x: jnp.full_like(sizes(x), reach), y)
         never = jnp.full_like(value, jnp.inf)
-        return _NewtonState(value, gradient, radii, jnp.array(0), never, aux)
+        return _NewtonState(value, gradient, radii, radii, jnp.array(0), never, aux)
 
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
@@ -220,13 +222,15 @@ class NewtonCG(AbstractSolver):
         here = (y, state.value, g, state.aux)
         y, value, g, aux = choose(end.accepted, (end.y, end.value, end.gradient, end.aux), here)
         products = state.num_products + end.products
-        return y, _NewtonState(value, g, radii, products, mean_force, aux), aux
+        return y, _NewtonState(value, g, radii, state.radii, products, mean_force, aux), aux
 
     def resumed(
         self, fresh: _NewtonState, old: _NewtonState, share: Rows, flipped: Bool[Array, ""]
     ) -> _NewtonState:
-        # Elsewhere the regions are as good as they were.
-        radii = jax.tree.map(lambda r, s: jnp.where(s < 1, 0.25 * r, r), old.radii, share)
+        # Where it was cut short the regions are smaller than before, whatever the model says, lest the same
+        # step be refused for ever. Elsewhere they are as good as they were.
+        smaller = lambda r, tried, s: jnp.where(s < 1, 0.25 * jnp.minimum(r, tried), r)
+        radii = jax.tree.map(smaller, old.radii, old.tried, share)
         kept = lambda s: (s.num_products, s.mean_force)
         return eqx.tree_at(lambda s: (s.radii, *kept(s)), fresh, (radii, *kept(old)))
 
