@@ -126,6 +126,11 @@ def test_what_cannot_go_on_is_not_tried_as_far_again():
         tissue = vx.initialise.periodic_voronoi(64, key=jax.random.key(seed))
         factors = 4.1 + 0.1 * jax.random.normal(jax.random.key(1 + seed), (64,))
         assert relax(tissue, shapes(factors)).num_steps < 100
+    # A cell of three sides that its line tensions close: only a long step leads on.
+    tissue = vx.initialise.periodic_voronoi(1000, key=jax.random.key(1))
+    tensions = jax.random.uniform(jax.random.key(2), (tissue.n_edges,), minval=0.2, maxval=0.6)
+    energy = vx.energies.AreaElasticity(2.0, 1.0) + vx.energies.LineTension(tensions)
+    assert relax(tissue, energy).num_steps < 150
 
 
 def test_without_contact_cells_overlap_and_that_is_refused():

@@ -96,13 +96,17 @@ def test_regions_do_not_grow_where_steps_were_cut_short():
     far = lambda y, _: (0.5 * jnp.sum((y - 9.0) ** 2), None)
     start = jnp.zeros((N, 2))
     _, before = steps(far, start, None, 0)
-    small = eqx.tree_at(lambda s: s.radii, before, 1e-3 * before.radii)
+    small = eqx.tree_at(lambda s: s.radii, before, 1e-2 * before.radii)
     _, after, _ = solver.step(far, start, None, {}, small, frozenset())
     assert (after.radii > 2 * small.radii).all()
     share = jnp.where(jnp.arange(N) < 3, 0.0, 1.0)
-    resumed = solver.resumed(after, after, share, jnp.array(False))
+    resumed = solver.resumed(before, after, share, jnp.array(False))
     np.testing.assert_allclose(resumed.radii[:3], 0.25 * small.radii[:3])
     np.testing.assert_array_equal(resumed.radii[3:], after.radii[3:])
+    # If no short step helps, they begin anew.
+    shortest = eqx.tree_at(lambda s: s.tried, after, 1e-6 * after.tried)
+    resumed = solver.resumed(before, shortest, share, jnp.array(False))
+    np.testing.assert_array_equal(resumed.radii[:3], before.radii[:3])
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

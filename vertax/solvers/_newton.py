@@ -228,9 +228,14 @@ class NewtonCG(AbstractSolver):
         self, fresh: _NewtonState, old: _NewtonState, share: Rows, flipped: Bool[Array, ""]
     ) -> _NewtonState:
         # Where it was cut short the regions are smaller than before, whatever the model says, lest the same
-        # step be refused for ever. Elsewhere they are as good as they were.
-        smaller = lambda r, tried, s: jnp.where(s < 1, 0.25 * jnp.minimum(r, tried), r)
-        radii = jax.tree.map(smaller, old.radii, old.tried, share)
+        # step be refused for ever; or as at first, if no short step helps. Elsewhere they are as good as they
+        # were.
+        def kept_short(radius: Array, tried: Array, whole: Array, share: Array) -> Array:
+            less = 0.25 * jnp.minimum(radius, tried)
+            less = jnp.where(less < _SHORTEST * whole, whole, less)
+            return jnp.where(share < 1, less, radius)
+
+        radii = jax.tree.map(kept_short, old.radii, old.tried, fresh.radii, share)
         kept = lambda s: (s.num_products, s.mean_force)
         return eqx.tree_at(lambda s: (s.radii, *kept(s)), fresh, (radii, *kept(old)))
 
@@ -292,6 +297,8 @@ _MOST = 16
 # No region is smaller than this, and if none is larger than that nothing moves; in units of the largest.
 _LEAST = 1e-6
 _COLLAPSED = 1e-5
+# One that was cut short so often that it is smaller than this, in units of the first one, begins anew.
+_SHORTEST = 1e-3
 
 
 def _relative(missing: Array, old: Array, change: Array) -> Float[Array, " rows"]:
