@@ -10,7 +10,7 @@ import optimistix as optx
 import pytest
 
 import vertax as vx
-from vertax.solvers import _bounded_step, _newton
+from vertax.solvers import _bounded_step, _newton, _rows
 
 N = 30
 PLACES = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (N, 2)))
@@ -124,17 +124,23 @@ def test_copies_side_by_side_go_as_one_alone(n):
     np.testing.assert_allclose(together.reshape(4, N, 2), jnp.stack(4 * [alone]), atol=1e-12)
 
 
-def test_one_place_that_newton_halves_takes_few_steps(monkeypatch):
-    """A wall that begins with the cube of the distance, as a contact, and others at rest."""
+def test_a_step_that_leaves_much_of_the_force_is_corrected(monkeypatch):
+    """Soft springs, which vertices may not follow to their ends in one step."""
+    soft = lambda y, _: (0.5e-3 * jnp.sum((y - 2.0) ** 2), None)
+    start = jnp.zeros((N, 2))
+    corrected = needed(soft, start)
+    monkeypatch.setattr(_newton, "_LEFT", np.inf)
+    assert corrected < 0.75 * needed(soft, start)
 
-    def wall(y, _):
-        others = 0.5 * jnp.sum((y[1:] - PLACES[1:]) ** 2) + 0.5 * y[0, 1] ** 2
-        return others + 0.05 * jnp.maximum(1 - y[0, 0], 0) ** 3, None
 
-    start = PLACES.at[0].set(0.0)
-    corrected = needed(wall, start)
-    monkeypatch.setattr(_newton, "_CHEAP", 0)
-    assert corrected < 0.75 * needed(wall, start)
+def test_few_large_forces_count_little():
+    forces = jnp.zeros((101, 2)).at[:100, 0].set(1e-3).at[0, 0].set(1.0)
+    assert np.mean(_rows.sizes(forces)) > 1e-2
+    assert _rows.typical_size(forces) < 2e-3
+    np.testing.assert_allclose(
+        _rows.typical_size(forces[1:]), 1e-3
+    )  # what does not move does not count
+    assert _rows.typical_size(0 * forces) == 0
 
 
 def test_no_row_goes_far_in_a_step():

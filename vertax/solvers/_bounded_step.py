@@ -42,7 +42,7 @@ def bounded_step(
     resumes: Bool[Array, ""],
     forcing: Float[Array, ""],
     waving: Bool[Array, ""],
-    max_products: int,
+    max_products: int | Int[Array, ""],
     options: dict[str, Any],
 ) -> System:
     """A step that goes downhill, and nowhere much beyond its bounds.

@@ -12,7 +12,7 @@ from optax import tree
 
 from vertax._base.modules import choose
 from vertax.solvers._bounded_step import bounded_step, gain
-from vertax.solvers._rows import inner, mean_size, number_of, row_inner, sizes
+from vertax.solvers._rows import inner, number_of, row_inner, sizes, typical_size
 from vertax.solvers._solver import AbstractSolver, Rows, value_and_gradient
 
 
@@ -23,8 +23,8 @@ class _NewtonState(eqx.Module):
     tried: Rows
     """The regions of the last step, before they grew."""
     num_products: Int[Array, ""]
-    mean_force: Float[Array, ""]
-    """Where the last step began; infinity before the first one."""
+    force: Float[Array, ""]
+    """What it typically was where the last step began; infinity before the first one."""
     aux: PyTree
 
 
@@ -39,14 +39,14 @@ class NewtonCG(AbstractSolver):
     go beyond twice its region is cut back to that, and nothing else. (Steihaug 1983,
     doi:10.1137/0720042; Nocedal & Wright 2006, alg. 4.1 and 7.2, doi:10.1007/978-0-387-40065-5.)
 
-    How exactly a step is solved follows from the mean force, and from how much the last step has lowered it
-    (Eisenstat & Walker 1996, doi:10.1137/0917003).
+    How exactly a step is solved follows from what forces typically are (few large ones count little), and
+    from how much the last step has lowered them (Eisenstat & Walker 1996, doi:10.1137/0917003).
 
     Soft motions follow curved valleys: a step along one climbs its side, and gains little or nothing. Such a
     step is corrected: a few products with the Hessian where it leads bring it back to the floor, and it is
     accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6). So is
-    a step of few products that leaves much of the force, which is then in a few places, such as a contact
-    that was hit. A correction stays near, the nearer if the last one has gained nothing.
+    a step that leaves much of the forces: a correction is solved coarsely, and needs no look at the topology.
+    It stays near, the nearer if the last one has gained nothing.
 
     Where a step gains less energy than the model promised, the regions shrink of those vertices whose
     forces it did not foresee, and of no others; a step that gains nothing is tried again with them, if they
@@ -60,7 +60,7 @@ class NewtonCG(AbstractSolver):
 
     - `max_displacement`: about the furthest that one vertex moves in a step, in units of the length scale
         (in [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
-    - `max_products`: most Hessian-vector products in one attempt at a step, and in each correction.
+    - `max_products`: most Hessian-vector products in one attempt at a step.
     """
 
     max_displacement: float = 0.2
@@ -79,17 +79,17 @@ class NewtonCG(AbstractSolver):
         self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
     ) -> tuple[Any, _NewtonState, Any]:
         reach = self.max_displacement * options.get("length_scale", 1.0)
-        # Forces are measured in that which moves a vertex by the length scale. (The mean of all, lest one
-        # place with large forces keep all others waiting.)
-        force = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
+        # Forces are measured in that which moves a vertex by the length scale. (That of most, lest few places
+        # with large forces keep all others waiting.)
+        unit = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
         g, zero = state.gradient, tree.zeros_like(y)
-        mean_force = mean_size(g)
-        finest = jnp.sqrt(_TYPICAL * mean_force / force)
+        force = typical_size(g)
+        finest = jnp.sqrt(_TYPICAL * force / unit)
         near = finest < _COARSEST
         # Where forces do not fall as they would near a minimum, exact steps are of no use (the second choice
         # of Eisenstat & Walker).
-        before = jnp.where(state.mean_force > 0, state.mean_force, jnp.inf)
-        useful = jnp.minimum(_ROUGH, _USEFUL * (mean_force / before) ** 2)
+        before = jnp.where(state.force > 0, state.force, jnp.inf)
+        useful = jnp.minimum(_ROUGH, _USEFUL * (force / before) ** 2)
         forcing = jnp.minimum(_COARSEST, jnp.maximum(finest, useful))
         no, yes, none = jnp.array(False), jnp.array(True), jnp.array(0)
         whole = jnp.ones_like(state.value)
@@ -108,7 +108,7 @@ class NewtonCG(AbstractSolver):
                 resumes=resumes,
                 forcing=jnp.where(first, forcing, _LOOSE),
                 waving=first & ~resumes & near,
-                max_products=self.max_products,
+                max_products=jnp.where(first, self.max_products, few_products),
                 options=options,
             )
             p, hp = solution.p, solution.hp
@@ -141,11 +141,8 @@ class NewtonCG(AbstractSolver):
             lower_force = inner(now.gradient, now.gradient) < inner(g, g)
             accepted = finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
-            # A place that a cheap step has left with large forces needs no new step of all others.
-            residual = mean_size(now.gradient) > _DOWN * mean_force
-            residual &= (solution.k < _CHEAP) & (n_rows >= _MANY)
-            short = (gained < _FINE * predicted) | residual
-            wanting = near & finite & ~lost & short
+            left = typical_size(now.gradient) > _LEFT * force
+            wanting = near & finite & ~lost & ((gained < _FINE * predicted) | left)
             corrects = wanting & (now.corrections < _CORRECTIONS)
 
             # What a correction has not mended is to be blamed on the step.
@@ -200,6 +197,7 @@ class NewtonCG(AbstractSolver):
             return choose(retries & ~corrects, refused, now)
 
         n_rows = number_of(state.radii)
+        few_products = min(self.max_products, _BRIEF)
         origin = {"y": y, "value": state.value, "gradient": g, "aux": state.aux, "foreseen": g}
         begin = _Trial(
             **origin,
@@ -222,7 +220,7 @@ class NewtonCG(AbstractSolver):
         here = (y, state.value, g, state.aux)
         y, value, g, aux = choose(end.accepted, (end.y, end.value, end.gradient, end.aux), here)
         products = state.num_products + end.products
-        return y, _NewtonState(value, g, radii, state.radii, products, mean_force, aux), aux
+        return y, _NewtonState(value, g, radii, state.radii, products, force, aux), aux
 
     def resumed(
         self, fresh: _NewtonState, old: _NewtonState, share: Rows, flipped: Bool[Array, ""]
@@ -236,7 +234,7 @@ class NewtonCG(AbstractSolver):
             return jnp.where(share < 1, less, radius)
 
         radii = jax.tree.map(kept_short, old.radii, old.tried, fresh.radii, share)
-        kept = lambda s: (s.num_products, s.mean_force)
+        kept = lambda s: (s.num_products, s.force)
         return eqx.tree_at(lambda s: (s.radii, *kept(s)), fresh, (radii, *kept(old)))
 
     def gradient(self, state: _NewtonState) -> PyTree[Float[Array, "..."]]:
@@ -269,22 +267,21 @@ class _Trial(NamedTuple):
     """The step itself, what it should do to the gradient, and the gradient where it leads."""
 
 
-# Forces are near those at rest by their mean size, so many times: their norm in a tissue of a hundred cells.
+# How near forces are to those at rest is their typical size so many times: their norm for a hundred cells.
 _TYPICAL = 14.0
 # How far conjugate gradients go at least.
 _COARSEST = 0.35
-# How far they go where the last step has not brought the mean force down by much more.
+# How far they go where the last step has not brought the force down by much more.
 _ROUGH = 0.1
 _USEFUL = 0.9
-# A step that gains less than this share of what it should is corrected, so many times at most, so well.
+# A step is corrected that gains less than this share of what it should, or leaves more than that of the
+# typical force;
 _FINE = 0.9
-_CORRECTIONS = 6
+_LEFT = 0.4
+# so many times at most, so well, by no more products than that.
+_CORRECTIONS = 12
 _LOOSE = 0.3
-# So is one of fewer products than this that leaves more than this share of the mean force. (With fewer
-# vertices than that there are no others to spare.)
-_CHEAP = 20
-_DOWN = 0.1
-_MANY = 16
+_BRIEF = 60
 # A correction goes no further than this share of what steps may; after one that gains nothing, of that.
 _NARROW = 0.3
 _NARROWER = 0.1

@@ -32,10 +32,11 @@ def times(rows: Float[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Arr
     return rows.reshape(rows.shape + (1,) * (x.ndim - rows.ndim)) * x
 
 
-def mean_size(x: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
-    """The mean length of a row."""
-    rows = jax.tree.map(sizes, x)
-    return jnp.asarray(tree.sum(rows)) / number_of(rows)
+def typical_size(x: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
+    """The length that rows have which are not zero: few long ones count less than they do in the mean."""
+    roots = jax.tree.map(lambda x: jnp.sqrt(sizes(x)), x)
+    some = jnp.asarray(tree.sum(jax.tree.map(jnp.count_nonzero, roots)))
+    return (jnp.asarray(tree.sum(roots)) / jnp.maximum(some, 1)) ** 2
 
 
 def number_of(rows: Rows) -> int:
