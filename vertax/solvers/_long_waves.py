@@ -17,7 +17,7 @@ from vertax.mesh._boundary import inverse_of
 from vertax.mesh._topology import take
 
 # Smaller tissues have no waves that are long enough to be slow, and pay more than they gain.
-FEWEST_CELLS = 300
+FEWEST_CELLS = 150
 # A finer grid takes up to a quarter fewer products with the Hessian, and as much longer for each of them.
 _CELLS_A_POINT = 4
 
