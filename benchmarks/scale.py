@@ -1,4 +1,4 @@
-"""How relaxations and gradients grow with the tissue, with the long waves of large tissues and without.
+"""How relaxations and gradients grow with the tissue, with the preconditioner of large tissues and without.
 
 Of relaxations from random tissues to forces below 1e-8: steps on average and at most, T1s, products with the
 Hessian, and seconds (without compilation); and steps and seconds of a gradient at the first one. A tissue
@@ -17,10 +17,12 @@ import numpy as np
 from _timing import first_and_best
 
 import vertax as vx
+import vertax.responses._search as search_module
 import vertax.solvers._long_waves as long_waves
 
 jax.config.update("jax_enable_x64", True)
 FEWEST = long_waves.FEWEST_CELLS
+FEWEST_FOR_EDGES = search_module._FEWEST_CELLS
 TOLERANCE = 1e-8
 
 
@@ -35,8 +37,9 @@ def energy_of(kind: str, tissue: vx.Tissue, seed: int = 0) -> vx.AbstractEnergy:
 
 
 def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str:
-    """What relaxations and a gradient take if tissues from this number of cells on have long waves."""
+    """What relaxations and a gradient take if tissues from this number of cells on are preconditioned."""
     long_waves.FEWEST_CELLS = fewest
+    search_module._FEWEST_CELLS = max(fewest, FEWEST_FOR_EDGES)
     jax.clear_caches()
 
     @eqx.filter_jit
