@@ -137,9 +137,8 @@ def test_few_large_forces_count_little():
     forces = jnp.zeros((101, 2)).at[:100, 0].set(1e-3).at[0, 0].set(1.0)
     assert np.mean(_rows.sizes(forces)) > 1e-2
     assert _rows.typical_size(forces) < 2e-3
-    np.testing.assert_allclose(
-        _rows.typical_size(forces[1:]), 1e-3
-    )  # what does not move does not count
+    # What does not move does not count.
+    np.testing.assert_allclose(_rows.typical_size(forces[1:]), 1e-3)
     assert _rows.typical_size(0 * forces) == 0
 
 

@@ -258,7 +258,7 @@ class Search(eqx.Module):
 
 
 _TAGS: frozenset[object] = frozenset()
-# Smaller tissues take as long with the preconditioner of edges as without.
+# The preconditioner of edges costs smaller tissues more than it saves.
 _FEWEST_CELLS = 300
 # So often what overlaps goes less far before it stays where it is; and after so many attempts nothing moves.
 _SHORTER = 3
