@@ -130,7 +130,21 @@ def test_a_step_that_leaves_much_of_the_force_is_corrected(monkeypatch):
     start = jnp.zeros((N, 2))
     corrected = needed(soft, start)
     monkeypatch.setattr(_newton, "_LEFT", np.inf)
+    monkeypatch.setattr(_newton, "_CHEAP", 0)
     assert corrected < 0.75 * needed(soft, start)
+
+
+def test_a_cheap_step_leaves_little(monkeypatch):
+    """One wall that begins with the cube of the distance, as a contact, and others at rest."""
+
+    def wall(y, _):
+        others = 0.5 * jnp.sum((y[1:] - PLACES[1:]) ** 2) + 0.5 * y[0, 1] ** 2
+        return others + 0.05 * jnp.maximum(1 - y[0, 0], 0) ** 3, None
+
+    start = PLACES.at[0].set(0.0)
+    corrected = needed(wall, start)
+    monkeypatch.setattr(_newton, "_CHEAP", 0)  # Newton's method halves it, and quarters the force
+    assert corrected < 0.75 * needed(wall, start)
 
 
 def test_few_large_forces_count_little():

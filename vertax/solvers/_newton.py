@@ -46,7 +46,9 @@ class NewtonCG(AbstractSolver):
     step is corrected: a few products with the Hessian where it leads bring it back to the floor, and it is
     accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6). So is
     a step that leaves much of the forces: a correction is solved coarsely, and needs no look at the topology.
-    It stays near, the nearer if the last one has gained nothing.
+    It stays near, the nearer if the last one has gained nothing. A tissue near rest leaves little, since that
+    is cheap there: it follows its parameters with its neighbours kept, and no edge flips that is short only
+    on the way.
 
     Where a step gains less energy than the model promised, the regions shrink of those vertices whose
     forces it did not foresee, and of no others; a step that gains nothing is tried again with them, if they
@@ -141,7 +143,9 @@ class NewtonCG(AbstractSolver):
             lower_force = inner(now.gradient, now.gradient) < inner(g, g)
             accepted = finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
-            left = typical_size(now.gradient) > _LEFT * force
+            # (It is cheap to leave little, and with little left fewer edges flip on the way.)
+            most = jnp.where(now.products < _CHEAP, _LITTLE, _LEFT)
+            left = typical_size(now.gradient) > most * force
             wanting = near & finite & ~lost & ((gained < _FINE * predicted) | left)
             corrects = wanting & (now.corrections < _CORRECTIONS)
 
@@ -275,9 +279,11 @@ _COARSEST = 0.35
 _ROUGH = 0.1
 _USEFUL = 0.9
 # A step is corrected that gains less than this share of what it should, or leaves more than that of the
-# typical force;
+# typical force, or after less than so many products more than that;
 _FINE = 0.9
 _LEFT = 0.4
+_CHEAP = 30
+_LITTLE = 0.1
 # so many times at most, so well, by no more products than that.
 _CORRECTIONS = 12
 _LOOSE = 0.3
