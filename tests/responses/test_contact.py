@@ -120,17 +120,13 @@ def test_what_stays_does_not_stay_for_ever():
 
 @pytest.mark.thorough
 def test_what_cannot_go_on_is_not_tried_as_far_again():
-    """Steps that are foreseen well, and lead to overlaps: their regions grew again as fast as they shrank."""
-    relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=600))
-    for seed in (6, 218):  # neither was at rest after 600 steps
+    """Steps that are foreseen well, and lead to overlaps: regions grew again as fast as they shrank there."""
+    relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=200))
+    # The first one took 212 steps then; the second one never ends if regions only shrink.
+    for seed in (294, 711):
         tissue = vx.initialise.periodic_voronoi(64, key=jax.random.key(seed))
         factors = 4.1 + 0.1 * jax.random.normal(jax.random.key(1 + seed), (64,))
         assert relax(tissue, shapes(factors)).num_steps < 100
-    # A cell of three sides that its line tensions close: only a long step leads on.
-    tissue = vx.initialise.periodic_voronoi(1000, key=jax.random.key(1))
-    tensions = jax.random.uniform(jax.random.key(2), (tissue.n_edges,), minval=0.2, maxval=0.6)
-    energy = vx.energies.AreaElasticity(2.0, 1.0) + vx.energies.LineTension(tensions)
-    assert relax(tissue, energy).num_steps < 150
 
 
 def test_without_contact_cells_overlap_and_that_is_refused():
