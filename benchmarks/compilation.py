@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from _arguments import count
 
 import vertax as vx
 
@@ -69,7 +70,7 @@ PARTS = {
 def main() -> None:
     """Print a row for each part and size."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, nargs="*", default=[100, 400])
+    parser.add_argument("--cells", type=count, nargs="*", default=[100, 400])
     parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=list(PARTS))
     chosen = parser.parse_args()
     print(f"{'part':>20} {'cells':>6} {'trace':>7} {'lower':>7} {'XLA':>7} {'kernels':>8}")

@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _arguments import count
 from _timing import first_and_best
 from jax.sharding import Mesh, PartitionSpec
 
@@ -31,8 +32,8 @@ jax.config.update("jax_enable_x64", True)
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Measure ensembles.")
-    parser.add_argument("--cells", type=int, nargs="+", default=[20, 64])
-    parser.add_argument("--tissues", type=int, nargs="+", default=[100, 1000])
+    parser.add_argument("--cells", type=count, nargs="+", default=[20, 64])
+    parser.add_argument("--tissues", type=count, nargs="+", default=[100, 1000])
     parser.add_argument("--shape-factor", type=float, default=3.7)
     parser.add_argument("--no-vmap", action="store_true")
     chosen = parser.parse_args()

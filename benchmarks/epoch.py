@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from _arguments import count
 
 import vertax as vx
 
@@ -37,9 +38,9 @@ def epoch_of(history: vx.fitting.History) -> float:
 def main() -> None:
     """Print one row a size."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cells", type=int, nargs="*", default=[20, 100, 1000])
+    parser.add_argument("cells", type=count, nargs="*", default=[20, 100, 1000])
     parser.add_argument("--adjoint", choices=list(ADJOINTS), default="implicit")
-    parser.add_argument("--epochs", type=int, default=60)
+    parser.add_argument("--epochs", type=count, default=60)
     chosen = parser.parse_args()
     print(
         f"{'cells':>6} {'first epoch s':>14} {'ms/epoch':>9} {'Newton steps':>13} {'T1s':>4} "

@@ -10,6 +10,7 @@ import argparse
 
 import equinox as eqx
 import jax
+from _arguments import count
 from _timing import first_and_best
 
 import vertax as vx
@@ -50,7 +51,7 @@ def relax(tissue: vx.Tissue) -> vx.Equilibrium:
 def main() -> None:
     """Print one row a size."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, nargs="*", default=[100, 500])
+    parser.add_argument("--cells", type=count, nargs="*", default=[100, 500])
     chosen = parser.parse_args()
     print(
         "cells | ms an event: division  removal  T2 sweep | ms of a relaxation: plain  25 % spare  more"

@@ -18,6 +18,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from _arguments import count
 from _timing import first_and_best
 
 import vertax as vx
@@ -28,8 +29,8 @@ jax.config.update("jax_enable_x64", True)
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Measure movement in time.")
-    parser.add_argument("--cells", type=int, nargs="+", default=[100, 1000])
-    parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--cells", type=count, nargs="+", default=[100, 1000])
+    parser.add_argument("--steps", type=count, default=20)
     chosen = parser.parse_args()
     print(
         "cells  steps/s  step/relaxation  gradient/forward  kB a step  T1s  velocities/s  explicit steps/s  "

@@ -14,6 +14,7 @@ import argparse
 import equinox as eqx
 import jax
 import numpy as np
+from _arguments import count
 from _timing import first_and_best
 
 import vertax as vx
@@ -27,7 +28,7 @@ STEP = 1e-3
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Measure the gradient of an extension.")
-    parser.add_argument("--cells", type=int, nargs="+", default=[50, 100, 200, 500])
+    parser.add_argument("--cells", type=count, nargs="+", default=[50, 100, 200, 500])
     parser.add_argument("--edges", type=int, default=3, help="edges with differences")
     chosen = parser.parse_args()
     response = BoxRelaxation(free="shape", relaxation=vx.Relaxation(contact_range=None))

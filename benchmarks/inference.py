@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _arguments import count
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import nnls
 
@@ -210,9 +211,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of dumps")
     parser.add_argument(
-        "--sizes", type=int, nargs="*", default=[20, 100, 300], help="cells of clusters"
+        "--sizes", type=count, nargs="*", default=[20, 100, 300], help="cells of clusters"
     )
-    parser.add_argument("--repeats", type=int, default=3, help="images of each cluster")
+    parser.add_argument("--repeats", type=count, default=3, help="images of each cluster")
     parser.add_argument("--forsys", help="interpreter that has ForSys")
     arguments = parser.parse_args()
     print(HEADER)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+from _arguments import count
 
 import vertax as vx
 
@@ -23,8 +24,8 @@ jax.config.update("jax_enable_x64", True)
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Measure least squares.")
-    parser.add_argument("--cells", type=int, nargs="+", default=[100, 1000])
-    parser.add_argument("--epochs", type=int, default=5)
+    parser.add_argument("--cells", type=count, nargs="+", default=[100, 1000])
+    parser.add_argument("--epochs", type=count, default=5)
     parser.add_argument("--solver", choices=["direct", "minres", "matrix-free"], default="direct")
     chosen = parser.parse_args()
     solver = vx.solvers.Direct() if chosen.solver == "direct" else vx.MINRES()

@@ -12,6 +12,7 @@ import argparse
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from _arguments import count
 from _timing import first_and_best
 
 import vertax as vx
@@ -23,8 +24,8 @@ jax.config.update("jax_enable_x64", True)
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Measure moduli and modes.")
-    parser.add_argument("--cells", type=int, nargs="+", default=[100, 1000])
-    parser.add_argument("--modes", type=int, default=20)
+    parser.add_argument("--cells", type=count, nargs="+", default=[100, 1000])
+    parser.add_argument("--modes", type=count, default=20)
     chosen = parser.parse_args()
     omegas = jnp.geomspace(1e-2, 1e2, 10)
     friction = vx.dissipations.SubstrateFriction(1.0)

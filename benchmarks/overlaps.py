@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from _arguments import count
 
 import vertax as vx
 
@@ -62,8 +63,8 @@ def row(name: str, cases: list[tuple[vx.Tissue, vx.AbstractEnergy]]) -> None:
 def main() -> None:
     """Print one row a kind of tissue."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tissues", type=int, default=100)
-    parser.add_argument("--cells", type=int, default=64)
+    parser.add_argument("--tissues", type=count, default=100)
+    parser.add_argument("--cells", type=count, default=64)
     parser.add_argument(
         "--only", default="", help="a regular expression that the names of rows match"
     )

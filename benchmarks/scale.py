@@ -14,6 +14,7 @@ import time
 import equinox as eqx
 import jax
 import numpy as np
+from _arguments import count
 from _timing import first_and_best
 
 import vertax as vx
@@ -86,11 +87,11 @@ def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str
 def main() -> None:
     """Print a row for each size, kind and choice."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, nargs="*", default=[100, 400, 1000])
+    parser.add_argument("--cells", type=count, nargs="*", default=[100, 400, 1000])
     parser.add_argument("--kinds", nargs="*", default=["3.7", "3.9", "tensions"])
     parser.add_argument("--waves", choices=["with", "without", "both"], default="both")
-    parser.add_argument("--tissues", type=int, default=4)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--tissues", type=count, default=4)
+    parser.add_argument("--repeats", type=count, default=3)
     chosen = parser.parse_args()
     print(
         f"{'cells':>7} {'kind':>8} {'waves':>8} {'steps':>7} {'most':>5} {'T1s':>8} {'products':>9} "

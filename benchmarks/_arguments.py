@@ -1,0 +1,13 @@
+"""What the scripts here take."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def count(text: str) -> int:
+    """A number of things, for `argparse`: at least one."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, and not {number}")
+    return number
