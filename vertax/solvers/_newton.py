@@ -144,7 +144,8 @@ class NewtonCG(AbstractSolver):
             accepted = finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
             # (It is cheap to leave little, and with little left fewer edges flip on the way.)
-            most = jnp.where(now.products < _CHEAP, _LITTLE, _LEFT)
+            few = (now.products < _CHEAP) & (n_rows >= _MANY)
+            most = jnp.where(few, _LITTLE, _LEFT)
             left = typical_size(now.gradient) > most * force
             wanting = near & finite & ~lost & ((gained < _FINE * predicted) | left)
             corrects = wanting & (now.corrections < _CORRECTIONS)
@@ -279,11 +280,13 @@ _COARSEST = 0.35
 _ROUGH = 0.1
 _USEFUL = 0.9
 # A step is corrected that gains less than this share of what it should, or leaves more than that of the
-# typical force, or after less than so many products more than that;
+# typical force, or after less than so many products more than that
 _FINE = 0.9
 _LEFT = 0.4
 _CHEAP = 30
 _LITTLE = 0.1
+# (with fewer vertices than these there are no others, which are to keep their neighbours);
+_MANY = 16
 # so many times at most, so well, by no more products than that.
 _CORRECTIONS = 12
 _LOOSE = 0.3
