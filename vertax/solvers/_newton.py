@@ -280,12 +280,12 @@ _COARSEST = 0.35
 _ROUGH = 0.1
 _USEFUL = 0.9
 # A step is corrected that gains less than this share of what it should, or leaves more than that of the
-# typical force, or after less than so many products more than that
+# typical force;
 _FINE = 0.9
 _LEFT = 0.4
+# or, while it has taken fewer products than these, more than that, where there are so many vertices;
 _CHEAP = 30
 _LITTLE = 0.1
-# (with fewer vertices than these there are no others, which are to keep their neighbours);
 _MANY = 16
 # so many times at most, so well, by no more products than that.
 _CORRECTIONS = 12
