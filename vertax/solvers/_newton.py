@@ -46,9 +46,8 @@ class NewtonCG(AbstractSolver):
     step is corrected: a few products with the Hessian where it leads bring it back to the floor, and it is
     accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6). So is
     a step that leaves much of the forces: a correction is solved coarsely, and needs no look at the topology.
-    It stays near, the nearer if the last one has gained nothing. A tissue near rest leaves little, since that
-    is cheap there: it follows its parameters with its neighbours kept, and no edge flips that is short only
-    on the way.
+    It stays near, the nearer if the last one has gained nothing. While a step is cheap, as near rest, it is
+    corrected until little is left: so fewer edges flip that are short only on the way.
 
     Where a step gains less energy than the model promised, the regions shrink of those vertices whose
     forces it did not foresee, and of no others; a step that gains nothing is tried again with them, if they
@@ -143,10 +142,9 @@ class NewtonCG(AbstractSolver):
             lower_force = inner(now.gradient, now.gradient) < inner(g, g)
             accepted = finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
-            # (It is cheap to leave little, and with little left fewer edges flip on the way.)
-            few = (now.products < _CHEAP) & (n_rows >= _MANY)
-            most = jnp.where(few, _LITTLE, _LEFT)
-            left = typical_size(now.gradient) > most * force
+            # (With little left fewer edges flip that are short only on the way.)
+            cheap = (now.products < _CHEAP) & (n_rows >= _MANY)
+            left = typical_size(now.gradient) > jnp.where(cheap, _LITTLE, _LEFT) * force
             wanting = near & finite & ~lost & ((gained < _FINE * predicted) | left)
             corrects = wanting & (now.corrections < _CORRECTIONS)
 
