@@ -8,7 +8,8 @@ from free_helpers import cluster
 from helpers import fine_difference, random_tissue
 
 import vertax as vx
-from vertax.responses._upheld import _FADE, _OFTEN, REACH, Upheld, _heights
+from vertax.responses._contact import Contacts, no_contacts
+from vertax.responses._upheld import _FADE, _OFTEN, REACH, Upheld, turned_height
 from vertax.transitions._edge_frames import EdgeFrames, edge_axes
 
 NUMBER = 4
@@ -28,6 +29,12 @@ def held(tissue: vx.Tissue, times: int = _OFTEN) -> Upheld:
     for _ in range(times):
         upheld = upheld.updated(tissue, jnp.arange(tissue.n_edges) == NUMBER)
     return upheld
+
+
+def holding(tissue: vx.Tissue, upheld: Upheld) -> Contacts:
+    """No contacts, but these edges are held."""
+    units = {"length_scale": jnp.asarray(1.0), "stiffness": jnp.asarray(6.0)}
+    return no_contacts(0.01, units, tissue).holding(tissue.topology, upheld)
 
 
 def numbers(upheld: Upheld, tissue: vx.Tissue) -> list[int]:
@@ -56,7 +63,7 @@ def test_of_more_edges_than_there_is_room_for_some_are_held():
     for _ in range(_OFTEN):
         upheld = upheld.updated(tissue, jnp.ones(tissue.n_edges, bool))
     assert len(numbers(upheld, tissue)) == len(upheld.edges) < tissue.n_edges
-    assert np.isfinite(upheld(tissue))
+    assert np.isfinite(holding(tissue, upheld)(tissue))
 
 
 @pytest.mark.parametrize("arcs", [False, True], ids=["straight", "arcs"])
@@ -70,11 +77,12 @@ def test_its_derivatives(across, arcs):
 
     def plain(x):
         tissue = there.with_vertices(x)
-        places = jnp.concatenate([tissue.edge_vectors, edge_axes(tissue)], axis=-1)
-        which = jnp.arange(there.n_edges) == NUMBER
-        return jnp.sum(_heights((upheld, which), places))
+        edges = tissue.edge_vectors, edge_axes(tissue)
+        return turned_height(*edges, upheld.reach, upheld.force)[NUMBER]
 
-    energy = lambda x: upheld(there.with_vertices(x))
+    contacts = holding(there, upheld)
+    energy = lambda x: contacts(there.with_vertices(x))
+    assert energy(there.vertices) > 0
     both = lambda f: jax.jvp(jax.value_and_grad(f), (there.vertices,), (jnp.asarray(way),))
     for one, other in zip(*map(jax.tree.leaves, (both(energy), both(plain))), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * float(jnp.abs(other).max()))

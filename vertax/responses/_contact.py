@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.reciprocal import reciprocal
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
 from vertax.mesh._sides import (
@@ -21,8 +22,8 @@ from vertax.mesh._sides import (
     squared_distance_to_segment,
     wedge,
 )
-from vertax.mesh._topology import source, take
-from vertax.responses._local import FLOOR, local_blocks, local_sum
+from vertax.mesh._topology import Topology, take
+from vertax.responses._local import FLOOR, Looks, barrier, local_blocks, local_sum
 from vertax.responses._upheld import REACH, Upheld
 from vertax.solvers._edge_blocks import Symmetric
 
@@ -51,67 +52,101 @@ class Contacts(eqx.Module):
     - `strength`: energy per length squared.
     - `pairs`: half-edges whose source is near another side of their face, and that side; the same twice
         after the last one.
+    - `kinds`: whether one side of each pair comes after the other, or before it; and whether they are two.
     - `slack`: how far the vertices may move until something else may come into range.
     - `upheld`: short edges that would turn inside out.
+    - `looks`: of those first; then for each pair at the corner, and at the start and the end of the side.
     """
 
     distance: Float[Array, ""]
     slope: Float[Array, ""]
     strength: Float[Array, ""]
     pairs: Int[Array, "contacts 2"]
+    kinds: Bool[Array, "3 contacts"]
     slack: Float[Array, ""]
     upheld: Upheld
+    looks: Looks
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The energy of the barrier."""
-        nothing = lambda: jnp.zeros((), tissue.vertices.dtype)
         # Most tissues are free of contacts most of the time, and arcs take thirty times as long with them.
         # Large ones are never free of them, but have few.
-        sizes = [len(self.pairs)]
-        if len(self.pairs) >= _MANY and tissue.arcs is None:
-            sizes.insert(0, len(self.pairs) // 16)
-        count = jnp.sum(self.pairs[:, 0] != self.pairs[:, 1])
-        enough = sum(count > size for size in (0, *sizes[:-1]))
-        energies = [Contacts._energy for _ in sizes]
+        n = len(self.pairs)
+        some, energies = [self], [Contacts._energy]
+        if tissue.arcs is None:
+            some = [self.first(n // 16), self] if n >= _MANY else [self]
+            # Without contacts derivatives would still hand on arrays of zeros: many of them, or long ones.
+            energies = [Contacts._energy_of_few, jax.checkpoint(Contacts._energy)]
+        enough = sum(jnp.sum(self.kinds[2]) > len(few.pairs) for few in some[:-1])
+        enough = jnp.where(jnp.any(self.kinds[2]) | self.upheld.any, 1 + enough, 0)
         if tissue.arcs is None:
             # What is near need not be in range; if nothing is, all derivatives vanish as well.
             there = jax.lax.stop_gradient(tissue)
             none = lambda: jnp.array(False)
-            some = [lambda size=size: self._in_range(there, self.pairs[:size]) for size in sizes]
-            enough = jnp.where(jax.lax.switch(enough, [none, *some]), enough, 0)
-            # Without contacts derivatives would still hand on arrays of zeros: many of them, or long ones.
-            energies = [Contacts._energy_of_few, jax.checkpoint(Contacts._energy)]
-        enough = jnp.maximum(enough, jnp.any(self.upheld.edges < tissue.n_edges))
-        some = [
-            lambda size=size, energy=energy: (
-                energy(self, tissue, self.pairs[:size]) + self.upheld(tissue)
-            )
-            for size, energy in zip(sizes, energies, strict=False)
+            in_range = [lambda few=few: few._in_range(there) for few in some]
+            enough = jnp.where(jax.lax.switch(enough, [none, *in_range]), enough, 0)
+        energies = [
+            lambda few=few, energy=energy: energy(few, tissue)
+            for few, energy in zip(some, energies, strict=False)
         ]
-        return jax.lax.switch(enough, [nothing, *some])
+        return jax.lax.switch(enough, [lambda: jnp.zeros((), tissue.vertices.dtype), *energies])
+
+    def first(self, size: int) -> Contacts:
+        """The first ones alone."""
+        few = self.pairs[:size], self.kinds[:, :size], self.looks[: self._n_looks + 3 * size]
+        return eqx.tree_at(lambda c: (c.pairs, c.kinds, c.looks), self, few)
+
+    def between(self, topology: Topology, pairs: Int[Array, "contacts 2"]) -> Contacts:
+        """The same of other pairs, in a topology."""
+        m, (corner, side) = topology, pairs.T
+        end = take(m.next, side)
+        after, before = take(m.next, corner) == side, take(m.next, end) == corner
+        kinds = jnp.stack([after, before, corner != side])
+        looks = Looks.of(m, jnp.stack([corner, side, end], axis=-1)).flat()
+        looks = self.looks[: self._n_looks].then(looks)
+        return eqx.tree_at(lambda c: (c.pairs, c.kinds, c.looks), self, (pairs, kinds, looks))
+
+    def holding(self, topology: Topology, upheld: Upheld) -> Contacts:
+        """The same with other upheld edges, in a topology."""
+        looks = upheld.looks(topology).flat().then(self.looks[self._n_looks :])
+        return eqx.tree_at(lambda c: (c.upheld, c.looks), self, (upheld, looks))
+
+    @property
+    def _n_looks(self) -> int:
+        return 6 * len(self.upheld.edges)
 
     def differ(self, other: Contacts) -> Bool[Array, ""]:
         """Whether these are others."""
         return jnp.any(self.pairs != other.pairs) | jnp.any(self.upheld.edges != other.upheld.edges)
 
-    def _energy(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
-        corner, side = pairs.T
-        one, other = tissue.sides_of(corner), tissue.sides_of(side)
-        return self.strength * jnp.sum(self._heights(_kinds(tissue, pairs), one, other))
+    def _energy(self, tissue: Tissue) -> Float[Array, ""]:
+        one, other = map(tissue.sides_of, self.pairs.T)
+        of_upheld = self.first(0)._energy_of_few(tissue)
+        return self.strength * jnp.sum(self._heights(one, other)) + of_upheld
 
-    def _energy_of_few(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Float[Array, ""]:
-        _, places = self._places(tissue, pairs)
-        return local_sum(_energies, (self, _kinds(tissue, pairs)), places)
+    def _energy_of_few(self, tissue: Tissue) -> Float[Array, ""]:
+        return local_sum(_heights, self, self._places(tissue))
+
+    def _places(self, tissue: Tissue) -> Float[Array, "some 4"]:
+        # (At once: the derivative of every look at the vertices is as long as all of them.)
+        there = self.looks.at(tissue)
+        of_upheld, of_pairs = there[: self._n_looks], there[self._n_looks :]
+        of_upheld = self.upheld.places(of_upheld.reshape(-1, 6, 2))
+        return jnp.concatenate([of_upheld, _pair_places(of_pairs)])
+
+    def _in_range(self, tissue: Tissue) -> Bool[Array, ""]:
+        looks = self.looks[self._n_looks :]
+        near = self._near(*_as_sides(_pair_places(looks.at(tissue))))
+        return jnp.any(jnp.stack([near < 1 for near, _ in near])) | self.upheld.any
 
     def resistance(self, tissue: Tissue) -> Symmetric:
         """How the barrier resists where one vertex moves alone, nowhere softer than nothing.
 
         For a preconditioner: of straight sides, and of so many contacts as there mostly are.
         """
-        pairs = self.pairs[: max(_FEW, len(self.pairs) // 16)]
-        ends, places = self._places(tissue, pairs)
-        kinds = _kinds(tissue, pairs)
-        rows = local_blocks(_energies, (self, kinds), places)
+        few = self.first(max(_FEW, len(self.pairs) // 16))
+        looks = few.looks[few._n_looks :]
+        rows = local_blocks(Contacts._pair_heights, few, _pair_places(looks.at(tissue)))
         # The corner moves the first vector, the end of the side its chord, and its start both.
         part = lambda i, j: Symmetric(rows[i][j], rows[i][j + 1], rows[i + 1][j + 1])
         corner, chord = part(0, 0), part(2, 2)
@@ -124,43 +159,28 @@ class Contacts(eqx.Module):
         nothing = jnp.zeros(tissue.n_vertices, tissue.vertices.dtype)
 
         def gathered(*blocks: Float[Array, " some"]) -> Float[Array, " vertices"]:
-            return nothing.at[source(ends)].add(jnp.stack(blocks))
+            return nothing.at[looks.vertices].add(jnp.stack(blocks, axis=-1).reshape(-1))
 
         blocks = (block.positive for block in (corner, start, chord))
         return Symmetric(*(gathered(*each) for each in zip(*blocks, strict=True)))
 
-    def _places(
-        self, tissue: Tissue, pairs: Int[Array, "some 2"]
-    ) -> tuple[Int[Array, "3 some"], Float[Array, "some 4"]]:
-        """The half-edges that begin at corners, and at the ends of sides; and where those are."""
-        corner, side = pairs.T
-        # (At once: the derivative of every look at the vertices is as long as all of them.)
-        ends = jnp.stack([corner, side, take(tissue.topology.next, side)])
-        corner, start, end = tissue.corners_of(ends)
-        return ends, jnp.concatenate([corner - start, end - start], axis=-1)
+    def _pair_heights(self, places: Float[Array, "some 4"]) -> Float[Array, " some"]:
+        return self.strength * self._heights(*_as_sides(places))
 
-    def _in_range(self, tissue: Tissue, pairs: Int[Array, "some 2"]) -> Bool[Array, ""]:
-        return jnp.any(jnp.stack([near < 1 for near, _ in self._between(tissue, pairs)]))
+    def _heights(self, one: Sides, other: Sides) -> Float[Array, " some"]:
+        """How high the barrier is for each pair, in units of its strength."""
+        heights = jnp.zeros(len(one), one.dtype)
+        for near, squared in self._near(one, other):
+            # (What is far may be infinitely so.)
+            heights += squared * barrier(jnp.where(near < 1, near, 1))
+        return heights
 
-    def _between(
-        self, tissue: Tissue, pairs: Int[Array, "some 2"]
+    def _near(
+        self, one: Sides, other: Sides
     ) -> list[tuple[Float[Array, " some"], Float[Array, " some"]]]:
         """How near the corners and sides of pairs are, see `_nearness`; those of no pair are far away."""
-        corner, side = pairs.T
-        after, before, apart = _kinds(tissue, pairs)
-        nearness = self._nearness(tissue.sides_of(corner), tissue.sides_of(side), after, before)
-        return [(jnp.where(apart, near, 1), squared) for near, squared in nearness]
-
-    def _heights(
-        self, kinds: Bool[Array, "3 some"], one: Sides, other: Sides
-    ) -> Float[Array, " some"]:
-        """How high the barrier is for each pair, in units of its strength."""
-        after, before, apart = kinds
-        heights = jnp.zeros(len(one), one.dtype)
-        for near, squared in self._nearness(one, other, after, before):
-            near = jnp.where(apart & (near < 1), near, 1)
-            heights -= squared * (1 - near) ** 2 * jnp.log((near + FLOOR) / (1 + FLOOR))
-        return heights
+        nearness = self._nearness(one, other, *self.kinds[:2])
+        return [(jnp.where(self.kinds[2], near, 1), squared) for near, squared in nearness]
 
     def _nearness(
         self, one: Sides, other: Sides, after: Bool[Array, " n"], before: Bool[Array, " n"]
@@ -170,30 +190,32 @@ class Contacts(eqx.Module):
         The distance is that of the start of one side from the other; of arcs also that between the two, or
         the angle if one follows on the other.
         """
-        range_ = jnp.broadcast_to(self.distance**2, after.shape)
+        apart = jnp.broadcast_to(reciprocal(self.distance**2), after.shape)
 
-        def limited(arm: Float[Array, " n"], where: Bool[Array, " n"]) -> Float[Array, " n"]:
-            short = self.slope**2 * arm
-            short = range_ * short / (range_ + short)
-            return jnp.where(where, jnp.where(short > 0, short, 1), range_)
+        def inverse_square(arm: Float[Array, " n"], where: Bool[Array, " n"]) -> Float[Array, " n"]:
+            """Of the range, where a side is next to another one with a squared distance to its end."""
+            where &= arm > 0
+            return apart + jnp.where(where, reciprocal(self.slope**2 * jnp.where(where, arm, 1)), 0)
 
         first = one[:, :2] - other[:, :2]
         last = first - other[:, 2:4]
-        limit = limited(jnp.minimum(dot(first, first), dot(last, last)), after | before)
+        inverse = inverse_square(jnp.minimum(dot(first, first), dot(last, last)), after | before)
+        squared = reciprocal(inverse)
         if one.shape[-1] == 4:
-            return [(squared_distance_to_segment(one[:, :2], other) / limit, limit)]
+            return [(squared_distance_to_segment(one[:, :2], other) * inverse, squared)]
         circles = circle_of(one), circle_of(other)
-        near = [(squared_distance_to_arc(one[:, :2], other, circles[1]) / limit, limit)]
+        near = [(squared_distance_to_arc(one[:, :2], other, circles[1]) * inverse, squared)]
         sine, cosine = wedge(one, circles)
         acute = after & (cosine > 0) & (sine > 0)
         arms = dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])
         # (The corner's other side is next to the one before. This one is not, and may come near anywhere.)
-        limit = limited(jnp.minimum(*arms), after)
+        inverse = inverse_square(jnp.minimum(*arms), after)
         angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
         gap, weight = bulge_gap(one, other, circles, self.distance)
         far = jnp.isinf(gap)
-        gap = jnp.where(far, jnp.inf, jnp.where(far, 1, gap) ** 2 / limit)
-        near.append((jnp.where(after, angle, gap), limit * jnp.where(after, 1, weight)))
+        gap = jnp.where(far, jnp.inf, jnp.where(far, 1, gap) ** 2 * inverse)
+        weight = reciprocal(inverse) * jnp.where(after, 1, weight)
+        near.append((jnp.where(after, angle, gap), weight))
         return near
 
     def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, " vertices"]]:
@@ -213,9 +235,8 @@ class Contacts(eqx.Module):
         there = jnp.arange(len(pairs)) < jnp.sum(near)
         pairs = jnp.where(there[:, None], pairs, 0)
         slack = 0.5 * (jnp.sqrt(least) - _MARGIN) * self.distance
-        return eqx.tree_at(lambda c: (c.pairs, c.slack), self, (pairs, slack)), overlaps.vertices(
-            tissue.topology
-        )
+        found = eqx.tree_at(lambda c: c.slack, self.between(tissue.topology, pairs), slack)
+        return found, overlaps.vertices(tissue.topology)
 
     def crushed(
         self, before: Tissue, tissue: Tissue, known: Bool[Array, " vertices"]
@@ -224,14 +245,12 @@ class Contacts(eqx.Module):
 
         That is said only of contacts between `known` vertices, which are what they were before.
         """
-        corner, side = self.pairs[:, 0], self.pairs[:, 1]
-        steps = zip(
-            self._between(before, self.pairs), self._between(tissue, self.pairs), strict=True
-        )
+        sides = [map(there.sides_of, self.pairs.T) for there in (before, tissue)]
+        steps = zip(*(self._near(*both) for both in sides), strict=True)
         worse = [(new < _CREST) & (new < old) for (old, _), (new, _) in steps]
-        ends = source(jnp.stack([corner, side, take(tissue.topology.next, side)]))
-        behind = functools.reduce(jnp.logical_or, worse) & jnp.all(take(known, ends), axis=0)
-        return jnp.zeros(tissue.n_vertices, bool).at[ends].max(behind)
+        ends = self.looks.vertices[self._n_looks :].reshape(-1, 3)
+        behind = functools.reduce(jnp.logical_or, worse) & jnp.all(take(known, ends), axis=-1)
+        return jnp.zeros(tissue.n_vertices, bool).at[ends].max(behind[:, None])
 
     def moved(self, before: Tissue, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
         """The contacts after vertices moved, if there are none, and whether that is certain."""
@@ -240,28 +259,29 @@ class Contacts(eqx.Module):
         # (Arcs bend as well, and their angles are not those of the chords.)
         straight = jnp.array(tissue.arcs is None)
         clear = straight & (slack > 0) & _angles_are_open(tissue, _MARGIN * self.slope)
-        return eqx.tree_at(lambda c: (c.pairs, c.slack), self, (0 * self.pairs, slack)), clear
+        none = 0 * self.pairs, jnp.zeros_like(self.kinds), slack
+        return eqx.tree_at(lambda c: (c.pairs, c.kinds, c.slack), self, none), clear
 
 
-def _kinds(tissue: Tissue, pairs: Int[Array, "some 2"]) -> Bool[Array, "3 some"]:
-    """Whether one side of each pair comes after the other, or before it; and whether they are two."""
-    following = tissue.topology.next
-    corner, side = pairs.T
-    after = take(following, corner) == side
-    before = take(following, take(following, side)) == corner
-    return jnp.stack([after, before, corner != side])
+def _pair_places(there: Float[Array, "looks 2"]) -> Float[Array, "some 4"]:
+    there = there.reshape(-1, 3, 2)
+    corner, start, end = (there[:, k] for k in range(3))
+    return jnp.concatenate([corner - start, end - start], axis=-1)
 
 
-# A corner and a straight side have four degrees of freedom: where the corner is from the start of the side,
-# and the chord.
-def _energies(
-    args: tuple[Contacts, Bool[Array, "3 some"]], places: Float[Array, "some 4"]
-) -> Float[Array, " some"]:
-    contacts, kinds = args
+def _as_sides(places: Float[Array, "some 4"]) -> tuple[Sides, Sides]:
+    # A corner and a straight side have four degrees of freedom: where the corner is from the start of the
+    # side, and the chord.
     first, chord = places[:, :2], places[:, 2:]
     zero = jnp.zeros_like(first)
-    one, other = jnp.concatenate([first, zero], axis=-1), jnp.concatenate([zero, chord], axis=-1)
-    return contacts.strength * contacts._heights(kinds, one, other)
+    return jnp.concatenate([first, zero], axis=-1), jnp.concatenate([zero, chord], axis=-1)
+
+
+def _heights(contacts: Contacts, places: Float[Array, "some 4"]) -> Float[Array, " some"]:
+    """The energies of upheld edges, and then of pairs."""
+    n = len(contacts.upheld.edges)
+    of_upheld = contacts.upheld.heights(places[:n])
+    return jnp.concatenate([of_upheld, contacts._pair_heights(places[n:])])
 
 
 # So many contacts count for a preconditioner at least.
@@ -291,10 +311,12 @@ def no_contacts(
     # The barrier must not depend on the parameters of the energy, not even through its strength: that would
     # be one more derivative. So it is a power of 16.
     strength = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0)) / slope
-    nothing = jnp.zeros((tissue.n_vertices, 2), tissue.topology.twin.dtype)
-    slack = jnp.zeros_like(length)
     upheld = Upheld.none(tissue, jnp.minimum(reach, REACH) * length, strength * slope * length)
-    return Contacts(reach * length, slope, strength, nothing, slack, upheld)
+    n, some = tissue.n_vertices, 3 * tissue.n_vertices + 6 * len(upheld.edges)
+    index = tissue.topology.twin.dtype
+    none = jnp.zeros((n, 2), index), jnp.zeros((3, n), bool)
+    looks = Looks(jnp.zeros(some, index), jnp.zeros((some, 2), tissue.topology.frame.dtype))
+    return Contacts(reach * length, slope, strength, *none, jnp.zeros_like(length), upheld, looks)
 
 
 def _angles_are_open(tissue: Tissue, least: Float[Array, ""]) -> Bool[Array, ""]:

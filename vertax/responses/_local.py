@@ -6,14 +6,52 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from vertax._base.reciprocal import logarithm
 from vertax._base.sums import total
+from vertax.mesh import Tissue
+from vertax.mesh._topology import Topology, source, take
 
 FLOOR = 1e-4
 """What stands beside the argument of their logarithm: they are finite, and high enough."""
+
+
+def barrier(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """-(1 - x)² ln x, up to 1: almost, see `FLOOR`."""
+    return (1 - x) ** 2 * (jnp.log1p(FLOOR) - logarithm(x + FLOOR))
+
+
+class Looks(eqx.Module):
+    """Which vertices the numbers of each row come from, in one topology: found once, and looked at often."""
+
+    vertices: Int[Array, "*some"]
+    images: Int[Array, "*some 2"]
+    """In which image of a periodic box."""
+
+    @classmethod
+    def of(cls, topology: Topology, half_edges: Int[Array, "*some"]) -> Looks:
+        """At the sources of half-edges, in the frames of the cells on their left."""
+        return cls(source(half_edges), take(topology.frame, half_edges))
+
+    def flat(self) -> Looks:
+        """One after the other."""
+        return Looks(self.vertices.reshape(-1), self.images.reshape(-1, 2))
+
+    def __getitem__(self, which: slice) -> Looks:
+        return Looks(self.vertices[which], self.images[which])
+
+    def then(self, other: Looks) -> Looks:
+        """Those, and then others."""
+        return jax.tree.map(lambda *both: jnp.concatenate(both), self, other)
+
+    def at(self, tissue: Tissue) -> Float[Array, "*some 2"]:
+        """Where those vertices are."""
+        return take(tissue.vertices, self.vertices) + tissue.boundary.translation(self.images)
+
 
 # Energies of places, one a row, and something else that they depend on.
 _Energies = Callable[[Any, Float[Array, "some 4"]], Float[Array, " some"]]
@@ -32,7 +70,9 @@ def _(energies: _Energies, primals: tuple, tangents: tuple) -> tuple[Array, Arra
     return local_sum(energies, *primals), jnp.sum(_slopes(energies, *primals) * tangents[-1].T)
 
 
+# (Compiled functions, so that each is traced once.)
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@functools.partial(jax.jit, static_argnums=0)
 def _slopes(energies: _Energies, args: Any, places: Float[Array, "some 4"]) -> Array:
     return _along_each(lambda x: energies(args, x), places)
 
@@ -44,11 +84,13 @@ def _(energies: _Energies, primals: tuple, tangents: tuple) -> tuple[Array, Arra
     return _slopes(energies, *primals), change
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def local_blocks(
     energies: _Energies, args: Any, places: Float[Array, "some 4"]
 ) -> Float[Array, "4 4 some"]:
     """The second derivatives by the four numbers of each row."""
-    return _along_each(lambda x: _slopes.fun(energies, args, x), places)
+    slopes = lambda x: _along_each(lambda x: energies(args, x), x)
+    return _along_each(slopes, places)
 
 
 def _along_each(

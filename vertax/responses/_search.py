@@ -204,7 +204,7 @@ class Search(eqx.Module):
                 turned = dot(there.edge_vectors, tissue.edge_vectors) < 0
                 turned &= jnp.all(counts == state.counts, axis=tuple(range(counts.ndim - 1)))
                 upheld = contacts.upheld.updated(tissue, turned)
-                contacts = eqx.tree_at(lambda c: c.upheld, contacts, upheld)
+                contacts = contacts.holding(tissue.topology, upheld)
             return _Arrival(tissue, contacts, counts, share, blamed, overlapping, last.tries + 1)
 
         whole = jnp.ones(goal.n_vertices, goal.vertices.dtype)

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.reciprocal import inverse_root, reciprocal
 from vertax.mesh import Tissue
 from vertax.mesh._sides import dot
-from vertax.mesh._topology import edge_neighbourhood, take
-from vertax.responses._local import FLOOR, local_sum
-from vertax.transitions._edge_frames import edge_axis
+from vertax.mesh._topology import Topology, edge_neighbourhood, take
+from vertax.responses._local import FLOOR, Looks, barrier
 
 # Where an energy presses the ends of an edge together, the edge opens once it has flipped. Forces can press
 # it from all sides: then four cells meet in a point, flipped or not, and the energy is least where the edge
@@ -47,15 +47,33 @@ class Upheld(eqx.Module):
         none = jnp.full(some, n, tissue.topology.edge.dtype)
         return cls(none, jnp.zeros(n, jnp.int32), reach, force)
 
-    def __call__(self, tissue: Tissue) -> Float[Array, ""]:
-        """The energy of the barrier."""
-        m = tissue.topology
-        there = self.edges < tissue.n_edges
-        edges = jnp.where(there, self.edges, 0)
-        half_edges = jnp.concatenate([take(m.half_edge, edges), *edge_neighbourhood(m, edges)[1:]])
-        chords = tissue.sides_of(half_edges)[:, 2:4].reshape(5, -1, 2)
-        places = jnp.concatenate([chords[0], edge_axis(*chords)], axis=-1)
-        return local_sum(_heights, (self, there), places)
+    @property
+    def any(self) -> Bool[Array, ""]:
+        """Whether there are any."""
+        return jnp.any(self.edges < len(self.counts))
+
+    def looks(self, topology: Topology) -> Looks:
+        """At the ends of each edge, and the far ends of its four neighbours, in one frame."""
+        m = topology
+        edges = jnp.minimum(self.edges, m.n_edges - 1)
+        _, *neighbours = edge_neighbourhood(m, edges)
+        leaving = jnp.stack([take(m.half_edge, edges), *neighbours], axis=-1)
+        here, there = Looks.of(m, leaving), Looks.of(m, take(m.next, leaving))
+        start, end = here.images[:, :1], there.images[:, :1]
+        offsets = there.images - here.images
+        images = [start, end, start + offsets[:, 1:3], end + offsets[:, 3:]]
+        vertices = jnp.concatenate([here.vertices[:, :1], there.vertices], axis=1)
+        return Looks(vertices, jnp.concatenate(images, axis=1))
+
+    def places(self, around: Float[Array, "some 6 2"]) -> Float[Array, "some 4"]:
+        """Each edge as a vector, and which way it ought to point, from where these are."""
+        start, end, a, b, c, d = (around[:, k] for k in range(6))
+        return jnp.concatenate([end - start, c + d - a - b], axis=-1)
+
+    def heights(self, places: Float[Array, "some 4"]) -> Float[Array, " some"]:
+        """The energy of each."""
+        heights = turned_height(places[:, :2], places[:, 2:], self.reach, self.force)
+        return jnp.where(self.edges < len(self.counts), heights, 0)
 
     def updated(self, tissue: Tissue, turned: Bool[Array, " edges"]) -> Upheld:
         """With those that were put upright, and without those that have grown."""
@@ -66,22 +84,13 @@ class Upheld(eqx.Module):
         held &= dot(chord, chord) < (_FADE * self.reach) ** 2
         held |= turned & (counts >= _OFTEN)
         edges = jnp.nonzero(held, size=len(self.edges), fill_value=n)[0]
-        there = edges.astype(self.edges.dtype), counts
-        return eqx.tree_at(lambda u: (u.edges, u.counts), self, there)
+        return Upheld(edges.astype(self.edges.dtype), counts, self.reach, self.force)
 
 
 # An edge is held once it was put upright so often. (Edges under high tension often turn on their way.)
 _OFTEN = 8
 # So many edges are held at most, or one of so many.
 _FEWEST, _SHARE = 16, 256
-
-
-def _heights(
-    args: tuple[Upheld, Bool[Array, " some"]], places: Float[Array, "some 4"]
-) -> Float[Array, " some"]:
-    upheld, there = args
-    heights = turned_height(places[:, :2], places[:, 2:], upheld.reach, upheld.force)
-    return jnp.where(there, heights, 0)
 
 
 def turned_height(
@@ -91,14 +100,15 @@ def turned_height(
     force: Float[Array, ""],
 ) -> Float[Array, " some"]:
     """The energy that it takes to turn edges away from the way they ought to point."""
-    squared = jnp.sum(edge**2, axis=-1)
-    near = jax.lax.stop_gradient(squared < (_FADE * reach) ** 2)
+    squared = dot(edge, edge)
+    inverse = reciprocal(reach)
+    far = squared * (inverse / _FADE) ** 2
+    near = jax.lax.stop_gradient(far < 1)
     # (What is said of others does not matter, and must have a derivative.)
     axis = jnp.where(near[:, None], axis, 1)
-    norm = jnp.sqrt(jnp.maximum(jnp.sum(axis**2, axis=-1), jnp.finfo(axis.dtype).tiny))
-    length = jnp.sqrt(squared + (FLOOR * reach) ** 2)
-    upright = (length + jnp.sum(edge * axis, axis=-1) / norm) / (2 * reach)
+    per_length = inverse_root(jnp.maximum(dot(axis, axis), jnp.finfo(axis.dtype).tiny))
+    softened = squared + (FLOOR * reach) ** 2
+    length = softened * inverse_root(softened)
+    upright = (length + dot(edge, axis) * per_length) * (0.5 * inverse)
     upright = jnp.where(near & (upright < 1), upright, 1)
-    fade = jnp.maximum(1 - squared / (_FADE * reach) ** 2, 0) ** 3
-    barrier = -((1 - upright) ** 2) * jnp.log((upright + FLOOR) / (1 + FLOOR))
-    return force * reach * fade * barrier
+    return force * reach * jnp.maximum(1 - far, 0) ** 3 * barrier(upright)

@@ -1,0 +1,43 @@
+"""Divisions whose derivatives divide no more.
+
+XLA compiles and runs a loop of its own for each division, and JAX divides again in the derivative of each.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+@jax.custom_jvp
+def reciprocal(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """1 / x."""
+    return 1 / x
+
+
+@reciprocal.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    y = reciprocal(*primals)
+    return y, -y * y * tangents[0]
+
+
+@jax.custom_jvp
+def inverse_root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """1 / √x."""
+    return 1 / jnp.sqrt(x)
+
+
+@inverse_root.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    y = inverse_root(*primals)
+    return y, -0.5 * y * y * y * tangents[0]
+
+
+@jax.custom_jvp
+def logarithm(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The natural logarithm."""
+    return jnp.log(x)
+
+
+@logarithm.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return logarithm(*primals), reciprocal(*primals) * tangents[0]
