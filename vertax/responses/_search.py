@@ -29,6 +29,8 @@ class SearchState(eqx.Module):
     origin: PyTree[Array]
     """The configuration right after the last transition, or the first one."""
     minimiser: PatientState
+    pending: Bool[Array, ""]
+    """Whether the minimiser has yet to find out what the forces are."""
     contacts: Contacts | None
     overlaps: Bool[Array, ""]
     """Whether the tissue overlaps, and always has."""
@@ -89,6 +91,7 @@ class Search(eqx.Module):
             tissue,
             tissue.configuration,
             minimiser,
+            no,
             contacts,
             no,
             counts,
@@ -105,10 +108,11 @@ class Search(eqx.Module):
         arrays, static = eqx.partition(state, eqx.is_array)
 
         def unfinished(arrays: SearchState) -> Bool[Array, ""]:
-            return ~arrays.finished & (arrays.num_steps < num_steps)
+            return ~arrays.finished & ((arrays.num_steps < num_steps) | arrays.pending)
 
         def iterate(arrays: SearchState) -> SearchState:
-            return eqx.filter(self._step(eqx.combine(arrays, static), energy), eqx.is_array)
+            last = arrays.num_steps >= num_steps
+            return eqx.filter(self._step(eqx.combine(arrays, static), energy, last), eqx.is_array)
 
         return eqx.combine(jax.lax.while_loop(unfinished, iterate, arrays), static)
 
@@ -122,13 +126,20 @@ class Search(eqx.Module):
         finite = jnp.isfinite(state.minimiser.force) & jnp.all(jnp.isfinite(state.tissue.vertices))
         return optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
 
-    def _step(self, state: SearchState, energy: AbstractEnergy) -> SearchState:
-        """A step of the minimiser (not the first time), then transitions."""
+    def _step(
+        self, state: SearchState, energy: AbstractEnergy, last: Bool[Array, ""]
+    ) -> SearchState:
+        """A step of the minimiser (not the first time), then transitions.
+
+        Or only a look at the forces, where they are pending and no more is to be done, or no more (`last`).
+        """
         before = state.tissue
         args = (before, energy, state.contacts)
+        rest = self.options["tolerance"]
         options = self.options | {
             "long_waves": LongWaves.of(before),
             "edge_blocks": blocks_of(before, energy, state.contacts),
+            "stays_below": jnp.where(state.pending, jnp.where(last, jnp.inf, rest), 0),
         }
 
         def step() -> tuple[PyTree, PatientState]:
@@ -139,7 +150,9 @@ class Search(eqx.Module):
 
         here = (before.configuration, state.minimiser)
         goal, minimiser = _either(state.started, step, lambda: here, here)
-        arrived = self._arrive(state, before.with_configuration(goal), energy)
+        done = self.minimiser.at_rest(minimiser) | jnp.isnan(minimiser.force)
+        stays = state.pending & (last | done)
+        arrived = self._arrive(state, before.with_configuration(goal), energy, stays)
         tissue, contacts = arrived.tissue, arrived.contacts
         flipped = jnp.any(arrived.counts != state.counts)
         elsewhere = jax.tree.map(
@@ -162,16 +175,19 @@ class Search(eqx.Module):
             tissue=tissue,
             origin=choose(flipped, tissue.configuration, state.origin),
             minimiser=minimiser,
+            pending=(changed | ~state.started) & self.minimiser.solver.evaluates_late,
             contacts=contacts,
-            overlaps=jnp.any(arrived.overlapping),
+            overlaps=jnp.where(stays, state.overlaps, jnp.any(arrived.overlapping)),
             counts=arrived.counts,
-            num_steps=state.num_steps + jnp.where(state.started, 1, 0),
+            num_steps=state.num_steps + jnp.where(state.started & ~stays, 1, 0),
             started=jnp.array(True),
             finished=(self.minimiser.at_rest(minimiser) & ~flipped & jnp.all(arrived.share == 1))
             | jnp.isnan(minimiser.force),
         )
 
-    def _arrive(self, state: SearchState, goal: Tissue, energy: AbstractEnergy) -> _Arrival:
+    def _arrive(
+        self, state: SearchState, goal: Tissue, energy: AbstractEnergy, stays: Bool[Array, ""]
+    ) -> _Arrival:
         """Transitions where a step leads; vertices of what would overlap go less far."""
         before = state.tissue
 
@@ -216,7 +232,7 @@ class Search(eqx.Module):
 
         def unfinished(arrays: _Arrival) -> Bool[Array, ""]:
             again = guarded & jnp.any(arrays.overlapping) & (arrays.tries < _TRIES)
-            return (arrays.tries == 0) | again
+            return ((arrays.tries == 0) & ~stays) | again
 
         def iterate(arrays: _Arrival) -> _Arrival:
             return eqx.filter(attempt(eqx.combine(arrays, static)), eqx.is_array)
@@ -251,10 +267,10 @@ class Search(eqx.Module):
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
     ) -> PatientState:
         struct = jax.ShapeDtypeStruct((), tissue.vertices.dtype)
-        args = (tissue, energy, contacts)
-        return self.minimiser.init(
-            objective, tissue.configuration, args, self.options, struct, None, _TAGS
-        )
+        start, args = tissue.configuration, (tissue, energy, contacts)
+        if self.minimiser.solver.evaluates_late:
+            return self.minimiser.unevaluated(start, self.options, struct, None)
+        return self.minimiser.init(objective, start, args, self.options, struct, None, _TAGS)
 
 
 _TAGS: frozenset[object] = frozenset()

@@ -44,6 +44,7 @@ def bounded_step(
     waving: Bool[Array, ""],
     max_products: int | Int[Array, ""],
     options: dict[str, Any],
+    active: Bool[Array, ""] | bool = True,
 ) -> System:
     """A step that goes downhill, and nowhere much beyond its bounds.
 
@@ -59,6 +60,7 @@ def bounded_step(
     - `waving`: whether the long waves of a large tissue precondition it.
     - `max_products`: most products with the Hessian.
     - `options`: of the minimiser: typical sizes, and what preconditions it.
+    - `active`: whether to do anything at all.
     """
     stiffness = options.get("stiffness", 1.0)
     blocks: EdgeBlocks | None = options.get("edge_blocks")
@@ -69,7 +71,7 @@ def bounded_step(
     if waves is not None:
         # Far from rest steps are short, and what is soft may have negative curvature.
         measure = lambda: waves.measured(hessian, g, stiffness)
-        medium = jax.lax.cond(waving, measure, lambda: medium)
+        medium = jax.lax.cond(waving & active, measure, lambda: medium)
 
     def preconditioner(shift: Rows) -> Callable[[PyTree], PyTree]:
         yielding = jax.tree.map(lambda s: 1 / (stiffness + s), shift)
@@ -168,9 +170,9 @@ def bounded_step(
         rounds = system.rounds + (end.far | cut_first)
         return System(end.p, end.hp, shift, rounds, done & ~over & ~cut_first, end.k, whole, over)
 
-    rounds, unsolved = jnp.where(resumes, -1, 0), jnp.array(False)
+    rounds, done = jnp.where(resumes, -1, 0), jnp.logical_not(active)
     unknown = jnp.zeros_like(forcing)
-    begin = System(*start, shift, rounds, unsolved, jnp.array(0), unknown, resumes)
+    begin = System(*start, shift, rounds, done, jnp.array(0), unknown, resumes)
     return jax.lax.while_loop(unfinished, solved, begin)
 
 

@@ -76,6 +76,16 @@ class NewtonCG(AbstractSolver):
         never = jnp.full_like(value, jnp.inf)
         return _NewtonState(value, gradient, radii, radii, jnp.array(0), never, aux)
 
+    @property
+    def evaluates_late(self) -> bool:
+        return True
+
+    def unevaluated(self, y: Any, options: Any, f_struct: Any, aux_struct: Any) -> _NewtonState:
+        of_any_value = lambda y, args: (jnp.full(f_struct.shape, jnp.inf, f_struct.dtype), aux)
+        aux = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct)
+        state = self.init(of_any_value, y, None, options, f_struct, aux_struct, frozenset())
+        return eqx.tree_at(lambda s: s.gradient, state, tree.full_like(y, jnp.inf))
+
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
     ) -> tuple[Any, _NewtonState, Any]:
@@ -83,75 +93,54 @@ class NewtonCG(AbstractSolver):
         # Forces are measured in that which moves a vertex by the length scale. (That of most, lest few places
         # with large forces keep all others waiting.)
         unit = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
-        g, zero = state.gradient, tree.zeros_like(y)
-        force = typical_size(g)
-        finest = jnp.sqrt(_TYPICAL * force / unit)
-        near = finest < _COARSEST
-        # Where forces do not fall as they would near a minimum, exact steps are of no use (the second choice
-        # of Eisenstat & Walker).
-        before = jnp.where(state.force > 0, state.force, jnp.inf)
-        useful = jnp.minimum(_ROUGH, _USEFUL * (force / before) ** 2)
-        forcing = jnp.minimum(_COARSEST, jnp.maximum(finest, useful))
+        n_rows = number_of(state.radii)
+        few_products = min(self.max_products, _BRIEF)
+        zero = tree.zeros_like(y)
         no, yes, none = jnp.array(False), jnp.array(True), jnp.array(0)
-        whole = jnp.ones_like(state.value)
 
         def attempt(last: _Trial) -> _Trial:
-            """A step, or the correction of one."""
-            first, resumes = ~last.corrects, ~last.corrects & (last.refusals > 0)
-            bound = last.room * reach
-            _, hessian = jax.linearize(lambda x: value_and_gradient(fn, x, args)[1], last.y)
-            solution = bounded_step(
-                hessian,
-                last.gradient,
-                last.shift,
-                jax.tree.map(lambda radius: jnp.minimum(radius, bound), last.radii),
-                start=choose(resumes, last.uncorrected[:2], (zero, zero)),
-                resumes=resumes,
-                forcing=jnp.where(first, forcing, _LOOSE),
-                waving=first & ~resumes & near,
-                max_products=jnp.where(first, self.max_products, few_products),
-                options=options,
-            )
-            p, hp = solution.p, solution.hp
-            predicted = jnp.where(first, gain(last.gradient, p, hp), last.predicted)
-            there = tree.add(last.y, p)
-            value, gradient, aux = value_and_gradient(fn, there, args)
-            better = first | (_finite(value, gradient) & (value < last.value))
-            foreseen = tree.add(last.gradient, hp)
-            reached = (there, value, gradient, aux, foreseen, solution.shift)
-            before = (last.y, last.value, last.gradient, last.aux, last.foreseen, last.shift)
-            now = _Trial(
-                *choose(better, reached, before),
-                radii=last.radii,
-                predicted=predicted,
-                products=last.products + solution.k,
-                corrections=last.corrections + ~first,
-                refusals=last.refusals,
-                corrects=yes,
-                room=jnp.where(first, _NARROW, jnp.where(better, 1, _NARROWER) * last.room),
-                again=no,
-                accepted=no,
-                uncorrected=choose(first, (p, hp, gradient), last.uncorrected),
-            )
+            """Look where the last one has led, and judge that; and a step, or a correction, from here."""
+            gradient, hessian, (value, aux) = jax.linearize(force_and_value, last.y, has_aux=True)
+            here = _Point(last.y, value, gradient, aux, last.foreseen, last.shift)
+            origin = choose(last.begins, (value, gradient, aux), last.origin)
+            whole, g, _ = origin
+            force = typical_size(g)
+            finest = jnp.sqrt(_TYPICAL * force / unit)
+            near = finest < _COARSEST
+            # Where forces do not fall as they would near a minimum, exact steps are of no use (the second
+            # choice of Eisenstat & Walker).
+            before = jnp.where(state.force > 0, state.force, jnp.inf)
+            useful = jnp.minimum(_ROUGH, _USEFUL * (force / before) ** 2)
+            forcing = jnp.minimum(_COARSEST, jnp.maximum(finest, useful))
+
+            first, arrived = ~last.corrects, last.arrives
+            better = arrived & (first | (_finite(value, gradient) & (value < last.best.value)))
+            best = choose(better, here, last.best)
+            p, hp, there = last.step
+            step = (p, hp, choose(arrived & first, gradient, there))
 
             # Near equilibrium the gain drowns in the rounding of E; there a step is good if it lowers the
             # force.
-            lost = jnp.abs(predicted) <= _rounding(now.value)
-            gained, finite = state.value - now.value, _finite(now.value, now.gradient)
+            predicted = last.predicted
+            lost = jnp.abs(predicted) <= _rounding(best.value)
+            gained, finite = whole - best.value, _finite(best.value, best.gradient)
             ratio = gained / jnp.where(predicted > 0, predicted, 1)
-            lower_force = inner(now.gradient, now.gradient) < inner(g, g)
-            accepted = finite & jnp.where(lost, lower_force, ratio > 1e-4)
+            lower_force = inner(best.gradient, best.gradient) < inner(g, g)
+            accepted = arrived & finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
             # (With little left fewer edges flip that are short only on the way.)
-            cheap = (now.products < _CHEAP) & (n_rows >= _MANY)
-            left = typical_size(now.gradient) > jnp.where(cheap, _LITTLE, _LEFT) * force
+            cheap = (last.products < _CHEAP) & (n_rows >= _MANY)
+            left = typical_size(best.gradient) > jnp.where(cheap, _LITTLE, _LEFT) * force
             wanting = near & finite & ~lost & ((gained < _FINE * predicted) | left)
-            corrects = wanting & (now.corrections < _CORRECTIONS)
+            corrections = last.corrections + (arrived & ~first)
+            corrects = arrived & wanting & (corrections < _CORRECTIONS)
+            narrower = jnp.where(better, 1, _NARROWER) * last.room
+            room = jnp.where(arrived, jnp.where(first, _NARROW, narrower), last.room)
 
             # What a correction has not mended is to be blamed on the step.
-            corrected = (tree.sub(now.y, y), tree.sub(now.foreseen, g), now.gradient)
-            p, hp, gradient = choose(fine, corrected, now.uncorrected)
-            missing = tree.sub(tree.sub(gradient, g), hp)
+            corrected = (tree.sub(best.y, y), tree.sub(best.foreseen, g), best.gradient)
+            p, hp, there = choose(fine, corrected, step)
+            missing = tree.sub(tree.sub(there, g), hp)
             errors = jax.tree.map(_relative, missing, g, hp)
             # What each row may be wrong about the energy, on average.
             due = jnp.maximum(predicted, 0) / n_rows
@@ -160,8 +149,8 @@ class NewtonCG(AbstractSolver):
                 lambda error, *row: (error < 0.25) | harmless(*row), errors, missing, p
             )
             blamed = n_rows - sum(jnp.sum(rows) for rows in jax.tree.leaves(foreseen))
-            retries = ~accepted & (blamed > 0) & (blamed < _FEW * n_rows)
-            retries &= now.refusals < _RETRIES
+            retries = arrived & ~accepted & ~corrects & (blamed > 0) & (blamed < _FEW * n_rows)
+            retries &= last.refusals < _RETRIES
 
             def adapted(
                 radius: Array, step: Array, error: Array, foreseen: Array
@@ -182,48 +171,95 @@ class NewtonCG(AbstractSolver):
                 return jnp.maximum(jnp.where(grows, larger, kept), _LEAST * reach)
 
             radii = jax.tree.map(adapted, last.radii, p, errors, foreseen)
-            now = now._replace(
-                radii=choose(corrects, last.radii, radii),
-                again=corrects | retries,
+            radii = choose(arrived & ~corrects, radii, last.radii)
+
+            # A step is tried again from where it began, and as the step that it was; a correction that has
+            # gained nothing, from the point before it. There is no Hessian at hand for either: back there
+            # first.
+            # (From what is not a number no step leads away.)
+            moves = self.norm(gradient) >= options.get("stays_below", 0.0)
+            stays = last.begins & ~moves
+            solves = jnp.where(arrived, corrects & better, ~stays)
+            corrects = jnp.where(arrived, corrects, last.corrects)
+            refusals = last.refusals + retries
+            resumes = ~corrects & (refusals > 0)
+            bound = room * reach
+            damping = lambda g, radius: sizes(g) / radius
+            solution = bounded_step(
+                hessian,
+                gradient,
+                choose(last.begins, jax.tree.map(damping, g, radii), last.shift),
+                jax.tree.map(lambda radius: jnp.minimum(radius, bound), radii),
+                start=choose(resumes, step[:2], (zero, zero)),
+                resumes=resumes,
+                forcing=jnp.where(corrects, _LOOSE, forcing),
+                waving=~corrects & ~resumes & near,
+                max_products=jnp.where(corrects, few_products, self.max_products),
+                options=options,
+                active=solves,
+            )
+            tighter = lambda shift, g, radius: jnp.maximum(shift, damping(g, radius))
+            back = choose(
+                retries,
+                (y, jax.tree.map(tighter, best.shift, g, radii)),
+                (best.y, best.shift),
+            )
+            ahead = (tree.add(last.y, solution.p), solution.shift)
+            there, shift = choose(solves, ahead, back)
+            steps = solves & ~corrects
+            return _Trial(
+                y=there,
+                foreseen=tree.add(gradient, solution.hp),
+                shift=shift,
+                origin=origin,
+                best=best,
+                step=(*choose(steps, (solution.p, solution.hp), step[:2]), step[2]),
+                radii=radii,
+                predicted=jnp.where(steps, gain(gradient, solution.p, solution.hp), predicted),
+                products=last.products + jnp.where(solves, solution.k, 0),
+                corrections=jnp.where(retries, 0, corrections),
+                refusals=refusals,
+                corrects=corrects,
+                room=jnp.where(retries, 1, room),
+                begins=no,
+                arrives=solves,
+                again=solves | (arrived & corrects) | retries,
                 accepted=accepted,
             )
-            # From where it began, and with the step that it was.
-            tighter = lambda shift, g, radius: jnp.maximum(shift, sizes(g) / radius)
-            refused = now._replace(
-                **origin,
-                shift=jax.tree.map(tighter, now.shift, g, radii),
-                refusals=now.refusals + 1,
-                corrections=none,
-                corrects=no,
-                room=whole,
-            )
-            return choose(retries & ~corrects, refused, now)
 
-        n_rows = number_of(state.radii)
-        few_products = min(self.max_products, _BRIEF)
-        origin = {"y": y, "value": state.value, "gradient": g, "aux": state.aux, "foreseen": g}
+        def force_and_value(y: PyTree) -> tuple[PyTree, tuple[Array, PyTree]]:
+            value, gradient, aux = value_and_gradient(fn, y, args)
+            return gradient, (value, aux)
+
+        unknown = (state.value, state.gradient, state.aux)
         begin = _Trial(
-            **origin,
-            shift=jax.tree.map(lambda g, radius: sizes(g) / radius, g, state.radii),
+            y=y,
+            foreseen=zero,
+            shift=state.radii,
+            origin=unknown,
+            best=_Point(y, *unknown, zero, state.radii),
+            step=(zero, zero, zero),
             radii=state.radii,
             predicted=jnp.zeros_like(state.value),
             products=none,
             corrections=none,
             refusals=none,
             corrects=no,
-            room=whole,
+            room=jnp.ones_like(state.value),
+            begins=yes,
+            arrives=no,
             again=yes,
             accepted=no,
-            uncorrected=(zero, zero, g),
         )
         end = jax.lax.while_loop(lambda trial: trial.again, attempt, begin)
         # Where nothing can move any more, a fresh start may find another way.
         collapsed = jnp.asarray(tree.max(end.radii)) < _COLLAPSED * reach
         radii = jax.tree.map(lambda radius: jnp.where(collapsed, reach, radius), end.radii)
-        here = (y, state.value, g, state.aux)
-        y, value, g, aux = choose(end.accepted, (end.y, end.value, end.gradient, end.aux), here)
+        best = (end.best.y, end.best.value, end.best.gradient, end.best.aux)
+        y, value, gradient, aux = choose(end.accepted, best, (y, *end.origin))
         products = state.num_products + end.products
-        return y, _NewtonState(value, g, radii, state.radii, products, force, aux), aux
+        force = typical_size(end.origin[1])
+        return y, _NewtonState(value, gradient, radii, state.radii, products, force, aux), aux
 
     def resumed(
         self, fresh: _NewtonState, old: _NewtonState, share: Rows, flipped: Bool[Array, ""]
@@ -244,8 +280,8 @@ class NewtonCG(AbstractSolver):
         return state.gradient
 
 
-class _Trial(NamedTuple):
-    """Where an attempt at a step leads."""
+class _Point(NamedTuple):
+    """Where a step may end."""
 
     y: PyTree[Array]
     value: Float[Array, ""]
@@ -254,6 +290,21 @@ class _Trial(NamedTuple):
     foreseen: PyTree[Array]
     """The gradient that the model had there."""
     shift: Rows
+
+
+class _Trial(NamedTuple):
+    """Where an attempt at a step leads."""
+
+    y: PyTree[Array]
+    """Where to look next."""
+    foreseen: PyTree[Array]
+    shift: Rows
+    origin: tuple[Float[Array, ""], PyTree[Array], PyTree]
+    """Value, gradient and auxiliary output where it began."""
+    best: _Point
+    """The step, or what the corrections have made of it so far."""
+    step: tuple[PyTree[Array], PyTree[Array], PyTree[Array]]
+    """The step itself, what it should do to the gradient, and the gradient where it leads."""
     radii: Rows
     predicted: Float[Array, ""]
     """The gain of the step itself."""
@@ -261,13 +312,14 @@ class _Trial(NamedTuple):
     corrections: Int[Array, ""]
     refusals: Int[Array, ""]
     corrects: Bool[Array, ""]
-    """Whether the next attempt corrects this one."""
+    """Whether what led there, or is to be done there, is a correction."""
     room: Float[Array, ""]
     """How far the next attempt may go, in units of the furthest that a vertex may."""
+    begins: Bool[Array, ""]
+    arrives: Bool[Array, ""]
+    """Whether a step or a correction leads there, and not the way back."""
     again: Bool[Array, ""]
     accepted: Bool[Array, ""]
-    uncorrected: tuple[PyTree[Array], PyTree[Array], PyTree[Array]]
-    """The step itself, what it should do to the gradient, and the gradient where it leads."""
 
 
 # How near forces are to those at rest is their typical size so many times: their norm for a hundred cells.

@@ -47,6 +47,11 @@ class Patient(optx.AbstractMinimiser):
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
         return self._judge(inner, options, jnp.array(0), jnp.array(0))
 
+    def unevaluated(self, y: Any, options: Any, f_struct: Any, aux_struct: Any) -> PatientState:
+        """The same if the first step is to find out where it begins, see `AbstractSolver`."""
+        inner = self.solver.unevaluated(y, options, f_struct, aux_struct)
+        return self._judge(inner, options, jnp.array(0), jnp.array(0))
+
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any
     ) -> tuple[Any, PatientState, Any]:

@@ -42,6 +42,18 @@ class AbstractSolver(optx.AbstractMinimiser):
         """
         return False
 
+    @property
+    def evaluates_late(self) -> bool:
+        """Whether a step finds value and gradient where it begins, so that `unevaluated` will do."""
+        return False
+
+    def unevaluated(self, y: Any, options: Any, f_struct: Any, aux_struct: Any) -> Any:
+        """The state of `init`, but value and gradient are infinite: the objective was not looked at.
+
+        Such a step knows the option `stays_below`: if no force is larger where it begins, it stays there.
+        """
+        raise NotImplementedError
+
     @abc.abstractmethod
     def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
