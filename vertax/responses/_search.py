@@ -226,7 +226,8 @@ class Search(eqx.Module):
             relieves = jnp.array(False)
             if relief is not None and last.relief is not None:
                 relieves = guarded & (last.tries == 0) & jnp.any(relief != 0)
-                relief = jnp.where(relieves & ~overlapping[:, None], relief, last.relief)
+                relief = jnp.where(relieves, relief, last.relief)
+                relief = jnp.where(overlapping[:, None], 0, relief)
             if contacts is not None and self.transitions is not None:
                 # What turned around, and has not flipped, was put upright.
                 turned = dot(there.edge_vectors, tissue.edge_vectors) < 0
@@ -298,7 +299,7 @@ _SHORTER = 3
 _TRIES = 9
 
 
-# A relaxation evaluates it in five places: so it is traced once.
+# A relaxation evaluates it in several places: so it is traced once.
 @eqx.filter_jit
 def objective(
     configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Contacts | None]

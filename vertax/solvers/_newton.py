@@ -103,7 +103,7 @@ class NewtonCG(AbstractSolver):
             gradient, hessian, (value, aux) = jax.linearize(force_and_value, last.y, has_aux=True)
             here = _Point(last.y, value, gradient, aux, last.foreseen, last.shift)
             origin = choose(last.begins, (value, gradient, aux), last.origin)
-            whole, g, _ = origin
+            initial, g, _ = origin
             force = typical_size(g)
             finest = jnp.sqrt(_TYPICAL * force / unit)
             near = finest < _COARSEST
@@ -123,7 +123,7 @@ class NewtonCG(AbstractSolver):
             # force.
             predicted = last.predicted
             lost = jnp.abs(predicted) <= _rounding(best.value)
-            gained, finite = whole - best.value, _finite(best.value, best.gradient)
+            gained, finite = initial - best.value, _finite(best.value, best.gradient)
             ratio = gained / jnp.where(predicted > 0, predicted, 1)
             lower_force = inner(best.gradient, best.gradient) < inner(g, g)
             accepted = arrived & finite & jnp.where(lost, lower_force, ratio > 1e-4)
@@ -173,12 +173,10 @@ class NewtonCG(AbstractSolver):
             radii = jax.tree.map(adapted, last.radii, p, errors, foreseen)
             radii = choose(arrived & ~corrects, radii, last.radii)
 
-            # A step is tried again from where it began, and as the step that it was; a correction that has
-            # gained nothing, from the point before it. There is no Hessian at hand for either: back there
-            # first.
             # (From what is not a number no step leads away.)
-            moves = self.norm(gradient) >= options.get("stays_below", 0.0)
-            stays = last.begins & ~moves
+            stays = last.begins & ~(self.norm(gradient) >= options.get("stays_below", 0.0))
+            # A step is tried again from where it began, and as the step that it was; a correction that has
+            # gained nothing, from the point before it. The Hessian here is that of neither: back there first.
             solves = jnp.where(arrived, corrects & better, ~stays)
             corrects = jnp.where(arrived, corrects, last.corrects)
             refusals = last.refusals + retries
