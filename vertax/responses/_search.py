@@ -57,10 +57,6 @@ class _Arrival(eqx.Module):
     blamed: Bool[Array, " vertices"]
     """Those that overlapped on the way here, or stay because of them."""
     overlapping: Bool[Array, " vertices"]
-    relief: Float[Array, "vertices 2"] | None
-    """How far vertices have gone besides, out of contacts."""
-    relieves: Bool[Array, ""]
-    """Whether that is new."""
     tries: Int[Array, ""]
 
 
@@ -194,8 +190,6 @@ class Search(eqx.Module):
     ) -> _Arrival:
         """Transitions where a step leads; vertices of what would overlap go less far."""
         before = state.tissue
-        # What overlapped from the start is not mended in this way.
-        guarded = state.started & ~state.overlaps
 
         def partway(a: Array, b: Array, share: Float[Array, " rows"]) -> Array:
             rows = share.reshape(share.shape + (1,) * (a.ndim - 1))
@@ -214,40 +208,31 @@ class Search(eqx.Module):
                 partway, before.configuration, goal.configuration, before.by_row(share)
             )
             there = before.with_configuration(on_the_way)
-            if last.relief is not None:
-                there = there.with_vertices(there.vertices + last.relief)
             tissue, counts = there, state.counts
             if self.transitions is not None:
                 tissue, counts = self.transitions.sweep(there, energy, state.counts)
             swept = jnp.any(tissue.vertices != there.vertices, axis=-1)
             twins = tissue.topology.twin != there.topology.twin
             swept |= jnp.any(twins.reshape(-1, 3), axis=-1) | ~state.started
-            contacts, overlapping, relief = self._near(tissue, state, swept)
-            relieves = jnp.array(False)
-            if relief is not None and last.relief is not None:
-                relieves = guarded & (last.tries == 0) & jnp.any(relief != 0)
-                relief = jnp.where(relieves, relief, last.relief)
-                relief = jnp.where(overlapping[:, None], 0, relief)
+            contacts, overlapping = self._near(tissue, state, swept)
             if contacts is not None and self.transitions is not None:
                 # What turned around, and has not flipped, was put upright.
                 turned = dot(there.edge_vectors, tissue.edge_vectors) < 0
                 turned &= jnp.all(counts == state.counts, axis=tuple(range(counts.ndim - 1)))
                 upheld = contacts.upheld.updated(tissue, turned)
                 contacts = contacts.holding(tissue.topology, upheld)
-            seen = (share, blamed, overlapping, relief, relieves, last.tries + 1)
-            return _Arrival(tissue, contacts, counts, *seen)
+            return _Arrival(tissue, contacts, counts, share, blamed, overlapping, last.tries + 1)
 
         whole = jnp.ones(goal.n_vertices, goal.vertices.dtype)
         none = jnp.zeros(goal.n_vertices, bool)
-        still = jnp.zeros_like(goal.vertices) if _relieves(state) else None
-        no, zero = jnp.array(False), jnp.array(0)
-        seen = (whole, none, none, still, no, zero)
-        start = _Arrival(goal, state.contacts, state.counts, *seen)
+        start = _Arrival(goal, state.contacts, state.counts, whole, none, none, jnp.array(0))
         arrays, static = eqx.partition(start, eqx.is_array)
+        # What overlapped from the start is not mended in this way.
+        guarded = state.started & ~state.overlaps
 
         def unfinished(arrays: _Arrival) -> Bool[Array, ""]:
             again = guarded & jnp.any(arrays.overlapping) & (arrays.tries < _TRIES)
-            return ((arrays.tries == 0) & ~stays) | again | arrays.relieves
+            return ((arrays.tries == 0) & ~stays) | again
 
         def iterate(arrays: _Arrival) -> _Arrival:
             return eqx.filter(attempt(eqx.combine(arrays, static)), eqx.is_array)
@@ -255,31 +240,28 @@ class Search(eqx.Module):
         arrived = eqx.combine(jax.lax.while_loop(unfinished, iterate, arrays), static)
         # Not even a sweep of transitions from where it was leads to a valid tissue.
         stuck = guarded & jnp.any(arrived.overlapping)
-        seen = (0 * whole, ~none, none, still, no, arrived.tries)
-        same = _Arrival(before, state.contacts, state.counts, *seen)
-        return choose(stuck, same, arrived)
+        same = (before, state.contacts, state.counts, 0 * whole, ~none, none, arrived.tries)
+        return choose(stuck, _Arrival(*same), arrived)
 
     def _near(
         self, tissue: Tissue, last: SearchState, swept: Bool[Array, " vertices"]
-    ) -> tuple[Contacts | None, Bool[Array, " vertices"], Float[Array, "vertices 2"] | None]:
-        """The contacts of a tissue; the vertices of what overlaps, and ways out of contacts, if that matters.
+    ) -> tuple[Contacts | None, Bool[Array, " vertices"]]:
+        """The contacts of a tissue, and the vertices of what overlaps, if that matters.
 
         Vertices that transitions have placed, or given other neighbours, come from nowhere.
         """
         nowhere = jnp.zeros(tissue.n_vertices, bool)
         if last.contacts is None:
-            return None, nowhere, None
-        still = jnp.zeros_like(tissue.vertices) if _relieves(last) else None
+            return None, nowhere
         contacts, clear = last.contacts.moved(last.tissue, tissue)
         clear &= ~jnp.any(swept) & ~last.overlaps
 
-        def looked_at() -> tuple:
+        def looked_at() -> tuple[Contacts, Bool[Array, " vertices"]]:
             found, overlapping = contacts.found(tissue)
             before = last.tissue.with_topology(tissue.topology)
-            relief = None if still is None else found.relief(before, tissue, ~swept)
-            return found, overlapping | found.crushed(before, tissue, ~swept), relief
+            return found, overlapping | found.crushed(before, tissue, ~swept)
 
-        return jax.lax.cond(clear, lambda: (contacts, nowhere, still), looked_at)
+        return jax.lax.cond(clear, lambda: (contacts, nowhere), looked_at)
 
     def _restarted(
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
@@ -292,7 +274,7 @@ class Search(eqx.Module):
 
 
 _TAGS: frozenset[object] = frozenset()
-# The preconditioner of edges costs smaller tissues more than it saves; and in those few contacts are hit.
+# The preconditioner of edges costs smaller tissues more than it saves.
 _FEWEST_CELLS = 300
 # So often what overlaps goes less far before it stays where it is; and after so many attempts nothing moves.
 _SHORTER = 3
@@ -320,13 +302,6 @@ def blocks_of(
     if contacts is None or tissue.arcs is not None:
         return EdgeBlocks.of(tissue, energy)
     return EdgeBlocks.of(tissue, energy, contacts.resistance(tissue))
-
-
-def _relieves(state: SearchState) -> bool:
-    """Whether contacts that a step hits are relieved."""
-    tissue = state.tissue
-    large = tissue.n_cells >= _FEWEST_CELLS
-    return large and tissue.arcs is None and state.contacts is not None
 
 
 def _around(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:
