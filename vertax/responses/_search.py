@@ -131,7 +131,7 @@ class Search(eqx.Module):
     ) -> SearchState:
         """A step of the minimiser (not the first time), then transitions.
 
-        Or only a look at the forces, where they are pending and no more is to be done, or no more (`last`).
+        Or only a look at the forces, if they are pending and no more is to be done, or may be (`last`).
         """
         before = state.tissue
         args = (before, energy, state.contacts)
@@ -188,7 +188,10 @@ class Search(eqx.Module):
     def _arrive(
         self, state: SearchState, goal: Tissue, energy: AbstractEnergy, stays: Bool[Array, ""]
     ) -> _Arrival:
-        """Transitions where a step leads; vertices of what would overlap go less far."""
+        """Transitions where a step leads; vertices of what would overlap go less far.
+
+        If it `stays` where it was, that is all known.
+        """
         before = state.tissue
 
         def partway(a: Array, b: Array, share: Float[Array, " rows"]) -> Array:

@@ -12,6 +12,7 @@ from vertax.mesh import Tissue
 from vertax.mesh._sides import dot
 from vertax.mesh._topology import Topology, edge_neighbourhood, take
 from vertax.responses._local import FLOOR, Looks, barrier
+from vertax.transitions._edge_frames import edge_axis
 
 # Where an energy presses the ends of an edge together, the edge opens once it has flipped. Forces can press
 # it from all sides: then four cells meet in a point, flipped or not, and the energy is least where the edge
@@ -68,7 +69,8 @@ class Upheld(eqx.Module):
     def places(self, around: Float[Array, "some 6 2"]) -> Float[Array, "some 4"]:
         """Each edge as a vector, and which way it ought to point, from where these are."""
         start, end, a, b, c, d = (around[:, k] for k in range(6))
-        return jnp.concatenate([end - start, c + d - a - b], axis=-1)
+        axis = edge_axis(end - start, a - start, b - start, c - end, d - end)
+        return jnp.concatenate([end - start, axis], axis=-1)
 
     def heights(self, places: Float[Array, "some 4"]) -> Float[Array, " some"]:
         """The energy of each."""
