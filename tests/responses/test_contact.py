@@ -196,6 +196,41 @@ def test_few_contacts_of_a_large_tissue_are_looked_at_alone(reach):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * float(jnp.abs(other).max()))
 
 
+def test_contacts_that_a_step_hits_are_left_at_once():
+    before, reach = tissue_of(0), 0.1
+    m = before.topology
+    face = int(np.argmax(m.neighbour_counts))
+    corner = int(np.flatnonzero(np.asarray(m.cell) == face)[0])
+    side = int(m.next[m.next[m.next[corner]]])
+    start, chord = np.split(np.asarray(before.sides[side, :4]), 2)
+    inward = np.array([-chord[1], chord[0]]) / np.linalg.norm(chord)
+    way = start + 0.5 * chord + 0.2 * reach * inward - np.asarray(before.corners[corner])
+    vertex = corner // 3
+    hit = before.with_vertices(before.vertices.at[vertex].add(way))
+    one = jnp.asarray(1.0)
+    contacts, _ = no_contacts(reach, {"length_scale": one, "stiffness": one}, hit).found(hit)
+    row = contacts.pairs.tolist().index([corner, side])
+    everywhere = jnp.ones(hit.n_vertices, bool)
+
+    def nearness(moves):
+        there = hit.with_vertices(hit.vertices + moves)
+        return contacts._near(*map(there.sides_of, contacts.pairs.T))[0][0]
+
+    np.testing.assert_allclose(nearness(0)[row], 0.04, rtol=1e-6)
+    moves = contacts.relief(before, hit, everywhere, free=everywhere)
+    assert nearness(moves).min() > 0.5
+    # Several sides at a time.
+    assert jnp.linalg.norm(moves, axis=-1).max() < 4 * reach
+    # What is pressed as deep as that stays, but not what has come from nowhere.
+    assert not contacts.relief(hit, hit, everywhere, free=everywhere).any()
+    assert contacts.relief(hit, hit, ~everywhere, free=everywhere).any()
+    # Where the corner must stay the side leaves.
+    others = jnp.arange(hit.n_vertices) != vertex
+    moves = contacts.relief(before, hit, everywhere, free=others)
+    assert not moves[vertex].any()
+    assert nearness(moves)[row] > 0.5
+
+
 def test_a_negative_range_is_refused():
     with pytest.raises(ValueError, match="contact_range"):
         vx.Relaxation(contact_range=-0.1)

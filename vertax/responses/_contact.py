@@ -23,7 +23,7 @@ from vertax.mesh._sides import (
     wedge,
 )
 from vertax.mesh._topology import Topology, take
-from vertax.responses._local import FLOOR, Looks, barrier, local_blocks, local_sum
+from vertax.responses._local import FLOOR, Looks, along_each, barrier, local_blocks, local_sum
 from vertax.responses._upheld import REACH, Upheld
 from vertax.solvers._edge_blocks import Symmetric
 
@@ -252,6 +252,52 @@ class Contacts(eqx.Module):
         behind = functools.reduce(jnp.logical_or, worse) & jnp.all(take(known, ends), axis=-1)
         return jnp.zeros(tissue.n_vertices, bool).at[ends].max(behind[:, None])
 
+    def relief(
+        self,
+        before: Tissue,
+        tissue: Tissue,
+        known: Bool[Array, " vertices"],
+        free: Bool[Array, " vertices"],
+    ) -> Float[Array, "vertices 2"]:
+        """How free vertices may leave contacts (of straight sides) that a step has brought deep into range.
+
+        A barrier pushes harder there than all else together, and steps would come out of it one by one.
+        """
+        looks = self.looks[self._n_looks :]
+        ends = looks.vertices.reshape(-1, 3)
+        places_of = lambda tissue: _pair_places(looks.at(tissue))
+        near = lambda places: self._near(*_as_sides(places))[0][0]
+        old = jnp.where(jnp.all(take(known, ends), axis=-1), near(places_of(before)), jnp.inf)
+
+        def hits(moves: Float[Array, "vertices 2"]) -> tuple[Array, Array]:
+            places = places_of(tissue.with_vertices(tissue.vertices + moves))
+            new = near(places)
+            # (What is pressed as deep as that by large forces stays there.)
+            return places, (new > 0) & (new < jnp.minimum(_DEEP, 0.5 * old))
+
+        def unfinished(last: tuple) -> Bool[Array, ""]:
+            i, _, (_, hit) = last
+            return (i < _ROUNDS) & jnp.any(hit)
+
+        def further(last: tuple) -> tuple:
+            i, moves, (places, hit) = last
+            distance = lambda places: jnp.sqrt(jnp.where(hit, near(places), 1))
+            corner, end = jnp.split(along_each(distance, places), 2)
+            ways = jnp.stack([corner, -corner - end, end])
+            squared = jnp.sum(ways**2, axis=(0, 1))
+            ways *= (_SHALLOW - distance(places)) / jnp.where(squared > 0, squared, 1)
+            size = jnp.sqrt(jnp.sum(ways**2, axis=1))
+            share = jnp.minimum(1, self.distance / jnp.where(size > 0, size, 1))
+            # (Two corners that are near each other are in contact by all their sides, and go further.)
+            ways = jnp.where(hit, ways * share[:, None], 0)
+            moves = moves.at[ends.T].add(jnp.moveaxis(ways, 1, -1))
+            moves = jnp.where(free[:, None], moves, 0)
+            return i + 1, moves, hits(moves)
+
+        nothing = jnp.zeros_like(tissue.vertices)
+        start = jnp.array(0), nothing, hits(nothing)
+        return jax.lax.while_loop(unfinished, further, start)[1]
+
     def moved(self, before: Tissue, tissue: Tissue) -> tuple[Contacts, Bool[Array, ""]]:
         """The contacts after vertices moved, if there are none, and whether that is certain."""
         steps = jnp.sum((tissue.vertices - before.vertices) ** 2, axis=-1)
@@ -291,6 +337,11 @@ _MANY = 1000
 # The barrier pushes hardest at FLOOR (squared distance over range) and not at all at 0. Only too long a step
 # leads nearer than this.
 _CREST = 4 * FLOOR
+# What has come deeper than this at once is taken back to so many ranges, in so many rounds: who leaves one
+# contact may come into another one.
+_DEEP = 0.5
+_SHALLOW = 0.9
+_ROUNDS = 4
 # What is less than so many ranges away may come into range in the next step.
 _MARGIN = 2
 

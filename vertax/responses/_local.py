@@ -74,7 +74,7 @@ def _(energies: _Energies, primals: tuple, tangents: tuple) -> tuple[Array, Arra
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @functools.partial(jax.jit, static_argnums=0)
 def _slopes(energies: _Energies, args: Any, places: Float[Array, "some 4"]) -> Array:
-    return _along_each(lambda x: energies(args, x), places)
+    return along_each(lambda x: energies(args, x), places)
 
 
 @_slopes.defjvp
@@ -89,11 +89,11 @@ def local_blocks(
     energies: _Energies, args: Any, places: Float[Array, "some 4"]
 ) -> Float[Array, "4 4 some"]:
     """The second derivatives by the four numbers of each row."""
-    slopes = lambda x: _along_each(lambda x: energies(args, x), x)
-    return _along_each(slopes, places)
+    slopes = lambda x: along_each(lambda x: energies(args, x), x)
+    return along_each(slopes, places)
 
 
-def _along_each(
+def along_each(
     function: Callable[[Array], Array], places: Float[Array, "some 4"]
 ) -> Float[Array, "4 ..."]:
     """How a function of places, row by row, changes with each of their four parts."""

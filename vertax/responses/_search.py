@@ -34,6 +34,8 @@ class SearchState(eqx.Module):
     contacts: Contacts | None
     overlaps: Bool[Array, ""]
     """Whether the tissue overlaps, and always has."""
+    relieved: Int[Array, " vertices"] | None
+    """How often each vertex was taken out of contacts; None where none is."""
     counts: Int[Array, "*rules edges"]
     """How often each edge took part in a transition."""
     num_steps: Int[Array, ""]
@@ -57,6 +59,10 @@ class _Arrival(eqx.Module):
     blamed: Bool[Array, " vertices"]
     """Those that overlapped on the way here, or stay because of them."""
     overlapping: Bool[Array, " vertices"]
+    relief: Float[Array, "vertices 2"] | None
+    """How far vertices have gone besides, out of contacts."""
+    relieves: Bool[Array, ""]
+    """Whether that is new."""
     tries: Int[Array, ""]
 
 
@@ -86,6 +92,8 @@ class Search(eqx.Module):
         if self.contact_range is not None:
             contacts = no_contacts(self.contact_range, self.options, tissue)
         minimiser = empty(self._restarted, tissue, energy, contacts)
+        relieves = contacts is not None and tissue.arcs is None and tissue.n_cells >= _FEWEST_CELLS
+        relieved = jnp.zeros(tissue.n_vertices, jnp.int32) if relieves else None
         no = jnp.array(False)
         return SearchState(
             tissue,
@@ -94,6 +102,7 @@ class Search(eqx.Module):
             no,
             contacts,
             no,
+            relieved,
             counts,
             jnp.array(0),
             started=no,
@@ -171,6 +180,9 @@ class Search(eqx.Module):
             return choose(state.started, resumed, fresh)
 
         minimiser = _either(changed | ~state.started, restart, lambda: minimiser, minimiser)
+        relieved = state.relieved
+        if relieved is not None and arrived.relief is not None:
+            relieved += jnp.any(arrived.relief != 0, axis=-1)
         return SearchState(
             tissue=tissue,
             origin=choose(flipped, tissue.configuration, state.origin),
@@ -178,6 +190,7 @@ class Search(eqx.Module):
             pending=(changed | ~state.started) & self.minimiser.solver.evaluates_late,
             contacts=contacts,
             overlaps=jnp.where(stays, state.overlaps, jnp.any(arrived.overlapping)),
+            relieved=relieved,
             counts=arrived.counts,
             num_steps=state.num_steps + jnp.where(state.started & ~stays, 1, 0),
             started=jnp.array(True),
@@ -193,6 +206,8 @@ class Search(eqx.Module):
         If it `stays` where it was, that is all known.
         """
         before = state.tissue
+        # What overlapped from the start is not mended in this way.
+        guarded = state.started & ~state.overlaps
 
         def partway(a: Array, b: Array, share: Float[Array, " rows"]) -> Array:
             rows = share.reshape(share.shape + (1,) * (a.ndim - 1))
@@ -211,31 +226,44 @@ class Search(eqx.Module):
                 partway, before.configuration, goal.configuration, before.by_row(share)
             )
             there = before.with_configuration(on_the_way)
+            if last.relief is not None:
+                there = there.with_vertices(there.vertices + last.relief)
             tissue, counts = there, state.counts
             if self.transitions is not None:
                 tissue, counts = self.transitions.sweep(there, energy, state.counts)
             swept = jnp.any(tissue.vertices != there.vertices, axis=-1)
             twins = tissue.topology.twin != there.topology.twin
             swept |= jnp.any(twins.reshape(-1, 3), axis=-1) | ~state.started
-            contacts, overlapping = self._near(tissue, state, swept)
+            contacts, overlapping, relief = self._near(tissue, state, swept)
+            relieves = jnp.array(False)
+            if relief is not None and last.relief is not None:
+                relieves = guarded & (last.tries < _SHORTER) & jnp.any(relief != 0)
+                relief = last.relief + jnp.where(relieves, relief, 0)
+                relief = jnp.where(overlapping[:, None], 0, relief)
             if contacts is not None and self.transitions is not None:
                 # What turned around, and has not flipped, was put upright.
                 turned = dot(there.edge_vectors, tissue.edge_vectors) < 0
                 turned &= jnp.all(counts == state.counts, axis=tuple(range(counts.ndim - 1)))
+                # If it is held, the step has jumped over its barrier, and the next one would again.
+                over = turned & contacts.upheld.held & guarded & (last.tries < _SHORTER)
+                ends = tissue.topology.edge_vertices
+                overlapping = overlapping.at[ends].max(over[:, None])
                 upheld = contacts.upheld.updated(tissue, turned)
                 contacts = contacts.holding(tissue.topology, upheld)
-            return _Arrival(tissue, contacts, counts, share, blamed, overlapping, last.tries + 1)
+            seen = (share, blamed, overlapping, relief, relieves, last.tries + 1)
+            return _Arrival(tissue, contacts, counts, *seen)
 
         whole = jnp.ones(goal.n_vertices, goal.vertices.dtype)
         none = jnp.zeros(goal.n_vertices, bool)
-        start = _Arrival(goal, state.contacts, state.counts, whole, none, none, jnp.array(0))
+        still = None if state.relieved is None else jnp.zeros_like(goal.vertices)
+        no, zero = jnp.array(False), jnp.array(0)
+        seen = (whole, none, none, still, no, zero)
+        start = _Arrival(goal, state.contacts, state.counts, *seen)
         arrays, static = eqx.partition(start, eqx.is_array)
-        # What overlapped from the start is not mended in this way.
-        guarded = state.started & ~state.overlaps
 
         def unfinished(arrays: _Arrival) -> Bool[Array, ""]:
             again = guarded & jnp.any(arrays.overlapping) & (arrays.tries < _TRIES)
-            return ((arrays.tries == 0) & ~stays) | again
+            return ((arrays.tries == 0) & ~stays) | again | arrays.relieves
 
         def iterate(arrays: _Arrival) -> _Arrival:
             return eqx.filter(attempt(eqx.combine(arrays, static)), eqx.is_array)
@@ -243,28 +271,36 @@ class Search(eqx.Module):
         arrived = eqx.combine(jax.lax.while_loop(unfinished, iterate, arrays), static)
         # Not even a sweep of transitions from where it was leads to a valid tissue.
         stuck = guarded & jnp.any(arrived.overlapping)
-        same = (before, state.contacts, state.counts, 0 * whole, ~none, none, arrived.tries)
-        return choose(stuck, _Arrival(*same), arrived)
+        seen = (0 * whole, ~none, none, still, no, arrived.tries)
+        same = _Arrival(before, state.contacts, state.counts, *seen)
+        return choose(stuck, same, arrived)
 
     def _near(
         self, tissue: Tissue, last: SearchState, swept: Bool[Array, " vertices"]
-    ) -> tuple[Contacts | None, Bool[Array, " vertices"]]:
-        """The contacts of a tissue, and the vertices of what overlaps, if that matters.
+    ) -> tuple[Contacts | None, Bool[Array, " vertices"], Float[Array, "vertices 2"] | None]:
+        """The contacts of a tissue; the vertices of what overlaps, and ways out of contacts, if that matters.
 
         Vertices that transitions have placed, or given other neighbours, come from nowhere.
         """
         nowhere = jnp.zeros(tissue.n_vertices, bool)
         if last.contacts is None:
-            return None, nowhere
+            return None, nowhere, None
+        still = None if last.relieved is None else jnp.zeros_like(tissue.vertices)
         contacts, clear = last.contacts.moved(last.tissue, tissue)
         clear &= ~jnp.any(swept) & ~last.overlaps
 
-        def looked_at() -> tuple[Contacts, Bool[Array, " vertices"]]:
+        def looked_at() -> tuple:
             found, overlapping = contacts.found(tissue)
             before = last.tissue.with_topology(tissue.topology)
-            return found, overlapping | found.crushed(before, tissue, ~swept)
+            relief = None
+            if last.relieved is not None:
+                free = last.relieved < _RELIEFS
+                if tissue.held is not None:
+                    free &= ~tissue.held
+                relief = found.relief(before, tissue, ~swept, free)
+            return found, overlapping | found.crushed(before, tissue, ~swept), relief
 
-        return jax.lax.cond(clear, lambda: (contacts, nowhere), looked_at)
+        return jax.lax.cond(clear, lambda: (contacts, nowhere, still), looked_at)
 
     def _restarted(
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
@@ -277,11 +313,13 @@ class Search(eqx.Module):
 
 
 _TAGS: frozenset[object] = frozenset()
-# The preconditioner of edges costs smaller tissues more than it saves.
+# The preconditioner of edges costs smaller tissues more than it saves; and in those few contacts are hit.
 _FEWEST_CELLS = 300
 # So often what overlaps goes less far before it stays where it is; and after so many attempts nothing moves.
 _SHORTER = 3
 _TRIES = 9
+# So often a vertex is taken out of contacts: forces may press it there again and again.
+_RELIEFS = 4
 
 
 # A relaxation evaluates it in several places: so it is traced once.

@@ -53,6 +53,11 @@ class Upheld(eqx.Module):
         """Whether there are any."""
         return jnp.any(self.edges < len(self.counts))
 
+    @property
+    def held(self) -> Bool[Array, " edges"]:
+        """Which edges these are."""
+        return jnp.zeros(len(self.counts), bool).at[self.edges].set(True, mode="drop")
+
     def looks(self, topology: Topology) -> Looks:
         """At the ends of each edge, and the far ends of its four neighbours, in one frame."""
         m = topology
@@ -80,10 +85,9 @@ class Upheld(eqx.Module):
     def updated(self, tissue: Tissue, turned: Bool[Array, " edges"]) -> Upheld:
         """With those that were put upright, and without those that have grown."""
         n = tissue.n_edges
-        held = jnp.zeros(n, bool).at[self.edges].set(True, mode="drop")
         chord = tissue.edge_vectors
         counts = self.counts + turned
-        held &= dot(chord, chord) < (_FADE * self.reach) ** 2
+        held = self.held & (dot(chord, chord) < (_FADE * self.reach) ** 2)
         held |= turned & (counts >= _OFTEN)
         edges = jnp.nonzero(held, size=len(self.edges), fill_value=n)[0]
         return Upheld(edges.astype(self.edges.dtype), counts, self.reach, self.force)
