@@ -14,6 +14,7 @@ from tilings import faces_that_overlap
 
 import vertax as vx
 from vertax.responses._contact import no_contacts
+from vertax.responses._search import _carried
 
 N = 20
 relaxed = vx.Relaxation(max_steps=300)
@@ -194,6 +195,31 @@ def test_few_contacts_of_a_large_tissue_are_looked_at_alone(reach):
     both = (force_and_stiffness(energy, tissue.vertices) for energy in (alone, all_at_once))
     for one, other in zip(*both, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * float(jnp.abs(other).max()))
+
+
+def test_what_goes_less_far_goes_along_with_those_next_to_it():
+    before = tissue_of(0)
+    corners = np.unique(np.flatnonzero(np.asarray(before.topology.cell) == 3) // 3)
+    share = jnp.ones(before.n_vertices).at[corners].set(0.25)
+    # One that stays where it is, as any that nothing is left to.
+    stays = next(v for v in range(before.n_vertices) if v not in corners)
+    share = share.at[stays].set(0.0)
+    steps = jnp.asarray(np.random.default_rng(0).normal(size=(before.n_vertices, 2)))
+    goal = before.with_vertices(before.vertices + steps)
+    besides = _carried(before, goal, share)
+    others = np.setdiff1d(np.arange(before.n_vertices), corners)
+    assert not besides[others].any()
+    # The corners of a cell are next to one another: they agree on one way, about the mean of theirs.
+    mean = 0.75 * steps[corners].mean(axis=0)
+    spread = jnp.abs(besides[corners] - mean).max()
+    assert spread < 0.3 * jnp.abs(0.75 * steps[corners] - mean).max()
+    # What all do, they do.
+    same = before.with_vertices(before.vertices + jnp.array([0.1, -0.2]))
+    way = jnp.broadcast_to(0.75 * jnp.array([0.1, -0.2]), (len(corners), 2))
+    np.testing.assert_allclose(_carried(before, same, share)[corners], way, rtol=1e-12)
+    pinned = jnp.arange(before.n_vertices) == int(corners[0])
+    held = eqx.tree_at(lambda t: t.pinned, before, pinned, is_leaf=lambda x: x is None)
+    assert not _carried(held, goal, share)[corners[0]].any()
 
 
 def test_contacts_that_a_step_hits_are_left_at_once():

@@ -1,5 +1,6 @@
 """Edges that a relaxation puts upright again and again are held, and four cells rest around a point."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ from helpers import fine_difference, random_tissue
 
 import vertax as vx
 from vertax.responses._contact import Contacts, no_contacts
-from vertax.responses._upheld import _FADE, _OFTEN, REACH, Upheld, turned_height
+from vertax.responses._upheld import _FADE, _LONG, _OFTEN, REACH, Upheld, turned_height
 from vertax.transitions._edge_frames import EdgeFrames, edge_axes
 
 NUMBER = 4
@@ -49,7 +50,11 @@ def test_an_edge_is_held_from_so_many_times_until_it_has_grown():
     assert numbers(upheld, short) == [NUMBER]
     nothing = jnp.zeros(short.n_edges, bool)
     assert numbers(upheld.updated(short, nothing), short) == [NUMBER]
-    grown = with_edge(short, 1.01 * _FADE * REACH)
+    # One step may turn it again from where the barrier has ended.
+    longer = with_edge(short, 1.01 * _FADE * REACH)
+    assert holding(longer, upheld)(longer) == 0
+    assert numbers(upheld.updated(longer, nothing), longer) == [NUMBER]
+    grown = with_edge(short, 1.01 * _LONG * REACH)
     let_go = upheld.updated(grown, nothing)
     assert numbers(let_go, grown) == []
     # It is known of old, and held at once when it turns again.
@@ -90,6 +95,29 @@ def test_its_derivatives(across, arcs):
     scale = REACH * way
     slope = jnp.sum(jax.grad(energy)(there.vertices) * scale)
     np.testing.assert_allclose(slope, fine_difference(at, there.vertices, scale), rtol=1e-6)
+
+
+@pytest.mark.parametrize("times", [0, _OFTEN], ids=["free", "held"])
+def test_a_step_that_jumps_over_its_barrier_goes_less_far(times):
+    """Or the edge would be put upright and turned, in turn, for ever."""
+    tissue = with_edge(random_tissue(20, 0), 2 * _FADE * REACH)
+    energy = vx.energies.ShapeFactorEnergy(jnp.full(20, 3.7))
+    search = vx.Relaxation().search(tissue, energy)
+    state = search.begin(tissue, energy)
+    assert state.contacts is not None
+    contacts = state.contacts.holding(tissue.topology, held(tissue, times))
+    state = eqx.tree_at(lambda s: (s.contacts, s.started), state, (contacts, jnp.array(True)))
+    ends = tissue.topology.edge_vertices[NUMBER]
+    edge = tissue.edge_vectors[NUMBER]
+    # A little beyond its middle, both from one end and from the other.
+    goal = tissue.with_vertices(tissue.vertices.at[ends].add(0.6 * jnp.stack([edge, -edge])))
+    arrived = search._arrive(state, goal, energy, jnp.array(False))
+    assert not arrived.overlapping.any()
+    other = jnp.ones(tissue.n_vertices, bool).at[ends].set(False)
+    assert (arrived.share[other] == 1).all()
+    assert (arrived.share[ends] == (0.25 if times else 1)).all()
+    way = arrived.tissue.edge_vectors[NUMBER] @ edge_axes(arrived.tissue)[NUMBER]
+    assert way > 0
 
 
 class Turning(vx.AbstractEnergy):

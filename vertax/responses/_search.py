@@ -11,10 +11,12 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import choose
+from vertax._base.sums import total
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._measured import Measured
 from vertax.mesh._sides import dot
+from vertax.mesh._topology import source, take
 from vertax.responses._contact import Contacts, no_contacts
 from vertax.solvers._edge_blocks import EdgeBlocks
 from vertax.solvers._long_waves import LongWaves
@@ -226,6 +228,7 @@ class Search(eqx.Module):
                 partway, before.configuration, goal.configuration, before.by_row(share)
             )
             there = before.with_configuration(on_the_way)
+            there = there.with_vertices(there.vertices + _carried(before, goal, share))
             if last.relief is not None:
                 there = there.with_vertices(there.vertices + last.relief)
             tissue, counts = there, state.counts
@@ -318,6 +321,8 @@ _FEWEST_CELLS = 300
 # So often what overlaps goes less far before it stays where it is; and after so many attempts nothing moves.
 _SHORTER = 3
 _TRIES = 9
+# In so many rounds those that go less far agree how far they all go.
+_ROUNDS = 16
 # So often a vertex is taken out of contacts: forces may press it there again and again.
 _RELIEFS = 4
 
@@ -352,6 +357,30 @@ def _around(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, "
     cells = jnp.zeros(m.n_cells, bool).at[m.cell].max(corners, mode="drop")
     there = cells.at[m.cell].get(mode="fill", fill_value=False)
     return vertices | jnp.any(there.reshape(-1, 3), axis=-1)
+
+
+def _carried(
+    before: Tissue, goal: Tissue, share: Float[Array, " vertices"]
+) -> Float[Array, "vertices 2"]:
+    """How far vertices go besides that share of a step: as others next to them that go less far.
+
+    Cells that would overlap go along with the tissue, and only change their shape less. Where nothing is left
+    of the share they stay.
+    """
+    short = (share > 0) & (share < 1)
+    if before.held is not None:
+        short &= ~before.held
+    step = goal.vertices - before.vertices
+    neighbours = source(before.topology.twin).reshape(-1, 3)
+    each = jnp.concatenate([neighbours, jnp.arange(before.n_vertices)[:, None]], axis=1)
+    weights = take(short, each) / jnp.maximum(jnp.sum(take(short, each), axis=1, keepdims=True), 1)
+
+    def further(_: Any, common: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
+        return total(weights[:, k, None] * take(common, each[:, k]) for k in range(4))
+
+    rounds = jnp.where(jnp.any(short), _ROUNDS, 0)
+    common = jax.lax.fori_loop(0, rounds, further, step)
+    return jnp.where(short[:, None], (1 - share[:, None]) * common, 0)
 
 
 def _empty(tree: PyTree) -> PyTree:

@@ -87,12 +87,14 @@ class Upheld(eqx.Module):
         n = tissue.n_edges
         chord = tissue.edge_vectors
         counts = self.counts + turned
-        held = self.held & (dot(chord, chord) < (_FADE * self.reach) ** 2)
+        held = self.held & (dot(chord, chord) < (_LONG * self.reach) ** 2)
         held |= turned & (counts >= _OFTEN)
         edges = jnp.nonzero(held, size=len(self.edges), fill_value=n)[0]
         return Upheld(edges.astype(self.edges.dtype), counts, self.reach, self.force)
 
 
+# An edge is held until it is so long: one step could turn it again from where its barrier ends.
+_LONG = 4 * _FADE
 # An edge is held once it was put upright so often. (Edges under high tension often turn on their way.)
 _OFTEN = 8
 # So many edges are held at most, or one of so many.

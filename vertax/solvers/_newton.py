@@ -131,6 +131,9 @@ class NewtonCG(AbstractSolver):
             # (With little left fewer edges flip that are short only on the way.)
             cheap = (last.products < _CHEAP) & (n_rows >= _MANY)
             left = typical_size(best.gradient) > jnp.where(cheap, _LITTLE, _LEFT) * force
+            # (In large tissues few large forces are not typical, and few products lower them.)
+            norm_left = inner(best.gradient, best.gradient) > _LEFT**2 * inner(g, g)
+            left |= norm_left & (n_rows >= _LARGE)
             wanting = near & finite & ~lost & ((gained < _FINE * predicted) | left)
             corrections = last.corrections + (arrived & ~first)
             corrects = arrived & wanting & (corrections < _CORRECTIONS)
@@ -328,10 +331,12 @@ _COARSEST = 0.35
 _ROUGH = 0.1
 _USEFUL = 0.9
 # A step is corrected that gains less than this share of what it should, or leaves more than that of the
-# typical force;
+# typical force (or, from so many vertices on, of the norm of all);
 _FINE = 0.9
 _LEFT = 0.4
-# or, while it has taken fewer products than these, more than that, where there are so many vertices;
+_LARGE = 600
+# or, while it has taken fewer products than these, more than that of the typical force, where there are so
+# many vertices;
 _CHEAP = 30
 _LITTLE = 0.1
 _MANY = 16
