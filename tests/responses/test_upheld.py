@@ -148,3 +148,14 @@ def test_a_fluid_tissue_comes_to_rest_around_such_points(seed):
     noise = jax.random.normal(jax.random.key(1 + seed), (100,))
     energy = vx.energies.ShapeFactorEnergy(3.9 + 0.1 * noise)
     assert vx.equilibrate(tissue, energy, tolerance=1e-8, max_steps=300).valid
+
+
+@pytest.mark.thorough
+def test_held_edges_of_a_large_tissue_do_not_turn_for_ever():
+    """A step turned one, the sweep put it upright, and so on with period two."""
+    relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=150))
+    for seed in range(4):
+        tissue = vx.initialise.periodic_voronoi(1000, key=jax.random.key(seed))
+        noise = jax.random.normal(jax.random.key(1 + seed), (1000,))
+        energy = vx.energies.ShapeFactorEnergy(3.9 + 0.1 * noise)
+        assert relax(tissue, energy, throw=False).converged

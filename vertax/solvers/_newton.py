@@ -45,7 +45,8 @@ class NewtonCG(AbstractSolver):
     Soft motions follow curved valleys: a step along one climbs its side, and gains little or nothing. Such a
     step is corrected: a few products with the Hessian where it leads bring it back to the floor, and it is
     accepted for what it gains then (a second-order correction, Nocedal & Wright 2006, section 15.6). So is
-    a step that leaves much of the forces: a correction is solved coarsely, and needs no look at the topology.
+    a step that leaves much of the forces, typically or (of 600 vertices and more) in few places: a correction
+    is solved coarsely, and needs no look at the topology.
     It stays near, the nearer if the last one has gained nothing. While a step is cheap, as near rest, it is
     corrected until little is left: so fewer edges flip that are short only on the way.
 
