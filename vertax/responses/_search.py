@@ -373,7 +373,8 @@ def _carried(
     step = goal.vertices - before.vertices
     neighbours = source(before.topology.twin).reshape(-1, 3)
     each = jnp.concatenate([neighbours, jnp.arange(before.n_vertices)[:, None]], axis=1)
-    weights = take(short, each) / jnp.maximum(jnp.sum(take(short, each), axis=1, keepdims=True), 1)
+    counted = take(short, each).astype(step.dtype)
+    weights = counted / jnp.maximum(jnp.sum(counted, axis=1, keepdims=True), 1)
 
     def further(_: Any, common: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
         return total(weights[:, k, None] * take(common, each[:, k]) for k in range(4))
