@@ -130,7 +130,7 @@ def test_most_tissues_near_rest_keep_their_neighbours():
         flips.append(relax(rest, ShapeFactorEnergy(changed)).num_t1)
     # (Single tissues say nothing: rounding decides. Of 200 some 160 keep all, and the others flip 1.5 edges.)
     assert np.mean(np.array(flips) == 0) > 0.65
-    assert np.mean(flips) < 0.7
+    assert np.mean(flips) < 0.6
 
 
 @pytest.mark.thorough

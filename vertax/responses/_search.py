@@ -228,9 +228,10 @@ class Search(eqx.Module):
                 partway, before.configuration, goal.configuration, before.by_row(share)
             )
             there = before.with_configuration(on_the_way)
-            there = there.with_vertices(there.vertices + _carried(before, goal, share))
+            besides = _carried(before, goal, share)
             if last.relief is not None:
-                there = there.with_vertices(there.vertices + last.relief)
+                besides += last.relief
+            there = there.with_vertices(there.vertices + besides)
             tissue, counts = there, state.counts
             if self.transitions is not None:
                 tissue, counts = self.transitions.sweep(there, energy, state.counts)
