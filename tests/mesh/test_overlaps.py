@@ -44,8 +44,8 @@ def test_free_tissues_with_arcs_against_brute_force(seed, size, bend):
     angles = np.clip(np.asarray(FREE.angles) + bend * rng.normal(size=FREE.n_edges), -2.8, 2.8)
     tissue = FREE.with_vertices(FREE.vertices + moves).with_angles(jnp.asarray(angles))
     found = faces(overlaps_of(tissue))
-    # Arcs that hardly touch need fine polygons.
-    assert found in (faces_that_overlap(tissue, points) for points in (160, 600))
+    # Arcs that hardly touch need fine polygons (seed 446, size 0, bend 1.0486: more than 600 points).
+    assert found in (faces_that_overlap(tissue, points) for points in (160, 600, 2000))
 
 
 def test_a_corner_that_moved_through_the_opposite_side():
