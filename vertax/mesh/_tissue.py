@@ -492,11 +492,11 @@ class Tissue(eqx.Module):
     def _chords(self, segments: tuple[Float[Array, " edges"], ...]) -> Float[Array, " edges"]:
         """How far the ends of each edge are from each other (softened)."""
         _, _, dx, dy = segments
-        squared = dx**2 + dy**2 + self.softening**2
-        # An edge of length exactly 0 without softening has no direction; the inner `where` keeps the
-        # derivative of the square root finite there (0, the middle of all its one-sided slopes).
-        at_zero = squared == 0
-        return jnp.where(at_zero, 0, jnp.sqrt(jnp.where(at_zero, 1, squared)))
+        squared = dx * dx + dy * dy + self.softening**2
+        # An edge of length exactly 0 without softening has no direction: the root of 1, less 1, keeps the
+        # derivative finite there (0, the middle of all its one-sided slopes).
+        at_zero = (squared == 0).astype(squared.dtype)
+        return jnp.sqrt(squared + at_zero) - at_zero
 
     def _area_shares(
         self, segments: tuple[Float[Array, " edges"], ...]
@@ -505,12 +505,14 @@ class Tissue(eqx.Module):
         m = self.topology
         x, y, dx, dy = segments
 
-        def swept(corner: Int[Array, " edges"]) -> Float[Array, " edges"]:
-            image = self.boundary.translation(take(m.frame, corner))
-            return 0.5 * ((x + image[:, 0]) * dy - (y + image[:, 1]) * dx)
-
-        # The right cell's corner at the first vertex is one slot clockwise.
-        left, right = swept(m.half_edge), -swept(clockwise(m.half_edge))
+        frame = take(m.frame, m.half_edge)
+        image = self.boundary.translation(frame)
+        left = 0.5 * ((x + image[:, 0]) * dy - (y + image[:, 1]) * dx)
+        right = -left
+        if not m.exterior:
+            # The right cell's corner at the first vertex, one slot clockwise, may be in another image.
+            shift = self.boundary.translation(take(m.frame, clockwise(m.half_edge)) - frame)
+            right -= 0.5 * (shift[:, 0] * dy - shift[:, 1] * dx)
         if self.arcs is None:
             return left, right
         bulge = (dx**2 + dy**2) * area_factor(self.edge_angles)
@@ -531,10 +533,11 @@ class Tissue(eqx.Module):
         self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]
     ) -> Float[Array, " cells"]:
         """Sums over the edges of each cell of what they contribute to it on their left and right."""
+        m = self.topology
         # The exterior, number n_cells, is out of range and dropped.
-        cells = self.topology.edge_cells
-        ids = jnp.concatenate([cells[:, 0], cells[:, 1]])
-        return jax.ops.segment_sum(jnp.concatenate(shares), ids, self.n_cells)
+        mode = "drop" if m.exterior or m.spare else "promise_in_bounds"
+        ids = jnp.concatenate([m.edge_cells[:, 0], m.edge_cells[:, 1]])
+        return jax.ops.segment_sum(jnp.concatenate(shares), ids, self.n_cells, mode=mode)
 
 
 def _checked_angles(
