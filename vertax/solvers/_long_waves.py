@@ -18,8 +18,8 @@ from vertax.mesh._topology import take
 
 # Smaller tissues have no waves that are long enough to be slow, and pay more than they gain.
 FEWEST_CELLS = 150
-# A finer grid takes up to a quarter fewer products with the Hessian, and as much longer for each of them.
-_CELLS_A_POINT = 4
+# (A point for four cells takes a quarter more products with the Hessian of a gradient.)
+_CELLS_A_POINT = 1
 
 
 class LongWaves(eqx.Module):
@@ -27,7 +27,7 @@ class LongWaves(eqx.Module):
 
     Krylov methods take as many steps as the wave length of the softest motion is long, in cells: in a tissue
     of $10^4$ cells a thousand. Long waves are those of an elastic medium, though, which Fourier transforms
-    solve. So the residual goes to a grid of about a point for four cells, is divided there by
+    solve. So the residual goes to a grid of about a point for each cell, is divided there by
 
     $$a + \mu k^2 \text{ (transverse waves)}, \qquad a + \lambda k^2 \text{ (longitudinal waves)},$$
 
@@ -190,8 +190,8 @@ class Compliance(eqx.Module):
         modes = jnp.fft.fft2(grid)
         opposite = jnp.roll(modes[::-1, ::-1], 1, axis=(0, 1)).conj()
         moved = jnp.fft.ifft2(self.direct * modes + self.mirrored * opposite).ravel()
-        there = total(self.weights[:, i] * take(moved, self.indices[:, i]) for i in range(4))
-        return jnp.stack([there.real, there.imag], axis=-1).astype(force.dtype)
+        moved = jnp.stack([moved.real, moved.imag], axis=-1).astype(force.dtype)
+        return total(self.weights[:, i, None] * take(moved, self.indices[:, i]) for i in range(4))
 
 
 def _wave(phase: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
