@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.extremes import lesser
 from vertax._base.reciprocal import reciprocal
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
@@ -199,7 +200,7 @@ class Contacts(eqx.Module):
 
         first = one[:, :2] - other[:, :2]
         last = first - other[:, 2:4]
-        inverse = inverse_square(jnp.minimum(dot(first, first), dot(last, last)), after | before)
+        inverse = inverse_square(lesser(dot(first, first), dot(last, last)), after | before)
         squared = reciprocal(inverse)
         if one.shape[-1] == 4:
             return [(squared_distance_to_segment(one[:, :2], other) * inverse, squared)]
@@ -209,7 +210,7 @@ class Contacts(eqx.Module):
         acute = after & (cosine > 0) & (sine > 0)
         arms = dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])
         # (The corner's other side is next to the one before. This one is not, and may come near anywhere.)
-        inverse = inverse_square(jnp.minimum(*arms), after)
+        inverse = inverse_square(lesser(*arms), after)
         angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
         gap, weight = bulge_gap(one, other, circles, self.distance)
         far = jnp.isinf(gap)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.extremes import greater
 from vertax._base.reciprocal import inverse_root, reciprocal
 from vertax.mesh import Tissue
 from vertax.mesh._sides import dot
@@ -114,9 +115,9 @@ def turned_height(
     near = jax.lax.stop_gradient(far < 1)
     # (What is said of others does not matter, and must have a derivative.)
     axis = jnp.where(near[:, None], axis, 1)
-    per_length = inverse_root(jnp.maximum(dot(axis, axis), jnp.finfo(axis.dtype).tiny))
+    per_length = inverse_root(greater(dot(axis, axis), jnp.finfo(axis.dtype).tiny))
     softened = squared + (FLOOR * reach) ** 2
     length = softened * inverse_root(softened)
     upright = (length + dot(edge, axis) * per_length) * (0.5 * inverse)
     upright = jnp.where(near & (upright < 1), upright, 1)
-    return force * reach * jnp.maximum(1 - far, 0) ** 3 * barrier(upright)
+    return force * reach * greater(1 - far, 0) ** 3 * barrier(upright)
