@@ -13,3 +13,4 @@ def test_values_and_derivatives():
     assert jax.grad(lambda x: jnp.sum(lesser(x, 1)))(x).tolist() == [1, 1, 0]
     assert jax.grad(lambda x: jnp.sum(greater(x, 0)))(x).tolist() == [0, 1, 1]
     assert jax.grad(lambda x: jnp.sum(lesser(x, x**2)))(x).tolist() == [1, 1, 1]
+    assert jnp.isnan(lesser(greater(jnp.nan * x, 0), 1)).all()

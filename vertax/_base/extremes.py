@@ -2,6 +2,7 @@
 
 JAX asks of the derivative of a minimum which of the two equals it. A compiler that works one of them out
 again in another place may round it otherwise; then neither does, and the derivative is lost.
+(If the first is not a number, neither is what comes of it.)
 """
 
 import jax.numpy as jnp
@@ -10,9 +11,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 def lesser(a: Float[Array, "..."], b: ArrayLike) -> Float[Array, "..."]:
     """The lesser of two numbers; with the derivative of the second where they are equal."""
-    return jnp.where(a < b, a, b)
+    return jnp.where(a >= b, b, a)
 
 
 def greater(a: Float[Array, "..."], b: ArrayLike) -> Float[Array, "..."]:
     """The greater of two numbers; with the derivative of the second where they are equal."""
-    return jnp.where(a > b, a, b)
+    return jnp.where(a <= b, b, a)
