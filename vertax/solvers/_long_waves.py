@@ -32,7 +32,7 @@ class LongWaves(eqx.Module):
     $$a + \mu k^2 \text{ (transverse waves)}, \qquad a + \lambda k^2 \text{ (longitudinal waves)},$$
 
     and comes back; to this is added the residual over the mean stiffness, for all that is as small as
-    cells. Stiffnesses $a, \mu, \lambda$ are those of waves in this tissue, from four products with its
+    cells. Stiffnesses $a, \mu, \lambda$ are those of waves in this tissue, from two products with its
     Hessian. It is symmetric and positive definite whatever the Hessian is, so it changes the number of steps
     and not where they lead.
 
@@ -109,20 +109,22 @@ class LongWaves(eqx.Module):
         long, short = 1, max(2, self.size // 8)
 
         def waves(number: int, polarisations: Float[Array, "2 2"]) -> Float[Array, "vertices 2"]:
-            # Those along both axes in one product: they hardly feel each other.
             phases = number * self.places + jnp.array([0.05, 0.18])
             return moves * total(_wave(phases[:, i, None]) * polarisations[i] for i in (0, 1))
 
-        def stiffness(wave: Float[Array, "vertices 2"]) -> Float[Array, ""]:
+        # All of one polarisation in one product, for they hardly feel each other.
+        def stiffness(each: Float[Array, "kinds vertices 2"]) -> Float[Array, " kinds"]:
             rest = [jnp.zeros(x.shape, x.dtype) for x in shapes]
-            leaves = [wave, *rest]
+            leaves = [total(each), *rest]
             product = hessian(jax.tree.unflatten(jax.tree.structure(like), leaves))
-            return jnp.vdot(wave, jax.tree.leaves(product)[0]) / jnp.vdot(wave, wave)
+            force = jax.tree.leaves(product)[0]
+            return jnp.stack([jnp.vdot(wave, force) / jnp.vdot(wave, wave) for wave in each])
 
         # (One after the other, so that the Hessian is compiled once.)
-        kinds = ((n, way) for way in (directions, across) for n in (long, short))
-        each = jnp.stack([waves(*kind) for kind in kinds])
-        far, near, far_across, near_across = jax.lax.map(stiffness, each)
+        each = jnp.stack(
+            [jnp.stack([waves(n, way) for n in (long, short)]) for way in (directions, across)]
+        )
+        (far, near), (far_across, near_across) = jax.lax.map(stiffness, each)
         square = jnp.mean(squares)
 
         def law(far: Array, near: Array, least: Array) -> tuple[Array, Array]:
