@@ -194,6 +194,25 @@ def test_the_unit_of_energy_does_not_matter(scale):
     np.testing.assert_allclose(y, expected, atol=1e-9)
 
 
+def test_the_rounding_of_an_energy_far_below_its_unit_does_not_matter():
+    """Lengths are almost what they should be: so their differences are known less well than themselves."""
+    far = jnp.array([[1.0, 0.2], [-0.6, 0.9], [-0.3, -1.1]])
+    lengths = lambda y: jnp.sum(jnp.linalg.norm(y[:, None] - far, axis=-1), axis=-1)
+
+    def strained(y, _):
+        change = lengths(y) - lengths(PLACES)
+        return 0.5 * jnp.sum((change - 1e-6) ** 2) + 0.5 * jnp.sum((y - PLACES) ** 2), None
+
+    def rest(start):
+        solver = vx.solvers.NewtonCG(atol=1e-14)
+        return optx.minimise(strained, solver, start, has_aux=True, max_steps=20)
+
+    at_rest = rest(PLACES).value
+    for key in jax.random.split(jax.random.key(0), 8):
+        start = at_rest + 3e-12 * jax.random.normal(key, (N, 2))
+        assert rest(start).stats["num_steps"] < 4
+
+
 def test_steps_follow_a_curved_valley(monkeypatch):
     """The floor is a circle, and falls gently around it."""
     tilt = 1e-4

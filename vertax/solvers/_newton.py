@@ -90,10 +90,11 @@ class NewtonCG(AbstractSolver):
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: _NewtonState, tags: Any
     ) -> tuple[Any, _NewtonState, Any]:
-        reach = self.max_displacement * options.get("length_scale", 1.0)
+        scale = options.get("length_scale", 1.0)
+        reach = self.max_displacement * scale
         # Forces are measured in that which moves a vertex by the length scale. (That of most, lest few places
         # with large forces keep all others waiting.)
-        unit = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
+        unit = options.get("stiffness", 1.0) * scale
         n_rows = number_of(state.radii)
         few_products = min(self.max_products, _BRIEF)
         zero = tree.zeros_like(y)
@@ -123,7 +124,7 @@ class NewtonCG(AbstractSolver):
             # Near equilibrium the gain drowns in the rounding of E; there a step is good if it lowers the
             # force.
             predicted = last.predicted
-            lost = jnp.abs(predicted) <= _rounding(best.value)
+            lost = jnp.abs(predicted) <= _rounding(best.value, unit * scale)
             gained, finite = initial - best.value, _finite(best.value, best.gradient)
             ratio = gained / jnp.where(predicted > 0, predicted, 1)
             squared, initial_squared = inner(best.gradient, best.gradient), inner(g, g)
@@ -369,5 +370,11 @@ def _finite(value: Float[Array, ""], gradient: PyTree[Array]) -> Bool[Array, ""]
     return jnp.isfinite(value) & jnp.isfinite(inner(gradient, gradient))
 
 
-def _rounding(value: Float[Array, ""]) -> Float[Array, ""]:
-    return 20 * jnp.finfo(value.dtype).eps * jnp.abs(value)
+def _rounding(value: Float[Array, ""], unit: Float[Array, ""] | float) -> Float[Array, ""]:
+    """How well an energy is known, in a material with this unit of energy.
+
+    A sum of squares may be far less than the unit: what is squared is a difference of lengths, then, and has
+    their rounding.
+    """
+    size = jnp.abs(value)
+    return 20 * jnp.finfo(value.dtype).eps * jnp.maximum(size, jnp.sqrt(size * unit))
