@@ -13,7 +13,7 @@ from helpers import ADAM, LEAST_SQUARES, STILL, random_like, relaxed, rewritten
 import vertax as vx
 from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
-from vertax.fitting import stack
+from vertax.fitting import _descent, stack
 
 EPOCHS = 6
 
@@ -92,6 +92,15 @@ def test_an_interrupted_fit_goes_on_to_the_same_numbers(case, path):
     assert seen == list(range(3, len(whole.history.cost)))
     assert bits(again) == bits(whole)
     np.testing.assert_array_equal(again.notes["cost"], whole.history.cost)
+
+
+@pytest.mark.thorough
+def test_a_fit_that_knows_its_hessian_goes_on_to_the_same_numbers(path, monkeypatch):
+    monkeypatch.setattr(_descent, "_FIRST_LOOK", 2)
+    monkeypatch.setattr(_descent, "_NEXT_LOOK", 2)
+    whole = run("adam", callback=interrupt_at(None))
+    run("adam", callback=interrupt_at(4), checkpoint=path)
+    assert bits(run("adam", callback=interrupt_at(None), checkpoint=path)) == bits(whole)
 
 
 def test_a_fit_that_is_done_is_not_repeated_but_may_be_continued(path):

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 import vertax as vx
 from vertax.costs import MeshImage, VertexDistance, render
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
-from vertax.fitting import stack
+from vertax.fitting import _descent, stack
 
 inverse_problem = functools.partial(vx.InverseProblem, response=STILL)
 
@@ -155,6 +155,28 @@ def test_the_optimiser_keeps_its_momentum_over_epochs(hidden):
     )
 
 
+@pytest.fixture
+def soon(monkeypatch):
+    """Fits work out a Hessian early, and again when they are elsewhere."""
+    monkeypatch.setattr(_descent, "_FIRST_LOOK", 4)
+    monkeypatch.setattr(_descent, "_NEXT_LOOK", 3)
+
+
+@pytest.mark.parametrize("adjoint", [vx.ImplicitDifferentiation(), vx.EquilibriumPropagation()])
+def test_a_fit_that_knows_its_hessian_goes_the_same_way(hidden, adjoint, soon, monkeypatch):
+    target, truth, guess, _ = hidden
+    problem = inverse_problem(target, guess, VertexDistance(target), adjoint=adjoint)
+    fit = lambda: vx.fit(problem, ADAM, 12, truth=truth, progress=False).history
+    known = fit()
+    monkeypatch.setattr(_descent, "_FIRST_LOOK", 1000)
+    unknown = fit()
+    np.testing.assert_allclose(known.cost, unknown.cost, rtol=1e-5)
+    np.testing.assert_allclose(known.relative_error, unknown.relative_error, rtol=1e-5)
+    if isinstance(adjoint, vx.ImplicitDifferentiation):
+        np.testing.assert_array_equal(known.gradient_steps[:4], unknown.gradient_steps[:4])
+        assert np.all(known.gradient_steps[4:8] < 0.5 * unknown.gradient_steps[4:8])
+
+
 def test_one_compilation_serves_all_epochs(hidden):
     target, _, _, start = hidden
     traces = []
@@ -243,7 +265,7 @@ def batch(hidden):
     ],
 )
 @pytest.mark.thorough
-def test_a_batch_is_fitted_as_its_members_are(batch, optimiser):
+def test_a_batch_is_fitted_as_its_members_are(batch, optimiser, soon):
     problems, stacked, truth, truths = batch
     together = vx.fit(stacked, optimiser, 8, truth=truths, batched=True, progress=False)
     assert together.history.cost.shape[1:] == together.cost.shape == (3,)
@@ -381,7 +403,7 @@ def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):
     target, _, guess, start = hidden
     problem = inverse_problem(start, guess, VertexDistance(target))
     with pytest.raises(vx.FitError, match=r"not finite|broke down") as error:
-        vx.fit(problem, optax.sgd(1e300), 20, progress=False)
+        vx.fit(problem, optax.sgd(np.inf), 20, progress=False)
     assert error.value.fit is not None
     assert error.value.fit.best_epoch == 0
     assert jnp.isfinite(error.value.fit.tissue.vertices).all()

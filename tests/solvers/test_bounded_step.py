@@ -33,7 +33,7 @@ def step(g, matrix, bounds, start=None, **given):
         bounds,
         start=(zero, zero) if start is None else start,
         resumes=jnp.array(start is not None),
-        waving=jnp.array(False),
+        helped=jnp.array(False),
         max_products=200,
         options={},
         **({"forcing": jnp.array(1e-3)} | given),

@@ -37,9 +37,10 @@ class Checkpoint(eqx.Module):
     start anew. A greater number of `epochs` continues a fit that is done, and further `times` a movement.
 
     The file is a NumPy `.npz` archive without pickles: of a fit the state of the optimiser, the parameters,
-    the tissue, the best point so far and the history; of a movement all frames, and the state that the next
-    one begins with. It is written at the end, at an interrupt from the keyboard, and between epochs or
-    frames, atomically: a process that is killed while it writes leaves the last one.
+    the tissue, what is known of its Hessian, the best point so far and the history; of a movement all
+    frames, and the state that the next one begins with. It is written at the end, at an interrupt from the
+    keyboard, and between epochs or frames, atomically: a process that is killed while it writes leaves the
+    last one.
 
     **Arguments:**
 

@@ -23,6 +23,7 @@ from vertax.adjoints._adjoint import (
 )
 from vertax.solvers import MINRES
 from vertax.solvers._elastic_minres import ElasticMINRES
+from vertax.solvers._known_hessian import KnownHessian
 
 
 class ImplicitDifferentiation(AbstractAdjoint):
@@ -74,8 +75,11 @@ class ImplicitDifferentiation(AbstractAdjoint):
         root, residual = frozen(root), jax.tree.map(eqxi.nondifferentiable_backward, residual)
         adjoint = cast(ImplicitDifferentiation, self.without_outcome())
         known = minimisation.options
-        if known.get("long_waves") is not None and isinstance(self.linear_solver, MINRES):
-            parts = (known[name] for name in ("edge_blocks", "long_waves", "stiffness"))
+        collective = known.get("collective")
+        if isinstance(collective, KnownHessian) and self.mode == "sensitivity":
+            collective = None  # for a batch of systems a dense matrix is no bargain
+        if collective is not None and isinstance(self.linear_solver, MINRES):
+            parts = (known[name] for name in ("edge_blocks", "collective", "stiffness"))
             solver = ElasticMINRES(self.linear_solver, *parts)
             adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
         system = _System(adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag})

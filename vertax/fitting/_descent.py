@@ -28,6 +28,11 @@ from vertax.fitting._epoch import (
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import Evaluation, InverseProblem
 from vertax.mesh import Tissue
+from vertax.solvers._known_hessian import KnownHessian
+
+# When the Hessian is worked out: that takes as long as a few epochs, and to compile it as long as hundreds.
+_FIRST_LOOK = 100
+_NEXT_LOOK = 20
 
 
 class State(eqx.Module):
@@ -39,6 +44,12 @@ class State(eqx.Module):
     best: Best
     going: Bool[Array, "*batch"]
     """False once an epoch was not sound."""
+    hessian: KnownHessian | None
+    """That of an equilibrium some epochs ago;"""
+    looked: Int[Array, "*batch"]
+    """how many epochs had passed then,"""
+    stale: Bool[Array, "*batch"]
+    """and whether the tissue is elsewhere now."""
 
 
 class Descent(AbstractMethod):
@@ -59,17 +70,26 @@ class Descent(AbstractMethod):
         strength = None
         if self.guidance is not None:
             strength = jnp.asarray(self.strength(epoch), self.problem.tissue.vertices.dtype)
-        return _epoch(
-            self._lenient(),
+        problem, hessian = self._lenient(), state.hessian
+        wait = _NEXT_LOOK if np.any(state.looked) else _FIRST_LOOK
+        due = hessian is not None and epoch >= np.max(state.looked) + wait
+        if due and np.any(state.stale & state.going):
+            hessian = _hessian_at(problem, self.constants, state, strength, self.batched)
+            state = dataclasses.replace(state, looked=jnp.full_like(state.looked, epoch))
+        without = dataclasses.replace(state, hessian=None)
+        state, record = _epoch(
+            problem,
             self.optimiser,
             self.constants,
             self.true,
-            state,
+            without,
+            hessian,
             jnp.array(epoch),
             strength,
             self.problem.adjoint.throw,
             self.batched,
         )
+        return dataclasses.replace(state, hessian=hessian), record
 
     def description(self) -> str:
         # An Optax optimiser is made of functions, which have no names for their constants. What they
@@ -109,7 +129,9 @@ def _start(
     def start(problem: InverseProblem, parameters: PyTree[Array]) -> State:
         fitted = cast(optax.Params, (parameters, no_shift(problem)))
         best = unbeaten(problem, parameters)
-        return State(parameters, optimiser.init(fitted), problem.tissue, best, jnp.array(True))
+        unknown = problem.response.hessian_at(problem.tissue, None)
+        state, yes, none = optimiser.init(fitted), jnp.array(True), jnp.array(0)
+        return State(parameters, state, problem.tissue, best, yes, unknown, none, stale=yes)
 
     return (over_members(start, problem) if batched else start)(problem, parameters)
 
@@ -121,6 +143,7 @@ def _epoch(
     constants: PyTree,
     true: PyTree[Array] | None,
     state: State,
+    hessian: KnownHessian | None,
     epoch: Int[Array, ""],
     guidance: Float[Array, ""] | None,
     throw: bool,
@@ -129,10 +152,15 @@ def _epoch(
     """One relaxation, gradient and update, for each of the batch."""
 
     def one(
-        problem: InverseProblem, constants: PyTree, true: PyTree[Array] | None, state: State
+        problem: InverseProblem,
+        constants: PyTree,
+        true: PyTree[Array] | None,
+        state: State,
+        hessian: KnownHessian | None,
     ) -> tuple[State, Record]:
-        if guidance is not None:
-            problem = dataclasses.replace(problem, guidance=guidance)
+        problem = dataclasses.replace(
+            _guided(problem, guidance), response=problem.response.knowing(hessian)
+        )
         shift = no_shift(problem)
         energy = eqx.combine(state.parameters, constants)
         evaluation = problem.value_and_gradient(energy, state.tissue, shift, throw=False)
@@ -161,12 +189,39 @@ def _epoch(
             epoch,
             going & equilibrium.converged,
         )
-        moved = State(parameters, optimiser_state, following, best, going)
+        stale = state.stale
+        if hessian is not None:
+            stale = ~hessian.seen_from(following.configuration).ready
+        moved = State(
+            parameters, optimiser_state, following, best, going, None, state.looked, stale
+        )
         # A relaxation that broke down must not be where the next one starts.
         return choose(going, moved, eqx.tree_at(lambda s: s.going, state, going)), record
 
-    arguments = (problem, constants, true, state)
+    arguments = (problem, constants, true, state, hessian)
     return (over_members(one, problem) if batched else one)(*arguments)
+
+
+@eqx.filter_jit
+def _hessian_at(
+    problem: InverseProblem,
+    constants: PyTree,
+    state: State,
+    guidance: Float[Array, ""] | None,
+    batched: bool,
+) -> KnownHessian | None:
+    """The Hessian where an epoch begins, for each of the batch."""
+
+    def one(problem: InverseProblem, constants: PyTree, state: State) -> KnownHessian | None:
+        energy = eqx.combine(state.parameters, constants)
+        pulled = _guided(problem, guidance).pulled(state.tissue, energy, no_shift(problem))
+        return problem.response.hessian_at(state.tissue, pulled)
+
+    return (over_members(one, problem) if batched else one)(problem, constants, state)
+
+
+def _guided(problem: InverseProblem, guidance: Float[Array, ""] | None) -> InverseProblem:
+    return problem if guidance is None else dataclasses.replace(problem, guidance=guidance)
 
 
 def _record(

@@ -17,13 +17,14 @@ from vertax._base.modules import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
-from vertax.energies._units import Units, units_of
+from vertax.energies._units import Units, cell_size, units_of
 from vertax.mesh import Tissue
 from vertax.responses._contact import Contacts
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._search import Search, SearchState, blocks_of, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
-from vertax.solvers._long_waves import LongWaves
+from vertax.solvers._known_hessian import KnownHessian
+from vertax.solvers._long_waves import FEWEST_CELLS
 from vertax.solvers._optimistix import check_solver
 from vertax.solvers._patience import AtRest, Patient
 from vertax.transitions import T1, AbstractTransitions
@@ -51,6 +52,7 @@ class Relaxation(AbstractResponse):
     - `contact_range`: how near a corner comes to a side of the same cell (or of the outline) before a
         barrier holds it off, in units of the size of a cell; see [Contact](../concepts.md#contact). 0 leaves
         the barrier out, and steps that would make cells overlap are still refused; None lets them overlap.
+    - `known_hessian`: that of an equilibrium near by, see `knowing`; it changes how long a relaxation takes.
 
     `tolerance`, `patience`, `max_steps`, `contact_range` and the numbers of `transitions` and of an energy
     are data: another number compiles nothing anew. The solver and the adjoint are parts of the program.
@@ -68,6 +70,7 @@ class Relaxation(AbstractResponse):
     patience: int | Int[Array, ""] = 1
     max_steps: int | Int[Array, ""] = 2000
     contact_range: float | Float[Array, ""] | None = 0.01
+    known_hessian: KnownHessian | None = eqx.field(default=None, kw_only=True, repr=False)
 
     def __check_init__(self):
         check_solver(self.solver)
@@ -155,6 +158,20 @@ class Relaxation(AbstractResponse):
             tolerance = jnp.minimum(tolerance, self.tolerance)
         return dataclasses.replace(self, tolerance=tolerance)
 
+    def hessian_at(self, tissue: Tissue, energy: AbstractEnergy | None) -> KnownHessian | None:
+        # (What is large has waves, and too many numbers to square; other solvers have no use for it.)
+        if tissue.n_cells >= FEWEST_CELLS or not isinstance(self.solver, NewtonCG):
+            return None
+        start = tissue.configuration
+        if energy is None:
+            return KnownHessian.unknown(start)
+        slope = jax.grad(lambda y: objective(y, (tissue, energy, None))[0])
+        product = lambda v: jax.jvp(slope, (start,), (v,))[1]
+        return KnownHessian.at(product, start, cell_size(tissue))
+
+    def knowing(self, hessian: KnownHessian | None) -> Relaxation:
+        return dataclasses.replace(self, known_hessian=hessian)
+
     @property
     def minimiser(self) -> AbstractSolver:
         """The solver, judged by its largest force."""
@@ -179,7 +196,8 @@ class Relaxation(AbstractResponse):
             "tolerance": jnp.asarray(tolerance, tissue.vertices.dtype),
         }
         minimiser = Patient(solver=self.minimiser, patience=self.patience)
-        return Search(minimiser, self.transitions, frozen(options), self.contact_range)
+        known = frozen(self.known_hessian)
+        return Search(minimiser, self.transitions, frozen(options), self.contact_range, known)
 
 
 def equilibrate(
@@ -258,7 +276,7 @@ def conclude(
         "start": state.origin,
         "max_steps": jnp.asarray(max_steps),
         "edge_blocks": frozen(blocks_of(settled, energy, state.contacts)),
-        "long_waves": frozen(LongWaves.of(settled)),
+        "collective": frozen(search.collective(settled)),
     }
     # This solve starts at rest and takes no step: it is there to be differentiated.
     solution = optx.minimise(

@@ -14,6 +14,7 @@ from vertax._base.modules import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
+from vertax.solvers._known_hessian import KnownHessian
 
 
 class Equilibrium(eqx.Module):
@@ -139,6 +140,20 @@ class AbstractResponse(eqx.Module):
     def complaint(self) -> str | None:
         """What went wrong last, in words, if it keeps them."""
         return None
+
+    def hessian_at(self, tissue: Tissue, energy: AbstractEnergy | None) -> KnownHessian | None:
+        """What others that come to rest near by may know, see `knowing`; None if that would be of no use.
+
+        **Arguments:**
+
+        - `tissue`: a tissue at rest.
+        - `energy`: its energy; None for what stands for a Hessian that is not known yet.
+        """
+        return None
+
+    def knowing(self, hessian: KnownHessian | None) -> AbstractResponse:
+        """The same with the Hessian of an equilibrium near by, which makes it faster and nothing else."""
+        return self
 
     @abc.abstractmethod
     def traced(self) -> AbstractResponse:

@@ -19,6 +19,7 @@ from vertax.mesh._sides import dot
 from vertax.mesh._topology import source, take
 from vertax.responses._contact import Contacts, no_contacts
 from vertax.solvers._edge_blocks import EdgeBlocks
+from vertax.solvers._known_hessian import KnownHessian
 from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._patience import Patient, PatientState
 from vertax.transitions import AbstractTransitions
@@ -77,12 +78,20 @@ class Search(eqx.Module):
     - `transitions`: the rule for topology changes, or None.
     - `options`: of the minimiser: typical sizes and the tolerance.
     - `contact_range`: of contacts; None to let cells overlap.
+    - `known_hessian`: of an equilibrium near by, if one is known.
     """
 
     minimiser: Patient
     transitions: AbstractTransitions | None
     options: dict[str, Array]
     contact_range: float | Float[Array, ""] | None
+    known_hessian: KnownHessian | None = None
+
+    def collective(self, tissue: Tissue) -> KnownHessian | LongWaves | None:
+        """What is known of its collective motions."""
+        if self.known_hessian is None:
+            return LongWaves.of(tissue)
+        return self.known_hessian.seen_from(tissue.configuration)
 
     def begin(self, tissue: Tissue, energy: AbstractEnergy) -> SearchState:
         """The state before the first step."""
@@ -148,7 +157,7 @@ class Search(eqx.Module):
         args = (before, energy, state.contacts)
         rest = self.options["tolerance"]
         options = self.options | {
-            "long_waves": LongWaves.of(before),
+            "collective": self.collective(before),
             "edge_blocks": blocks_of(before, energy, state.contacts),
             "stays_below": jnp.where(state.pending, jnp.where(last, jnp.inf, rest), 0),
         }

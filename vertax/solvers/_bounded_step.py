@@ -13,7 +13,8 @@ from optax import tree
 
 from vertax._base.modules import choose
 from vertax.solvers._edge_blocks import EdgeBlocks
-from vertax.solvers._long_waves import LongWaves, Stiffness
+from vertax.solvers._known_hessian import KnownHessian
+from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._rows import inner, row_inner, sizes, times
 from vertax.solvers._solver import Rows
 
@@ -41,7 +42,7 @@ def bounded_step(
     start: tuple[PyTree, PyTree],
     resumes: Bool[Array, ""],
     forcing: Float[Array, ""],
-    waving: Bool[Array, ""],
+    helped: Bool[Array, ""],
     max_products: int | Int[Array, ""],
     options: dict[str, Any],
     active: Bool[Array, ""] | bool = True,
@@ -57,37 +58,38 @@ def bounded_step(
     - `start`: the step to begin with, and its product with the Hessian.
     - `resumes`: whether that is more than nothing, and may go too far.
     - `forcing`: the residual to come to, in units of the first one.
-    - `waving`: whether the long waves of a large tissue precondition it.
+    - `helped`: whether it is preconditioned by what is known of collective motions: the long waves of a
+        large tissue, or the Hessian of an equilibrium near by.
     - `max_products`: most products with the Hessian.
     - `options`: of the minimiser: typical sizes, and what preconditions it.
     - `active`: whether to do anything at all.
     """
     stiffness = options.get("stiffness", 1.0)
     blocks: EdgeBlocks | None = options.get("edge_blocks")
-    waves: LongWaves | None = options.get("long_waves")
+    collective: LongWaves | KnownHessian | None = options.get("collective")
     zero = tree.zeros_like(g)
-    one = jnp.ones_like(forcing)
-    medium = Stiffness(one, one, one)
-    if waves is not None:
+    medium: Any = None
+    if collective is not None:
         # Far from rest steps are short, and what is soft may have negative curvature.
-        measure = lambda: waves.measured(hessian, g, stiffness)
-        medium = jax.lax.cond(waving & active, measure, lambda: medium)
+        helped &= collective.ready
+        measure = lambda: collective.measured(hessian, g, stiffness)
+        medium = jax.lax.cond(helped & active, measure, lambda: collective.unmeasured)
 
     def preconditioner(shift: Rows) -> Callable[[PyTree], PyTree]:
         yielding = jax.tree.map(lambda s: 1 / (stiffness + s), shift)
         near = lambda r: jax.tree.map(times, yielding, r)
         if blocks is not None:
             near = blocks.compliance(jax.tree.leaves(shift)[0])
-        if waves is None:
+        if collective is None:
             return near
         # A place that is held tightly must not hold all others, nor drag them along.
-        first = jax.tree.leaves(shift)[0]
-        held = jnp.mean(jnp.minimum(first, stiffness))
-        yields = waves.compliance(medium, held, stiffness / (stiffness + first))
+        held = jnp.mean(jnp.minimum(jax.tree.leaves(shift)[0], stiffness))
+        shares = jax.tree.map(lambda y: stiffness * y, yielding)
+        yields = collective.compliance(medium, held, shares)
 
         def both(r: PyTree) -> PyTree:
             z = near(r)
-            return jax.lax.cond(waving, lambda: yields.added(z, r), lambda: z)
+            return jax.lax.cond(helped, lambda: yields.added(z, r), lambda: z)
 
         return both
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -37,19 +38,17 @@ class Direct(lx.AbstractLinearSolver[Any]):
         """Set up the matrix and factorise it."""
         if not lx.is_symmetric(operator):
             raise ValueError("Argument `operator` must be symmetric, and tagged as such.")
-        zero, unravel = _flat(operator)
-        column = lambda v: ravel_pytree(operator.mv(unravel(v)))[0]
-        identity = jnp.eye(zero.size, dtype=zero.dtype)
-        matrix = jax.lax.map(column, identity, batch_size=_BATCH)
+        matrix = as_matrix(operator.mv, operator.in_structure())
         size = jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
-        factors, pivots = jax.scipy.linalg.lu_factor(matrix + _share(zero) * size * identity)
+        identity = jnp.eye(len(matrix), dtype=matrix.dtype)
+        factors, pivots = jax.scipy.linalg.lu_factor(matrix + _share(matrix) * size * identity)
         return _Factors(operator, factors, pivots)
 
     def compute(
         self, state: _Factors, vector: PyTree[Array], options: dict[str, Any]
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         """Solve for one right-hand side, with two steps of refinement."""
-        zero, unravel = _flat(state.operator)
+        zero, unravel = _flat(state.operator.in_structure())
         product = lambda v: ravel_pytree(state.operator.mv(unravel(v)))[0]
         solve = lambda r: jax.scipy.linalg.lu_solve((state.factors, state.pivots), r)
         rhs = ravel_pytree(vector)[0]
@@ -84,8 +83,18 @@ class Direct(lx.AbstractLinearSolver[Any]):
 _REFINED = 2
 
 
-def _flat(operator: lx.AbstractLinearOperator) -> tuple[Float[Array, " n"], Any]:
-    structure = operator.in_structure()
+def as_matrix(product: Callable[[PyTree], PyTree], like: PyTree) -> Float[Array, "n n"]:
+    """The matrix of a symmetric operator, from its products with vectors of the shapes of `like`."""
+    zero, unravel = _flat(like)
+    column = lambda v: ravel_pytree(product(unravel(v)))[0]
+    # (Without a smaller last batch, which would be compiled besides.)
+    batches = -(-zero.size // _BATCH)
+    unit_vectors = jnp.eye(batches * _BATCH, zero.size, dtype=zero.dtype)
+    each = jax.lax.map(jax.vmap(column), unit_vectors.reshape(batches, _BATCH, zero.size))
+    return each.reshape(-1, zero.size)[: zero.size]
+
+
+def _flat(structure: PyTree) -> tuple[Float[Array, " n"], Any]:
     return ravel_pytree(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), structure))
 
 

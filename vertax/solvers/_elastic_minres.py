@@ -1,4 +1,4 @@
-"""MINRES for the Hessian of a large tissue."""
+"""MINRES for the Hessian of a tissue of which more is known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax.solvers._edge_blocks import EdgeBlocks, EdgeCompliance
-from vertax.solvers._long_waves import Compliance, LongWaves
+from vertax.solvers._known_hessian import KnownHessian
+from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._minres import MINRES
 
 
@@ -24,8 +25,8 @@ class _Attempt(NamedTuple):
     again: Bool[Array, ""]
 
 
-class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance, EdgeCompliance | None]]):
-    """MINRES for the Hessian of a large tissue, preconditioned by its edges and its long waves.
+class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Any, EdgeCompliance | None]]):
+    """MINRES for the Hessian of a tissue, preconditioned by its edges and its collective motions.
 
     Where the system has no solution, as if there are zero modes that the right-hand side sees, the result
     would depend on the preconditioner: such a system is solved again without.
@@ -33,20 +34,20 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance, EdgeComplianc
 
     plain: MINRES
     edges: EdgeBlocks | None
-    waves: LongWaves
+    collective: LongWaves | KnownHessian
     stiffness: Float[Array, ""]
 
     def init(
         self, operator: lx.AbstractLinearOperator, options: dict[str, Any]
-    ) -> tuple[Any, Compliance, EdgeCompliance | None]:
+    ) -> tuple[Any, Any, EdgeCompliance | None]:
         linear = self.plain.init(operator, options)
-        stiffness = self.waves.measured(linear.mv, operator.in_structure(), self.stiffness)
+        medium: Any = self.collective.measured(linear.mv, operator.in_structure(), self.stiffness)
         edges = None if self.edges is None else self.edges.compliance()
-        return linear, self.waves.compliance(stiffness), edges
+        return linear, self.collective.compliance(medium), edges
 
     def compute(
         self,
-        state: tuple[Any, Compliance, EdgeCompliance | None],
+        state: tuple[Any, Any, EdgeCompliance | None],
         vector: PyTree[Array],
         options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
@@ -70,7 +71,7 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Compliance, EdgeComplianc
 
         outcome = jax.eval_shape(lambda: self.plain.compute(linear, vector, options))
         solution, result, stats = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), outcome)
-        start = _Attempt(solution, result, stats, jnp.array(True), jnp.array(True))
+        start = _Attempt(solution, result, stats, self.collective.ready, jnp.array(True))
         end = jax.lax.while_loop(lambda last: last.again, attempt, start)
         return end.solution, end.result, end.stats
 

@@ -9,12 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int, PyTree
+from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from vertax._base.sums import total
 from vertax.mesh import Periodic, Tissue
 from vertax.mesh._boundary import inverse_of
 from vertax.mesh._topology import take
+from vertax.solvers._solver import Rows
 
 # Smaller tissues have no waves that are long enough to be slow, and pay more than they gain.
 FEWEST_CELLS = 150
@@ -88,6 +89,17 @@ class LongWaves(eqx.Module):
             size=size,
         )
 
+    @property
+    def ready(self) -> Bool[Array, ""]:
+        """Whether there is anything to precondition with: always."""
+        return jnp.array(True)
+
+    @property
+    def unmeasured(self) -> Stiffness:
+        """What stands for what is not measured."""
+        one = jnp.ones_like(self.filled)
+        return Stiffness(one, one, one)
+
     def measured(
         self, hessian: Callable[[PyTree], PyTree], like: PyTree, mean: Float[Array, ""]
     ) -> Stiffness:
@@ -139,11 +151,11 @@ class LongWaves(eqx.Module):
         self,
         stiffness: Stiffness,
         shift: Float[Array, ""] | float = 0.0,
-        share: Float[Array, " vertices"] | None = None,
+        shares: Rows | None = None,
     ) -> Compliance:
         """How the medium gives way if a spring of stiffness `shift` holds each vertex besides.
 
-        Vertices hand on a `share` of their force to the medium, and go with it as much; all by default.
+        Vertices hand on a share of their force to the medium, and go with it as much; all by default.
         """
         # Vectors are complex numbers, so half the transforms do. If Z(k) is a transform, the part of the
         # vectors' transform along k is (Z(k) + κ/κ* Z*(-k)) / 2 with κ = k_x + i k_y, the rest across.
@@ -155,7 +167,9 @@ class LongWaves(eqx.Module):
         along, across = (1 / (offset + shift + c * squared) for c in (compression, shear))
         scale = jnp.where(whole, 0, 0.5 / self.filled)
         turned = jax.lax.complex(x**2 - y**2, 2 * x * y) / squared
-        weights = self.weights if share is None else share[:, None] * self.weights
+        weights = self.weights
+        if shares is not None:
+            weights *= jax.tree.leaves(shares)[0][:, None]
         mirrored = scale * (along - across) * turned
         return Compliance(self.indices, weights, scale * (along + across), mirrored)
 

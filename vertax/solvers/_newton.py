@@ -194,7 +194,7 @@ class NewtonCG(AbstractSolver):
                 start=choose(resumes, step[:2], (zero, zero)),
                 resumes=resumes,
                 forcing=jnp.where(corrects, _LOOSE, forcing),
-                waving=~corrects & ~resumes & near,
+                helped=~corrects & ~resumes & near,
                 max_products=jnp.where(corrects, few_products, self.max_products),
                 options=options,
                 active=solves,
