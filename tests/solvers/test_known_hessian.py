@@ -91,6 +91,13 @@ def test_large_tissues_and_other_responses_have_none():
     assert evolution.knowing(None) is evolution
 
 
+def test_what_is_none_or_that_of_another_tissue_is_refused(known, as_a_user):
+    with pytest.raises(TypeError, match="`known_hessian` must be what `hessian_at`"):
+        RELAXATION.knowing("soft")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="a tissue with 64 coordinates, but this one has 32"):
+        RELAXATION.knowing(known)(random_tissue(8), ShapeFactorEnergy(3.7))
+
+
 @eqx.filter_jit
 def _found(relaxation, tissue, energy):
     """Where a tissue comes to rest, a gradient there, and what both have taken."""

@@ -84,6 +84,11 @@ class Relaxation(AbstractResponse):
                 check_number(name, getattr(self, name), above=0, many=True)
         if self.contact_range is not None:
             check_number("contact_range", self.contact_range, least=0, many=True)
+        if not isinstance(self.known_hessian, KnownHessian | None):
+            raise TypeError(
+                "Argument `known_hessian` must be what `hessian_at` of a relaxation returns, or None, but is "
+                f"{named(self.known_hessian)}."
+            )
 
     def __call__(
         self,
@@ -130,6 +135,12 @@ class Relaxation(AbstractResponse):
             raise TypeError(
                 "Argument `energy` must be one of vertax.energies, e.g. ShapeFactorEnergy(3.8), or a "
                 f"function, but is {named(energy)}."
+            )
+        known, size = self.known_hessian, sum(map(jnp.size, jax.tree.leaves(tissue.configuration)))
+        if known is not None and known.inverse.shape != (size, size):
+            raise ValueError(
+                f"Argument `known_hessian` is that of a tissue with {len(known.inverse)} coordinates, but "
+                f"this one has {size}. Take `hessian_at` of a tissue like it, or None."
             )
         _check_adjoint(adjoint, self.minimiser)
         _check_sharding((tissue, energy))
