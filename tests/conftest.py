@@ -12,6 +12,7 @@ if version("jaxlib").startswith("0.10."):
 os.environ["VERTAX_CACHE"] = "off"  # nothing of the tests in the user's cache folder
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS])
 
+import equinox as eqx
 import jax
 import jaxtyping
 import matplotlib
@@ -28,11 +29,12 @@ gc.set_threshold(20_000, 20, 10)
 def _few_compiled_functions():
     """Forget compiled functions before there are too many."""
     # Each holds some memory maps, of which Linux allows a process 65530; beyond, the compiler aborts.
-    from vertax._base.memory_maps import forget_compiled, memory_maps
+    from vertax._base.memory_maps import memory_maps
 
     yield
     if memory_maps() > 15_000:
-        forget_compiled()
+        eqx.clear_caches()
+        jax.clear_caches()
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Compiled functions are forgotten before there are too many."""
+"""A process is warned before compiled functions hold too many memory maps."""
 
 import warnings
 
@@ -7,35 +7,37 @@ import jax.numpy as jnp
 import pytest
 
 from vertax._base import memory_maps
+from vertax._base.memory_maps import warn_of_memory_maps
 
 
-@pytest.fixture
-def square():
-    return eqx.filter_jit(lambda x: x**2)
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch):
+    monkeypatch.setattr(memory_maps, "INTERVAL", 0.0)
+    monkeypatch.setattr(memory_maps, "_has_warned", False)
 
 
-def test_they_are_forgotten_with_a_warning_where_there_are_too_many(square, monkeypatch):
+def test_the_warning_names_the_remedy_and_comes_once(monkeypatch):
     if not memory_maps.MAPS.exists():
-        pytest.skip("this system does not show the memory maps of a process")
-    monkeypatch.setattr(memory_maps, "PAUSE", 0.0)
-    forgotten = []
-    monkeypatch.setattr(memory_maps.eqx, "clear_caches", lambda: forgotten.append(True))
-    memory_maps.spare_memory_maps()
-    assert not forgotten
-    monkeypatch.setattr(memory_maps, "SHARE", 0.0)
+        pytest.skip("this system does not list the memory maps of a process")
+    square = eqx.filter_jit(lambda x: x**2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_memory_maps()
+    monkeypatch.setattr(memory_maps, "FRACTION", 0.0)
     assert square(3) == 9
-    with pytest.warns(RuntimeWarning, match="memory maps"):
-        memory_maps.spare_memory_maps()
-    assert forgotten
+    with pytest.warns(RuntimeWarning, match=r"memory maps.*jax\.clear_caches"):
+        warn_of_memory_maps()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_memory_maps()
     assert square(3) == 9
 
 
-def test_nothing_is_forgotten_within_a_trace(monkeypatch):
-    monkeypatch.setattr(memory_maps, "SHARE", 0.0)
-    monkeypatch.setattr(memory_maps, "PAUSE", 0.0)
+def test_no_warning_inside_a_trace(monkeypatch):
+    monkeypatch.setattr(memory_maps, "FRACTION", 0.0)
 
     def square(x):
-        memory_maps.spare_memory_maps()
+        warn_of_memory_maps()
         return x**2
 
     with warnings.catch_warnings():
@@ -43,18 +45,17 @@ def test_nothing_is_forgotten_within_a_trace(monkeypatch):
         assert eqx.filter_jit(square)(jnp.asarray(3.0)) == 9
 
 
-def test_one_look_a_second_is_enough(monkeypatch):
-    monkeypatch.setattr(memory_maps, "SHARE", 0.0)
-    monkeypatch.setattr(memory_maps, "_last_look", float("inf"))
+def test_maps_are_counted_at_most_once_in_an_interval(monkeypatch):
+    monkeypatch.setattr(memory_maps, "FRACTION", 0.0)
+    monkeypatch.setattr(memory_maps, "_last_count", float("inf"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        memory_maps.spare_memory_maps()
+        warn_of_memory_maps()
 
 
-def test_other_systems_need_none(monkeypatch, tmp_path):
-    monkeypatch.setattr(memory_maps, "PAUSE", 0.0)
-    monkeypatch.setattr(memory_maps, "SHARE", 0.0)
+def test_no_warning_where_the_system_does_not_list_maps(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory_maps, "FRACTION", 0.0)
     monkeypatch.setattr(memory_maps, "MAPS", tmp_path / "maps")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        memory_maps.spare_memory_maps()
+        warn_of_memory_maps()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -69,53 +68,6 @@ def member(tree: Tree, index: int) -> Tree:
             f"Argument `index` must lie in 0 … {min(sizes) - 1}, the members of the batch, but is {index}."
         )
     return jax.tree.map(lambda x: x[index] if _is_array(x) else x, tree)
-
-
-def for_each(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function for each of a batch, in the way that suits the device.
-
-    Relaxations differ in how long they take. On a CPU they go one after another, each as long as it needs
-    (`jax.lax.map`); elsewhere all go side by side, until the slowest is done (`jax.vmap`). On a CPU
-    `jax.vmap` computes along whatever is done already, and both sides of every branch.
-
-    ```python
-    relax = jax.jit(vx.fitting.for_each(vx.Relaxation()))
-    equilibria = relax(vx.fitting.stack(tissues), vx.fitting.stack(energies))
-    ```
-
-    **Arguments:**
-
-    - `function`: of pytrees of arrays (and of what is no array, which is the same for all), such as
-        tissues and energies. Its results are such pytrees.
-
-    **Returns:** a function of pytrees whose arrays have one more axis at the front, as made by
-    [`stack`][vertax.fitting.stack].
-    """
-
-    @functools.wraps(function)
-    def of_batch(*batch: Any) -> Any:
-        if _platform() != "cpu":
-            return eqx.filter_vmap(function)(*batch)
-        arrays, static = eqx.partition(batch, eqx.is_array)
-        kept: list[Any] = []
-
-        def one(arrays: Any) -> Any:
-            found, rest = eqx.partition(function(*eqx.combine(arrays, static)), eqx.is_array)
-            kept.append(rest)
-            return found
-
-        found = jax.lax.map(one, arrays)
-        return eqx.combine(found, kept[-1])
-
-    return of_batch
-
-
-def _platform() -> str:
-    """Where JAX puts what it is not told where to put."""
-    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-    if device is None:
-        return jax.default_backend()
-    return device if isinstance(device, str) else device.platform
 
 
 def _is_array(x: Any) -> bool:

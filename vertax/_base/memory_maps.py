@@ -1,4 +1,4 @@
-"""A guard against more compiled functions than Linux lets a process keep."""
+"""A warning before a process has more compiled functions than Linux lets it keep."""
 
 from __future__ import annotations
 
@@ -6,59 +6,53 @@ import time
 import warnings
 from pathlib import Path
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from vertax._base.modules import is_concrete
 
 MAPS = Path("/proc/self/maps")
-MOST = Path("/proc/sys/vm/max_map_count")
-SHARE = 0.7
-"""Which share of them one may have: the next function may need some thousands."""
-PAUSE = 1.0
-"""Seconds from one look to the next, which takes milliseconds."""
+LIMIT = Path("/proc/sys/vm/max_map_count")
+FRACTION = 0.7
+"""Fraction of the limit at which to warn: the next function may need some thousands."""
+INTERVAL = 1.0
+"""Seconds between two counts, each of which takes milliseconds."""
 
-_last_look = 0.0
+_last_count = 0.0
+_has_warned = False
 
 
 def memory_maps() -> int:
-    """How many memory maps this process has; 0 where that cannot be seen."""
+    """Number of memory maps of this process; 0 where the system does not list them."""
     return MAPS.read_bytes().count(b"\n") if MAPS.exists() else 0
 
 
-def forget_compiled() -> None:
-    """Forget all compiled functions."""
-    eqx.clear_caches()
-    jax.clear_caches()
-
-
-def spare_memory_maps() -> None:
-    """Forget all compiled functions if there are nearly too many, and say so.
+def warn_of_memory_maps() -> None:
+    """Warn, once in a process, if compiled functions hold nearly all memory maps that the system allows.
 
     Each function that XLA compiles for a CPU holds some memory maps of the process, and a gradient of one
-    size of tissue is more than a thousand of them. Linux allows 65530; at the next one LLVM finds no memory
-    and the process dies by a segmentation fault. To be called before something may be compiled; within a
-    trace it does nothing.
+    size of tissue is more than a thousand of them. Linux allows 65530; beyond, LLVM cannot allocate memory
+    and the process ends by a segmentation fault. Call this before a compilation; inside a trace it does
+    nothing.
     """
-    global _last_look
+    global _last_count, _has_warned
     now = time.monotonic()
-    # (What is made within a trace is traced.)
-    if now - _last_look < PAUSE or not is_concrete(jnp.zeros(())):
+    # (Inside a trace a new array is a tracer.)
+    if _has_warned or now - _last_count < INTERVAL or not is_concrete(jnp.zeros(())):
         return
-    _last_look = now
+    _last_count = now
     try:
-        most = int(MOST.read_text())
+        limit = int(LIMIT.read_text())
     except (OSError, ValueError):
-        return  # no Linux
+        return  # not Linux
     count = memory_maps()
-    if not count or count < SHARE * most:
+    if count < FRACTION * limit or not count:
         return
-    forget_compiled()
+    _has_warned = True
     warnings.warn(
-        f"This process held {count} memory maps of the {most} that the system allows, most of them for "
-        "compiled functions. These were all forgotten, and what is used again is compiled again. Use "
-        "fewer sizes of tissue in one process, or raise vm.max_map_count (sysctl).",
+        f"This process holds {count} of the {limit} memory maps that the system allows, most of them for "
+        "compiled functions; at the limit it ends by a segmentation fault. Pad tissues to a few sizes "
+        "(vertax.mesh.pad), call jax.clear_caches() and equinox.clear_caches() between sizes, or raise "
+        "vm.max_map_count (sysctl).",
         RuntimeWarning,
         stacklevel=3,
     )

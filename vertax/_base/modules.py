@@ -46,16 +46,29 @@ def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
     return jax.tree.map(pick, new, old)
 
 
-def traced(tree: Tree, *, integers: bool = False) -> Tree:
-    """The same pytree with its Python floats (and integers) as arrays.
+def traced(tree: Tree, dtype: Any = None, *, integers: bool = False) -> Tree:
+    """The same pytree with arrays for its Python floats (and integers), and without weakly typed arrays.
 
-    `equinox.filter_jit` takes numbers that are no arrays for a part of the program, and compiles another
-    one for each. These arrays keep the precision of what they are combined with, as Python numbers do.
+    `equinox.filter_jit` compiles a function again for another Python number and for another type of an
+    array. Weak types differ between a number, `jnp.full(n, 3.7)` and the result of a computation.
+
+    **Arguments:**
+
+    - `tree`: the pytree.
+    - `dtype`: the floating-point type of floats and of weakly typed arrays, usually that of the tissue. If
+        left out, floats become weakly typed arrays, which take the precision of what they are combined with,
+        and weakly typed arrays stay.
+    - `integers`: convert Python integers too.
     """
 
     def convert(x: Any) -> Any:
-        if isinstance(x, float) or (integers and isinstance(x, int) and not isinstance(x, bool)):
-            return jnp.asarray(x)
+        if isinstance(x, float):
+            return jnp.asarray(x, dtype)
+        if integers and isinstance(x, int) and not isinstance(x, bool):
+            return jnp.asarray(x, None if dtype is None else jnp.result_type(int))
+        if dtype is not None and eqx.is_array(x) and x.weak_type:
+            strong = dtype if jnp.issubdtype(x.dtype, jnp.floating) else x.dtype
+            return jax.lax.convert_element_type(x, strong)
         return x
 
     return jax.tree.map(convert, tree)

@@ -15,6 +15,8 @@ import equinox as eqx
 import equinox.internal as eqxi
 from jaxtyping import Array, Int, PyTree
 
+from vertax._base.vmapping import one_at_a_time
+
 
 class Minimisation(eqx.Module):
     """A minimisation as an adjoint of Optimistix sees it."""
@@ -46,6 +48,10 @@ class Minimisation(eqx.Module):
         """The minimum, and what Optimistix has to say of the way there."""
         loop = partial(eqxi.while_loop, kind=kind, checkpoints=checkpoints)
         return self.run_with((*self.inputs, loop))
+
+    def run_as_constant(self) -> tuple[PyTree[Array], PyTree]:
+        """The same, not differentiable; on a CPU members of a `jax.vmap` run one after another."""
+        return one_at_a_time(Minimisation.run)(self)
 
     def but(self, **changes: Any) -> Minimisation:
         """The same with some of its parts replaced."""

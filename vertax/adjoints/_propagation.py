@@ -13,7 +13,6 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from vertax._base.batch import for_each
 from vertax._base.optimistix import Minimisation, steps_of
 from vertax.adjoints._adjoint import (
     AbstractAdjoint,
@@ -163,7 +162,9 @@ def _(
     ) -> tuple[PyTree[Array], Array, Array]:
         nudged = _Nudged(fn, force)
         tolerance = jnp.minimum(coarsest, adjoint.tolerance(strength))
-        y, residual = nudge.but(fn=nudged, options=options | {"tolerance": tolerance}).run()
+        y, residual = nudge.but(
+            fn=nudged, options=options | {"tolerance": tolerance}
+        ).run_as_constant()
         left = optx.max_norm(jax.grad(lambda y: nudged(y, args)[0])(y))
         return slope(y), left, steps_of(residual)
 
@@ -185,7 +186,6 @@ def two_phases(
     options: dict[str, Any],
     phase: Phase,
     at_rest: PyTree[Array] | None,
-    each: Callable[[Callable[..., Any]], Callable[..., Any]] = for_each,
 ) -> tuple[PyTree[Array], GradientOutcome]:
     """The gradient from relaxations under weak forces, whoever does them, and how it came about.
 
@@ -198,7 +198,6 @@ def two_phases(
         partial derivative of the energy with respect to the parameters where the nudged system comes to
         rest, the largest force there, and the steps it took.
     - `at_rest`: that derivative without a nudge, for a difference that is one-sided.
-    - `each`: makes of a function the same for a batch.
 
     **Returns:** the gradient, shaped as the derivatives; and its outcome.
     """
@@ -208,7 +207,7 @@ def two_phases(
     # One phase is a batch of the two signs. A one-sided difference needs no second relaxation.
     signs = jnp.asarray([s for s in adjoint.signs if s != 0], size.dtype)
     nudged = lambda sign: phase(optax.tree.scale(sign * strength, direction), strength)
-    slopes, left, num_steps = each(nudged)(signs)
+    slopes, left, num_steps = jax.vmap(nudged)(signs)
     if adjoint.centred:
         difference = jax.tree.map(lambda s: (s[0] - s[1]) / 2, slopes)
     else:
@@ -291,7 +290,7 @@ def _(
         return jax.grad(energy)(moving), left, num_steps
 
     signs = jnp.asarray(adjoint.signs, half_beta.dtype)
-    slopes, left, num_steps = for_each(phase)(signs)
+    slopes, left, num_steps = jax.vmap(phase)(signs)
     beta = half_beta * (signs[0] - signs[1])
     gradient = jax.tree.map(lambda s: cotangent * (s[0] - s[1]) / beta, slopes)
     outcome = _outcome(jnp.max(left) / force, jnp.sum(num_steps))

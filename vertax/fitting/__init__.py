@@ -1,6 +1,6 @@
 """Inverse problems: parameters whose equilibrium minimises a cost."""
 
-from vertax._base.batch import for_each as for_each, member as member, stack as stack
+from vertax._base.batch import member as member, stack as stack
 from vertax._base.checkpoints import Checkpoint as Checkpoint
 from vertax.fitting._batch import stack_fits as stack_fits
 from vertax.fitting._fit import fit as fit

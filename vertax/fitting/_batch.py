@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vertax._base.batch import for_each, stack
+from vertax._base.batch import stack
 from vertax.fitting._history import Fit, History
-from vertax.fitting._inverse import InverseProblem
-
-
-def over_members(function: Callable[..., Any], problem: InverseProblem) -> Callable[..., Any]:
-    """The function for each of a batch of problems, in the way that suits their response."""
-    return eqx.filter_vmap(function) if problem.response.side_by_side else for_each(function)
 
 
 def stack_fits(fits: Sequence[Fit[Any]], *, at_once: int = 1) -> Fit[Any]:

@@ -14,8 +14,7 @@ import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from vertax._base.checkpoints import without_addresses
-from vertax._base.modules import choose
-from vertax.fitting._batch import over_members
+from vertax._base.modules import choose, traced
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
@@ -70,25 +69,21 @@ class Descent(AbstractMethod):
         strength = None
         if self.guidance is not None:
             strength = jnp.asarray(self.strength(epoch), self.problem.tissue.vertices.dtype)
-        problem, hessian = self._lenient(), state.hessian
+        problem, hessian = self._lenient(strength), state.hessian
         wait = _NEXT_LOOK if np.any(state.looked) else _FIRST_LOOK
         due = hessian is not None and epoch >= np.max(state.looked) + wait
         if due and np.any(state.stale & state.going):
-            hessian = _hessian_at(problem, self.constants, state, strength, self.batched)
-            state = dataclasses.replace(state, looked=jnp.full_like(state.looked, epoch))
+            hessian = _hessian_at(problem, self.constants, state, self.batched)
+            looked = jnp.full_like(state.looked, epoch)
+            state = dataclasses.replace(state, looked=looked, hessian=hessian)
+        evaluate = _evaluate_batch if self.batched else _evaluation
+        evaluation = evaluate(problem, self.constants, state)
+        following = problem.onward(evaluation.equilibrium.tissue)
         without = dataclasses.replace(state, hessian=None)
-        state, record = _epoch(
-            problem,
-            self.optimiser,
-            self.constants,
-            self.true,
-            without,
-            hessian,
-            jnp.array(epoch),
-            strength,
-            self.problem.adjoint.throw,
-            self.batched,
-        )
+        arguments = (without, evaluation, following, hessian, self.true, guidance_of(problem))
+        number = jnp.asarray(epoch, state.looked.dtype)
+        settings = (self.problem.adjoint.throw, self.batched)
+        state, record = _update(self.optimiser, arguments, number, *settings)
         return dataclasses.replace(state, hessian=hessian), record
 
     def description(self) -> str:
@@ -114,9 +109,14 @@ class Descent(AbstractMethod):
             )
         return float(value)
 
-    def _lenient(self) -> InverseProblem:
+    def _lenient(self, strength: Float[Array, ""] | None = None) -> InverseProblem:
         # A step that cannot be trusted is refused here, one member of a batch at a time.
-        return eqx.tree_at(lambda p: p.adjoint.throw, self.problem, False)
+        problem = eqx.tree_at(lambda p: p.adjoint.throw, self.problem, False)
+        if strength is None:
+            return problem
+        if self.batched:
+            strength = jnp.full(len(problem.tissue.vertices), strength)
+        return dataclasses.replace(problem, guidance=strength)
 
 
 @eqx.filter_jit
@@ -130,40 +130,45 @@ def _start(
         fitted = cast(optax.Params, (parameters, no_shift(problem)))
         best = unbeaten(problem, parameters)
         unknown = problem.response.hessian_at(problem.tissue, None)
-        state, yes, none = optimiser.init(fitted), jnp.array(True), jnp.array(0)
+        state, yes = traced(optimiser.init(fitted), problem.tissue.vertices.dtype), jnp.array(True)
+        none = jnp.zeros((), jnp.result_type(int))
         return State(parameters, state, problem.tissue, best, yes, unknown, none, stale=yes)
 
-    return (over_members(start, problem) if batched else start)(problem, parameters)
+    return (eqx.filter_vmap(start) if batched else start)(problem, parameters)
+
+
+def _evaluation(problem: InverseProblem, constants: PyTree, state: State) -> Evaluation:
+    """Cost and gradient of an epoch, by the compiled functions that `value_and_gradient` shares."""
+    response = problem.response.knowing(state.hessian)
+    problem = eqx.tree_at(lambda p: p.response, problem, response)
+    energy = eqx.combine(state.parameters, constants)
+    return problem.value_and_gradient(energy, state.tissue, no_shift(problem), throw=False)
+
+
+_evaluate_batch = eqx.filter_jit(eqx.filter_vmap(_evaluation))
 
 
 @eqx.filter_jit
-def _epoch(
-    problem: InverseProblem,
+def _update(
     optimiser: optax.GradientTransformation,
-    constants: PyTree,
-    true: PyTree[Array] | None,
-    state: State,
-    hessian: KnownHessian | None,
+    arguments: tuple,
     epoch: Int[Array, ""],
-    guidance: Float[Array, ""] | None,
     throw: bool,
     batched: bool,
 ) -> tuple[State, Record]:
-    """One relaxation, gradient and update, for each of the batch."""
+    """One update of the parameters, for each of the batch."""
 
     def one(
-        problem: InverseProblem,
-        constants: PyTree,
-        true: PyTree[Array] | None,
         state: State,
+        evaluation: Evaluation,
+        following: Tissue,
         hessian: KnownHessian | None,
+        true: PyTree[Array] | None,
+        guidance: Float[Array, ""],
     ) -> tuple[State, Record]:
-        problem = dataclasses.replace(
-            _guided(problem, guidance), response=problem.response.knowing(hessian)
+        shift = (
+            None if evaluation.shift_gradient is None else jnp.zeros_like(evaluation.shift_gradient)
         )
-        shift = no_shift(problem)
-        energy = eqx.combine(state.parameters, constants)
-        evaluation = problem.value_and_gradient(energy, state.tissue, shift, throw=False)
         gradient = (evaluation.gradient, evaluation.shift_gradient)
         equilibrium = evaluation.equilibrium
         record = _record(state.parameters, evaluation, gradient, true, throw)
@@ -177,7 +182,6 @@ def _epoch(
             grad=gradient,
         )
         parameters, shift = eqx.apply_updates(fitted, updates)
-        following = problem.onward(equilibrium.tissue)
         if shift is not None:
             following = following.with_vertices(following.vertices + shift)
         best = better(
@@ -185,7 +189,7 @@ def _epoch(
             state.parameters,
             equilibrium.tissue,
             Facts(**record.facts()),
-            guidance_of(problem),
+            guidance,
             epoch,
             going & equilibrium.converged,
         )
@@ -198,30 +202,21 @@ def _epoch(
         # A relaxation that broke down must not be where the next one starts.
         return choose(going, moved, eqx.tree_at(lambda s: s.going, state, going)), record
 
-    arguments = (problem, constants, true, state, hessian)
-    return (over_members(one, problem) if batched else one)(*arguments)
+    return (eqx.filter_vmap(one) if batched else one)(*arguments)
 
 
 @eqx.filter_jit
 def _hessian_at(
-    problem: InverseProblem,
-    constants: PyTree,
-    state: State,
-    guidance: Float[Array, ""] | None,
-    batched: bool,
+    problem: InverseProblem, constants: PyTree, state: State, batched: bool
 ) -> KnownHessian | None:
     """The Hessian where an epoch begins, for each of the batch."""
 
     def one(problem: InverseProblem, constants: PyTree, state: State) -> KnownHessian | None:
         energy = eqx.combine(state.parameters, constants)
-        pulled = _guided(problem, guidance).pulled(state.tissue, energy, no_shift(problem))
+        pulled = problem.pulled(state.tissue, energy, no_shift(problem))
         return problem.response.hessian_at(state.tissue, pulled)
 
-    return (over_members(one, problem) if batched else one)(problem, constants, state)
-
-
-def _guided(problem: InverseProblem, guidance: Float[Array, ""] | None) -> InverseProblem:
-    return problem if guidance is None else dataclasses.replace(problem, guidance=guidance)
+    return (eqx.filter_vmap(one) if batched else one)(problem, constants, state)
 
 
 def _record(

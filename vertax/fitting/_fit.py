@@ -113,10 +113,9 @@ def fit(
         )
     if batched:
         _check_batch((problem, truth))
-    # Weakly typed arrays (jnp.full(20, 3.7)) turn into strong ones at the first update, and each change
-    # of type would compile the epoch anew.
-    parameters = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
-    true = None if truth is None else eqx.filter(truth, problem.trainable)
+    dtype = problem.tissue.vertices.dtype
+    parameters = traced(parameters, dtype)
+    true = None if truth is None else traced(eqx.filter(truth, problem.trainable), dtype)
     given, problem = problem, _with_numbers_as_data(problem, parameters, batched)
     constants = eqx.partition(problem.energy, problem.trainable)[1]
     method: AbstractMethod
@@ -170,10 +169,10 @@ def _with_numbers_as_data(
     """The same problem with arrays for its Python numbers, of which another one compiles nothing anew."""
     # Which leaves are fitted is settled before: a number of the energy is a constant.
     fitted = jax.tree.map(lambda x: x is not None, parameters, is_leaf=lambda x: x is None)
-    energy, cost, guidance = traced((problem.energy, problem.cost, problem.guidance))
-    response = problem.response.traced()
+    dtype = problem.tissue.vertices.dtype
+    tissue, energy = traced((problem.tissue, problem.energy), dtype)
     data = dataclasses.replace(
-        problem, energy=energy, cost=cost, guidance=guidance, response=response, trainable=fitted
+        problem.as_data(dtype), tissue=tissue, energy=energy, trainable=fitted
     )
     if not batched:
         return data

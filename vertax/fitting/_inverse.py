@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -11,7 +12,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from vertax._base.memory_maps import spare_memory_maps
+from vertax._base.memory_maps import warn_of_memory_maps
+from vertax._base.modules import traced
 from vertax.adjoints import (
     AbstractAdjoint,
     EquilibriumPropagation,
@@ -123,19 +125,42 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         """
         energy = self.energy if energy is None else energy
         tissue = self.tissue if tissue is None else tissue
-        if isinstance(self.adjoint, EquilibriumPropagation) and self.adjoint.nudge == "cost":
+        return self._cost_at(None, energy, tissue, shift, throw=throw)
+
+    def _cost_at(
+        self,
+        primal: PyTree,
+        energy: AbstractEnergy,
+        tissue: Tissue,
+        shift: Float[Array, 2] | None,
+        *,
+        throw: bool,
+    ) -> tuple[Float[Array, ""], Equilibrium]:
+        """Cost and equilibrium; `primal` is that of the response, or None if it is to be computed."""
+        if self._nudged_by_cost:
             start = frozen((tissue, energy, shift))
-            settled = frozen(self.relax(*start, adjoint=ImplicitDifferentiation(), throw=throw))
+            adjoint = ImplicitDifferentiation()
+            settled = frozen(self.relax(*start, adjoint=adjoint, primal=primal, throw=throw))
+            adjoint = cast(EquilibriumPropagation, self.adjoint)
             problem = eqx.tree_at(
-                lambda p: (p.adjoint, p.energy), self, (self.adjoint.without_outcome(), None)
+                lambda p: (p.adjoint, p.energy),
+                self,
+                (adjoint.without_outcome(), None),
+                is_leaf=lambda x: x is None,
             )
             system = _Nudging(frozen(problem), settled.tissue)
-            vjp_arg = ((energy, shift), self.adjoint.outcome)
+            vjp_arg = ((energy, shift), adjoint.outcome)
             cost = cost_by_nudging(vjp_arg, system, problem.adjoint)
             return cost, _placed(settled, shift)
-        relaxed = self.relax(tissue, energy, shift, adjoint=self.adjoint, throw=throw)
+        relaxed = self.relax(
+            tissue, energy, shift, adjoint=self.adjoint, primal=primal, throw=throw
+        )
         equilibrium = _placed(relaxed, shift)
         return self.cost(self._seen(equilibrium), energy), equilibrium
+
+    @property
+    def _nudged_by_cost(self) -> bool:
+        return isinstance(self.adjoint, EquilibriumPropagation) and self.adjoint.nudge == "cost"
 
     def residuals(
         self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
@@ -174,21 +199,29 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge; and
             for a gradient that cannot be trusted, unless the adjoint is told not to with `throw=False`.
         """
-        spare_memory_maps()
+        warn_of_memory_maps()
         energy = self.energy if energy is None else energy
+        tissue = self.tissue if tissue is None else tissue
         parameters, constants = eqx.partition(energy, self.trainable)
+        dtype = tissue.vertices.dtype
+        arguments = traced((tissue, parameters, constants, shift), dtype)
+        tissue, parameters, constants, shift = arguments
+        problem = self.as_data(dtype)
+        pulled = problem.pulled(tissue, eqx.combine(parameters, constants), shift)
+        primal = problem.response.primal(tissue, pulled)
+        # The compiled function of all problems with this cost and adjoint.
+        parts = lambda p: (p.tissue, p.energy, p.trainable)
+        problem = eqx.tree_at(parts, problem, (None,) * 3, is_leaf=lambda x: x is None)
+        evaluation = _evaluate(problem, primal, *arguments)
+        if not throw:
+            return evaluation
+        return eqx.tree_at(lambda e: e.equilibrium, evaluation, evaluation.equilibrium.checked())
 
-        def cost(arguments: tuple) -> tuple[Array, Equilibrium]:
-            parameters, shift, outcome = arguments
-            adjoint = self.adjoint.with_outcome(outcome)
-            problem = eqx.tree_at(lambda p: p.adjoint, self, adjoint)
-            return problem(eqx.combine(parameters, constants), tissue, shift, throw=False)
-
-        arguments = (parameters, shift, GradientOutcome())
-        evaluate = jax.value_and_grad(cost, has_aux=True)
-        (value, equilibrium), (gradient, shift_gradient, outcome) = evaluate(arguments)
-        equilibrium = equilibrium.checked() if throw else equilibrium
-        return Evaluation(value, equilibrium, gradient, shift_gradient, outcome)
+    def as_data(self, dtype: Any) -> InverseProblem[Energy]:
+        """The same problem with arrays for its numbers other than those of the energy."""
+        cost, guidance = traced((self.cost, self.guidance), dtype)
+        response = self.response.traced()
+        return dataclasses.replace(self, cost=cost, guidance=guidance, response=response)
 
     def relax(
         self,
@@ -197,6 +230,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         shift: Float[Array, 2] | None,
         *,
         adjoint: AbstractAdjoint,
+        primal: PyTree = None,
         nudge: Float[Array, ""] | None = None,
         tolerance: Float[Array, ""] | None = None,
         throw: bool = False,
@@ -204,7 +238,10 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         """The equilibrium from `tissue`, not displaced; pulled by the cost where guided or nudged."""
         pulled = self.pulled(tissue, energy, shift, nudge)
         response = self.response if tolerance is None else self.response.finer(tolerance)
-        equilibrium = response(tissue, pulled, adjoint=adjoint, throw=throw)
+        if primal is None:
+            equilibrium = response(tissue, pulled, adjoint=adjoint, throw=throw)
+        else:
+            equilibrium = response.attach(primal, tissue, pulled, adjoint)
         if pulled is energy:
             return equilibrium
         return eqx.tree_at(lambda e: e.energy, equilibrium, energy(equilibrium.tissue))
@@ -222,6 +259,30 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         strength = (0 if self.guidance is None else self.guidance) + (0 if nudge is None else nudge)
         strength = jnp.asarray(strength, tissue.vertices.dtype)
         return _Pulled(energy, self.cost, shift, strength, frozen(tissue))
+
+
+@eqx.filter_jit
+def _evaluate(
+    problem: InverseProblem,
+    primal: PyTree,
+    tissue: Tissue,
+    parameters: PyTree[Array],
+    constants: PyTree,
+    shift: Float[Array, 2] | None,
+) -> Evaluation:
+    """Cost and gradient where the primal of the response has led."""
+
+    def cost(arguments: tuple) -> tuple[Array, Equilibrium]:
+        parameters, shift, outcome = arguments
+        adjoint = problem.adjoint.with_outcome(outcome)
+        reporting = eqx.tree_at(lambda p: p.adjoint, problem, adjoint)
+        energy = eqx.combine(parameters, constants)
+        return reporting._cost_at(primal, energy, tissue, shift, throw=False)
+
+    arguments = (parameters, shift, GradientOutcome())
+    evaluate = jax.value_and_grad(cost, has_aux=True)
+    (value, equilibrium), (gradient, shift_gradient, outcome) = evaluate(arguments)
+    return Evaluation(value, equilibrium, gradient, shift_gradient, outcome)
 
 
 def _moved(tissue: Tissue, shift: Float[Array, 2] | None) -> Tissue:

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from vertax._base.checkpoints import without_addresses
 from vertax._base.modules import choose
 from vertax.adjoints import ImplicitDifferentiation
-from vertax.fitting._batch import over_members
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
@@ -197,7 +196,7 @@ def _start(
         return State(fitted, leaves, *tissues, facts, scale, best, still, going)
 
     arguments = (problem, constants, true, parameters)
-    return (over_members(start, problem) if batched else start)(*arguments)
+    return (eqx.filter_vmap(start) if batched else start)(*arguments)
 
 
 @eqx.filter_jit
@@ -229,7 +228,7 @@ def _epoch(
         return state, _record(state)
 
     arguments = (problem, constants, true, state)
-    return (over_members(one, problem) if batched else one)(*arguments)
+    return (eqx.filter_vmap(one) if batched else one)(*arguments)
 
 
 def _record(state: State) -> Record:

@@ -187,7 +187,7 @@ def grow(
     adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
     relaxation = Relaxation(transitions=T1() + T2()) if relaxation is None else relaxation
     times = increasing(times)
-    parts = traced((tissue, energy, cycle, dissipation))
+    parts = traced((tissue, energy, cycle, dissipation), tissue.vertices.dtype)
     grown = _grow(
         *parts, relaxation.traced(), adjoint, times, as_key(key), (substeps, divisions, records)
     )

@@ -121,7 +121,7 @@ class BoxRelaxation(AbstractResponse):
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.relaxation.check(tissue, energy, adjoint)
         self.goes_with(adjoint)
-        found = _relax_box(*traced((tissue, energy)), self.traced(), adjoint)
+        found = _relax_box(*traced((tissue, energy), tissue.vertices.dtype), self.traced(), adjoint)
         return found.checked() if throw else found
 
     def goes_with(

@@ -77,7 +77,9 @@ def elastic_tensor(
     check_system(tissue, energy, box="an elastic modulus")
     solver = MINRES() if linear_solver is None else linear_solver
     check_linear_solver(solver)
-    tensor = _elastic_tensor(*traced((tissue, energy)), _Elasticity(solver, affine))
+    tensor = _elastic_tensor(
+        *traced((tissue, energy), tissue.vertices.dtype), _Elasticity(solver, affine)
+    )
     return checked(tensor, _REASON) if throw else tensor
 
 

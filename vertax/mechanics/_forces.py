@@ -77,7 +77,7 @@ def pressures_and_tensions(
 ) -> tuple[Float[Array, " cells"], Float[Array, " edges"]]:
     """Both at once."""
     check_system(tissue, energy)
-    return _pressures_and_tensions(*traced((tissue, energy)))
+    return _pressures_and_tensions(*traced((tissue, energy), tissue.vertices.dtype))
 
 
 @eqx.filter_jit

@@ -100,7 +100,7 @@ def modes(
             'Argument `method` can be "sparse" only for an AbstractLocalEnergy and outside of jax.jit, '
             'jax.vmap and jax.grad: pass method="dense".'
         )
-    tissue, energy = traced((tissue, energy))
+    tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     sparse = possible and size > max(DENSE, 4 * k) if method is None else method == "sparse"
     if sparse and isinstance(energy, AbstractLocalEnergy):
         vectors = jnp.asarray(_softest(Landscape(tissue, energy), k), tissue.vertices.dtype)
@@ -126,7 +126,7 @@ def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
     """
     check_system(tissue, energy)
     check_concrete("spectrum", tissue, energy)
-    matrix = np.asarray(_dense(Landscape(*traced((tissue, energy)))))
+    matrix = np.asarray(_dense(Landscape(*traced((tissue, energy), tissue.vertices.dtype))))
     free = np.asarray(ravel_pytree(movable(tissue))[0])
     return jnp.asarray(np.linalg.eigvalsh(matrix[np.ix_(free, free)]))
 

@@ -91,7 +91,7 @@ def complex_modulus(
         )
     if method not in (None, "dense", "sparse"):
         raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
-    args = (*traced((tissue, energy, dissipation)), omegas)
+    args = (*traced((tissue, energy, dissipation), tissue.vertices.dtype), omegas)
     real, imaginary = _tensors_of(args, method)
     part = jax.vmap(lambda tensor: shear_part(tensor, angle))
     return jax.lax.complex(part(real), part(imaginary))

@@ -123,7 +123,7 @@ def ramp(
     relaxation = Relaxation() if relaxation is None else relaxation
     check_relaxation(relaxation)
     adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
-    tissue, energy = traced((tissue, energy))
+    tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     relaxation.check(tissue, energy, adjoint)
     found = _ramp(tissue, energy, values, deformation, relaxation.traced(), adjoint)
     if not throw:

@@ -55,7 +55,7 @@ def velocities(
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
     solver = MINRES() if linear_solver is None else linear_solver
-    found = _velocities(*traced((tissue, energy, dissipation)), solver)
+    found = _velocities(*traced((tissue, energy, dissipation), tissue.vertices.dtype), solver)
     return checked(found, _REASON) if throw else found
 
 
@@ -120,7 +120,7 @@ def recoil(
             )
     solver = MINRES() if linear_solver is None else linear_solver
     check_linear_solver(solver)
-    tissue, energy, dissipation = traced((tissue, energy, dissipation))
+    tissue, energy, dissipation = traced((tissue, energy, dissipation), tissue.vertices.dtype)
     found = _recoil(tissue, energy, jnp.asarray(edge), dissipation, solver)
     return checked(found, _REASON) if throw else found
 

@@ -42,7 +42,7 @@ def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
     - `ValueError` for a batch of tissues.
     """
     check_system(tissue, energy)
-    return _stress(*traced((tissue, energy)))
+    return _stress(*traced((tissue, energy), tissue.vertices.dtype))
 
 
 @eqx.filter_jit
@@ -70,7 +70,7 @@ def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2
     **Raises:** as `stress`.
     """
     check_system(tissue, energy)
-    return _cell_stress(*traced((tissue, energy)))
+    return _cell_stress(*traced((tissue, energy), tissue.vertices.dtype))
 
 
 @eqx.filter_jit

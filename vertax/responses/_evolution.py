@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
 from vertax._base.checkpoints import Checkpoint
 from vertax._base.checks import as_key, check_whole, increasing, named
-from vertax._base.memory_maps import spare_memory_maps
+from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.modules import is_concrete, traced
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
@@ -177,8 +177,8 @@ class Evolution(AbstractResponse):
         response.relaxation.check(tissue, energy, adjoint)
         response._check(tissue)
         response._check_drive(tissue)
-        spare_memory_maps()
-        given = (*traced((tissue, energy)), response.traced(), adjoint)
+        warn_of_memory_maps()
+        given = (*traced((tissue, energy), tissue.vertices.dtype), response.traced(), adjoint)
         if progress or checkpoint is not None:
             evolved = evolve_by_frames(*given, checkpoint, progress=progress, throw=throw)
         else:

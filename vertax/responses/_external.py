@@ -20,9 +20,9 @@ from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units, cell_size, units_of
 from vertax.mesh import Tissue
+from vertax.responses._equilibrium import free_motions
 from vertax.responses._external_gradient import Rest, at_rest, force_of
 from vertax.responses._host import Answer, Job, Request, ask, stacked
-from vertax.responses._relaxation import free_motions
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
 
@@ -107,11 +107,6 @@ class External(AbstractResponse):
                 "Argument `timeout` needs processes=True: a simulator that hangs in a thread cannot be ended."
             )
 
-    @property
-    def side_by_side(self) -> bool:
-        """Yes: each run of the program is a thread of its own."""
-        return True
-
     def __call__(
         self,
         tissue: Tissue,
@@ -147,7 +142,10 @@ class External(AbstractResponse):
         failed = self.ledger.failed
         response = self.traced()
         equilibrium = _answered(
-            *traced((tissue, energy)), response, adjoint, throw and not concrete
+            *traced((tissue, energy), tissue.vertices.dtype),
+            response,
+            adjoint,
+            throw and not concrete,
         )
         if not throw:
             return equilibrium

@@ -114,6 +114,6 @@ def _(
         unpulled = slope(tissue) if known else by_program(rest.slope)
     sizes = {"stiffness": rest.units.stiffness, "length_scale": rest.units.length}
     # (The program may run twice at a time.)
-    gradient, outcome = two_phases(adjoint, pull, sizes, phase, unpulled, each=jax.vmap)
+    gradient, outcome = two_phases(adjoint, pull, sizes, phase, unpulled)
     (d_energy, d_boundary), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
     return d_energy, d_boundary, outcome

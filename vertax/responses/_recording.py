@@ -13,7 +13,8 @@ from vertax.adjoints import ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import units_of
 from vertax.mesh import Tissue
-from vertax.responses._relaxation import Relaxation, conclude, free_motions
+from vertax.responses._equilibrium import SearchEnd, free_motions
+from vertax.responses._relaxation import Relaxation, attached
 from vertax.responses._response import Equilibrium
 from vertax.responses._search import Search, SearchState
 from vertax.responses._trajectory import Trajectory
@@ -53,7 +54,8 @@ def record_relaxation(
             f"{tissue.vertices.shape}. Record the members of a batch one by one."
         )
     response = (Relaxation() if response is None else response).traced()
-    tissue, energy = traced((jax.tree.map(jnp.asarray, tissue), energy))
+    tissue, energy = jax.tree.map(jnp.asarray, tissue), energy
+    tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     trajectory = Trajectory()
 
     def add(frame: Tissue, num_steps: Array, num_t1: Array) -> None:
@@ -68,7 +70,7 @@ def record_relaxation(
         if not state.finished and state.num_steps < response.max_steps:
             frame = _settled(state.tissue, tissue) if adrift else state.tissue
             add(frame, state.num_steps, state.num_t1)
-    equilibrium = _conclude(search, state, tissue, energy, response.max_steps)
+    equilibrium = _conclude(search, state, tissue, energy, response)
     if equilibrium.num_steps > 0:
         add(equilibrium.tissue, equilibrium.num_steps, equilibrium.num_t1)
     return equilibrium.checked() if throw else equilibrium, trajectory
@@ -97,9 +99,10 @@ def _conclude(
     state: SearchState,
     tissue: Tissue,
     energy: AbstractEnergy,
-    max_steps: int | Int[Array, ""],
+    response: Relaxation,
 ) -> Equilibrium:
-    return conclude(search, state, tissue, energy, ImplicitDifferentiation(), max_steps)
+    end = SearchEnd.of(search, state)
+    return attached(end, tissue, energy, response, ImplicitDifferentiation())
 
 
 @eqx.filter_jit

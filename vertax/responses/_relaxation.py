@@ -9,24 +9,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.checks import check_number, named
-from vertax._base.memory_maps import spare_memory_maps
+from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.modules import differs_between_devices, is_concrete, traced
+from vertax._base.vmapping import one_at_a_time
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
-from vertax.energies._units import Units, cell_size, units_of
+from vertax.energies._units import cell_size, units_of
 from vertax.mesh import Tissue
-from vertax.responses._contact import Contacts
+from vertax.responses._equilibrium import SearchEnd, conclude
 from vertax.responses._response import AbstractResponse, Equilibrium
-from vertax.responses._search import Search, SearchState, blocks_of, objective
+from vertax.responses._search import Search, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
 from vertax.solvers._known_hessian import KnownHessian
 from vertax.solvers._long_waves import FEWEST_CELLS
 from vertax.solvers._optimistix import check_solver
-from vertax.solvers._patience import AtRest, Patient
+from vertax.solvers._patience import Patient
 from vertax.transitions import T1, AbstractTransitions
 
 
@@ -114,11 +115,12 @@ class Relaxation(AbstractResponse):
         """
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.check(tissue, energy, adjoint)
+        warn_of_memory_maps()
+        tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
         if all(map(is_concrete, jax.tree.leaves((tissue, energy, self, adjoint)))):
             # Nothing is differentiated: one program serves all adjoints.
             adjoint = ImplicitDifferentiation()
-            spare_memory_maps()
-        equilibrium = _equilibrate(*traced((tissue, energy)), self.traced(), adjoint)
+        equilibrium = self.attach(self.primal(tissue, energy), tissue, energy, adjoint)
         # An error that is raised within a compiled program calls back to the host, and JAX keeps no such
         # program in its cache on disk.
         return equilibrium.checked() if throw else equilibrium
@@ -142,8 +144,17 @@ class Relaxation(AbstractResponse):
                 f"Argument `known_hessian` is that of a tissue with {len(known.inverse)} coordinates, but "
                 f"this one has {size}. Take `hessian_at` of a tissue like it, or None."
             )
-        _check_adjoint(adjoint, self.minimiser)
+        _check_adjoint(adjoint, self._solver)
         _check_sharding((tissue, energy))
+
+    def primal(self, tissue: Tissue, energy: AbstractEnergy) -> SearchEnd:
+        """The relaxed tissue, by the compiled function that all callers share."""
+        return _search(*frozen((tissue, energy, self._complete(tissue))))
+
+    def attach(
+        self, primal: SearchEnd, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
+    ) -> Equilibrium:
+        return _compiled_attachment(primal, tissue, energy, self._complete(tissue), adjoint)
 
     def solve(
         self,
@@ -157,11 +168,9 @@ class Relaxation(AbstractResponse):
 
         If `thrifty`, a gradient keeps little of it and evaluates the rest again: for one of many in a row.
         """
-        start, constant = frozen((tissue, energy))
-        search = self.search(start, constant)
-        end = search.advance(search.begin(start, constant), constant, self.max_steps)
-        finish = eqx.filter_checkpoint(conclude) if thrifty else conclude
-        return finish(search, end, tissue, energy, adjoint, self.max_steps)
+        end = one_at_a_time(search)(*frozen((tissue, energy, self)))
+        finish = eqx.filter_checkpoint(attached) if thrifty else attached
+        return finish(end, tissue, energy, self, adjoint)
 
     def finer(self, tolerance: Float[Array, ""]) -> Relaxation:
         """The same, at rest only where the largest force is below this tolerance too."""
@@ -184,9 +193,21 @@ class Relaxation(AbstractResponse):
         return dataclasses.replace(self, known_hessian=hessian)
 
     @property
-    def minimiser(self) -> AbstractSolver:
+    def minimiser(self) -> Patient:
         """The solver, judged by its largest force."""
+        return Patient(solver=self._solver, patience=self.patience)
+
+    @property
+    def _solver(self) -> AbstractSolver:
         return self.solver if isinstance(self.solver, AbstractSolver) else Wrapped(self.solver)
+
+    def _complete(self, tissue: Tissue) -> Relaxation:
+        """The same with arrays for its numbers and for a Hessian that is not known.
+
+        The structure is then the same with and without a known Hessian, so both share a compilation.
+        """
+        known = self.hessian_at(tissue, None) if self.known_hessian is None else self.known_hessian
+        return dataclasses.replace(self.traced(), known_hessian=known)
 
     def traced(self) -> Relaxation:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""
@@ -195,7 +216,7 @@ class Relaxation(AbstractResponse):
         return dataclasses.replace(self, **numbers)
 
     def search(self, tissue: Tissue, energy: AbstractEnergy) -> Search:
-        """The way to equilibrium, step by step, in the units of a tissue."""
+        """The search for an equilibrium, step by step, in the units of a tissue."""
         units = units_of(tissue, energy)
         tolerance = self.tolerance
         if tolerance is None:
@@ -206,9 +227,8 @@ class Relaxation(AbstractResponse):
             "stiffness": units.stiffness,
             "tolerance": jnp.asarray(tolerance, tissue.vertices.dtype),
         }
-        minimiser = Patient(solver=self.minimiser, patience=self.patience)
         known = frozen(self.known_hessian)
-        return Search(minimiser, self.transitions, frozen(options), self.contact_range, known)
+        return Search(self.minimiser, self.transitions, frozen(options), self.contact_range, known)
 
 
 def equilibrate(
@@ -257,59 +277,27 @@ def equilibrate(
     return response(tissue, energy, adjoint=adjoint, throw=throw)
 
 
-@eqx.filter_jit
-def _equilibrate(
-    tissue: Tissue, energy: AbstractEnergy, response: Relaxation, adjoint: AbstractAdjoint
-) -> Equilibrium:
-    return response.solve(tissue, energy, adjoint)
+def search(tissue: Tissue, energy: AbstractEnergy, relaxation: Relaxation) -> SearchEnd:
+    """Relax a tissue, step by step."""
+    search = relaxation.search(tissue, energy)
+    state = search.advance(search.begin(tissue, energy), energy, relaxation.max_steps)
+    return SearchEnd.of(search, state)
 
 
-def conclude(
-    search: Search,
-    state: SearchState,
+def attached(
+    end: SearchEnd,
     tissue: Tissue,
     energy: AbstractEnergy,
+    relaxation: Relaxation,
     adjoint: AbstractAdjoint,
-    max_steps: int | Int[Array, ""],
 ) -> Equilibrium:
-    """The equilibrium that a search from `tissue` ended at, differentiable."""
-    relaxed = state.tissue
-    units = Units(search.options["length_scale"], search.options["stiffness"])
-    free = free_motions(relaxed, frozen(energy), units)
-    # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
-    # unless the energy has something to say about where the tissue is.
-    settled = _choose(jnp.all(free), relaxed.settled(frozen(tissue)), relaxed)
-    moved = settled.held_as(_choose(jnp.all(free), tissue, relaxed))
-    springs = jnp.ones_like(moved.drift(settled.configuration)).at[: len(free)].set(free)
-    memory = {
-        "stiffness": units.stiffness,
-        "relaxation": search.minimiser,
-        "start": state.origin,
-        "max_steps": jnp.asarray(max_steps),
-        "edge_blocks": frozen(blocks_of(settled, energy, state.contacts)),
-        "collective": frozen(search.collective(settled)),
-    }
-    # This solve starts at rest and takes no step: it is there to be differentiated.
-    solution = optx.minimise(
-        _pinned_energy,
-        AtRest(),
-        settled.configuration,
-        (moved, energy, frozen(state.contacts), units.stiffness * springs),
-        search.options | memory,
-        max_steps=None,
-        adjoint=adjoint,
-        throw=False,
-    )
-    final = moved.with_configuration(solution.value)
-    return Equilibrium(
-        tissue=final,
-        energy=energy(final),
-        max_force=state.minimiser.force,
-        num_steps=state.num_steps,
-        num_t1=state.num_t1,
-        valid=~state.overlaps if state.contacts is not None else ~final.overlaps.any,
-        result=search.result(state),
-    )
+    """The equilibrium at the end of a search by `relaxation`, differentiable."""
+    parts = relaxation.minimiser, relaxation.max_steps, relaxation.known_hessian
+    return conclude(end, tissue, energy, adjoint, *parts)
+
+
+_search = eqx.filter_jit(one_at_a_time(search))
+_compiled_attachment = eqx.filter_jit(attached)
 
 
 def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
@@ -341,32 +329,3 @@ def _check_sharding(tree: PyTree) -> None:
             "A relaxation within jax.shard_map needs jax.shard_map(..., check_vma=False): its loops begin "
             "with numbers that are the same on all devices."
         )
-
-
-def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
-    """The vertices of one tissue or another; pinned ones are where the first has them."""
-    if one.pinned is not None:
-        condition = condition | one.pinned[:, None]
-    return one.with_vertices(jnp.where(condition, one.vertices, other.vertices))
-
-
-def free_motions(tissue: Tissue, energy: AbstractEnergy, units: Units) -> Bool[Array, " modes"]:
-    """Which motions of the whole cost nothing: all, unless the energy knows positions."""
-    there = tissue.boundary.motions(tissue.vertices, 0.3 * units.length)
-    places = jnp.concatenate([tissue.vertices[None], there])
-    energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(places)
-    here = energies[0]
-    rounding = jnp.finfo(here.dtype).eps ** 0.6
-    size = jnp.abs(here) + units.stiffness * units.length**2
-    return jnp.abs(energies[1:] - here) <= rounding * size
-
-
-def _pinned_energy(
-    configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Contacts | None, Array]
-) -> Array:
-    """The energy, and a term that pins the motions which cost nothing."""
-    # Motions of the whole are zero modes. They make the Hessian singular, and a nudged relaxation would
-    # drift along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
-    tissue, energy, contacts, gauge = args
-    drift = tissue.drift(configuration)
-    return objective(configuration, (tissue, energy, contacts))[0] + 0.5 * jnp.sum(gauge * drift**2)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import is_concrete
 from vertax.adjoints import AbstractAdjoint
@@ -95,11 +95,6 @@ class AbstractResponse(eqx.Module):
         """Whether the next epoch of a fit may begin where this one ended, as it may at rest."""
         return True
 
-    @property
-    def side_by_side(self) -> bool:
-        """Whether many answer sooner together than one after another, whatever the device."""
-        return False
-
     @abc.abstractmethod
     def __call__(
         self,
@@ -120,6 +115,34 @@ class AbstractResponse(eqx.Module):
 
         **Returns:** where it ends.
         """
+
+    def primal(self, tissue: Tissue, energy: AbstractEnergy) -> PyTree:
+        """The part of the response that is not differentiated, which is compiled by itself.
+
+        A fit, an equilibrium and a gradient that call it outside of `jax.jit` share the compiled function.
+
+        **Arguments:**
+
+        - `tissue`: where it starts.
+        - `energy`: what it answers to.
+
+        **Returns:** the first argument of `attach`; None if the response does not separate the two parts.
+        """
+        return None
+
+    def attach(
+        self, primal: PyTree, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
+    ) -> Equilibrium:
+        """The response as a differentiable function, where `primal` has led; nothing is raised.
+
+        **Arguments:**
+
+        - `primal`: the result of the method `primal` for these arguments.
+        - `tissue`, `energy`, `adjoint`: as in a call of the response.
+
+        **Returns:** as a call of the response.
+        """
+        return self(tissue, energy, adjoint=adjoint, throw=False)
 
     def goes_with(
         self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False

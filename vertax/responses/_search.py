@@ -87,12 +87,6 @@ class Search(eqx.Module):
     contact_range: float | Float[Array, ""] | None
     known_hessian: KnownHessian | None = None
 
-    def collective(self, tissue: Tissue) -> KnownHessian | LongWaves | None:
-        """What is known of its collective motions."""
-        if self.known_hessian is None:
-            return LongWaves.of(tissue)
-        return self.known_hessian.seen_from(tissue.configuration)
-
     def begin(self, tissue: Tissue, energy: AbstractEnergy) -> SearchState:
         """The state before the first step."""
         rule = self.transitions
@@ -157,7 +151,7 @@ class Search(eqx.Module):
         args = (before, energy, state.contacts)
         rest = self.options["tolerance"]
         options = self.options | {
-            "collective": self.collective(before),
+            "collective": collective_of(before, self.known_hessian),
             "edge_blocks": blocks_of(before, energy, state.contacts),
             "stays_below": jnp.where(state.pending, jnp.where(last, jnp.inf, rest), 0),
         }
@@ -347,6 +341,15 @@ def objective(
     there = tissue.with_configuration(configuration)
     value = energy(Measured(there))
     return value if contacts is None else value + contacts(there), None
+
+
+def collective_of(
+    tissue: Tissue, known_hessian: KnownHessian | None
+) -> KnownHessian | LongWaves | None:
+    """A preconditioner for collective motions; None for a small tissue of which no Hessian is given."""
+    if known_hessian is None:
+        return LongWaves.of(tissue)
+    return known_hessian.seen_from(tissue.configuration)
 
 
 def blocks_of(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from vertax._base.vmapping import one_at_a_time
 from vertax.solvers._edge_blocks import EdgeBlocks, EdgeCompliance
 from vertax.solvers._known_hessian import KnownHessian
 from vertax.solvers._long_waves import LongWaves
@@ -51,29 +52,7 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Any, EdgeCompliance | Non
         vector: PyTree[Array],
         options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        linear, medium, edges = state
-
-        def attempt(last: _Attempt) -> _Attempt:
-            def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
-                alone = jax.tree.map(lambda x: x / self.stiffness, r)
-                helped = lambda: medium.added(alone if edges is None else edges(r), r)
-                return jax.lax.cond(last.helped, helped, lambda: alone)
-
-            preconditioner = lx.FunctionLinearOperator(
-                approximate_inverse, linear.in_structure(), lx.positive_semidefinite_tag
-            )
-            helped = options | {"preconditioner": preconditioner}
-            solution, result, stats = self.plain.compute(linear, vector, helped)
-            stats = stats | {"num_steps": stats["num_steps"] + last.stats["num_steps"]}
-            doubtful = stats["inconsistent"] | (result != lx.RESULTS.successful)
-            again = last.helped & doubtful
-            return _Attempt(solution, result, jax.tree.map(jnp.asarray, stats), ~again, again)
-
-        outcome = jax.eval_shape(lambda: self.plain.compute(linear, vector, options))
-        solution, result, stats = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), outcome)
-        start = _Attempt(solution, result, stats, self.collective.ready, jnp.array(True))
-        end = jax.lax.while_loop(lambda last: last.again, attempt, start)
-        return end.solution, end.result, end.stats
+        return one_at_a_time(_solve)(self, state, vector, options)
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options
@@ -83,3 +62,34 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Any, EdgeCompliance | Non
 
     def assume_full_rank(self) -> bool:
         return self.plain.assume_full_rank()
+
+
+def _solve(
+    solver: ElasticMINRES,
+    state: tuple[Any, Any, EdgeCompliance | None],
+    vector: PyTree[Array],
+    options: dict[str, Any],
+) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
+    linear, medium, edges = state
+
+    def attempt(last: _Attempt) -> _Attempt:
+        def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
+            alone = jax.tree.map(lambda x: x / solver.stiffness, r)
+            helped = lambda: medium.added(alone if edges is None else edges(r), r)
+            return jax.lax.cond(last.helped, helped, lambda: alone)
+
+        preconditioner = lx.FunctionLinearOperator(
+            approximate_inverse, linear.in_structure(), lx.positive_semidefinite_tag
+        )
+        helped = options | {"preconditioner": preconditioner}
+        solution, result, stats = solver.plain.compute(linear, vector, helped)
+        stats = stats | {"num_steps": stats["num_steps"] + last.stats["num_steps"]}
+        doubtful = stats["inconsistent"] | (result != lx.RESULTS.successful)
+        again = last.helped & doubtful
+        return _Attempt(solution, result, jax.tree.map(jnp.asarray, stats), ~again, again)
+
+    outcome = jax.eval_shape(lambda: solver.plain.compute(linear, vector, options))
+    solution, result, stats = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), outcome)
+    start = _Attempt(solution, result, stats, solver.collective.ready, jnp.array(True))
+    end = jax.lax.while_loop(lambda last: last.again, attempt, start)
+    return end.solution, end.result, end.stats

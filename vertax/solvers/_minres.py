@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import choose
 from vertax._base.probe import probe
+from vertax._base.vmapping import one_at_a_time
 from vertax.solvers._lanczos import (
     BREAKDOWN,
     CONVERGED,
@@ -184,179 +185,7 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         """Solves the system for one vector; see the class."""
-        b, unravel = jfu.ravel_pytree(vector)
-        eps = float(jnp.finfo(b.dtype).eps)
-        rtol = eps ** (2 / 3) if self.rtol is None else self.rtol
-        max_steps = 50 * max(b.size, 1) if self.max_steps is None else self.max_steps
-        rounding = ROUNDING_UNITS * eps
-        hardly_solved = eps**0.125
-        # Why √eps: see the end of the derivation. If no more than that is asked for, solve 0 stops
-        # there at once and the others have nothing to add.
-        nearly_null = max(rtol, 4 * eps**0.5)
-        coarse = rtol == nearly_null
-
-        flat = lambda operator: lambda v: jfu.ravel_pytree(operator.mv(unravel(v)))[0]
-        a = flat(state)
-        preconditioner = _preconditioner(state.in_structure(), options)
-        p = None if preconditioner is None else flat(preconditioner)
-        precondition = (lambda z: z) if p is None else p
-
-        # The cotangents of a float32 loss can be so small that their squares vanish.
-        scale = _power_of_two_near(jnp.max(jnp.abs(b), initial=0))
-        b = b / scale
-        norm_b = norm(b, precondition(b))
-        target = self.atol / scale + rtol * norm_b
-        x_0, r_0 = jnp.zeros_like(b), b
-        if options.get("y0") is not None:
-            x_0 = _first_guess(vector, options) / scale
-            r_0 = b - a(x_0)
-
-        # |A| must be known before Lanczos can tell it: if b is a null vector, A b is rounding
-        # error, and this shows only in comparison with |A|. With no pattern in g, the mean square
-        # of |A g|/|g| is that of the eigenvalues.
-        g = probe(b)
-        norm_g = norm(g, precondition(g))
-
-        # Solve 0 is the system itself; solve -1 solves nothing, and has A P g looked at instead. If the
-        # system has only a least-squares solution, two more follow:
-        #     solve 1, A P y = A P r, makes y the part of r in the range of A,
-        #     solve 2, A P d = y,     makes A⁺ r to be added to u.
-        # Both are consistent, and so do not blow up. Without rounding, A P r and y would be zero.
-        def one_solve(solve: _Solve) -> _Solve:
-            probing, first, second = (solve.number == k for k in (-1, 0, 1))
-            null = jnp.where(first & coarse, rtol, ROUNDING_UNITS * rounding).astype(b.dtype)
-            end = solve_in_krylov_space(
-                a,
-                p,
-                solve.rhs,
-                target=solve.target,
-                null=null,
-                nearly_null=nearly_null,
-                operator_norm=solve.operator_norm,
-                negative_curvature=solve.negative_curvature,
-                step=solve.step,
-                max_steps=max_steps,
-            )
-            norm_rhs = end.norm_rhs
-
-            # The looks, one in a turn of a loop: what takes long to compile is the operator, and it stands
-            # here once.
-            def look(turn: Int[Array, ""], seen: _Looks) -> _Looks:
-                begin = jnp.where(probing, g, end.u)
-                v = lax.select_n(turn, begin, seen.rest, seen.u, seen.r, seen.a_r)
-                p_v = precondition(v)
-                turns = [turn == k for k in range(5)]
-                a_v = lax.cond(turns[1] | turns[4], lambda: v, lambda: a(p_v))
-
-                # The level of rounding grows with u, so a u that blows up at one stroke reaches it. It
-                # shows in the recomputed residual, which is that of the suspect or larger.
-                norm_v = norm(v, p_v)
-                no_gain = (end.residual_suspect > 0) & (norm_v > 0.5 * end.residual_suspect)
-                blown_up = (
-                    (end.status == CONVERGED)
-                    & (norm_v > _SLACK * solve.target)
-                    & (no_gain | (norm_v > hardly_solved * norm_rhs))
-                )
-                # The test for LEAST_SQUARES, too, can be late, when u has already grown.
-                least_squares = blown_up | (end.status == LEAST_SQUARES)
-                change = jnp.where(least_squares, end.u_suspect, end.u)
-                u = jnp.where(second, seen.u, seen.u + change)
-                new = _Looks(
-                    rest=solve.rhs - a_v,
-                    norm_rest=norm_v,
-                    u=u,
-                    p_u=p_v,
-                    r=r_0 - a_v,
-                    p_r=p_v,
-                    a_r=a_v,
-                    norm_a_r=norm_v,
-                    status=jnp.where(least_squares, LEAST_SQUARES, end.status),
-                )
-                when = (0, 1, 1, 2, 2, 3, 3, 4, 1)
-                each = zip(when, new, seen, strict=True)
-                return _Looks(*(jnp.where(turns[k], now, before) for k, now, before in each))
-
-            seen = lax.fori_loop(0, jnp.where(probing, 2, 5), look, solve.last)
-            least_squares = seen.status == LEAST_SQUARES
-            change = jnp.where(least_squares, end.u_suspect, end.u)
-            ended = least_squares | (seen.status == CONVERGED)
-            more = jnp.where(first, least_squares & (not coarse), second & ended)
-            operator_norm = jnp.where(probing, over(seen.norm_rest, norm_g), end.operator_norm)
-            # Solve 1 goes as far as A P r means anything.
-            finest = rounding * operator_norm * norm(seen.r, seen.p_r)
-            return _Solve(
-                number=solve.number + 1,
-                more=more | probing,
-                rhs=jnp.where(probing, r_0, jnp.where(first, seen.a_r, change)),
-                target=jnp.where(first, finest, target),
-                last=choose(probing, solve.last, seen),
-                step=end.step,
-                status=seen.status,
-                operator_norm=operator_norm,
-                negative_curvature=end.negative_curvature,
-            )
-
-        zero, zeros, running = jnp.zeros_like(norm_g), jnp.zeros_like(b), jnp.array(RUNNING)
-        start = _Solve(
-            number=jnp.array(-1),
-            more=jnp.array(True),
-            rhs=zeros,
-            target=zero,
-            last=_Looks(zeros, zero, zeros, zeros, zeros, zeros, zeros, zero, running),
-            step=jnp.array(0),
-            status=running,
-            operator_norm=zero,
-            negative_curvature=jnp.array(False),
-        )
-        solve = lax.while_loop(lambda solve: solve.more, one_solve, start)
-
-        seen = solve.last
-        u, r, p_u, p_r, norm_a_r = seen.u, seen.r, seen.p_u, seen.p_r, seen.norm_a_r
-        norm_r = norm(r, p_r)
-        x = x_0 + p_u
-        # With a preconditioner this is the lower bound of |x| by Cauchy and Schwarz, for x_0 is not
-        # known in the form P u.
-        size_x = jnp.sqrt(dot(x, x)) if p is None else over(jnp.abs(dot(x, b)), norm_b)
-        size_x = jnp.maximum(size_x, norm(u, p_u))
-        reach = solve.operator_norm * size_x + norm_b
-        # The recomputed r has errors of this size, and A P r those times |A|.
-        noise = ROUNDING_UNITS * rounding * reach
-
-        ended = (solve.status == CONVERGED) | (solve.status == LEAST_SQUARES)
-        within = norm_r <= _SLACK * target
-        inconsistent = (
-            ended
-            & ~within
-            & ((solve.number > 1) | (solve.status == LEAST_SQUARES))
-            & (norm_r > noise)
-            & (norm_a_r <= solve.operator_norm * (_SLACK * nearly_null * norm_r + noise))
-        )
-        stagnated = ended & ~within & ~inconsistent
-        explained = norm_r <= hardly_solved * norm_b
-        acceptable = explained & (norm_r <= jnp.maximum(rtol * reach, noise))
-        # P r is a null vector, and the only one along which P u can have a part: u is in the span
-        # of b, A P b, ..., of which only b has a part outside the range.
-        lifted = x - over(dot(r, p_u), norm_r**2) * p_r
-        x = jnp.where(inconsistent, lifted, x)
-
-        result = lx.RESULTS.where(ended, lx.RESULTS.successful, lx.RESULTS.max_steps_reached)
-        for where, what in (
-            (stagnated & ~acceptable, lx.RESULTS.stagnation),
-            (solve.status == BREAKDOWN, lx.RESULTS.breakdown),
-            (solve.status == NONFINITE, lx.RESULTS.nonfinite_input),
-        ):
-            result = lx.RESULTS.where(where, what, result)
-        x = jnp.where(solve.status == NONFINITE, jnp.nan, x)
-        stats = {
-            "num_steps": solve.step,
-            "max_steps": max_steps,
-            "residual_norm": over(jnp.sqrt(dot(r, r)), jnp.sqrt(dot(b, b))),
-            "operator_norm": solve.operator_norm,
-            "negative_curvature": solve.negative_curvature,
-            "inconsistent": inconsistent,
-            "stagnated": stagnated,
-        }
-        return unravel(x * scale), result, stats
+        return one_at_a_time(_solve)(self, state, vector, options)
 
     def transpose(
         self, state: lx.AbstractLinearOperator, options: dict[str, Any]
@@ -373,6 +202,187 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     def assume_full_rank(self) -> bool:
         """False: the result is the pseudo-inverse solution whatever the rank."""
         return False
+
+
+def _solve(
+    solver: MINRES,
+    state: lx.AbstractLinearOperator,
+    vector: PyTree[Array],
+    options: dict[str, Any],
+) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
+    b, unravel = jfu.ravel_pytree(vector)
+    eps = float(jnp.finfo(b.dtype).eps)
+    rtol = eps ** (2 / 3) if solver.rtol is None else solver.rtol
+    max_steps = 50 * max(b.size, 1) if solver.max_steps is None else solver.max_steps
+    rounding = ROUNDING_UNITS * eps
+    hardly_solved = eps**0.125
+    # Why √eps: see the end of the derivation. If no more than that is asked for, solve 0 stops
+    # there at once and the others have nothing to add.
+    nearly_null = max(rtol, 4 * eps**0.5)
+    coarse = rtol == nearly_null
+
+    flat = lambda operator: lambda v: jfu.ravel_pytree(operator.mv(unravel(v)))[0]
+    a = flat(state)
+    preconditioner = _preconditioner(state.in_structure(), options)
+    p = None if preconditioner is None else flat(preconditioner)
+    precondition = (lambda z: z) if p is None else p
+
+    # The cotangents of a float32 loss can be so small that their squares vanish.
+    scale = _power_of_two_near(jnp.max(jnp.abs(b), initial=0))
+    b = b / scale
+    norm_b = norm(b, precondition(b))
+    target = solver.atol / scale + rtol * norm_b
+    x_0, r_0 = jnp.zeros_like(b), b
+    if options.get("y0") is not None:
+        x_0 = _first_guess(vector, options) / scale
+        r_0 = b - a(x_0)
+
+    # |A| must be known before Lanczos can tell it: if b is a null vector, A b is rounding
+    # error, and this shows only in comparison with |A|. With no pattern in g, the mean square
+    # of |A g|/|g| is that of the eigenvalues.
+    g = probe(b)
+    norm_g = norm(g, precondition(g))
+
+    # Solve 0 is the system itself; solve -1 solves nothing, and has A P g looked at instead. If the
+    # system has only a least-squares solution, two more follow:
+    #     solve 1, A P y = A P r, makes y the part of r in the range of A,
+    #     solve 2, A P d = y,     makes A⁺ r to be added to u.
+    # Both are consistent, and so do not blow up. Without rounding, A P r and y would be zero.
+    def one_solve(solve: _Solve) -> _Solve:
+        probing, first, second = (solve.number == k for k in (-1, 0, 1))
+        null = jnp.where(first & coarse, rtol, ROUNDING_UNITS * rounding).astype(b.dtype)
+        end = solve_in_krylov_space(
+            a,
+            p,
+            solve.rhs,
+            target=solve.target,
+            null=null,
+            nearly_null=nearly_null,
+            operator_norm=solve.operator_norm,
+            negative_curvature=solve.negative_curvature,
+            step=solve.step,
+            max_steps=max_steps,
+        )
+        norm_rhs = end.norm_rhs
+
+        # The looks, one in a turn of a loop: what takes long to compile is the operator, and it stands
+        # here once.
+        def look(turn: Int[Array, ""], seen: _Looks) -> _Looks:
+            begin = jnp.where(probing, g, end.u)
+            v = lax.select_n(turn, begin, seen.rest, seen.u, seen.r, seen.a_r)
+            p_v = precondition(v)
+            turns = [turn == k for k in range(5)]
+            a_v = lax.cond(turns[1] | turns[4], lambda: v, lambda: a(p_v))
+
+            # The level of rounding grows with u, so a u that blows up at one stroke reaches it. It
+            # shows in the recomputed residual, which is that of the suspect or larger.
+            norm_v = norm(v, p_v)
+            no_gain = (end.residual_suspect > 0) & (norm_v > 0.5 * end.residual_suspect)
+            blown_up = (
+                (end.status == CONVERGED)
+                & (norm_v > _SLACK * solve.target)
+                & (no_gain | (norm_v > hardly_solved * norm_rhs))
+            )
+            # The test for LEAST_SQUARES, too, can be late, when u has already grown.
+            least_squares = blown_up | (end.status == LEAST_SQUARES)
+            change = jnp.where(least_squares, end.u_suspect, end.u)
+            u = jnp.where(second, seen.u, seen.u + change)
+            new = _Looks(
+                rest=solve.rhs - a_v,
+                norm_rest=norm_v,
+                u=u,
+                p_u=p_v,
+                r=r_0 - a_v,
+                p_r=p_v,
+                a_r=a_v,
+                norm_a_r=norm_v,
+                status=jnp.where(least_squares, LEAST_SQUARES, end.status),
+            )
+            when = (0, 1, 1, 2, 2, 3, 3, 4, 1)
+            each = zip(when, new, seen, strict=True)
+            return _Looks(*(jnp.where(turns[k], now, before) for k, now, before in each))
+
+        seen = lax.fori_loop(0, jnp.where(probing, 2, 5), look, solve.last)
+        least_squares = seen.status == LEAST_SQUARES
+        change = jnp.where(least_squares, end.u_suspect, end.u)
+        ended = least_squares | (seen.status == CONVERGED)
+        more = jnp.where(first, least_squares & (not coarse), second & ended)
+        operator_norm = jnp.where(probing, over(seen.norm_rest, norm_g), end.operator_norm)
+        # Solve 1 goes as far as A P r means anything.
+        finest = rounding * operator_norm * norm(seen.r, seen.p_r)
+        return _Solve(
+            number=solve.number + 1,
+            more=more | probing,
+            rhs=jnp.where(probing, r_0, jnp.where(first, seen.a_r, change)),
+            target=jnp.where(first, finest, target),
+            last=choose(probing, solve.last, seen),
+            step=end.step,
+            status=seen.status,
+            operator_norm=operator_norm,
+            negative_curvature=end.negative_curvature,
+        )
+
+    zero, zeros, running = jnp.zeros_like(norm_g), jnp.zeros_like(b), jnp.array(RUNNING)
+    start = _Solve(
+        number=jnp.array(-1),
+        more=jnp.array(True),
+        rhs=zeros,
+        target=zero,
+        last=_Looks(zeros, zero, zeros, zeros, zeros, zeros, zeros, zero, running),
+        step=jnp.array(0),
+        status=running,
+        operator_norm=zero,
+        negative_curvature=jnp.array(False),
+    )
+    solve = lax.while_loop(lambda solve: solve.more, one_solve, start)
+
+    seen = solve.last
+    u, r, p_u, p_r, norm_a_r = seen.u, seen.r, seen.p_u, seen.p_r, seen.norm_a_r
+    norm_r = norm(r, p_r)
+    x = x_0 + p_u
+    # With a preconditioner this is the lower bound of |x| by Cauchy and Schwarz, for x_0 is not
+    # known in the form P u.
+    size_x = jnp.sqrt(dot(x, x)) if p is None else over(jnp.abs(dot(x, b)), norm_b)
+    size_x = jnp.maximum(size_x, norm(u, p_u))
+    reach = solve.operator_norm * size_x + norm_b
+    # The recomputed r has errors of this size, and A P r those times |A|.
+    noise = ROUNDING_UNITS * rounding * reach
+
+    ended = (solve.status == CONVERGED) | (solve.status == LEAST_SQUARES)
+    within = norm_r <= _SLACK * target
+    inconsistent = (
+        ended
+        & ~within
+        & ((solve.number > 1) | (solve.status == LEAST_SQUARES))
+        & (norm_r > noise)
+        & (norm_a_r <= solve.operator_norm * (_SLACK * nearly_null * norm_r + noise))
+    )
+    stagnated = ended & ~within & ~inconsistent
+    explained = norm_r <= hardly_solved * norm_b
+    acceptable = explained & (norm_r <= jnp.maximum(rtol * reach, noise))
+    # P r is a null vector, and the only one along which P u can have a part: u is in the span
+    # of b, A P b, ..., of which only b has a part outside the range.
+    lifted = x - over(dot(r, p_u), norm_r**2) * p_r
+    x = jnp.where(inconsistent, lifted, x)
+
+    result = lx.RESULTS.where(ended, lx.RESULTS.successful, lx.RESULTS.max_steps_reached)
+    for where, what in (
+        (stagnated & ~acceptable, lx.RESULTS.stagnation),
+        (solve.status == BREAKDOWN, lx.RESULTS.breakdown),
+        (solve.status == NONFINITE, lx.RESULTS.nonfinite_input),
+    ):
+        result = lx.RESULTS.where(where, what, result)
+    x = jnp.where(solve.status == NONFINITE, jnp.nan, x)
+    stats = {
+        "num_steps": solve.step,
+        "max_steps": max_steps,
+        "residual_norm": over(jnp.sqrt(dot(r, r)), jnp.sqrt(dot(b, b))),
+        "operator_norm": solve.operator_norm,
+        "negative_curvature": solve.negative_curvature,
+        "inconsistent": inconsistent,
+        "stagnated": stagnated,
+    }
+    return unravel(x * scale), result, stats
 
 
 def _power_of_two_near(size: Float[Array, ""]) -> Float[Array, ""]:

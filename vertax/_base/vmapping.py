@@ -1,0 +1,81 @@
+"""Functions that `jax.vmap` runs one after another on a CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+from jax.extend.core import jaxpr_as_fun
+from jaxtyping import Array
+
+Result = TypeVar("Result")
+
+
+def one_at_a_time(function: Callable[..., Result]) -> Callable[..., Result]:
+    """A function whose `jax.vmap` is a loop over the batch on a CPU, and a batched program elsewhere.
+
+    Members of a batch need different numbers of iterations. Batched, a `while` loop runs until the slowest
+    member is done, and a `cond` computes both branches; on a CPU that takes longer than one member after
+    another. The function is not differentiable while it is batched: its inputs must be constants of the
+    differentiation.
+
+    **Arguments:**
+
+    - `function`: of pytrees, which returns a pytree. It must take all arrays as arguments.
+
+    **Returns:** a function of the same arguments and results.
+    """
+
+    def call(*args: Any) -> Result:
+        arrays, static = eqx.partition(args, eqx.is_array)
+        leaves, structure = jax.tree.flatten(arrays)
+        results: list[Any] = []
+
+        def of_leaves(*leaves: Array) -> list[Array]:
+            result = function(*eqx.combine(jax.tree.unflatten(structure, leaves), static))
+            outputs, rest = eqx.partition(result, eqx.is_array)
+            flat, out_structure = jax.tree.flatten(outputs)
+            results.append((out_structure, rest))
+            return flat
+
+        # Traced once: the rule below evaluates the same program again.
+        flat = _mapped(jaxpr_as_fun(jax.make_jaxpr(of_leaves)(*leaves)))(*leaves)
+        out_structure, rest = results[-1]
+        return eqx.combine(jax.tree.unflatten(out_structure, flat), rest)
+
+    return call
+
+
+def _mapped(program: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
+    """A function of arrays with the rule for `jax.vmap`."""
+    mapped = jax.custom_batching.custom_vmap(lambda *leaves: tuple(program(*leaves)))
+
+    @mapped.def_vmap
+    def _(size: int, batched: list[bool], *leaves: Array) -> tuple[Any, Any]:
+        if _platform() == "cpu":
+            members = [x for x, is_batched in zip(leaves, batched, strict=True) if is_batched]
+
+            def one(members: list[Array]) -> Any:
+                rest = iter(members)
+                # `mapped`, so that a second `vmap` is a loop as well.
+                pairs = zip(leaves, batched, strict=True)
+                return mapped(*(next(rest) if is_batched else x for x, is_batched in pairs))
+
+            result = jax.lax.map(one, members)
+        else:
+            axes = tuple(0 if is_batched else None for is_batched in batched)
+            result = jax.vmap(program, in_axes=axes, axis_size=size)(*leaves)
+            result = tuple(result)
+        return result, tuple(True for _ in result)
+
+    return mapped
+
+
+def _platform() -> str:
+    """The platform of JAX's default device."""
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    if device is None:
+        return jax.default_backend()
+    return device if isinstance(device, str) else device.platform
