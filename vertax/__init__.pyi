@@ -17,6 +17,7 @@ from . import (
     solvers as solvers,
     transitions as transitions,
 )
+from ._base.compilation_cache import enable_compilation_cache as enable_compilation_cache
 from .activities import AbstractActivity as AbstractActivity
 from .adjoints import (
     AutomaticDifferentiation as AutomaticDifferentiation,

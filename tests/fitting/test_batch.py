@@ -8,7 +8,7 @@ import pytest
 from helpers import random_tissue
 
 import vertax as vx
-from vertax.fitting import for_each, member, stack
+from vertax.fitting import member, stack
 
 
 def problem(seed, **options):
@@ -50,22 +50,3 @@ def test_what_cannot_be_a_batch_is_refused():
 def test_a_member_that_is_not_there_is_refused():
     with pytest.raises(IndexError, match="0 … 1"):
         member(stack([jnp.zeros(2), jnp.ones(2)]), 2)
-
-
-def test_for_each_of_a_batch_is_what_it_is_for_one():
-    tissues = [random_tissue(6, seed) for seed in range(3)]
-    energy = vx.energies.ShapeFactorEnergy(jnp.full(6, 3.7))
-
-    def answer(tissue, energy):
-        moved = tissue.with_vertices(tissue.vertices + 0.1)
-        return {"moved": moved, "energy": energy(moved), "name": "no array"}
-
-    batch = jax.jit(for_each(lambda t: answer(t, energy)["energy"]))(stack(tissues))
-    np.testing.assert_allclose(batch, [energy(t) for t in tissues], rtol=1e-12)
-    found = for_each(answer)(stack(tissues), stack([energy] * 3))
-    assert found["name"] == "no array"
-    for index, tissue in enumerate(tissues):
-        one, alone = member(found["moved"], index), answer(tissue, energy)["moved"]
-        assert eqx.tree_equal(one, alone, rtol=1e-12)
-    gradient = jax.grad(lambda p: jnp.sum(for_each(lambda x: p * x**2)(jnp.arange(3.0))))(2.0)
-    np.testing.assert_allclose(gradient, 5.0)

@@ -17,7 +17,6 @@ EXTRAS = {
     "typer": "run",
     "pydantic": "run",
     "tomli_w": "run",
-    "filelock": "run",
     "skimage": "image",
     "tifffile": "image",
     "meshio": "files",

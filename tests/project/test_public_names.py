@@ -24,7 +24,7 @@ FAMILIES = {
     "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
     "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts "
-    "fit for_each limits member stack stack_fits uncertainty",
+    "fit limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
     "inference": "EdgeMotion InferredTensions Micrograph Microscope MovingTensions PinnedEnergy "
     "RecoveryWatch Scene Transition fit_onset fit_transition foam_energy foam_terms "

@@ -1,4 +1,3 @@
-from ._cache import enable_cache as enable_cache
 from ._config import (
     ExperimentConfig as ExperimentConfig,
     Section as Section,

@@ -15,10 +15,10 @@ from typing import Any
 
 from tqdm import tqdm
 
+from vertax._base.compilation_cache import enable_compilation_cache
 from vertax._base.extras import needing
 from vertax.fitting import FitError
 from vertax.io import write_csv
-from vertax.runs._cache import enable_cache
 from vertax.runs._claim import CONFIG, METRICS, changes
 from vertax.runs._config import ExperimentConfig, validate
 from vertax.runs._errors import ConfigError, RunFolderError
@@ -293,7 +293,7 @@ def perform(content: dict[str, Any], folder: str, figures: tuple[str, ...]) -> s
         experiment = find_experiment(content.get("experiment"))
         config = validate(experiment.config, content)
         jax.config.update("jax_enable_x64", config.precision == "float64")
-        enable_cache()
+        enable_compilation_cache()
         if (Path(folder) / CONFIG).is_file():
             run = RunFolder.unfinished(folder, config, figures=figures)
         else:

@@ -123,13 +123,12 @@ def run(
     """Run the experiment that a configuration file describes."""
     import jax
 
-    from vertax import FitError
+    from vertax import FitError, enable_compilation_cache
     from vertax._base.extras import needing
     from vertax.runs import (
         ConfigError,
         RunFolder,
         RunFolderError,
-        enable_cache,
         load_config,
         summary,
     )
@@ -145,7 +144,7 @@ def run(
         # The library leaves the precision of JAX to the user; here the configuration decides.
         jax.config.update("jax_enable_x64", settings.precision == "float64")
         if not no_cache:
-            enable_cache()
+            enable_compilation_cache()
         if resume is None:
             folder = RunFolder.claim(config.stem, output, overwrite=overwrite, figures=formats)
             folder.save_config(settings)

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from vertax.runs import ConfigError, enable_cache
+from vertax import enable_compilation_cache
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,36 +35,36 @@ def home(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other folders")
 def test_it_lies_in_the_users_cache_folder(home, monkeypatch):
-    assert enable_cache() == home / ".cache/vertax"
+    assert enable_compilation_cache() == home / ".cache/vertax"
     assert (home / ".cache/vertax").stat().st_mode & 0o777 == 0o700
     assert jax.config.jax_compilation_cache_dir == str(home / ".cache/vertax")
     jax.config.update("jax_compilation_cache_dir", None)
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "elsewhere"))
-    assert enable_cache() == home / "elsewhere/vertax"
+    assert enable_compilation_cache() == home / "elsewhere/vertax"
 
 
 def test_the_environment_switches_it_off_or_names_a_folder(home, monkeypatch):
     for off in ("off", "OFF", "0", "no"):
         monkeypatch.setenv("VERTAX_CACHE", off)
-        assert enable_cache() is None
+        assert enable_compilation_cache() is None
         assert jax.config.jax_compilation_cache_dir is None
     assert list(home.iterdir()) == []
     monkeypatch.setenv("VERTAX_CACHE", str(home / "mine"))
-    assert enable_cache() == home / "mine"
+    assert enable_compilation_cache() == home / "mine"
 
 
 def test_a_folder_that_was_set_for_jax_is_left_alone(home):
     jax.config.update("jax_compilation_cache_dir", str(home / "of the user"))
-    assert enable_cache() == home / "of the user"
-    assert enable_cache(home / "asked for") == home / "asked for"
+    assert enable_compilation_cache() == home / "of the user"
+    assert enable_compilation_cache(home / "asked for") == home / "asked for"
 
 
 def test_a_folder_that_cannot_be_used_is_an_error_only_if_it_was_asked_for(home, monkeypatch):
     (home / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"Cannot keep compiled functions in .*VERTAX_CACHE=off"):
-        enable_cache(home / "file")
+    with pytest.raises(ValueError, match=r"Cannot keep compiled functions in .*VERTAX_CACHE=off"):
+        enable_compilation_cache(home / "file")
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "file"))
-    assert enable_cache() is None
+    assert enable_compilation_cache() is None
     assert jax.config.jax_compilation_cache_dir is None
 
 
@@ -76,10 +76,10 @@ def test_halves_are_forgotten(home):
         (folder / name).write_bytes(b"x")
         if not name.startswith("fresh"):
             os.utime(folder / name, (old, old))
-    enable_cache(folder)  # JAX does not write times of use there
+    enable_compilation_cache(folder)  # JAX does not write times of use there
     assert (folder / "half-cache").exists()
     (folder / ".lockfile").touch()
-    enable_cache(folder)
+    enable_compilation_cache(folder)
     assert sorted(path.name for path in folder.glob("*-*")) == [
         "fresh-cache",
         "whole-atime",
@@ -89,8 +89,8 @@ def test_halves_are_forgotten(home):
 
 CODE = """
 import jax, logging, sys
-from vertax.runs import enable_cache
-enable_cache()
+import vertax as vx
+vx.enable_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 hits = []
 jax.monitoring.register_event_listener(lambda event, **_: hits.append(event))

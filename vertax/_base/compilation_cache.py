@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import sys
 import time
@@ -11,33 +10,38 @@ from pathlib import Path
 
 import jax
 
-from vertax.runs._errors import ConfigError
-
 VARIABLE = "VERTAX_CACHE"
 _OFF = ("off", "0", "no", "false")
 _LARGEST = 2 * 1024**3  # bytes; what was not used for longest goes first
 
 
-def enable_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Keep compiled functions on disk, so that a script that is started again does not compile again.
+def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
+    """Keep compiled functions on disk, so that the next process does not compile them again.
 
-    `vertax run` and the notebooks call it; the library does not, because the cache is a setting of JAX
-    for the whole process. Call it before the first computation. Functions are found again if they, the
-    shapes of their arguments and the versions of JAX and of the device are the same; numbers may differ.
+    ```python
+    import vertax as vx
+
+    vx.enable_compilation_cache()
+    ```
+
+    The command `vertax`, the notebooks and the widget of napari call it; the library does not, because the
+    cache is a setting of JAX for the whole process. Call it before the first computation. A function is found
+    again if it, the shapes of its arguments and the versions of JAX and of the device are the same; numbers
+    may differ. At 2 GB the functions that were not used for longest are removed.
 
     **Arguments:**
 
     - `folder`: where to keep them. If left out, the folder that the environment variable `VERTAX_CACHE`
         names (`off` for none), and else `vertax` in the user's cache folder (`XDG_CACHE_HOME`, by default
         `~/.cache`; `~/Library/Caches` on macOS, `%LOCALAPPDATA%` on Windows). Others must not be able to
-        write there: what lies in it is run.
+        write there: the programs in it are executed.
 
     **Returns:** the folder, or `None` if nothing is kept: it is switched off, or the user's cache folder
     cannot be written to. A folder that was set for JAX before (`JAX_COMPILATION_CACHE_DIR`) is left as it is.
 
     **Raises:**
 
-    - [`ConfigError`][vertax.runs.ConfigError] if the folder that was asked for cannot be used.
+    - `ValueError` if the folder that was asked for cannot be used.
     """
     asked = os.environ.get(VARIABLE, "") if folder is None else os.fspath(folder)
     if folder is None and asked.lower() in _OFF:
@@ -52,7 +56,7 @@ def enable_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     except OSError as error:
         if not asked:  # a home that is read-only is no reason to stop
             return None
-        raise ConfigError(
+        raise ValueError(
             f"Cannot keep compiled functions in {path}: {error.strerror}. Name another folder, or set "
             f"{VARIABLE}=off."
         ) from None
@@ -61,8 +65,7 @@ def enable_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     jax.config.update("jax_compilation_cache_dir", str(path))
     # JAX keeps what took a second; hundreds of small functions take as long together.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    if importlib.util.find_spec("filelock") is not None:  # JAX needs it to keep to a size
-        jax.config.update("jax_compilation_cache_max_size", _LARGEST)
+    jax.config.update("jax_compilation_cache_max_size", _LARGEST)
     return path
 
 

@@ -1,0 +1,141 @@
+"""Each function compiles once for its shapes."""
+
+import contextlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+from helpers import random_tissue
+from label_helpers import bricks
+
+import vertax as vx
+from vertax.energies import ShapeFactorEnergy
+from vertax.fitting import stack
+
+N = 5
+EVENT = "/jax/core/compile/backend_compile_duration"
+_events: list[str] = []
+jax.monitoring.register_event_duration_secs_listener(lambda name, _, **__: _events.append(name))
+
+
+class Count:
+    """Number of programs that were compiled, or read from the cache of programs."""
+
+    n = 0
+
+
+@contextlib.contextmanager
+def compilations():
+    count, before = Count(), _events.count(EVENT)
+    yield count
+    count.n = _events.count(EVENT) - before
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _fresh():
+    jax.clear_caches()
+    eqx.clear_caches()
+
+
+def problem(**options):
+    tissue = random_tissue(N, 0)
+    # Weakly typed, as users write it.
+    return vx.InverseProblem(
+        tissue, ShapeFactorEnergy(jnp.full(N, 3.7)), vx.costs.VertexDistance(tissue), **options
+    )
+
+
+def evolve():
+    times = jnp.linspace(0, 1, 3)
+    friction = vx.dissipations.SubstrateFriction(1.0)
+    return vx.evolve(random_tissue(N, 0), ShapeFactorEnergy(3.7), friction, times)
+
+
+def grow():
+    energy = lambda cells: vx.energies.AreaElasticity(1.0, cells.target_area)
+    cycle = vx.growth.GrowAndDivide(growth_rate=0.1, division_area=1.5)
+    tissue = random_tissue(N, 0).with_capacity(8)
+    return vx.growth.grow(tissue, energy, cycle, jnp.linspace(0, 2, 3), key=1, throw=False)
+
+
+OPTIMISER = optax.adam(1e-2)
+SOLVER = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+BATCH = lambda: stack([problem(), problem()])
+FIT = lambda p, optimiser, **options: vx.fit(p, optimiser, 2, progress=False, **options)
+CALLS = {
+    "equilibrate": lambda: vx.equilibrate(random_tissue(N, 1), ShapeFactorEnergy(jnp.full(N, 3.7))),
+    "value_and_gradient": lambda: problem().value_and_gradient(),
+    "fit": lambda: FIT(problem(), OPTIMISER),
+    "fit of a batch": lambda: FIT(BATCH(), OPTIMISER, batched=True),
+    "fit by least squares": lambda: FIT(problem(), SOLVER),
+    "fit of a batch by least squares": lambda: FIT(BATCH(), SOLVER, batched=True),
+    "evolve": evolve,
+    "grow": grow,
+    "uncertainty": lambda: vx.uncertainty(problem(), FIT(problem(), OPTIMISER)),
+    "infer_tensions": lambda: vx.inference.infer_tensions(bricks()),
+}
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_a_second_call_compiles_nothing(call):
+    call()
+    with compilations() as second:
+        call()
+    assert second.n == 0
+
+
+def test_a_relaxed_tissue_has_the_types_of_the_initial_one():
+    kind = lambda x: (jnp.shape(x), jnp.result_type(x), jax.typeof(x).weak_type)
+    starts = [random_tissue(N, 1), vx.initialise.free_voronoi(N, key=jax.random.key(0))]
+    for start in starts:
+        end = vx.equilibrate(start, ShapeFactorEnergy(3.7)).tissue
+        assert jax.tree.map(kind, end) == jax.tree.map(kind, start)
+
+
+def test_epochs_after_the_first_compile_nothing():
+    counts = []
+    for epochs in (1, 3):
+        with compilations() as count:
+            vx.fit(problem(), optax.sgd(1e-3), epochs, progress=False)
+        counts.append(count.n)
+    assert (
+        counts[0] == counts[1]
+    )  # another optimiser each time, and the same program for all epochs
+
+
+def test_equilibrium_gradient_and_fit_share_the_relaxation(monkeypatch):
+    from vertax.responses import _search
+
+    traces = []
+    advance = _search.Search.advance
+    record = lambda *args: (traces.append(None), advance(*args))[1]
+    monkeypatch.setattr(_search.Search, "advance", record)
+    jax.clear_caches()
+    eqx.clear_caches()
+    tissue, energy = random_tissue(N, 2), ShapeFactorEnergy(jnp.full(N, 3.65))
+    relaxed = vx.equilibrate(tissue, energy).tissue
+    cost = vx.costs.VertexDistance(tissue)
+    vx.InverseProblem(relaxed, energy, cost).value_and_gradient()
+    FIT(vx.InverseProblem(relaxed, energy, cost), OPTIMISER)
+    jax.grad(lambda e: cost(vx.equilibrate(tissue, e).tissue, e))(energy)
+    assert len(traces) == 1
+
+
+def test_another_optimiser_compiles_only_its_update():
+    FIT(problem(), OPTIMISER)
+    with compilations() as count:
+        FIT(problem(), optax.adam(1e-2))
+    assert count.n <= 2  # its state, and its update
+
+
+def test_gradients_of_shared_programs_are_those_of_one_program():
+    p = problem()
+    shared = p.value_and_gradient()
+    whole = eqx.filter_jit(lambda: p.value_and_gradient(throw=False))()
+    np.testing.assert_allclose(shared.cost, whole.cost, rtol=1e-12)
+    pair = shared.gradient.target_shape_factor, whole.gradient.target_shape_factor
+    np.testing.assert_allclose(*pair, rtol=1e-9)
