@@ -152,6 +152,23 @@ def test_a_cell_goes_and_its_neighbours_close_the_gap(kind):
             assert new.areas.sum() == pytest.approx(float(tissue.areas.sum()))
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 2), (3, 1), (1, 3), (2, 2)])
+def test_removal_from_a_small_box_ends(shape, as_a_user):
+    # A cell that meets itself gains a side at one end of an edge for one that it loses.
+    tissue = vx.initialise.hexagonal(*shape)
+    tissue = tissue.with_capacity(tissue.n_cells)
+    change = remove(tissue, 0, throw=False)
+    if change.done:
+        change.tissue.topology.validate()
+        assert not change.tissue.overlaps.any
+        assert change.tissue.areas.sum() == pytest.approx(tissue.n_cells)
+    else:
+        assert eqx.tree_equal(change.tissue, tissue)
+        with pytest.raises(RuntimeError, match="cannot be removed"):
+            remove(tissue, 0)
+    assert change.done == (shape in [(3, 1), (1, 3)])
+
+
 @pytest.mark.slow
 def test_events_in_a_batch():
     tissues = [random_tissue(6, seed, lloyd_steps=2).with_capacity(7) for seed in (1, 2)]
