@@ -65,7 +65,7 @@ def sparse_hessian(landscape: Landscape) -> sparse.csr_array | None:
     incidence = _incidence(tissue)
     near = sparse.csr_array((incidence @ incidence.T).astype(bool))
     # (A vertex of a spare slot has no cell: with the identity it is at least its own neighbour.)
-    itself = sparse.eye_array(near.shape[0], dtype=bool)
+    itself = sparse.eye_array(near.indptr.size - 1, dtype=bool)
     colour = _colours(sparse.csr_array(near @ near + itself))
     seed = 2 * colour[owner] + component
     # A multiple, lest each tissue compile another program. The last one asks everything at once.
