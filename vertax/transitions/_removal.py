@@ -98,7 +98,7 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     go = do & can_vanish(reduced)[cell]
     gone = vanished(reduced, cell, go)
     done = go & ~jnp.any(overlapping_faces(gone.overlaps) & ~overlapping_faces(tissue.overlaps))
-    return Change(choose(done, gone, tissue), none.cells, none.edges, done)
+    return Change(choose(done, gone, tissue), none.cells, none.edges, none.vertices, done)
 
 
 def flipped(
