@@ -219,6 +219,16 @@ def test_fluctuating_tensions_forget():
         FluctuatingTensions(0.1, 0.0)
 
 
+def test_fluctuating_tensions_of_short_steps_in_float32():
+    # 1 - exp(-dt / τ)² rounds to 0 here.
+    short = jnp.asarray(2e-8, jnp.float32)
+    activity = FluctuatingTensions(jnp.float32(1.0), jnp.float32(1.0))
+    start = jnp.zeros(500, jnp.float32)
+    _, after = activity.drive(start, solid()[0], FRICTION, 0 * short, short, KEY)
+    assert after.dtype == jnp.float32
+    assert np.std(after) == pytest.approx(np.sqrt(2 * 2e-8), rel=0.1)
+
+
 def test_activities_add_and_can_be_ones_own():
     class Wind(vx.AbstractActivity):
         force: float

@@ -94,6 +94,14 @@ def test_a_nearly_one_to_one_plan_is_found_at_once():
     np.testing.assert_allclose(plan.sum(axis=1), 1 / 20, rtol=1e-11)
 
 
+def test_a_plan_that_is_not_balanced_is_nan(monkeypatch):
+    from vertax.costs import _transport
+
+    monkeypatch.setattr(_transport, "_MAX_SWEEPS", 2)
+    costs = jax.random.uniform(jax.random.key(1), (12, 12))
+    assert np.isnan(transport_plan(costs, jnp.asarray(1e-4))).all()
+
+
 @pytest.mark.parametrize("epsilon", [0.05, 0.5])
 def test_derivatives_of_transport(epsilon):
     costs = 2 * jax.random.uniform(jax.random.key(5), (8, 8))

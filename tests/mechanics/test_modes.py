@@ -45,6 +45,18 @@ def test_the_sparse_matrix_is_the_dense_one():
     assert sparse_hessian(Landscape(large, spring)) is None
 
 
+def test_the_sparse_matrix_of_a_tissue_with_spare_slots():
+    from vertax.mechanics._hessian import sparse_hessian
+    from vertax.mechanics._landscape import Landscape
+
+    # The vertices of the slot that a removal leaves lie among the others, and have no cell.
+    change = vx.transitions.remove(random_tissue(12, 1).with_capacity(12), 4)
+    energy = AreaElasticity(1.0, 1.2)
+    matrix = sparse_hessian(Landscape(change.tissue, energy))
+    assert matrix is not None
+    np.testing.assert_allclose(matrix.toarray(), dense_hessian(change.tissue, energy), atol=1e-10)
+
+
 @pytest.mark.slow
 def test_sparse_modes_of_a_relaxed_tissue_are_the_dense_ones():
     energy = ShapeFactorEnergy(shape_factors(64, 3.6, 0.1))

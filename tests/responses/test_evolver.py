@@ -19,6 +19,7 @@ from vertax.responses import SimulatorError, SurfaceEvolver, run_program
 from vertax.responses._evolver_model import Terms, slope_of
 from vertax.responses._evolver_strings import Strings
 from vertax.responses._evolver_t1 import can_flip, flipped
+from vertax.responses._simulator import Relaxed
 
 needs_evolver = pytest.mark.skipif(
     shutil.which("evolver") is None,
@@ -189,6 +190,18 @@ def test_failures_are_errors_with_the_tail_of_the_log(impostor, source, says):
     evolver = SurfaceEvolver(command=impostor(source))
     with pytest.raises(SimulatorError, match=f"(?s){says}"):
         evolver.relax(on_host(PERIODIC), energies(PERIODIC)["foam"], None)
+
+
+def test_transitions_that_come_to_no_end_are_an_error(monkeypatch):
+    from vertax.responses import _evolver
+
+    energy = iter(np.linspace(1.0, 0.0, 10_000))
+    tissue = on_host(PERIODIC)
+    rest = lambda self, tissue, *_: Relaxed(tissue.vertices, energy=next(energy))
+    monkeypatch.setattr(SurfaceEvolver, "_at_rest", rest)
+    monkeypatch.setattr(_evolver, "swapped", lambda tissue, *_: tissue)
+    with pytest.raises(SimulatorError, match="came to no end"):
+        SurfaceEvolver(t1=10.0).relax(tissue, energies(PERIODIC)["foam"], None)
 
 
 def test_what_takes_too_long_is_ended(impostor):

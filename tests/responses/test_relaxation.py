@@ -266,6 +266,22 @@ def test_a_parameter_that_is_not_a_number_is_reported():
         vx.equilibrate(random_tissue(12, 0), energy)
 
 
+class _Blind(vx.AbstractEnergy):
+    """Springs to the origin, but for the first vertex."""
+
+    def __call__(self, tissue):
+        first = jnp.arange(tissue.n_vertices)[:, None] == 0
+        return jnp.sum(jnp.where(first, 0, jnp.nan_to_num(tissue.vertices)) ** 2)
+
+
+def test_a_relaxation_ends_where_an_energy_ignores_a_coordinate_that_is_nan():
+    tissue = random_tissue(3, 1)
+    tissue = tissue.with_vertices(tissue.vertices.at[0].set(jnp.nan))
+    found = dataclasses.replace(STILL, max_steps=20)(tissue, _Blind(), throw=False)
+    assert found.num_steps == 20
+    assert found.result == optx.RESULTS.nonfinite
+
+
 @pytest.mark.parametrize(
     "options", [{"tolerance": 0.0}, {"tolerance": -1e-3}, {"patience": 0}, {"max_steps": 0}]
 )

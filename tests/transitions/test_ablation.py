@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,6 +54,35 @@ def test_cells_become_one_hole_without_energy():
     np.testing.assert_allclose(
         np.delete(areas, [3, 9]), np.delete(parent.areas, [3, 9]), atol=1e-13
     )
+
+
+def test_holes_that_cannot_become_one_are_refused(as_a_user):
+    energy = vx.energies.AreaElasticity(1.0, 1.0)
+    cluster = vx.initialise.free_voronoi(8, key=0, lloyd_steps=5).with_capacity(8)
+    touching = np.asarray(cluster.topology.edge_cells)
+    (inner,) = np.setdiff1d(np.arange(8), touching[(touching == 8).any(axis=1)])
+    ring = np.isin(np.arange(9), touching[(touching == inner).any(axis=1)])[:8]
+    ring[inner] = False
+    for cells in (ring, np.ones(8, bool)):  # around a living cell; and all of a free tissue
+        with pytest.raises(RuntimeError, match="but two of them cannot"):
+            ablate(cluster, energy, cells=cells)
+        with pytest.raises(Exception, match="but two of them cannot"):
+            jax.block_until_ready(
+                jax.jit(lambda t, c: ablate(t, energy, cells=c)[0])(cluster, cells)
+            )
+
+
+def test_a_pin_goes_with_its_vertex():
+    tissue = random_tissue(9, 2)
+    pinned = eqx.tree_at(
+        lambda t: t.pinned,
+        tissue.with_capacity(9),
+        jnp.ones(18, bool),
+        is_leaf=lambda x: x is None,
+    )
+    pair = jnp.isin(jnp.arange(9), tissue.topology.edge_cells[0])
+    wounded, _ = ablate(pinned, vx.energies.AreaElasticity(1.0, 1.0), cells=pair)
+    np.testing.assert_array_equal(wounded.pinned, wounded.topology.alive_vertices)
 
 
 def test_bad_arguments_are_named(as_a_user):

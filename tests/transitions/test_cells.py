@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers import random_tissue
 from hypothesis import given, settings, strategies as st
+from jaxtyping import Array, Float, PRNGKeyArray
 
 import vertax as vx
 from vertax.transitions import divide, remove
@@ -120,6 +121,87 @@ def test_parameters_are_inherited():
             np.testing.assert_array_equal(mothers, old[origin])
 
 
+class Network(vx.AbstractEnergy):
+    """An energy whose weights have as many rows as there are cells, or edges."""
+
+    layer: eqx.nn.Linear
+    rows: Float[Array, "hidden"]
+    marked: Array = eqx.field(metadata={"axis": None})
+    of_knots: Float[Array, "knots edges"]
+    of_vertices: Float[Array, "vertices 2"]
+    of_pairs: Float[Array, "cells cells"]
+    given: np.ndarray = eqx.field(metadata={"axis": "cells"})
+    parts: dict[str, Float[Array, "*edges"]]
+    text: str = "none"
+    key: PRNGKeyArray | None = None
+
+    def __call__(self, tissue):
+        return jnp.zeros(())
+
+
+def network(**fields):
+    n, e, v = 8, 24, 16
+    return Network(
+        layer=eqx.nn.Linear(e, n, key=jax.random.key(0)),
+        rows=jnp.arange(1.0 * n),
+        marked=jnp.arange(1.0 * e),
+        of_knots=jnp.arange(3.0 * e).reshape(3, e),
+        of_vertices=jnp.arange(2.0 * v).reshape(v, 2),
+        of_pairs=jnp.arange(1.0 * n * n).reshape(n, n),
+        given=np.arange(1.0 * n),
+        parts={"a": jnp.arange(1.0 * e), "b": jnp.array(3.0)},
+        key=jax.random.key(1),
+        **fields,
+    )
+
+
+def test_only_what_is_declared_is_inherited():
+    tissue = random_tissue(6, 3).with_capacity(8)
+    change = divide(tissue, 2)
+    old = network()
+    new = change.inherited(old)
+    for same in ("layer", "rows", "marked", "text", "key"):
+        assert eqx.tree_equal(getattr(new, same), getattr(old, same)), same
+    cells, edges, vertices = map(np.asarray, (change.cells, change.edges, change.vertices))
+    assert cells[newborn(tissue, change.tissue)] == 2
+    np.testing.assert_array_equal(new.of_knots, old.of_knots[:, edges])
+    np.testing.assert_array_equal(new.of_vertices, old.of_vertices[vertices])
+    np.testing.assert_array_equal(new.of_pairs, old.of_pairs[np.ix_(cells, cells)])
+    np.testing.assert_array_equal(new.given, old.given[cells])
+    assert isinstance(new.given, np.ndarray)
+    np.testing.assert_array_equal(new.parts["a"], old.parts["a"][edges])
+    assert new.parts["b"] == 3
+    # A corner of the new edge was on an edge that began at the vertex whose entries it has.
+    born = np.flatnonzero(change.tissue.topology.alive_vertices & ~tissue.topology.alive_vertices)
+    assert (vertices[born] < 12).all()
+    np.testing.assert_array_equal(np.delete(vertices, born), np.delete(np.arange(16), born))
+    # Keys of random numbers, one a cell; and arrays outside of modules.
+    keys = {"keys": jax.random.split(jax.random.key(0), 8), "age": jnp.arange(8.0)}
+    heirs = change.inherited(keys, axis="cells")
+    assert (jax.random.key_data(heirs["keys"]) == jax.random.key_data(keys["keys"][cells])).all()
+    np.testing.assert_array_equal(heirs["age"], cells)
+
+
+class Undeclared(vx.AbstractEnergy):
+    strength: Array
+
+    def __call__(self, tissue):
+        return jnp.sum(self.strength * tissue.perimeters)
+
+
+def test_what_is_not_declared_is_refused_by_name(as_a_user):
+    change = divide(random_tissue(6, 3).with_capacity(8), 2)
+    with pytest.raises(TypeError, match="`strength` of Undeclared must declare"):
+        change.inherited(Undeclared(jnp.ones(8)))
+    assert change.inherited(Undeclared(jnp.ones(5))).strength.shape == (5,)
+    with pytest.raises(TypeError, match='axis="cells"'):
+        change.inherited([jnp.ones(8)])
+    with pytest.raises(ValueError, match="`logits` of BoundedTension must have one entry"):
+        change.inherited(vx.energies.BoundedTension(jnp.full(18, 0.5), 0.0, 1.0))
+    with pytest.raises(ValueError, match="`axis` must be one of"):
+        change.inherited(Undeclared(jnp.ones(5)), axis="faces")
+
+
 def test_a_full_pool_names_its_capacity(as_a_user):
     tissue = random_tissue(6, 3).with_capacity(7)
     full = divide(tissue, 0).tissue
@@ -150,6 +232,23 @@ def test_a_cell_goes_and_its_neighbours_close_the_gap(kind):
         assert not new.overlaps.any
         if kind == "periodic":
             assert new.areas.sum() == pytest.approx(float(tissue.areas.sum()))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 2), (3, 1), (1, 3), (2, 2)])
+def test_removal_from_a_small_box_ends(shape, as_a_user):
+    # A cell that meets itself gains a side at one end of an edge for one that it loses.
+    tissue = vx.initialise.hexagonal(*shape)
+    tissue = tissue.with_capacity(tissue.n_cells)
+    change = remove(tissue, 0, throw=False)
+    if change.done:
+        change.tissue.topology.validate()
+        assert not change.tissue.overlaps.any
+        assert change.tissue.areas.sum() == pytest.approx(tissue.n_cells)
+    else:
+        assert eqx.tree_equal(change.tissue, tissue)
+        with pytest.raises(RuntimeError, match="cannot be removed"):
+            remove(tissue, 0)
+    assert change.done == (shape in [(3, 1), (1, 3)])
 
 
 @pytest.mark.slow

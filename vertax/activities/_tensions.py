@@ -54,5 +54,7 @@ class FluctuatingTensions(AbstractActivity):
         """Tensions of edges."""
         left = jnp.exp(-dt / self.persistence)
         drawn = jax.random.normal(key, state.shape, state.dtype)
-        state = left * state + jnp.sqrt(1 - left**2) * drawn
+        # 1 - exp(-2 dt / τ), which would lose all digits for dt / τ near the unit of rounding.
+        forgotten = -jnp.expm1(-2 * dt / self.persistence)
+        state = left * state + jnp.sqrt(forgotten) * drawn
         return LineTension(self.deviation * state), state

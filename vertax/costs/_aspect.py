@@ -107,7 +107,8 @@ def _from_moments(tissue: Tissue) -> Float[Array, ""]:
     squared = half**2 + xy**2
     distinct = squared > 0
     spread = jnp.where(distinct, jnp.sqrt(jnp.where(distinct, squared, 1)), 0)
-    return jnp.sqrt((mean + spread) / (mean - spread))
+    # Their product is the determinant: mean - spread cancels for a long tissue.
+    return (mean + spread) / jnp.sqrt(xx * yy - xy**2)
 
 
 def _second_moments(tissue: Tissue) -> tuple[Array, Array, Array]:

@@ -97,7 +97,8 @@ class IndexAwareStructural(AbstractCost):
                 jnp.where(x[:, None], 0, y) for x, y in ((none, rows), (gone, columns))
             )
         squared = _squared_distances(rows, columns)
-        distances = jnp.sqrt(squared + self.softening**2) - self.softening
+        # √(d² + s²) - s, without the difference, which cancels for d far below s.
+        distances = squared / (jnp.sqrt(squared + self.softening**2) + self.softening)
         if not spare:
             return distances
         # The first spare slot belongs to the first, and so on, so that there is nothing to choose.

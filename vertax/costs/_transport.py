@@ -57,7 +57,8 @@ def transport_plan(costs: Float[Array, "n n"], epsilon: Float[Array, ""]) -> Flo
     - `costs`: of moving a point (row) to a point (column).
     - `epsilon`: strength of the entropy.
 
-    **Returns:** the logarithms; rows and columns of the plan sum to $1/n$.
+    **Returns:** the logarithms; rows and columns of the plan sum to $1/n$. NaN if 300 sweeps do not balance
+    it, as with an entropy too weak for the precision of the numbers.
     """
     n = len(costs)
     log_n = jnp.log(1.0 * n).astype(costs.dtype)
@@ -105,7 +106,10 @@ def transport_plan(costs: Float[Array, "n n"], epsilon: Float[Array, ""]) -> Flo
     zero = jnp.zeros(n, costs.dtype)
     infinite = jnp.asarray(jnp.inf, costs.dtype)
     begin = _Search(jnp.array(0), sharpness, zero, plan_of(zero, sharpness * full), infinite)
-    return jax.lax.while_loop(unfinished, sweep, begin).log_plan
+    end = jax.lax.while_loop(unfinished, sweep, begin).log_plan
+    # An unbalanced plan is no transport plan: NaN, so that a fit of a batch stops this member alone.
+    balanced = imbalance(end) <= jnp.maximum(1e-3, 10 * tight)
+    return jnp.where(balanced, end, jnp.nan)
 
 
 class _Search(NamedTuple):

@@ -228,7 +228,7 @@ def _grow(
         change = divided(state.tissue, cell, axis, jnp.any(due))
         daughter = jnp.argmax(change.tissue.alive & ~state.tissue.alive).astype(jnp.int32)
         pair = jnp.stack([cell, daughter])
-        cells = cycle.born(change.inherited(state.cells), change.tissue, pair, draw)
+        cells = cycle.born(change.inherited(state.cells, axis="cells"), change.tissue, pair, draw)
         cells = jax.tree.map(lambda a, b: jnp.where(change.done, a, b), cells, state.cells)
         lineage, number = divided_at(state.lineage, state.number, pair, time, change.done)
         full = state.full | (jnp.any(due) & jnp.all(state.tissue.alive))

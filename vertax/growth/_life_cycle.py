@@ -18,7 +18,8 @@ class AbstractLifeCycle(eqx.Module):
     """What cells do in time besides moving: how they age, when they divide, and along which axis.
 
     What a cell knows of itself is a pytree of arrays with one entry (or row) a cell; a daughter begins with
-    that of her mother.
+    that of her mother. An array that has not, declares it by the metadata of its field, see
+    [`Change.inherited`][vertax.transitions.Change].
     """
 
     @abc.abstractmethod

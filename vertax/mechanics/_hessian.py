@@ -64,7 +64,9 @@ def sparse_hessian(landscape: Landscape) -> sparse.csr_array | None:
     owner, component = _degrees_of_freedom(tissue)
     incidence = _incidence(tissue)
     near = sparse.csr_array((incidence @ incidence.T).astype(bool))
-    colour = _colours(sparse.csr_array(near @ near))
+    # (A vertex of a spare slot has no cell: with the identity it is at least its own neighbour.)
+    itself = sparse.eye_array(near.indptr.size - 1, dtype=bool)
+    colour = _colours(sparse.csr_array(near @ near + itself))
     seed = 2 * colour[owner] + component
     # A multiple, lest each tissue compile another program. The last one asks everything at once.
     seeds = np.zeros((32 * ((seed.max() + 1) // 32 + 1), seed.size))
@@ -120,7 +122,11 @@ def _incidence(tissue: Tissue) -> sparse.csr_array:
 
 
 def _colours(graph: sparse.csr_array) -> Int[np.ndarray, " nodes"]:
-    """Colours such that neighbours differ, each as often as it can be (Luby 1986, doi:10.1137/0215074)."""
+    """Colours such that neighbours differ, each as often as it can be (Luby 1986, doi:10.1137/0215074).
+
+    Each node must be a neighbour of itself: then the open node of the highest rank is chosen, and the loops
+    end.
+    """
     pointers, neighbours = graph.indptr[:-1], graph.indices
     n = pointers.size
     order = np.random.default_rng(0).permutation(n)

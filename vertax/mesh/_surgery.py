@@ -114,10 +114,12 @@ def split_cell(m: Topology, first: Index, second: Index, slot: Slot, do: Yes) ->
 def _relabelled(m: Topology, start: Index, label: Index, do: Yes) -> tuple[Array, Array]:
     """The cells of half-edges with one face called otherwise; and which half-edges those are."""
 
+    # The next half-edge around a face is a permutation, so the walk returns to its start. (It also ends if
+    # it meets a half-edge again, which a broken topology may have.)
     def one(carry: tuple) -> tuple:
         marked, h, _ = carry
         h = clockwise(take(m.twin, h))
-        return marked.at[h].set(True), h, h != start
+        return marked.at[h].set(True), h, (h != start) & ~take(marked, h)
 
     marked = jnp.zeros(m.n_half_edges, bool)
     marked, *_ = jax.lax.while_loop(lambda carry: carry[2], one, (marked, start, do))

@@ -22,6 +22,9 @@ from vertax.responses._evolver_t1 import can_flip, shortest, swapped
 from vertax.responses._program import run_program, tail
 from vertax.responses._simulator import AbstractSimulator, Edges, Relaxed, SimulatorError
 
+# T1 transitions in one relaxation, at most, per edge: as `T1.max_flips`.
+_MOST_T1 = 20
+
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceEvolver(AbstractSimulator):
@@ -113,12 +116,17 @@ class SurfaceEvolver(AbstractSimulator):
             edge = shortest(lengths, self.t1, allowed)
             if edge is None:
                 return found._replace(tissue=there, num_t1=number)
+            if number >= _MOST_T1 * tissue.n_edges:
+                raise SimulatorError(
+                    f"T1 transitions by Surface Evolver came to no end after {number}. Lower `t1`, or pass "
+                    "`t1=None`."
+                )
             other = swapped(there, edge, 0.5 * self.t1, self._ask)
             trial = None
             if other is not None:
                 with suppress(SimulatorError):  # it comes to no rest that way
                     trial = self._at_rest(other, energy, None, None)
-            # (The energy falls each time, so this ends.)
+            # The energy falls with each transition, and between two of them each edge is refused once.
             if trial is not None and trial.energy < found.energy - 1e-9 * abs(found.energy):
                 found, there, refused, number = trial, other, set(), number + 1
             else:

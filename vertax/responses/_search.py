@@ -169,8 +169,10 @@ class Search(eqx.Module):
         arrived = self._arrive(state, before.with_configuration(goal), energy, stays)
         tissue, contacts = arrived.tissue, arrived.contacts
         flipped = jnp.any(arrived.counts != state.counts)
+        # (NaN is equal to NaN here: the search would otherwise restart without end where an energy
+        # ignores a coordinate that is NaN.)
         elsewhere = jax.tree.map(
-            lambda a, b: jnp.any(a != b),
+            lambda a, b: jnp.any((a != b) & ~(jnp.isnan(a) & jnp.isnan(b))),
             tissue.configuration,
             tissue.with_configuration(goal).configuration,
         )

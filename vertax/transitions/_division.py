@@ -150,6 +150,7 @@ def divided(
     drop = lambda e: jnp.where(done, e, tissue.n_edges)
     heirs = jnp.stack([drop(e) for e in slot.edges])
     edges = none.edges.at[heirs].set(jnp.stack([edge, other, edge]), mode="drop")
+    vertices = none.vertices.at[place].set(take(m.source, both), mode="drop")
     if tissue.angles is not None:
         # The part that an edge keeps, and that which becomes another edge. What was cut before is shorter.
         early = jnp.where(late, (share[1] - 1 + share[0]) / share[0], share[1] / (1 - share[0]))
@@ -161,7 +162,7 @@ def divided(
             angles = angles.at[drop(slot.edges[k])].set((1 - shares[k]) * angle, mode="drop")
             angles = angles.at[drop(old[k])].set(shares[k] * angle, mode="drop")
         new = new.with_angles(angles.at[drop(slot.edges[2])].set(0, mode="drop"))
-    return Change(new, cells, edges, done)
+    return Change(new, cells, edges, vertices, done)
 
 
 def _centre_and_axis(

@@ -67,9 +67,14 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     def sides(tissue: Tissue) -> Array:
         return jnp.sum(tissue.topology.cell == cell)
 
-    def candidates(tissue: Tissue, frames: EdgeFrames, refused: Array) -> Array:
-        its_own = jnp.any(frames.cells[:, :2] == cell, axis=-1)
-        return its_own & frames.can_flip & ~refused
+    # A flip takes the edge from the two cells beside it and gives it to the two at its ends. In a small
+    # periodic box these may be the same cell. Only flips that take sides from the cell are candidates, so
+    # that the loop ends: each flip lowers the number of sides, and between two flips each edge is refused
+    # at most once.
+    def candidates(frames: EdgeFrames, refused: Array) -> Array:
+        its_own = frames.cells == cell
+        lost = jnp.sum(its_own[:, :2], axis=-1) - jnp.sum(its_own[:, 2:], axis=-1)
+        return (lost > 0) & frames.can_flip & ~refused
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
         *_, more = carry
@@ -78,7 +83,7 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     def flip(carry: tuple) -> tuple:
         tissue, refused, _ = carry
         frames = EdgeFrames(tissue)
-        may = candidates(tissue, frames, refused)
+        may = candidates(frames, refused)
         edge = jnp.argmin(jnp.where(may, frames.length, jnp.inf))
         which = may & (edges == edge)
         tissue, good = flipped(tissue, frames, which)
@@ -93,7 +98,7 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     go = do & can_vanish(reduced)[cell]
     gone = vanished(reduced, cell, go)
     done = go & ~jnp.any(overlapping_faces(gone.overlaps) & ~overlapping_faces(tissue.overlaps))
-    return Change(choose(done, gone, tissue), none.cells, none.edges, done)
+    return Change(choose(done, gone, tissue), none.cells, none.edges, none.vertices, done)
 
 
 def flipped(

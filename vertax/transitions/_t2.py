@@ -93,14 +93,8 @@ _ROUNDING = 1e-2
 def can_vanish(tissue: Tissue) -> Bool[Array, " cells"]:
     """Which cells can become a vertex, or a part of an edge, and leave their neighbours enough sides."""
     m = tissue.topology
-    sides = jax.ops.segment_sum(jnp.ones_like(m.cell), m.cell, m.n_faces)
+    sides, least = face_sides(tissue)
     across = take(m.cell, m.twin)
-    # Two sides bound a face if one is an arc on the outline; two arcs bound the exterior.
-    least = jnp.full(m.n_faces, 3)
-    if m.exterior and tissue.angles is not None:
-        outer = take(m.on_outline, m.edge).astype(m.cell.dtype)
-        arcs = jax.ops.segment_sum(outer, m.cell, m.n_faces)
-        least = jnp.where(arcs > 0, 2, 3)
     # A triangle takes a side of each neighbour, two sides take two.
     lost = jnp.where(take(sides, m.cell) == 2, 2, 1)
     times = 1 + sum(_meets_again(m.cell, across, m.twin))
@@ -111,6 +105,19 @@ def can_vanish(tissue: Tissue) -> Bool[Array, " cells"]:
     all_enough = jax.ops.segment_min(enough.astype(m.cell.dtype), m.cell, m.n_faces) > 0
     few = (sides == 3) | (sides == 2)
     return (all_enough & few)[: m.n_cells]
+
+
+def face_sides(tissue: Tissue) -> tuple[Int[Array, " faces"], Int[Array, " faces"]]:
+    """How many sides each face has, and how many it needs at least."""
+    m = tissue.topology
+    sides = jax.ops.segment_sum(jnp.ones_like(m.cell), m.cell, m.n_faces)
+    # Two sides bound a face if one is an arc on the outline; two arcs bound the exterior.
+    least = jnp.full(m.n_faces, 3)
+    if m.exterior and tissue.angles is not None:
+        outer = take(m.on_outline, m.edge).astype(m.cell.dtype)
+        arcs = jax.ops.segment_sum(outer, m.cell, m.n_faces)
+        least = jnp.where(arcs > 0, 2, 3)
+    return sides, least
 
 
 def _meets_again(cell: Array, across: Array, twin: Array) -> list[Array]:

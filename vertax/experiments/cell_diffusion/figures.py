@@ -40,7 +40,7 @@ def diffusion(
         axes[0].plot(lags, values, color=colour, label=f"$p_0 = {name}$")
     # A persistent random walk: Bi et al. 2016, eq. 8.
     turn = config.rotational_diffusion
-    free = 2 * (speed / turn) ** 2 * (turn * lags - 1 + np.exp(-turn * lags))
+    free = 2 * (speed / turn) ** 2 * (turn * lags + np.expm1(-turn * lags))
     axes[0].plot(lags, free, "--", color=INK, lw=0.8, label="free cell")
     axes[0].set(
         xscale="log", yscale="log", xlabel="time", title=f"$v_0 = {speed:g}$",

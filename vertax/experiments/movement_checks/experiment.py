@@ -137,7 +137,7 @@ def _metrics(config: Config, found: Findings) -> dict[str, Any]:
     ]
     firm = next((i for i in range(len(same)) if all(same[i:])), len(same) - 1)
     implicit, propagation = found.gradient_errors
-    weights = 1 - np.exp(-found.eigenvalues * 0.4 / config.friction)
+    weights = -np.expm1(-found.eigenvalues * 0.4 / config.friction)
     return {
         "decay_order": [power(found.decay_steps[1:], e[1:]) for e in found.decay_errors],
         "largest_rise": float(max(rises)),
