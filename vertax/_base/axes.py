@@ -9,11 +9,18 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vertax._base.modules import is_concrete
+
+Tree = TypeVar("Tree", bound=Any)
 
 AXES = ("cells", "edges", "vertices")
 """The names of axes, as in `Float[Array, "cells"]`."""
@@ -65,6 +72,105 @@ def declarations(tree: Any, opaque: tuple[type, ...] = ()) -> list[Declaration |
     is_leaf = lambda x: isinstance(x, opaque)
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=is_leaf)
     return [_declared(tree, path) for path, _ in leaves]
+
+
+def gather(
+    tree: Tree,
+    parents: Mapping[str, Any],
+    sizes: Mapping[str, int],
+    *,
+    axis: str | None = None,
+    opaque: tuple[type, ...] = (),
+    strict: tuple[type, ...] = (eqx.Module,),
+) -> Tree:
+    """A pytree of which arrays with one entry for each cell, edge or vertex have the entries of `parents`.
+
+    **Arguments:**
+
+    - `tree`: the pytree.
+    - `parents`: for each of the names in `AXES` the index of the entry that each new entry repeats.
+    - `sizes`: the number of entries before, by the same names.
+    - `axis`: the name of the first axis of arrays of which no field declares anything.
+    - `opaque`: classes whose instances stay as they are.
+    - `strict`: classes whose fields must declare an array whose first axis is as long as one of `sizes`.
+
+    **Raises:**
+
+    - `TypeError` without `axis`, for an array outside of modules, and for an array in a field of a class in
+        `strict` that declares nothing and has one of the sizes.
+    - `ValueError` for an array of another length than was declared.
+    """
+    is_leaf = lambda x: isinstance(x, opaque)
+    leaves, structure = jax.tree.flatten(tree, is_leaf=is_leaf)
+    pairs = zip(leaves, declarations(tree, opaque), strict=True)
+    return jax.tree.unflatten(
+        structure, [_gathered(x, field, parents, sizes, axis, strict) for x, field in pairs]
+    )
+
+
+def _gathered(
+    x: Any,
+    field: Declaration | None,
+    parents: Mapping[str, Any],
+    sizes: Mapping[str, int],
+    default: str | None,
+    strict: tuple[type, ...],
+) -> Any:
+    if not isinstance(x, jax.Array | np.ndarray) or x.ndim == 0:
+        return x
+    name = (
+        "Argument `tree`" if field is None else f"Field `{field.field}` of {field.owner.__name__}"
+    )
+    if field is not None and field.shapes is not None:
+        axes = field.axes(x.ndim)
+    elif default is not None:
+        axes = {0: default}
+    elif field is None:
+        raise TypeError(
+            f"{name} must hold its arrays in fields of modules, which declare what has one entry for "
+            'each cell, edge or vertex, but holds one outside. Pass axis="cells", "edges" or "vertices".'
+        )
+    else:
+        _check_undeclared(name, x, field, sizes, strict)
+        axes = {}
+    for at, kind in axes.items():
+        if x.shape[at] != sizes[kind]:
+            raise ValueError(
+                f"{name} must have one entry for each of {sizes[kind]} {kind} along its axis {at}, but its "
+                f'shape is {x.shape}. If it has not, declare it: eqx.field(metadata={{"axis": None}}).'
+            )
+        x = _taken(x, parents[kind], at)
+    return x
+
+
+def _check_undeclared(
+    name: str,
+    x: Array | np.ndarray,
+    field: Declaration,
+    sizes: Mapping[str, int],
+    strict: tuple[type, ...],
+) -> None:
+    kinds = {sizes[kind]: kind for kind in reversed(AXES)}
+    if issubclass(field.owner, strict) and x.shape[0] in kinds:
+        kind = kinds[x.shape[0]]
+        raise TypeError(
+            f"{name} must declare whether it has one entry for each of the {kind}, of which there are as "
+            f'many, but does not. Annotate it, {field.field}: Float[Array, "{kind}"], or '
+            'eqx.field(metadata={"axis": None}).'
+        )
+
+
+def _taken(x: Array | np.ndarray, parent: Any, axis: int) -> Array | np.ndarray:
+    if is_concrete(x) and is_concrete(parent) and not _is_key(x):
+        # By NumPy: JAX would compile for each size.
+        taken = np.take(np.asarray(x), np.asarray(parent), axis)
+        return taken if isinstance(x, np.ndarray) else jnp.asarray(taken)
+    # (Indexed, and not by `jnp.take`: keys of random numbers may be indexed.)
+    return jnp.asarray(x)[(slice(None),) * axis + (parent,)]
+
+
+def _is_key(x: Array | np.ndarray) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def _declared(tree: Any, path: tuple[Any, ...]) -> Declaration | None:

@@ -66,7 +66,7 @@ def traced(tree: Tree, dtype: Any = None, *, integers: bool = False) -> Tree:
             return jnp.asarray(x, dtype)
         if integers and isinstance(x, int) and not isinstance(x, bool):
             return jnp.asarray(x, None if dtype is None else jnp.result_type(int))
-        if dtype is not None and eqx.is_array(x) and x.weak_type:
+        if dtype is not None and isinstance(x, jax.Array) and x.weak_type:
             strong = dtype if jnp.issubdtype(x.dtype, jnp.floating) else x.dtype
             return jax.lax.convert_element_type(x, strong)
         return x

@@ -22,6 +22,7 @@ from vertax.inference._solve import solve, told
 from vertax.initialise import Segmentation, from_labels
 from vertax.io import Foam, read_surface_evolver
 from vertax.mesh import Tissue
+from vertax.mesh._geometry import geometry_of
 
 # A tissue given as such is known to this share of a cell diameter, the points of a foam to that; and the
 # points that stand for an edge without any.
@@ -164,7 +165,7 @@ def _of_mask(source: Segmentation) -> _Course:
             "balance. Use vx.initialise.from_labels(mask, boundary='free')."
         )
     _check_arcs(source.tissue)
-    first = np.asarray(source.tissue.topology.edge_vertices)[:, 0]
+    first = geometry_of(source.tissue).edge_vertices[:, 0]
     edge = source.courses.edge
     away = source.courses.points - np.asarray(source.tissue.vertices)[first][edge]
     points = Points(edge, away)

@@ -13,6 +13,7 @@ from vertax.inference._curves import Fitted
 from vertax.inference._inferred import InferredTensions
 from vertax.inference._solve import Balance
 from vertax.mesh import Tissue
+from vertax.mesh._geometry import geometry_of
 
 # From this standard deviation on, relative to the mean, a tension is not determined.
 _UNKNOWN = 0.3
@@ -117,9 +118,11 @@ def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
     """The tissue with the vertices and angles of the fit."""
     n = 2 * tissue.n_vertices
     dtype = tissue.vertices.dtype
-    vertices = tissue.vertices + jnp.asarray(change[:n].reshape(-1, 2), dtype)
-    angles = tissue.edge_angles + jnp.asarray(change[n : n + tissue.n_edges], dtype)
-    return tissue.with_vertices(vertices).with_angles(angles)
+    # By NumPy: JAX would compile for each size.
+    vertices = np.asarray(tissue.vertices) + change[:n].reshape(-1, 2)
+    angles = geometry_of(tissue).edge_angles + change[n : n + tissue.n_edges]
+    moved = tissue.with_vertices(jnp.asarray(vertices, dtype))
+    return moved.with_angles(jnp.asarray(angles, dtype))
 
 
 def _stresses(
@@ -131,8 +134,8 @@ def _stresses(
     """Half the tension of its edges, less the pressure, in each cell (Batchelor 1970,
     doi:10.1017/S0022112070000745)."""
     # Along an arc the tangent turns from -α to α: the integral of t t over its length, along and across.
-    chord, angle = np.asarray(tissue.edge_vectors, float), np.asarray(tissue.edge_angles, float)
-    length = np.asarray(tissue.edge_lengths, float)
+    geometry = geometry_of(tissue)
+    chord, angle, length = geometry.edge_vectors, geometry.edge_angles, geometry.edge_lengths
     unit = chord / np.maximum(np.linalg.norm(chord, axis=1), 1e-300)[:, None]
     aside = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
     share = 0.5 * (1 + np.sinc(2 * angle / np.pi))
@@ -141,7 +144,7 @@ def _stresses(
     known = np.where(determined, tensions, np.nan)
     pulled = 0.5 * (known * length)[:, None, None] * fabric
     total = np.zeros((tissue.n_cells + 1, 2, 2))
-    for side in np.asarray(tissue.topology.edge_cells).T:
+    for side in geometry.edge_cells.T:
         np.add.at(total, side, pulled)
-    areas = np.asarray(tissue.areas, float)[:, None, None]
+    areas = geometry.areas[:, None, None]
     return total[:-1] / areas - pressures[:, None, None] * np.eye(2)

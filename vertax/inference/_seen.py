@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vertax.mesh import Tissue
+from vertax.mesh._geometry import geometry_of
 
 
 class Seen(NamedTuple):
@@ -57,18 +58,17 @@ class Seen(NamedTuple):
 
 def seen(tissue: Tissue) -> Seen:
     """The geometry of a tissue."""
-    m = tissue.topology
-    edge, forward, cell = (np.asarray(x) for x in (m.edge, m.forward, m.cell))
-    inner = np.all(cell.reshape(-1, 3) < tissue.n_cells, axis=1)
+    m, geometry = tissue.topology, geometry_of(tissue)
+    inner = np.all(np.asarray(m.cell).reshape(-1, 3) < tissue.n_cells, axis=1)
     return Seen(
-        ends=np.asarray(m.edge_vertices),
-        cells=np.asarray(m.edge_cells),
-        half_edge=edge.reshape(-1, 3),
-        forward=forward.reshape(-1, 3),
-        chord=np.asarray(tissue.edge_vectors, float),
-        angle=np.asarray(tissue.edge_angles, float),
+        ends=geometry.edge_vertices,
+        cells=geometry.edge_cells,
+        half_edge=np.asarray(m.edge).reshape(-1, 3),
+        forward=geometry.forward.reshape(-1, 3),
+        chord=geometry.edge_vectors,
+        angle=geometry.edge_angles,
         bend=np.zeros((tissue.n_edges, 2)),
         n_cells=tissue.n_cells,
         inner=inner,
-        size=float(np.sqrt(np.mean(np.abs(np.asarray(tissue.areas, float))))),
+        size=float(np.sqrt(np.mean(np.abs(geometry.areas)))),
     )

@@ -23,6 +23,7 @@ from vertax.initialise._repairs import (
 from vertax.initialise._tidy import without_overlaps
 from vertax.mesh import Free, Periodic, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
+from vertax.mesh._geometry import geometry_of
 
 _BOUNDARIES = ("mirrored", "periodic", "free")
 
@@ -270,7 +271,7 @@ def _with_arcs(
 ) -> Tissue:
     """The tissue with arcs that bound the areas which edges bound in the image."""
     half_edge = np.asarray(straight.topology.half_edge)
-    chord = np.linalg.norm(np.asarray(straight.edge_vectors, float), axis=1) / pixel_size
+    chord = np.linalg.norm(geometry_of(straight).edge_vectors, axis=1) / pixel_size
     angles = np.where(curved[half_edge], angle_of_area(mesh.bulge[half_edge], chord), 0.0)
     return Tissue(
         straight.vertices,

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from vertax.mesh import Periodic, Tissue
+from vertax.mesh._geometry import geometry_of
 from vertax.mesh._overlaps import crossed_sides
 
 _ROUNDS = 60
@@ -30,7 +31,8 @@ def without_overlaps(tissue: Tissue) -> Tissue:
         bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
         if not crossed.any():
             return tissue
-        ends, faces = np.asarray(m.edge_vertices), np.asarray(m.edge_cells)
+        geometry = geometry_of(tissue)
+        ends, faces = geometry.edge_vertices, geometry.edge_cells
         touched = np.any(np.append(bad, False)[faces], axis=1)
         touched[np.asarray(m.edge)[crossed]] = True
         if tissue.arcs is not None:
@@ -39,7 +41,7 @@ def without_overlaps(tissue: Tissue) -> Tissue:
             moving = np.zeros(m.n_vertices, bool)
             moving[ends[touched]] = True
             step = np.zeros((m.n_vertices, 2))
-            vectors = np.asarray(tissue.edge_vectors)
+            vectors = geometry.edge_vectors
             np.add.at(step, ends[:, 0], vectors / 3)
             np.add.at(step, ends[:, 1], -vectors / 3)
             tissue = tissue.with_vertices(

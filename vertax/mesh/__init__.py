@@ -7,5 +7,6 @@ from vertax.mesh._boundary import (
 )
 from vertax.mesh._outlines import cell_polygons as cell_polygons
 from vertax.mesh._overlaps import Overlaps as Overlaps
+from vertax.mesh._padding import pad as pad
 from vertax.mesh._tissue import Tissue as Tissue
 from vertax.mesh._topology import Topology as Topology

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from vertax._base.checks import check_concrete, check_whole
+from vertax._base.modules import is_concrete
 from vertax.mesh._topology import Topology
+
+
+def size_class(n_cells: int) -> int:
+    """The number of cells to which a tissue is padded, at most a quarter more."""
+    size = n_cells if n_cells < 4 else 4
+    while size < n_cells:
+        size = 5 * (size + 1) // 4
+    return size
 
 
 def with_slots(m: Topology, n_cells: int) -> Topology:
@@ -20,23 +30,26 @@ def with_slots(m: Topology, n_cells: int) -> Topology:
             f"already, but is {n_cells}. To drop spare slots call `without_spare()` first."
         )
     more = n_cells - have
-    slot = 6 * jnp.arange(more, dtype=m.twin.dtype)[:, None]
+    # By NumPy where the numbers are at hand: JAX would compile for each size.
+    xp = np if all(map(is_concrete, (m.twin, m.cell, m.frame, m.edge, m.half_edge))) else jnp
+    slot = 6 * xp.arange(more, dtype=m.twin.dtype)[:, None]
     # Of a slot the half-edges 0, 1, 2 leave one vertex, and 3, 5, 4 are their twins.
-    twins = m.n_half_edges + slot + jnp.asarray([3, 5, 4, 0, 2, 1], m.twin.dtype)
-    edges = m.n_edges + slot // 2 + jnp.asarray([0, 1, 2, 0, 2, 1], m.twin.dtype)
-    begins = m.n_half_edges + slot + jnp.arange(3, dtype=m.twin.dtype)
+    twins = m.n_half_edges + slot + xp.asarray([3, 5, 4, 0, 2, 1], m.twin.dtype)
+    edges = m.n_edges + slot // 2 + xp.asarray([0, 1, 2, 0, 2, 1], m.twin.dtype)
+    begins = m.n_half_edges + slot + xp.arange(3, dtype=m.twin.dtype)
     # The labels of what is no cell come after those of the cells.
-    cell = jnp.where(m.cell >= have, m.cell + more, m.cell)
-    join = lambda a, b: jnp.concatenate([a, b.astype(a.dtype)])
+    cell = xp.asarray(m.cell)
+    cell = xp.where(cell >= have, cell + more, cell)
+    join = lambda a, b: xp.concatenate([xp.asarray(a), b.astype(a.dtype)])
     topology = Topology(
         join(m.twin, twins.ravel()),
-        join(cell, jnp.full(6 * more, n_cells + 1)),
-        join(m.frame, jnp.zeros((6 * more, 2))),
+        join(cell, xp.full(6 * more, n_cells + 1)),
+        join(m.frame, xp.zeros((6 * more, 2))),
         join(m.edge, edges.ravel()),
         exterior=m.exterior,
         spare=True,
     )
-    return _directed(topology, join(m.half_edge, begins.ravel()))
+    return _directed(topology, jnp.asarray(join(m.half_edge, begins.ravel())))
 
 
 def without_slots(

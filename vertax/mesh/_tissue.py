@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from vertax._base.modules import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free
-from vertax.mesh._capacity import with_slots, without_slots
+from vertax.mesh._capacity import size_class, with_slots, without_slots
 from vertax.mesh._ends import at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
@@ -121,7 +121,10 @@ class Tissue(eqx.Module):
             )
         self.softening = jnp.zeros((), vertices.dtype)
         if softening is None or (angles is not None and angle_length is None):
-            size = jnp.sqrt(jax.lax.stop_gradient(_mean_area(self)))
+            # Padded, so that similar sizes share the compiled function.
+            known = all(map(is_concrete, jax.tree.leaves(self)))
+            padded = self.with_capacity(size_class(self.n_cells)) if known else self
+            size = jnp.sqrt(jax.lax.stop_gradient(_mean_area(padded)))
             softening = 1e-3 * size if softening is None else softening
             angle_length = 0.5 * size if angle_length is None else angle_length
         softening = jnp.asarray(softening, vertices.dtype)
@@ -378,13 +381,15 @@ class Tissue(eqx.Module):
         """
         topology = with_slots(self.topology, n_cells)
 
-        def longer(x: Array, size: int, filling: Array | float = 0) -> Array:
-            more = jnp.broadcast_to(filling, (size - len(x), *x.shape[1:]))
-            return jnp.concatenate([x, more.astype(x.dtype)])
+        def longer(x: Array, size: int, filling: Array | np.ndarray | float = 0) -> Array:
+            xp = np if is_concrete(x) else jnp
+            more = xp.broadcast_to(filling, (size - len(x), *x.shape[1:])).astype(x.dtype)
+            return jnp.asarray(xp.concatenate([xp.asarray(x), more]))
 
         of_vertices = lambda x: longer(x, topology.n_vertices)
         of_edges = lambda x: longer(x, topology.n_edges)
-        middle = jnp.mean(self.vertices, axis=0)
+        xp = np if is_concrete(self.vertices) else jnp
+        middle = xp.mean(xp.asarray(self.vertices), axis=0)
         vertices = longer(self.vertices, topology.n_vertices, middle)
         return self._with(topology, vertices, of_vertices, of_edges)
 

@@ -112,7 +112,8 @@ class Topology(eqx.Module):
         if known and not spare:
             n_cells = int(cell.max()) + (not exterior)
         half_edge = xp.where(cell[half_edge] == n_cells, twin[half_edge], half_edge)
-        to_int32 = lambda x: jnp.asarray(x, jnp.int32)
+        # (Converted by NumPy if known: JAX would compile for each size.)
+        to_int32 = lambda x: jnp.asarray(xp.asarray(x, np.int32))
         self.twin = to_int32(twin)
         self.cell = to_int32(cell)
         self.frame = to_int32(frame)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from vertax._base.axes import AXES, Declaration, declarations
+from vertax._base.axes import AXES, gather
 from vertax._base.modules import is_concrete
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -56,58 +55,9 @@ class Change(eqx.Module):
         """
         if axis is not None and axis not in AXES:
             raise ValueError(f"Argument `axis` must be one of {AXES} or None, but is {axis!r}.")
-        declared = declarations(tree, (Tissue,))
-        leaves, structure = jax.tree.flatten(tree, is_leaf=lambda x: isinstance(x, Tissue))
-        pairs = zip(leaves, declared, strict=True)
-        return jax.tree.unflatten(structure, [self._of(x, field, axis) for x, field in pairs])
-
-    def _of(self, x: Any, field: Declaration | None, default: str | None) -> Any:
-        """A leaf, of which a field declares something, with the entries of new cells, edges and vertices."""
-        if not isinstance(x, jax.Array | np.ndarray) or x.ndim == 0:
-            return x
-        name = (
-            "Argument `tree`"
-            if field is None
-            else f"Field `{field.field}` of {field.owner.__name__}"
-        )
-        if field is not None and field.shapes is not None:
-            axes = field.axes(x.ndim)
-        elif default is not None:
-            axes = {0: default}
-        elif field is None:
-            raise TypeError(
-                f"{name} must hold its arrays in fields of modules, which declare what has one entry for "
-                'each cell, edge or vertex, but holds one outside. Pass axis="cells", "edges" or "vertices".'
-            )
-        else:
-            self._check_undeclared(name, x, field)
-            axes = {}
-        for at, kind in axes.items():
-            parent: Array = getattr(self, kind)
-            size = parent.shape[-1]
-            if x.shape[at] != size:
-                raise ValueError(
-                    f"{name} must have one entry for each of {size} {kind} along its axis {at}, but its "
-                    f'shape is {x.shape}. If it has not, declare it: eqx.field(metadata={{"axis": None}}).'
-                )
-            concrete = isinstance(x, np.ndarray) and is_concrete(parent)
-            x = np.take(x, np.asarray(parent), at) if concrete else _taken(x, parent, at)
-        return x
-
-    def _check_undeclared(self, name: str, x: Array | np.ndarray, field: Declaration) -> None:
-        sizes = {getattr(self, kind).shape[-1]: kind for kind in reversed(AXES)}
-        if issubclass(field.owner, AbstractEnergy) and x.shape[0] in sizes:
-            kind = sizes[x.shape[0]]
-            raise TypeError(
-                f"{name} must declare whether it has one entry for each of the {kind}, of which there are as "
-                f'many, but does not. Annotate it, {field.field}: Float[Array, "{kind}"], or '
-                'eqx.field(metadata={"axis": None}).'
-            )
-
-
-def _taken(x: Array | np.ndarray, parent: Int[Array, " n"], axis: int) -> Array:
-    # (Indexed, and not by `jnp.take`: keys of random numbers may be indexed.)
-    return jnp.asarray(x)[(slice(None),) * axis + (parent,)]
+        parents = {kind: getattr(self, kind) for kind in AXES}
+        sizes = {kind: parent.shape[-1] for kind, parent in parents.items()}
+        return gather(tree, parents, sizes, axis=axis, opaque=(Tissue,), strict=(AbstractEnergy,))
 
 
 def unchanged(tissue: Tissue) -> Change:

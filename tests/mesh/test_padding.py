@@ -1,0 +1,83 @@
+"""Tissues of nearly the same size are brought to one size."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import random_tissue
+from hypothesis import given, strategies as st
+from jaxtyping import Array, Float
+
+import vertax as vx
+from vertax.mesh import pad
+from vertax.mesh._capacity import size_class
+from vertax.mesh._geometry import geometry_of
+
+N = 9
+
+
+@given(st.integers(1, 100_000))
+def test_a_size_class_is_at_most_a_quarter_more_and_belongs_to_itself(n):
+    size = size_class(n)
+    assert n <= size <= 1.25 * n
+    assert size_class(size) == size
+
+
+def test_sizes_within_a_fifth_have_two_classes_at_most():
+    assert len({size_class(n) for n in range(90, 111)}) == 2
+
+
+def test_a_padded_tissue_relaxes_as_it_does_alone():
+    tissue, energy = random_tissue(N), vx.energies.ShapeFactorEnergy(jnp.linspace(3.6, 3.8, N))
+    padded, longer = pad(tissue, energy)
+    assert padded.n_cells == len(longer.target_shape_factor) == 11
+    assert longer.target_shape_factor[N] == energy.target_shape_factor[0]
+    alone, together = (
+        vx.equilibrate(*pair).tissue for pair in ((tissue, energy), (padded, longer))
+    )
+    np.testing.assert_allclose(together.without_spare().vertices, alone.vertices, atol=1e-7)
+
+
+def test_what_is_padded_is_what_fields_declare():
+    class Network(eqx.Module):
+        weights: Float[Array, "cells"]
+        by_edge: Float[Array, "knots edges"]
+        matrix: Float[Array, "inputs outputs"]
+        number: float
+
+    tissue = random_tissue(N)
+    n_edges = tissue.n_edges
+    network = Network(jnp.arange(N), jnp.ones((2, n_edges)), jnp.ones((N, n_edges)), 2.0)
+    padded, longer = pad(tissue, network)
+    assert longer.weights.tolist() == [*range(N), 0, 0]
+    assert longer.by_edge.shape == (2, padded.n_edges)
+    assert eqx.tree_equal(longer.matrix, network.matrix)
+
+
+def test_an_array_that_may_be_one_a_cell_must_declare_it():
+    class Vague(eqx.Module):
+        weights: Array
+
+    with pytest.raises(TypeError, match="Field `weights` of Vague must declare"):
+        pad(random_tissue(N), Vague(jnp.ones(N)))
+    with pytest.raises(ValueError, match="one entry for each of 9 cells"):
+        pad(random_tissue(N), vx.energies.ShapeFactorEnergy(jnp.ones(8)))
+
+
+def test_padding_needs_numbers():
+    with pytest.raises(TypeError, match=r"does not work inside jax\.jit"):
+        eqx.filter_jit(pad)(random_tissue(N))
+
+
+@pytest.mark.parametrize("arcs", [None, False, True])
+def test_the_geometry_in_numpy_is_that_of_the_tissue(arcs):
+    if arcs is None:
+        tissue = random_tissue(N)
+    else:
+        tissue = vx.initialise.free_voronoi(N, key=jax.random.key(0), inner_arcs=arcs)
+    geometry = geometry_of(tissue)
+    for name in ("edge_vectors", "edge_lengths", "edge_angles", "areas"):
+        np.testing.assert_allclose(getattr(geometry, name), getattr(tissue, name), atol=1e-12)
+    for name in ("edge_vertices", "edge_cells", "forward"):
+        np.testing.assert_array_equal(getattr(geometry, name), getattr(tissue.topology, name))

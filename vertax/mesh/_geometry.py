@@ -1,0 +1,51 @@
+"""The geometry of a tissue as NumPy arrays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax.mesh._padding import pad
+from vertax.mesh._tissue import Tissue
+
+
+class Geometry(NamedTuple):
+    """What programs in NumPy need to know of a tissue."""
+
+    edge_vertices: Int[np.ndarray, "edges 2"]
+    edge_cells: Int[np.ndarray, "edges 2"]
+    """On the left and on the right; the exterior is the number of cells."""
+    forward: Bool[np.ndarray, " halfedges"]
+    edge_vectors: Float[np.ndarray, "edges 2"]
+    edge_lengths: Float[np.ndarray, " edges"]
+    edge_angles: Float[np.ndarray, " edges"]
+    areas: Float[np.ndarray, " cells"]
+
+
+def geometry_of(tissue: Tissue) -> Geometry:
+    """The geometry of a tissue, by one compiled function for each size class (see `pad`)."""
+    padded = pad(tissue)
+    parts = [np.asarray(x) for x in _measure(padded)]
+    m = tissue.topology
+    sizes = (m.n_edges, m.n_edges, m.n_half_edges, m.n_edges, m.n_edges, m.n_edges, m.n_cells)
+    geometry = Geometry(*(x[:size] for x, size in zip(parts, sizes, strict=True)))
+    cells = geometry.edge_cells
+    return geometry._replace(
+        edge_cells=np.where(cells == padded.n_cells, tissue.n_cells, cells),
+        edge_vectors=geometry.edge_vectors.astype(float),
+        edge_lengths=geometry.edge_lengths.astype(float),
+        edge_angles=geometry.edge_angles.astype(float),
+        areas=geometry.areas.astype(float),
+    )
+
+
+@eqx.filter_jit
+def _measure(tissue: Tissue) -> list[Array]:
+    m = tissue.topology
+    topology = [m.edge_vertices, m.edge_cells, m.forward]
+    lengths = [tissue.edge_vectors, tissue.edge_lengths, tissue.edge_angles, tissue.areas]
+    return jax.tree.map(jax.numpy.asarray, topology + lengths)
