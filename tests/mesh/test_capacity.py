@@ -36,7 +36,9 @@ def test_spare_slots_are_valid_and_come_off_again(kind):
         values = getattr(roomy, name)
         np.testing.assert_array_equal(values[tissue.n_cells :], 0)
     assert eqx.tree_equal(roomy.without_spare(), tissue)
-    assert eqx.tree_equal(jax.jit(lambda t: t.with_capacity(10))(tissue), roomy)
+    # (The position of spare vertices, a mean, is rounded differently.)
+    compiled = jax.jit(lambda t: t.with_capacity(10))(tissue)
+    assert eqx.tree_equal(compiled, roomy, rtol=1e-12, atol=1e-12)
     twice = tissue.with_capacity(8).with_capacity(10)
     assert eqx.tree_equal(twice.topology, roomy.topology)
 

@@ -32,7 +32,7 @@ def test_a_padded_tissue_relaxes_as_it_does_alone():
     tissue, energy = random_tissue(N), vx.energies.ShapeFactorEnergy(jnp.linspace(3.6, 3.8, N))
     padded, longer = pad(tissue, energy)
     assert padded.n_cells == len(longer.target_shape_factor) == 11
-    assert longer.target_shape_factor[N] == energy.target_shape_factor[0]
+    assert np.asarray(longer.target_shape_factor)[N] == 3.6
     alone, together = (
         vx.equilibrate(*pair).tissue for pair in ((tissue, energy), (padded, longer))
     )

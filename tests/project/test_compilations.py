@@ -10,7 +10,6 @@ import optax
 import optimistix as optx
 import pytest
 from helpers import random_tissue
-from label_helpers import bricks
 
 import vertax as vx
 from vertax.energies import ShapeFactorEnergy
@@ -19,7 +18,9 @@ from vertax.fitting import stack
 N = 5
 EVENT = "/jax/core/compile/backend_compile_duration"
 _events: list[str] = []
-jax.monitoring.register_event_duration_secs_listener(lambda name, _, **__: _events.append(name))
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, duration_secs, **_: _events.append(event)
+)
 
 
 class Count:
@@ -60,6 +61,13 @@ def grow():
     cycle = vx.growth.GrowAndDivide(growth_rate=0.1, division_area=1.5)
     tissue = random_tissue(N, 0).with_capacity(8)
     return vx.growth.grow(tissue, energy, cycle, jnp.linspace(0, 2, 3), key=1, throw=False)
+
+
+def bricks():
+    """A mask of nine cells in three rows, shifted against each other."""
+    rows = [[3 * r + 1, 3 * r + 2, 3 * r + 3, 0] for r in range(3)]
+    shifted = [np.roll(np.repeat(row, 20), 10 * (r % 2)) for r, row in enumerate(rows)]
+    return np.pad(np.repeat(np.array(shifted), 20, axis=0), 6)
 
 
 OPTIMISER = optax.adam(1e-2)

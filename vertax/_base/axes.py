@@ -182,9 +182,9 @@ def _declared(tree: Any, path: tuple[Any, ...]) -> Declaration | None:
         if isinstance(key, jax.tree_util.GetAttrKey):
             node = getattr(node, key.name)
         elif isinstance(key, jax.tree_util.SequenceKey):
-            node = node[key.idx]
+            node = node[key.idx]  # pyright: ignore[reportIndexIssue]
         elif isinstance(key, jax.tree_util.DictKey):
-            node = node[key.key]
+            node = node[key.key]  # pyright: ignore[reportIndexIssue]
         else:  # a node that says nothing of its children
             break
     return found

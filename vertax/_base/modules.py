@@ -11,6 +11,8 @@ import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from vertax._base.announce import announced_jit
+
 Tree = TypeVar("Tree", bound=Any)
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ else:
         """
 
         def __init__(self, method: Callable[[Any], Any]):
-            super().__init__(eqx.filter_jit(method, inline=True), doc=method.__doc__)
+            super().__init__(announced_jit(method, inline=True), doc=method.__doc__)
 
 
 def is_concrete(value: Any) -> bool:

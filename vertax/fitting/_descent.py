@@ -13,6 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
 from vertax._base.modules import choose, traced
 from vertax.fitting._epoch import (
@@ -119,7 +120,7 @@ class Descent(AbstractMethod):
         return dataclasses.replace(problem, guidance=strength)
 
 
-@eqx.filter_jit
+@announced_jit
 def _start(
     problem: InverseProblem,
     optimiser: optax.GradientTransformation,
@@ -145,10 +146,10 @@ def _evaluation(problem: InverseProblem, constants: PyTree, state: State) -> Eva
     return problem.value_and_gradient(energy, state.tissue, no_shift(problem), throw=False)
 
 
-_evaluate_batch = eqx.filter_jit(eqx.filter_vmap(_evaluation))
+_evaluate_batch = announced_jit(eqx.filter_vmap(_evaluation))
 
 
-@eqx.filter_jit
+@announced_jit
 def _update(
     optimiser: optax.GradientTransformation,
     arguments: tuple,
@@ -205,7 +206,7 @@ def _update(
     return (eqx.filter_vmap(one) if batched else one)(*arguments)
 
 
-@eqx.filter_jit
+@announced_jit
 def _hessian_at(
     problem: InverseProblem, constants: PyTree, state: State, batched: bool
 ) -> KnownHessian | None:

@@ -17,6 +17,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Int, PyTree
 from tqdm import tqdm
 
+from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import (
     Checkpoint,
     Keeper,
@@ -38,6 +39,7 @@ from vertax.fitting._least_squares import LeastSquares
 Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 
 
+@announce_compilations("a fit")
 def fit(
     problem: InverseProblem[Energy],
     optimiser: optax.GradientTransformation | optx.AbstractLeastSquaresSolver[Any, Any, Any, Any],

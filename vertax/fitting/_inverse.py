@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.announce import announced_jit
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.modules import traced
 from vertax.adjoints import (
@@ -163,10 +164,14 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         return isinstance(self.adjoint, EquilibriumPropagation) and self.adjoint.nudge == "cost"
 
     def residuals(
-        self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
+        self,
+        energy: AbstractEnergy,
+        tissue: Tissue,
+        shift: Float[Array, 2] | None,
+        primal: PyTree = None,
     ) -> tuple[Float[Array, " residuals"], Equilibrium, Tissue]:
         """Residuals of a least-squares cost, the equilibrium, and its tissue displaced by `shift`."""
-        equilibrium = self.relax(tissue, energy, shift, adjoint=self.adjoint)
+        equilibrium = self.relax(tissue, energy, shift, adjoint=self.adjoint, primal=primal)
         placed = _placed(equilibrium, shift)
         return self.cost.residuals(self._seen(placed), energy), equilibrium, placed.tissue
 
@@ -207,8 +212,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         arguments = traced((tissue, parameters, constants, shift), dtype)
         tissue, parameters, constants, shift = arguments
         problem = self.as_data(dtype)
-        pulled = problem.pulled(tissue, eqx.combine(parameters, constants), shift)
-        primal = problem.response.primal(tissue, pulled)
+        primal = problem.primal(eqx.combine(parameters, constants), tissue, shift)
         # The compiled function of all problems with this cost and adjoint.
         parts = lambda p: (p.tissue, p.energy, p.trainable)
         problem = eqx.tree_at(parts, problem, (None,) * 3, is_leaf=lambda x: x is None)
@@ -216,6 +220,12 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         if not throw:
             return evaluation
         return eqx.tree_at(lambda e: e.equilibrium, evaluation, evaluation.equilibrium.checked())
+
+    def primal(
+        self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
+    ) -> PyTree:
+        """The primal of the response; None if the response has none."""
+        return self.response.primal(tissue, self.pulled(tissue, energy, shift))
 
     def as_data(self, dtype: Any) -> InverseProblem[Energy]:
         """The same problem with arrays for its numbers other than those of the energy."""
@@ -261,7 +271,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         return _Pulled(energy, self.cost, shift, strength, frozen(tissue))
 
 
-@eqx.filter_jit
+@announced_jit
 def _evaluate(
     problem: InverseProblem,
     primal: PyTree,

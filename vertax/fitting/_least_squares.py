@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
 from vertax._base.modules import choose
 from vertax.adjoints import ImplicitDifferentiation
@@ -67,9 +68,12 @@ class LeastSquares(AbstractMethod):
     batched: bool
 
     def start(self) -> State:
-        return _start(
-            self.solver, self.problem, self.constants, self.true, self.parameters, self.batched
-        )
+        primal, problem = None, self.problem
+        if not self.batched:
+            energy = eqx.combine(self.parameters, self.constants)
+            primal = problem.primal(energy, problem.tissue, no_shift(problem))
+        parts = (problem, self.constants, self.true, self.parameters, primal)
+        return _start(self.solver, parts, self.batched)
 
     def advance(self, state: State, epoch: int) -> tuple[State, Record]:
         return _epoch(
@@ -140,13 +144,14 @@ def _residuals(
     constants: PyTree,
     true: PyTree[Array] | None,
     scale: Float[Array, ""],
+    primal: PyTree = None,
 ) -> Callable[[PyTree, Tissue], tuple[Array, tuple]]:
     """The residuals of some parameters, and what there is to know of their equilibrium."""
 
     def evaluate(y: PyTree, tissue: Tissue) -> tuple[Array, tuple]:
         parameters, shift = y
         energy = eqx.combine(parameters, constants)
-        residuals, relaxed, placed = problem.residuals(energy, tissue, shift)
+        residuals, relaxed, placed = problem.residuals(energy, tissue, shift, primal)
         # A relaxation that did not arrive says nothing of these parameters: the solver must not
         # go there, and comes closer if the cost is worse than any other.
         worst = jnp.asarray(jnp.finfo(residuals.dtype).max ** 0.25, residuals.dtype)
@@ -170,22 +175,19 @@ def _residuals(
     return evaluate
 
 
-@eqx.filter_jit
-def _start(
-    solver: optx.AbstractLeastSquaresSolver,
-    problem: InverseProblem,
-    constants: PyTree,
-    true: PyTree[Array] | None,
-    parameters: PyTree[Array],
-    batched: bool,
-) -> State:
+@announced_jit
+def _start(solver: optx.AbstractLeastSquaresSolver, parts: tuple, batched: bool) -> State:
     def start(
-        problem: InverseProblem, constants: PyTree, true: PyTree, parameters: PyTree
+        problem: InverseProblem,
+        constants: PyTree,
+        true: PyTree,
+        parameters: PyTree,
+        primal: PyTree,
     ) -> State:
         # The damping that a solver begins with suits residuals of order one.
         fitted = (parameters, no_shift(problem))
         one = jnp.ones((), problem.tissue.vertices.dtype)
-        first, _ = _residuals(problem, constants, true, one)(fitted, problem.tissue)
+        first, _ = _residuals(problem, constants, true, one, primal)(fitted, problem.tissue)
         scale = jax.lax.rsqrt(jnp.maximum(jnp.sum(first**2), jnp.finfo(first.dtype).tiny))
         machine = _Machine(solver, problem, constants, true, fitted, scale)
         leaves = _leaves(machine.blank)
@@ -195,11 +197,10 @@ def _start(
         still, going = jnp.array(0), jnp.array(True)
         return State(fitted, leaves, *tissues, facts, scale, best, still, going)
 
-    arguments = (problem, constants, true, parameters)
-    return (eqx.filter_vmap(start) if batched else start)(*arguments)
+    return (eqx.filter_vmap(start) if batched else start)(*parts)
 
 
-@eqx.filter_jit
+@announced_jit
 def _epoch(
     solver: optx.AbstractLeastSquaresSolver,
     problem: InverseProblem,

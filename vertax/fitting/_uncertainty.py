@@ -10,7 +10,9 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import check_number
+from vertax._base.modules import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._history import Fit
 from vertax.fitting._inverse import InverseProblem
@@ -78,12 +80,14 @@ def uncertainty(
             "Arguments `problem` and `fit` must be single ones, but are a batch. Take a member of each: "
             "jax.tree.map(lambda x: x[0] if equinox.is_array(x) else x, fit)."
         )
-    parameters, constants = eqx.partition(fit.energy, problem.trainable)
+    dtype = problem.tissue.vertices.dtype
+    parameters, constants = traced(eqx.partition(fit.energy, problem.trainable), dtype)
+    problem = problem.as_data(dtype)
     flat, unravel = jfu.ravel_pytree(parameters)
     shift = jnp.zeros(2, flat.dtype) if problem.fit_position else None
-    gram, squares, n_residuals = _gram(
-        problem, problem.onward(fit.tissue), flat, unravel, constants, shift
-    )
+    tissue = traced(problem.onward(fit.tissue), dtype)
+    primal = problem.primal(eqx.combine(parameters, constants), tissue, shift)
+    gram, squares, n_residuals = _gram(problem, primal, tissue, flat, unravel, constants, shift)
     n_free = n_residuals if n_independent is None else n_independent
     n_fitted = len(gram)
     if not n_free > n_fitted:
@@ -119,9 +123,10 @@ def uncertainty(
     return Uncertainty(unravel(deviation), covariance, vectors.T, along, jnp.sqrt(variance))
 
 
-@eqx.filter_jit
+@announced_jit
 def _gram(
     problem: InverseProblem,
+    primal: PyTree,
     tissue: Tissue,
     flat: Float[Array, " parameters"],
     unravel: Callable[[Array], PyTree[Array]],
@@ -133,7 +138,7 @@ def _gram(
 
     def residuals(x: Float[Array, " n"]) -> Float[Array, " residuals"]:
         energy = eqx.combine(unravel(x[:n]), constants)
-        return problem.residuals(energy, tissue, None if shift is None else x[n:])[0]
+        return problem.residuals(energy, tissue, None if shift is None else x[n:], primal)[0]
 
     at = flat if shift is None else jnp.concatenate([flat, shift])
     values, forward = jax.linearize(residuals, at)

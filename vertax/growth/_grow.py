@@ -12,6 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.checks import as_key, check_whole, increasing, named
 from vertax._base.modules import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
@@ -188,9 +189,9 @@ def grow(
     relaxation = Relaxation(transitions=T1() + T2()) if relaxation is None else relaxation
     times = increasing(times)
     parts = traced((tissue, energy, cycle, dissipation), tissue.vertices.dtype)
-    grown = _grow(
-        *parts, relaxation.traced(), adjoint, times, as_key(key), (substeps, divisions, records)
-    )
+    settings = (relaxation.traced(), adjoint, times, as_key(key), (substeps, divisions, records))
+    with announce_compilations(f"the growth of a tissue with room for {tissue.n_cells} cells"):
+        grown = _grow(*parts, *settings)
     return grown.checked() if throw else grown
 
 
@@ -206,7 +207,7 @@ class _State(eqx.Module):
     log_likelihood: Float[Array, ""]
 
 
-@eqx.filter_jit
+@announced_jit
 def _grow(
     tissue: Tissue,
     energy: Energy,

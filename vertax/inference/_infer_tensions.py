@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Shaped
 
+from vertax._base.announce import announce_compilations
 from vertax._base.checks import check_number, check_whole, named
 from vertax.inference._balance import equations
 from vertax.inference._curves import Points, read_courses
@@ -30,6 +31,7 @@ _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 _EVOLVER = (".dmp", ".fe")
 
 
+@announce_compilations("measurements of a tissue")
 def infer_tensions(
     segmentation_or_mask: Segmentation
     | Foam

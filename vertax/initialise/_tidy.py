@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
+from vertax._base.announce import announced_jit
 from vertax.mesh import Periodic, Tissue
 from vertax.mesh._geometry import geometry_of
 from vertax.mesh._overlaps import crossed_sides
@@ -82,4 +82,4 @@ def _crossed(
     return np.asarray(_compiled(*map(jnp.asarray, padded)))[:n] != np.arange(n)
 
 
-_compiled = eqx.filter_jit(crossed_sides)
+_compiled = announced_jit(crossed_sides)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.announce import announced_jit
 from vertax.mesh._padding import pad
 from vertax.mesh._tissue import Tissue
 
@@ -43,7 +43,7 @@ def geometry_of(tissue: Tissue) -> Geometry:
     )
 
 
-@eqx.filter_jit
+@announced_jit
 def _measure(tissue: Tissue) -> list[Array]:
     m = tissue.topology
     topology = [m.edge_vertices, m.edge_cells, m.forward]

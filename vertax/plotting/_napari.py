@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import Normalize
 
+from vertax._base.compilation_cache import enable_compilation_cache
 from vertax.inference import InferredTensions, infer_tensions
 
 _POINTS = 13
@@ -71,9 +72,13 @@ def napari_tensions(
     **Returns:** a layer of edges, and one of labels with the table of cells.
     """
     import napari.utils.notifications as notifications  # pyright: ignore[reportMissingImports]
+    from napari.utils import progress  # pyright: ignore[reportMissingImports]
 
+    enable_compilation_cache()
     mask = np.asarray(cells.data)
-    found = infer_tensions(mask, kind="labels")
+    # The activity dock is drawn before the computation, which blocks the window.
+    with progress(total=1, desc="vertax: tensions (first compiles for this size)"):
+        found = infer_tensions(mask, kind="labels")
     for doubt in found.doubts:
         notifications.show_warning(doubt)
     placed = {"scale": cells.scale, "translate": cells.translate}

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
+from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import Checkpoint
 from vertax._base.checks import as_key, check_whole, increasing, named
 from vertax._base.memory_maps import warn_of_memory_maps
@@ -179,10 +180,11 @@ class Evolution(AbstractResponse):
         response._check_drive(tissue)
         warn_of_memory_maps()
         given = (*traced((tissue, energy), tissue.vertices.dtype), response.traced(), adjoint)
-        if progress or checkpoint is not None:
-            evolved = evolve_by_frames(*given, checkpoint, progress=progress, throw=throw)
-        else:
-            evolved = evolve_at_once(*given)
+        with announce_compilations(f"the evolution of {tissue.n_cells} cells"):
+            if progress or checkpoint is not None:
+                evolved = evolve_by_frames(*given, checkpoint, progress=progress, throw=throw)
+            else:
+                evolved = evolve_at_once(*given)
         return evolved.checked() if throw else evolved
 
     def goes_with(

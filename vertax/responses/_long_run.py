@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import Checkpoint, Keeper, Progress, Row, digest, without_addresses
 from vertax._base.modules import is_concrete
 from vertax.adjoints import AbstractAdjoint
@@ -97,13 +98,13 @@ def _joined(times: np.ndarray, end: State, rows: tuple[Row, ...], like: Frames) 
     return evolved(jnp.asarray(times), end, frames)
 
 
-@eqx.filter_jit
+@announced_jit
 def _begin(tissue: Tissue, energy: Any, evolution: Any) -> tuple[State, Frames]:
     start = begin(tissue, evolution)
     return start, first_frame(start, energy, evolution)
 
 
-@eqx.filter_jit
+@announced_jit
 def _advance(
     state: State, energy: Any, evolution: Any, adjoint: AbstractAdjoint
 ) -> tuple[State, Frames]:

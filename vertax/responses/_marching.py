@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import named
 from vertax._base.modules import choose
 from vertax.adjoints import AbstractAdjoint
@@ -239,7 +240,7 @@ def evolved(times: Float[Array, " times"], end: State, frames: Frames) -> Evolve
     )
 
 
-@eqx.filter_jit
+@announced_jit
 def evolve_at_once(
     tissue: Tissue, energy: Any, evolution: Any, adjoint: AbstractAdjoint
 ) -> Evolved:

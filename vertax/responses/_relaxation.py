@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int, PyTree
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import check_number, named
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.modules import differs_between_devices, is_concrete, traced
@@ -296,8 +297,8 @@ def attached(
     return conclude(end, tissue, energy, adjoint, *parts)
 
 
-_search = eqx.filter_jit(one_at_a_time(search))
-_compiled_attachment = eqx.filter_jit(attached)
+_search = announced_jit(one_at_a_time(search))
+_compiled_attachment = announced_jit(attached)
 
 
 def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:

@@ -124,6 +124,7 @@ def run(
     import jax
 
     from vertax import FitError, enable_compilation_cache
+    from vertax._base.announce import announce_in_this_process
     from vertax._base.extras import needing
     from vertax.runs import (
         ConfigError,
@@ -156,6 +157,7 @@ def run(
             folder = RunFolder.unfinished(resume, settings, figures=formats)
         if not quiet:
             typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
+            announce_in_this_process(f"functions for {experiment.name}")
         folder.talkative = not quiet
         metrics = experiment.run(settings, folder, progress=not quiet)
         folder.finish(metrics)

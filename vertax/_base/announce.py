@@ -1,0 +1,83 @@
+"""A message for users who wait for a compilation."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import equinox as eqx
+from tqdm import tqdm
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+DELAY = 1.0
+"""Seconds of a compilation after which a message is printed."""
+
+
+class _Thread(threading.local):
+    label: str | None = None
+    """What is compiled, if that is announced."""
+    timer: threading.Timer | None = None
+    """The timer of the outermost compiled function that is being called."""
+
+
+_thread = _Thread()
+_label_of_process: list[str] = []
+
+
+def announced_jit(function: Function, *, inline: bool = False) -> Function:
+    """`equinox.filter_jit`, for functions whose compilation `announce_compilations` reports."""
+
+    # JAX calls it only to trace it: a function that is compiled already does not start the timer.
+    @functools.wraps(function)
+    def traced(*args: Any, **kwargs: Any) -> Any:
+        timer = _thread.timer
+        if timer is not None and timer.ident is None:
+            timer.start()
+        return function(*args, **kwargs)
+
+    compiled = eqx.filter_jit(traced, inline=inline)  # pyright: ignore[reportCallIssue]
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        label = _thread.label or next(iter(_label_of_process), None)
+        if label is None or _thread.timer is not None:
+            return compiled(*args, **kwargs)
+        _thread.timer = threading.Timer(DELAY, _say, (label,))
+        _thread.timer.daemon = True
+        try:
+            return compiled(*args, **kwargs)
+        finally:
+            _thread.timer.cancel()
+            _thread.timer = None
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+@contextlib.contextmanager
+def announce_compilations(what: str) -> Iterator[None]:
+    """Print, once a compilation takes a second, that `what` is compiled.
+
+    It prints on a terminal and in a notebook; elsewhere only if `announce_in_this_process` was called.
+    """
+    before = _thread.label
+    # The outermost context names the job that the user started.
+    if before is None and (sys.stderr.isatty() or "ipykernel" in sys.modules or _label_of_process):
+        _thread.label = what
+    try:
+        yield
+    finally:
+        _thread.label = before
+
+
+def announce_in_this_process(what: str) -> None:
+    """Announce compilations in all threads, also outside of a terminal; by default that of `what`."""
+    _label_of_process[:] = [what]
+
+
+def _say(what: str) -> None:
+    tqdm.write(f"Compiling {what} (once for each size and kind of tissue) …", file=sys.stderr)
