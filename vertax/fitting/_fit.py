@@ -221,6 +221,7 @@ def _run(
     try:
         done = keeper.load(method.start())
         _check_progress(done, method, epochs)
+        # Closed at the end, whatever ends it: a bar that is not keeps an old number of epochs.
         bar = tqdm(
             total=epochs,
             initial=len(done.rows),
@@ -228,27 +229,28 @@ def _run(
             disable=None if progress else True,
             desc="compiling",  # while the first epoch stands at 0
         )
-        while len(done.rows) < epochs and np.any(done.state.going):
-            epoch, began = len(done.rows), time.perf_counter()
-            state, record = method.advance(done.state, epoch)
-            sound = np.asarray(record.sound)  # waits for the epoch to be done
-            row = _row(record, time.perf_counter() - began, method.strength(epoch))
-            if not sound.any():
-                return (
-                    Progress(state, (*done.rows, row), done.notes),
-                    _trouble(record, epoch),
-                    False,
+        with bar:
+            while len(done.rows) < epochs and np.any(done.state.going):
+                epoch, began = len(done.rows), time.perf_counter()
+                state, record = method.advance(done.state, epoch)
+                sound = np.asarray(record.sound)  # waits for the epoch to be done
+                row = _row(record, time.perf_counter() - began, method.strength(epoch))
+                if not sound.any():
+                    return (
+                        Progress(state, (*done.rows, row), done.notes),
+                        _trouble(record, epoch),
+                        False,
+                    )
+                notes = None if callback is None else callback(epoch, record)
+                done = Progress(state, (*done.rows, row), _noted(done.notes, notes, epoch))
+                bar.set_description(refresh=False)
+                bar.set_postfix(
+                    cost=f"{np.nanmean(row['cost']):.3e}",
+                    force=f"{np.max(row['max_force']):.1e}",
+                    t1=int(np.sum(row["num_t1"])),
                 )
-            notes = None if callback is None else callback(epoch, record)
-            done = Progress(state, (*done.rows, row), _noted(done.notes, notes, epoch))
-            bar.set_description(refresh=False)
-            bar.set_postfix(
-                cost=f"{np.nanmean(row['cost']):.3e}",
-                force=f"{np.max(row['max_force']):.1e}",
-                t1=int(np.sum(row["num_t1"])),
-            )
-            bar.update()
-            keeper.note(done)
+                bar.update()
+                keeper.note(done)
     except KeyboardInterrupt:
         if not done.rows or not np.isfinite(done.state.best.facts.cost).any():
             raise
