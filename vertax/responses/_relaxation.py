@@ -24,7 +24,7 @@ from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._search import Search, SearchState, blocks_of, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
 from vertax.solvers._known_hessian import KnownHessian
-from vertax.solvers._long_waves import FEWEST_CELLS
+from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._optimistix import check_solver
 from vertax.solvers._patience import AtRest, Patient
 from vertax.transitions import T1, AbstractTransitions
@@ -171,7 +171,7 @@ class Relaxation(AbstractResponse):
 
     def hessian_at(self, tissue: Tissue, energy: AbstractEnergy | None) -> KnownHessian | None:
         # (What is large has waves, and too many numbers to square; other solvers have no use for it.)
-        if tissue.n_cells >= FEWEST_CELLS or not isinstance(self.solver, NewtonCG):
+        if tissue.n_cells >= LongWaves.min_cells or not isinstance(self.solver, NewtonCG):
             return None
         start = tissue.configuration
         if energy is None:
