@@ -18,6 +18,7 @@ from vertax._base.modules import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import check_energy
 from vertax.energies._units import Units, cell_size, units_of
 from vertax.mesh import Tissue
 from vertax.responses._external_gradient import Rest, at_rest, force_of
@@ -139,6 +140,8 @@ class External(AbstractResponse):
         - `RuntimeError` if what it returns is not at rest, or its cells overlap.
         - `ValueError` for another adjoint.
         """
+        if isinstance(energy, type):  # (A program may take parameters that are no function.)
+            check_energy(energy)
         adjoint = EquilibriumPropagation() if adjoint is None else adjoint
         self.goes_with(adjoint)
         assert isinstance(adjoint, EquilibriumPropagation)

@@ -53,6 +53,7 @@ def record_relaxation(
             f"{tissue.vertices.shape}. Record the members of a batch one by one."
         )
     response = (Relaxation() if response is None else response).traced()
+    response.check(tissue, energy, ImplicitDifferentiation())
     tissue, energy = traced((jax.tree.map(jnp.asarray, tissue), energy))
     trajectory = Trajectory()
 

@@ -17,6 +17,7 @@ from vertax._base.modules import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import check_energy
 from vertax.energies._units import Units, cell_size, units_of
 from vertax.mesh import Tissue
 from vertax.responses._contact import Contacts
@@ -131,11 +132,7 @@ class Relaxation(AbstractResponse):
         - `TypeError` for an energy that is no function, or an adjoint that is none.
         - `ValueError` for one that does not go with the solver, or a `jax.shard_map` that this does not.
         """
-        if not callable(energy):
-            raise TypeError(
-                "Argument `energy` must be one of vertax.energies, e.g. ShapeFactorEnergy(3.8), or a "
-                f"function, but is {named(energy)}."
-            )
+        check_energy(energy)
         known, size = self.known_hessian, sum(map(jnp.size, jax.tree.leaves(tissue.configuration)))
         if known is not None and known.inverse.shape != (size, size):
             raise ValueError(
