@@ -23,7 +23,7 @@ from vertax.energies._units import Units, cell_size, units_of
 from vertax.mesh import Tissue
 from vertax.responses._external_gradient import Rest, at_rest, force_of
 from vertax.responses._host import Answer, Job, Request, ask, stacked
-from vertax.responses._relaxation import free_motions
+from vertax.responses._relaxation import follow_start, free_motions
 from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
 
@@ -290,6 +290,8 @@ def _answered(
     configuration = at_rest(slots, rest, response, adjoint.without_outcome())
     whole = eqx.tree_at(lambda t: t.boundary, there, tissue.boundary)
     final = whole.with_configuration(configuration)
+    if known:
+        final = follow_start(final, tissue, free)
     force = optx.max_norm(force_of(there, constant)) if known else answer.max_force
     return Equilibrium(
         tissue=final,

@@ -225,8 +225,10 @@ def equilibrate(
 
     The relaxation and its T1 transitions find the final topology and positions; the gradient is that
     of the equilibrium in this topology, by the method that `adjoint` names. Works under `jax.jit`,
-    `jax.vmap` (over tissues of one size, and over parameters) and `jax.grad` with respect to the energy
-    and the boundary.
+    `jax.vmap` (over tissues of one size, and over parameters) and `jax.grad` with respect to the energy,
+    the boundary, pinned vertices and the start. (The equilibrium keeps the centroid of the start, and the
+    orientation of a free tissue, unless the energy or pins determine them. Otherwise it does not depend on
+    the start, if it is unique.)
 
     **Arguments:**
 
@@ -297,7 +299,7 @@ def conclude(
         adjoint=adjoint,
         throw=False,
     )
-    final = moved.with_configuration(solution.value)
+    final = follow_start(moved.with_configuration(solution.value), tissue, free)
     return Equilibrium(
         tissue=final,
         energy=energy(final),
@@ -307,6 +309,24 @@ def conclude(
         valid=~state.overlaps if state.contacts is not None else ~final.overlaps.any,
         result=search.result(state),
     )
+
+
+def follow_start(relaxed: Tissue, start: Tissue, free: Bool[Array, " modes"]) -> Tissue:
+    """The same tissue, whose place depends on that of `start` when differentiated.
+
+    A relaxation keeps what the energy does not determine: the centroid of the start, and the orientation of a
+    free tissue. The adjoint differentiates the shape in a fixed place. Here that place is differentiated, by
+    the formula that determines it, so that every adjoint has the derivative with respect to the start. Where
+    only some motions are free, their translations are followed.
+    """
+    settled = relaxed.settled(start).vertices
+    # (All but the derivative stays as it is, to the last bit.)
+    settled = settled + jax.lax.stop_gradient(relaxed.vertices - settled)
+    there = start.gathered(start.vertices)
+    moved = jnp.mean(there - jax.lax.stop_gradient(there), axis=0) * free[:2]
+    if start.pinned is not None:
+        moved = jnp.where(jnp.any(start.pinned), 0, moved)
+    return relaxed.with_vertices(jnp.where(jnp.all(free), settled, relaxed.vertices + moved))
 
 
 def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
