@@ -19,10 +19,10 @@ from _timing import first_and_best
 
 import vertax as vx
 import vertax.responses._search as search_module
-import vertax.solvers._long_waves as long_waves
+from vertax.solvers._long_waves import LongWaves
 
 jax.config.update("jax_enable_x64", True)
-FEWEST = long_waves.FEWEST_CELLS
+FEWEST = LongWaves.min_cells
 FEWEST_FOR_EDGES = search_module._FEWEST_CELLS
 TOLERANCE = 1e-8
 
@@ -39,7 +39,7 @@ def energy_of(kind: str, tissue: vx.Tissue, seed: int = 0) -> vx.AbstractEnergy:
 
 def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str:
     """What relaxations and a gradient take if tissues from this number of cells on are preconditioned."""
-    long_waves.FEWEST_CELLS = fewest
+    LongWaves.min_cells = fewest
     search_module._FEWEST_CELLS = max(fewest, FEWEST_FOR_EDGES)
     jax.clear_caches()
 

@@ -24,6 +24,7 @@ from helpers import (
 from jaxtyping import Array, Float
 
 import vertax as vx
+from vertax.adjoints._propagation import Resistance
 from vertax.costs import VertexDistance
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 
@@ -416,6 +417,58 @@ class TestOutcome:
             energy = ShapeFactorEnergy(np.full(CELLS, p0))
             outcome = evaluate(tissue, energy, cost, vx.ImplicitDifferentiation(), STILL).outcome
             assert outcome.negative_curvature == is_saddle
+
+
+@functools.cache
+def fluid():
+    """A tissue whose cells have all they want: areas and perimeters are those asked for in a flat valley."""
+    tissue, energy = relaxed(CELLS, 2, 4.1)
+    assert energy(tissue) < 1e-18
+    assert vx.mechanics.zero_modes(tissue, energy) > 2
+    return tissue, energy, start_and_cost()[2]
+
+
+class TestDegenerateEquilibrium:
+    """Along motions without stiffness an equilibrium is not unique, and neither is a cost of positions."""
+
+    @pytest.mark.parametrize("adjoint", [vx.ImplicitDifferentiation(), vx.EquilibriumPropagation()])
+    def test_gradient_of_a_cost_of_positions_is_rejected(self, adjoint):
+        for function in (evaluate, plain_gradient):
+            with pytest.raises(RuntimeError, match=r"equilibrium is not unique\..*zero_modes"):
+                jax.block_until_ready(function(*fluid(), adjoint, STILL))
+
+    @pytest.mark.parametrize(
+        "adjoint",
+        [
+            vx.ImplicitDifferentiation(throw=False),
+            pytest.param(vx.EquilibriumPropagation(throw=False), marks=pytest.mark.thorough),
+        ],
+    )
+    def test_outcome_reports_it(self, adjoint):
+        outcome = evaluate(*fluid(), adjoint, STILL).outcome
+        assert outcome.degenerate == 1
+        assert not outcome.trusted
+        outcome = evaluate(*start_and_cost(), adjoint, STILL).outcome
+        assert outcome.degenerate == 0
+        assert outcome.trusted
+
+    def test_gradient_of_a_cost_of_shapes_is_exact(self):
+        tissue, energy, _ = fluid()
+        found = evaluate(tissue, energy, TotalCubes(), vx.ImplicitDifferentiation(), STILL)
+        # Each perimeter is its target: the derivative of the sum of cubes is 3 p0².
+        expected = 3 * energy.target_shape_factor**2
+        np.testing.assert_allclose(found.gradient.target_shape_factor, expected, rtol=1e-6)
+        assert found.outcome.degenerate == 0
+
+
+@pytest.mark.parametrize(
+    ("power", "nonlinearity"), [(1, 0), (0, 1), (2, 0.5), (3, 0.75), (1.5, 1 - 0.5**0.5)]
+)
+def test_nonlinearity_of_a_power_law(power, nonlinearity):
+    force = lambda y: jnp.where(y == 0, 0, jnp.abs(y) ** power)
+    along = Resistance.along(force, jnp.zeros(1), jnp.full(1, 0.3))
+    assert along.nonlinearity == pytest.approx(nonlinearity, abs=1e-12)
+    assert Resistance.along(force, jnp.ones(1), jnp.ones(1)).nonlinearity == 0
 
 
 class Touching(vx.AbstractCost):

@@ -36,6 +36,7 @@ TAKE_BOTH = [
     lambda t, e: mechanics.modes(t, e, 2),
     lambda t, e: mechanics.complex_modulus(t, e, friction, jnp.array([1.0])),
     lambda t, e: mechanics.recoil(t, e, 1, friction),
+    lambda t, e: mechanics.velocities(t, e, friction),
     lambda t, e: mechanics.ramp(t, e, np.array([0.0, 0.1])),
     lambda t, e: BoxRelaxation()(t, e),
 ]
@@ -119,6 +120,11 @@ WRONG = {
         "`edge` must be at least 0",
     ),
     "slick": (lambda: mechanics.recoil(tissue, energy, 1, None), "must be a dissipation"),
+    "no friction": (lambda: mechanics.velocities(tissue, energy, 1.0), "must be a dissipation"),
+    "speed": (
+        lambda: mechanics.velocities(tissue, energy, friction, linear_solver=3),
+        "linear solver",
+    ),
     "stress": (lambda: BoxRelaxation(stress=np.nan), "`stress` must be finite"),
     "skewed": (lambda: BoxRelaxation(stress=skewed), "`stress` must be symmetric"),
     "relaxation": (lambda: BoxRelaxation(relaxation=None), "`relaxation` must be"),

@@ -1,6 +1,7 @@
 """Imports point downward, and experiments use what users can use."""
 
 import ast
+import importlib.util
 from pathlib import Path
 
 import pytest
@@ -30,24 +31,59 @@ LAYERS = [
     "experiments",
 ]
 # An experiment sees what a user sees: these packages by their public names.
+FIGURES = "vertax.experiments.tissue_moduli.figures"
 PUBLIC = {"vertax", *(f"vertax.{name}" for name in LAYERS if name != "_base")}
 
 
-def imports(path: Path) -> list[str]:
-    """The modules of vertax that a file imports from, at the top or in a function."""
-    found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def module_name(path: Path) -> str:
+    """The absolute name of the module in a file, e.g. `vertax.mesh._tissue`."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(["vertax", *(part for part in parts if part != "__init__")])
+
+
+MODULES = {module_name(path) for path in ROOT.rglob("*.py")}
+
+
+def imports(path: Path, source: str | None = None) -> list[str]:
+    """The absolute names of the vertax modules that a file imports, at the top or in a function.
+
+    `source` replaces the text of the file.
+    """
+    text = path.read_text(encoding="utf-8") if source is None else source
+    # `from .` in a module is its package; in an `__init__.py` it is the package itself.
+    package = module_name(path if path.name == "__init__.py" else path.parent / "__init__.py")
+    names = []
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found.append(node.module)
-            if node.module == "vertax":
-                found += [f"vertax.{alias.name}" for alias in node.names if alias.name in LAYERS]
-    return [name for name in found if name.split(".")[0] == "vertax"]
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            module = node.module or ""
+            if node.level:
+                module = importlib.util.resolve_name("." * node.level + module, package)
+            names.append(module)
+            submodules = [f"{module}.{alias.name}" for alias in node.names]
+            names += [name for name in submodules if name in MODULES]
+    return [name for name in names if name.split(".")[0] == "vertax"]
 
 
 def modules(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
+
+
+@pytest.mark.parametrize(
+    ("statement", "expected"),
+    [
+        ("from . import figures", ["vertax.experiments.tissue_moduli", FIGURES]),
+        ("from .figures import moduli", [FIGURES]),
+        ("from ...mesh import _tissue", ["vertax.mesh", "vertax.mesh._tissue"]),
+        ("from vertax.mesh import _tissue", ["vertax.mesh", "vertax.mesh._tissue"]),
+        ("from vertax import mesh, Tissue", ["vertax", "vertax.mesh"]),
+        ("import numpy, vertax.mesh", ["vertax.mesh"]),
+    ],
+)
+def test_imports_are_resolved_to_absolute_names(statement, expected):
+    path = ROOT / "experiments" / "tissue_moduli" / "experiment.py"
+    assert imports(path, statement) == expected
 
 
 def test_every_package_has_its_layer():
@@ -70,8 +106,7 @@ def test_imports_point_downward(package):
 
 def test_no_circles_within_a_package():
     files = {path: set(imports(path)) for path in ROOT.rglob("*.py") if path.name != "__init__.py"}
-    name_of = lambda path: ".".join(["vertax", *path.relative_to(ROOT).with_suffix("").parts])
-    below = {name_of(path): names for path, names in files.items()}
+    below = {module_name(path): names for path, names in files.items()}
     while below:
         leaves = [name for name, names in below.items() if not names & (below.keys() - {name})]
         assert leaves, f"these import each other: {sorted(below)}"

@@ -13,6 +13,7 @@ import vertax as vx
 from vertax.activities import SelfPropulsion, ThermalNoise
 from vertax.dissipations import SubstrateFriction
 from vertax.energies import ShapeFactorEnergy
+from vertax.responses._long_run import _check_times
 
 FRICTION = SubstrateFriction(1.0)
 ENERGY = ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
@@ -105,6 +106,23 @@ def test_without_noise_and_with_a_control_of_steps(tmp_path):
     at_once, by_frames = run(), run(checkpoint=tmp_path / "run.npz", progress=True)
     np.testing.assert_array_equal(at_once.steps > 0, by_frames.steps > 0)
     np.testing.assert_allclose(at_once.tissue.vertices, by_frames.tissue.vertices, atol=1e-9)
+
+
+def test_times_equal_up_to_rounding_continue(tmp_path):
+    file = tmp_path / "run.npz"
+    run = lambda times: vx.evolve(
+        random_tissue(9, 0), ENERGY, FRICTION, times, relaxation=STILL, checkpoint=file
+    )
+    computed = np.arange(4) * 0.1
+    written = [0, 0.1, 0.2, 0.3, 0.4]
+    assert computed[3] != written[3]
+    run(computed)
+    assert run(written).times.shape == (5,)
+    with pytest.raises(ValueError, match=r"frame 3 differs first: 0.30000000000000004 there, 0.31"):
+        run([0, 0.1, 0.2, 0.31, 0.4])
+    _check_times(np.asarray(computed, np.float32), np.asarray(written, np.float32))
+    with pytest.raises(ValueError, match="frame 1 differs first"):
+        _check_times(np.asarray([0, 1e-3, 2e-3]), np.asarray([0, 1e-3 + 1e-11, 2e-3]))
 
 
 class TestBadInput:

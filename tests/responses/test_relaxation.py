@@ -246,9 +246,13 @@ def test_no_convergence_is_an_error_by_default_and_a_result_otherwise():
     tissue, energy = random_tissue(12, 0), ShapeFactorEnergy(jnp.full(12, 3.7))
     with pytest.raises(Exception, match="no equilibrium in 2 steps"):
         vx.equilibrate(tissue, energy, max_steps=2)
-    few = dataclasses.replace(STILL, max_steps=2)
+    # (Without contacts two steps from the random tissue make cells overlap, which has another message.)
+    few, lattice = (
+        dataclasses.replace(STILL, max_steps=2, tolerance=1e-30),
+        vx.initialise.hexagonal(3, 4),
+    )
     with pytest.raises(Exception, match="reached no equilibrium"):
-        jax.jit(lambda t: few(t, energy).energy)(tissue).block_until_ready()
+        jax.jit(lambda t: few(t, energy).energy)(lattice).block_until_ready()
     found = vx.equilibrate(tissue, energy, max_steps=2, throw=False)
     assert not found.converged
     assert found.num_steps == 2
@@ -262,8 +266,43 @@ def test_a_parameter_that_is_not_a_number_is_reported():
     found = vx.equilibrate(random_tissue(12, 0), energy, throw=False)
     assert found.result == optx.RESULTS.nonfinite
     assert found.num_steps == 0
-    with pytest.raises(RuntimeError, match="broke down: its forces are not finite"):
+    message = "broke down: its forces are not finite. The parameters of the energy must be finite"
+    with pytest.raises(RuntimeError, match=message):
         vx.equilibrate(random_tissue(12, 0), energy)
+    tissue = random_tissue(12, 0)
+    relax = eqx.filter_jit(lambda p: STILL(tissue, ShapeFactorEnergy(p)).energy)
+    with pytest.raises(RuntimeError, match=message):
+        relax(jnp.full(12, jnp.nan)).block_until_ready()
+
+
+def equilibrium(**outcome):
+    """An equilibrium of no relaxation, with a given outcome."""
+    converged = vx.Equilibrium(
+        tissue=random_tissue(5),
+        energy=jnp.array(1.0),
+        max_force=jnp.array(0.0),
+        num_steps=jnp.array(3),
+        num_t1=jnp.array(0),
+        valid=jnp.array(True),
+        result=optx.RESULTS.successful,
+    )
+    return dataclasses.replace(converged, **outcome)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "message"),
+    [
+        ({"result": optx.RESULTS.nonlinear_max_steps_reached}, "reached no equilibrium"),
+        ({"valid": jnp.array(False)}, "Cells of the relaxed tissue overlap"),
+        ({"max_force": jnp.array(jnp.nan), "result": optx.RESULTS.nonfinite}, "must be finite"),
+    ],
+)
+def test_messages_in_compiled_programs_name_the_cause(outcome, message):
+    failed = equilibrium(**outcome)
+    with pytest.raises(RuntimeError, match=message):
+        failed.checked()
+    with pytest.raises(RuntimeError, match=message):
+        jax.block_until_ready(eqx.filter_jit(lambda e: e.checked().energy)(failed))
 
 
 class _Blind(vx.AbstractEnergy):

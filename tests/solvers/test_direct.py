@@ -27,6 +27,22 @@ def test_a_singular_indefinite_matrix():
     np.testing.assert_allclose(found, jnp.linalg.pinv(matrix) @ many, atol=2e-6)
 
 
+def test_derivative_of_a_singular_system_whose_null_space_is_fixed():
+    basis = jnp.linalg.qr(jax.random.normal(jax.random.key(0), (8, 8)))[0]
+    values = jnp.array([-2.0, -0.1, 0.0, 0.0, 0.3, 1.0, 5.0, 20.0])
+    growth, c = jnp.arange(8) / 8, jax.random.normal(jax.random.key(1), (8,))
+
+    @eqx.filter_jit
+    def solve(t):
+        matrix = (basis * values * (1 + t * growth)) @ basis.T
+        operator = lx.MatrixLinearOperator(matrix, lx.symmetric_tag)
+        return lx.linear_solve(operator, (basis * values) @ basis.T @ c, Direct()).value
+
+    moving = values != 0
+    exact = -(basis * moving * growth) @ basis.T @ c
+    np.testing.assert_allclose(jax.jacfwd(solve)(0.0), exact, atol=2e-6)
+
+
 def test_what_has_no_solution_is_told():
     operator = lx.MatrixLinearOperator(jnp.diag(jnp.array([1.0, 0.0])), lx.symmetric_tag)
     told = lx.linear_solve(operator, jnp.ones(2), Direct(), throw=False)

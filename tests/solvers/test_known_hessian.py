@@ -14,7 +14,7 @@ import vertax as vx
 from vertax.costs import VertexDistance
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 from vertax.solvers._known_hessian import KnownHessian
-from vertax.solvers._long_waves import FEWEST_CELLS
+from vertax.solvers._long_waves import LongWaves
 
 N_CELLS = 16
 START = random_tissue(N_CELLS)
@@ -84,7 +84,7 @@ def test_nothing_is_known_of_what_is_no_number(at_rest):
 
 
 def test_large_tissues_and_other_responses_have_none():
-    large = random_tissue(FEWEST_CELLS)
+    large = random_tissue(LongWaves.min_cells)
     assert RELAXATION.hessian_at(large, None) is None
     evolution = vx.Evolution(vx.dissipations.SubstrateFriction(1.0), [0.0, 1.0])
     assert evolution.hessian_at(START, None) is None

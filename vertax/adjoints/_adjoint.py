@@ -44,6 +44,10 @@ class GradientOutcome(eqx.Module):
     if the method cannot tell."""
     failed: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
     """1 if the gradient cannot be trusted, otherwise 0."""
+    degenerate: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
+    """1 if the equilibrium is not unique along motions that the cost depends on, so that there is no
+    gradient, or if these motions are too soft for the nudge of equilibrium propagation; NaN if the method
+    cannot tell."""
 
     @property
     def trusted(self) -> Bool[Array, "*batch"]:
@@ -81,6 +85,17 @@ class AbstractAdjoint(optx.AbstractAdjoint):
         return eqx.tree_at(lambda a: a.outcome, self, outcome, is_leaf=lambda x: x is None)
 
 
+UNTRUSTED = 0.01
+"""The largest relative residual of a gradient that counts as solved: of the linear system, or of the force of
+a nudged tissue."""
+
+DEGENERATE = (
+    "the equilibrium is not unique. Along some motions (vertax.mechanics.zero_modes counts them) the tissue "
+    "has no stiffness, and the cost depends on them. Use a cost of areas, perimeters or other shapes that "
+    "these motions keep, pin vertices, or add a little stiffness"
+)
+
+
 def frozen(tree: PyTree) -> PyTree:
     """The same values, taken for constants by differentiation."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
@@ -91,11 +106,15 @@ def settle(
     outcome: GradientOutcome,
     throw: bool,
     like: GradientOutcome | None,
-    reason: str,
+    reasons: tuple[str, str],
 ) -> tuple[PyTree, GradientOutcome | None]:
-    """Refuse a gradient that cannot be trusted, and shape the outcome as the slot it goes to."""
+    """Raise an error for a gradient that cannot be trusted, and shape the outcome as the slot it goes to.
+
+    The second of the reasons is that of a degenerate equilibrium.
+    """
     if throw:
-        gradient = eqx.error_if(gradient, ~outcome.trusted, reason)
+        number = jnp.where(outcome.degenerate == 1, 1, 0)
+        gradient = eqx.branched_error_if(gradient, ~outcome.trusted, number, reasons)
     if like is None:
         return gradient, None
     return gradient, jax.tree.map(lambda x, slot: jnp.asarray(x, slot.dtype), outcome, like)

@@ -134,6 +134,7 @@ class AutomaticDifferentiation(AbstractAdjoint):
             jnp.asarray(state.num_steps, left.dtype),
             jnp.nan,
             jnp.asarray(~(left <= rtol * initial), left.dtype),
+            jnp.nan,
         )
 
 
@@ -199,7 +200,7 @@ def _(
     *_, slot = vjp_arg
     pull, outcome = residuals
     (gradient,) = pull(materialise(cotangent, root))
-    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
+    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, (_REASON, _REASON))
     return d_fn, d_args, outcome
 
 

@@ -10,11 +10,14 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from vertax._base.optimistix import Minimisation
 from vertax.adjoints._adjoint import (
+    DEGENERATE,
+    UNTRUSTED,
     AbstractAdjoint,
     GradientOutcome,
     frozen,
@@ -45,7 +48,14 @@ class ImplicitDifferentiation(AbstractAdjoint):
         comparison with the paper; time and memory grow with the number of parameters.
     - `linear_solver`: solves the systems with the Hessian, which is symmetric and may be indefinite.
     - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is not
-        trusted if the linear solver reports failure.
+        trusted if the linear solver reports failure, or if the system $H \lambda = b$ is degenerate: it has
+        only a least-squares solution, with a residual above 1 %; the residual grew above $\|b\|$; or the
+        effective stiffness $\|b\| / \|\lambda\|$ is below
+        $\max(\sqrt{\epsilon}\,k, 10\, f / \ell)$ with the mean stiffness $k$, the size of a cell $\ell$,
+        and the largest force $f$ that counts as equilibrium. (In units of $k$ that is 1.5e-8 in float64;
+        with less, $\lambda$ has no correct digit, or the position is not known to within $\ell / 10$.) The
+        systems of forward and of `"sensitivity"` mode do not hold the cost. There the result is the response
+        of least length, and degenerate if a parameter pushes along motions without stiffness.
 
     **Raises:**
 
@@ -82,7 +92,9 @@ class ImplicitDifferentiation(AbstractAdjoint):
             parts = (known[name] for name in ("edge_blocks", "collective", "stiffness"))
             solver = ElasticMINRES(self.linear_solver, *parts)
             adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
-        system = _System(adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag})
+        system = _System(
+            adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag}, _least_stiffness(known, root)
+        )
         if self.outcome is None:
             return _follow(inputs, root, system), residual
         return _follow_and_report((inputs, self.outcome), root, system), residual
@@ -95,6 +107,7 @@ class _System(eqx.Module):
     rewrite_fn: Callable = eqx.field(static=True)
     residual: PyTree
     tags: frozenset[object] = eqx.field(static=True)
+    least_stiffness: Array
 
     def force(self, root: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
         return self.rewrite_fn(root, self.residual, inputs)
@@ -103,16 +116,9 @@ class _System(eqx.Module):
         self, root: PyTree[Array], inputs: PyTree, rhs: PyTree[Array], *, strict: bool = False
     ) -> tuple[PyTree[Array], GradientOutcome]:
         operator = lx.JacobianLinearOperator(self.force, root, inputs, tags=self.tags)
-        solver = self.adjoint.linear_solver
-        solution = lx.linear_solve(operator, rhs, solver, throw=strict)
-        known = lambda name: jnp.asarray(solution.stats.get(name, jnp.nan), float)
-        outcome = GradientOutcome(
-            known("residual_norm"),
-            known("num_steps"),
-            known("negative_curvature"),
-            jnp.asarray(solution.result != lx.RESULTS.successful, float),
-        )
-        return solution.value, outcome
+        solver = _Judged(self.adjoint.linear_solver, self.least_stiffness, strict)
+        solution = lx.linear_solve(operator, rhs, solver, throw=False)
+        return solution.value, solution.stats["outcome"]
 
     def tangent(
         self, root: PyTree[Array], inputs: PyTree, t_inputs: PyTree, *, strict: bool = False
@@ -139,10 +145,16 @@ class _System(eqx.Module):
         return jax.vmap(one)(jnp.eye(flat.size, dtype=flat.dtype))
 
 
-class _Lenient(lx.AbstractLinearSolver):
-    """A linear solver that calls everything a success."""
+class _Judged(lx.AbstractLinearSolver):
+    """A linear solver that returns a `GradientOutcome` in its statistics, and always reports success.
+
+    If `strict`, it raises an error for an outcome that cannot be trusted. (Lineax raises its own errors in
+    transposed solves, whatever `throw` is, and does not know what a failure means for an equilibrium.)
+    """
 
     solver: lx.AbstractLinearSolver
+    least_stiffness: Array
+    strict: bool = eqx.field(static=True)
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
         return self.solver.init(operator, options)
@@ -150,8 +162,28 @@ class _Lenient(lx.AbstractLinearSolver):
     def compute(
         self, state: Any, vector: PyTree[Array], options: dict[str, Any]
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        solution, _, stats = self.solver.compute(state, vector, options)
-        return solution, lx.RESULTS.successful, stats
+        solution, result, stats = self.solver.compute(state, vector, options)
+        known = lambda name: jnp.asarray(stats.get(name, jnp.nan), float)
+        residual, failed = known("residual_norm"), result != lx.RESULTS.successful
+        rhs, response = optx.two_norm(vector), optx.two_norm(solution)
+        soft = (rhs > 0) & (rhs < self.least_stiffness * response)
+        # MINRES lowers the residual in each step. It ends above that of 0, or far from a solution, only where
+        # rounding errors along null vectors grow without bound.
+        far = (residual > 1) | ((known("stagnated") == 1) & (residual > UNTRUSTED))
+        diverged = failed & (far | (result == lx.RESULTS.singular))
+        degenerate = soft | diverged | ((known("inconsistent") == 1) & (residual > UNTRUSTED))
+        outcome = GradientOutcome(
+            residual,
+            known("num_steps"),
+            known("negative_curvature"),
+            failed | degenerate,
+            degenerate,
+        )
+        outcome = jax.tree.map(lambda x: x.astype(float), outcome)
+        if self.strict:
+            number = jnp.where(degenerate, 1, 0)
+            solution = eqx.branched_error_if(solution, ~outcome.trusted, number, _REASONS)
+        return solution, lx.RESULTS.successful, stats | {"outcome": outcome}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return self.solver.transpose(state, options)
@@ -161,6 +193,16 @@ class _Lenient(lx.AbstractLinearSolver):
 
     def assume_full_rank(self) -> bool:
         return self.solver.assume_full_rank()
+
+
+def _least_stiffness(options: dict[str, Any], root: PyTree[Array]) -> Array:
+    """The effective stiffness below which a system counts as degenerate, see the class; 0 if unknown."""
+    dtype = jnp.result_type(*jax.tree.leaves(root))
+    if not {"stiffness", "length_scale", "tolerance"} <= options.keys():
+        return jnp.zeros((), dtype)
+    rounding = jnp.finfo(dtype).eps ** 0.5 * options["stiffness"]
+    uncertain = 10 * options["tolerance"] / options["length_scale"]
+    return jnp.asarray(jnp.maximum(rounding, uncertain), dtype)
 
 
 def _split(inputs: PyTree, t_inputs: PyTree) -> tuple[PyTree, PyTree]:
@@ -185,10 +227,6 @@ def _(primals: tuple, tangents: tuple) -> tuple[PyTree[Array], PyTree[Array]]:
     # The root itself depends on the inputs, which matters for second derivatives.
     root = _follow(*primals)
     strict = system.adjoint.throw
-    if not strict:
-        # Lineax raises errors of transposed solves whatever it is told.
-        solver = _Lenient(system.adjoint.linear_solver)
-        system = eqx.tree_at(lambda s: s.adjoint.linear_solver, system, solver)
     if system.adjoint.mode == "adjoint":
         t_root, _ = system.tangent(root, inputs, t_inputs, strict=strict)
     else:
@@ -231,11 +269,14 @@ def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, root: Any, 
             jnp.max(outcomes.num_steps),
             jnp.max(outcomes.negative_curvature),
             jnp.max(outcomes.failed),
+            jnp.max(outcomes.degenerate),
         )
-    return settle(gradient, outcome, system.adjoint.throw, slot, _REASON)
+    return settle(gradient, outcome, system.adjoint.throw, slot, _REASONS)
 
 
-_REASON = (
+_REASONS = (
     "The gradient through the equilibrium cannot be trusted: the linear solve with the Hessian failed. "
-    "Relax to a smaller tolerance, or allow it with ImplicitDifferentiation(throw=False)."
+    "Relax to a smaller tolerance, or allow it with ImplicitDifferentiation(throw=False).",
+    f"The gradient through the equilibrium cannot be trusted: {DEGENERATE}. "
+    "ImplicitDifferentiation(throw=False) allows it.",
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +15,8 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax._base.optimistix import Minimisation, steps_of
 from vertax.adjoints._adjoint import (
+    DEGENERATE,
+    UNTRUSTED,
     AbstractAdjoint,
     GradientOutcome,
     differentiable,
@@ -51,7 +53,13 @@ class EquilibriumPropagation(AbstractAdjoint):
     - `rtol`: tolerance of the nudged relaxations relative to the nudging force; they are never
         coarser than the first relaxation. By default 1e-6 in float64 and 1e-3 in float32.
     - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is not
-        trusted if a nudged relaxation ended with a force above 1 % of the nudging one.
+        trusted if a nudged relaxation ended with a force above 1 % of the nudging one, or if the response
+        to a linear nudge is not linear. Let $g(u)$ be $\nabla_X E$ after the fraction $u$ of the
+        displacement $D$ of a nudged tissue. In linear response
+        $(g(\tfrac12) - g(0)) \cdot D = \tfrac12 (g(1) - g(0)) \cdot D$; of a force that grows as $u^p$
+        the ratio of the two products is $2^{-p}$. The response counts as linear if the ratio lies between
+        1/4 and 3/4, $0.4 < p < 2$. Along motions without stiffness it does not: either nothing resists
+        ($p = 0$), or only terms of higher order do ($p \ge 2$).
 
     **Raises:**
 
@@ -157,34 +165,70 @@ def _(
 
         return jax.grad(energy)(moving)
 
-    def phase(
-        force: PyTree[Array], strength: Float[Array, ""]
-    ) -> tuple[PyTree[Array], Array, Array]:
+    def phase(force: PyTree[Array], strength: Float[Array, ""]) -> Phase:
         nudged = _Nudged(fn, force)
         tolerance = jnp.minimum(coarsest, adjoint.tolerance(strength))
         y, residual = nudge.but(
             fn=nudged, options=options | {"tolerance": tolerance}
         ).run_as_constant()
-        left = optx.max_norm(jax.grad(lambda y: nudged(y, args)[0])(y))
-        return slope(y), left, steps_of(residual)
+        along = Resistance.along(jax.grad(lambda y: fn(y, args)[0]), root, y)
+        left = optx.max_norm(jax.tree.map(jnp.add, along.force, force))
+        return Phase(slope(y), left, steps_of(residual), along.nonlinearity)
 
     cotangent = materialise(cotangent, root)
     at_rest = None if adjoint.centred else slope(root)
     gradient, outcome = two_phases(adjoint, cotangent, options, phase, at_rest)
-    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
+    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASONS)
     return d_fn, d_args, outcome
 
 
-Phase: TypeAlias = Callable[
-    [PyTree[Array], Float[Array, ""]], tuple[PyTree[Array], Float[Array, ""], Array]
-]
+class Phase(NamedTuple):
+    """A relaxation under a nudge."""
+
+    slope: PyTree[Array]
+    """The partial derivative of the energy with respect to the parameters at the nudged equilibrium."""
+    left: Float[Array, ""]
+    """The largest force there."""
+    num_steps: Array
+    """Steps of the relaxation."""
+    nonlinearity: Float[Array, ""]
+    """See `Resistance`; NaN if it is not known."""
+
+
+class Resistance(NamedTuple):
+    r"""The force that resists a displacement $D$, and how far it is from linear.
+
+    The nonlinearity is $\lvert 2\,(g(\tfrac12) - g(0)) \cdot D / (g(1) - g(0)) \cdot D - 1 \rvert$ with the
+    gradient $g$ of the energy after a fraction of the displacement: 0 of a quadratic energy, 1 if nothing
+    resists half of the displacement, $\lvert 2^{1 - p} - 1 \rvert$ if the force grows with the power $p$ of
+    the displacement.
+    """
+
+    force: PyTree[Array]
+    nonlinearity: Float[Array, ""]
+
+    @classmethod
+    def along(
+        cls, gradient: Callable[[PyTree[Array]], PyTree[Array]], start: PyTree, end: PyTree
+    ) -> Resistance:
+        """From the gradients at both ends of a displacement and in its middle."""
+        displacement = jax.tree.map(jnp.subtract, end, start)
+        points = jax.tree.map(
+            lambda a, d, b: jnp.stack([a, a + d / 2, b]), start, displacement, end
+        )
+        # (As a loop, so that the gradient is compiled once.)
+        gradients = jax.lax.map(gradient, points)
+        middle, whole = (jax.tree.map(lambda g, i=i: g[i] - g[0], gradients) for i in (1, 2))
+        half, work = (jnp.asarray(optax.tree.vdot(g, displacement)) for g in (middle, whole))
+        nonlinearity = jnp.abs(2 * half - work) / jnp.where(work == 0, 1, jnp.abs(work))
+        return cls(jax.tree.map(lambda g: g[2], gradients), nonlinearity)
 
 
 def two_phases(
     adjoint: EquilibriumPropagation,
     cotangent: PyTree[Array],
     options: dict[str, Any],
-    phase: Phase,
+    phase: Callable[[PyTree[Array], Float[Array, ""]], Phase],
     at_rest: PyTree[Array] | None,
 ) -> tuple[PyTree[Array], GradientOutcome]:
     """The gradient from relaxations under weak forces, whoever does them, and how it came about.
@@ -194,9 +238,8 @@ def two_phases(
     - `adjoint`: how strong, and with which signs.
     - `cotangent`: derivative of the cost with respect to the configuration.
     - `options`: the typical sizes `stiffness` and `length_scale`.
-    - `phase`: of a term linear in the configuration that is added to the energy, and its largest entry: the
-        partial derivative of the energy with respect to the parameters where the nudged system comes to
-        rest, the largest force there, and the steps it took.
+    - `phase`: a function of a term linear in the configuration that is added to the energy, and of its
+        largest entry, that relaxes the nudged system.
     - `at_rest`: that derivative without a nudge, for a difference that is one-sided.
 
     **Returns:** the gradient, shaped as the derivatives; and its outcome.
@@ -207,13 +250,17 @@ def two_phases(
     # One phase is a batch of the two signs. A one-sided difference needs no second relaxation.
     signs = jnp.asarray([s for s in adjoint.signs if s != 0], size.dtype)
     nudged = lambda sign: phase(optax.tree.scale(sign * strength, direction), strength)
-    slopes, left, num_steps = jax.vmap(nudged)(signs)
+    phases = jax.vmap(nudged)(signs)
+    slopes = phases.slope
     if adjoint.centred:
         difference = jax.tree.map(lambda s: (s[0] - s[1]) / 2, slopes)
     else:
         difference = jax.tree.map(lambda s, at_rest: s[0] - at_rest, slopes, at_rest)
     gradient = jax.tree.map(lambda d: size / strength * d, difference)
-    return gradient, _outcome(jnp.max(left) / strength, jnp.sum(num_steps))
+    # (Without a nudge there is no displacement but that of rounding.)
+    nonlinearity = jnp.where(size > 0, jnp.max(phases.nonlinearity), 0)
+    residual = jnp.max(phases.left) / strength
+    return gradient, _outcome(residual, jnp.sum(phases.num_steps), nonlinearity)
 
 
 class AbstractNudging(eqx.Module):
@@ -293,17 +340,34 @@ def _(
     slopes, left, num_steps = jax.vmap(phase)(signs)
     beta = half_beta * (signs[0] - signs[1])
     gradient = jax.tree.map(lambda s: cotangent * (s[0] - s[1]) / beta, slopes)
-    outcome = _outcome(jnp.max(left) / force, jnp.sum(num_steps))
-    return settle(gradient, outcome, adjoint.throw, slot, _REASON)
+    # (A nudge by the cost may be strong, and flip edges: its response need not be linear.)
+    outcome = _outcome(jnp.max(left) / force, jnp.sum(num_steps), jnp.full_like(force, jnp.nan))
+    return settle(gradient, outcome, adjoint.throw, slot, _REASONS)
 
 
-def _outcome(residual: Float[Array, ""], num_steps: Array) -> GradientOutcome:
-    return GradientOutcome(residual, num_steps, jnp.nan, ~(residual < _UNTRUSTED))
+def _outcome(
+    residual: Float[Array, ""], num_steps: Array, nonlinearity: Float[Array, ""]
+) -> GradientOutcome:
+    degenerate = nonlinearity >= _NONLINEAR
+    failed = ~(residual < UNTRUSTED) | degenerate
+    known = jnp.where(jnp.isnan(nonlinearity), jnp.nan, degenerate)
+    return GradientOutcome(residual, num_steps, jnp.nan, failed, known)
 
 
-_UNTRUSTED = 0.01
-_REASON = (
+# For a force h x + c x² / 2 the nonlinearity is η = ε / 4 with ε = c f / h² under a nudge f. Expanding x in f
+# gives the relative error of the gradient: ε / 2 = 2 η for one nudge, ε² / 2 = 8 η² for two opposite ones. At
+# η = 1/2, which is also that of a force of second order alone, both are as large as the gradient or larger.
+_NONLINEAR = 0.5
+NOT_LINEAR = (
+    "The gradient by equilibrium propagation cannot be trusted: a small nudge moved the tissue so far that "
+    f"its response is not linear. As a rule {DEGENERATE}. (For a cost of shapes use "
+    "ImplicitDifferentiation: a nudged tissue also moves along motions that change them in second order "
+    "only.) Otherwise the nudge is too strong: take a smaller `beta`. "
+    "EquilibriumPropagation(throw=False) allows it."
+)
+_REASONS = (
     "The gradient by equilibrium propagation cannot be trusted: a nudged relaxation did not come to "
     "rest. Raise `max_steps`, use the default solver or a larger `beta`, or allow it with "
-    "EquilibriumPropagation(throw=False)."
+    "EquilibriumPropagation(throw=False).",
+    NOT_LINEAR,
 )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import abc
-from typing import TypeAlias
+import inspect
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._base.checks import as_real
+from vertax._base.checks import as_real, named
 from vertax.mesh import Tissue
 
 
@@ -41,6 +42,8 @@ class AbstractEnergy(eqx.Module):
 
     def __add__(self, other: AbstractEnergy) -> AbstractEnergy:
         """The sum of two energies."""
+        if isinstance(other, type):
+            check_energy(other, "other")
         if not isinstance(other, AbstractEnergy):
             return NotImplemented
         terms = (*_terms(self), *_terms(other))
@@ -100,6 +103,38 @@ class LocalSum(AbstractLocalEnergy):
         """Energy of each edge."""
         zero = jnp.zeros((), tissue.vertices.dtype)
         return sum((term.edge_terms(tissue) for term in self.terms), zero)
+
+
+def check_energy(energy: Any, name: str = "energy") -> None:
+    """Raise an error unless an argument is an energy, or another function of a tissue.
+
+    **Arguments:**
+
+    - `energy`: the argument.
+    - `name`: its name in the message.
+
+    **Raises:**
+
+    - `TypeError` for an object that cannot be called, or a class of energies in place of an instance.
+    """
+    if callable(energy) and not isinstance(energy, type):
+        return
+    raise TypeError(
+        f"Argument `{name}` must be an energy, e.g. vertax.energies.ShapeFactorEnergy(3.8), but is "
+        f"{named(energy)}.{instance_hint(energy)}"
+    )
+
+
+def instance_hint(value: Any) -> str:
+    """How to make an instance of a class that was passed in its place; empty for other values."""
+    if not isinstance(value, type):
+        return ""
+    try:
+        parameters = inspect.signature(value).parameters.values()
+    except (TypeError, ValueError):  # a class of C code without a signature
+        return f" Pass an instance, {value.__name__}(...)."
+    required = [p.name for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
+    return f" Pass an instance, {value.__name__}({', '.join(required)})."
 
 
 def _terms(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:

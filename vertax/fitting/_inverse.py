@@ -13,6 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from vertax._base.announce import announced_jit
+from vertax._base.checks import named
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.modules import traced
 from vertax.adjoints import (
@@ -25,6 +26,7 @@ from vertax.adjoints._adjoint import frozen
 from vertax.adjoints._propagation import AbstractNudging, cost_by_nudging
 from vertax.costs import AbstractCost
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import check_energy, instance_hint
 from vertax.energies._units import mean_stiffness, units_of
 from vertax.mesh import Tissue
 from vertax.responses import AbstractResponse, Equilibrium, Evolved, Relaxation
@@ -72,7 +74,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
 
     **Raises:**
 
-    - `TypeError` for a response or a cost that is none.
+    - `TypeError` for a tissue, an energy, a cost, a response or an adjoint of another type.
     - `ValueError` for an adjoint, guidance or a fitted position that do not go with the response, or a cost
         of frames without an evolution.
     """
@@ -87,11 +89,24 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     guidance: float | Float[Array, ""] | None = None
 
     def __check_init__(self):
-        if not isinstance(self.response, AbstractResponse):
-            raise TypeError(
-                f"Argument `response` must be a response such as vertax.Relaxation(), but is "
-                f"{self.response!r}."
-            )
+        for name, kind, example in (
+            ("tissue", Tissue, "a vertax.Tissue"),
+            ("cost", AbstractCost, "a cost, e.g. vertax.costs.VertexDistance(target)"),
+            ("response", AbstractResponse, "a response, e.g. vertax.Relaxation()"),
+            ("adjoint", AbstractAdjoint, "an adjoint, e.g. vertax.ImplicitDifferentiation()"),
+        ):
+            value: Any = getattr(self, name)
+            if not isinstance(value, kind):
+                remedy = instance_hint(value)
+                if name == "cost" and not remedy and callable(value):
+                    remedy = (
+                        " Make a function of tissue and energy the method `__call__` of a subclass of "
+                        "vertax.AbstractCost."
+                    )
+                raise TypeError(
+                    f"Argument `{name}` must be {example}, but is {named(value)}.{remedy}"
+                )
+        check_energy(self.energy)
         self.response.goes_with(
             self.adjoint, guided=self.guidance is not None, placed=self.fit_position
         )

@@ -168,10 +168,13 @@ def grow(
     ):
         if not isinstance(value, kind):
             raise TypeError(f"Argument `{name}` is of a wrong kind: {named(value)}.")
-    if isinstance(energy, AbstractEnergy) or not callable(energy):
+    wrong = isinstance(energy, AbstractEnergy) or not callable(energy)
+    if wrong or (isinstance(energy, type) and issubclass(energy, AbstractEnergy)):
+        name = energy.__name__ if isinstance(energy, type) else "energy"
         raise TypeError(
             "Argument `energy` must be a function of what cells know of themselves that returns an energy, "
-            f"but is {named(energy)}."
+            f"but is {named(energy)}. Pass such a function, e.g. lambda cells: {name}"
+            f"{'(...)' if isinstance(energy, type) else ''}."
         )
     if not tissue.topology.spare:
         raise ValueError(

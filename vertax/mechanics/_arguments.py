@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from vertax._base.checks import as_real, named
 from vertax._base.modules import is_concrete
 from vertax.dissipations import AbstractDissipation
+from vertax.energies._energy import check_energy
 from vertax.mesh import Periodic, Tissue
 from vertax.responses import Relaxation
 
@@ -31,11 +32,7 @@ def check_system(tissue: Any, energy: Any, *, box: str | None = None) -> None:
     - `ValueError` for a batch of tissues, or a free tissue where a box is needed.
     """
     check_tissue(tissue, box=box)
-    if not callable(energy) or isinstance(energy, type):
-        raise TypeError(
-            f"Argument `energy` must be an energy, e.g. vertax.energies.ShapeFactorEnergy(3.7), but is "
-            f"{named(energy)}."
-        )
+    check_energy(energy)
 
 
 def check_tissue(tissue: Any, *, box: str | None = None) -> None:

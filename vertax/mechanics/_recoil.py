@@ -52,9 +52,13 @@ def velocities(
 
     **Raises:**
 
+    - `TypeError` for what is no tissue, energy, dissipation or linear solver.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
+    check_system(tissue, energy)
+    check_dissipation(dissipation)
     solver = MINRES() if linear_solver is None else linear_solver
+    check_linear_solver(solver)
     found = _velocities(*traced((tissue, energy, dissipation), tissue.vertices.dtype), solver)
     return checked(found, _REASON) if throw else found
 

@@ -95,7 +95,7 @@ def conclude(
         adjoint=adjoint,
         throw=False,
     )
-    final = moved.with_configuration(solution.value)
+    final = follow_start(moved.with_configuration(solution.value), tissue, free)
     return Equilibrium(
         tissue=final,
         energy=energy(final),
@@ -105,6 +105,24 @@ def conclude(
         valid=~final.overlaps.any if end.overlaps is None else ~end.overlaps,
         result=end.result,
     )
+
+
+def follow_start(relaxed: Tissue, start: Tissue, free: Bool[Array, " modes"]) -> Tissue:
+    """The same tissue, whose place depends on that of `start` when differentiated.
+
+    A relaxation keeps what the energy does not determine: the centroid of the start, and the orientation of a
+    free tissue. The adjoint differentiates the shape in a fixed place. Here that place is differentiated, by
+    the formula that determines it, so that every adjoint has the derivative with respect to the start. Where
+    only some motions are free, their translations are followed.
+    """
+    settled = relaxed.settled(start).vertices
+    # (All but the derivative stays as it is, to the last bit.)
+    settled = settled + jax.lax.stop_gradient(relaxed.vertices - settled)
+    there = start.gathered(start.vertices)
+    moved = jnp.mean(there - jax.lax.stop_gradient(there), axis=0) * free[:2]
+    if start.pinned is not None:
+        moved = jnp.where(jnp.any(start.pinned), 0, moved)
+    return relaxed.with_vertices(jnp.where(jnp.all(free), settled, relaxed.vertices + moved))
 
 
 def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import is_concrete
 from vertax.mesh import Tissue
-from vertax.responses._response import Equilibrium
+from vertax.responses._response import _NOT_FINITE, Equilibrium
 from vertax.responses._trajectory import Trajectory
 
 
@@ -62,25 +62,40 @@ class Evolved(Equilibrium):
         - `RuntimeError` (of Equinox inside `jax.jit`) if one did not, or if cells overlap.
         """
         if not is_concrete(self.sound):
-            reason = f"A step in time came to no end, or cells overlap. {_REMEDY}"
+            # Of a batch the message with the largest index is raised.
+            messages = (
+                f"A step in time did not converge. {_REMEDY}",
+                f"On the way of a movement cells overlap, or the box folds. {_REMEDY}",
+                f"A movement broke down: {_NOT_FINITE}",
+            )
+            which = jnp.where(jnp.isfinite(self.max_force), jnp.where(self.valid, 0, 1), 2)
+            which = jnp.where(self.converged, 0, which)
             # (A callback to the host takes no keys.)
             keys, rest = eqx.partition(self, _is_key)
-            return eqx.combine(eqx.error_if(rest, ~self.converged, reason), keys)
+            checked = eqx.branched_error_if(rest, ~self.converged, which, messages)
+            return eqx.combine(checked, keys)
         if np.all(self.sound):
             return self
-        first = np.argmin(np.asarray(self.sound), axis=-1).max()
-        time = np.asarray(self.times).reshape(-1, np.shape(self.times)[-1])[0, first]
-        what = (
-            "cells overlap, or the box folds"
-            if not np.all(self.valid)
-            else "a step in time came to no end"
-        )
-        if not np.isfinite(np.asarray(self.max_force)).all():
-            what = "forces are not finite"
-        raise RuntimeError(
-            f"On the way to time {time:g} (frame {first}) {what} (largest force "
-            f"{np.max(self.max_force):.1e}). {_REMEDY}"
-        )
+        raise RuntimeError(self._first_failure())
+
+    def _first_failure(self) -> str:
+        """The message for the member of a batch that fails in the earliest frame, at its own time."""
+        sound = np.asarray(self.sound)
+        n_times = sound.shape[-1]
+        sound = sound.reshape(-1, n_times)
+        failed = ~sound.all(axis=-1)
+        frames = np.where(failed, np.argmin(sound, axis=-1), n_times)
+        number = int(np.argmin(frames))
+        of_member = lambda x: np.asarray(x).reshape(len(sound), -1)[number]
+        frame, (force,), (valid,) = frames[number], of_member(self.max_force), of_member(self.valid)
+        time = of_member(self.times)[frame]
+        where = f"On the way to time {time:g} (frame {frame})"
+        if self.sound.ndim > 1:
+            where += f" of member {number} ({failed.sum()} of {failed.size} failed)"
+        if not np.isfinite(force):
+            return f"{where} a step broke down: {_NOT_FINITE}"
+        reason = "a step in time did not converge" if valid else "cells overlap, or the box folds"
+        return f"{where} {reason} (largest force {force:.1e}). {_REMEDY}"
 
     @property
     def trajectory(self) -> Trajectory:

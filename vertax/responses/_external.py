@@ -18,9 +18,10 @@ from vertax._base.modules import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import check_energy
 from vertax.energies._units import Units, cell_size, units_of
 from vertax.mesh import Tissue
-from vertax.responses._equilibrium import free_motions
+from vertax.responses._equilibrium import follow_start, free_motions
 from vertax.responses._external_gradient import Rest, at_rest, force_of
 from vertax.responses._host import Answer, Job, Request, ask, stacked
 from vertax.responses._response import AbstractResponse, Equilibrium
@@ -134,6 +135,8 @@ class External(AbstractResponse):
         - `RuntimeError` if what it returns is not at rest, or its cells overlap.
         - `ValueError` for another adjoint.
         """
+        if isinstance(energy, type):  # (A program may take parameters that are no function.)
+            check_energy(energy)
         adjoint = EquilibriumPropagation() if adjoint is None else adjoint
         self.goes_with(adjoint)
         assert isinstance(adjoint, EquilibriumPropagation)
@@ -285,6 +288,8 @@ def _answered(
     configuration = at_rest(slots, rest, response, adjoint.without_outcome())
     whole = eqx.tree_at(lambda t: t.boundary, there, tissue.boundary)
     final = whole.with_configuration(configuration)
+    if known:
+        final = follow_start(final, tissue, free)
     force = optx.max_norm(force_of(there, constant)) if known else answer.max_force
     return Equilibrium(
         tissue=final,

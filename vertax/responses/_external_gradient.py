@@ -12,16 +12,17 @@ from jaxtyping import Array, Bool, PyTree
 
 from vertax.adjoints import EquilibriumPropagation, GradientOutcome
 from vertax.adjoints._adjoint import differentiable, frozen, materialise, settle
-from vertax.adjoints._propagation import two_phases
+from vertax.adjoints._propagation import NOT_LINEAR, Phase, Resistance, two_phases
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units
 from vertax.mesh import Tissue
 from vertax.responses._host import Request
 
-_REASON = (
+_REASONS = (
     "The gradient by equilibrium propagation cannot be trusted: the program failed, or left a force that is "
     "not small beside the nudge. Let it relax further, raise `beta`, or allow it with "
-    "EquilibriumPropagation(throw=False)."
+    "EquilibriumPropagation(throw=False).",
+    NOT_LINEAR,
 )
 
 
@@ -92,7 +93,7 @@ def _(
         # (What the energy does with the box is not known: its derivative is none.)
         return slope, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), moving[1])
 
-    def phase(pull: PyTree[Array], strength: Array) -> tuple[PyTree[Array], Array, Array]:
+    def phase(pull: PyTree[Array], strength: Array) -> Phase:
         vertices, torques = pull if isinstance(pull, tuple) else (pull, None)
         if torques is not None:
             torques = -torques * tissue.angle_length
@@ -104,9 +105,12 @@ def _(
         finite = jnp.all(jnp.isfinite(answer.vertices))
         if not known:
             left = jnp.where(jnp.isnan(answer.max_force) & finite, 0, answer.max_force)
-            return by_program(answer.slope), left, answer.num_steps
-        left = jax.tree.map(jnp.add, force_of(there, frozen(energy)), pull)
-        return slope(there), optx.max_norm(left), answer.num_steps
+            unknown = jnp.full_like(left, jnp.nan)
+            return Phase(by_program(answer.slope), left, answer.num_steps, unknown)
+        gradient = lambda y: force_of(there.with_configuration(y), frozen(energy))
+        along = Resistance.along(gradient, tissue.configuration, there.configuration)
+        left = optx.max_norm(jax.tree.map(jnp.add, along.force, pull))
+        return Phase(slope(there), left, answer.num_steps, along.nonlinearity)
 
     pull = rest.balanced(materialise(cotangent, tissue.configuration))
     unpulled = None
@@ -115,5 +119,5 @@ def _(
     sizes = {"stiffness": rest.units.stiffness, "length_scale": rest.units.length}
     # (The program may run twice at a time.)
     gradient, outcome = two_phases(adjoint, pull, sizes, phase, unpulled)
-    (d_energy, d_boundary), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASON)
+    (d_energy, d_boundary), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASONS)
     return d_energy, d_boundary, outcome

@@ -53,14 +53,7 @@ def evolve_by_frames(
     done = keeper.load(start)
     if not done.rows:
         done = Progress(start, (_row(times[0], first),))
-    then = np.array([row["time"] for row in done.rows])
-    if not np.array_equal(then, times[: len(then)]):
-        raise ValueError(
-            f"The checkpoint holds frames at other times ({len(then)}, from {then[0]:g} to {then[-1]:g}) "
-            f"than argument `times` begins with ({len(times)}, from {times[0]:g} to {times[-1]:g}). Give the "
-            "same times again, with more after them if it is to go on for longer, or delete the file to "
-            "start anew."
-        )
+    _check_times(np.array([row["time"] for row in done.rows]), times)
     bar = tqdm(
         total=len(times) - 1,
         initial=len(done.rows) - 1,
@@ -89,6 +82,33 @@ def evolve_by_frames(
         bar.close()
     keeper.save(done)
     return _joined(times, done.state, done.rows, first)
+
+
+def _check_times(stored: np.ndarray, times: np.ndarray) -> None:
+    """Raise an error unless the times of a checkpoint are those that `times` begins with, up to rounding."""
+    common = min(len(stored), len(times))
+    differences = np.abs(stored[:common] - times[:common])
+    # The same time computed in two ways, such as 3 * 0.1 and 0.3, differs by units in the last place.
+    rounding = 4 * np.finfo(times.dtype).eps * np.max(np.abs(times))
+    tolerance = max(_EQUAL_TIMES * np.min(np.diff(times)), rounding)
+    if len(stored) <= len(times) and np.all(differences <= tolerance):
+        return
+    where = ""
+    if np.any(differences > tolerance):
+        frame = int(np.argmax(differences > tolerance))
+        where = (
+            f"; frame {frame} differs first: {stored[frame]:.17g} there, {times[frame]:.17g} here"
+        )
+    raise ValueError(
+        f"The checkpoint holds frames at other times ({len(stored)}, from {stored[0]:g} to {stored[-1]:g}) "
+        f"than argument `times` begins with ({len(times)}, from {times[0]:g} to {times[-1]:g}{where}). Give "
+        "the same times again, with more after them if it is to go on for longer, or delete the file to "
+        "start anew."
+    )
+
+
+# Times that differ by less than this fraction of the shortest frame are equal.
+_EQUAL_TIMES = 1e-9
 
 
 def _joined(times: np.ndarray, end: State, rows: tuple[Row, ...], like: Frames) -> Evolved:

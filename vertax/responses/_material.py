@@ -11,6 +11,7 @@ from vertax._base.checks import named
 from vertax.activities import AbstractActivity
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import check_energy
 from vertax.mesh import Tissue
 
 
@@ -41,6 +42,7 @@ class Material(AbstractEnergy):
     activity: AbstractActivity | None = None
 
     def __check_init__(self):
+        check_energy(self.energy)
         for name, kind in (
             ("dissipation", AbstractDissipation),
             ("activity", AbstractActivity),

@@ -54,6 +54,7 @@ def record_relaxation(
             f"{tissue.vertices.shape}. Record the members of a batch one by one."
         )
     response = (Relaxation() if response is None else response).traced()
+    response.check(tissue, energy, ImplicitDifferentiation())
     tissue, energy = jax.tree.map(jnp.asarray, tissue), energy
     tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     trajectory = Trajectory()

@@ -19,6 +19,7 @@ from vertax._base.vmapping import one_at_a_time
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import check_energy
 from vertax.energies._units import cell_size, units_of
 from vertax.mesh import Tissue
 from vertax.responses._equilibrium import SearchEnd, conclude
@@ -26,7 +27,7 @@ from vertax.responses._response import AbstractResponse, Equilibrium
 from vertax.responses._search import Search, objective
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
 from vertax.solvers._known_hessian import KnownHessian
-from vertax.solvers._long_waves import FEWEST_CELLS
+from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._optimistix import check_solver
 from vertax.solvers._patience import Patient
 from vertax.transitions import T1, AbstractTransitions
@@ -134,11 +135,7 @@ class Relaxation(AbstractResponse):
         - `TypeError` for an energy that is no function, or an adjoint that is none.
         - `ValueError` for one that does not go with the solver, or a `jax.shard_map` that this does not.
         """
-        if not callable(energy):
-            raise TypeError(
-                "Argument `energy` must be one of vertax.energies, e.g. ShapeFactorEnergy(3.8), or a "
-                f"function, but is {named(energy)}."
-            )
+        check_energy(energy)
         known, size = self.known_hessian, sum(map(jnp.size, jax.tree.leaves(tissue.configuration)))
         if known is not None and known.inverse.shape != (size, size):
             raise ValueError(
@@ -181,7 +178,7 @@ class Relaxation(AbstractResponse):
 
     def hessian_at(self, tissue: Tissue, energy: AbstractEnergy | None) -> KnownHessian | None:
         # (What is large has waves, and too many numbers to square; other solvers have no use for it.)
-        if tissue.n_cells >= FEWEST_CELLS or not isinstance(self.solver, NewtonCG):
+        if tissue.n_cells >= LongWaves.min_cells or not isinstance(self.solver, NewtonCG):
             return None
         start = tissue.configuration
         if energy is None:
@@ -249,8 +246,10 @@ def equilibrate(
 
     The relaxation and its T1 transitions find the final topology and positions; the gradient is that
     of the equilibrium in this topology, by the method that `adjoint` names. Works under `jax.jit`,
-    `jax.vmap` (over tissues of one size, and over parameters) and `jax.grad` with respect to the energy
-    and the boundary.
+    `jax.vmap` (over tissues of one size, and over parameters) and `jax.grad` with respect to the energy,
+    the boundary, pinned vertices and the start. (The equilibrium keeps the centroid of the start, and the
+    orientation of a free tissue, unless the energy or pins determine them. Otherwise it does not depend on
+    the start, if it is unique.)
 
     **Arguments:**
 

@@ -6,6 +6,7 @@ import abc
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
@@ -49,18 +50,22 @@ class Equilibrium(eqx.Module):
         """
         converged = self.converged
         if not is_concrete(converged):
-            # The message of a compiled program cannot hold numbers.
-            reason = f"The relaxation reached no equilibrium, or its cells overlap. {_REMEDY}"
-            return eqx.error_if(self, ~converged, reason)
+            # A compiled program selects one of several messages, which cannot hold numbers. Of a batch the
+            # message with the largest index is raised.
+            messages = (
+                f"The relaxation reached no equilibrium. {_REMEDY}",
+                f"Cells of the relaxed tissue overlap. {_UNTANGLE}",
+                f"The relaxation broke down: {_NOT_FINITE}",
+            )
+            which = jnp.where(jnp.isfinite(self.max_force), jnp.where(self.valid, 0, 1), 2)
+            which = jnp.where(converged, 0, which)
+            return eqx.branched_error_if(self, ~converged, which, messages)
         if np.all(converged):
             return self
         members = f" ({np.sum(~converged)} of {np.size(converged)})" if np.ndim(converged) else ""
         forces = np.asarray(self.max_force)
         if not np.isfinite(forces).all():
-            raise RuntimeError(
-                f"The relaxation broke down{members}: its forces are not finite. The parameters of the "
-                "energy may be NaN, or so extreme that the tissue collapses."
-            )
+            raise RuntimeError(f"The relaxation broke down{members}: {_NOT_FINITE}")
         if not np.all(self.valid):
             raise RuntimeError(
                 f"Cells of the relaxed tissue overlap{members}: {self._first_overlap()}. {_UNTANGLE}"
@@ -77,6 +82,10 @@ class Equilibrium(eqx.Module):
         return jax.tree.map(one, self.tissue).overlaps.describe()
 
 
+_NOT_FINITE = (
+    "its forces are not finite. The parameters of the energy must be finite, but may be NaN or infinity, or "
+    "so extreme that the tissue collapses. Check them."
+)
 _UNTANGLE = (
     "A relaxation never makes cells overlap unless `contact_range` is None, but it may start from a tissue "
     "in which they do: look at its `overlaps`."

@@ -76,7 +76,12 @@ class Direct(lx.AbstractLinearSolver[Any]):
         return state, options
 
     def assume_full_rank(self) -> bool:
-        """It does not: derivatives are those of a pseudo-inverse."""
+        """True: derivatives of the solution are those of a nonsingular matrix.
+
+        They hold for a singular one too, as long as its null space stays the same when it changes and the
+        right-hand sides of the differentiated systems have no part in it. Otherwise the result is
+        `singular`; take [`MINRES`][vertax.MINRES], which differentiates the pseudo-inverse.
+        """
         return True
 
 

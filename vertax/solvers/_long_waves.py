@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,8 +17,6 @@ from vertax.mesh._boundary import inverse_of
 from vertax.mesh._topology import take
 from vertax.solvers._solver import Rows
 
-# Smaller tissues have no waves that are long enough to be slow, and pay more than they gain.
-FEWEST_CELLS = 150
 # (A point for four cells takes a quarter more products with the Hessian of a gradient.)
 _CELLS_A_POINT = 1
 
@@ -55,10 +53,14 @@ class LongWaves(eqx.Module):
     """Vertices for each point of the grid."""
     size: int = eqx.field(static=True)
 
+    min_cells: ClassVar[int] = 150
+    """The smallest tissue that is preconditioned: smaller ones have no slow waves, so it costs more than it
+    saves. (A class attribute, because a benchmark changes it: a module constant could have copies.)"""
+
     @classmethod
     def of(cls, tissue: Tissue) -> LongWaves | None:
         """Those of a tissue as it is now; None if it is small."""
-        if tissue.n_cells < FEWEST_CELLS:
+        if tissue.n_cells < cls.min_cells:
             return None
         size = _good_size(tissue.n_cells)
         lattice, origin = _box(tissue)

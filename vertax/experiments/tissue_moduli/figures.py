@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -12,8 +11,7 @@ from matplotlib.figure import Figure
 from vertax.experiments.rigidity_transition.figures import REFERENCE
 from vertax.plotting import INK, SERIES, house_style, new_figure
 
-if TYPE_CHECKING:
-    from .stiffening import Branch
+from ._branch import Branch
 
 # Of the regular hexagon, at which the ordered lattice softens.
 HEXAGON = float(np.sqrt(8 * np.sqrt(3)))

@@ -17,7 +17,7 @@ ways; since it need not begin at $\gamma_0$, $\gamma_c$ is half of the distance 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -34,6 +34,7 @@ from vertax.responses import Relaxation as Response
 from vertax.runs import RunFolder, Section, TissueSection, scan, spread_of
 
 from . import figures
+from ._branch import Branch
 
 
 class Stiffening(Section):
@@ -56,21 +57,6 @@ class Stiffening(Section):
     alone with it.)"""
     tissue: TissueSection = TissueSection(n_cells=64, lloyd_steps=5)
     """The tissues."""
-
-
-class Branch(NamedTuple):
-    """One tissue sheared one way, from its onset on."""
-
-    strains: Float[np.ndarray, " points"]
-    stresses: Float[np.ndarray, " points"]
-    moduli: Float[np.ndarray, " points"]
-    onset: float
-    """The strain at which it becomes solid."""
-
-    def line(self, centre: float) -> tuple[float, float]:
-        """Slope and offset of the modulus over the stress per strain, counted from a centre."""
-        slope, offset = np.polyfit(self.stresses / (self.strains - centre), self.moduli, 1)
-        return float(slope), float(offset)
 
 
 def stiffen(

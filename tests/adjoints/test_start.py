@@ -1,0 +1,155 @@
+"""The derivative of an equilibrium with respect to the start of its relaxation.
+
+An equilibrium that is unique depends on the start only through its place: the centroid, and the orientation
+of a free tissue, which the energy does not determine.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from free_helpers import cluster
+from helpers import STILL, central_difference, random_like, random_tissue
+from jaxtyping import Array, Float
+
+import vertax as vx
+from vertax.dissipations import PerimeterViscosity, SubstrateFriction
+from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
+
+PRECISE = dataclasses.replace(STILL, tolerance=jnp.asarray(1e-11))
+SGD = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
+MOMENTUM = dataclasses.replace(STILL, solver=SGD, max_steps=jnp.asarray(20_000))
+IMPLICIT = vx.ImplicitDifferentiation()
+TILE, TILE_ENERGY = random_tissue(8, 2), ShapeFactorEnergy(jnp.linspace(3.5, 3.7, 8))
+DROP, DROP_ENERGY = cluster(7, 6), AreaElasticity(10.0, 1.0) + LineTension(jnp.array(0.8))
+
+
+@eqx.filter_jit
+def place_and_slope(vertices, tissue, energy, adjoint, response):
+    """A cost linear in the relaxed positions, and its derivative with respect to the start."""
+
+    def place(vertices):
+        found = response(tissue.with_vertices(vertices), energy, adjoint=adjoint)
+        return jnp.sum(random_like(vertices, 3) * found.tissue.vertices)
+
+    return jax.value_and_grad(place)(vertices)
+
+
+def check(tissue, energy, adjoint=IMPLICIT, response=PRECISE, *, rtol=1e-6):
+    """Compare with finite differences along all vertices; return the gradient."""
+    at = lambda x: place_and_slope(x, tissue, energy, adjoint, response)
+    slope = at(tissue.vertices)[1]
+    direction = random_like(tissue.vertices)
+    difference = float(central_difference(lambda x: at(x)[0], tissue.vertices, direction))
+    product = float(jnp.sum(slope * direction))
+    assert product == pytest.approx(difference, rel=rtol, abs=1e-6)
+    return slope
+
+
+def pinned(tissue, *vertices):
+    mask = jnp.zeros(tissue.n_vertices, bool).at[jnp.asarray(vertices)].set(True)
+    return eqx.tree_at(lambda t: t.pinned, tissue, mask, is_leaf=lambda x: x is None)
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "response"),
+    [
+        pytest.param(IMPLICIT, PRECISE, id="implicit"),
+        pytest.param(
+            vx.ImplicitDifferentiation("sensitivity"),
+            PRECISE,
+            id="sensitivity",
+            marks=pytest.mark.thorough,
+        ),
+        pytest.param(vx.EquilibriumPropagation(), PRECISE, id="propagation"),
+        pytest.param(
+            vx.AutomaticDifferentiation(), MOMENTUM, id="automatic", marks=pytest.mark.thorough
+        ),
+    ],
+)
+def test_centroid_of_a_periodic_tissue_follows_the_start(adjoint, response):
+    slope = check(TILE, TILE_ENERGY, adjoint, response, rtol=1e-4)
+    # Each vertex of the start moves the centroid by its share.
+    share = jnp.sum(random_like(TILE.vertices, 3), axis=0) / TILE.n_vertices
+    np.testing.assert_allclose(slope, jnp.broadcast_to(share, slope.shape), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "adjoint", [IMPLICIT, pytest.param(vx.EquilibriumPropagation(), marks=pytest.mark.thorough)]
+)
+def test_orientation_of_a_free_tissue_follows_the_start(adjoint):
+    slope = check(DROP, DROP_ENERGY, adjoint)
+    # More than the centroid.
+    assert jnp.abs(slope - jnp.mean(slope, axis=0)).max() > 1e-3
+
+
+def test_forward_mode_follows_the_start():
+    direction = random_like(TILE.vertices)
+    relax = lambda x: PRECISE(TILE.with_vertices(x), TILE_ENERGY).tissue.vertices
+    tangent = jax.jit(lambda x, d: jax.jvp(relax, (x,), (d,))[1])(TILE.vertices, direction)
+    expected = jnp.broadcast_to(jnp.mean(direction, axis=0), direction.shape)
+    np.testing.assert_allclose(tangent, expected, atol=1e-9)
+
+
+@pytest.mark.thorough
+def test_a_free_tissue_with_one_pin_turns_about_it():
+    slope = check(pinned(DROP, 0), DROP_ENERGY)
+    assert jnp.abs(slope[1:]).max() > 1e-3
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("tissue", [pinned(TILE, 0, 7), pinned(DROP, 0, 5)])
+def test_pins_determine_the_place(tissue):
+    energy = TILE_ENERGY if tissue.n_cells == 8 else DROP_ENERGY
+    slope = check(tissue, energy)
+    np.testing.assert_array_equal(slope[~tissue.pinned], 0)
+    assert jnp.abs(slope[tissue.pinned]).min() > 1e-3
+
+
+class Trap(vx.AbstractEnergy):
+    """Springs of all vertices to a place, along x and y."""
+
+    stiffness: Float[Array, "2"]
+
+    def __call__(self, tissue):
+        return 0.5 * jnp.sum(self.stiffness * tissue.vertices**2)
+
+
+def test_only_motions_that_the_energy_does_not_determine_follow_the_start():
+    trapped = lambda x, y: TILE_ENERGY + Trap(jnp.array([x, y]))
+    np.testing.assert_array_equal(check(TILE, trapped(0.1, 0.2)), 0)
+    slope = place_and_slope(TILE.vertices, TILE, trapped(0.1, 0.0), IMPLICIT, PRECISE)[1]
+    at = lambda y: place_and_slope(
+        TILE.vertices + y * jnp.array([0.0, 1.0]), TILE, trapped(0.1, 0.0), IMPLICIT, PRECISE
+    )
+    difference = (at(1e-4)[0] - at(-1e-4)[0]) / 2e-4
+    assert jnp.sum(slope[:, 1]) == pytest.approx(float(difference), rel=1e-6)
+    np.testing.assert_array_equal(slope[:, 0], 0)
+
+
+@pytest.mark.parametrize(
+    "dissipation",
+    [PerimeterViscosity(0.5), pytest.param(SubstrateFriction(1.0), marks=pytest.mark.thorough)],
+)
+def test_movement_follows_the_start(dissipation):
+    # Friction remembers where each step begins; viscosity alone does not say where the tissue is.
+    tissue, weights = TILE, random_like(TILE.vertices, 3)
+
+    @eqx.filter_jit
+    def place(vertices):
+        movie = vx.evolve(
+            tissue.with_vertices(vertices),
+            TILE_ENERGY,
+            dissipation,
+            jnp.array([0.0, 0.05, 0.1]),
+            relaxation=PRECISE,
+        )
+        return jnp.sum(weights * movie.tissue.vertices)
+
+    shift = jnp.broadcast_to(jnp.array([0.3, -0.7]), weights.shape)
+    slope = jnp.sum(jax.grad(place)(tissue.vertices) * shift)
+    assert slope == pytest.approx(float(jnp.sum(weights * shift)), rel=1e-6)
