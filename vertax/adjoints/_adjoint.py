@@ -72,6 +72,8 @@ class AbstractAdjoint(optx.AbstractAdjoint):
     """
 
     unrolls: ClassVar[bool] = False
+    reasons: ClassVar[tuple[str, str]]
+    """The errors for a gradient that cannot be trusted: in general, and where it is degenerate."""
 
     throw: eqx.AbstractVar[bool]
     outcome: eqx.AbstractVar[GradientOutcome | None]

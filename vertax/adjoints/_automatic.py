@@ -21,6 +21,12 @@ from vertax.adjoints._adjoint import (
     settle,
 )
 
+_REASON = (
+    "The gradient through the unrolled relaxation cannot be trusted: it had not converged when "
+    "`max_steps` ended it. Raise `max_steps`, choose a faster solver such as "
+    "Optax(optax.sgd(1e-2, momentum=0.9)), or allow it with AutomaticDifferentiation(throw=False)."
+)
+
 
 class AutomaticDifferentiation(AbstractAdjoint):
     r"""Gradients through the unrolled steps of the relaxation (paper, Methods, "AD").
@@ -53,6 +59,7 @@ class AutomaticDifferentiation(AbstractAdjoint):
     """
 
     unrolls: ClassVar[bool] = True
+    reasons: ClassVar[tuple[str, str]] = (_REASON, _REASON)
 
     checkpoints: int = eqx.field(static=True, default=16)
     rtol: float | None = None
@@ -200,12 +207,5 @@ def _(
     *_, slot = vjp_arg
     pull, outcome = residuals
     (gradient,) = pull(materialise(cotangent, root))
-    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, (_REASON, _REASON))
+    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, adjoint.reasons)
     return d_fn, d_args, outcome
-
-
-_REASON = (
-    "The gradient through the unrolled relaxation cannot be trusted: it had not converged when "
-    "`max_steps` ended it. Raise `max_steps`, choose a faster solver such as "
-    "Optax(optax.sgd(1e-2, momentum=0.9)), or allow it with AutomaticDifferentiation(throw=False)."
-)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -27,6 +27,13 @@ from vertax.adjoints._adjoint import (
 from vertax.solvers import MINRES
 from vertax.solvers._elastic_minres import ElasticMINRES
 from vertax.solvers._known_hessian import KnownHessian
+
+_REASONS = (
+    "The gradient through the equilibrium cannot be trusted: the linear solve with the Hessian failed. "
+    "Relax to a smaller tolerance, or allow it with ImplicitDifferentiation(throw=False).",
+    f"The gradient through the equilibrium cannot be trusted: {DEGENERATE}. "
+    "ImplicitDifferentiation(throw=False) allows it.",
+)
 
 
 class ImplicitDifferentiation(AbstractAdjoint):
@@ -61,6 +68,8 @@ class ImplicitDifferentiation(AbstractAdjoint):
 
     - `ValueError` for another mode.
     """
+
+    reasons: ClassVar[tuple[str, str]] = _REASONS
 
     mode: Literal["adjoint", "sensitivity"] = eqx.field(static=True, default="adjoint")
     linear_solver: lx.AbstractLinearSolver = eqx.field(default_factory=MINRES)
@@ -272,11 +281,3 @@ def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, root: Any, 
             jnp.max(outcomes.degenerate),
         )
     return settle(gradient, outcome, system.adjoint.throw, slot, _REASONS)
-
-
-_REASONS = (
-    "The gradient through the equilibrium cannot be trusted: the linear solve with the Hessian failed. "
-    "Relax to a smaller tolerance, or allow it with ImplicitDifferentiation(throw=False).",
-    f"The gradient through the equilibrium cannot be trusted: {DEGENERATE}. "
-    "ImplicitDifferentiation(throw=False) allows it.",
-)

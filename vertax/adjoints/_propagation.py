@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,6 +23,24 @@ from vertax.adjoints._adjoint import (
     frozen,
     materialise,
     settle,
+)
+
+# For a force h x + c x² / 2 the nonlinearity is η = ε / 4 with ε = c f / h² under a nudge f. Expanding x in f
+# gives the relative error of the gradient: ε / 2 = 2 η for one nudge, ε² / 2 = 8 η² for two opposite ones. At
+# η = 1/2, which is also that of a force of second order alone, both are as large as the gradient or larger.
+_NONLINEAR = 0.5
+NOT_LINEAR = (
+    "The gradient by equilibrium propagation cannot be trusted: a small nudge moved the tissue so far that "
+    f"its response is not linear. As a rule {DEGENERATE}. (For a cost of shapes use "
+    "ImplicitDifferentiation: a nudged tissue also moves along motions that change them in second order "
+    "only.) Otherwise the nudge is too strong: take a smaller `beta`. "
+    "EquilibriumPropagation(throw=False) allows it."
+)
+_REASONS = (
+    "The gradient by equilibrium propagation cannot be trusted: a nudged relaxation did not come to "
+    "rest. Raise `max_steps`, use the default solver or a larger `beta`, or allow it with "
+    "EquilibriumPropagation(throw=False).",
+    NOT_LINEAR,
 )
 
 
@@ -65,6 +83,8 @@ class EquilibriumPropagation(AbstractAdjoint):
 
     - `ValueError` for another nudge, or a `beta` or `rtol` that is not positive.
     """
+
+    reasons: ClassVar[tuple[str, str]] = _REASONS
 
     beta: float | Float[Array, ""] | None = None
     nudge: Literal["linear", "cost"] = eqx.field(static=True, default="linear")
@@ -352,22 +372,3 @@ def _outcome(
     failed = ~(residual < UNTRUSTED) | degenerate
     known = jnp.where(jnp.isnan(nonlinearity), jnp.nan, degenerate)
     return GradientOutcome(residual, num_steps, jnp.nan, failed, known)
-
-
-# For a force h x + c x² / 2 the nonlinearity is η = ε / 4 with ε = c f / h² under a nudge f. Expanding x in f
-# gives the relative error of the gradient: ε / 2 = 2 η for one nudge, ε² / 2 = 8 η² for two opposite ones. At
-# η = 1/2, which is also that of a force of second order alone, both are as large as the gradient or larger.
-_NONLINEAR = 0.5
-NOT_LINEAR = (
-    "The gradient by equilibrium propagation cannot be trusted: a small nudge moved the tissue so far that "
-    f"its response is not linear. As a rule {DEGENERATE}. (For a cost of shapes use "
-    "ImplicitDifferentiation: a nudged tissue also moves along motions that change them in second order "
-    "only.) Otherwise the nudge is too strong: take a smaller `beta`. "
-    "EquilibriumPropagation(throw=False) allows it."
-)
-_REASONS = (
-    "The gradient by equilibrium propagation cannot be trusted: a nudged relaxation did not come to "
-    "rest. Raise `max_steps`, use the default solver or a larger `beta`, or allow it with "
-    "EquilibriumPropagation(throw=False).",
-    NOT_LINEAR,
-)

@@ -22,7 +22,7 @@ from vertax.adjoints import (
     GradientOutcome,
     ImplicitDifferentiation,
 )
-from vertax.adjoints._adjoint import frozen
+from vertax.adjoints._adjoint import frozen, settle
 from vertax.adjoints._propagation import AbstractNudging, cost_by_nudging
 from vertax.costs import AbstractCost
 from vertax.energies import AbstractEnergy
@@ -228,10 +228,17 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         tissue, parameters, constants, shift = arguments
         problem = self.as_data(dtype)
         primal = problem.primal(eqx.combine(parameters, constants), tissue, shift)
-        # The compiled function of all problems with this cost and adjoint.
+        # What is left is the compiled function of all problems with this cost and adjoint, lenient or not.
         parts = lambda p: (p.tissue, p.energy, p.trainable)
         problem = eqx.tree_at(parts, problem, (None,) * 3, is_leaf=lambda x: x is None)
+        checks = self.adjoint.throw and primal is not None
+        if checks:
+            problem = eqx.tree_at(lambda p: p.adjoint.throw, problem, False)
         evaluation = _evaluate(problem, primal, *arguments)
+        if checks:
+            outcome, reasons = evaluation.outcome, self.adjoint.reasons
+            gradient, _ = settle(evaluation.gradient, outcome, True, None, reasons)
+            evaluation = eqx.tree_at(lambda e: e.gradient, evaluation, gradient)
         if not throw:
             return evaluation
         return eqx.tree_at(lambda e: e.equilibrium, evaluation, evaluation.equilibrium.checked())
