@@ -2,6 +2,8 @@
 
 import importlib
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -284,3 +286,60 @@ def test_the_program_runs_as_a_process():
     outcome = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert outcome.returncode == 2
     assert outcome.stderr == "Error: There is no configuration file none.toml.\n"
+
+
+# An experiment that compiles one large function of JAX alone, and says when it begins to. After an interrupt
+# JAX crashes in most processes, not in all, when Python destroys its modules: `Crash` does so in each.
+COMPILES = """
+import os, signal, sys
+import jax, jax.numpy as jnp
+import vertax.experiments.infer_shape_factors as experiment
+from vertax.__main__ import main
+
+class Crash:
+    def __del__(self, kill=os.kill, process=os.getpid(), crash=signal.SIGSEGV):
+        kill(process, crash)
+
+sys.crash = Crash()
+
+def function(x):
+    for k in range(100):
+        step = lambda c: (c[0] + 1, jnp.sin(c[1] @ c[1].T) + k)
+        x = jax.lax.while_loop(lambda c: c[0] < k + 3, step, (0, x))[1]
+    return x
+
+def run(config, folder, *, progress):
+    lowered = jax.jit(function).lower(jnp.ones((4, 4)))
+    print("compiling", flush=True)
+    lowered.compile()
+    print("compiled", flush=True)
+    return {}
+
+experiment.run = run
+main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT cannot be sent to a process")
+def test_an_interrupt_while_compiling_ends_with_its_exit_code(tiny):
+    # Without the cache that other tests share, or it would not compile.
+    cached = ("JAX_COMPILATION_CACHE_DIR", "VERTAX_CACHE")
+    environment = {name: value for name, value in os.environ.items() if name not in cached}
+    path = os.pathsep.join([str(ROOT), environment.get("PYTHONPATH", "")])
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMPILES, "run", "tiny.toml", "--no-cache", "--quiet"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment | {"PYTHONPATH": path},
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "compiling\n"
+    process.send_signal(signal.SIGINT)
+    rest, errors = process.communicate(timeout=120)
+    assert rest == ""
+    assert errors == (
+        "Interrupted. What there is lies in runs/tiny. To go on: vertax run tiny.toml --resume runs/tiny\n"
+    )
+    assert process.returncode == 130
+    assert [path.name for path in (tiny / "runs/tiny").iterdir()] == ["config.toml"]
