@@ -60,6 +60,54 @@ def test_an_exact_shape_gives_tensions_and_pressures_back(foam):
     assert found.doubts == []
 
 
+# Three cells around the vertex 1; the outline of each has a vertex in its middle.
+TRIPLET = """SPACE_DIMENSION 2
+STRING
+vertices
+1 0 0
+2 0 1
+3 -0.866 -0.5
+4 0.866 -0.5
+5 -1 0.6
+6 0 -1.2
+7 1 0.6
+edges
+1 1 2
+2 1 3
+3 1 4
+4 2 5
+5 5 3
+6 3 6
+7 6 4
+8 4 7
+9 7 2
+faces
+1 1 4 5 -2
+2 2 6 7 -3
+3 3 8 9 -1
+bodies
+3 1
+7 2
+9 3
+"""
+
+
+def test_labels_of_cells_differ_from_that_of_the_exterior(foam, tmp_path):
+    (tmp_path / "triplet.fe").write_text(TRIPLET, encoding="utf-8")
+    from_dump, from_tissue = infer_tensions(tmp_path / "triplet.fe"), infer_tensions(foam[0])
+    np.testing.assert_array_equal(from_dump.labels, [3, 7, 9])
+    np.testing.assert_array_equal(from_tissue.labels, np.arange(1, 15))
+    for found in (from_dump, from_tissue):
+        edges, cells = found.edge_table(), found.cell_table()
+        label = dict(zip(cells["cell"], cells["label"], strict=True)) | {-1: 0}
+        for side in ("left", "right"):
+            np.testing.assert_array_equal(
+                edges[f"{side}_label"], [label[cell] for cell in edges[f"{side}_cell"]]
+            )
+        outside = (edges["left_label"] == 0) | (edges["right_label"] == 0)
+        np.testing.assert_array_equal(outside, edges["on_outline"])
+
+
 def test_turning_moving_and_scaling_a_tissue_changes_nothing(foam):
     tissue, *_ = foam
     turn = jnp.array([[0.6, -0.8], [0.8, 0.6]])

@@ -179,7 +179,7 @@ def _of_foam(source: Foam, noise: float | None) -> _Course:
     same = edge[1:] == edge[:-1]
     apart = float(np.mean(np.linalg.norm(np.diff(away, axis=0), axis=1)[same]))
     grain = _GRAIN * seen(tissue).size if noise is None else noise
-    return _Course(tissue, np.arange(tissue.n_cells), Points(edge, away), grain, apart, None, None)
+    return _Course(tissue, source.bodies, Points(edge, away), grain, apart, None, None)
 
 
 def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:
@@ -191,7 +191,8 @@ def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:
     geometry = seen(tissue)
     noise = _EXACT * geometry.size if noise is None else noise
     apart = float(np.mean(np.linalg.norm(geometry.chord, axis=1))) / _POINTS
-    return _Course(tissue, np.arange(tissue.n_cells), points, noise, apart, noise, None)
+    labels = np.arange(1, tissue.n_cells + 1)  # 0 is the label of the exterior
+    return _Course(tissue, labels, points, noise, apart, noise, None)
 
 
 def _check_arcs(tissue: Tissue) -> None:

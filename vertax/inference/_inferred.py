@@ -41,7 +41,8 @@ class InferredTensions(eqx.Module):
     """Stress of each cell, tension positive: half the tension of its edges, less its pressure. NaN for cells
     with an edge that is not determined."""
     labels: Int[np.ndarray, " cells"]
-    """Label of each cell in the mask, or its number."""
+    """Label of each cell: in the mask, or the number of its body in a dump of Surface Evolver; of a tissue
+    without either, the number of the cell plus 1. The exterior has the label 0."""
     noise: float
     """Standard deviation of the position of an edge, in units of length."""
     correlation: float
