@@ -235,6 +235,46 @@ def test_masks_of_cellpose_and_of_other_backgrounds_are_read(foam, tmp_path):
     assert len(np.unique(read_mask(colours))) == len(np.unique(labels))
 
 
+def test_a_boolean_mask_of_cells_apart_gives_the_cells(foam):
+    labels = label_image(foam[0], 300)
+    n = foam[0].n_cells
+    for mask in (labels, np.pad(labels, 80)):
+        cells = (mask > 0) & ~outlines(mask, 2)
+        found = read_mask(cells)
+        assert len(np.unique(found)) == n + 1
+        # The surroundings are no cell, and lines go to both sides.
+        wrong = (found > 0) != (mask > 0)
+        assert wrong.mean() < 0.02
+
+
+def test_a_binary_mask_without_lines_is_refused(foam):
+    inside = label_image(foam[0], 300) > 0
+    rows, columns = np.indices(inside.shape)
+    holes = inside.copy()
+    for row, column in ((100, 100), (150, 200), (200, 120)):
+        holes &= (rows - row) ** 2 + (columns - column) ** 2 >= 64
+    for mask in (holes, holes[60:240, 60:240], (255 * holes).astype(np.uint8)):
+        with pytest.raises(ValueError, match=r"lines that are thinner than cells.*ndimage\.label"):
+            read_mask(mask)
+    assert len(np.unique(read_mask(holes, kind="outlines"))) > 1
+    with pytest.raises(ValueError, match="one region"):
+        read_mask(inside)
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8])
+@pytest.mark.parametrize("read", [read_mask, infer_tensions])
+def test_labels_from_which_1_was_subtracted_are_refused(foam, dtype, read):
+    labels = label_image(foam[0], 200).astype(dtype)
+    shifted = labels - dtype(1)  # the background is -1 or 255, one cell is 0
+    with pytest.raises(ValueError, match=r"has the label 0 beside (-1|255).*pass image \+ 1"):
+        read(shifted)
+    np.testing.assert_array_equal(shifted + dtype(1), labels)
+    if dtype is np.int32:
+        np.testing.assert_array_equal(
+            read_mask(np.maximum(shifted, 0)) > 0, read_mask(shifted, background=0) > 0
+        )
+
+
 def test_what_cannot_be_used_is_refused(foam):
     tissue, *_ = foam
     with pytest.raises(ValueError, match="`noise`"):
