@@ -108,6 +108,24 @@ def test_labels_of_cells_differ_from_that_of_the_exterior(foam, tmp_path):
         np.testing.assert_array_equal(outside, edges["on_outline"])
 
 
+def test_edges_where_four_cells_meet_name_no_pair():
+    """On a square lattice the numbers of the cells decide which two share an edge of length 0."""
+    place, tables = np.kron(np.arange(36).reshape(6, 6), np.ones((20, 20), int)), []
+    for numbers in (np.arange(36), np.random.default_rng(1).permutation(36)):
+        found = infer_tensions(np.pad(numbers[place] + 1, 10))
+        table = found.edge_table()
+        assert table["four_fold"].sum() == 25
+        assert not table["determined"][table["four_fold"]].any()
+        position = {0: -1, -1: -2} | {int(label) + 1: k for k, label in enumerate(numbers)}
+        pairs = [
+            tuple(sorted((position[int(left)], position[int(right)])))
+            for left, right in zip(table["left_label"], table["right_label"], strict=True)
+        ]
+        tables.append(sorted(pairs))
+    assert tables[0] == tables[1]
+    assert tables[0].count((-2, -2)) == 25
+
+
 def test_turning_moving_and_scaling_a_tissue_changes_nothing(foam):
     tissue, *_ = foam
     turn = jnp.array([[0.6, -0.8], [0.8, 0.6]])

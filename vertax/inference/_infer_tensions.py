@@ -134,7 +134,10 @@ def infer_tensions(
         turned_over = resampled_deviations(
             *seen_as, balance, prior=prior, times=resamples, seed=seed
         )
-    return outcome(tissue, curves, which, balance, course.labels, course.pixel_size, turned_over)
+    # Corners of cells in a mask are corners of pixels, so edges of length 0 differ from all others.
+    four_fold = np.asarray(tissue.edge_lengths, float) < 0.5 * course.grain
+    source = course.labels, course.pixel_size, four_fold
+    return outcome(tissue, curves, which, balance, source, turned_over)
 
 
 class _Course(NamedTuple):
