@@ -31,11 +31,11 @@ def write_vtk(
 ) -> None:
     """Write the cells of a tissue for ParaView and PyVista, through meshio.
 
-    A convex cell is a polygon. Any other cell is several triangles, because these programs draw a polygon as
-    a fan of triangles about its first corner, which spills over the neighbours. Periodic cells are whole, as
-    in pictures. The data of the elements are the columns of [`cell_table`][vertax.io.cell_table], in its
-    order; all triangles of a cell have the row of the cell, and `cell` is its number. The file is written
-    atomically.
+    A convex cell is a polygon. Any other cell is several triangles: VTK measures a polygon as a fan of
+    triangles about its first corner, which spills over the neighbours, and some versions draw it so. Periodic
+    cells are whole, as in pictures. The data of the elements are the columns of
+    [`cell_table`][vertax.io.cell_table], in its order; all triangles of a cell have the row of the cell, and
+    `cell` is its number. The file is written atomically.
 
     ```python
     vx.io.write_vtk("tissue.vtu", tissue, cells={"pressure": pressure}, edges={"tension": tension})
