@@ -90,7 +90,8 @@ def compare(truth: Truth, found: InferredTensions) -> tuple[np.ndarray, ...]:
     """True and inferred tensions, their standard scores, and the same of pressures."""
     tissue = truth.tissue
     exact = found.pixel_size is None
-    cell = np.append(found.labels - (0 if exact else 1), tissue.n_cells)
+    # An exact shape has the cells of the truth; an image labels them from 1.
+    cell = np.append(np.arange(tissue.n_cells) if exact else found.labels - 1, tissue.n_cells)
     pairs = np.sort(np.asarray(tissue.topology.edge_cells), axis=1).tolist()
     number = {tuple(pair): k for k, pair in enumerate(pairs) if pairs.count(pair) == 1}
     between = np.sort(cell[np.asarray(found.tissue.topology.edge_cells)], axis=1).tolist()

@@ -6,4 +6,12 @@ neither JAX nor Matplotlib.
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    if name == "__version__":  # reading it takes milliseconds, which an import alone does not need
+        from vertax.runs._versions import installed_version
+
+        return installed_version("vertax")
+    return _imported(name)

@@ -68,3 +68,5 @@ from .responses import (
 )
 from .solvers import MINRES as MINRES
 from .transitions import T1 as T1, T2 as T2, AbstractTransitions as AbstractTransitions
+
+__version__: str

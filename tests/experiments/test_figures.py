@@ -110,6 +110,7 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
         model_errors=(0.0, 0.0),
         bending=0.0,
         pixel_size=0.4,
+        four_fold=edges < 0,
     )
     left, right = panels(tensions.foam(picture, found))
     np.testing.assert_allclose(left.images[0].get_array(), picture)

@@ -60,6 +60,72 @@ def test_an_exact_shape_gives_tensions_and_pressures_back(foam):
     assert found.doubts == []
 
 
+# Three cells around the vertex 1; the outline of each has a vertex in its middle.
+TRIPLET = """SPACE_DIMENSION 2
+STRING
+vertices
+1 0 0
+2 0 1
+3 -0.866 -0.5
+4 0.866 -0.5
+5 -1 0.6
+6 0 -1.2
+7 1 0.6
+edges
+1 1 2
+2 1 3
+3 1 4
+4 2 5
+5 5 3
+6 3 6
+7 6 4
+8 4 7
+9 7 2
+faces
+1 1 4 5 -2
+2 2 6 7 -3
+3 3 8 9 -1
+bodies
+3 1
+7 2
+9 3
+"""
+
+
+def test_labels_of_cells_differ_from_that_of_the_exterior(foam, tmp_path):
+    (tmp_path / "triplet.fe").write_text(TRIPLET, encoding="utf-8")
+    from_dump, from_tissue = infer_tensions(tmp_path / "triplet.fe"), infer_tensions(foam[0])
+    np.testing.assert_array_equal(from_dump.labels, [3, 7, 9])
+    np.testing.assert_array_equal(from_tissue.labels, np.arange(1, 15))
+    for found in (from_dump, from_tissue):
+        edges, cells = found.edge_table(), found.cell_table()
+        label = dict(zip(cells["cell"], cells["label"], strict=True)) | {-1: 0}
+        for side in ("left", "right"):
+            np.testing.assert_array_equal(
+                edges[f"{side}_label"], [label[cell] for cell in edges[f"{side}_cell"]]
+            )
+        outside = (edges["left_label"] == 0) | (edges["right_label"] == 0)
+        np.testing.assert_array_equal(outside, edges["on_outline"])
+
+
+def test_edges_where_four_cells_meet_name_no_pair():
+    """On a square lattice the numbers of the cells decide which two share an edge of length 0."""
+    place, tables = np.kron(np.arange(36).reshape(6, 6), np.ones((20, 20), int)), []
+    for numbers in (np.arange(36), np.random.default_rng(1).permutation(36)):
+        found = infer_tensions(np.pad(numbers[place] + 1, 10))
+        table = found.edge_table()
+        assert table["four_fold"].sum() == 25
+        assert not table["determined"][table["four_fold"]].any()
+        position = {0: -1, -1: -2} | {int(label) + 1: k for k, label in enumerate(numbers)}
+        pairs = [
+            tuple(sorted((position[int(left)], position[int(right)])))
+            for left, right in zip(table["left_label"], table["right_label"], strict=True)
+        ]
+        tables.append(sorted(pairs))
+    assert tables[0] == tables[1]
+    assert tables[0].count((-2, -2)) == 25
+
+
 def test_turning_moving_and_scaling_a_tissue_changes_nothing(foam):
     tissue, *_ = foam
     turn = jnp.array([[0.6, -0.8], [0.8, 0.6]])
@@ -185,6 +251,46 @@ def test_masks_of_cellpose_and_of_other_backgrounds_are_read(foam, tmp_path):
     np.testing.assert_array_equal(read_mask(labels + 7, background=7) > 0, labels > 0)
     colours = np.stack([labels % 4, labels // 4, 0 * labels], axis=-1).astype(np.uint8)
     assert len(np.unique(read_mask(colours))) == len(np.unique(labels))
+
+
+def test_a_boolean_mask_of_cells_apart_gives_the_cells(foam):
+    labels = label_image(foam[0], 300)
+    n = foam[0].n_cells
+    for mask in (labels, np.pad(labels, 80)):
+        cells = (mask > 0) & ~outlines(mask, 2)
+        found = read_mask(cells)
+        assert len(np.unique(found)) == n + 1
+        # The surroundings are no cell, and lines go to both sides.
+        wrong = (found > 0) != (mask > 0)
+        assert wrong.mean() < 0.02
+
+
+def test_a_binary_mask_without_lines_is_refused(foam):
+    inside = label_image(foam[0], 300) > 0
+    rows, columns = np.indices(inside.shape)
+    holes = inside.copy()
+    for row, column in ((100, 100), (150, 200), (200, 120)):
+        holes &= (rows - row) ** 2 + (columns - column) ** 2 >= 64
+    for mask in (holes, holes[60:240, 60:240], (255 * holes).astype(np.uint8)):
+        with pytest.raises(ValueError, match=r"lines that are thinner than cells.*ndimage\.label"):
+            read_mask(mask)
+    assert len(np.unique(read_mask(holes, kind="outlines"))) > 1
+    with pytest.raises(ValueError, match="one region"):
+        read_mask(inside)
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8])
+@pytest.mark.parametrize("read", [read_mask, infer_tensions])
+def test_labels_from_which_1_was_subtracted_are_refused(foam, dtype, read):
+    labels = label_image(foam[0], 200).astype(dtype)
+    shifted = labels - dtype(1)  # the background is -1 or 255, one cell is 0
+    with pytest.raises(ValueError, match=r"has the label 0 beside (-1|255).*pass image \+ 1"):
+        read(shifted)
+    np.testing.assert_array_equal(shifted + dtype(1), labels)
+    if dtype is np.int32:
+        np.testing.assert_array_equal(
+            read_mask(np.maximum(shifted, 0)) > 0, read_mask(shifted, background=0) > 0
+        )
 
 
 def test_what_cannot_be_used_is_refused(foam):

@@ -237,6 +237,27 @@ def test_a_wrong_background_is_refused(background, error, message, as_a_user):
         from_labels(honeycomb(), background=background)
 
 
+@pytest.mark.parametrize("dtype", [np.int64, np.uint8, np.uint16])
+def test_labels_from_which_1_was_subtracted_are_refused(dtype):
+    mask = np.pad(honeycomb(), 12).astype(dtype)
+    shifted = mask - dtype(1)  # the background is -1, or the largest number; one cell is 0
+    other = shifted[0, 0]
+    with pytest.raises(ValueError, match=rf"label 0 beside {other}.*pass mask \+ 1; if it is none"):
+        from_labels(shifted, boundary="free")
+    with pytest.raises(ValueError, match=rf"label 0 beside {other}"):
+        from_labels(shifted, boundary="free", background=int(other))
+    again = from_labels(shifted + dtype(1), boundary="free")
+    np.testing.assert_array_equal(again.labels, from_labels(mask, boundary="free").labels)
+    # What the message says where 0 is no cell.
+    fewer = np.where(shifted == other, 0, shifted)
+    assert 0 not in from_labels(fewer, boundary="free").labels
+    if dtype is np.int64:
+        named = from_labels(shifted, boundary="free", background=0)
+        np.testing.assert_array_equal(
+            named.labels, from_labels(np.maximum(shifted, 0), boundary="free").labels
+        )
+
+
 def test_one_cell_besides_the_background_is_too_few():
     mask = np.pad(np.full((10, 10), 2), 5, constant_values=1)
     with pytest.raises(ValueError, match="but holds 1 besides the background, 1"):

@@ -432,3 +432,12 @@ def test_a_segmenter_that_is_a_function_is_called_by_its_name(small):
 def test_what_is_no_skeleton_is_refused(image, message):
     with pytest.raises(ValueError, match=f"Argument `image` {message}"):
         labels_from_skeleton(image)
+
+
+@pytest.mark.parametrize("boundary", ["mirrored", "periodic"])
+def test_a_segmenter_whose_label_0_may_be_a_cell_is_refused(small, boundary):
+    def shifted(image):
+        return np.arange(image.size).reshape(image.shape) // (image.size // 8) - 1
+
+    with pytest.raises(ValueError, match="label 0 beside -1"):
+        from_microscopy(small[0], segmenter=shifted, boundary=boundary)

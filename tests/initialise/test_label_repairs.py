@@ -12,6 +12,8 @@ from label_helpers import (
     sides_of,
 )
 
+from vertax.initialise import from_labels
+
 
 def test_gaps_go_to_the_nearest_label():
     mask = rasterise(clear_seeds(20, SHAPE, 3), SHAPE)
@@ -19,7 +21,7 @@ def test_gaps_go_to_the_nearest_label():
     outline = (mask != np.roll(mask, 1, 0)) | (mask != np.roll(mask, 1, 1))
     holed = np.where(outline, 0, mask)
     holed[5:9, 5:9] = -3
-    filled = make(holed)
+    filled = from_labels(holed, boundary="periodic", pixel_size=1.0, softening=0.0, background=0)
     assert neighbours(filled.tissue, filled.labels) == neighbours(full.tissue, full.labels)
     np.testing.assert_allclose(areas_of(filled.tissue), areas_of(full.tissue), rtol=0.1)
 

@@ -56,6 +56,7 @@ def test_a_doublet(doublet):
     np.testing.assert_allclose(foam.target_areas, [1.5, 1.6], rtol=1e-12)
     np.testing.assert_allclose(foam.pressures, [0.25, 0.0])
     assert foam.time == 12.5
+    np.testing.assert_array_equal(foam.bodies, [1, 2])
     inner = int(np.argmin(np.asarray(tissue.topology.on_outline)))
     assert foam.tensions[inner] == 0.5
     assert len(foam.chains[inner]) == 3
@@ -79,6 +80,7 @@ def test_a_doublet(doublet):
         (lambda t: t.replace("1 2 5 6", "1 2 5 -6"), "no closed loop"),
         (lambda t: t.replace(" 5   0   1", " 5   0"), "a line cannot be read"),
         (lambda t: "nothing", "no section `vertices`"),
+        (lambda t: t.replace(" 1   1  volume", " 0   1  volume"), "a body has the number 0"),
     ],
 )
 def test_a_broken_file_is_refused(doublet, change, message):

@@ -30,6 +30,11 @@ def test_every_notebook_is_listed_and_no_other(page):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 class TestNotebook:
+    def test_begins_with_the_number_of_its_file(self, path):
+        title = "".join(_cells(path)[0]["source"]).splitlines()[0]
+        number, _, name = path.stem.partition("_")
+        assert title.lower() == f"# {number}. {name.replace('_', ' ')}"
+
     def test_was_executed_once_from_top_to_bottom(self, path):
         counts = [c["execution_count"] for c in _cells(path) if c["cell_type"] == "code"]
         assert counts == list(range(1, len(counts) + 1))

@@ -1,3 +1,5 @@
+import importlib.metadata
+
 import vertax as vx
 
 # The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
@@ -61,6 +63,10 @@ def public(module):
 def test_top_level_names():
     assert sorted(dir(vx)) == NAMES.split()
     assert all(hasattr(vx, name) for name in NAMES.split())
+
+
+def test_the_version_is_that_of_the_package():
+    assert vx.__version__ == importlib.metadata.version("vertax")
 
 
 def test_names_of_the_families():

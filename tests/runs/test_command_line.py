@@ -2,8 +2,11 @@
 
 import importlib
 import json
+import os
+import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import jax
@@ -14,7 +17,7 @@ from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 import vertax as vx
-from vertax.runs import EXPERIMENTS, RunFolder, RunFolderError
+from vertax.runs import EXPERIMENTS, RunFolder, RunFolderError, _shipped
 from vertax.runs.command_line import app
 
 ROOT = Path(__file__).parents[2]
@@ -85,6 +88,10 @@ def test_a_chosen_folder_is_overwritten_only_if_told_to(tiny):
         (["tiny.toml", "--set", "fit.epochs=x"], "`fit.epochs` must be an integer"),
         (["tiny.toml", "--set", "fit.epochs"], "must have the form key=value"),
         (
+            ["tiny.toml", "--set", "data="],
+            "'data=' has none: is a variable unset? An empty text is",
+        ),
+        (
             ["tiny.toml", "--set", f"seed={2**63}"],
             "`seed` is 9223372036854775808, which is no integer of 64",
         ),
@@ -128,9 +135,98 @@ def test_a_failed_run_is_a_message_and_exit_code_1(tiny, instead, error):
     outcome = vertax("run", "tiny.toml")
     assert outcome.exit_code == 1
     assert outcome.stderr == "Error: It broke.\n"
-    # A folder without metrics is one of a run that did not end.
-    assert [path.name for path in (tiny / "runs/tiny").iterdir()] == ["config.toml"]
+    assert not (tiny / "runs/tiny").exists()
     assert vertax("run", "tiny.toml", "--debug").exception is error
+
+
+@pytest.mark.parametrize("missing", [FileNotFoundError("no image"), ImportError("pip install it")])
+def test_a_run_that_could_not_begin_does_not_block_the_same_command(tiny, instead, missing):
+    def fail(config, folder, *, progress):
+        (folder.path / "unfinished").mkdir()
+        raise missing
+
+    instead(fail)
+    for _ in range(2):
+        outcome = vertax("run", "tiny.toml", "--output", "out")
+        assert outcome.exit_code == 1
+        assert str(missing) in outcome.stderr + str(outcome.exception)
+        assert not (tiny / "out").exists()
+    instead(lambda config, folder, *, progress: {"cost": 1.0})
+    assert vertax("run", "tiny.toml", "--output", "out").exit_code == 0
+    assert (tiny / "out/metrics.json").is_file()
+
+
+def test_a_run_that_failed_later_keeps_what_it_wrote(tiny, instead):
+    def fail(config, folder, *, progress):
+        folder.save_array("positions", np.ones(3))
+        raise OSError("It broke.")
+
+    instead(fail)
+    assert vertax("run", "tiny.toml").exit_code == 1
+    # A folder without metrics is one of a run that did not end.
+    files = sorted(path.name for path in (tiny / "runs/tiny").iterdir())
+    assert files == ["config.toml", "positions.npy"]
+
+
+def test_a_resumed_run_that_fails_keeps_its_configuration(tiny, instead):
+    def fail(config, folder, *, progress):
+        raise OSError("It broke.")
+
+    folder = RunFolder.claim("tiny")
+    folder.save_config(EXPERIMENTS["infer_shape_factors"].config())
+    config = str(folder.path / "config.toml")
+    instead(fail)
+    assert vertax("run", config, "--resume", str(folder.path)).exit_code == 1
+    assert (folder.path / "config.toml").is_file()
+
+
+def test_configurations_come_with_vertax(tiny, instead):
+    instead(lambda config, folder, *, progress: {"n_cells": config.tissue.n_cells})
+    outcome = vertax("run", "demo")
+    assert outcome.exit_code == 0, outcome.output
+    assert json.loads((tiny / "runs/demo/metrics.json").read_text()) == {"n_cells": 20}
+    # A file of that name comes first, a folder does not.
+    (tiny / "demo").mkdir()
+    assert vertax("run", "demo").exit_code == 0
+    (tiny / "demo").rmdir()
+    (tiny / "demo").write_text(TINY)
+    assert vertax("run", "demo", "--output", "own").exit_code == 0
+    assert json.loads((tiny / "own/metrics.json").read_text()) == {"n_cells": 6}
+    outcome = vertax("run", "demoo")
+    assert outcome.exit_code == 2
+    assert "There is no configuration file demoo. Did you mean demo, which comes" in outcome.stderr
+
+
+def test_the_wheel_holds_the_configurations(tmp_path, monkeypatch):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert included == {"configs": "vertax/configs"}
+    # As it is installed: the folder is in the package.
+    (tmp_path / "vertax" / "configs").mkdir(parents=True)
+    (tmp_path / "vertax" / "configs" / "mine.toml").write_text("# What it\n# does. More.\n")
+    monkeypatch.setattr(_shipped, "_PACKAGE", tmp_path / "vertax")
+    assert list(_shipped.shipped_configurations()) == ["mine"]
+    assert _shipped.configuration_summary(_shipped.configuration_file("mine")) == "What it does"
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["sweep"], ["list"], ["describe"], ["show"]])
+def test_help_shows_no_type_for_flags(command):
+    shown = vertax(*command, "--help").output
+    assert "--help" in shown
+    assert "bool" not in shown
+
+
+def test_an_empty_file_name_is_refused(tiny):
+    (tiny / "empty.toml").write_text('experiment = "infer_tensions"\nimage.path = ""\n')
+    outcome = vertax("run", "empty.toml")
+    assert outcome.exit_code == 2
+    assert "`image.path`: must name a file, but is empty." in outcome.stderr
+    for config, key in (("infer_tensions", "image.path"), ("external_tensions", "foam.file")):
+        for value in ("", " ", "''"):
+            outcome = vertax("run", config, "--set", f"{key}={value}")
+            assert outcome.exit_code == 2
+            assert "empty" in outcome.stderr
+    assert not (tiny / "runs").exists()
 
 
 def test_a_run_that_is_too_large_is_a_message_and_exit_code_1(tiny, instead):
@@ -197,7 +293,8 @@ def test_help_version_list_and_describe(tiny):
     assert vertax("--version").output.startswith("vertax ")
     listed = vertax("list").output
     # However many there are, and however wide their names.
-    assert [line.split()[0] for line in listed.splitlines()] == list(EXPERIMENTS)
+    names = [line.split()[0] for line in listed.splitlines() if line.startswith("  ")]
+    assert names == [*EXPERIMENTS, *sorted(path.stem for path in ROOT.glob("configs/*.toml"))]
     described = vertax("describe", "infer_shape_factors")
     (tiny / "described.toml").write_text(described.output)
     assert vertax("run", "described.toml", "--set", "fit.epochs=0").exit_code == 2
@@ -283,4 +380,63 @@ def test_the_program_runs_as_a_process():
     command = [sys.executable, "-m", "vertax", "run", "none.toml"]
     outcome = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert outcome.returncode == 2
-    assert outcome.stderr == "Error: There is no configuration file none.toml.\n"
+    assert outcome.stderr == (
+        "Error: There is no configuration file none.toml. `vertax list` shows those that come with vertax.\n"
+    )
+
+
+# An experiment that compiles one large function of JAX alone, and says when it begins to. After an interrupt
+# JAX crashes in most processes, not in all, when Python destroys its modules: `Crash` does so in each.
+COMPILES = """
+import os, signal, sys
+import jax, jax.numpy as jnp
+import vertax.experiments.infer_shape_factors as experiment
+from vertax.__main__ import main
+
+class Crash:
+    def __del__(self, kill=os.kill, process=os.getpid(), crash=signal.SIGSEGV):
+        kill(process, crash)
+
+sys.crash = Crash()
+
+def function(x):
+    for k in range(100):
+        step = lambda c: (c[0] + 1, jnp.sin(c[1] @ c[1].T) + k)
+        x = jax.lax.while_loop(lambda c: c[0] < k + 3, step, (0, x))[1]
+    return x
+
+def run(config, folder, *, progress):
+    lowered = jax.jit(function).lower(jnp.ones((4, 4)))
+    print("compiling", flush=True)
+    lowered.compile()
+    print("compiled", flush=True)
+    return {}
+
+experiment.run = run
+main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT cannot be sent to a process")
+def test_an_interrupt_while_compiling_ends_with_its_exit_code(tiny):
+    # Without the cache that other tests share, or it would not compile.
+    cached = ("JAX_COMPILATION_CACHE_DIR", "VERTAX_CACHE")
+    environment = {name: value for name, value in os.environ.items() if name not in cached}
+    path = os.pathsep.join([str(ROOT), environment.get("PYTHONPATH", "")])
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMPILES, "run", "tiny.toml", "--no-cache", "--quiet"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment | {"PYTHONPATH": path},
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "compiling\n"
+    process.send_signal(signal.SIGINT)
+    rest, errors = process.communicate(timeout=120)
+    assert rest == ""
+    assert errors == (
+        "Interrupted. What there is lies in runs/tiny. To go on: vertax run tiny.toml --resume runs/tiny\n"
+    )
+    assert process.returncode == 130
+    assert [path.name for path in (tiny / "runs/tiny").iterdir()] == ["config.toml"]

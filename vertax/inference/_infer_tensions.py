@@ -137,7 +137,10 @@ def infer_tensions(
         turned_over = resampled_deviations(
             *seen_as, balance, prior=prior, times=resamples, seed=seed
         )
-    return outcome(tissue, curves, which, balance, course.labels, course.pixel_size, turned_over)
+    # Corners of cells in a mask are corners of pixels, so edges of length 0 differ from all others.
+    four_fold = np.asarray(tissue.edge_lengths, float) < 0.5 * course.grain
+    source = course.labels, course.pixel_size, four_fold
+    return outcome(tissue, curves, which, balance, source, turned_over)
 
 
 class _Course(NamedTuple):
@@ -182,7 +185,7 @@ def _of_foam(source: Foam, noise: float | None) -> _Course:
     same = edge[1:] == edge[:-1]
     apart = float(np.mean(np.linalg.norm(np.diff(away, axis=0), axis=1)[same]))
     grain = _GRAIN * seen(tissue).size if noise is None else noise
-    return _Course(tissue, np.arange(tissue.n_cells), Points(edge, away), grain, apart, None, None)
+    return _Course(tissue, source.bodies, Points(edge, away), grain, apart, None, None)
 
 
 def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:
@@ -194,7 +197,8 @@ def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:
     geometry = seen(tissue)
     noise = _EXACT * geometry.size if noise is None else noise
     apart = float(np.mean(np.linalg.norm(geometry.chord, axis=1))) / _POINTS
-    return _Course(tissue, np.arange(tissue.n_cells), points, noise, apart, noise, None)
+    labels = np.arange(1, tissue.n_cells + 1)  # 0 is the label of the exterior
+    return _Course(tissue, labels, points, noise, apart, noise, None)
 
 
 def _check_arcs(tissue: Tissue) -> None:

@@ -41,7 +41,8 @@ class InferredTensions(eqx.Module):
     """Stress of each cell, tension positive: half the tension of its edges, less its pressure. NaN for cells
     with an edge that is not determined."""
     labels: Int[np.ndarray, " cells"]
-    """Label of each cell in the mask, or its number."""
+    """Label of each cell: in the mask, or the number of its body in a dump of Surface Evolver; of a tissue
+    without either, the number of the cell plus 1. The exterior has the label 0."""
     noise: float
     """Standard deviation of the position of an edge, in units of length."""
     correlation: float
@@ -53,6 +54,9 @@ class InferredTensions(eqx.Module):
     those of a balance, beyond the noise."""
     pixel_size: float | None
     """Length of a pixel side, if the tissue comes from an image."""
+    four_fold: Bool[np.ndarray, " edges"]
+    """Whether the edge has length 0: it is shorter than half a pixel of the mask, or half the accuracy of the
+    positions. Four cells meet in a point, and which two of them share the edge depends on their numbers."""
     resampled_deviations: Float[np.ndarray, " edges"] | None = None
     """Standard deviations of the tensions by resampling, if that was asked for."""
 
@@ -106,8 +110,8 @@ class InferredTensions(eqx.Module):
     def edge_table(self) -> dict[str, np.ndarray]:
         """The edges as a table, see [`edge_table`][vertax.io.edge_table].
 
-        **Returns:** its columns, and `left_label`, `right_label` (0: the exterior), `tension`,
-        `tension_deviation` and `determined`.
+        **Returns:** its columns, and `left_label`, `right_label` (0: the exterior; -1: no pair of cells, for
+        an edge that is four-fold), `four_fold`, `tension`, `tension_deviation` and `determined`.
         """
         return edge_table(self.tissue, **self._edge_columns)
 
@@ -152,8 +156,9 @@ class InferredTensions(eqx.Module):
     def _edge_columns(self) -> dict[str, Any]:
         left, right = np.append(self.labels, 0)[np.asarray(self.tissue.topology.edge_cells)].T
         return {
-            "left_label": left,
-            "right_label": right,
+            "left_label": np.where(self.four_fold, -1, left),
+            "right_label": np.where(self.four_fold, -1, right),
+            "four_fold": self.four_fold,
             "tension": self.tensions,
             "tension_deviation": self.tension_deviations,
             "determined": self.determined,

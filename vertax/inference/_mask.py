@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label
 
+from vertax.initialise._mask_arguments import check_bits, check_zero
 from vertax.io import read_image
 
 _KINDS = ("auto", "labels", "outlines")
@@ -16,6 +19,8 @@ _KINDS = ("auto", "labels", "outlines")
 _OUTSIDE = 5.0
 # What is smaller than this share of it is none either.
 _SPECK = 0.03
+# Lines are thinner than this share of the size of a cell, or they are no lines.
+_THIN = 0.3
 
 
 def read_mask(
@@ -27,17 +32,18 @@ def read_mask(
     """A label for each pixel, from a label image or an image of outlines.
 
     - **Labels**: integers, or a colour for each cell; also `NAME_seg.npy` of Cellpose.
-    - **Outlines**: two values, of which the rarer one is the line, as of Tissue Analyzer, EPySeg and
-        skeletons; grey or in colours, of any thickness, connected by sides or by corners of pixels. Each
-        region within lines is a cell, and the lines go half to each of their sides. A region at the border
-        of the image is a cell that the border cuts; but one that has most of the border, or is much larger
-        than cells, is outside.
+    - **Outlines**: two values, as of Tissue Analyzer, EPySeg and skeletons, and of boolean masks of cells
+        with lines between them; grey or in colours, of any thickness, connected by sides or by corners of
+        pixels. The rarer value is the line, or the other one where that makes no cells. Each region within
+        lines is a cell, and the lines go half to each of their sides. A region at the border of the image
+        is a cell that the border cuts; but one that has most of the border, or is much larger than cells,
+        is outside.
 
     **Arguments:**
 
     - `image`: the pixels, shape (rows, columns) or (rows, columns, colours); or a file: TIFF, PNG, NPY.
     - `kind`: `"labels"`, `"outlines"`, or `"auto"`: outlines if there are two values or colours.
-    - `background`: the label of what is no cell, if it is not 0.
+    - `background`: the label of what is no cell, if it is not 0. Labels of cells are positive.
 
     **Returns:** the labels, 0 where there is no cell. See [`from_labels`][vertax.initialise.from_labels].
 
@@ -45,7 +51,9 @@ def read_mask(
 
     - `FileNotFoundError` if there is no such file.
     - `ValueError` for an unknown `kind`, pixels of another shape or that are not finite, a `background`
-        that no pixel has, and outlines that enclose less than two cells.
+        that no pixel has, labels of which 0 may be that of a cell (0 and negative ones), outlines that
+        enclose less than two cells, and two values of which neither is a line thinner than a third of a cell,
+        unless `kind` is `"outlines"`.
     """
     if kind not in _KINDS:
         raise ValueError(
@@ -59,15 +67,17 @@ def read_mask(
                 f"Argument `background` must be a label of the mask, but no pixel has {background}."
             )
         values = np.where(values == background, 0, values)
-    counts = np.unique(values, return_counts=True)
-    if kind == "outlines" or (kind == "auto" and len(counts[0]) == 2):
-        if len(counts[0]) < 2:
+    colours, counts = np.unique(values, return_counts=True)
+    if kind == "outlines" or (kind == "auto" and len(colours) == 2):
+        if len(colours) < 2:
             raise ValueError("Argument `image` must show lines, but all its pixels are alike.")
-        lines = values != 0
-        if len(counts[0]) == 2:
-            lines = values == counts[0][np.argmin(counts[1])]
-        return _within(lines)
-    return values
+        lines = [values != 0]
+        if len(colours) == 2:
+            lines = [values == colour for colour in colours[np.argsort(counts, kind="stable")]]
+        return _outlined(lines, check_width=kind == "auto")
+    if pixels.ndim == 2 and pixels.dtype.kind in "iu":
+        check_zero("image", pixels, background)
+    return np.maximum(values, 0)
 
 
 def _loaded(file: Path) -> np.ndarray:
@@ -117,11 +127,50 @@ def _numbered(pixels: Shaped[np.ndarray, "..."]) -> Int[np.ndarray, "rows column
         return np.rint(pixels).astype(np.int64)
     if pixels.dtype.kind not in "iu":
         raise ValueError(f"Argument `image` must hold numbers, but its dtype is {pixels.dtype}.")
+    check_bits("image", pixels)
     return pixels.astype(np.int64)
 
 
-def _within(lines: Shaped[np.ndarray, "rows columns"]) -> Int[np.ndarray, "rows columns"]:
-    """Numbers of the regions that lines enclose."""
+class _Outlined(NamedTuple):
+    """Cells that lines separate."""
+
+    labels: Int[np.ndarray, "rows columns"]
+    line_width: float
+    """Width of the lines in pixels: lower quartile along each interface, median over all."""
+    cell_size: float
+    """Root of the median area of a region, in pixels."""
+
+
+def _outlined(
+    candidates: Sequence[Bool[np.ndarray, "rows columns"]], *, check_width: bool
+) -> Int[np.ndarray, "rows columns"]:
+    """Labels of the cells between lines: the first of the candidates for the lines that has some.
+
+    **Raises:**
+
+    - `ValueError` if none has at least two regions; with `check_width` also if no lines are thinner than
+        the cells.
+    """
+    found = [_between(lines) for lines in candidates]
+    outlined = [each for each in found if isinstance(each, _Outlined)]
+    if not outlined:
+        raise ValueError(
+            "Argument `image` must show lines that enclose cells, but they enclose "
+            f"{'one region' if any(found) else 'nothing'}: are they closed?"
+        )
+    thin = [each for each in outlined if each.line_width < _THIN * each.cell_size]
+    if check_width and not thin:
+        first = outlined[0]
+        raise ValueError(
+            "Argument `image` must hold labels, or lines that are thinner than cells, but what may be a line "
+            f"is {first.line_width:.0f} pixels wide between regions of {first.cell_size:.0f} pixels. Number "
+            "the cells of a binary mask, e.g. by scipy.ndimage.label; pass kind='outlines' for thick lines."
+        )
+    return (thin or outlined)[0].labels
+
+
+def _between(lines: Bool[np.ndarray, "rows columns"]) -> _Outlined | int:
+    """The regions that lines separate, or how many there are if they are not at least two."""
     regions = np.zeros(lines.shape, np.int64)
     label(~lines, output=regions)
     count = int(regions.max())
@@ -130,17 +179,42 @@ def _within(lines: Shaped[np.ndarray, "rows columns"]) -> Int[np.ndarray, "rows 
     # Specks between thick lines are no cells.
     cells = np.flatnonzero(sizes > _SPECK * typical) + 1
     if len(cells) < 2:
-        raise ValueError(
-            "Argument `image` must show lines that enclose cells, but they enclose "
-            f"{'one region' if len(cells) else 'nothing'}: are they closed?"
-        )
-    between = ~np.isin(regions, cells)
-    nearest = distance_transform_edt(between, return_distances=False, return_indices=True)
+        return len(cells)
+    line = ~np.isin(regions, cells)
+    distance = np.asarray(distance_transform_edt(line))
+    nearest = distance_transform_edt(line, return_distances=False, return_indices=True)
     regions = regions[tuple(np.asarray(nearest))]
+    half_width = _half_width(regions, distance)
+    # What is farther from all cells than any point of a line, junctions included, is no line.
+    regions[distance > 2 * half_width + 1] = 0
     border = np.concatenate([regions[0], regions[-1], regions[1:-1, 0], regions[1:-1, -1]])
     met = np.bincount(border, minlength=count + 1)
     inside = np.flatnonzero((met == 0) & (np.bincount(regions.ravel(), minlength=count + 1) > 0))
+    inside = inside[inside > 0]
     large = len(inside) > 2 and sizes > _OUTSIDE * np.median(sizes[inside - 1])
     outside = np.flatnonzero((met[1:] > 0) & (large | (met[1:] > 0.4 * len(border)))) + 1
     regions[np.isin(regions, outside)] = 0
-    return np.unique(np.append(0, regions), return_inverse=True)[1][1:].reshape(lines.shape)
+    labels = np.unique(np.append(0, regions), return_inverse=True)[1][1:].reshape(lines.shape)
+    return _Outlined(labels, 2 * half_width - 1, float(np.sqrt(typical)))
+
+
+def _half_width(
+    regions: Int[np.ndarray, "rows columns"], distance: Float[np.ndarray, "rows columns"]
+) -> float:
+    """Distance from both regions at which neighbours meet: lower quartile of each pair, median over all."""
+    first, second, met = [], [], []
+    for one, other in (
+        ((slice(None), slice(1, None)), (slice(None), slice(-1))),
+        ((slice(1, None),), (slice(-1),)),
+    ):
+        differ = regions[one] != regions[other]
+        first.append(np.minimum(regions[one], regions[other])[differ])
+        second.append(np.maximum(regions[one], regions[other])[differ])
+        met.append(np.maximum(distance[one], distance[other])[differ])
+    pairs = np.stack([np.concatenate(first), np.concatenate(second)], axis=1)
+    pair = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
+    # The lower quartile: cells on the outline of a cluster also meet far out in its surroundings.
+    order = np.lexsort((np.concatenate(met), pair))
+    counts = np.bincount(pair)
+    quartile = order[np.cumsum(counts) - counts + (counts - 1) // 4]
+    return float(np.median(np.concatenate(met)[quartile]))

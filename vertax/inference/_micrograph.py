@@ -23,6 +23,7 @@ from vertax.initialise import (
     from_labels,
     from_microscopy,
 )
+from vertax.initialise._mask_arguments import check_zero
 from vertax.mesh import Tissue
 from vertax.responses import Equilibrium, Relaxation
 
@@ -279,7 +280,8 @@ def _pinned(
     """The cells that lie whole in the image, as a free tissue whose outline does not move."""
     labels = np.asarray(segmenter(image))
     rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
-    labels = np.where(np.isin(labels, rim), 0, labels)
+    check_zero("segmenter(image)", labels, None)
+    labels = np.maximum(np.where(np.isin(labels, rim), 0, labels), 0)
     found = from_labels(labels, boundary="free", pixel_size=pixel_size)
     cluster = found.tissue
     on_outline = np.asarray(cluster.topology.on_outline)

@@ -65,9 +65,8 @@ def outcome(
     curves: Fitted,
     which: Equations,
     balance: Balance,
-    labels: Int[np.ndarray, " cells"],
-    pixel_size: float | None,
-    resampled: Float[np.ndarray, " edges"] | None,
+    source: tuple[Int[np.ndarray, " cells"], float | None, Bool[np.ndarray, " edges"]],
+    resampled: Float[np.ndarray, " tensions"] | None,
 ) -> InferredTensions:
     """What is reported.
 
@@ -76,12 +75,13 @@ def outcome(
     - `tissue`: as it was seen.
     - `curves`: its edges, fitted.
     - `which`, `balance`: what balances forces.
-    - `labels`, `pixel_size`: of the mask.
+    - `source`: labels of the cells, length of a pixel side, and which edges have length 0.
     - `resampled`: standard deviations of tensions by resampling.
 
     **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions].
     """
     tissue = _moved(tissue, curves.change)
+    labels, pixel_size, four_fold = source
     found = relative(balance, which)
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
@@ -92,7 +92,7 @@ def outcome(
     nan, edges = float("nan"), (tissue.n_edges, which.edges)
     tensions = spread(*edges, found.tension, nan)
     sure = ~balance.loose & (found.tension_deviation < _UNKNOWN)
-    determined = spread(*edges, sure, False)
+    determined = spread(*edges, sure, False) & ~four_fold
     cells = (tissue.n_cells, which.cells)
     pressures = spread(*cells, found.pressure, nan)
     return InferredTensions(
@@ -110,6 +110,7 @@ def outcome(
         bending=curves.bending,
         model_errors=(float(balance.errors.junction), float(balance.errors.arc)),
         pixel_size=pixel_size,
+        four_fold=four_fold,
         resampled_deviations=None if resampled is None else spread(*edges, resampled, nan),
     )
 

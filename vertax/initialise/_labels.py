@@ -7,10 +7,11 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Integer, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from vertax._base.checks import check_concrete, check_number, check_whole
+from vertax._base.checks import check_concrete, check_number
 from vertax.initialise._cracks import Mesh, crack_graph
+from vertax.initialise._mask_arguments import check_options, checked_mask
 from vertax.initialise._repairs import (
     fill_gaps,
     join_pieces,
@@ -24,8 +25,6 @@ from vertax.initialise._tidy import without_overlaps
 from vertax.mesh import Free, Periodic, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
 from vertax.mesh._geometry import geometry_of
-
-_BOUNDARIES = ("mirrored", "periodic", "free")
 
 
 class Courses(eqx.Module):
@@ -86,8 +85,9 @@ def from_labels(
 
     Not every label image is a trivalent mesh. First it is repaired:
 
-    - pixels with label 0 or less, and of the background, are gaps, and go to the nearest label. One
-        label all along the border of the image, which so surrounds all others, is the background;
+    - pixels with label 0 or less, and of the background, are gaps, and go to the nearest label (where 0 may
+        be a cell, because there are negative labels too, `background=0` says that it is none). One label all
+        along the border of the image, which so surrounds all others, is the background;
     - of a label in several pieces the largest stays (pixels hang together by their sides, not by
         their corners); each other piece goes to the neighbour with the longest common interface;
     - a label inside another (alone or in a group) goes to the one around it;
@@ -117,7 +117,7 @@ def from_labels(
     - `gap_width`: how wide lines between cells may be, in pixels, not to be taken for a part of the
         exterior of a free tissue.
     - `background`: a positive label that stands for no cell, where cells touch the border of the image too;
-        otherwise it is found.
+        otherwise it is found. 0: negative labels are no cells, and 0 is none either.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
     - `inner_arcs`: make every edge an arc, with the area that its cells have over its chord in the image,
         and not only those on the outline of a free tissue. Of edges a few pixels long, the angle is
@@ -130,14 +130,15 @@ def from_labels(
 
     - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
         labels, or has a cell that reaches around the (mirrored) image or around all other cells;
-        for an unknown `boundary`, a `pixel_size` that is not positive, a `gap_width` that is negative or
+        for a mask whose label 0 may be that of a cell, because it has negative ones too; for an unknown
+        `boundary`, a `pixel_size` that is not positive, a `gap_width` that is negative or
         larger than the image, or a `background` that no pixel has.
     - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`.
     """
     check_concrete("from_labels", mask, pixel_size)
     check_options(boundary, pixel_size)
     check_number("gap_width", gap_width, least=0)
-    values, image, background = _checked(mask, background)
+    values, image, background = checked_mask(mask, background)
     if boundary == "free":
         if gap_width > max(image.shape):
             raise ValueError(
@@ -289,76 +290,6 @@ def _no_polygons(labels: Int[np.ndarray, " labels"]) -> ValueError:
         f"area were found around the labels {listed(labels)}. Smooth their outlines or merge them "
         "with a neighbour."
     )
-
-
-def check_options(boundary: str, pixel_size: float | None) -> None:
-    """Refuse an unknown boundary or an impossible pixel size with a `ValueError`."""
-    if boundary not in _BOUNDARIES:
-        raise ValueError(
-            f"Argument `boundary` must be one of {', '.join(map(repr, _BOUNDARIES))}, but is "
-            f"{boundary!r}."
-        )
-    if pixel_size is not None:
-        check_number("pixel_size", pixel_size, above=0)
-
-
-def _checked(
-    mask: Shaped[np.ndarray | Array, " *shape"], background: int | None
-) -> tuple[Int[np.ndarray, " labels"], Int[np.ndarray, "rows columns"], int | None]:
-    """The labels in ascending order, the mask with each replaced by its rank, and the background.
-
-    Gaps are -1.
-    """
-    # Of a masked array, what is masked is no cell.
-    mask = np.ma.filled(mask, 0) if isinstance(mask, np.ma.MaskedArray) else np.asarray(mask)
-    if mask.ndim != 2 or mask.size == 0:
-        raise ValueError(
-            "Argument `mask` must have shape (rows, columns), one label a pixel, but its shape is "
-            f"{mask.shape}. Pass one plane of a stack, without a channel axis."
-        )
-    if mask.dtype.kind not in "iu":
-        raise ValueError(
-            f"Argument `mask` must hold integer labels, but its dtype is {mask.dtype}. Number the "
-            "cells (scipy.ndimage.label does it for a binary mask) or convert the labels with "
-            "mask.astype(int)."
-        )
-    if mask.max() > np.iinfo(np.int64).max:
-        raise ValueError(
-            "Argument `mask` must hold labels of at most 63 bits, but its largest is "
-            f"{mask.max()}. Number the cells anew: numpy.unique(mask, return_inverse=True)[1]."
-        )
-    background = _background(mask, background)
-    if background is not None:
-        mask = np.where(mask == background, 0, mask)
-    values, image = np.unique(mask, return_inverse=True)
-    n_gaps = int(np.count_nonzero(values <= 0))
-    values = values[n_gaps:]
-    if len(values) < 2:
-        but = f"holds {len(values)}"
-        if background is not None:
-            but += f" besides the background, {background}"
-        raise ValueError(
-            "Argument `mask` must hold at least two cells, labelled by positive integers, but "
-            f"{but}: every cell needs its own label."
-        )
-    image = image.reshape(mask.shape).astype(np.int32) - n_gaps
-    return values.astype(np.int64), np.maximum(image, -1), background
-
-
-def _background(mask: Integer[np.ndarray, "rows columns"], given: int | None) -> int | None:
-    """The positive label of what is no cell."""
-    if given is not None:
-        check_whole("background", given)
-        if not np.any(mask == given):
-            raise ValueError(
-                f"Argument `background` must be a label of the mask, but no pixel has {given}."
-            )
-        return int(given) if given > 0 else None
-    # All others lie within a label that has the whole border, and a cell around all others is none.
-    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    around = int(border[0])
-    alone = around <= 0 or np.any(border != around) or np.all((mask == around) | (mask <= 0))
-    return None if alone else around
 
 
 def _touching(

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Int, Shaped
 
 from vertax._base.checks import check_concrete
-from vertax.initialise._labels import Segmentation, check_options, from_labels
+from vertax.initialise._labels import Segmentation, from_labels
+from vertax.initialise._mask_arguments import check_options, check_zero
 from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
 
 Segmenter: TypeAlias = Callable[[np.ndarray], np.ndarray]
@@ -100,6 +101,7 @@ def _segment_periodic(image: np.ndarray, segmenter: Segmenter) -> Int[np.ndarray
     rows, columns = image.shape
     top, left = rows // 2, columns // 2
     labels = _segment(np.pad(image, ((top, top), (left, left)), mode="wrap"), segmenter)
+    check_zero(f"{_name(segmenter)}(image)", labels, None)
     y, x = np.nonzero(labels > 0)
     label = labels[y, x].astype(np.int64)
     counts = np.maximum(np.bincount(label), 1)

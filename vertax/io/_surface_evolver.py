@@ -36,6 +36,8 @@ class Foam(eqx.Module):
     """`TOTAL_TIME`."""
     chains: tuple[Float[np.ndarray, "_ 2"], ...]
     """The points of each edge from one end to the other."""
+    bodies: Int[np.ndarray, " cells"]
+    """Number of the body of each cell in the file, at least 1."""
 
 
 def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
@@ -73,6 +75,8 @@ class _Pieces(NamedTuple):
     loops: list[Int[np.ndarray, " _"]]
     pressures: Float[np.ndarray, " bodies"]
     volumes: Float[np.ndarray, " bodies"]
+    bodies: Int[np.ndarray, " bodies"]
+    """Their numbers in the file."""
     time: float
 
 
@@ -121,6 +125,9 @@ def _parsed(path: Path) -> _Pieces:
         ]
     except (ValueError, IndexError) as error:
         raise broken(f"a line cannot be read ({error})") from error
+    bodies_in_file = np.array([int(w[0]) for w in rows["bodies"]])
+    if bodies_in_file.min() < 1:
+        raise broken("a body has the number 0, and numbers begin at 1")
     try:
         number = {name: index for index, name in enumerate(points)}
         place = {name: index for index, name in enumerate(edges)}
@@ -140,6 +147,7 @@ def _parsed(path: Path) -> _Pieces:
         loops=loops,
         pressures=np.array([pressure for *_, pressure in bodies]),
         volumes=np.array([volume for _, volume, _ in bodies]),
+        bodies=bodies_in_file,
         time=float(time[1]) if time else 0.0,
     )
 
@@ -250,6 +258,7 @@ def _foam(pieces: _Pieces, path: Path) -> Foam:
         target_areas=as_numbers(volumes),
         time=pieces.time,
         chains=tuple(courses),
+        bodies=pieces.bodies,
     )
 
 

@@ -6,14 +6,16 @@ import itertools
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from vertax._base.atomic import atomic_draft
 from vertax._base.extras import needing
 from vertax.io._data_tables import Column, cell_columns, edge_columns
 from vertax.io._geojson import checked_drawing, edge_path
+from vertax.io._triangles import is_convex, triangulate
 from vertax.mesh import Tissue
 
 _SUFFIXES = (".vtu", ".vtk")
@@ -27,10 +29,13 @@ def write_vtk(
     edges: Mapping[str, Column] | None = None,
     points_per_arc: int = 24,
 ) -> None:
-    """Write the cells of a tissue as polygons for ParaView, through meshio.
+    """Write the cells of a tissue for ParaView and PyVista, through meshio.
 
-    Periodic cells are whole, as in pictures. The cell data are the columns of
-    [`cell_table`][vertax.io.cell_table], in its order. The file is written atomically.
+    A convex cell is a polygon. Any other cell is several triangles: VTK measures a polygon as a fan of
+    triangles about its first corner, which spills over the neighbours, and some versions draw it so. Periodic
+    cells are whole, as in pictures. The data of the elements are the columns of
+    [`cell_table`][vertax.io.cell_table], in its order; all triangles of a cell have the row of the cell, and
+    `cell` is its number. The file is written atomically.
 
     ```python
     vx.io.write_vtk("tissue.vtu", tissue, cells={"pressure": pressure}, edges={"tension": tension})
@@ -61,49 +66,61 @@ def write_vtk(
     drawing = checked_drawing(tissue, points_per_arc)
     polygons, counts = drawing.polygons()
     corners = [polygon[:n] for polygon, n in zip(polygons, counts, strict=True) if n > 0]
-    meshes = {
-        Path(path): (
-            "polygon",
-            corners,
-            cell_columns(tissue, drawing, {} if cells is None else cells),
-        )
-    }
+    table = cell_columns(tissue, drawing, {} if cells is None else cells)
+    files = {Path(path): _mesh(np.concatenate(corners), _cell_blocks(corners), table)}
     if edges is not None:
         lines, shown = drawing.sides(np.ones(tissue.n_cells, bool))
         table = edge_columns(tissue, drawing, edges)
         # meshio has no lines of many pieces: each piece is an element of its own.
         pieces = np.stack([lines[:, :-1], lines[:, 1:]], axis=2)
         row = np.cumsum(drawing.alive_edges) - 1
+        ends = np.arange(pieces.size // 2).reshape(-1, 2)
         owner = np.repeat(row[shown], pieces.shape[1])
-        table = {name: column[owner] for name, column in table.items()}
-        meshes[edge_path(path)] = ("line", list(pieces.reshape(-1, 2, 2)), table)
-    files = {
-        place: meshio.Mesh(*_elements(kind, shapes, table))
-        for place, (kind, shapes, table) in meshes.items()
-    }
+        block = _Block("line", ends, owner)
+        files[edge_path(path)] = _mesh(pieces.reshape(-1, 2), [block], table)
     for place, mesh in files.items():
-        _write(place, mesh)
+        _write(place, meshio.Mesh(*mesh))
 
 
-def _elements(
-    kind: str, shapes: list[np.ndarray], table: dict[str, np.ndarray]
+class _Block(NamedTuple):
+    """Elements of one kind and size."""
+
+    kind: str
+    corners: Int[np.ndarray, "elements corners"]
+    row: Int[np.ndarray, " elements"]
+    """Rows of the elements in the table."""
+
+
+def _cell_blocks(polygons: list[Float[np.ndarray, "_ 2"]]) -> list[_Block]:
+    """Convex cells as polygons and others as triangles, of corners numbered throughout."""
+    elements, first = [], 0
+    for row, polygon in enumerate(polygons):
+        whole = np.arange(len(polygon))[None]
+        triangles = whole[:0] if is_convex(polygon) else triangulate(polygon)
+        # (A cell without an area has no triangles.)
+        kind, corners = ("triangle", triangles) if len(triangles) else ("polygon", whole)
+        elements += [(kind, first + each, row) for each in corners]
+        first += len(polygon)
+    # Neighbours that are alike share a block, so the order of the cells stays.
+    alike = itertools.groupby(elements, lambda element: (element[0], len(element[1])))
+    blocks = [(kind, list(block)) for (kind, _), block in alike]
+    return [
+        _Block(kind, np.stack([each[1] for each in block]), np.array([each[2] for each in block]))
+        for kind, block in blocks
+    ]
+
+
+def _mesh(
+    plane: Float[np.ndarray, "points 2"], blocks: list[_Block], table: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, list[Any], None, dict[str, Any]]:
     """Points, blocks of elements, no data of points, and data of the elements by block."""
-    plane = np.concatenate(shapes)
     points = np.column_stack([plane, np.zeros(len(plane))])
-    blocks, runs, first, row = [], [], 0, 0
-    # A block holds elements of one size; neighbours of one size share one, so their order stays.
-    for size, group in itertools.groupby(shapes, len):
-        n = len(list(group))
-        blocks.append((kind, first + np.arange(n * size).reshape(n, size)))
-        runs.append(slice(row, row + n))
-        first, row = first + n * size, row + n
     data = {
-        name: [_numbers(name, column)[run] for run in runs]
+        name: [_numbers(name, column)[block.row] for block in blocks]
         for name, column in table.items()
         if name not in ("x", "y")
     }
-    return points, blocks, None, data
+    return points, [(block.kind, block.corners) for block in blocks], None, data
 
 
 def _numbers(name: str, column: np.ndarray) -> np.ndarray:

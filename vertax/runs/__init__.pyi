@@ -32,6 +32,7 @@ from ._sections import (
     ShapeFactors as ShapeFactors,
     TensionRange as TensionRange,
     TissueSection as TissueSection,
+    file_name as file_name,
     read_micrograph as read_micrograph,
     replicate_keys as replicate_keys,
     spread_of as spread_of,

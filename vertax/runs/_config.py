@@ -135,7 +135,7 @@ def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[s
 
     **Raises:**
 
-    - `ConfigError` for a text without `=`, an empty key, or a key inside what is no table.
+    - `ConfigError` for a text without `=`, an empty key or value, or a key inside what is no table.
     """
     config = _copy(data)
     for override in overrides:
@@ -145,6 +145,11 @@ def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[s
             raise ConfigError(
                 f"An override must have the form key=value, as in fit.epochs=50, but is "
                 f"{override!r}."
+            )
+        if not text.strip():
+            raise ConfigError(
+                f"An override must have a value, but {override!r} has none: is a variable unset? An empty "
+                f"text is {key}='\"\"'."
             )
         table = config
         for depth, part in enumerate(parts[:-1], start=1):

@@ -373,6 +373,20 @@ class RunFolder:
         self.save_metrics(metrics)
         self.forget_parts()
 
+    def discard_if_empty(self) -> None:
+        """Remove the folder if the run has written nothing but its configuration.
+
+        For a run that failed when it began, because a file or an extra is missing: the same command may be
+        given again.
+        """
+        if any(file != self.path / CONFIG for file in self.files()):
+            return
+        (self.path / CONFIG).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # in use, or not there
+            for folder in (self.path / PARTS, self.path / "figures", self.path):
+                if folder.is_dir():
+                    folder.rmdir()
+
     def metrics(self) -> dict[str, Any]:
         """The metrics of a finished run.
 

@@ -9,6 +9,7 @@ from typing import Any
 from vertax.runs._config import apply_overrides, read_toml, validate
 from vertax.runs._errors import ConfigError
 from vertax.runs._registry import EXPERIMENTS, Experiment, find_experiment
+from vertax.runs._shipped import configuration_file, nearest_configuration
 
 
 def load_config(
@@ -18,7 +19,8 @@ def load_config(
 
     **Arguments:**
 
-    - `path`: a TOML file; its key `experiment` says which experiment it configures.
+    - `path`: a TOML file; its key `experiment` says which experiment it configures. Or the name of a
+        configuration that comes with vertax, such as `"demo"`; `vertax list` shows them.
     - `overrides`: texts `key=value` that set single keys, see
         `apply_overrides`.
 
@@ -28,7 +30,12 @@ def load_config(
 
     - `ConfigError` if the file is missing or no TOML, or for an unknown or ill-typed key.
     """
-    data = apply_overrides(read_toml(path), overrides)
+    file = configuration_file(path)
+    if not file.exists():
+        raise ConfigError(
+            f"There is no configuration file {os.fspath(path)}.{nearest_configuration(path)}"
+        )
+    data = apply_overrides(read_toml(file), overrides)
     if "experiment" not in data:
         raise ConfigError(
             f"In {os.fspath(path)}: `experiment` is missing; it names the experiment to run, one "

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Key, PRNGKeyArray, Shaped
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from vertax import solvers
 from vertax.adjoints import (
@@ -200,12 +200,17 @@ class TensionRange(Section):
 class ImageFile(Section):
     """An image in a file: the table `image` of a configuration."""
 
-    path: str = ""
+    path: str | None = None
     """The file: TIFF, PNG, …"""
     channel: int | None = Field(default=None, ge=0)
     """Which channel, from 0, if there are several, as in a colour image."""
     plane: int | None = Field(default=None, ge=0)
     """Which plane, from 0, if it is a stack."""
+
+    @field_validator("path")
+    @classmethod
+    def _not_empty(cls, path: str | None) -> str | None:
+        return path if path is None else file_name(path)
 
     def read(self) -> Shaped[np.ndarray, "rows columns"]:
         """The image.
@@ -217,7 +222,7 @@ class ImageFile(Section):
         - `ConfigError` if no file is named, or a channel or plane has to be chosen.
         - `FileNotFoundError` and `ValueError` as [`read_image`][vertax.io.read_image].
         """
-        if not self.path:
+        if self.path is None:
             raise ConfigError(
                 "`image.path` is missing: name an image, as in --set image.path=IMAGE.tif."
             )
@@ -307,6 +312,24 @@ class Microscope(Section):
         return SyntheticMicroscope(
             noise=noise, **{name: getattr(self, name) for name in Microscope.model_fields}
         )
+
+
+def file_name(path: str) -> str:
+    """The check of a key that names a file: in most cases an empty one comes from a variable that is unset.
+
+    **Arguments:**
+
+    - `path`: what the key holds.
+
+    **Returns:** the same.
+
+    **Raises:**
+
+    - `ValueError` if it is empty.
+    """
+    if not path.strip():
+        raise ValueError("must name a file, but is empty")
+    return path
 
 
 def read_micrograph(

@@ -19,6 +19,7 @@ app = typer.Typer(
     epilog="Exit codes: 0 all went well, 1 the run failed or is unfinished, 2 wrong use, 130 interrupted.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode=None,  # Rich shows a type, <bool>, for flags, which take no value
     pretty_exceptions_enable=False,
 )
 
@@ -48,12 +49,18 @@ def _options(
 
 @app.command("list")
 def list_experiments() -> None:
-    """List all experiments."""
+    """List all experiments, and the configurations that come with vertax."""
     from vertax.runs import EXPERIMENTS
+    from vertax.runs._shipped import configuration_summary, shipped_configurations
 
-    width = max(map(len, EXPERIMENTS))
+    shipped = shipped_configurations()
+    width = max(map(len, [*EXPERIMENTS, *shipped]))
+    typer.echo("Experiments; vertax describe NAME prints all keys of one:")
     for name, experiment in EXPERIMENTS.items():
-        typer.echo(f"{name:{width}}  {experiment.summary}")
+        typer.echo(f"  {name:{width}}  {experiment.summary}")
+    typer.echo("Configurations; vertax run NAME runs one:")
+    for name, file in shipped.items():
+        typer.echo(f"  {name:{width}}  {configuration_summary(file)}")
 
 
 @app.command()
@@ -72,7 +79,12 @@ def describe(
 
 @app.command()
 def run(
-    config: Annotated[Path, typer.Argument(help="Configuration file, e.g. configs/demo.toml.")],
+    config: Annotated[
+        Path,
+        typer.Argument(
+            help="Configuration file, or the name of one that comes with vertax, e.g. demo."
+        ),
+    ],
     overrides: Annotated[
         list[str] | None,
         typer.Option(
@@ -159,7 +171,12 @@ def run(
             typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
             announce_in_this_process(f"functions for {experiment.name}")
         folder.talkative = not quiet
-        metrics = experiment.run(settings, folder, progress=not quiet)
+        try:
+            metrics = experiment.run(settings, folder, progress=not quiet)
+        except Exception:
+            if resume is None:
+                folder.discard_if_empty()
+            raise
         folder.finish(metrics)
     except KeyboardInterrupt:
         typer.echo(_interrupted(config, overrides or (), folder), err=True)
@@ -188,7 +205,11 @@ def run(
 @app.command()
 def sweep(
     configs: Annotated[
-        list[Path], typer.Argument(metavar="CONFIG...", help="Configuration files.")
+        list[Path],
+        typer.Argument(
+            metavar="CONFIG...",
+            help="Configuration files, or names of those that come with vertax.",
+        ),
     ],
     grid: Annotated[
         list[str] | None,

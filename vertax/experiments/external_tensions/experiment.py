@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.costs import AbstractLeastSquaresCost, VertexDistance
@@ -40,6 +40,7 @@ from vertax.runs import (
     RunFolder,
     Section,
     TissueSection,
+    file_name,
     history_columns,
 )
 
@@ -55,12 +56,14 @@ class Foam(Section):
     """Standard deviation of the tensions of its edges."""
     stiffness: float = Field(default=10.0, gt=0)
     """Stiffness of the areas, known."""
-    file: str = ""
-    """A dump of Surface Evolver whose foam it is, with its tensions, arcs and areas, in place of one that is
-    drawn."""
+    file: str = "synthetic"
+    """A dump of Surface Evolver whose foam it is, with its tensions, arcs and areas; or synthetic, a foam
+    that is drawn."""
     at_rest: bool = True
     """Let the foam of a file come to rest under its true tensions first; otherwise its shape is taken as it
     is, whether at rest or not."""
+
+    _not_empty = field_validator("file")(file_name)
 
 
 class Program(Section):
@@ -123,7 +126,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
             f"There is no program {config.program.command!r} here: this experiment needs Surface Evolver. "
             "Install it by apt-get install evolver-nox, or set program.command."
         )
-    case = _of_file(config) if config.foam.file else _drawn(config)
+    case = _drawn(config) if config.foam.file == "synthetic" else _of_file(config)
     target, true, ways = case.target, case.true, case.ways
     external = ways["Surface Evolver"][0]
     # (Where the program has run before: in a test, say, or to bring the foam to rest.)

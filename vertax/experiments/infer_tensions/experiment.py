@@ -34,10 +34,14 @@ from vertax.runs import ExperimentConfig, ImageFile, Relaxation, RunFolder, Sect
 
 from . import figures
 
+SYNTHETIC = "synthetic"
+
 
 class ImageSection(ImageFile):
-    """The segmented image; without a file, one of a synthetic cluster."""
+    """The segmented image."""
 
+    path: str | None = SYNTHETIC
+    """The file: TIFF, PNG, NPY; or synthetic, the image of a cluster that is drawn."""
     kind: Literal["auto", "outlines", "labels"] = "auto"
     """Whether it shows the outlines of cells, or a number or colour in each pixel of a cell; `"auto"` takes
     an image of two values for outlines."""
@@ -49,9 +53,8 @@ class ImageSection(ImageFile):
     def labels(self) -> Int[np.ndarray, "rows columns"]:
         """A label for each pixel."""
         chosen = self.channel is not None or self.plane is not None
-        return read_mask(
-            self.read() if chosen else self.path, kind=self.kind, background=self.background
-        )
+        image = self.read() if chosen or self.path is None else self.path
+        return read_mask(image, kind=self.kind, background=self.background)
 
 
 class Cluster(Section):
@@ -73,7 +76,7 @@ class Config(ExperimentConfig):
     image: ImageSection = ImageSection()
     """The segmented image."""
     cluster: Cluster = Cluster()
-    """What is drawn if there is no image."""
+    """What is drawn if the image is synthetic."""
     noise: float | None = Field(default=None, gt=0)
     """Standard deviation of the position of an edge, in pixels; left out, how far pixels are from arcs."""
     prior: float | None = Field(default=None, gt=0)
@@ -99,7 +102,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     - `FileNotFoundError` and `ValueError` for an image that cannot be used.
     """
     truth = None
-    if config.image.path:
+    if config.image.path != SYNTHETIC:
         labels = config.image.labels()
     else:
         truth, labels = _synthetic(config)

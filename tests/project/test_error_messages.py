@@ -1,0 +1,146 @@
+"""The page on errors quotes messages that the program has, and pages agree on how many things there are."""
+
+import ast
+import functools
+import importlib.util
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ANY = "…"  # any text, in a quotation and in place of what a program fills in
+PAGE = (ROOT / "docs/errors.md").read_text(encoding="utf-8")
+HEADINGS = re.findall(r'^\?\?\? failure "(.*)"$', PAGE, re.MULTILINE)
+QUOTED = [message for heading in HEADINGS for message in heading.split('" and "')]
+
+
+def templates(source: str) -> Iterator[str]:
+    """The texts in a program, with … for what it fills in."""
+    tree = ast.parse(source)
+    inside: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            inside.update(node.values)
+            parts = [
+                str(part.value) if isinstance(part, ast.Constant) else ANY for part in node.values
+            ]
+            yield "".join(parts)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in inside:
+            yield node.value
+
+
+@functools.cache
+def sources() -> list[tuple[str, frozenset[str]]]:
+    """All texts of vertax, and of the libraries whose errors come through; and the words of each."""
+    folders = [ROOT / "vertax"]
+    for name in ("equinox", "optimistix"):
+        spec = importlib.util.find_spec(name)
+        assert spec is not None
+        assert spec.origin is not None
+        folders.append(Path(spec.origin).parent)
+    files = [file for folder in folders for file in folder.rglob("*.py")]
+    texts = {
+        " ".join(text.split())
+        for file in files
+        for text in templates(file.read_text(encoding="utf-8"))
+    }
+    return [(text, words(text)) for text in texts if 5 < len(text) < 1000]
+
+
+def words(text: str) -> frozenset[str]:
+    return frozenset(re.findall(r"[a-z_]{3,}", text.lower()))
+
+
+def agreement(quoted: str, template: str) -> float:
+    """Share of the letters of a quotation that are those of a template; 0 if it is none of its messages.
+
+    Both are patterns; … stands for any text. A table over all beginnings of both, as for the edit distance.
+    """
+    impossible = -1
+    row = [0] + [impossible] * len(template)
+    for j, letter in enumerate(template):
+        row[j + 1] = row[j] if letter == ANY else impossible
+    for mine in quoted:
+        above, row = row, [impossible] * (len(template) + 1)
+        row[0] = above[0] if mine == ANY else impossible
+        for j, letter in enumerate(template):
+            best = above[j] + 1 if mine == letter != ANY and above[j] >= 0 else impossible
+            if letter == ANY:
+                best = max(best, row[j], above[j + 1], above[j])
+            if mine == ANY:
+                best = max(best, above[j + 1], row[j], above[j])
+            row[j + 1] = best
+    letters = len(quoted) - quoted.count(ANY)
+    return max(row[-1], 0) / letters
+
+
+def best_agreement(quoted: str) -> float:
+    """How well the nearest message of the program agrees, with a second text where it fills one in."""
+    message = re.sub(r"^\w+Error: ", "", quoted)
+    mine = words(message)
+    near = sorted(sources(), key=lambda each: -len(mine & each[1]) / (4 + len(mine | each[1])))[:12]
+    # A quotation may leave out the end, and what stands before it in a longer message.
+    endings = [message, message.removesuffix(f" {ANY}"), ANY + message]
+    whole = max(agreement(each, text) for each in endings for text, _ in near)
+    if whole > 0.6:
+        return whole
+    frames = [text for text, _ in sources() if ANY in text and len(text) < 80]
+    frame = max(agreement(each, text) for each in endings for text in frames)
+    part = max(agreement(message, f"{ANY}{text}{ANY}") for text, _ in near)
+    return frame + part if frame > 0 else 0
+
+
+@pytest.mark.parametrize("quoted", QUOTED)
+def test_every_quoted_message_is_one_of_the_program(quoted):
+    assert best_agreement(quoted) > 0.6
+
+
+@pytest.mark.parametrize(
+    "quoted",
+    [
+        "The gradient by equilibrium propagation cannot be trusted: the moon is full. …",
+        "Argument `mask` must hold integer numbers, but its dtype is float64. …",
+        "Nothing of this kind is raised anywhere.",
+    ],
+)
+def test_other_messages_are_none_of_the_program(quoted):
+    assert best_agreement(quoted) < 0.6
+
+
+NUMBERS = [
+    "zero",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+    "eleven",
+    "twelve",
+    "thirteen",
+    "fourteen",
+]
+COUNTED = {
+    "notebooks": len(list(ROOT.glob("notebooks/*.ipynb"))),
+    "stories": len(list(ROOT.glob("notebooks/*.ipynb"))),
+    "experiments": len(list(ROOT.glob("vertax/experiments/*/__init__.py"))),
+    "configurations": len(list(ROOT.glob("configs/*.toml"))),
+}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/*.md"))],
+    ids=lambda page: page.name,
+)
+def test_a_page_that_counts_counts_right(page):
+    text = page.read_text(encoding="utf-8").lower()
+    stated = re.findall(rf"\b(\d+|{'|'.join(NUMBERS)}) (?:small )?({'|'.join(COUNTED)})\b", text)
+    number = lambda word: NUMBERS.index(word) if word in NUMBERS else int(word)
+    assert all(number(word) == COUNTED[what] for word, what in stated)

@@ -1,0 +1,116 @@
+"""Which labels of a mask are cells: checks of the arguments of `from_labels`."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Array, Int, Integer, Shaped
+
+from vertax._base.checks import check_number, check_whole
+
+_BOUNDARIES = ("mirrored", "periodic", "free")
+
+
+def check_options(boundary: str, pixel_size: float | None) -> None:
+    """Refuse an unknown boundary or an impossible pixel size with a `ValueError`."""
+    if boundary not in _BOUNDARIES:
+        raise ValueError(
+            f"Argument `boundary` must be one of {', '.join(map(repr, _BOUNDARIES))}, but is "
+            f"{boundary!r}."
+        )
+    if pixel_size is not None:
+        check_number("pixel_size", pixel_size, above=0)
+
+
+def checked_mask(
+    mask: Shaped[np.ndarray | Array, " *shape"], background: int | None
+) -> tuple[Int[np.ndarray, " labels"], Int[np.ndarray, "rows columns"], int | None]:
+    """The labels in ascending order, the mask with each replaced by its rank, and the background.
+
+    Gaps are -1.
+    """
+    # Of a masked array, what is masked is no cell.
+    mask = np.ma.filled(mask, 0) if isinstance(mask, np.ma.MaskedArray) else np.asarray(mask)
+    if mask.ndim != 2 or mask.size == 0:
+        raise ValueError(
+            "Argument `mask` must have shape (rows, columns), one label a pixel, but its shape is "
+            f"{mask.shape}. Pass one plane of a stack, without a channel axis."
+        )
+    if mask.dtype.kind not in "iu":
+        raise ValueError(
+            f"Argument `mask` must hold integer labels, but its dtype is {mask.dtype}. Number the "
+            "cells (scipy.ndimage.label does it for a binary mask) or convert the labels with "
+            "mask.astype(int)."
+        )
+    check_bits("mask", mask)
+    check_zero("mask", mask, background)
+    background = _background(mask, background)
+    if background is not None:
+        mask = np.where(mask == background, 0, mask)
+    values, image = np.unique(mask, return_inverse=True)
+    n_gaps = int(np.count_nonzero(values <= 0))
+    values = values[n_gaps:]
+    if len(values) < 2:
+        but = f"holds {len(values)}"
+        if background is not None:
+            but += f" besides the background, {background}"
+        raise ValueError(
+            "Argument `mask` must hold at least two cells, labelled by positive integers, but "
+            f"{but}: every cell needs its own label."
+        )
+    image = image.reshape(mask.shape).astype(np.int32) - n_gaps
+    return values.astype(np.int64), np.maximum(image, -1), background
+
+
+def check_bits(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:
+    """Raise a `ValueError` for labels that are no signed integers of 64 bits."""
+    if mask.max() > np.iinfo(np.int64).max:
+        raise ValueError(
+            f"Argument `{name}` must hold labels of at most 63 bits, but its largest is "
+            f"{mask.max()}. Number the cells anew: numpy.unique({name}, return_inverse=True)[1]."
+        )
+
+
+def check_zero(
+    name: str, mask: Integer[np.ndarray, "rows columns"], background: int | None
+) -> None:
+    """Raise an error where 0 may be the label of a cell: where another label of what is no cell is below it.
+
+    **Arguments:**
+
+    - `name`: of the argument, for the message.
+    - `mask`: the labels.
+    - `background`: the label of what is no cell, if it was given.
+
+    **Raises:**
+
+    - `ValueError` for 0 beside negative labels, unless `background` is 0; and beside a background that is the
+        largest number of an unsigned type, which is -1 wrapped around.
+    """
+    if background == 0 or not np.any(mask == 0):
+        return
+    other, not_a_cell = mask.min(), f"background=0 or numpy.maximum({name}, 0)"
+    if other >= 0:
+        other = np.iinfo(mask.dtype).max if mask.dtype.kind == "u" else 0
+        not_a_cell = f"numpy.where({name} == {other}, 0, {name})"
+        if other == 0 or _background(mask, background) != other:
+            return
+    raise ValueError(
+        f"Argument `{name}` must have positive labels for cells, but has the label 0 beside {other}, which "
+        f"is no cell. If 0 is a cell, pass {name} + 1; if it is none, {not_a_cell}."
+    )
+
+
+def _background(mask: Integer[np.ndarray, "rows columns"], given: int | None) -> int | None:
+    """The positive label of what is no cell."""
+    if given is not None:
+        check_whole("background", given)
+        if not np.any(mask == given):
+            raise ValueError(
+                f"Argument `background` must be a label of the mask, but no pixel has {given}."
+            )
+        return int(given) if given > 0 else None
+    # All others lie within a label that has the whole border, and a cell around all others is none.
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    around = int(border[0])
+    alone = around <= 0 or np.any(border != around) or np.all((mask == around) | (mask <= 0))
+    return None if alone else around
