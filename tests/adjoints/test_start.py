@@ -20,7 +20,7 @@ import vertax as vx
 from vertax.dissipations import PerimeterViscosity, SubstrateFriction
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 
-PRECISE = dataclasses.replace(STILL, tolerance=jnp.asarray(1e-11))
+PRECISE = dataclasses.replace(STILL, tolerance=jnp.asarray(1e-13))
 SGD = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
 MOMENTUM = dataclasses.replace(STILL, solver=SGD, max_steps=jnp.asarray(20_000))
 IMPLICIT = vx.ImplicitDifferentiation()

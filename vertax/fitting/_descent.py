@@ -22,6 +22,7 @@ from vertax.fitting._epoch import (
     better,
     guidance_of,
     no_shift,
+    over_members,
     relative_error,
     unbeaten,
 )
@@ -147,7 +148,10 @@ def _evaluation(problem: InverseProblem, constants: PyTree, state: State) -> Eva
     return problem.value_and_gradient(energy, state.tissue, no_shift(problem), throw=False)
 
 
-_evaluate_batch = announced_jit(eqx.filter_vmap(_evaluation))
+@announced_jit
+def _evaluate_batch(problem: InverseProblem, constants: PyTree, state: State) -> Evaluation:
+    """The same for each of a batch, in one compiled function."""
+    return over_members(_evaluation, problem)(problem, constants, state)
 
 
 @announced_jit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.modules import choose
+from vertax._base.vmapping import one_at_a_time
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
@@ -24,6 +26,12 @@ class Best(eqx.Module):
     facts: Facts
     guidance: Float[Array, ""]
     epoch: Int[Array, ""]
+
+
+def over_members(function: Callable[..., Any], problem: InverseProblem) -> Callable[..., Any]:
+    """A function, which takes derivatives inside, of each member of a batch of problems."""
+    batched = problem.response.prefers_batching
+    return eqx.filter_vmap(function if batched else one_at_a_time(function))
 
 
 class AbstractMethod(eqx.Module):

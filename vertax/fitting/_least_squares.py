@@ -22,6 +22,7 @@ from vertax.fitting._epoch import (
     guidance_of,
     no_shift,
     nothing_known,
+    over_members,
     relative_error,
     unbeaten,
 )
@@ -197,7 +198,7 @@ def _start(solver: optx.AbstractLeastSquaresSolver, parts: tuple, batched: bool)
         still, going = jnp.array(0), jnp.array(True)
         return State(fitted, leaves, *tissues, facts, scale, best, still, going)
 
-    return (eqx.filter_vmap(start) if batched else start)(*parts)
+    return (over_members(start, parts[0]) if batched else start)(*parts)
 
 
 @announced_jit
@@ -229,7 +230,7 @@ def _epoch(
         return state, _record(state)
 
     arguments = (problem, constants, true, state)
-    return (eqx.filter_vmap(one) if batched else one)(*arguments)
+    return (over_members(one, problem) if batched else one)(*arguments)
 
 
 def _record(state: State) -> Record:

@@ -108,6 +108,11 @@ class External(AbstractResponse):
                 "Argument `timeout` needs processes=True: a simulator that hangs in a thread cannot be ended."
             )
 
+    @property
+    def prefers_batching(self) -> bool:
+        """True: the runs of a batch are started at the same time."""
+        return True
+
     def __call__(
         self,
         tissue: Tissue,

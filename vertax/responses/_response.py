@@ -125,6 +125,11 @@ class AbstractResponse(eqx.Module):
         **Returns:** where it ends.
         """
 
+    @property
+    def prefers_batching(self) -> bool:
+        """Whether a batch is faster in one batched call than one after another, also on a CPU."""
+        return False
+
     def primal(self, tissue: Tissue, energy: AbstractEnergy) -> PyTree:
         """The part of the response that is not differentiated, which is compiled by itself.
 
