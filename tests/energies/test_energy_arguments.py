@@ -1,6 +1,8 @@
 # pyright: reportArgumentType=false
 """What energies refuse, and how."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import pytest
 from helpers import random_tissue
 
 from vertax.energies import (
+    AbstractEnergy,
     AreaElasticity,
     BoundedTension,
     LineTension,
@@ -72,3 +75,47 @@ def test_a_batch_of_tissues_wants_vmap():
     with pytest.raises(ValueError, match=r"single tissue, but .*filter_vmap"):
         energy(batch)
     np.testing.assert_allclose(eqx.filter_vmap(energy)(batch), energy(tissue), rtol=1e-12)
+
+
+class Part(eqx.Module):
+    table: Any = eqx.field(static=True)
+
+
+class Odd(AbstractEnergy):
+    strength: Any
+    table: Any = eqx.field(static=True, default=None)
+
+    def __call__(self, tissue):
+        return jnp.sum(tissue.perimeters**2)
+
+
+# (Equinox warns of static arrays, and accepts them.)
+@pytest.mark.filterwarnings("ignore:A JAX array is being set as static")
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Odd(1.0, np.ones(3)), "`table` of Odd must have a hash.*shape .3,"),
+        (lambda: Odd(1.0, [1, 2]), "`table` of Odd must have a hash.*type list.*tuple"),
+        (lambda: Odd(1.0, (1, {"a": 2})), "`table` of Odd must have a hash"),
+        (lambda: Odd({"a": [Part(np.ones(3))]}), "`table` of Part must have a hash"),
+        (lambda: Odd(np.array(["a", "b"])), "`strength` of Odd must hold numbers"),
+    ],
+)
+def test_fields_that_cannot_be_compiled_are_refused_by_name(make, message):
+    with pytest.raises(TypeError, match=message):
+        make()
+
+
+def test_unusual_fields_work_more_than_once():
+    tissue = random_tissue(3, 1)
+    value = eqx.filter_jit(lambda energy: energy(tissue))
+    for odd in (
+        np.ones(3),
+        jax.random.key(0),
+        "text",
+        None,
+        Part("text"),
+        [1.0, "a", None, jnp.sin],
+        eqx.nn.MLP(2, 2, 4, 1, key=jax.random.key(0)),
+    ):
+        assert value(Odd(odd, ("a", 1))) == value(Odd(odd, ("a", 1)))

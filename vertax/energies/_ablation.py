@@ -47,8 +47,12 @@ class Ablated(AbstractLocalEnergy):
     """
 
     energy: AbstractLocalEnergy
-    cells: Bool[Array, "*cells"] | None = eqx.field(default=None, converter=partial(_as_mask, "cells"))
-    edges: Bool[Array, "*edges"] | None = eqx.field(default=None, converter=partial(_as_mask, "edges"))
+    cells: Bool[Array, "*cells"] | None = eqx.field(
+        default=None, converter=partial(_as_mask, "cells")
+    )
+    edges: Bool[Array, "*edges"] | None = eqx.field(
+        default=None, converter=partial(_as_mask, "edges")
+    )
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell that is no hole."""

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.checks import as_real, check_number
+from vertax._base.fields import check_fields
 from vertax.mesh import Tissue
 
 
@@ -21,6 +22,9 @@ class AbstractLifeCycle(eqx.Module):
     that of her mother. An array that has not, declares it by the metadata of its field, see
     [`Change.inherited`][vertax.transitions.Change].
     """
+
+    def __check_init__(self):
+        check_fields(self)
 
     @abc.abstractmethod
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
