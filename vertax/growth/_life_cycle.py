@@ -56,6 +56,10 @@ class AbstractLifeCycle(eqx.Module):
         """
         return jnp.zeros((), tissue.vertices.dtype)
 
+    def overdue(self, cells: PyTree[Array], tissue: Tissue) -> Bool[Array, " cells"]:
+        """Which cells should have vanished by now; `grow` counts those that have not. By default none."""
+        return jnp.zeros(tissue.n_cells, bool)
+
     def axis(
         self, cells: PyTree[Array], tissue: Tissue, cell: Int[Array, ""], key: PRNGKeyArray
     ) -> Float[Array, "2"] | None:
@@ -159,6 +163,10 @@ class GrowAndDivide(AbstractLifeCycle):
         each = jnp.where(after.dying & ~certain, dies, -spent)
         could = tissue.alive & ~before.dying
         return jnp.sum(jnp.where(could, each, 0)).astype(tissue.vertices.dtype)
+
+    def overdue(self, cells: Cells, tissue: Tissue) -> Bool[Array, " cells"]:
+        """Dying cells that aim at less than a thousandth of the area at which they would divide."""
+        return cells.dying & (cells.target_area < 1e-3 * cells.division_area)
 
     def born(self, cells: Cells, tissue: Tissue, pair: Int[Array, "2"], key: PRNGKeyArray) -> Cells:
         """Two cells of half the size."""
