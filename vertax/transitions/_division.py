@@ -17,7 +17,7 @@ from vertax.mesh._surgery import Slot, spare_slot, split_cell
 from vertax.mesh._topology import take
 from vertax.transitions._change import Change, raised_if, unchanged
 from vertax.transitions._cut import Cut, find_cut, points_at
-from vertax.transitions._t1 import overlapping_faces
+from vertax.transitions._t1 import has_new_overlaps
 
 
 def divide(
@@ -127,7 +127,7 @@ def divided(
             angles = angles.at[drop(kept)].set(share * angle, mode="drop")
         new = new.with_angles(angles.at[drop(slot.edges[2])].set(0, mode="drop"))
     # (Through a concave cell, or near a corner, the new edge may cross other sides.)
-    good = done & ~jnp.any(overlapping_faces(new.overlaps) & ~overlapping_faces(tissue.overlaps))
+    good = done & ~has_new_overlaps(new, tissue)
 
     none = unchanged(tissue)
     put = lambda old, where, parent: old.at[jnp.where(good, where, old.size)].set(
