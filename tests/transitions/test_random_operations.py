@@ -53,7 +53,13 @@ def smoothed(tissue):
     vertices = tissue.vertices + 0.3 * jnp.where(m.alive_vertices[:, None], pull, 0)
     moved = tissue.with_vertices(vertices.astype(tissue.vertices.dtype))
     worse = moved.overlaps.any
-    return jax.tree.map(lambda a, b: jnp.where(worse, a, b), tissue, moved)
+    moved = jax.tree.map(lambda a, b: jnp.where(worse, a, b), tissue, moved)
+    if not m.exterior:
+        return moved
+    # A free tissue would shrink to a point.
+    middle = jnp.mean(moved.vertices, axis=0)
+    scale = jnp.sqrt(jnp.sum(moved.alive) / jnp.sum(moved.areas))
+    return moved.with_vertices((moved.vertices - middle) * scale)
 
 
 class Player:
