@@ -19,7 +19,7 @@ def check_tissue(tissue, rtol=1e-9):
     assert (edge[half_edge] == np.arange(half_edge.size)).all()
     following = np.where(twin % 3 == 0, twin + 2, twin - 1)
     faces = _faces(following)
-    labels = [set(cell[face].tolist()) for face in faces]
+    labels = [{int(cell[h]) for h in face} for face in faces]
     assert all(len(label) == 1 for label in labels), "a face of several cells"
     number = np.array([label.pop() for label in labels])
     real = number < n + m.exterior
@@ -27,7 +27,7 @@ def check_tissue(tissue, rtol=1e-9):
     spare = int(np.sum(~real))
     assert all(len(faces[i]) == 2 for i in np.flatnonzero(~real))
     n_vertices = len({v // 3 for i in np.flatnonzero(real) for v in faces[i]})
-    n_edges = len({edge[k] for i in np.flatnonzero(real) for k in faces[i]})
+    n_edges = len({int(edge[k]) for i in np.flatnonzero(real) for k in faces[i]})
     assert n_vertices + 2 * (spare // 3) == twin.size // 3
     assert n_vertices - n_edges + real.sum() == (2 if m.exterior else 0), "Euler characteristic"
     living = np.zeros(n, bool)

@@ -16,9 +16,9 @@ from vertax.transitions import ablate, divide, remove
 # One capacity, so that all tissues of a kind share what is compiled.
 CAPACITY = 12
 ENERGY = (
-    vx.energies.AreaElasticity(jnp.ones(()), jnp.ones(()))
-    + vx.energies.PerimeterElasticity(jnp.full((), 0.05), jnp.full((), 2.0))
-    + vx.energies.LineTension(jnp.full((), 0.02))
+    vx.energies.AreaElasticity(1.0, 1.0)
+    + vx.energies.PerimeterElasticity(0.05, 2.0)
+    + vx.energies.LineTension(0.02)
 )
 FRICTION = vx.dissipations.SubstrateFriction(1.0)
 
@@ -110,10 +110,12 @@ class Player:
             return None
 
     def t1(self):
-        return swept(self.tissue, vx.T1(threshold=jnp.asarray(self.rng.uniform(0.05, 0.6))))
+        return swept(
+            self.tissue, vx.T1(threshold=jnp.asarray(self.rng.uniform(0.05, 0.6), self.dtype))
+        )
 
     def t2(self):
-        return swept(self.tissue, vx.transitions.T2(threshold=jnp.asarray(0.5)))
+        return swept(self.tissue, vx.transitions.T2(threshold=0.5))
 
     def save(self):
         path = self.folder / "tissue.npz"
