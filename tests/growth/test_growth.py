@@ -53,6 +53,39 @@ def test_cells_divide_and_the_tissue_stays_sound(grown):
     assert (np.asarray(grown.cells.target_area)[young] < 1.2).all()
 
 
+def test_growth_from_two_free_cells_counts_what_could_not_happen():
+    tissue, times = vx.initialise.free_voronoi(2, key=0).with_capacity(5), jnp.linspace(0, 10, 9)
+    run = lambda cycle: grow(tissue, energy_of, cycle, times, key=1, relaxation=STILL, throw=False)
+    grown = run(GrowAndDivide(0.2, 1.5))
+    assert grown.n_alive[0] == 2
+    assert grown.n_alive[-1] == 5
+    for frame in grown.trajectory:
+        frame.topology.validate()
+        assert not frame.overlaps.any
+    # From the first division for which there was no slot on, they are counted.
+    assert grown.full
+    failed = np.asarray(grown.failed_divisions)
+    assert failed[-1] > 0
+    assert (failed[np.asarray(grown.n_alive) < 5] == 0).all()
+    assert (np.diff(failed) >= 0).all()
+    assert (grown.failed_deaths == 0).all()
+    # Nothing can vanish without T2 transitions.
+    dying = run(GrowAndDivide(0.0, 1.5, death_rate=10.0, shrinking_time=0.3))
+    assert dying.n_alive[-1] == 2
+    assert dying.failed_deaths[0] == 0
+    assert dying.failed_deaths[-1] >= 2
+    assert (dying.failed_divisions == 0).all()
+
+
+def test_growth_from_one_periodic_cell():
+    tissue, times = random_tissue(1).with_capacity(5), jnp.linspace(0, 8, 9)
+    cycle = GrowAndDivide(0.2, 1.5)
+    grown = grow(tissue, energy_of, cycle, times, key=1, relaxation=STILL)
+    assert grown.n_alive[0] == 1
+    assert grown.n_alive[-1] > 2
+    assert grown.tissue.areas.sum() == pytest.approx(1)
+
+
 def test_the_lineage_is_a_forest(grown):
     lineage = grown.lineage
     count = int(lineage.count)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from free_helpers import doublet
 from helpers import random_tissue
 from hypothesis import given, settings, strategies as st
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -93,6 +94,45 @@ def test_a_single_periodic_cell_grows_to_many():
     assert grown.alive.all()
     assert not grown.overlaps.any
     assert grown.areas.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("inner_arcs", [False, True])
+def test_a_doublet_divides_along_every_axis(inner_arcs):
+    # The corners of its cells lie on one line, and a cut may cross one arc twice.
+    tissue = doublet(inner_arcs=inner_arcs).with_angles(jnp.array([1.4, 0.3, 1.6])).with_capacity(3)
+    n_sides = set()
+    for mother in range(2):
+        for angle in [None, *np.linspace(0, np.pi, 9)]:
+            axis = None if angle is None else jnp.array([np.cos(angle), np.sin(angle)])
+            new = divide(tissue, mother, axis).tissue
+            new.topology.validate()
+            assert not new.overlaps.any
+            areas = new.areas[mother] + new.areas[2]
+            assert areas == pytest.approx(float(tissue.areas[mother]), abs=1e-13)
+            assert new.areas[1 - mother] == pytest.approx(float(tissue.areas[1 - mother]))
+            halves = np.sort(new.areas[jnp.array([mother, 2])])
+            assert halves[0] > 0.7 * halves[1]
+            n_sides |= {tuple(np.sort(new.neighbour_counts).tolist())}
+    assert n_sides == {(3, 3, 3), (2, 2, 4)}
+
+
+def test_a_cut_that_makes_cells_overlap_is_refused():
+    # A chevron: the line through its centroid across x leaves it and enters it again.
+    tissue = random_tissue(6, 3)
+    cell = int(tissue.topology.cell[0])
+    mine = np.flatnonzero(np.asarray(tissue.topology.cell) == cell)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        shift = np.zeros((12, 2))
+        shift[mine // 3] = 0.35 * rng.normal(size=(mine.size, 2))
+        bent = tissue.with_vertices(tissue.vertices + shift)
+        if bent.overlaps.any:
+            continue
+        for angle in np.linspace(0, np.pi, 7):
+            axis = jnp.array([np.cos(angle), np.sin(angle)])
+            change = divide(bent.with_capacity(8), cell, axis, throw=False)
+            assert not change.tissue.overlaps.any
+            assert change.done == (change.tissue.alive.sum() == 7)
 
 
 def test_parameters_are_inherited():

@@ -177,9 +177,9 @@ def _declared(tree: Any, path: tuple[Any, ...]) -> Declaration | None:
     found: Declaration | None = None
     node: Any = tree
     for key in path:
-        if isinstance(key, jax.tree_util.GetAttrKey) and isinstance(node, eqx.Module):
-            found = declaration_of(type(node), key.name)
         if isinstance(key, jax.tree_util.GetAttrKey):
+            if isinstance(node, eqx.Module):
+                found = declaration_of(type(node), key.name)
             node = getattr(node, key.name)
         elif isinstance(key, jax.tree_util.SequenceKey):
             node = node[key.idx]  # pyright: ignore[reportIndexIssue]

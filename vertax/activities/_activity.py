@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from vertax._base.fields import check_fields
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -37,6 +38,9 @@ class AbstractActivity(eqx.Module):
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
         """The state that it begins with; by default none."""
         return None
+
+    def __check_init__(self):
+        check_fields(self)
 
     @abc.abstractmethod
     def drive(

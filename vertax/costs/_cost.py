@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.batch import member
 from vertax._base.checks import check_number
+from vertax._base.fields import check_fields
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 
@@ -20,6 +21,9 @@ class AbstractCost(eqx.Module):
     Subclass it and write `__call__`; data and settings are fields. Weighted sums are written as such:
     `0.99 * cost_a + 0.01 * cost_b`.
     """
+
+    def __check_init__(self):
+        check_fields(self)
 
     @abc.abstractmethod
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vertax._base.fields import check_fields
 from vertax.mesh import Tissue
 
 
@@ -33,6 +34,9 @@ class AbstractDissipation(eqx.Module):
     Dissipations add: `SubstrateFriction(1.0) + PerimeterViscosity(0.2)`. One that is half a sum of squares
     is better a subclass of [`AbstractViscosity`][vertax.dissipations.AbstractViscosity].
     """
+
+    def __check_init__(self):
+        check_fields(self)
 
     @abc.abstractmethod
     def __call__(

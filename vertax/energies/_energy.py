@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.checks import as_real, named
+from vertax._base.fields import check_fields
 from vertax.mesh import Tissue
 
 
@@ -35,6 +36,9 @@ class AbstractEnergy(eqx.Module):
     `jax.custom_vjp` must not be used inside: implicit differentiation needs forward mode through the
     gradient (`jax.custom_jvp` is fine).
     """
+
+    def __check_init__(self):
+        check_fields(self)
 
     @abc.abstractmethod
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:

@@ -50,6 +50,12 @@ class Grown(eqx.Module):
     """Whether all steps up to a frame came to an end, in tissues without overlaps."""
     full: Bool[Array, "*batch"]
     """Whether a cell could not divide for want of a spare slot."""
+    failed_divisions: Int[Array, "*batch times"]
+    """How many divisions up to a frame were due and could not happen: there was no spare slot, or the cell
+    could not be cut in two. A cell that remains due is tried in each step, and counted each time."""
+    failed_deaths: Int[Array, "*batch times"]
+    """How many deaths up to a frame were overdue, see `overdue` of the life cycle, and could not happen, such
+    as that of a cell without which a neighbour had too few sides. Counted in each step that it remains."""
     log_likelihood: Float[Array, "*batch"]
     """The logarithm of how likely the choices of the cycle were, see
     [`score_function`][vertax.growth.score_function]."""
@@ -138,7 +144,8 @@ def grow(
     **Arguments:**
 
     - `tissue`: where it begins, with room for all that will be alive at a time, see
-        [`with_capacity`][vertax.Tissue.with_capacity].
+        [`with_capacity`][vertax.Tissue.with_capacity]: one cell or more in a periodic box, two or more of a
+        free tissue.
     - `energy`: a function of what cells know of themselves that returns their energy.
     - `cycle`: the rules, such as [`GrowAndDivide`][vertax.growth.GrowAndDivide].
     - `times`: when there is to be a frame; they increase, and the first is that of the start.
@@ -207,6 +214,8 @@ class _State(eqx.Module):
     lineage: Lineage
     sound: Bool[Array, ""]
     full: Bool[Array, ""]
+    failed_divisions: Int[Array, ""]
+    failed_deaths: Int[Array, ""]
     log_likelihood: Float[Array, ""]
 
 
@@ -236,8 +245,17 @@ def _grow(
         cells = jax.tree.map(lambda a, b: jnp.where(change.done, a, b), cells, state.cells)
         lineage, number = divided_at(state.lineage, state.number, pair, time, change.done)
         full = state.full | (jnp.any(due) & jnp.all(state.tissue.alive))
+        failed = state.failed_divisions + (jnp.any(due) & ~change.done)
         after = _State(
-            change.tissue, cells, number, lineage, state.sound, full, state.log_likelihood
+            tissue=change.tissue,
+            cells=cells,
+            number=number,
+            lineage=lineage,
+            sound=state.sound,
+            full=full,
+            failed_divisions=failed,
+            failed_deaths=state.failed_deaths,
+            log_likelihood=state.log_likelihood,
         )
         return after, due & (jnp.arange(due.size) != cell)
 
@@ -263,8 +281,17 @@ def _grow(
         gone = before.alive & ~moved.tissue.alive
         lineage, number = died_at(state.lineage, state.number, gone, end)
         sound = state.sound & (moved.result == optx.RESULTS.successful) & moved.valid
+        overdue = moved.tissue.alive & cycle.overdue(state.cells, moved.tissue)
         return _State(
-            moved.tissue, state.cells, number, lineage, sound, state.full, state.log_likelihood
+            tissue=moved.tissue,
+            cells=state.cells,
+            number=number,
+            lineage=lineage,
+            sound=sound,
+            full=state.full,
+            failed_divisions=state.failed_divisions,
+            failed_deaths=state.failed_deaths + jnp.sum(overdue),
+            log_likelihood=state.log_likelihood,
         )
 
     def interval(arrays: _State, inputs: tuple) -> tuple[_State, tuple]:
@@ -276,20 +303,31 @@ def _grow(
 
         keys = jax.random.split(key, substeps)
         arrays, _ = jax.lax.scan(substep, arrays, (marks[:-1], marks[1:], keys))
-        return arrays, (arrays.tissue, arrays.cells, arrays.number, arrays.sound)
+        return arrays, frame_of(arrays)
+
+    def frame_of(arrays: _State) -> tuple:
+        failed = (arrays.failed_divisions, arrays.failed_deaths)
+        return arrays.tissue, arrays.cells, arrays.number, arrays.sound, failed
 
     first, rest = jax.random.split(key)
     lineage, number = founded(tissue, times[0], records)
-    no, yes = jnp.array(False), jnp.array(True)
-    certain = jnp.zeros((), tissue.vertices.dtype)
-    begin = _State(tissue, cycle.init(tissue, first), number, lineage, yes, no, certain)
+    begin = _State(
+        tissue=tissue,
+        cells=cycle.init(tissue, first),
+        number=number,
+        lineage=lineage,
+        sound=jnp.array(True),
+        full=jnp.array(False),
+        failed_divisions=jnp.array(0),
+        failed_deaths=jnp.array(0),
+        log_likelihood=jnp.zeros((), tissue.vertices.dtype),
+    )
     arrays, static = eqx.partition(begin, eqx.is_array)
     whole = lambda arrays: eqx.combine(arrays, static)
     keys = jax.random.split(rest, times.shape[0] - 1)
     end, frames = jax.lax.scan(interval, arrays, ((times[:-1], times[1:]), keys))
     join = lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest])
-    start = (arrays.tissue, arrays.cells, arrays.number, arrays.sound)
-    tissues, cells, numbers, sound = jax.tree.map(join, start, frames)
+    tissues, cells, numbers, sound, failed = jax.tree.map(join, frame_of(arrays), frames)
     last = whole(end)
     return Grown(
         tissue=last.tissue,
@@ -301,6 +339,8 @@ def _grow(
         lineage=last.lineage,
         sound=sound,
         full=last.full,
+        failed_divisions=failed[0],
+        failed_deaths=failed[1],
         log_likelihood=last.log_likelihood,
     )
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.checks import as_real, check_number
+from vertax._base.fields import check_fields
 from vertax.mesh import Tissue
 
 
@@ -21,6 +22,9 @@ class AbstractLifeCycle(eqx.Module):
     that of her mother. An array that has not, declares it by the metadata of its field, see
     [`Change.inherited`][vertax.transitions.Change].
     """
+
+    def __check_init__(self):
+        check_fields(self)
 
     @abc.abstractmethod
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
@@ -51,6 +55,10 @@ class AbstractLifeCycle(eqx.Module):
         a size, is differentiated as such. By default 0, that of a cycle without choices.
         """
         return jnp.zeros((), tissue.vertices.dtype)
+
+    def overdue(self, cells: PyTree[Array], tissue: Tissue) -> Bool[Array, " cells"]:
+        """Which cells should have vanished by now; `grow` counts those that have not. By default none."""
+        return jnp.zeros(tissue.n_cells, bool)
 
     def axis(
         self, cells: PyTree[Array], tissue: Tissue, cell: Int[Array, ""], key: PRNGKeyArray
@@ -155,6 +163,10 @@ class GrowAndDivide(AbstractLifeCycle):
         each = jnp.where(after.dying & ~certain, dies, -spent)
         could = tissue.alive & ~before.dying
         return jnp.sum(jnp.where(could, each, 0)).astype(tissue.vertices.dtype)
+
+    def overdue(self, cells: Cells, tissue: Tissue) -> Bool[Array, " cells"]:
+        """Dying cells that aim at less than a thousandth of the area at which they would divide."""
+        return cells.dying & (cells.target_area < 1e-3 * cells.division_area)
 
     def born(self, cells: Cells, tissue: Tissue, pair: Int[Array, "2"], key: PRNGKeyArray) -> Cells:
         """Two cells of half the size."""

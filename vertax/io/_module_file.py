@@ -67,8 +67,8 @@ def save_energy(path: str | os.PathLike[str], energy: AbstractEnergy) -> None:
     **Arguments:**
 
     - `path`: the file, by custom with the ending `.npz`; taken as it is.
-    - `energy`: an energy of vertax or of your own, or a sum of such. Fields may hold arrays, numbers,
-        text, None, tuples, lists, dictionaries and modules.
+    - `energy`: an energy of vertax or of your own, or a sum of such. Fields may hold arrays, keys of random
+        numbers, numbers, text, None, tuples, lists, dictionaries and modules.
 
     **Raises:**
 
@@ -235,6 +235,9 @@ class _Writer:
         if type(value) is dict and all(type(key) is str for key in value):
             nodes = [self.node(item, f"{path}.{i}") for i, item in enumerate(value.values())]
             return {"kind": "dict", "keys": list(value), "items": nodes}
+        if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+            data = self.array("key", jax.random.key_data(value), path)
+            return data | {"generator": str(jax.random.key_impl(value))}
         if isinstance(value, jax.Array):
             return self.array("array", value, path) | {"weak": bool(value.weak_type)}
         if isinstance(value, np.ndarray) and type(value) is np.ndarray:
@@ -264,11 +267,11 @@ class _Writer:
 
     def array(self, kind: str, value: Any, path: str) -> dict[str, Any]:
         dtype = value.dtype
-        # bfloat16 and the like come back from a file as raw bytes; keys of random numbers are no NumPy.
+        # bfloat16 and the like come back from a file as raw bytes.
         if not isinstance(dtype, np.dtype) or dtype.kind not in "biufc":
             raise ValueError(
                 f"Argument `{self.argument}` must hold numbers of a type NumPy knows, but its "
-                f"`{path[1:]}` is {dtype}."
+                f"`{path[1:]}` is {dtype}. Convert it before saving, such as to float32."
             )
         name = f"data{path}"
         self.arrays[name] = np.asarray(value)
@@ -319,6 +322,8 @@ class _Reader:
             case {"kind": "array", "name": str(name), "weak": bool(weak)}:
                 array = as_jax(self.array(name), self.file)
                 return _weakly_typed(array) if weak else array
+            case {"kind": "key", "name": str(name), "generator": str(generator)}:
+                return self.key(name, generator, path)
             case {"kind": "numpy", "name": str(name)}:
                 return self.array(name)
             case {"kind": "scalar", "name": str(name)}:
@@ -335,6 +340,16 @@ class _Reader:
         if name not in self.arrays:
             raise ValueError(f"{self.file} is incomplete: it has no array `{name}`.")
         return self.arrays[name]
+
+    def key(self, name: str, generator: str, path: str) -> jax.Array:
+        """Keys of random numbers, from what they consist of."""
+        data = as_jax(self.array(name), self.file)
+        try:
+            return jax.random.wrap_key_data(data, impl=generator)
+        except Exception as error:
+            raise ValueError(
+                f"{self.file} is broken: `{path}` is no key of the generator {generator!r} ({error})."
+            ) from error
 
     def find(self, kind: str, name: str, path: str) -> type[eqx.Module]:
         if kind == "vertax":

@@ -13,7 +13,7 @@ from vertax.energies import Ablated, AbstractEnergy, AbstractLocalEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._surgery import merge_cells
 from vertax.mesh._topology import take
-from vertax.transitions._t1 import overlapping_faces
+from vertax.transitions._t1 import has_new_overlaps
 from vertax.transitions._t2 import face_sides
 
 
@@ -126,5 +126,4 @@ def _is_sound(new: Tissue, before: Tissue) -> Bool[Array, ""]:
     if m.exterior:  # a cell that meets itself would surround others
         same = m.edge_cells[:, 0] == m.edge_cells[:, 1]
         sound &= ~jnp.any(same & m.alive_edges)
-    crossed = overlapping_faces(new.overlaps) & ~overlapping_faces(before.overlaps)
-    return sound & ~jnp.any(crossed)
+    return sound & ~has_new_overlaps(new, before)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,16 +11,13 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.checks import as_real, check_whole
-from vertax._base.modules import is_concrete
-from vertax.mesh import Tissue
-from vertax.mesh._arcs import arc_points
-from vertax.mesh._sides import cross
-from vertax.mesh._surgery import spare_slot, split_cell
+from vertax._base.modules import choose, is_concrete
+from vertax.mesh import Tissue, Topology
+from vertax.mesh._surgery import Slot, spare_slot, split_cell
 from vertax.mesh._topology import take
 from vertax.transitions._change import Change, raised_if, unchanged
-
-# The ends of a new edge keep this share of the side they lie on away from its corners.
-_MARGIN = 0.05
+from vertax.transitions._cut import Cut, find_cut, points_at
+from vertax.transitions._t1 import has_new_overlaps
 
 
 def divide(
@@ -47,7 +46,7 @@ def divide(
     - `tissue`: the tissue, with spare slots.
     - `cell`: number of the cell.
     - `axis`, shape `(2,)`: direction of one daughter from the other; by default the long axis of the second
-        moments of the area within the corners.
+        moments of the area.
     - `throw`: raise an error if the cell cannot divide. If False, look at `done`.
 
     **Returns:** a [`Change`][vertax.transitions.Change], with the tissue.
@@ -56,7 +55,7 @@ def divide(
 
     - `ValueError` for an axis that is none, or a cell that is not there.
     - `RuntimeError` (of Equinox inside `jax.jit`) if there is no spare slot left, or if it cannot be cut
-        in two along this axis.
+        in two along this axis without overlaps.
     """
     if axis is not None:
         axis = as_real("axis", axis)
@@ -105,113 +104,73 @@ def divided(
 ) -> Change:
     """Divide a cell, if it is to, there is room and it can be cut."""
     m, sides = tissue.topology, tissue.sides
-    mine = m.cell == cell
-    centre, long = _centre_and_axis(sides, mine)
-    axis = long if axis is None else axis.astype(sides.dtype)
-    axis = axis / jnp.sqrt(jnp.sum(axis**2))
-    along = jnp.stack([-axis[1], axis[0]])  # of the cut
-    first, last = sides[:, :2] - centre, sides[:, :2] + sides[:, 2:4] - centre
-    beside = lambda x: -jnp.sum(axis * x, axis=-1)
-    before, after = beside(first), beside(last)
-    leaves, enters = mine & (before < 0) & (after >= 0), mine & (before >= 0) & (after < 0)
-    share = before / jnp.where(leaves | enters, before - after, 1)
-    at = jnp.sum(along * (first + share[:, None] * sides[:, 2:4]), axis=-1)
-    # Where the line leaves the cell after the centroid, and where it last came in before.
-    out = jnp.argmin(jnp.where(leaves & (at > 0), at, jnp.inf)).astype(m.twin.dtype)
-    into = jnp.argmax(jnp.where(enters & (at < at[out]), at, -jnp.inf)).astype(m.twin.dtype)
+    cut = find_cut(tissue, m.cell == cell, axis)
     slot = spare_slot(m)
-    done = do & slot.there & leaves[out] & enters[into] & (at[out] > 0) & (at[into] < at[out])
+    done = do & slot.there & cut.possible
 
+    out, into = cut.out, cut.into
     both = jnp.stack([out, into])
-    cut = take(sides, both)
-    share = take(share, both)
-    if tissue.arcs is not None:
-        share = _where_arcs_meet(cut, centre, axis)
-    share = jnp.clip(share, _MARGIN, 1 - _MARGIN)
-    points = cut[:, :2] + share[:, None] * cut[:, 2:4]
-    if tissue.arcs is not None:
-        points = _on_arcs(cut, share)
-
-    # A cell that is its own neighbour may be cut twice at one edge: then it matters what comes first.
-    same = take(m.twin, out) == into
-    late = same & (share[0] + share[1] > 1)
-    second = jnp.where(late, 3 * slot.vertices[0] + 2, into)
-    changed = split_cell(m, out, second, slot, done)
-    frames = jnp.stack([take(m.frame, out), take(changed.frame, second)])
+    points = points_at(take(sides, both), cut.shares)
+    parts = _Parts.of(m, cut, slot)
+    changed = split_cell(m, out, parts.second, slot, done)
+    frames = jnp.stack([take(m.frame, out), take(changed.frame, parts.second)])
     points = points - tissue.boundary.translation(frames)
     place = jnp.where(done, jnp.stack(slot.vertices), tissue.n_vertices)
     new = tissue.with_vertices(tissue.vertices.at[place].set(points, mode="drop"))
     new = new.with_topology(changed)
+    drop = lambda e: jnp.where(done, e, tissue.n_edges)
+    if tissue.angles is not None:
+        angles = tissue.angles
+        for kept, more, share in zip(parts.edges, slot.edges, parts.shares, strict=False):
+            angle = take(angles, kept)
+            angles = angles.at[drop(more)].set((1 - share) * angle, mode="drop")
+            angles = angles.at[drop(kept)].set(share * angle, mode="drop")
+        new = new.with_angles(angles.at[drop(slot.edges[2])].set(0, mode="drop"))
+    # (Through a concave cell, or near a corner, the new edge may cross other sides.)
+    good = done & ~has_new_overlaps(new, tissue)
 
     none = unchanged(tissue)
-    daughter = jnp.where(done, slot.cell, tissue.n_cells)
-    cells = none.cells.at[daughter].set(cell.astype(none.cells.dtype), mode="drop")
+    put = lambda old, where, parent: old.at[jnp.where(good, where, old.size)].set(
+        parent.astype(old.dtype), mode="drop"
+    )
     edge, other = take(m.edge, out), take(m.edge, into)
-    drop = lambda e: jnp.where(done, e, tissue.n_edges)
-    heirs = jnp.stack([drop(e) for e in slot.edges])
-    edges = none.edges.at[heirs].set(jnp.stack([edge, other, edge]), mode="drop")
-    vertices = none.vertices.at[place].set(take(m.source, both), mode="drop")
-    if tissue.angles is not None:
-        # The part that an edge keeps, and that which becomes another edge. What was cut before is shorter.
-        early = jnp.where(late, (share[1] - 1 + share[0]) / share[0], share[1] / (1 - share[0]))
-        shares = jnp.stack([share[0], jnp.where(same, early, share[1])])
-        angles = tissue.angles
-        old = jnp.stack([edge, jnp.where(same & ~late, slot.edges[0], other)])
-        for k in range(2):
-            angle = take(angles, old[k])
-            angles = angles.at[drop(slot.edges[k])].set((1 - shares[k]) * angle, mode="drop")
-            angles = angles.at[drop(old[k])].set(shares[k] * angle, mode="drop")
-        new = new.with_angles(angles.at[drop(slot.edges[2])].set(0, mode="drop"))
-    return Change(new, cells, edges, vertices, done)
+    return Change(
+        choose(good, new, tissue),
+        put(none.cells, slot.cell, cell),
+        put(none.edges, jnp.stack(slot.edges), jnp.stack([edge, other, edge])),
+        put(none.vertices, jnp.stack(slot.vertices), take(m.source, both)),
+        good,
+    )
 
 
-def _centre_and_axis(
-    sides: Float[Array, "halfedges parts"], mine: Bool[Array, " halfedges"]
-) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """The centroid of a cell and its long axis, both of the polygon of its corners."""
-    # From one of its corners: far from the origin digits would be lost.
-    reference = sides[jnp.argmax(mine), :2]
-    p = sides[:, :2] - reference
-    q = p + sides[:, 2:4]
-    swept = jnp.where(mine, cross(p, q), 0)
-    area = jnp.sum(swept) / 2
-    centre = jnp.sum((p + q) * swept[:, None], axis=0) / (6 * area)
-    p, q = p - centre, q - centre
-    swept = jnp.where(mine, cross(p, q), 0)
-    # Of a triangle from the centroid, but for a factor: the three points half-way along its sides.
-    points = jnp.stack([p, q, p + q])
-    moment = lambda a, b: jnp.sum(swept * jnp.sum(points[..., a] * points[..., b], axis=0))
-    xx, xy, yy = moment(0, 0), moment(0, 1), moment(1, 1)
-    angle = 0.5 * jnp.arctan2(2 * xy, xx - yy)
-    return reference + centre, jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+class _Parts(NamedTuple):
+    """What becomes of the edges that are cut, the first before the second."""
 
+    second: Int[Array, ""]
+    """The half-edge that is cut second; one of the first cut, if both are on one edge."""
+    edges: tuple[Int[Array, ""], Int[Array, ""]]
+    """The edges that are cut, which keep the part before the cut."""
+    shares: tuple[Float[Array, ""], Float[Array, ""]]
+    """How long that part is, in units of what is cut."""
 
-def _on_arcs(sides: Float[Array, "2 parts"], shares: Float[Array, "2"]) -> Float[Array, "2 2"]:
-    """Points at some shares of the lengths of two sides."""
-    one = lambda side, share: arc_points(side[None, :2], side[None, 2:4], side[4:], share[None])
-    return jax.vmap(one)(sides, shares)[:, 0, 0]
-
-
-def _where_arcs_meet(
-    sides: Float[Array, "2 parts"],
-    centre: Float[Array, "2"],
-    axis: Float[Array, "2"],
-) -> Float[Array, "2"]:
-    """At which share of their length two sides cross the line across an axis, by bisection."""
-    distance = lambda x: jnp.sum(axis * (x - centre), axis=-1)
-    before = distance(sides[:, :2]) > 0
-
-    def halve(_: Array, ends: tuple) -> tuple:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        early = (distance(_on_arcs(sides, middle)) > 0) == before
-        return jnp.where(early, middle, low), jnp.where(early, high, middle)
-
-    none = jnp.zeros(2, sides.dtype)
-    steps = 10 - int(np.log2(jnp.finfo(sides.dtype).eps))
-    low, high = jax.lax.fori_loop(0, steps, halve, (none, none + 1))
-    # Bisection knows no derivative; a step of Newton's method has the right one.
-    found = jax.lax.stop_gradient(0.5 * (low + high))
-    at = lambda share: distance(_on_arcs(sides, share))
-    value, slope = jax.jvp(at, (found,), (jnp.ones_like(found),))
-    return found - value / jax.lax.stop_gradient(slope)
+    @classmethod
+    def of(cls, m: Topology, cut: Cut, slot: Slot) -> _Parts:
+        first, share = cut.shares
+        out, into = cut.out, cut.into
+        edge, other, ahead = take(m.edge, out), take(m.edge, into), 3 * slot.vertices[0]
+        # A cell that is its own neighbour may be cut twice at one edge, from either side: the second cut is
+        # on the part before the first one, or after it.
+        opposite = take(m.twin, out) == into
+        late = opposite & (first + share > 1)
+        before = jnp.where(late, (share - 1 + first) / first, share / (1 - first))
+        # An arc may be cut twice from the same side.
+        same = out == into
+        after = same & (share > first)
+        along = jnp.where(after, (share - first) / (1 - first), share / first)
+        second = jnp.where(late, ahead + 2, jnp.where(after, ahead, into))
+        on_new = (opposite & ~late) | after
+        return cls(
+            second,
+            (edge, jnp.where(on_new, slot.edges[0], other)),
+            (first, jnp.where(same, along, jnp.where(opposite, before, share))),
+        )

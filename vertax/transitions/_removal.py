@@ -12,7 +12,7 @@ from vertax.mesh import Tissue
 from vertax.transitions._change import Change, raised_if, unchanged
 from vertax.transitions._division import check_cell
 from vertax.transitions._edge_frames import EdgeFrames
-from vertax.transitions._t1 import overlapping_faces
+from vertax.transitions._t1 import has_new_overlaps, overlapping_faces
 from vertax.transitions._t2 import can_vanish, vanished
 
 # A flipped edge is at first so long, compared with what it was; and shorter where there is no room.
@@ -97,7 +97,7 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     reduced, *_ = jax.lax.while_loop(unfinished, flip, start)
     go = do & can_vanish(reduced)[cell]
     gone = vanished(reduced, cell, go)
-    done = go & ~jnp.any(overlapping_faces(gone.overlaps) & ~overlapping_faces(tissue.overlaps))
+    done = go & ~has_new_overlaps(gone, tissue)
     return Change(choose(done, gone, tissue), none.cells, none.edges, none.vertices, done)
 
 

@@ -15,7 +15,7 @@ from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._measured import Measured
 from vertax.mesh._overlaps import Overlaps, faces_crossed
-from vertax.mesh._tissue import Known
+from vertax.mesh._tissue import Known, mean_area
 from vertax.mesh._topology import take
 from vertax.transitions._edge_frames import EdgeFrames, suspects
 from vertax.transitions._transitions import AbstractTransitions
@@ -187,6 +187,15 @@ _SHORTENED = 3
 def overlapping_faces(overlaps: Overlaps) -> Bool[Array, " faces"]:
     """Which faces overlap, the exterior last."""
     return jnp.append(overlaps.cells, overlaps.exterior)
+
+
+def has_new_overlaps(new: Tissue, before: Tissue) -> Bool[Array, ""]:
+    """Whether faces overlap after a change that did not before, or cells have no area but rounding errors."""
+    crossed = overlapping_faces(new.overlaps) & ~overlapping_faces(before.overlaps)
+    # (A cell of two sides has none if its arc is straight.)
+    least = 1e3 * jnp.finfo(before.vertices.dtype).eps * mean_area(before)
+    flat = new.alive & (new.areas <= least) & ~(before.alive & (before.areas <= least))
+    return jnp.any(crossed) | jnp.any(flat)
 
 
 def _number_of_rows(tissue: Tissue) -> int:

@@ -13,7 +13,7 @@ from vertax.mesh import Tissue
 from vertax.mesh._surgery import collapse_triangle, merge_cells
 from vertax.mesh._tissue import mean_area
 from vertax.mesh._topology import clockwise, counter_clockwise, source, take
-from vertax.transitions._t1 import overlapping_faces
+from vertax.transitions._t1 import has_new_overlaps
 from vertax.transitions._transitions import AbstractTransitions
 
 
@@ -74,8 +74,7 @@ class T2(AbstractTransitions):
             accepted = energy(_enlarged(tissue, cell)) >= energy(tissue)
             gone = vanished(tissue, cell, accepted)
             # Where there is no room for that, there will be when it is smaller.
-            crossed = overlapping_faces(gone.overlaps) & ~overlapping_faces(tissue.overlaps)
-            accepted &= ~jnp.any(crossed)
+            accepted &= ~has_new_overlaps(gone, tissue)
             h = jnp.argmax(tissue.topology.cell == cell)
             edge = jnp.where(accepted, take(tissue.topology.edge, h), tissue.n_edges)
             tissue = choose(accepted, gone, tissue)

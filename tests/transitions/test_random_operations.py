@@ -1,0 +1,180 @@
+"""Random sequences of operations on small tissues, checked by NumPy alone."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+from helpers import random_tissue
+from mesh_checks import check_tissue
+
+import vertax as vx
+from vertax.io import load_tissue, save_tissue
+from vertax.transitions import ablate, divide, remove
+
+# One capacity, so that all tissues of a kind share what is compiled.
+CAPACITY = 12
+ENERGY = (
+    vx.energies.AreaElasticity(1.0, 1.0)
+    + vx.energies.PerimeterElasticity(0.05, 2.0)
+    + vx.energies.LineTension(0.02)
+)
+FRICTION = vx.dissipations.SubstrateFriction(1.0)
+
+
+def straight(n, seed):
+    """A free tissue of straight edges, in which a cell of two sides would have no area."""
+    tissue = cluster(max(n, 5), seed, lloyd_steps=4)
+    tissue = vx.Tissue(tissue.vertices, tissue.topology, vx.Free())
+    sound = (tissue.topology.neighbour_counts > 2).all() and not tissue.overlaps.any
+    return tissue if sound else straight(n, seed + 1000)
+
+
+KINDS = {
+    "periodic": lambda n, seed: random_tissue(n, seed, lloyd_steps=3),
+    "straight": straight,
+    "arcs": lambda n, seed: cluster(max(n, 2), seed, lloyd_steps=3),
+    "foam": lambda n, seed: cluster(max(n, 2), seed, lloyd_steps=3, inner_arcs=True),
+}
+
+
+@eqx.filter_jit
+def swept(tissue, rule):
+    return rule.sweep(tissue, ENERGY, rule.init(tissue))[0]
+
+
+@eqx.filter_jit
+def smoothed(tissue):
+    """Vertices some way to the middle of their neighbours, if no cells overlap then."""
+    m = tissue.topology
+    vector = jnp.where(m.forward[:, None], 1, -1) * tissue.edge_vectors[m.edge]
+    pull = jnp.mean(vector.reshape(-1, 3, 2), axis=1)
+    vertices = tissue.vertices + 0.3 * jnp.where(m.alive_vertices[:, None], pull, 0)
+    moved = tissue.with_vertices(vertices.astype(tissue.vertices.dtype))
+    worse = moved.overlaps.any
+    moved = jax.tree.map(lambda a, b: jnp.where(worse, a, b), tissue, moved)
+    if not m.exterior:
+        return moved
+    # A free tissue would shrink to a point.
+    middle = jnp.mean(moved.vertices, axis=0)
+    scale = jnp.sqrt(jnp.sum(moved.alive) / jnp.sum(moved.areas))
+    return moved.with_vertices((moved.vertices - middle) * scale)
+
+
+class Player:
+    """Applies random operations to a tissue, one after another."""
+
+    def __init__(self, kind, seed, folder, dtype=jnp.float64):
+        self.rng, self.folder, self.kind, self.dtype = (
+            np.random.default_rng(seed),
+            folder,
+            kind,
+            dtype,
+        )
+        self.counts: dict[str, int] = {}
+        self.rtol = 1e-9 if dtype == jnp.float64 else 1e-4
+        self.restart()
+
+    def restart(self):
+        n = int(self.rng.integers(1, CAPACITY + 1))
+        tissue = KINDS[self.kind](n, int(self.rng.integers(1000))).with_capacity(CAPACITY)
+        floats = lambda x: x.astype(self.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
+        self.tissue = jax.tree.map(floats, tissue)
+        check_tissue(self.tissue, self.rtol)
+
+    def cell(self):
+        return int(self.rng.choice(np.flatnonzero(self.tissue.alive)))
+
+    def divide(self):
+        angle = self.rng.uniform(0, np.pi)
+        axis = jnp.asarray([np.cos(angle), np.sin(angle)], self.dtype)
+        change = divide(self.tissue, self.cell(), axis, throw=False)
+        assert change.tissue.alive.sum() == self.tissue.alive.sum() + change.done
+        return change.tissue
+
+    def remove(self):
+        change = remove(self.tissue, self.cell(), throw=False)
+        assert change.tissue.alive.sum() == self.tissue.alive.sum() - change.done
+        return change.tissue
+
+    def ablate(self):
+        pairs = np.asarray(self.tissue.topology.edge_cells)
+        pairs = pairs[(pairs < CAPACITY).all(axis=1)]
+        pair = pairs[self.rng.integers(len(pairs))]
+        try:
+            return ablate(self.tissue, ENERGY, cells=np.isin(np.arange(CAPACITY), pair))[0]
+        except RuntimeError as error:
+            if "become one hole" not in str(error):
+                raise
+            return None
+
+    def t1(self):
+        return swept(
+            self.tissue, vx.T1(threshold=jnp.asarray(self.rng.uniform(0.05, 0.6), self.dtype))
+        )
+
+    def t2(self):
+        return swept(self.tissue, vx.transitions.T2(threshold=0.5))
+
+    def save(self):
+        path = self.folder / "tissue.npz"
+        save_tissue(path, self.tissue)
+        loaded = load_tissue(path)
+        assert eqx.tree_equal(loaded, self.tissue)
+        return loaded
+
+    def renumber(self):
+        dense = self.tissue.without_spare()
+        check_tissue(dense, self.rtol)
+        return dense.with_capacity(CAPACITY)
+
+    def relax(self):
+        found = vx.equilibrate(
+            self.tissue, ENERGY, transitions=vx.T1() + vx.transitions.T2(), throw=False
+        )
+        assert found.valid
+        return found.tissue
+
+    def evolve(self):
+        times = jnp.asarray([0.0, 0.05], self.dtype)
+        found = vx.evolve(self.tissue, ENERGY, FRICTION, times, throw=False)
+        return found.tissue
+
+    def play(self, steps, shares):
+        names = list(shares)
+        weights = np.array([shares[name] for name in names], float)
+        for step in range(steps):
+            name = str(self.rng.choice(names, p=weights / weights.sum()))
+            new = getattr(self, name)()
+            if new is not None:
+                same = eqx.tree_equal(new.topology, self.tissue.topology)
+                self.counts[name] = self.counts.get(name, 0) + (not bool(same))
+                self.tissue = new
+            try:
+                check_tissue(self.tissue, self.rtol)
+            except AssertionError as error:
+                raise AssertionError(f"after step {step}, {name}: {error}") from error
+            self.tissue = smoothed(self.tissue)
+            if step % 40 == 39:
+                self.restart()
+
+
+QUICK = {"divide": 5, "remove": 3, "t1": 3, "t2": 1, "ablate": 1, "save": 0.3, "renumber": 0.1}
+ALL = QUICK | {"relax": 0.4, "evolve": 0.3}
+
+
+@pytest.mark.parametrize("kind", ["periodic", "arcs"])
+def test_random_operations_keep_tissues_sound(kind, tmp_path):
+    player = Player(kind, 0, tmp_path)
+    player.play(150, QUICK)
+    assert min(player.counts[name] for name in ("divide", "remove", "t1")) >= 3, player.counts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_many_random_operations_keep_tissues_sound(kind, dtype, tmp_path):
+    player = Player(kind, 1, tmp_path, dtype)
+    player.play(250, ALL)
+    assert min(player.counts[name] for name in ("divide", "remove", "t1")) >= 3, player.counts

@@ -1,0 +1,54 @@
+"""What fields of modules may hold: refused by the name of the field when a module is made."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vertax._base.checks import named
+
+
+def check_fields(module: eqx.Module) -> None:
+    """Raise an error if a field of a module, or of a module in it, holds what cannot be compiled.
+
+    A static field is a part of the program, which JAX finds by hash and equality: an array has neither.
+
+    **Raises:**
+
+    - `TypeError`, with the name of the field, for a static field whose value has no hash, such as an array,
+        and for an array of NumPy that holds no numbers.
+    """
+    for field in dataclasses.fields(module):
+        if not hasattr(module, field.name):
+            continue
+        value, what = getattr(module, field.name), f"`{field.name}` of {type(module).__name__}"
+        if field.metadata.get("static", False):
+            _check_static(what, value)
+            continue
+        for leaf in jax.tree.leaves(value, is_leaf=lambda x: isinstance(x, eqx.Module)):
+            if isinstance(leaf, eqx.Module):
+                check_fields(leaf)
+            elif isinstance(leaf, np.ndarray) and not _numeric(leaf.dtype):
+                raise TypeError(
+                    f"Field {what} must hold numbers, but holds {named(leaf)}. Give text as a tuple: "
+                    "tuple(array.tolist())."
+                )
+
+
+def _check_static(what: str, value: Any) -> None:
+    try:
+        hash(value)
+    except TypeError as error:
+        raise TypeError(
+            f"Field {what} must have a hash, because it is static, but holds {named(value)} ({error}). For "
+            "an array leave out static=True (a NumPy array is not fitted); give a list as a tuple."
+        ) from error
+
+
+def _numeric(dtype: np.dtype) -> bool:
+    return dtype.kind in "biufc" or bool(jnp.issubdtype(dtype, np.number))
