@@ -4,14 +4,17 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+NEWEST := .venv-newest
 # Tests compile a lot: two processes are nearly twice as fast as one, more need more memory.
 WORKERS ?= 2
+# What `make test-newest` runs: the parts of the library that depend most on the version of JAX.
+CORE := _base mesh energies adjoints solvers transitions costs responses/test_relaxation.py fitting io
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-thorough test-docs test-experiments test-slow notebooks notebooks-write lint format types docs benchmark build clean
+.PHONY: help demo test test-thorough test-docs test-experiments test-slow test-newest notebooks notebooks-write lint format types docs benchmark build clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 22
@@ -33,6 +36,14 @@ test-experiments: $(VENV)/.dev ## short runs of each experiment
 
 test-slow: $(VENV)/.dev ## the longer scientific checks
 	$(BIN)/python tests/run.py --workers $(WORKERS) -m slow $(PYTEST_OPTIONS)
+
+test-newest: $(NEWEST)/.dev ## the core tests with the newest Python of this machine and the newest JAX
+	@if [ -e $(NEWEST)/.dev ]; then \
+	    $(NEWEST)/bin/python -c "import jax, platform; print('Python', platform.python_version(), 'and JAX', jax.__version__)"; \
+	    $(NEWEST)/bin/python tests/run.py --workers $(WORKERS) $(addprefix --only ,$(CORE)) $(PYTEST_OPTIONS); \
+	else \
+	    echo "Not tested: this machine has no newer Python than $(VENV), which has $$($(BIN)/python -V)."; \
+	fi
 
 notebooks: $(VENV)/.dev ## execute the notebooks, shortened; their outputs stay as they are
 	$(BIN)/python notebooks/execute.py --light --jobs $(WORKERS)
@@ -67,7 +78,7 @@ build: $(VENV)/.dev ## wheel and source archive in dist
 	$(BIN)/python -m build
 
 clean: ## remove the environment, caches and builds, but no results
-	rm -rf $(VENV) build dist site *.egg-info .cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(NEWEST) build dist site *.egg-info .cache .pytest_cache .ruff_cache .hypothesis
 	find . -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is newer than pyproject.toml when the environment holds what that asks for. The package itself
@@ -86,6 +97,17 @@ $(VENV)/.docs: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV) for the documentation; this takes a minute or two and happens once."
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	@touch $@
+
+# Made anew each time, so that it has the newest versions; without a newer Python there is none, and no stamp.
+$(NEWEST)/.dev: pyproject.toml | $(BIN)/python
+	@rm -rf $(NEWEST)
+	@python=$$($(BIN)/python tests/newest_python.py) || exit 1; \
+	if [ -n "$$python" ]; then \
+	    echo "Setting up $(NEWEST) with $$python; this takes a few minutes and happens once."; \
+	    "$$python" -m venv $(NEWEST) && \
+	    $(NEWEST)/bin/python -m pip install --quiet --editable '.[dev]' && \
+	    touch $@; \
+	fi
 
 $(BIN)/python:
 	@command -v $(PYTHON) >/dev/null || { \

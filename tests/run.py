@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -44,13 +45,20 @@ TOGETHER = (
 NOTHING_SELECTED = 5
 
 
-def groups(only: str = "", without: str | None = None) -> list[list[Path]]:
-    """The files of tests that share a process; of those whose path begins with something, and not so."""
+def groups(only: Sequence[str] = (), without: Sequence[str] = ()) -> list[list[Path]]:
+    """The files of tests that share a process.
+
+    **Arguments:**
+
+    - `only`: prefixes of paths, relative to `tests/`; files with none of them are left out. By default all
+        files are kept.
+    - `without`: prefixes of paths; files with one of them are left out.
+    """
     place = {name: number for number, names in enumerate(TOGETHER) for name in names}
     shared: dict[int, list[Path]] = {}
     for file in sorted(FOLDER.rglob("test_*.py")):
         name, folder = (path.relative_to(FOLDER).as_posix() for path in (file, file.parent))
-        if name.startswith(only) and not (without and name.startswith(without)):
+        if name.startswith(tuple(only) or "") and not name.startswith(tuple(without)):
             number = place.get(name, place.get(folder, len(TOGETHER)))
             shared.setdefault(number, []).append(file)
     return [files for _, files in sorted(shared.items())]
@@ -78,8 +86,18 @@ def main() -> int:
     """Run all tests; the exit code is 0 if all passed."""
     parser = argparse.ArgumentParser(description="Run the tests.", allow_abbrev=False)
     parser.add_argument("--workers", type=int, default=2, help="processes at a time")
-    parser.add_argument("--only", default="", help="folder or file of tests, without `tests/`")
-    parser.add_argument("--without", help="what to leave out, in the same way")
+    parser.add_argument(
+        "--only",
+        action="append",
+        default=[],
+        help="folder or file of tests, without `tests/`; may be repeated",
+    )
+    parser.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        help="folder or file of tests to leave out; may be repeated",
+    )
     chosen, options = parser.parse_known_args()
     began = time.perf_counter()
     with ThreadPoolExecutor(chosen.workers) as pool:
