@@ -7,8 +7,9 @@ BIN := $(VENV)/bin
 NEWEST := .venv-newest
 # Tests compile a lot: two processes are nearly twice as fast as one, more need more memory.
 WORKERS ?= 2
-# What `make test-newest` runs: the parts of the library that depend most on the version of JAX.
-CORE := _base mesh energies adjoints solvers transitions costs responses/test_relaxation.py fitting io
+# What `make test-newest` runs: the parts that depend most on the version of JAX, in about ten minutes on two
+# cores. Others by `make test-newest CORE="costs io"`.
+CORE ?= _base mesh energies adjoints solvers fitting responses/test_relaxation.py project/test_compilations.py
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 

@@ -52,14 +52,14 @@ def smoothed(tissue):
     pull = jnp.mean(vector.reshape(-1, 3, 2), axis=1)
     vertices = tissue.vertices + 0.3 * jnp.where(m.alive_vertices[:, None], pull, 0)
     moved = tissue.with_vertices(vertices.astype(tissue.vertices.dtype))
+    if m.exterior:
+        # A free tissue would shrink to a point. (Vertices of spare slots go to its middle.)
+        vertices = moved.gathered(moved.vertices)
+        middle = jnp.mean(vertices, axis=0)
+        scale = jnp.sqrt(jnp.sum(moved.alive) / jnp.sum(moved.areas)).astype(vertices.dtype)
+        moved = moved.with_vertices((vertices - middle) * scale)
     worse = moved.overlaps.any
-    moved = jax.tree.map(lambda a, b: jnp.where(worse, a, b), tissue, moved)
-    if not m.exterior:
-        return moved
-    # A free tissue would shrink to a point.
-    middle = jnp.mean(moved.vertices, axis=0)
-    scale = jnp.sqrt(jnp.sum(moved.alive) / jnp.sum(moved.areas))
-    return moved.with_vertices((moved.vertices - middle) * scale)
+    return jax.tree.map(lambda a, b: jnp.where(worse, a, b), tissue, moved)
 
 
 class Player:
@@ -153,6 +153,7 @@ class Player:
                 self.tissue = new
             try:
                 check_tissue(self.tissue, self.rtol)
+                assert not self.tissue.overlaps.any, self.tissue.overlaps.describe()
             except AssertionError as error:
                 raise AssertionError(f"after step {step}, {name}: {error}") from error
             self.tissue = smoothed(self.tissue)
