@@ -48,13 +48,13 @@ def free_voronoi(
         connected depends on numbers, which are not known there.
     """
     check_concrete("free_voronoi", key)
-    check_whole("n_cells", n_cells)
-    if n_cells < 2:
+    if n_cells == 1 and n_cells is not True:
         raise ValueError(
-            f"Argument `n_cells` must be at least 2, but is {n_cells}: three edges meet at every vertex of a "
+            "Argument `n_cells` must be at least 2, but is 1: three edges meet at every vertex of a "
             "tissue, and a single free cell has none. Begin with two cells, or with one in a periodic box: "
             "vx.initialise.periodic_voronoi(1, key=0)."
         )
+    check_whole("n_cells", n_cells, least=2)
     check_whole("lloyd_steps", lloyd_steps, least=0)
     dtype = jnp.result_type(float)
     # A periodic box of seeds, so that no cell is unbounded, with a margin of three cells.
