@@ -91,7 +91,14 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+# These compile for a quarter of a minute each.
+LONG = ("fit of a batch", "fit of a batch by least squares", "grow", "uncertainty")
+MARKS = {name: [pytest.mark.thorough] for name in LONG}
+
+
+@pytest.mark.parametrize(
+    "call", [pytest.param(call, id=n, marks=MARKS.get(n, [])) for n, call in CALLS.items()]
+)
 def test_a_second_call_compiles_nothing(call):
     call()
     with compilations() as second:
