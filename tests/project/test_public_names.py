@@ -8,9 +8,10 @@ AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnerg
 AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiation Checkpoint
 Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free GradientOutcome
 History ImplicitDifferentiation InverseProblem MINRES Periodic Record Relaxation T1 T2 Tissue
-Topology Uncertainty activities adjoints animate costs dissipations energies equilibrate evolve
-fit fitting growth inference initialise io load_tissue mechanics mesh plot_history plot_recovery
-plot_tissue plotting responses runs save_tissue solvers transitions uncertainty
+Topology Uncertainty activities adjoints animate costs dissipations enable_compilation_cache
+energies equilibrate evolve fit fitting growth inference initialise io load_tissue mechanics mesh
+plot_history plot_recovery plot_tissue plotting responses runs save_tissue solvers transitions
+uncertainty
 """
 
 FAMILIES = {
@@ -42,7 +43,7 @@ FAMILIES = {
     "complex_modulus deformed density_of_states elastic_tensor modes pressures "
     "principal pure_shear ramp recoil self_stresses shear_modulus simple_shear "
     "spectrum stress tensions velocities youngs_modulus zero_modes",
-    "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons",
+    "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons pad",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
     "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tissue "
