@@ -18,9 +18,16 @@ from vertax.fitting import stack
 N = 5
 EVENT = "/jax/core/compile/backend_compile_duration"
 _events: list[str] = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, duration_secs, **_: _events.append(event)
-)
+_programs: list[str] = []
+
+
+def _listen(event: str, duration_secs: float, **data: str | int) -> None:
+    _events.append(event)
+    if event == EVENT:
+        _programs.append(str(data.get("fun_name")))
+
+
+jax.monitoring.register_event_duration_secs_listener(_listen)
 
 
 class Count:
@@ -138,7 +145,10 @@ def test_equilibrium_gradient_and_fit_share_the_relaxation(monkeypatch):
     relaxed = vx.equilibrate(tissue, energy).tissue
     cost = vx.costs.VertexDistance(tissue)
     vx.InverseProblem(relaxed, energy, cost).value_and_gradient()
+    assert any("_evaluate" in name for name in _programs)
+    _programs.clear()
     FIT(vx.InverseProblem(relaxed, energy, cost), OPTIMISER)
+    assert not any("_evaluate" in name for name in _programs)
     jax.grad(lambda e: cost(vx.equilibrate(tissue, e).tissue, e))(energy)
     assert len(traces) == 1
 

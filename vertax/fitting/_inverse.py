@@ -226,7 +226,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         dtype = tissue.vertices.dtype
         arguments = traced((tissue, parameters, constants, shift), dtype)
         tissue, parameters, constants, shift = arguments
-        problem = self.as_data(dtype)
+        problem = dataclasses.replace(self.as_data(dtype), response=self.response.completed(tissue))
         primal = problem.primal(eqx.combine(parameters, constants), tissue, shift)
         # What is left is the compiled function of all problems with this cost and adjoint, lenient or not.
         parts = lambda p: (p.tissue, p.energy, p.trainable)

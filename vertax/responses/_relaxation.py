@@ -147,12 +147,12 @@ class Relaxation(AbstractResponse):
 
     def primal(self, tissue: Tissue, energy: AbstractEnergy) -> SearchEnd:
         """The relaxed tissue, by the compiled function that all callers share."""
-        return _search(*frozen((tissue, energy, self._complete(tissue))))
+        return _search(*frozen((tissue, energy, self.completed(tissue))))
 
     def attach(
         self, primal: SearchEnd, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
     ) -> Equilibrium:
-        return _compiled_attachment(primal, tissue, energy, self._complete(tissue), adjoint)
+        return _compiled_attachment(primal, tissue, energy, self.completed(tissue), adjoint)
 
     def solve(
         self,
@@ -199,11 +199,8 @@ class Relaxation(AbstractResponse):
     def _solver(self) -> AbstractSolver:
         return self.solver if isinstance(self.solver, AbstractSolver) else Wrapped(self.solver)
 
-    def _complete(self, tissue: Tissue) -> Relaxation:
-        """The same with arrays for its numbers and for a Hessian that is not known.
-
-        The structure is then the same with and without a known Hessian, so both share a compilation.
-        """
+    def completed(self, tissue: Tissue) -> Relaxation:
+        """As `traced`, with a placeholder for a Hessian that is not known."""
         known = self.hessian_at(tissue, None) if self.known_hessian is None else self.known_hessian
         return dataclasses.replace(self.traced(), known_hessian=known)
 

@@ -196,6 +196,10 @@ class AbstractResponse(eqx.Module):
     def traced(self) -> AbstractResponse:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""
 
+    def completed(self, tissue: Tissue) -> AbstractResponse:
+        """As `traced`, with all that is optional, so that one compiled function serves with and without."""
+        return self.traced()
+
     @abc.abstractmethod
     def finer(self, tolerance: Float[Array, ""]) -> AbstractResponse:
         """The same, at rest only where the largest force is below this tolerance too."""
