@@ -138,7 +138,7 @@ def infer_tensions(
             *seen_as, balance, prior=prior, times=resamples, seed=seed
         )
     # Corners of cells in a mask are corners of pixels, so edges of length 0 differ from all others.
-    four_fold = np.asarray(tissue.edge_lengths, float) < 0.5 * course.grain
+    four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
     source = course.labels, course.pixel_size, four_fold
     return outcome(tissue, curves, which, balance, source, turned_over)
 
