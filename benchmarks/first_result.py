@@ -21,7 +21,7 @@ from typing import Any
 
 from _arguments import count
 
-N_BATCH, CELLS_OF_BATCH = 60, 20
+N_BATCH, CELLS_OF_BATCH, N_REPEATS = 60, 20, 10
 
 
 def steps(n_cells: int) -> Iterator[tuple[str, Callable[[], Any]]]:
@@ -91,7 +91,7 @@ def batch_steps() -> Iterator[tuple[str, Callable[[], Any]]]:
         for name, run in ((f"{N_BATCH} {what}, a loop", one_by_one), ("by jax.vmap", together)):
             wait = lambda run=run: jax.block_until_ready(run())
             yield f"{name}: first", wait
-            yield f"{name}: again", wait
+            yield f"{name}: {N_REPEATS} more", lambda wait=wait: [wait() for _ in range(N_REPEATS)]
 
 
 def mask_steps() -> Iterator[tuple[str, Callable[[], Any]]]:

@@ -178,7 +178,7 @@ class Relaxation(AbstractResponse):
 
     def hessian_at(self, tissue: Tissue, energy: AbstractEnergy | None) -> KnownHessian | None:
         # (What is large has waves, and too many numbers to square; other solvers have no use for it.)
-        if tissue.n_cells >= LongWaves.min_cells or not isinstance(self.solver, NewtonCG):
+        if not self._knows_hessians(tissue):
             return None
         start = tissue.configuration
         if energy is None:
@@ -186,6 +186,9 @@ class Relaxation(AbstractResponse):
         slope = jax.grad(lambda y: objective(y, (tissue, energy, None))[0])
         product = lambda v: jax.jvp(slope, (start,), (v,))[1]
         return KnownHessian.at(product, start, cell_size(tissue))
+
+    def _knows_hessians(self, tissue: Tissue) -> bool:
+        return tissue.n_cells < LongWaves.min_cells and isinstance(self.solver, NewtonCG)
 
     def knowing(self, hessian: KnownHessian | None) -> Relaxation:
         return dataclasses.replace(self, known_hessian=hessian)
@@ -201,8 +204,10 @@ class Relaxation(AbstractResponse):
 
     def completed(self, tissue: Tissue) -> Relaxation:
         """As `traced`, with a placeholder for a Hessian that is not known."""
-        known = self.hessian_at(tissue, None) if self.known_hessian is None else self.known_hessian
-        return dataclasses.replace(self.traced(), known_hessian=known)
+        relaxation = self if eqx.is_array(self.max_steps) else self.traced()
+        if relaxation.known_hessian is not None or not self._knows_hessians(tissue):
+            return relaxation
+        return dataclasses.replace(relaxation, known_hessian=self.hessian_at(tissue, None))
 
     def traced(self) -> Relaxation:
         """The same with its numbers as arrays, of which another one compiles nothing anew."""
