@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -63,6 +63,19 @@ class Descent(AbstractMethod):
     true: PyTree[Array] | None
     batched: bool
     guidance: Callable[[Int[Array, ""]], ArrayLike] | None
+    recent: list[Any] = eqx.field(default_factory=list)
+    """The problem and the Hessian of the last epoch, and what compiled functions need of both."""
+
+    def _evaluation(self, problem: InverseProblem, state: State) -> Evaluation:
+        if self.batched:
+            return _evaluate_batch(problem, self.constants, state)
+        # Made anew only if something has changed: it takes as long as an epoch of a small tissue.
+        if not self.recent or self.recent[0] is not problem or self.recent[1] is not state.hessian:
+            response = problem.response.knowing(state.hessian)
+            known = eqx.tree_at(lambda p: p.response, problem, response)
+            self.recent[:] = [problem, state.hessian, known.bare(state.tissue)]
+        shift = no_shift(problem)
+        return self.recent[2].evaluate(state.tissue, state.parameters, self.constants, shift)
 
     def start(self) -> State:
         return _start(self._lenient(), self.optimiser, self.parameters, self.batched)
@@ -78,8 +91,7 @@ class Descent(AbstractMethod):
             hessian = _hessian_at(problem, self.constants, state, self.batched)
             looked = jnp.full_like(state.looked, epoch)
             state = dataclasses.replace(state, looked=looked, hessian=hessian)
-        evaluate = _evaluate_batch if self.batched else _evaluation
-        evaluation = evaluate(problem, self.constants, state)
+        evaluation = self._evaluation(problem, state)
         following = problem.onward(evaluation.equilibrium.tissue)
         without = dataclasses.replace(state, hessian=None)
         guidance = jnp.broadcast_to(guidance_of(problem), state.going.shape)
@@ -114,6 +126,8 @@ class Descent(AbstractMethod):
 
     def _lenient(self, strength: Float[Array, ""] | None = None) -> InverseProblem:
         # A step that cannot be trusted is refused here, one member of a batch at a time.
+        if strength is None and self.recent:
+            return self.recent[0]
         problem = eqx.tree_at(lambda p: p.adjoint.throw, self.problem, False)
         if strength is None:
             return problem

@@ -226,22 +226,36 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         dtype = tissue.vertices.dtype
         arguments = traced((tissue, parameters, constants, shift), dtype)
         tissue, parameters, constants, shift = arguments
-        problem = dataclasses.replace(self.as_data(dtype), response=self.response.completed(tissue))
-        primal = problem.primal(eqx.combine(parameters, constants), tissue, shift)
-        # What is left is the compiled function of all problems with this cost and adjoint, lenient or not.
-        parts = lambda p: (p.tissue, p.energy, p.trainable)
-        problem = eqx.tree_at(parts, problem, (None,) * 3, is_leaf=lambda x: x is None)
-        checks = self.adjoint.throw and primal is not None
-        if checks:
-            problem = eqx.tree_at(lambda p: p.adjoint.throw, problem, False)
-        evaluation = _evaluate(problem, primal, *arguments)
-        if checks:
+        problem = self.bare(tissue)
+        evaluation = problem.evaluate(*arguments)
+        if self.adjoint.throw and not problem.adjoint.throw:
             outcome, reasons = evaluation.outcome, self.adjoint.reasons
             gradient, _ = settle(evaluation.gradient, outcome, True, None, reasons)
             evaluation = eqx.tree_at(lambda e: e.gradient, evaluation, gradient)
         if not throw:
             return evaluation
         return eqx.tree_at(lambda e: e.equilibrium, evaluation, evaluation.equilibrium.checked())
+
+    def bare(self, tissue: Tissue) -> InverseProblem[Energy]:
+        """What compiled functions need; problems with one cost and adjoint, strict or not, share them."""
+        response = self.response.completed(tissue)
+        problem = dataclasses.replace(self.as_data(tissue.vertices.dtype), response=response)
+        parts = lambda p: (p.tissue, p.energy, p.trainable)
+        problem = eqx.tree_at(parts, problem, (None,) * 3, is_leaf=lambda x: x is None)
+        if not isinstance(response, Relaxation):
+            return problem
+        return eqx.tree_at(lambda p: p.adjoint.throw, problem, False)
+
+    def evaluate(
+        self,
+        tissue: Tissue,
+        parameters: PyTree[Array],
+        constants: PyTree,
+        shift: Float[Array, 2] | None,
+    ) -> Evaluation:
+        """Cost and gradient of a `bare` problem, by compiled functions."""
+        primal = self.primal(eqx.combine(parameters, constants), tissue, shift)
+        return _evaluate(self, primal, tissue, parameters, constants, shift)
 
     def primal(
         self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
