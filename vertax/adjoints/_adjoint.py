@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
+from vertax._base.modules import is_concrete
+
 
 def _floating(x: ArrayLike) -> Array:
     # An outcome is handed over as a gradient, and gradients are floating-point arrays.
@@ -101,7 +103,7 @@ DEGENERATE = (
 def frozen(tree: PyTree) -> PyTree:
     """The same values, taken for constants by differentiation."""
     # (An array that is no tracer is a constant already, and a call of JAX takes ten microseconds.)
-    constant = lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x
+    constant = lambda x: x if is_concrete(x) else jax.lax.stop_gradient(x)
     return jax.tree.map(constant, tree)
 
 
