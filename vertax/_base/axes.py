@@ -47,9 +47,9 @@ class Declaration:
 
         - `TypeError` if its annotation allows several answers.
         """
-        found = [_axes_of(shape, ndim) for shape in self.shapes or ()]
-        found = [axes for axes in found if axes is not None]
-        distinct = {tuple(axes.items()): axes for axes in found}
+        candidates = [_axes_of(shape, ndim) for shape in self.shapes or ()]
+        candidates = [axes for axes in candidates if axes is not None]
+        distinct = {tuple(axes.items()): axes for axes in candidates}
         if len(distinct) > 1:
             raise TypeError(
                 f"Field `{self.field}` of {self.owner.__name__} must declare one meaning of an array of "
@@ -174,12 +174,12 @@ def _is_key(x: Array | np.ndarray) -> bool:
 
 
 def _declared(tree: Any, path: tuple[Any, ...]) -> Declaration | None:
-    found: Declaration | None = None
+    declaration: Declaration | None = None
     node: Any = tree
     for key in path:
         if isinstance(key, jax.tree_util.GetAttrKey):
             if isinstance(node, eqx.Module):
-                found = declaration_of(type(node), key.name)
+                declaration = declaration_of(type(node), key.name)
             node = getattr(node, key.name)
         elif isinstance(key, jax.tree_util.SequenceKey):
             node = node[key.idx]  # pyright: ignore[reportIndexIssue]
@@ -187,7 +187,7 @@ def _declared(tree: Any, path: tuple[Any, ...]) -> Declaration | None:
             node = node[key.key]  # pyright: ignore[reportIndexIssue]
         else:  # a node that says nothing of its children
             break
-    return found
+    return declaration
 
 
 @functools.cache
