@@ -123,13 +123,12 @@ def test_a_relaxed_tissue_has_the_types_of_the_initial_one():
 
 def test_epochs_after_the_first_compile_nothing():
     counts = []
-    for epochs in (1, 3):
+    for epochs in (1, 1, 3):  # the first fit of the process compiles what all fits share
         with compilations() as count:
             vx.fit(problem(), optax.sgd(1e-3), epochs, progress=False)
         counts.append(count.n)
-    assert (
-        counts[0] == counts[1]
-    )  # another optimiser each time, and the same program for all epochs
+    # A new optimiser compiles its update, once for all epochs.
+    assert counts[1] == counts[2] > 0
 
 
 def test_equilibrium_gradient_and_fit_share_the_relaxation(monkeypatch):
