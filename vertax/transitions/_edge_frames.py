@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax.mesh import Tissue
-from vertax.mesh._arcs import area_factor, length_factor
+from vertax.mesh._arcs import length_factor
 from vertax.mesh._sides import Sides, cross, dot
-from vertax.mesh._tissue import Known
 from vertax.mesh._topology import edge_neighbourhood, flip_edges, source, take
 
 
@@ -92,55 +91,17 @@ class EdgeFrames(eqx.Module):
             tissue = tissue.with_angles(jnp.where(marked, 0, tissue.angles))
         return tissue.with_topology(flip_edges(tissue.topology, marked))
 
-    def measures(
+    def changed(
         self,
         tissue: Tissue,
-        known: Known,
-        which: Bool[Array, " rows"],
-        flips: Bool[Array, ""],
-        direction: Float[Array, "rows 2"],
+        flips: Bool[Array, " rows"],
+        turns: Bool[Array, " rows"],
         length: Float[Array, " rows"],
-    ) -> Known:
-        """What is known of a tissue, after the marked edges were laid in a direction, and flipped or not.
-
-        No two of them may share a cell.
-        """
-        half = self._half(which, direction, length)
-        nowhere = jnp.zeros_like(half)
-        start, end = nowhere - half, self.vector + half
-        bulge = lambda vector, angle: dot(vector, vector) * area_factor(angle)
-
-        def size(vector: Float[Array, "rows 2"], angle: Float[Array, " rows"]) -> Array:
-            return jnp.sqrt(dot(vector, vector) + tissue.softening**2) * length_factor(angle)
-
-        # With the letters of `flip_edges`: from where the four leave, before and after.
-        before = (nowhere, nowhere, self.vector, self.vector)
-        after = (start, jnp.where(flips, end, start), end, jnp.where(flips, start, end))
-        areas, lengths = [], []
-        for side, old, new in zip(self.neighbours, before, after, strict=True):
-            vector, angle = side[:, 2:4], _angles(side)
-            far = old + vector
-            swept = 0.5 * (cross(new, far) - cross(old, far))
-            areas.append(swept + bulge(far - new, angle) - bulge(vector, angle))
-            lengths.append(size(far - new, angle) - size(vector, angle))
-        (a, b, c, d), (p, q, r, s) = areas, lengths
-        # The edge itself counts for the cells at its sides, and if it flips for those at its ends.
-        vector, angle = end - start, jnp.where(flips, 0, self.angle)
-        area, length = 0.5 * cross(start, end) + bulge(vector, angle), size(vector, angle)
-        old_area, old_length = bulge(self.vector, self.angle), size(self.vector, self.angle)
-        e, f = jnp.where(flips, 0, area) - old_area, jnp.where(flips, area, 0)
-        t, u = jnp.where(flips, 0, length) - old_length, jnp.where(flips, length, 0)
-        marked = lambda *parts: jnp.where(which[:, None], jnp.stack(parts, axis=-1), 0)
-        added = lambda values, where, change: values.at[where].add(change, mode="drop")
-        return Known(
-            lengths=added(known.lengths, self.edges, marked(t + u, p, q, r, s)),
-            areas=added(
-                known.areas, self.cells, marked(d - a + e, b - c - e, a - b - f, c - d + f)
-            ),
-            perimeters=added(
-                known.perimeters, self.cells, marked(s + p + t, q + r + t, p + q + u, r + s + u)
-            ),
-        )
+    ) -> Tissue:
+        """The tissue with some edges flipped, and others laid upright, with a given length."""
+        direction = jnp.where(flips[:, None], self.across, self.along)
+        chord = jnp.where(flips, length, length / self.stretch)
+        return self.flip(self.place(tissue, flips | turns, direction, chord), flips)
 
     def _half(
         self,

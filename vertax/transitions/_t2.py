@@ -55,9 +55,16 @@ class T2(AbstractTransitions):
         return jnp.zeros(tissue.n_edges, jnp.int32)
 
     def sweep(
-        self, tissue: Tissue, energy: AbstractEnergy, counts: Int[Array, " edges"]
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        counts: Int[Array, " edges"],
+        length_fraction: Float[Array, " edges"] | float = 1.0,
     ) -> tuple[Tissue, Int[Array, " edges"]]:
-        """Let every small cell vanish that may; returns the new tissue and the updated counts."""
+        """Let every small cell vanish that may; returns the new tissue and the updated counts.
+
+        `length_fraction` has no effect: a cell that vanishes leaves no new edge.
+        """
         limit = self.threshold * mean_area(tissue)
 
         def candidates(tissue: Tissue, todo: Array) -> Array:

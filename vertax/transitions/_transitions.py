@@ -6,7 +6,7 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -24,9 +24,24 @@ class AbstractTransitions(eqx.Module):
 
     @abc.abstractmethod
     def sweep(
-        self, tissue: Tissue, energy: AbstractEnergy, counts: Int[Array, "*rules edges"]
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        counts: Int[Array, "*rules edges"],
+        length_fraction: Float[Array, " edges"] | float = 1.0,
     ) -> tuple[Tissue, Int[Array, "*rules edges"]]:
-        """Try every candidate once; returns the new tissue and the updated counts."""
+        """Try every candidate once.
+
+        **Arguments:**
+
+        - `tissue`: the tissue.
+        - `energy`: its energy, which decides.
+        - `counts`: how often each edge took part in a transition.
+        - `length_fraction`: new edges have this fraction of their usual length; an edge of fraction 0 does
+            not flip. A relaxation shortens new edges that make cells overlap.
+
+        **Returns:** the new tissue and the updated counts.
+        """
 
     def __add__(self, other: AbstractTransitions) -> AbstractTransitions:
         """Both rules, one after the other."""
@@ -45,12 +60,16 @@ class InTurn(AbstractTransitions):
         return jnp.stack([rule.init(tissue) for rule in self.rules])
 
     def sweep(
-        self, tissue: Tissue, energy: AbstractEnergy, counts: Int[Array, "rules edges"]
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        counts: Int[Array, "rules edges"],
+        length_fraction: Float[Array, " edges"] | float = 1.0,
     ) -> tuple[Tissue, Int[Array, "rules edges"]]:
         """A sweep of each; returns the new tissue and the updated counts."""
         updated = []
         for rule, own in zip(self.rules, counts, strict=True):
-            tissue, own = rule.sweep(tissue, energy, own)
+            tissue, own = rule.sweep(tissue, energy, own, length_fraction)
             updated.append(own)
         return tissue, jnp.stack(updated)
 
