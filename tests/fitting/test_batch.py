@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from helpers import random_tissue
 
@@ -50,3 +51,23 @@ def test_what_cannot_be_a_batch_is_refused():
 def test_a_member_that_is_not_there_is_refused():
     with pytest.raises(IndexError, match="0 … 1"):
         member(stack([jnp.zeros(2), jnp.ones(2)]), 2)
+
+
+def test_guidance_of_a_batch_is_that_of_each_fit():
+    fit = lambda problem, **options: vx.fit(
+        problem,
+        optax.sgd(1e-3),
+        2,
+        guidance=lambda epoch: 1.0 / (1 + epoch),
+        progress=False,
+        **options,
+    )
+    problems = [problem(seed) for seed in range(2)]
+    together = fit(stack(problems), batched=True)
+    np.testing.assert_allclose(together.history.guidance, [1.0, 0.5])
+    for index, alone in enumerate(map(fit, problems)):
+        np.testing.assert_allclose(
+            member(together, index).energy.target_shape_factor,
+            alone.energy.target_shape_factor,
+            rtol=1e-9,
+        )

@@ -133,7 +133,8 @@ class Descent(AbstractMethod):
             return problem
         if self.batched:
             strength = jnp.full(len(problem.tissue.vertices), strength)
-        return dataclasses.replace(problem, guidance=strength)
+        # (In a batch each array has one more axis than its annotation, which `replace` would check.)
+        return eqx.tree_at(lambda p: p.guidance, problem, strength, is_leaf=lambda x: x is None)
 
 
 @announced_jit

@@ -101,7 +101,7 @@ def better(
     return choose(ok & lower, new, best)
 
 
-def guidance_of(problem: InverseProblem) -> Float[Array, ""]:
+def guidance_of(problem: InverseProblem) -> Float[Array, "*batch"]:
     return jnp.asarray(
         0 if problem.guidance is None else problem.guidance, problem.tissue.vertices.dtype
     )
