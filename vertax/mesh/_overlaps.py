@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
@@ -44,16 +45,6 @@ class Overlaps(eqx.Module):
     def sides(self) -> Bool[Array, "*batch halfedges"]:
         """Which half-edges cross another side of the face on their left."""
         return self.crossed != jnp.arange(self.crossed.shape[-1])
-
-    def vertices(self, topology: Topology) -> Bool[Array, " vertices"]:
-        """The corners of cells that overlap, and the ends of sides of the outline that cross."""
-        crosses, after = self.sides, topology.next
-        other = jnp.where(crosses, self.crossed, jnp.arange(after.size))
-        outside = jnp.zeros(topology.n_faces - topology.n_cells, bool)
-        bad = take(jnp.concatenate([self.cells, outside]), topology.cell) | crosses
-        for half_edge in (after, other, take(after, other)):
-            bad = bad.at[half_edge].max(crosses)
-        return jnp.any(bad.reshape(-1, 3), axis=1)
 
     def describe(self) -> str:
         """Where the tissue (of a batch: the first one that does) overlaps, in words; empty if nowhere."""
@@ -135,44 +126,50 @@ def overlaps_and_nearest(
     sides: Sides,
     areas: Float[Array, " cells"],
     measure: Callable[[Sides, Sides, Array, Array], Float[Array, " halfedges"]],
-) -> tuple[Overlaps, Int[Array, "halfedges 2"], Float[Array, "halfedges 2"], Float[Array, ""]]:
-    """Overlaps; and of each corner the two nearest sides of its face that it does not end.
+) -> tuple[Bool[Array, " vertices"], Int[Array, "2 halfedges"], Float[Array, "2 halfedges"]]:
+    """The vertices of overlaps; and of each corner the two nearest sides of its face that it does not end.
+
+    Vertices of overlaps are the corners of cells that cross themselves or are inside out, and the ends of the
+    sides of the outline that cross.
 
     **Arguments:**
 
     - `measure`: how near the starts of sides are to other sides; given also whether each of those is the
         next side, and whether it is the last but one.
 
-    **Returns:** the overlaps; the two sides, as half-edges; how near they are; and how near the nearest side
-    of all is that is not next to a corner's own.
+    **Returns:** the vertices; the two sides, as half-edges; and how near they are.
     """
     here = _numbers(m)
     before_last = take(m.previous, m.previous)
 
     def both(pair: Pairs, carry: tuple) -> tuple:
-        crossed, nearest, gaps, least = carry
+        crossed, first, second, low, high = carry
         after = jnp.broadcast_to(pair.k == 1, pair.here.shape)
         before = pair.other == take(before_last, pair.here)
-        gap = measure(pair.mine, pair.theirs, after, before)
-        gap = jnp.where(pair.other == pair.here, jnp.inf, gap)
-        closest = gap < gaps[0]
-        second = ~closest & (gap < gaps[1])
-        insert = lambda x, best: (
-            jnp.where(closest, x, best[0]),
-            jnp.where(closest, best[0], jnp.where(second, x, best[1])),
-        )
-        crossed = jnp.where(_crosses(pair), pair.other, crossed)
-        least = jnp.minimum(least, jnp.where(after | before, jnp.inf, gap))
-        return crossed, insert(pair.other, nearest), insert(gap, gaps), least
+        paired = pair.other != pair.here
+        gap = jnp.where(paired, measure(pair.mine, pair.theirs, after, before), jnp.inf)
+        crossed |= sides_cross(pair.mine, pair.theirs, pair.k == 1) & paired
+        nearest, nearer = gap < low, gap < high
+        second = jnp.where(nearest, first, jnp.where(nearer, pair.other, second))
+        high = jnp.where(nearest, low, jnp.where(nearer, gap, high))
+        first, low = jnp.where(nearest, pair.other, first), jnp.where(nearest, gap, low)
+        return crossed, first, second, low, high
 
-    none = jnp.full(here.size, jnp.inf, sides.dtype)
-    start = (here, (here, here), (none, none), none)
+    none, no = jnp.full(here.size, jnp.inf, sides.dtype), jnp.zeros(here.size, bool)
+    start = (no, here, here, none, none)
     rows = lambda half_edges: take(sides, half_edges)
-    crossed, nearest, gaps, least = around(
+    crossed, first, second, low, high = around(
         rows, m.next, here, _last(m), both, start, few_long=m.exterior
     )
-    nearest, gaps = jnp.stack(nearest, axis=-1), jnp.stack(gaps, axis=-1)
-    return _overlaps(m, areas, crossed), nearest, gaps, jnp.min(least)
+    inside_out = ~(areas > 0) & m.alive if m.spare else ~(areas > 0)
+    faces = jnp.concatenate([inside_out, jnp.zeros(m.n_faces - m.n_cells, bool)])
+    faces = faces.at[m.cell].max(crossed)
+    bad = take(faces, m.cell)
+    if m.exterior:
+        ends = crossed | take(crossed, m.previous)
+        bad = jnp.where(m.cell == m.n_cells, ends, bad)
+    vertices = functools.reduce(jnp.logical_or, (bad[slot::3] for slot in range(3)))
+    return vertices, jnp.stack([first, second]), jnp.stack([low, high])
 
 
 def _crosses(pair: Pairs) -> Bool[Array, " pairs"]:

@@ -46,7 +46,7 @@ class SearchEnd(eqx.Module):
             contacts=state.contacts,
             units=Units(options["length_scale"], options["stiffness"]),
             tolerance=options["tolerance"],
-            max_force=state.minimiser.force,
+            max_force=state.force,
             num_steps=state.num_steps,
             num_t1=state.num_t1,
             overlaps=None if state.contacts is None else state.overlaps,

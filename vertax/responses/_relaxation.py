@@ -30,6 +30,7 @@ from vertax.solvers._known_hessian import KnownHessian
 from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._optimistix import check_solver
 from vertax.solvers._patience import Patient
+from vertax.solvers._solver import AbstractIteration, Stepwise
 from vertax.transitions import T1, AbstractTransitions
 
 
@@ -227,8 +228,16 @@ class Relaxation(AbstractResponse):
             "stiffness": units.stiffness,
             "tolerance": jnp.asarray(tolerance, tissue.vertices.dtype),
         }
-        known = frozen(self.known_hessian)
-        return Search(self.minimiser, self.transitions, frozen(options), self.contact_range, known)
+        solver = self._solver
+        iteration = solver if isinstance(solver, AbstractIteration) else Stepwise(solver)
+        return Search(
+            iteration,
+            self.transitions,
+            frozen(options),
+            self.patience,
+            self.contact_range,
+            frozen(self.known_hessian),
+        )
 
 
 def equilibrate(

@@ -11,8 +11,7 @@ from vertax.energies import AbstractEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._topology import edge_neighbourhood, source, take
-from vertax.responses._upheld import REACH, turned_height
-from vertax.transitions._edge_frames import edge_axes
+from vertax.responses._upheld import REACH, turned_energy
 
 
 class Incremental(AbstractEnergy):
@@ -43,8 +42,7 @@ class Incremental(AbstractEnergy):
         value = self.energy(tissue)
         if self.pressed is not None:
             reach = REACH * cell_size(self.before)
-            edges = tissue.edge_vectors, edge_axes(tissue)
-            value += jnp.sum(turned_height(*edges, reach, self.pressed))
+            value += turned_energy(tissue, reach, self.pressed)
         if self.strained is None or not isinstance(self.dissipation, AbstractViscosity):
             return value + self.dissipation(tissue, before, self.dt)
         strains = self.dissipation.strains(tissue, before) - self.strained

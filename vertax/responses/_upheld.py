@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-import equinox as eqx
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.extremes import greater
-from vertax._base.reciprocal import inverse_root, reciprocal
+from vertax._base.sums import total
 from vertax.mesh import Tissue
-from vertax.mesh._sides import dot
 from vertax.mesh._topology import Topology, edge_neighbourhood, take
-from vertax.responses._local import FLOOR, Looks, barrier
-from vertax.transitions._edge_frames import edge_axis
+from vertax.responses._local import (
+    FLOOR,
+    AbstractBarrier,
+    Expansion,
+    GatherPlan,
+    barrier_energy,
+    composed,
+    outer,
+    profile,
+)
 
 # Where an energy presses the ends of an edge together, the edge opens once it has flipped. Forces can press
 # it from all sides: then four cells meet in a point, flipped or not, and the energy is least where the edge
@@ -25,7 +33,7 @@ REACH = 2e-3
 _FADE = 8.0
 
 
-class Upheld(eqx.Module):
+class Upheld(AbstractBarrier):
     """The barrier of those edges that a relaxation had to put upright.
 
     **Arguments:**
@@ -35,6 +43,10 @@ class Upheld(eqx.Module):
     - `reach`: its range, a length.
     - `force`: about what it resists with at a third of that.
     """
+
+    # (The axis of `edge_axis`, in which the ends of the edge cancel.)
+    matrix: ClassVar[np.ndarray] = np.array([[-1, 1, 0, 0, 0, 0], [0, 0, -1, -1, 1, 1]])
+    """The edge, and the direction that it ought to have, of the points of `plan`."""
 
     edges: Int[Array, " some"]
     counts: Int[Array, " edges"]
@@ -59,36 +71,67 @@ class Upheld(eqx.Module):
         """Which edges these are."""
         return jnp.zeros(len(self.counts), bool).at[self.edges].set(True, mode="drop")
 
-    def looks(self, topology: Topology) -> Looks:
-        """At the ends of each edge, and the far ends of its four neighbours, in one frame."""
+    def plan(self, topology: Topology) -> GatherPlan:
+        """The two ends of each edge, and the far ends of its four neighbours, in one frame."""
         m = topology
         edges = jnp.minimum(self.edges, m.n_edges - 1)
         _, *neighbours = edge_neighbourhood(m, edges)
-        leaving = jnp.stack([take(m.half_edge, edges), *neighbours], axis=-1)
-        here, there = Looks.of(m, leaving), Looks.of(m, take(m.next, leaving))
-        start, end = here.images[:, :1], there.images[:, :1]
+        leaving = jnp.stack([take(m.half_edge, edges), *neighbours])
+        here, there = GatherPlan.of(m, leaving), GatherPlan.of(m, take(m.next, leaving))
+        start, end = here.images[:1], there.images[:1]
         offsets = there.images - here.images
-        images = [start, end, start + offsets[:, 1:3], end + offsets[:, 3:]]
-        vertices = jnp.concatenate([here.vertices[:, :1], there.vertices], axis=1)
-        return Looks(vertices, jnp.concatenate(images, axis=1))
+        images = [start, end, start + offsets[1:3], end + offsets[3:]]
+        vertices = jnp.concatenate([here.vertices[:1], there.vertices])
+        return GatherPlan(vertices, jnp.concatenate(images))
 
-    def places(self, around: Float[Array, "some 6 2"]) -> Float[Array, "some 4"]:
-        """Each edge as a vector, and which way it ought to point, from where these are."""
-        start, end, a, b, c, d = (around[:, k] for k in range(6))
-        axis = edge_axis(end - start, a - start, b - start, c - end, d - end)
-        return jnp.concatenate([end - start, axis], axis=-1)
+    def expansion(self, places: Float[Array, "4 some"]) -> Expansion:
+        """The energy of each row, $F r\\, f(s)\\, \\varphi(w)$, and its derivatives."""
+        u, a = places[:2], places[2:]
+        s = total(u * u)
+        axis = jax.lax.rsqrt(jnp.maximum(total(a * a), jnp.finfo(a.dtype).tiny))
+        n = a * axis
+        root = jax.lax.rsqrt(s + (FLOOR * self.reach) ** 2)
+        along = total(u * n)
+        half = 0.5 / self.reach
+        w = half * ((s + (FLOOR * self.reach) ** 2) * root + along)
+        scale = 1 / (_FADE * self.reach) ** 2
+        fade = jnp.maximum(1 - scale * s, 0)
+        f, df, ddf = fade**3, -3 * scale * fade**2, 6 * scale**2 * fade
+        b = profile(w)
+        strength = jnp.where(self.edges < len(self.counts), self.force * self.reach, 0)
+        zero = jnp.zeros_like(u)
+        eye = jnp.eye(2, dtype=u.dtype)[:, :, None]
+        across = eye - outer(n, n)
+        pull = total(across[:, j] * u[j] for j in range(2))  # u less its part along the axis
+        uu = half * (eye * root - outer(u, u) * root**3)
+        ua = half * axis * across
+        aa = -half * axis**2 * (along * across + outer(pull, n) + outer(n, pull))
+        wide = lambda uu, ua, aa: jnp.concatenate(
+            [jnp.concatenate([uu, ua], 1), jnp.concatenate([ua, aa], 1)]
+        )
+        none = jnp.zeros_like(across)
+        return composed(
+            strength * f * b.value,
+            (strength * df * b.value, strength * f * b.first),
+            (strength * ddf * b.value, strength * df * b.first, strength * f * b.second),
+            (
+                jnp.concatenate([2 * u, zero]),
+                half * jnp.concatenate([u * root + n, axis * pull]),
+            ),
+            (wide(2 * eye + none, none, none), wide(uu, ua, aa)),
+        )
 
-    def heights(self, places: Float[Array, "some 4"]) -> Float[Array, " some"]:
-        """The energy of each."""
-        heights = turned_height(places[:, :2], places[:, 2:], self.reach, self.force)
-        return jnp.where(self.edges < len(self.counts), heights, 0)
+    def updated(self, turned: Bool[Array, " edges"], squared: Float[Array, " edges"]) -> Upheld:
+        """With edges that were put upright, and without those that have grown.
 
-    def updated(self, tissue: Tissue, turned: Bool[Array, " edges"]) -> Upheld:
-        """With those that were put upright, and without those that have grown."""
-        n = tissue.n_edges
-        chord = tissue.edge_vectors
+        **Arguments:**
+
+        - `turned`: which edges were put upright.
+        - `squared`: their squared lengths.
+        """
+        n = turned.size
         counts = self.counts + turned
-        held = self.held & (dot(chord, chord) < (_LONG * self.reach) ** 2)
+        held = self.held & (squared < (_LONG * self.reach) ** 2)
         held |= turned & (counts >= _OFTEN)
         edges = jnp.nonzero(held, size=len(self.edges), fill_value=n)[0]
         return Upheld(edges.astype(self.edges.dtype), counts, self.reach, self.force)
@@ -102,22 +145,8 @@ _OFTEN = 8
 _FEWEST, _SHARE = 16, 256
 
 
-def turned_height(
-    edge: Float[Array, "some 2"],
-    axis: Float[Array, "some 2"],
-    reach: Float[Array, ""],
-    force: Float[Array, ""],
-) -> Float[Array, " some"]:
-    """The energy that it takes to turn edges away from the way they ought to point."""
-    squared = dot(edge, edge)
-    inverse = reciprocal(reach)
-    far = squared * (inverse / _FADE) ** 2
-    near = jax.lax.stop_gradient(far < 1)
-    # (What is said of others does not matter, and must have a derivative.)
-    axis = jnp.where(near[:, None], axis, 1)
-    per_length = inverse_root(greater(dot(axis, axis), jnp.finfo(axis.dtype).tiny))
-    softened = squared + (FLOOR * reach) ** 2
-    length = softened * inverse_root(softened)
-    upright = (length + dot(edge, axis) * per_length) * (0.5 * inverse)
-    upright = jnp.where(near & (upright < 1), upright, 1)
-    return force * reach * greater(1 - far, 0) ** 3 * barrier(upright)
+def turned_energy(tissue: Tissue, reach: Float[Array, ""], force: Float[Array, ""]) -> Array:
+    """The energy of the barrier of all edges."""
+    edges = jnp.arange(tissue.n_edges, dtype=tissue.topology.edge.dtype)
+    every = Upheld(edges, jnp.zeros_like(edges), reach, force)
+    return barrier_energy(every, every.plan(tissue.topology).positions(tissue))

@@ -63,7 +63,7 @@ class GradientDescent(AbstractSolver):
     def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
-    def evaluated_anew(self, fresh: _State, old: _State) -> _State:
+    def reevaluated(self, fresh: _State, old: _State) -> _State:
         return with_value_and_gradient(fresh, old)
 
 
@@ -123,7 +123,7 @@ class Optax(AbstractSolver):
     def gradient(self, state: _State) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
-    def evaluated_anew(self, fresh: _State, old: _State) -> _State:
+    def reevaluated(self, fresh: _State, old: _State) -> _State:
         return with_value_and_gradient(fresh, old)
 
 
@@ -250,7 +250,7 @@ class FIRE(AbstractSolver):
     def gradient(self, state: _FIREState) -> PyTree[Float[Array, "..."]]:
         return state.gradient
 
-    def evaluated_anew(self, fresh: _FIREState, old: _FIREState) -> _FIREState:
+    def reevaluated(self, fresh: _FIREState, old: _FIREState) -> _FIREState:
         return with_value_and_gradient(fresh, old)
 
 

@@ -11,8 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax.solvers._direct import as_matrix
-from vertax.solvers._rows import row_inner, times
-from vertax.solvers._solver import Rows
+from vertax.solvers._rows import Rows, row_inner, times
 
 # No motion is taken to be softer than this, in units of the mean stiffness: some cost nothing, or next to it.
 _SOFTEST = 1e-3

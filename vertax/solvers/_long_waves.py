@@ -15,7 +15,7 @@ from vertax._base.sums import total
 from vertax.mesh import Periodic, Tissue
 from vertax.mesh._boundary import inverse_of
 from vertax.mesh._topology import take
-from vertax.solvers._solver import Rows
+from vertax.solvers._rows import Rows
 
 # (A point for four cells takes a quarter more products with the Hessian of a gradient.)
 _CELLS_A_POINT = 1

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax.solvers._solver import AbstractSolver, Rows
+from vertax.solvers._solver import AbstractSolver
 
 
 class PatientState(eqx.Module):
@@ -45,25 +45,14 @@ class Patient(optx.AbstractMinimiser):
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> PatientState:
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
-        return self._judge(inner, options, jnp.array(0), jnp.array(0))
-
-    def unevaluated(self, y: Any, options: Any, f_struct: Any, aux_struct: Any) -> PatientState:
-        """The same if the first step is to find out where it begins, see `AbstractSolver`."""
-        inner = self.solver.unevaluated(y, options, f_struct, aux_struct)
-        return self._judge(inner, options, jnp.array(0), jnp.array(0))
+        state = self._judge(inner, options, jnp.array(0), jnp.array(0))
+        return eqx.tree_at(lambda s: s.num_steps, state, jnp.array(0))
 
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any
     ) -> tuple[Any, PatientState, Any]:
         y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
-        return y, self._judge(inner, options, state.n_below, state.num_steps + 1), aux
-
-    def resumed(
-        self, fresh: PatientState, old: PatientState, share: Rows, flipped: Bool[Array, ""]
-    ) -> PatientState:
-        """Where to go on when something else had a hand in the last step, see `AbstractSolver`."""
-        inner = self.solver.resumed(fresh.inner, old.inner, share, flipped)
-        return eqx.tree_at(lambda s: (s.inner, s.num_steps), fresh, (inner, old.num_steps))
+        return y, self._judge(inner, options, state.n_below, state.num_steps), aux
 
     def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any
@@ -91,9 +80,10 @@ class Patient(optx.AbstractMinimiser):
     def _judge(
         self, inner: Any, options: Any, n_below: Int[Array, ""], num_steps: Int[Array, ""]
     ) -> PatientState:
-        force = self.norm(self.solver.gradient(inner))
-        below = force < options["tolerance"]
-        return PatientState(inner, force, jnp.where(below, n_below + 1, 0), num_steps)
+        progress = self.solver.progress(inner)
+        below = jnp.where(progress.force < options["tolerance"], n_below + 1, 0)
+        n_below = jnp.where(progress.accepted, below, n_below)
+        return PatientState(inner, progress.force, n_below, num_steps + progress.stepped)
 
 
 class AtRest(optx.AbstractMinimiser):

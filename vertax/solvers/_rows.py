@@ -1,19 +1,44 @@
-"""Sums and products of points, row by row: of a tissue a row is a vertex, or an arc."""
+"""Points of a minimisation as a table: one row for each vertex, and one for each arc."""
 
 from __future__ import annotations
+
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
-from optax import tree
 
+from vertax._base.reductions import max_of
 from vertax._base.sums import total
-from vertax.solvers._solver import Rows
+
+Rows: TypeAlias = PyTree[Float[Array, "..."]]
+"""One number for each row of the arrays of a point: of a tissue one a vertex, and one an arc."""
+Table: TypeAlias = Float[Array, "rows columns"]
 
 
-def inner(a: PyTree, b: PyTree) -> Float[Array, ""]:
+def table_of(y: PyTree[Float[Array, "..."]]) -> Table:
+    """The rows of all arrays, one below the other, with zeros in columns that an array does not have."""
+    leaves = [x.reshape(x.shape[0], -1) if x.ndim else x.reshape(1, 1) for x in jax.tree.leaves(y)]
+    width = max(x.shape[1] for x in leaves)
+    padded = [jnp.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in leaves]
+    return padded[0] if len(padded) == 1 else jnp.concatenate(padded)
+
+
+def point_of(table: Table, like: PyTree[Float[Array, "..."]]) -> PyTree[Float[Array, "..."]]:
+    """The arrays that `table_of` made a table of."""
+    leaves, structure = jax.tree.flatten(like)
+    start, parts = 0, []
+    for x in leaves:
+        rows = x.shape[0] if x.ndim else 1
+        columns = x.size // max(rows, 1)
+        parts.append(table[start : start + rows, :columns].reshape(x.shape))
+        start += rows
+    return jax.tree.unflatten(structure, parts)
+
+
+def inner(a: Table, b: Table) -> Float[Array, ""]:
     """The inner product of two points."""
-    return jnp.asarray(tree.sum(jax.tree.map(jnp.multiply, a, b)))
+    return jnp.dot(a.reshape(-1), b.reshape(-1), precision=jax.lax.Precision.HIGHEST)
 
 
 def row_inner(a: Float[Array, "rows ..."], b: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
@@ -28,17 +53,19 @@ def sizes(x: Float[Array, "rows ..."]) -> Float[Array, " rows"]:
 
 
 def times(rows: Float[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
-    """Each row so many times."""
+    """Each row times a number."""
     return rows.reshape(rows.shape + (1,) * (x.ndim - rows.ndim)) * x
 
 
-def typical_size(x: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
-    """The length that rows have which are not zero: few long ones count less than they do in the mean."""
-    roots = jax.tree.map(lambda x: jnp.sqrt(sizes(x)), x)
-    some = jnp.asarray(tree.sum(jax.tree.map(jnp.count_nonzero, roots)))
-    return (jnp.asarray(tree.sum(roots)) / jnp.maximum(some, 1)) ** 2
+def typical_size(x: Table) -> Float[Array, ""]:
+    """The squared mean root length of the rows that are not zero: large outliers count less than in the mean."""
+    roots = jnp.sqrt(sizes(x))
+    ones = jnp.ones_like(roots)
+    number = jnp.dot((roots > 0).astype(roots.dtype), ones)
+    return (jnp.dot(roots, ones) / jnp.maximum(number, 1)) ** 2
 
 
-def number_of(rows: Rows) -> int:
-    """How many rows there are in all."""
-    return sum(r.shape[0] for r in jax.tree.leaves(rows))
+def max_size(x: Table) -> Float[Array, ""]:
+    """The largest component, as a size; NaN if any is NaN."""
+    finite = jnp.isfinite(inner(x, x))
+    return jnp.where(finite, max_of(jnp.abs(x)), jnp.nan)

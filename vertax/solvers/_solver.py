@@ -4,19 +4,88 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
 from vertax._base.modules import choose
+from vertax.solvers._rows import Rows
 
-Rows: TypeAlias = PyTree[Float[Array, "..."]]
-"""One number for each row of the arrays of a point: of a tissue one a vertex, and one an arc."""
+State = TypeVar("State")
+
+
+class Progress(eqx.Module):
+    """The result of an evaluation."""
+
+    accepted: Bool[Array, ""]
+    """Whether the evaluated point is the iterate now."""
+    stepped: Bool[Array, ""]
+    """Whether a step ended, accepted or rejected."""
+    moved: Bool[Array, ""]
+    """Whether the iterate is another point than before."""
+    force: Float[Array, ""]
+    """The largest component of the gradient at the iterate."""
+
+    @classmethod
+    def none(cls, force: Float[Array, ""]) -> Progress:
+        """Before the first evaluation."""
+        no = jnp.array(False)
+        return cls(no, no, no, force)
+
+
+class AbstractIteration(eqx.Module, Generic[State]):
+    """A minimiser in two halves, between which the iterate may be changed.
+
+    `evaluate` evaluates the objective at the trial point, and accepts it or not; `propose` computes the next
+    trial point. Between them a relaxation applies transitions to an accepted point.
+    """
+
+    @abc.abstractmethod
+    def unevaluated(self, fn: Any, y: Any, args: Any, options: Any) -> State:
+        """The state before the first evaluation, which is at `y`."""
+
+    @abc.abstractmethod
+    def evaluate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: State
+    ) -> tuple[Any, State, Any, Any]:
+        """Evaluate the trial point.
+
+        **Returns:** the iterate, the state, the model of the objective at the trial point, and the auxiliary
+        output.
+        """
+
+    @abc.abstractmethod
+    def propose(self, model: Any, options: Any, state: State, active: Bool[Array, ""]) -> State:
+        """The next trial point; that of a step only if `active`. Otherwise the iterate is evaluated anew."""
+
+    @abc.abstractmethod
+    def moved(
+        self,
+        state: State,
+        fraction: Rows,
+        flipped: Bool[Array, ""],
+        changed: Bool[Array, ""],
+        options: Any,
+    ) -> State:
+        """The state after the iterate was `changed`.
+
+        **Arguments:**
+
+        - `state`: the state.
+        - `fraction`: the fraction of the last step that each row has taken.
+        - `flipped`: whether the topology has changed.
+        - `changed`: whether the iterate or the objective has changed at all.
+        - `options`: typical sizes.
+        """
+
+    @abc.abstractmethod
+    def progress(self, state: State) -> Progress:
+        """The result of the last evaluation."""
 
 
 class AbstractSolver(optx.AbstractMinimiser):
@@ -42,40 +111,17 @@ class AbstractSolver(optx.AbstractMinimiser):
         """
         return False
 
-    @property
-    def evaluates_late(self) -> bool:
-        """Whether a step finds value and gradient where it begins, so that `unevaluated` will do."""
-        return False
-
-    def unevaluated(self, y: Any, options: Any, f_struct: Any, aux_struct: Any) -> Any:
-        """The state of `init`, but value and gradient are infinite: the objective was not looked at.
-
-        Such a step knows the option `stays_below`: if no force is larger where it begins, it stays there.
-        """
-        raise NotImplementedError
-
     @abc.abstractmethod
     def gradient(self, state: Any) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
 
-    def resumed(self, fresh: Any, old: Any, share: Rows, flipped: Bool[Array, ""]) -> Any:
-        """Where a solver goes on when something other than itself has had a hand in its last step.
+    def progress(self, state: Any) -> Progress:
+        """The result of the last step."""
+        yes = jnp.array(True)
+        return Progress(yes, yes, yes, self.norm(self.gradient(state)))
 
-        By default it begins again where transitions changed the topology, or the step was cut short: what
-        is remembered of the way there misleads.
-
-        **Arguments:**
-
-        - `fresh`: the state of `init` at the point where the solver is.
-        - `old`: its last state, of which value and gradient are those of another point or objective.
-        - `share`: which share of its last step each row of `y` has taken.
-        - `flipped`: whether there were transitions.
-        """
-        begins = flipped | (jnp.asarray(tree.min(share)) < 1)
-        return choose(begins, fresh, self.evaluated_anew(fresh, old))
-
-    def evaluated_anew(self, fresh: Any, old: Any) -> Any:
-        """The old state with what `fresh` knows of the objective; all of `fresh` if that is not known."""
+    def reevaluated(self, fresh: Any, old: Any) -> Any:
+        """The old state with the value and the gradient of `fresh`; all of `fresh` if they are inseparable."""
         return fresh
 
     def terminate(
@@ -98,3 +144,85 @@ def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, Py
 def with_value_and_gradient(fresh: Any, old: Any) -> Any:
     """A state with the value and the gradient of another one."""
     return eqx.tree_at(lambda s: (s.value, s.gradient), old, (fresh.value, fresh.gradient))
+
+
+class _StepwiseState(eqx.Module):
+    inner: Any
+    restart: Int[Array, ""]
+    progress: Progress
+
+
+class Stepwise(AbstractIteration[_StepwiseState]):
+    """Any solver as an iteration: each evaluation is one of its steps.
+
+    **Arguments:**
+
+    - `solver`: the solver.
+    """
+
+    solver: AbstractSolver
+
+    def unevaluated(self, fn: Any, y: Any, args: Any, options: Any) -> _StepwiseState:
+        value, aux = jax.eval_shape(fn, y, args)
+        init = lambda y, args: self.solver.init(fn, y, args, options, value, aux, frozenset())
+        inner = _zeros(eqx.filter_eval_shape(init, y, args))
+        progress = Progress.none(jnp.full(value.shape, jnp.inf, value.dtype))
+        return _StepwiseState(inner, jnp.array(_FRESH), progress)
+
+    def evaluate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: _StepwiseState
+    ) -> tuple[Any, _StepwiseState, None, Any]:
+        value, aux = jax.eval_shape(fn, y, args)
+        arrays, static = eqx.partition(state.inner, eqx.is_array)
+
+        def restart() -> tuple[Any, Any]:
+            fresh = self.solver.init(fn, y, args, options, value, aux, frozenset())
+            old = self.solver.reevaluated(fresh, state.inner)
+            return y, eqx.filter(choose(state.restart == _FRESH, fresh, old), eqx.is_array)
+
+        def step() -> tuple[Any, Any]:
+            inner = eqx.combine(arrays, static)
+            new, inner, _ = self.solver.step(fn, y, args, options, inner, frozenset())
+            return new, eqx.filter(inner, eqx.is_array)
+
+        anew = state.restart != _NO
+        y, arrays = jax.lax.cond(anew, restart, step)
+        inner = eqx.combine(arrays, static)
+        force, yes = self.solver.norm(self.solver.gradient(inner)), jnp.array(True)
+        return (
+            y,
+            _StepwiseState(inner, jnp.array(_NO), Progress(yes, ~anew, ~anew, force)),
+            None,
+            aux,
+        )
+
+    def propose(
+        self, model: None, options: Any, state: _StepwiseState, active: Bool[Array, ""]
+    ) -> _StepwiseState:
+        return state
+
+    def moved(
+        self,
+        state: _StepwiseState,
+        fraction: Rows,
+        flipped: Bool[Array, ""],
+        changed: Bool[Array, ""],
+        options: Any,
+    ) -> _StepwiseState:
+        # After transitions and shortened steps the memory of the solver (momentum, curvature) misleads.
+        fresh = flipped | (jnp.asarray(tree.min(fraction)) < 1)
+        restart = jnp.where(changed, jnp.where(fresh, _FRESH, _OLD), _NO)
+        return eqx.tree_at(lambda s: s.restart, state, restart)
+
+    def progress(self, state: _StepwiseState) -> Progress:
+        return state.progress
+
+
+# Whether the next evaluation restarts the solver at the iterate: not, with its old memory, or without.
+_NO, _OLD, _FRESH = range(3)
+
+
+def _zeros(tree: PyTree) -> PyTree:
+    """Zeros for the arrays of a pytree of shapes."""
+    is_shape = lambda x: isinstance(x, jax.ShapeDtypeStruct)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_shape(x) else x, tree)
