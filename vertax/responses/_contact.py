@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.reductions import any_of, indices_of
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
 from vertax.mesh._sides import Sides, dot
@@ -56,8 +57,8 @@ class Contacts(eqx.Module):
 
     def differ(self, other: Contacts) -> Bool[Array, ""]:
         """Whether these are others."""
-        changed = jnp.any(self.sides != other.sides)
-        return changed | jnp.any(self.upheld.edges != other.upheld.edges)
+        changed = any_of(self.sides != other.sides)
+        return changed | any_of(self.upheld.edges != other.upheld.edges)
 
     def resistance(self, tissue: Tissue) -> Symmetric:
         """The stiffness of the pairs where one vertex moves alone, without negative eigenvalues.
@@ -121,12 +122,11 @@ class Contacts(eqx.Module):
         m, (_, size) = tissue.topology, self.sides.shape
         overlapping, nearest, gaps = overlaps_and_nearest(m, tissue.sides, tissue.areas, measure)
         near = (gaps < _MARGIN**2).reshape(-1)
-        which = jnp.nonzero(near, size=size, fill_value=near.size)[0]
-        valid = which < near.size
-        which = jnp.minimum(which, near.size - 1).astype(m.twin.dtype)
+        which, valid = indices_of(near, size + 1)
+        overflow, which, valid = self.overflow | valid[size], which[:size], valid[:size]
+        which = which.astype(m.twin.dtype)
         corner = jax.lax.rem(which, jnp.asarray(m.n_half_edges, which.dtype))
         sides = jnp.where(valid, jnp.stack([corner, take(nearest.reshape(-1), which)]), 0)
-        overflow = self.overflow | (jnp.sum(near) > size)
         corner, side = sides
         end = take(m.next, side)
         after, before = take(m.next, corner) == side, take(m.next, end) == corner

@@ -107,22 +107,17 @@ class GatherPlan(eqx.Module):
 class AbstractBarrier(eqx.Module):
     """A sum of energies of rows of two vectors, which are linear in the positions of some points."""
 
-    matrix: eqx.AbstractClassVar[np.ndarray]
-    """The two vectors in terms of the points."""
-
     @abc.abstractmethod
     def expansion(self, vectors: Float[Array, "4 rows"]) -> Expansion:
         """The energies of rows and their derivatives."""
 
+    @abc.abstractmethod
     def vectors(self, positions: Float[Array, "points rows 2"]) -> Float[Array, "4 rows"]:
         """The two vectors of each row."""
-        both = jnp.tensordot(self.matrix.astype(positions.dtype), positions, 1)
-        return jnp.swapaxes(both, 1, 2).reshape(4, -1)
 
+    @abc.abstractmethod
     def forces(self, slopes: Float[Array, "4 rows"]) -> Float[Array, "points rows 2"]:
         """The transpose of `vectors`."""
-        both = jnp.swapaxes(slopes.reshape(2, 2, -1), 1, 2)
-        return jnp.tensordot(self.matrix.T.astype(slopes.dtype), both, 1)
 
 
 @jax.custom_jvp

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vertax._base.extremes import lesser
@@ -56,9 +53,6 @@ class PairBarrier(AbstractBarrier):
     - `valid`: which rows are pairs.
     """
 
-    matrix: ClassVar[np.ndarray] = np.array([[1, -1, 0], [0, -1, 1]])
-    """The corner from the start of the side, and the chord, of the points corner, start and end."""
-
     distance: Float[Array, ""]
     slope: Float[Array, ""]
     strength: Float[Array, ""]
@@ -66,14 +60,24 @@ class PairBarrier(AbstractBarrier):
     before: Bool[Array, " pairs"]
     valid: Bool[Array, " pairs"]
 
-    def expansion(self, places: Float[Array, "4 pairs"]) -> Expansion:
+    def vectors(self, positions: Float[Array, "3 pairs 2"]) -> Float[Array, "4 pairs"]:
+        """The corner from the start of the side, and the chord."""
+        corner, start, end = positions
+        return jnp.concatenate([corner - start, end - start], axis=-1).T
+
+    def forces(self, slopes: Float[Array, "4 pairs"]) -> Float[Array, "3 pairs 2"]:
+        """The transpose of `vectors`."""
+        corner, end = slopes[:2].T, slopes[2:].T
+        return jnp.stack([corner, -corner - end, end])
+
+    def expansion(self, vectors: Float[Array, "4 pairs"]) -> Expansion:
         r"""The energies of pairs of straight sides, $S / I\, \varphi(u I)$, and their derivatives.
 
         With the corner at $x$ and the side from 0 to $c$, $u = |x - t c|^2$ is the squared distance,
         $v = |x - e c|^2$ that of the nearer end, and $I(v) = 1 / d_0^2 + b / v$ the inverse squared range.
         Inside of the side the derivative of $u$ by $t$ vanishes; at its ends $t$ is fixed.
         """
-        x, c = places[:2], places[2:]
+        x, c = vectors[:2], vectors[2:]
         squared = total(c * c)
         inverse_squared = 1 / jnp.where(squared > 0, squared, 1)
         along = total(x * c)

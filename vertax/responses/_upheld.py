@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.reductions import indices_of
 from vertax._base.sums import total
 from vertax.mesh import Tissue
 from vertax.mesh._topology import Topology, edge_neighbourhood, take
@@ -43,10 +41,6 @@ class Upheld(AbstractBarrier):
     - `reach`: its range, a length.
     - `force`: about what it resists with at a third of that.
     """
-
-    # (The axis of `edge_axis`, in which the ends of the edge cancel.)
-    matrix: ClassVar[np.ndarray] = np.array([[-1, 1, 0, 0, 0, 0], [0, 0, -1, -1, 1, 1]])
-    """The edge, and the direction that it ought to have, of the points of `plan`."""
 
     edges: Int[Array, " some"]
     counts: Int[Array, " edges"]
@@ -84,9 +78,20 @@ class Upheld(AbstractBarrier):
         vertices = jnp.concatenate([here.vertices[:1], there.vertices])
         return GatherPlan(vertices, jnp.concatenate(images))
 
-    def expansion(self, places: Float[Array, "4 some"]) -> Expansion:
+    def vectors(self, positions: Float[Array, "6 some 2"]) -> Float[Array, "4 some"]:
+        """The edge, and the direction that it ought to have, of the points of `plan`."""
+        start, end, a, b, c, d = positions
+        # (Of `edge_axis`, in which the ends of the edge cancel.)
+        return jnp.concatenate([end - start, c + d - a - b], axis=-1).T
+
+    def forces(self, slopes: Float[Array, "4 some"]) -> Float[Array, "6 some 2"]:
+        """The transpose of `vectors`."""
+        edge, axis = slopes[:2].T, slopes[2:].T
+        return jnp.stack([-edge, edge, -axis, -axis, axis, axis])
+
+    def expansion(self, vectors: Float[Array, "4 some"]) -> Expansion:
         """The energy of each row, $F r\\, f(s)\\, \\varphi(w)$, and its derivatives."""
-        u, a = places[:2], places[2:]
+        u, a = vectors[:2], vectors[2:]
         s = total(u * u)
         axis = jax.lax.rsqrt(jnp.maximum(total(a * a), jnp.finfo(a.dtype).tiny))
         n = a * axis
@@ -133,7 +138,8 @@ class Upheld(AbstractBarrier):
         counts = self.counts + turned
         held = self.held & (squared < (_LONG * self.reach) ** 2)
         held |= turned & (counts >= _OFTEN)
-        edges = jnp.nonzero(held, size=len(self.edges), fill_value=n)[0]
+        edges, valid = indices_of(held, len(self.edges))
+        edges = jnp.where(valid, edges, n)
         return Upheld(edges.astype(self.edges.dtype), counts, self.reach, self.force)
 
 
