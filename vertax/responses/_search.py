@@ -20,6 +20,8 @@ from vertax.responses._contact import Contacts, no_contacts
 from vertax.solvers._edge_blocks import EdgeBlocks
 from vertax.solvers._known_hessian import KnownHessian
 from vertax.solvers._long_waves import LongWaves
+from vertax.solvers._newton import NewtonCG
+from vertax.solvers._preconditioner import Preconditioner
 from vertax.solvers._solver import AbstractIteration
 from vertax.transitions import AbstractTransitions
 
@@ -165,6 +167,9 @@ class Search(eqx.Module):
         num_below = jnp.where(changed, 0, num_below)
         finished = (num_below >= self.consecutive_steps) | jnp.isnan(progress.force)
         active = progress.accepted & ~changed & ~finished
+        options = options | {
+            "preconditioner": self._preconditioner(tissue, energy, contacts, active)
+        }
         return SearchState(
             tissue=tissue,
             origin=choose(flipped, tissue.configuration, state.origin),
@@ -178,6 +183,25 @@ class Search(eqx.Module):
             started=jnp.array(True),
             finished=finished,
         )
+
+    def _preconditioner(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        contacts: Contacts | None,
+        active: Bool[Array, ""],
+    ) -> Preconditioner:
+        """The preconditioner of a step, if there is to be one."""
+        build = lambda: Preconditioner(
+            blocks_of(tissue, energy, contacts), collective_of(tissue, self.known_hessian)
+        )
+        struct = eqx.filter_eval_shape(build)
+        if struct.is_diagonal or not isinstance(self.iteration, NewtonCG):
+            return Preconditioner(None, None)
+        arrays, static = eqx.partition(struct, lambda x: isinstance(x, jax.ShapeDtypeStruct))
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), arrays)
+        built = jax.lax.cond(active, lambda: eqx.filter(build(), eqx.is_array), lambda: zeros)
+        return eqx.combine(built, static)
 
     def _feasible(
         self, state: SearchState, goal: Tissue, energy: AbstractEnergy, arrives: Bool[Array, ""]

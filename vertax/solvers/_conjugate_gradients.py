@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.reductions import max_of
 from vertax.solvers._rows import Table, inner, row_inner, sizes
@@ -25,15 +26,44 @@ class Proposal(NamedTuple):
     num_products: Int[Array, ""]
 
 
+class AbstractInverse(eqx.Module):
+    """An approximate inverse of a damped Hessian, symmetric and positive definite."""
+
+    @abc.abstractmethod
+    def factors(self, damping: Float[Array, " rows"]) -> PyTree[Array]:
+        """What is computed once for a damping."""
+
+    @abc.abstractmethod
+    def apply(self, factors: PyTree[Array], residual: Table) -> Table:
+        """The product with a residual."""
+
+
+class DiagonalInverse(AbstractInverse):
+    """$1 / (k + \\lambda)$ with the stiffness $k$ and the damping $\\lambda$ of each row."""
+
+    stiffness: Float[Array, ""] | float
+
+    def factors(self, damping: Float[Array, " rows"]) -> Float[Array, " rows"]:
+        return damping
+
+    def apply(self, factors: Float[Array, " rows"], residual: Table) -> Table:
+        return residual / (self.stiffness + factors)[:, None]
+
+
 class _State(NamedTuple):
     step: Table
     residual: Table
     """$g + (H + \\Lambda) p$"""
-    preconditioned: Table
     direction: Table
     """The last one."""
-    beta: Float[Array, ""]
+    last: Float[Array, ""]
+    """The squared norm of the last residual; 0 where the iteration begins anew."""
+    first: Float[Array, ""]
+    """The squared norm of the first residual."""
+    rayleigh: Float[Array, ""]
+    """The curvature along the last direction."""
     damping: Float[Array, " rows"]
+    factors: PyTree[Array]
     phase: Int[Array, ""]
     num_products: Int[Array, ""]
     num_rounds: Int[Array, ""]
@@ -44,10 +74,10 @@ class TruncatedCG(eqx.Module):
 
     $\Lambda$ is diagonal, with one number for each row.
 
-    1. Iterate until the preconditioned residual is below `forcing` times the first one.
-    2. Where a row is longer than `overshoot` times its bound (`overshoot_solved` once the residual is
-        small), or the curvature along a direction is negative, increase $\Lambda$ there and continue from the
-        current step; at most `max_rounds` times.
+    1. Iterate until the residual, in the norm of the preconditioner, is below `forcing` times the first one.
+    2. Where a row would become longer than `overshoot` times its bound (at the end: `overshoot_solved`), or
+        the curvature along a direction is negative, increase $\Lambda$ there, and begin anew from the current
+        step; at most `max_rounds` times.
     3. Clip the rows that are longer than `clip` times their bound.
 
     (Steihaug 1983, doi:10.1137/0720042; Nocedal & Wright 2006, alg. 7.2, doi:10.1007/978-0-387-40065-5.)
@@ -64,7 +94,7 @@ class TruncatedCG(eqx.Module):
         gradient: Table,
         damping: Float[Array, " rows"],
         bounds: Float[Array, " rows"],
-        inverse: Callable[[Table, Float[Array, " rows"]], Table],
+        inverse: AbstractInverse,
         forcing: Float[Array, ""],
         max_products: int | Int[Array, ""],
         active: Bool[Array, ""],
@@ -77,62 +107,75 @@ class TruncatedCG(eqx.Module):
         - `gradient`: the gradient $g$.
         - `damping`: the diagonal of $\\Lambda$ to begin with.
         - `bounds`: about how long each row may become.
-        - `inverse`: the preconditioner, a function of a residual and the damping.
+        - `inverse`: the preconditioner.
         - `forcing`: the residual at the end, relative to the first one.
         - `max_products`: most products with the Hessian.
         - `active`: whether to do anything; otherwise the step is zero.
         """
         apart = 1 / bounds[:, None]
         tiny = jnp.finfo(gradient.dtype).tiny
-        start = inverse(gradient, damping)
-        whole = inner(gradient, start)
 
         def iterate(s: _State) -> _State:
-            clips = s.phase == _CLIP
+            fresh, clips = s.last == 0, s.phase == _CLIP
+            factors = s.factors
+            if not isinstance(inverse, DiagonalInverse):
+                build = lambda: inverse.factors(s.damping)
+                factors = jax.lax.cond(fresh & ~clips, build, lambda: s.factors)
+            else:
+                factors = s.damping
+            z = inverse.apply(factors, s.residual)
+            rz = inner(s.residual, z)
+            first = jnp.where(s.num_products == 0, rz, s.first)
+            small = ~clips & (s.num_products > 0) & (rz <= forcing**2 * first)
+            # One iteration, unless the residual is small.
+            beta = jnp.where(fresh, 0, rz / jnp.where(fresh, 1, s.last))
             short = self.clip / jnp.maximum(sizes(s.step * apart), self.clip)
-            back = (short - 1)[:, None] * s.step
-            d = jnp.where(clips, back, s.beta * s.direction - s.preconditioned)
-            hd = product(d)
+            d = jnp.where(clips, (short - 1)[:, None] * s.step, beta * s.direction - z)
+            hd = jax.lax.cond(small, jnp.zeros_like, product, d)
             damped = hd + s.damping[:, None] * d
-            curvature, squared = inner(d, damped), inner(d, d)
+            curvature = inner(d, damped)
             convex = curvature > 0
-            safe = jnp.where(convex, curvature, 1)
-            alpha = jnp.where(convex, -inner(s.residual, d) / safe, 0)
+            alpha = jnp.where(convex & ~small, rz / jnp.where(convex, curvature, 1), 0)
             alpha = jnp.where(clips, 1, alpha)
             reached = sizes((s.step + alpha * d) * apart)
             furthest = max_of(reached)
-            residual = s.residual + alpha * damped
-            z = inverse(residual, s.damping)
-            small = inner(residual, z) <= forcing**2 * whole
-            limit = jnp.where(small, self.overshoot_solved, self.overshoot)
-            far = ~clips & convex & (furthest > limit)
-            # Beyond the larger limit the step is not taken.
-            refused = far & (furthest > self.overshoot)
+            concave = ~small & ~clips & ~convex
+            refused = ~small & ~clips & (furthest > self.overshoot)
             alpha = jnp.where(refused, 0, alpha)
             step, residual = s.step + alpha * d, s.residual + alpha * damped
-            again = ~clips & (far | ~convex) & (s.num_rounds < self.max_rounds)
-            rayleigh = curvature / jnp.maximum(squared, tiny)
+            # More damping where the step is too long or the curvature negative.
+            wants = concave | refused | (small & (furthest > self.overshoot_solved))
+            again = wants & (s.num_rounds < self.max_rounds)
+            rayleigh = curvature / jnp.maximum(inner(d, d), tiny)
+            rayleigh = jnp.where(small, s.rayleigh, rayleigh)
             tighter = jnp.maximum(reached - 1, 0) * (s.damping + rayleigh)
-            concave = -2 * jnp.minimum(row_inner(d, hd), 0) / jnp.maximum(row_inner(d, d), tiny)
-            extra = jnp.where(again, jnp.where(convex, tighter, concave), 0)
-            ends = (~again & (small | far | ~convex)) | (s.num_products + 1 >= max_products)
-            too_far = (furthest > self.clip) & ~refused
-            after = jnp.where(ends, jnp.where(too_far, _CLIP, _END), _SOLVE)
+            negative = -2 * jnp.minimum(row_inner(d, hd), 0) / jnp.maximum(row_inner(d, d), tiny)
+            extra = jnp.where(again, jnp.where(concave, negative, tighter), 0)
+            num_products = s.num_products + jnp.where(small, 0, 1)
+            ends = ((small | wants) & ~again) | (num_products >= max_products)
+            clip_next = ends & (furthest > self.clip) & ~refused & ~concave
+            after = jnp.where(ends, jnp.where(clip_next, _CLIP, _END), _SOLVE)
             return _State(
                 step,
                 residual + extra[:, None] * step,
-                jnp.where(refused, s.preconditioned, z),
                 d,
-                jnp.where(again, 0, inner(z, damped) / safe),
+                jnp.where(again, 0, rz),
+                first,
+                rayleigh,
                 s.damping + extra,
+                factors,
                 jnp.where(clips, _END, after),
-                s.num_products + 1,
+                num_products,
                 s.num_rounds + again,
             )
 
-        zero, none = jnp.zeros_like(gradient), jnp.array(0)
-        phase = jnp.where(active & (whole > 0), _SOLVE, _END)
-        begin = _State(zero, gradient, start, zero, 0 * whole, damping, phase, none, none)
+        zero, none, nothing = jnp.zeros_like(gradient), jnp.array(0), jnp.zeros((), gradient.dtype)
+        phase = jnp.where(active & (inner(gradient, gradient) > 0), _SOLVE, _END)
+        shapes = jax.eval_shape(inverse.factors, damping)
+        factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        begin = _State(
+            zero, gradient, zero, nothing, nothing, nothing, damping, factors, phase, none, none
+        )
         end = jax.lax.while_loop(lambda s: s.phase != _END, iterate, begin)
         hp = end.residual - gradient - end.damping[:, None] * end.step
         return Proposal(end.step, hp, end.num_products)

@@ -12,8 +12,21 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import choose
-from vertax.solvers._conjugate_gradients import Proposal, TruncatedCG
-from vertax.solvers._rows import Table, inner, max_size, point_of, sizes, table_of, typical_size
+from vertax.solvers._conjugate_gradients import (
+    AbstractInverse,
+    DiagonalInverse,
+    Proposal,
+    TruncatedCG,
+)
+from vertax.solvers._rows import (
+    Table,
+    inner,
+    max_size,
+    point_of,
+    sizes,
+    table_of,
+    typical_size,
+)
 from vertax.solvers._solver import AbstractIteration, AbstractSolver, Progress, value_and_gradient
 from vertax.solvers._trust_region import VertexTrustRegion
 
@@ -27,6 +40,8 @@ class Model(NamedTuple):
     value: Float[Array, ""]
     gradient: Table
     product: Callable[[Table], Table]
+    point: Callable[[Table], PyTree[Array]]
+    """A table as a point."""
 
 
 class NewtonState(eqx.Module):
@@ -90,7 +105,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
 
     max_displacement: float = 0.2
     max_products: int = eqx.field(static=True, default=600)
-    max_corrections: int = eqx.field(static=True, default=6)
+    max_corrections: int = eqx.field(static=True, default=12)
     accept: float = eqx.field(static=True, default=1e-4)
     forcing: float = eqx.field(static=True, default=0.35)
     corrected_gain: float = eqx.field(static=True, default=0.9)
@@ -152,7 +167,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
 
         trial = start + state.trial
         g, product, (value, aux) = jax.linearize(force_and_value, trial, has_aux=True)
-        model = Model(value, g, product)
+        model = Model(value, g, product, lambda table: point_of(table, y))
         state = self._judged(model, options, state)
         return point_of(choose(state.progress.accepted, trial, start), y), state, model, aux
 
@@ -233,8 +248,8 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         damping = sizes(s.gradient) / s.radii
         bounds = jnp.minimum(s.radii, jnp.where(corrects, self.correction_displacement, 1) * reach)
         bounds = jnp.where(corrects, bounds, s.radii)
-        stiffness = options.get("stiffness", 1.0)
-        inverse = lambda r, damping: r / (stiffness + damping)[:, None]
+        near = self._finest(s.typical, unit) < self.forcing
+        inverse = self._inverse(model, options, near & active)
         proposal = self.conjugate_gradients(
             model.product,
             model.gradient,
@@ -261,6 +276,15 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
                 s.num_products + proposal.num_products,
             ),
         )
+
+    def _inverse(self, model: Model, options: Any, coarse: Bool[Array, ""]) -> AbstractInverse:
+        """The preconditioner."""
+        stiffness = options.get("stiffness", 1.0)
+        preconditioner = options.get("preconditioner")
+        if preconditioner is None or preconditioner.is_diagonal:
+            return DiagonalInverse(stiffness)
+        product = lambda v: model.point(model.product(table_of(v)))
+        return preconditioner.inverse(product, model.point(model.gradient), stiffness, coarse)
 
     def moved(
         self,

@@ -36,6 +36,12 @@ def point_of(table: Table, like: PyTree[Float[Array, "..."]]) -> PyTree[Float[Ar
     return jax.tree.unflatten(structure, parts)
 
 
+def rows_of(rows: Float[Array, " rows"], like: PyTree[Float[Array, "..."]]) -> Rows:
+    """The numbers of the rows of a table, as they belong to the arrays."""
+    ones = jax.tree.map(lambda x: jnp.zeros(x.shape[:1], x.dtype), like)
+    return point_of(rows[:, None], ones)
+
+
 def inner(a: Table, b: Table) -> Float[Array, ""]:
     """The inner product of two points."""
     return jnp.dot(a.reshape(-1), b.reshape(-1), precision=jax.lax.Precision.HIGHEST)
