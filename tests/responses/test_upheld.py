@@ -10,7 +10,8 @@ from helpers import fine_difference, random_tissue
 
 import vertax as vx
 from vertax.responses._contact import Contacts, no_contacts
-from vertax.responses._upheld import _FADE, _LONG, _OFTEN, REACH, Upheld, turned_height
+from vertax.responses._local import barrier
+from vertax.responses._upheld import _FADE, _LONG, _OFTEN, REACH, Upheld
 from vertax.transitions._edge_frames import EdgeFrames, edge_axes
 
 NUMBER = 4
@@ -28,7 +29,7 @@ def held(tissue: vx.Tissue, times: int = _OFTEN) -> Upheld:
     """Its edge of that number put upright so often."""
     upheld = Upheld.none(tissue, jnp.asarray(REACH), jnp.asarray(2.0))
     for _ in range(times):
-        upheld = upheld.updated(tissue, jnp.arange(tissue.n_edges) == NUMBER)
+        upheld = updated(upheld, tissue, jnp.arange(tissue.n_edges) == NUMBER)
     return upheld
 
 
@@ -36,6 +37,11 @@ def holding(tissue: vx.Tissue, upheld: Upheld) -> Contacts:
     """No contacts, but these edges are held."""
     units = {"length_scale": jnp.asarray(1.0), "stiffness": jnp.asarray(6.0)}
     return no_contacts(0.01, units, tissue).holding(tissue.topology, upheld)
+
+
+def updated(upheld: Upheld, tissue: vx.Tissue, turned) -> Upheld:
+    """After a step to that tissue, in which some edges were put upright."""
+    return upheld.updated(turned, jnp.sum(tissue.edge_vectors**2, axis=1))
 
 
 def numbers(upheld: Upheld, tissue: vx.Tissue) -> list[int]:
@@ -49,16 +55,16 @@ def test_an_edge_is_held_from_so_many_times_until_it_has_grown():
     upheld = held(short)
     assert numbers(upheld, short) == [NUMBER]
     nothing = jnp.zeros(short.n_edges, bool)
-    assert numbers(upheld.updated(short, nothing), short) == [NUMBER]
+    assert numbers(updated(upheld, short, nothing), short) == [NUMBER]
     # One step may turn it again from where the barrier has ended.
     longer = with_edge(short, 1.01 * _FADE * REACH)
     assert holding(longer, upheld)(longer) == 0
-    assert numbers(upheld.updated(longer, nothing), longer) == [NUMBER]
+    assert numbers(updated(upheld, longer, nothing), longer) == [NUMBER]
     grown = with_edge(short, 1.01 * _LONG * REACH)
-    let_go = upheld.updated(grown, nothing)
+    let_go = updated(upheld, grown, nothing)
     assert numbers(let_go, grown) == []
     # It is known of old, and held at once when it turns again.
-    again = let_go.updated(short, jnp.arange(short.n_edges) == NUMBER)
+    again = updated(let_go, short, jnp.arange(short.n_edges) == NUMBER)
     assert numbers(again, short) == [NUMBER]
 
 
@@ -66,7 +72,7 @@ def test_of_more_edges_than_there_is_room_for_some_are_held():
     tissue = random_tissue(12, 3)
     upheld = Upheld.none(tissue, jnp.asarray(REACH), jnp.asarray(2.0))
     for _ in range(_OFTEN):
-        upheld = upheld.updated(tissue, jnp.ones(tissue.n_edges, bool))
+        upheld = updated(upheld, tissue, jnp.ones(tissue.n_edges, bool))
     assert len(numbers(upheld, tissue)) == len(upheld.edges) < tissue.n_edges
     assert np.isfinite(holding(tissue, upheld)(tissue))
 
@@ -82,8 +88,12 @@ def test_its_derivatives(across, arcs):
 
     def plain(x):
         tissue = there.with_vertices(x)
-        edges = tissue.edge_vectors, edge_axes(tissue)
-        return turned_height(*edges, upheld.reach, upheld.force)[NUMBER]
+        edge, axis = tissue.edge_vectors[NUMBER], edge_axes(tissue)[NUMBER]
+        squared = edge @ edge
+        length = jnp.sqrt(squared + (1e-4 * REACH) ** 2)
+        upright = (length + edge @ axis / jnp.linalg.norm(axis)) / (2 * REACH)
+        fade = (1 - squared / (_FADE * REACH) ** 2) ** 3
+        return 2.0 * REACH * fade * barrier(upright)
 
     contacts = holding(there, upheld)
     energy = lambda x: contacts(there.with_vertices(x))
@@ -111,11 +121,11 @@ def test_a_step_that_jumps_over_its_barrier_goes_less_far(times):
     edge = tissue.edge_vectors[NUMBER]
     # A little beyond its middle, both from one end and from the other.
     goal = tissue.with_vertices(tissue.vertices.at[ends].add(0.6 * jnp.stack([edge, -edge])))
-    arrived = search._arrive(state, goal, energy, jnp.array(False))
+    arrived = search._feasible(state, goal, energy, jnp.array(True))
     assert not arrived.overlapping.any()
     other = jnp.ones(tissue.n_vertices, bool).at[ends].set(False)
-    assert (arrived.share[other] == 1).all()
-    assert (arrived.share[ends] == (0.25 if times else 1)).all()
+    assert (arrived.fraction[other] == 1).all()
+    assert (arrived.fraction[ends] == (0.25 if times else 1)).all()
     way = arrived.tissue.edge_vectors[NUMBER] @ edge_axes(arrived.tissue)[NUMBER]
     assert way > 0
 

@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import vertax as vx
-from vertax.responses._contact import Contacts, _pair_places
-from vertax.responses._local import local_blocks
 from vertax.responses._search import objective
 from vertax.solvers._edge_blocks import EdgeBlocks, EdgeCompliance, Symmetric
 from vertax.solvers._solver import value_and_gradient
@@ -189,26 +187,8 @@ def test_contacts_count_as_their_hessian_does():
     assert not jnp.any(jnp.where(untouched, found.xx + found.yy, 0))
 
 
-def test_compiled_derivatives_of_contacts_are_those_of_single_operations():
-    # (Compiled, a distance may be worked out twice, and rounded in two ways.)
-    tissue = foam(100, seed=2)
-    energy = vx.energies.ShapeFactorEnergy(4.3)
-    search = vx.Relaxation(contact_range=0.05).search(tissue, energy)
-    for steps in (8, 13):
-        state = search.advance(search.begin(tissue, energy), energy, steps)
-        contacts, there = state.contacts, state.tissue
-        assert contacts is not None
-        places = _pair_places(contacts.looks[contacts._n_looks :].at(there))
-        compiled = local_blocks(Contacts._pair_heights, contacts, places)
-        with jax.disable_jit():
-            expected = local_blocks(Contacts._pair_heights, contacts, places)
-        scale = float(jnp.abs(expected).max())
-        assert scale > 0
-        np.testing.assert_allclose(compiled, expected, atol=1e-9 * scale)
-
-
 def _vertices_of(contacts, tissue) -> np.ndarray:
-    corner, side = (np.asarray(x) for x in contacts.pairs.T)
+    corner, side = (np.asarray(x) for x in contacts.sides)
     real = corner != side
     after = np.asarray(tissue.topology.next)[side]
     return np.concatenate([corner[real], side[real], after[real]]) // 3

@@ -84,7 +84,7 @@ class Search(eqx.Module):
     consecutive_steps: int | Int[Array, ""]
     contact_range: float | Float[Array, ""] | None
     known_hessian: KnownHessian | None = None
-    max_attempts: int = eqx.field(static=True, default=9)
+    max_attempts: int = eqx.field(static=True, default=12)
     """Most attempts to make a point feasible; then the step is rejected."""
     max_shortenings: int = eqx.field(static=True, default=4)
     """After so many attempts vertices that overlap stay where they are."""
@@ -167,9 +167,7 @@ class Search(eqx.Module):
         num_below = jnp.where(changed, 0, num_below)
         finished = (num_below >= self.consecutive_steps) | jnp.isnan(progress.force)
         active = progress.accepted & ~changed & ~finished
-        options = options | {
-            "preconditioner": self._preconditioner(tissue, energy, contacts, active)
-        }
+        options = options | {"preconditioner": self._preconditioner(tissue, active)}
         return SearchState(
             tissue=tissue,
             origin=choose(flipped, tissue.configuration, state.origin),
@@ -184,17 +182,9 @@ class Search(eqx.Module):
             finished=finished,
         )
 
-    def _preconditioner(
-        self,
-        tissue: Tissue,
-        energy: AbstractEnergy,
-        contacts: Contacts | None,
-        active: Bool[Array, ""],
-    ) -> Preconditioner:
+    def _preconditioner(self, tissue: Tissue, active: Bool[Array, ""]) -> Preconditioner:
         """The preconditioner of a step, if there is to be one."""
-        build = lambda: Preconditioner(
-            blocks_of(tissue, energy, contacts), collective_of(tissue, self.known_hessian)
-        )
+        build = lambda: Preconditioner(None, collective_of(tissue, self.known_hessian))
         struct = eqx.filter_eval_shape(build)
         if struct.is_diagonal or not isinstance(self.iteration, NewtonCG):
             return Preconditioner(None, None)
@@ -209,9 +199,11 @@ class Search(eqx.Module):
         """Apply transitions where a step leads, if it `arrives`; shorten it where cells would overlap.
 
         1. Apply transitions, and compute the contacts.
-        2. Where cells overlap, the vertices take a quarter of the step, from the fourth attempt on nothing;
-            and new edges are a quarter as long. Try again.
-        3. If cells overlap after the last attempt, reject the step.
+        2. Where cells overlap, the vertices take a quarter of the step, and new edges are a quarter as long. Try
+            again.
+        3. After `max_shortenings` attempts these vertices stay; then with each attempt also the vertices around
+            them; all other vertices take the whole step. At the last attempt all stay.
+        4. If cells overlap even then, reject the step.
         """
         before, rule = state.tissue, self.transitions
         n_edges, dtype = goal.n_edges, goal.vertices.dtype
@@ -233,6 +225,10 @@ class Search(eqx.Module):
         def attempt(last: Feasible) -> Feasible:
             less = jnp.where(last.num_attempts < self.max_shortenings, self.shortening, 0)
             fraction = jnp.where(last.overlapping, less, 1) * last.fraction
+            frozen = dilated(before, last.overlapping | (fraction == 0))
+            frozen &= last.num_attempts > self.max_shortenings
+            frozen |= last.num_attempts == self.max_attempts - 1
+            fraction = jnp.where(frozen, 0, fraction)
             rows = before.by_row(fraction)
             partway = lambda a, b, rows: jnp.where(
                 _column(rows, a) < 1, a + _column(rows, a) * (b - a), b
@@ -279,6 +275,17 @@ class Search(eqx.Module):
             eqx.filter((before, state.contacts, state.counts, 0 * end.fraction), eqx.is_array),
         )
         return eqx.combine(choose(rejected, nothing, end), static)
+
+
+def dilated(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:
+    """The corners of all faces that have one of these corners."""
+    m = tissue.topology
+    faces = jnp.zeros(m.n_faces, bool).at[m.cell].max(jnp.repeat(vertices, 3))
+    corners = take(faces, m.cell)
+    # (The exterior has corners everywhere.)
+    if m.n_faces > m.n_cells:
+        corners &= m.cell < m.n_cells
+    return vertices | corners[::3] | corners[1::3] | corners[2::3]
 
 
 def _column(rows: Float[Array, " rows"], x: Array) -> Array:

@@ -93,7 +93,8 @@ class Upheld(AbstractBarrier):
         """The energy of each row, $F r\\, f(s)\\, \\varphi(w)$, and its derivatives."""
         u, a = vectors[:2], vectors[2:]
         s = total(u * u)
-        axis = jax.lax.rsqrt(jnp.maximum(total(a * a), jnp.finfo(a.dtype).tiny))
+        squared = total(a * a)
+        axis = jax.lax.rsqrt(jnp.where(squared > 0, squared, 1))
         n = a * axis
         root = jax.lax.rsqrt(s + (FLOOR * self.reach) ** 2)
         along = total(u * n)

@@ -136,16 +136,21 @@ class TruncatedCG(eqx.Module):
             curvature = inner(d, damped)
             convex = curvature > 0
             alpha = jnp.where(convex & ~small, rz / jnp.where(convex, curvature, 1), 0)
-            alpha = jnp.where(clips, 1, alpha)
+            # (Along a negative curvature: to the bounds.)
+            alpha = jnp.where(
+                clips | (~convex & ~small & (s.num_rounds >= self.max_rounds)), 1, alpha
+            )
             reached = sizes((s.step + alpha * d) * apart)
             furthest = max_of(reached)
+            more = s.num_rounds < self.max_rounds
             concave = ~small & ~clips & ~convex
-            refused = ~small & ~clips & (furthest > self.overshoot)
+            refused = ~small & ~clips & more & (furthest > self.overshoot)
             alpha = jnp.where(refused, 0, alpha)
             step, residual = s.step + alpha * d, s.residual + alpha * damped
             # More damping where the step is too long or the curvature negative.
-            wants = concave | refused | (small & (furthest > self.overshoot_solved))
-            again = wants & (s.num_rounds < self.max_rounds)
+            far = furthest > jnp.where(small, self.overshoot_solved, self.overshoot)
+            wants = concave | (~clips & far)
+            again = wants & more
             rayleigh = curvature / jnp.maximum(inner(d, d), tiny)
             rayleigh = jnp.where(small, s.rayleigh, rayleigh)
             tighter = jnp.maximum(reached - 1, 0) * (s.damping + rayleigh)
@@ -153,7 +158,7 @@ class TruncatedCG(eqx.Module):
             extra = jnp.where(again, jnp.where(concave, negative, tighter), 0)
             num_products = s.num_products + jnp.where(small, 0, 1)
             ends = ((small | wants) & ~again) | (num_products >= max_products)
-            clip_next = ends & (furthest > self.clip) & ~refused & ~concave
+            clip_next = ends & (furthest > self.clip)
             after = jnp.where(ends, jnp.where(clip_next, _CLIP, _END), _SOLVE)
             return _State(
                 step,

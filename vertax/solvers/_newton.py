@@ -83,8 +83,8 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
 
     1. Evaluate the trial point.
     2. *Second-order correction* (Nocedal & Wright 2006, section 15.6): if the step gained less than
-        `corrected_gain` of the prediction, or left more than `remaining_force` of the typical force, solve for
-        a short step from the trial point, to return to the floor of a curved valley. Evaluate again, at most
+        `corrected_gain` of the prediction, or left more than `remaining_force` of the typical force, compute a
+        short step from the trial point, back to the floor of a curved valley. Evaluate again, at most
         `max_corrections` times. A correction that does not lower the energy is undone.
     3. Accept or reject the point, and update the radii ([`VertexTrustRegion`]
         [vertax.solvers.VertexTrustRegion]).
@@ -111,7 +111,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     corrected_gain: float = eqx.field(static=True, default=0.9)
     remaining_force: float = eqx.field(static=True, default=0.4)
     cheap_products: int = eqx.field(static=True, default=30)
-    """Up to so many products, `remaining_force` is a quarter as large: a correction costs less than a step."""
+    """Up to this number of products, `remaining_force` counts a quarter: a correction is as cheap."""
     correction_forcing: float = eqx.field(static=True, default=0.3)
     correction_displacement: float = eqx.field(static=True, default=0.3)
     """The largest displacement of a correction, in units of that of a step."""
@@ -221,7 +221,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             error=error,
             radii=jnp.where(judged, radii, s.radii),
             typical=jnp.where(accepted, typical, s.typical),
-            previous=jnp.where(accepted, s.typical, s.previous),
+            previous=jnp.where(accepted & ~anew, s.typical, s.previous),
             num_corrections=jnp.where(judged, 0, s.num_corrections + corrects),
             num_products=s.num_products,
             progress=Progress(accepted, judged, accepted & ~anew, force),

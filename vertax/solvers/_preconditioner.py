@@ -25,7 +25,7 @@ class Preconditioner(eqx.Module):
     2. In the large: an elastic medium ([`LongWaves`]); or the Hessian of an equilibrium near by in place of
         both ([`KnownHessian`]). Only near an equilibrium: elsewhere what is soft may have negative curvature.
 
-    It is positive definite whatever the Hessian is, so it changes the number of iterations and not the solution.
+    It is positive definite whatever the Hessian is: it changes the number of iterations, not the solution.
     """
 
     edges: EdgeBlocks | None

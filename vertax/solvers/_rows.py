@@ -64,7 +64,7 @@ def times(rows: Float[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Arr
 
 
 def typical_size(x: Table) -> Float[Array, ""]:
-    """The squared mean root length of the rows that are not zero: large outliers count less than in the mean."""
+    """The squared mean root length of the rows that are not zero: outliers count less than in the mean."""
     roots = jnp.sqrt(sizes(x))
     ones = jnp.ones_like(roots)
     number = jnp.dot((roots > 0).astype(roots.dtype), ones)

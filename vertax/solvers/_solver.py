@@ -121,7 +121,7 @@ class AbstractSolver(optx.AbstractMinimiser):
         return Progress(yes, yes, yes, self.norm(self.gradient(state)))
 
     def reevaluated(self, fresh: Any, old: Any) -> Any:
-        """The old state with the value and the gradient of `fresh`; all of `fresh` if they are inseparable."""
+        """The old state with the value and the gradient of `fresh`; `fresh` if they are inseparable."""
         return fresh
 
     def terminate(
