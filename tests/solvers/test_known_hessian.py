@@ -106,7 +106,7 @@ def _found(relaxation, tissue, energy):
     problem = vx.InverseProblem(tissue, energy, VertexDistance(START), response=relaxation)
     evaluation = problem.value_and_gradient(throw=False)
     rest = evaluation.equilibrium.tissue.vertices
-    products = end.minimiser.inner.num_products
+    products = end.iteration.num_products
     return rest, evaluation.gradient, products, evaluation.outcome.num_steps
 
 

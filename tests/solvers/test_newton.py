@@ -10,7 +10,8 @@ import optimistix as optx
 import pytest
 
 import vertax as vx
-from vertax.solvers import _bounded_step, _newton, _rows
+from vertax.solvers import _rows
+from vertax.solvers._conjugate_gradients import TruncatedCG
 
 N = 30
 PLACES = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (N, 2)))
@@ -22,21 +23,30 @@ def landscape(y, difficulty):
     return 0.5 * jnp.sum((y[1:] - PLACES[1:]) ** 2) + difficulty * edge, None
 
 
-def steps(fn, y, args, n, **options):
-    """The point after some steps, and the state of the solver."""
-    solver: Any = vx.solvers.NewtonCG()
+NEWTON = vx.solvers.NewtonCG()
+
+
+def steps(fn, y, args, n, solver: Any = NEWTON, **options):
+    """The point after some steps, accepted or rejected, and the state of the solver."""
     value, aux = jax.eval_shape(fn, y, args)
     state = solver.init(fn, y, args, options, value, aux, frozenset())
 
-    def step(_, carry):
-        return solver.step(fn, carry[0], args, options, carry[1], frozenset())[:2]
+    def step(carry):
+        y, state, k = carry
+        y, state, _ = solver.step(fn, y, args, options, state, frozenset())
+        return y, state, k + state.progress.stepped
 
-    return jax.jit(lambda n: jax.lax.fori_loop(0, n, step, (y, state)))(n)
+    @jax.jit
+    def run(n):
+        unfinished = lambda carry: carry[2] < n
+        return jax.lax.while_loop(unfinished, step, (y, state, jnp.array(0)))[:2]
+
+    return run(n)
 
 
 def test_one_difficult_place_does_not_hold_back_the_others():
     start = jnp.zeros((N, 2))
-    radii = np.array([steps(landscape, start, 1.0, n)[1].radii for n in range(12)])
+    radii = np.array([steps(landscape, start, 1.0, n)[1].radii for n in range(1, 12)])
     assert radii[:, 0].min() < 0.02
     assert radii[:, 0].min() < 0.5 * radii[:, 1:].min()
     y, _ = steps(landscape, start, 1.0, 6)
@@ -47,8 +57,8 @@ def test_one_difficult_place_does_not_hold_back_the_others():
     np.testing.assert_allclose(found.value, PLACES, atol=1e-8)
 
 
-def test_a_step_that_gains_nothing_is_tried_again_without_what_is_to_blame(monkeypatch):
-    """Wells, and a wall in the way of one of so many."""
+def test_a_rejected_step_shrinks_the_radii_of_wrong_vertices_alone():
+    """Wells, and a wall in the way of one of many."""
     many = 2 * N
     places = jnp.concatenate([PLACES, PLACES])
 
@@ -56,32 +66,25 @@ def test_a_step_that_gains_nothing_is_tried_again_without_what_is_to_blame(monke
         wells = 0.5 * jnp.sum((y[1:] - places[1:]) ** 2)
         return wells - y[0, 0] + 0.5e4 * jnp.maximum(y[0, 0] - 0.01, 0) ** 2, None
 
-    def first_step():
-        jax.clear_caches()
-        y, state = steps(wall, jnp.zeros((many, 2)), None, 1)
-        return jnp.linalg.norm(y, axis=-1), state
-
-    moved, state = first_step()
-    assert 0 < moved[0] < 0.02
-    assert jnp.all(moved[1:] > 0)
+    y, state = steps(wall, jnp.zeros((many, 2)), None, 1)
+    assert jnp.all(y == 0)
     assert state.radii[0] < 0.1
-    np.testing.assert_allclose(state.radii[1:].min(), 0.2)
-    monkeypatch.setattr(_newton, "_RETRIES", 0)
-    moved, state = first_step()
-    assert jnp.all(moved == 0)
-    assert state.radii.max() < 0.2
+    np.testing.assert_allclose(state.radii[1:], 0.2)
+    y, state = steps(wall, jnp.zeros((many, 2)), None, 4)
+    assert jnp.all(jnp.linalg.norm(y[1:], axis=-1) > 0)
 
 
-def needed(fn, start, radius=0.2):
-    """How many steps it takes to come to rest, with regions of that radius at first."""
-    solver = vx.solvers.NewtonCG()
+def needed(fn, start, radius=0.2, **settings):
+    """How many steps it takes to come to rest, with radii of that size at first."""
+    solver: Any = vx.solvers.NewtonCG(**settings)
     value, aux = jax.eval_shape(fn, start, None)
     state = solver.init(fn, start, None, {}, value, aux, frozenset())
     state = eqx.tree_at(lambda s: s.radii, state, jnp.full(N, radius))
+    step = jax.jit(lambda y, state: solver.step(fn, y, None, {}, state, frozenset())[:2])
     y, n = start, 0
-    while jnp.max(jnp.abs(state.gradient)) > 1e-8:
-        y, state, _ = solver.step(fn, y, None, {}, state, frozenset())
-        n += 1
+    while state.progress.force > 1e-8:
+        y, state = step(y, state)
+        n += bool(state.progress.stepped)
     return n
 
 
@@ -91,22 +94,19 @@ def test_regions_grow_fast_where_steps_are_foreseen():
 
 
 def test_regions_do_not_grow_where_steps_were_cut_short():
-    """The model foresaw those steps well, and would have had them again for ever."""
+    """The model predicted those steps well, and would propose them again without end."""
     solver: Any = vx.solvers.NewtonCG()
     far = lambda y, _: (0.5 * jnp.sum((y - 9.0) ** 2), None)
-    start = jnp.zeros((N, 2))
-    _, before = steps(far, start, None, 0)
-    small = eqx.tree_at(lambda s: s.radii, before, 1e-2 * before.radii)
-    _, after, _ = solver.step(far, start, None, {}, small, frozenset())
-    assert (after.radii > 2 * small.radii).all()
-    share = jnp.where(jnp.arange(N) < 3, 0.0, 1.0)
-    resumed = solver.resumed(before, after, share, jnp.array(False))
-    np.testing.assert_allclose(resumed.radii[:3], 0.25 * small.radii[:3])
-    np.testing.assert_array_equal(resumed.radii[3:], after.radii[3:])
-    # If no short step helps, they begin anew.
-    shortest = eqx.tree_at(lambda s: s.tried, after, 1e-6 * after.tried)
-    resumed = solver.resumed(before, shortest, share, jnp.array(False))
-    np.testing.assert_array_equal(resumed.radii[:3], before.radii[:3])
+    _, after = steps(far, jnp.zeros((N, 2)), None, 3)
+    fraction = jnp.where(jnp.arange(N) < 3, 0.0, 1.0)
+    no, yes = jnp.array(False), jnp.array(True)
+    cut = solver.moved(after, fraction, no, yes, {})
+    assert (cut.radii[:3] <= 0.25 * after.radii[:3]).all()
+    np.testing.assert_array_equal(cut.radii[3:], after.radii[3:])
+    # If short steps do not help either, they start again with the largest radius.
+    for _ in range(8):
+        cut = solver.moved(cut, fraction, no, yes, {})
+    assert (cut.radii[:3] > 1e-3 * 0.2).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -124,17 +124,14 @@ def test_copies_side_by_side_go_as_one_alone(n):
     np.testing.assert_allclose(together.reshape(4, N, 2), jnp.stack(4 * [alone]), atol=1e-12)
 
 
-def test_a_step_that_leaves_much_of_the_force_is_corrected(monkeypatch):
+def test_a_step_that_leaves_much_of_the_force_is_corrected():
     """Soft springs, which vertices may not follow to their ends in one step."""
     soft = lambda y, _: (0.5e-3 * jnp.sum((y - 2.0) ** 2), None)
     start = jnp.zeros((N, 2))
-    corrected = needed(soft, start)
-    monkeypatch.setattr(_newton, "_LEFT", np.inf)
-    monkeypatch.setattr(_newton, "_CHEAP", 0)
-    assert corrected < 0.75 * needed(soft, start)
+    assert needed(soft, start) <= 0.75 * needed(soft, start, max_corrections=0)
 
 
-def test_a_cheap_step_leaves_little(monkeypatch):
+def test_a_cheap_step_leaves_little():
     """One wall that begins with the cube of the distance, as a contact, and others at rest."""
 
     def wall(y, _):
@@ -142,9 +139,8 @@ def test_a_cheap_step_leaves_little(monkeypatch):
         return others + 0.05 * jnp.maximum(1 - y[0, 0], 0) ** 3, None
 
     start = PLACES.at[0].set(0.0)
-    corrected = needed(wall, start)
-    monkeypatch.setattr(_newton, "_CHEAP", 0)  # Newton's method halves it, and quarters the force
-    assert corrected < 0.75 * needed(wall, start)
+    # (Newton's method halves the distance, and quarters the force.)
+    assert needed(wall, start) < 0.75 * needed(wall, start, cheap_products=0)
 
 
 def test_few_large_forces_count_little():
@@ -165,10 +161,11 @@ def test_no_row_goes_far_in_a_step():
     assert hill(y, None)[0] < hill(start, None)[0]
 
 
-def test_what_goes_too_far_is_cut_and_nothing_else(monkeypatch):
+def test_rows_that_go_too_far_are_clipped_and_no_others():
     """A long lever, whose end goes a hundred times as far as what is pushed."""
-    monkeypatch.setattr(_bounded_step, "_ROUNDS", 0)
-    monkeypatch.setattr(_newton, "_COARSEST", 1e-6)
+    solver = vx.solvers.NewtonCG(
+        forcing=1e-6, max_corrections=0, conjugate_gradients=TruncatedCG(max_rounds=0)
+    )
 
     def lever(y, _):
         bent = y[1] - 100 * y[0]
@@ -176,13 +173,13 @@ def test_what_goes_too_far_is_cut_and_nothing_else(monkeypatch):
         return wells + 0.1 * y[0, 0] + 0.5e-4 * jnp.sum(bent**2), None
 
     start = jnp.zeros((N, 2))
-    y, state = steps(lever, start, None, 1)
+    y, state = steps(lever, start, None, 1, solver)
     far = jnp.sqrt(jnp.sum(y**2, axis=-1))
     assert 0.3 < far[1] <= 2 * 0.2 * 1.001
     np.testing.assert_allclose(state.gradient, jax.grad(lambda y: lever(y, None)[0])(y), atol=1e-12)
     # As far as their own damping lets them.
     damped = PLACES[2:] / (1 + jnp.linalg.norm(PLACES[2:], axis=-1, keepdims=True) / 0.2)
-    np.testing.assert_allclose(y[2:], damped, rtol=0.01)
+    np.testing.assert_allclose(y[2:], damped, rtol=0.05)
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
@@ -210,10 +207,10 @@ def test_the_rounding_of_an_energy_far_below_its_unit_does_not_matter():
     at_rest = rest(PLACES).value
     for key in jax.random.split(jax.random.key(0), 8):
         start = at_rest + 3e-12 * jax.random.normal(key, (N, 2))
-        assert rest(start).stats["num_steps"] < 4
+        assert rest(start).stats["num_steps"] < 8  # evaluations
 
 
-def test_steps_follow_a_curved_valley(monkeypatch):
+def test_steps_follow_a_curved_valley():
     """The floor is a circle, and falls gently around it."""
     tilt = 1e-4
 
@@ -223,17 +220,11 @@ def test_steps_follow_a_curved_valley(monkeypatch):
 
     angles = jnp.linspace(1.0, 2.5, N)
     start = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-
-    def needed():
-        solver = vx.solvers.NewtonCG(atol=1e-10)
-        found = optx.minimise(valley, solver, start, has_aux=True, max_steps=300)
-        np.testing.assert_allclose(found.value[:, 0], 1 + tilt, atol=1e-6)
-        return int(found.stats["num_steps"])
-
-    corrected = needed()
-    monkeypatch.setattr(_newton, "_CORRECTIONS", 0)
-    jax.clear_caches()
-    assert corrected < 0.75 * needed()
+    found = optx.minimise(
+        valley, vx.solvers.NewtonCG(atol=1e-10), start, has_aux=True, max_steps=400
+    )
+    np.testing.assert_allclose(found.value[:, 0], 1 + tilt, atol=1e-6)
+    assert needed(valley, start) < 0.75 * needed(valley, start, max_corrections=0)
 
 
 @pytest.mark.thorough

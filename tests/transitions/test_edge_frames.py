@@ -9,7 +9,6 @@ from helpers import random_tissue
 
 import vertax as vx
 from vertax.transitions._edge_frames import EdgeFrames, suspects
-from vertax.transitions._t1 import _independent
 
 TISSUES = {
     "periodic": lambda: random_tissue(40, 3),
@@ -26,30 +25,6 @@ def bent(tissue):
         return tissue
     angles = 0.3 * jax.random.normal(jax.random.key(3), (tissue.n_edges,))
     return tissue.with_angles(angles)
-
-
-@pytest.mark.parametrize("flips", [False, True])
-@pytest.mark.parametrize("kind", TISSUES)
-def test_measures_are_those_of_the_tissue(kind, flips):
-    tissue = bent(TISSUES[kind]())
-    rows = jnp.arange(0, tissue.n_edges, 2)
-
-    @jax.jit
-    def both(tissue):
-        corner = EdgeFrames(tissue, rows)
-        which = _independent(corner.can_flip, corner, tissue.n_cells)
-        direction = corner.across if flips else corner.along
-        there = corner.place(tissue, which, direction, 0.3 + 0.1 * corner.length)
-        there = corner.flip(there, which & flips)
-        known = corner.measures(
-            tissue, tissue.measured(), which, jnp.array(flips), direction, 0.3 + 0.1 * corner.length
-        )
-        return jnp.sum(which), there.measured(), known
-
-    count, expected, known = both(tissue)
-    assert count > 3
-    for part, value in zip(expected, known, strict=True):
-        np.testing.assert_allclose(value, part, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", TISSUES)

@@ -71,7 +71,7 @@ def conclude(
     free = free_motions(relaxed, frozen(energy), units)
     # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
     # unless the energy has something to say about where the tissue is.
-    settled = _choose(jnp.all(free), relaxed.settled(frozen(tissue)), relaxed)
+    settled = _choose(jnp.all(free), relaxed.settled(frozen(tissue)), _recentred(relaxed, tissue, free))
     moved = settled.held_as(_choose(jnp.all(free), tissue, relaxed))
     springs = jnp.ones_like(moved.drift(settled.configuration)).at[: len(free)].set(free)
     options = {
@@ -123,6 +123,15 @@ def follow_start(relaxed: Tissue, start: Tissue, free: Bool[Array, " modes"]) ->
     if start.pinned is not None:
         moved = jnp.where(jnp.any(start.pinned), 0, moved)
     return relaxed.with_vertices(jnp.where(jnp.all(free), settled, relaxed.vertices + moved))
+
+
+def _recentred(relaxed: Tissue, start: Tissue, free: Bool[Array, " modes"]) -> Tissue:
+    """The same tissue, moved to the centroid of `start` along the translations that are free."""
+    drift = jnp.mean(start.gathered(start.vertices) - relaxed.gathered(relaxed.vertices), axis=0)
+    drift = jax.lax.stop_gradient(drift) * free[:2]
+    if start.pinned is not None:
+        drift = jnp.where(jnp.any(start.pinned), 0, drift)
+    return relaxed.with_vertices(relaxed.vertices + drift)
 
 
 def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:

@@ -93,7 +93,8 @@ class Search(eqx.Module):
     def begin(self, tissue: Tissue, energy: AbstractEnergy) -> SearchState:
         """The state before the first step."""
         rule = self.transitions
-        counts = jnp.zeros(0, jnp.int32) if rule is None else rule.init(tissue)
+        none = jnp.zeros(tissue.n_edges, jnp.int32)
+        counts = none if rule is None else rule.init(tissue)
         contacts = None
         if self.contact_range is not None:
             contacts = no_contacts(self.contact_range, self.options, tissue)
@@ -199,10 +200,10 @@ class Search(eqx.Module):
         """Apply transitions where a step leads, if it `arrives`; shorten it where cells would overlap.
 
         1. Apply transitions, and compute the contacts.
-        2. Where cells overlap, the vertices take a quarter of the step, and new edges are a quarter as long. Try
-            again.
-        3. After `max_shortenings` attempts these vertices stay; then with each attempt also the vertices around
-            them; all other vertices take the whole step. At the last attempt all stay.
+        2. Where cells overlap, the vertices take a quarter of the step, and new edges are a quarter as long.
+            Try again.
+        3. After `max_shortenings` attempts these vertices stay; then with each attempt also the vertices
+            around them; all other vertices take the whole step. At the last attempt all stay.
         4. If cells overlap even then, reject the step.
         """
         before, rule = state.tissue, self.transitions

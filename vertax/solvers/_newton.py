@@ -83,8 +83,8 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
 
     1. Evaluate the trial point.
     2. *Second-order correction* (Nocedal & Wright 2006, section 15.6): if the step gained less than
-        `corrected_gain` of the prediction, or left more than `remaining_force` of the typical force, compute a
-        short step from the trial point, back to the floor of a curved valley. Evaluate again, at most
+        `corrected_gain` of the prediction, or left more than `remaining_force` of the typical force, compute
+        a short step from the trial point, back to the floor of a curved valley. Evaluate again, at most
         `max_corrections` times. A correction that does not lower the energy is undone.
     3. Accept or reject the point, and update the radii ([`VertexTrustRegion`]
         [vertax.solvers.VertexTrustRegion]).
@@ -182,11 +182,12 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         typical = typical_size(g)
         gained = s.value - value
         below_rounding = jnp.abs(s.predicted) <= _rounding(value, unit * length)
-        falls = jnp.where(
-            below_rounding,
-            squared < inner(s.gradient, s.gradient),
-            gained >= self.accept * s.predicted,
-        )
+        # Where the gain is below rounding, the force must fall; or the gain be as predicted.
+        smaller = squared < inner(s.gradient, s.gradient)
+        as_predicted = gained > self.trust_region.good_gain * s.predicted
+        as_predicted &= gained > 20 * jnp.finfo(value.dtype).eps * jnp.abs(value)
+        enough = gained >= self.accept * s.predicted
+        falls = jnp.where(below_rounding, smaller | as_predicted, enough)
         # (A point that is evaluated anew is the iterate, whatever its value.)
         falls = anew | (finite & falls)
         good = ~anew & (below_rounding | (gained > self.trust_region.good_gain * s.predicted))

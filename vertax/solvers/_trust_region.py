@@ -35,8 +35,8 @@ class VertexTrustRegion(eqx.Module):
     max_growth: float = 16.0
     shrink: float = 0.25
     few: float = 0.1
-    min_radius: float = 1e-6
-    collapsed: float = 1e-5
+    min_radius: float = 1e-10
+    collapsed: float = 1e-9
 
     def error(
         self,
