@@ -123,7 +123,7 @@ class T1(AbstractTransitions):
                 length = jnp.where(k == 2, _SHORTER, 1) * size
                 length = jnp.where(last & ~flips, frames.length, length)
                 trial_tissue = frames.changed(tissue, flips, turns, length)
-                if local:
+                if isinstance(energy, AbstractLocalEnergy):
                     cost = _local_costs(energy, Measured(trial_tissue), frames)
                 else:
                     cost = jnp.where(tried, energy(Measured(trial_tissue)), costs[k])
