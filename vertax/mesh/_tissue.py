@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from vertax._base.modules import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
-from vertax.mesh._boundary import AbstractBoundary, Free
+from vertax.mesh._boundary import AbstractBoundary, Free, Periodic
 from vertax.mesh._capacity import size_class, with_slots, without_slots
 from vertax.mesh._ends import at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
@@ -565,6 +565,9 @@ def _mean_area(tissue: Tissue) -> Float[Array, ""]:
 
 def mean_area(tissue: Tissue) -> Float[Array, ""]:
     """The mean area of the cells that there are."""
+    if isinstance(tissue.boundary, Periodic):
+        number = jnp.sum(tissue.alive) if tissue.topology.spare else tissue.n_cells
+        return jnp.abs(tissue.boundary.area) / number
     areas = jnp.abs(tissue.areas)
     return jnp.sum(areas) / jnp.sum(tissue.alive) if tissue.topology.spare else jnp.mean(areas)
 

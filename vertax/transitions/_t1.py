@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -16,7 +18,7 @@ from vertax.mesh._measured import Measured
 from vertax.mesh._overlaps import Overlaps
 from vertax.mesh._tissue import mean_area
 from vertax.mesh._topology import take
-from vertax.transitions._edge_frames import EdgeFrames, suspects
+from vertax.transitions._edge_frames import EdgeFrames
 from vertax.transitions._transitions import AbstractTransitions
 
 
@@ -135,7 +137,7 @@ class T1(AbstractTransitions):
             tissue, flips, _ = jax.lax.fori_loop(0, n_passes, trial, start)
             return tissue, counts + flips, candidates & ~chosen
 
-        start = (tissue, counts, suspects(tissue, threshold))
+        start = (tissue, counts, jnp.ones(tissue.n_edges, bool))
         tissue, counts, _ = jax.lax.while_loop(unfinished, one_round, start)
         return tissue, counts
 
@@ -174,7 +176,8 @@ def _independent(
     rank = jnp.where(candidates, rank, n_edges)
     first = jnp.full(n_cells, n_edges).at[cells].min(rank[:, None], mode="drop")
     shortest = first.at[cells].get(mode="fill", fill_value=n_edges) == rank[:, None]
-    return candidates & jnp.all(shortest | (cells == n_cells), axis=-1)
+    shortest |= cells == n_cells
+    return candidates & functools.reduce(jnp.logical_and, (shortest[:, k] for k in range(4)))
 
 
 def _local_costs(
