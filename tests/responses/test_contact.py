@@ -168,7 +168,7 @@ def test_an_edge_that_vanishes_along_another_side_has_a_moderate_curvature(offse
     b = int(m.next[0]) // 3
     there = tissue.with_vertices(tissue.vertices.at[b].add(away - tissue.sides[0, 2:4]))
     one = jnp.asarray(1.0)
-    contacts, _ = no_contacts(0.01, {"length_scale": one, "stiffness": one}, there).found(there)
+    contacts, _ = no_contacts(0.01, one, there).found(there)
     assert [int(m.next[0]), side] in contacts.sides.T.tolist()
     own = lambda x: contacts(there.with_vertices(there.vertices.at[b].set(x)))
     curvature = jax.hessian(own)(there.vertices[b])

@@ -35,8 +35,8 @@ def held(tissue: vx.Tissue, times: int = _OFTEN) -> Upheld:
 
 def holding(tissue: vx.Tissue, upheld: Upheld) -> Contacts:
     """No contacts, but these edges are held."""
-    units = {"length_scale": jnp.asarray(1.0), "stiffness": jnp.asarray(6.0)}
-    return no_contacts(0.01, units, tissue).holding(tissue.topology, upheld)
+    contacts = no_contacts(0.01, jnp.asarray(1.0), tissue)
+    return contacts.holding(tissue.topology, upheld)
 
 
 def updated(upheld: Upheld, tissue: vx.Tissue, turned) -> Upheld:

@@ -81,6 +81,15 @@ class Contacts(eqx.Module):
         blocks = (block.positive for block in (corner, start, chord))
         return Symmetric(*(gathered(*each) for each in zip(*blocks, strict=True)))
 
+    def with_stiffness(self, stiffness: Float[Array, ""]) -> Contacts:
+        """The same contacts in a material of another stiffness."""
+        # The barrier must not depend on the parameters of the energy, not even through its strength: that
+        # would be one more derivative. So it is a power of 16.
+        step = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0))
+        strength = step / self.pairs.slope
+        force = step * self.pairs.distance / self.pairs.slope * SLOPE
+        return eqx.tree_at(lambda c: (c.pairs.strength, c.upheld.force), self, (strength, force))
+
     def updated(
         self, point: Tissue, tissue: Tissue, unflipped: Bool[Array, "*rules edges"]
     ) -> tuple[Contacts, Bool[Array, " vertices"]]:
@@ -148,30 +157,26 @@ the range in cells: both are the same at a fifth of a cell from the end."""
 
 def no_contacts(
     reach: float | Float[Array, ""],
-    options: dict[str, Array],
+    length: Float[Array, ""],
     tissue: Tissue,
     capacity: int | None = None,
 ) -> Contacts:
-    """Contacts that are not found yet.
+    """Contacts that are not found yet, in a material of stiffness 1.
 
     **Arguments:**
 
     - `reach`: the range in units of the size of a cell.
-    - `options`: of a minimiser: typical sizes.
+    - `length`: the size of a cell.
     - `tissue`: for which tissue.
     - `capacity`: most pairs; by default a quarter of the number of vertices, and at least 64.
     """
-    length, stiffness = options["length_scale"], options["stiffness"]
     reach = jnp.maximum(jnp.asarray(reach, length.dtype), 1e-9)
-    slope = SLOPE * reach
-    # The barrier must not depend on the parameters of the energy, not even through its strength: that would
-    # be one more derivative. So it is a power of 16.
-    strength = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0)) / slope
-    upheld = Upheld.none(tissue, jnp.minimum(reach, REACH) * length, strength * slope * length)
+    slope, strength = SLOPE * reach, jnp.ones_like(length)
+    upheld = Upheld.none(tissue, jnp.minimum(reach, REACH) * length, length)
     n = max(64, tissue.n_vertices // 4) if capacity is None else capacity
     topology = tissue.topology
     no, sides = jnp.zeros(n, bool), jnp.zeros((2, n), topology.twin.dtype)
-    return Contacts(
+    contacts = Contacts(
         PairBarrier(reach * length, slope, strength, no, no, no),
         sides,
         GatherPlan.none(topology, (3, n)),
@@ -179,3 +184,4 @@ def no_contacts(
         GatherPlan.none(topology, (6, len(upheld.edges))),
         jnp.array(False),
     )
+    return contacts.with_stiffness(strength)

@@ -39,7 +39,7 @@ class SearchEnd(eqx.Module):
     @classmethod
     def of(cls, search: Search, state: SearchState) -> SearchEnd:
         """The end of a search that is not to go on."""
-        options = search.options
+        options = search.options(state.stiffness)
         return cls(
             tissue=state.tissue,
             origin=state.origin,
@@ -71,7 +71,9 @@ def conclude(
     free = free_motions(relaxed, frozen(energy), units)
     # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
     # unless the energy has something to say about where the tissue is.
-    settled = _choose(jnp.all(free), relaxed.settled(frozen(tissue)), _recentred(relaxed, tissue, free))
+    settled = _choose(
+        jnp.all(free), relaxed.settled(frozen(tissue)), _recentred(relaxed, tissue, free)
+    )
     moved = settled.held_as(_choose(jnp.all(free), tissue, relaxed))
     springs = jnp.ones_like(moved.drift(settled.configuration)).at[: len(free)].set(free)
     options = {

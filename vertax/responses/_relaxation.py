@@ -218,22 +218,19 @@ class Relaxation(AbstractResponse):
 
     def search(self, tissue: Tissue, energy: AbstractEnergy) -> Search:
         """The search for an equilibrium, step by step, in the units of a tissue."""
-        units = units_of(tissue, energy)
-        tolerance = self.tolerance
-        if tolerance is None:
-            precise = tissue.vertices.dtype == jnp.float64
-            tolerance = (1e-10 if precise else 1e-5) * units.force
-        options = {
-            "length_scale": units.length,
-            "stiffness": units.stiffness,
-            "tolerance": jnp.asarray(tolerance, tissue.vertices.dtype),
-        }
         solver = self._solver
-        iteration = solver if isinstance(solver, AbstractIteration) else Stepwise(solver)
+        native = isinstance(solver, NewtonCG)
+        # (NewtonCG measures the stiffness itself.)
+        stiffness = None if native else units_of(tissue, energy).stiffness
+        tolerance = self.tolerance
+        if tolerance is not None:
+            tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
         return Search(
-            iteration,
+            solver if isinstance(solver, AbstractIteration) else Stepwise(solver),
             self.transitions,
-            frozen(options),
+            frozen(cell_size(tissue)),
+            frozen(stiffness),
+            frozen(tolerance),
             self.patience,
             self.contact_range,
             frozen(self.known_hessian),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import choose
+from vertax._base.probe import probe
 from vertax._base.reductions import any_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -22,6 +24,7 @@ from vertax.solvers._known_hessian import KnownHessian
 from vertax.solvers._long_waves import LongWaves
 from vertax.solvers._newton import NewtonCG
 from vertax.solvers._preconditioner import Preconditioner
+from vertax.solvers._rows import Table, inner, table_of
 from vertax.solvers._solver import AbstractIteration
 from vertax.transitions import AbstractTransitions
 
@@ -34,6 +37,8 @@ class SearchState(eqx.Module):
     origin: PyTree[Array]
     """The configuration right after the last transition, or the first one."""
     iteration: PyTree
+    stiffness: Float[Array, ""]
+    """A typical second derivative of the energy, see `Units`; 1 before it is measured."""
     contacts: Contacts | None
     overlaps: Bool[Array, ""]
     """Whether the tissue overlaps, as it has since the start."""
@@ -73,14 +78,18 @@ class Search(eqx.Module):
 
     - `iteration`: the minimiser.
     - `transitions`: the rule for topology changes, or None.
-    - `options`: of the minimiser: typical sizes and the tolerance.
+    - `length`: the size of a cell.
+    - `stiffness`: see `Units`; None to measure it in the first evaluation.
+    - `tolerance`: largest force at rest; None for 1e-10 of the unit of force (1e-5 in float32).
     - `consecutive_steps`: steps in a row after which the force must be below the tolerance.
     - `contact_range`: of contacts; None to let cells overlap.
     """
 
     iteration: AbstractIteration
     transitions: AbstractTransitions | None
-    options: dict[str, Array]
+    length: Float[Array, ""]
+    stiffness: Float[Array, ""] | None
+    tolerance: Float[Array, ""] | None
     consecutive_steps: int | Int[Array, ""]
     contact_range: float | Float[Array, ""] | None
     known_hessian: KnownHessian | None = None
@@ -97,15 +106,18 @@ class Search(eqx.Module):
         counts = none if rule is None else rule.init(tissue)
         contacts = None
         if self.contact_range is not None:
-            contacts = no_contacts(self.contact_range, self.options, tissue)
+            contacts = no_contacts(self.contact_range, self.length, tissue)
         args = (tissue, energy, contacts)
-        iteration = self.iteration.unevaluated(objective, tissue.configuration, args, self.options)
+        stiffness = jnp.ones_like(self.length) if self.stiffness is None else self.stiffness
+        options = self.options(stiffness)
+        iteration = self.iteration.unevaluated(objective, tissue.configuration, args, options)
         no, none = jnp.array(False), jnp.array(0)
         infinite = jnp.full((), jnp.inf, tissue.vertices.dtype)
         return SearchState(
             tissue,
             tissue.configuration,
             iteration,
+            stiffness,
             contacts,
             no,
             counts,
@@ -115,6 +127,15 @@ class Search(eqx.Module):
             started=no,
             finished=no,
         )
+
+    def options(self, stiffness: Float[Array, ""]) -> dict[str, Array]:
+        """What a minimiser is told: typical sizes and the tolerance."""
+        tolerance = self.tolerance
+        if tolerance is None:
+            precise = stiffness.dtype == jnp.float64
+            tolerance = (1e-10 if precise else 1e-5) * stiffness * self.length
+        tolerance = jnp.asarray(tolerance, stiffness.dtype)
+        return {"length_scale": self.length, "stiffness": stiffness, "tolerance": tolerance}
 
     def advance(
         self, state: SearchState, energy: AbstractEnergy, num_steps: int | Int[Array, ""]
@@ -143,11 +164,20 @@ class Search(eqx.Module):
 
     def _step(self, state: SearchState, energy: AbstractEnergy) -> SearchState:
         """One evaluation: accept or reject the trial point, make it feasible, compute the next one."""
-        iteration, options, before = self.iteration, self.options, state.tissue
-        args = (before, energy, state.contacts)
+        iteration, before, known = self.iteration, state.tissue, state.contacts
+        options = self.options(state.stiffness)
+        args = (before, energy, known)
         y, minimiser, model, _ = iteration.evaluate(
             objective, before.configuration, args, options, state.iteration
         )
+        stiffness = state.stiffness
+        if self.stiffness is None:
+            measure = lambda: mean_curvature(model.product, before)
+            stiffness = jax.lax.cond(state.started, lambda: state.stiffness, measure)
+            options = self.options(stiffness)
+            if known is not None:
+                known = known.with_stiffness(stiffness)
+        state = eqx.tree_at(lambda s: s.contacts, state, known, is_leaf=lambda x: x is None)
         progress = iteration.progress(minimiser)
         arrives = progress.moved | ~state.started
         goal = before.with_configuration(y)
@@ -173,6 +203,7 @@ class Search(eqx.Module):
             tissue=tissue,
             origin=choose(flipped, tissue.configuration, state.origin),
             iteration=iteration.propose(model, options, minimiser, active),
+            stiffness=stiffness,
             contacts=contacts,
             overlaps=jnp.where(arrives, any_of(feasible.overlapping), state.overlaps),
             counts=feasible.counts,
@@ -276,6 +307,23 @@ class Search(eqx.Module):
             eqx.filter((before, state.contacts, state.counts, 0 * end.fraction), eqx.is_array),
         )
         return eqx.combine(choose(rejected, nothing, end), static)
+
+
+def mean_curvature(product: Callable[[Table], Table], tissue: Tissue) -> Float[Array, ""]:
+    """The size of a typical second derivative: the Rayleigh quotient of a vector without pattern.
+
+    **Arguments:**
+
+    - `product`: multiplies by the Hessian.
+    - `tissue`: at which it is.
+    """
+    like = table_of(tissue.configuration)
+    direction = probe(like)
+    if tissue.topology.spare:  # what cannot move must not make the rest look soft
+        alive = tissue.by_row(tissue.topology.alive_vertices.astype(like.dtype))
+        direction *= table_of(alive)
+    curvature = jnp.abs(inner(direction, product(direction))) / inner(direction, direction)
+    return jnp.where(jnp.isfinite(curvature) & (curvature > 0), curvature, 1)
 
 
 def dilated(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, " vertices"]:
