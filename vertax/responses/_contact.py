@@ -173,7 +173,7 @@ def no_contacts(
     reach = jnp.maximum(jnp.asarray(reach, length.dtype), 1e-9)
     slope, strength = SLOPE * reach, jnp.ones_like(length)
     upheld = Upheld.none(tissue, jnp.minimum(reach, REACH) * length, length)
-    n = max(64, tissue.n_vertices // 4) if capacity is None else capacity
+    n = max(64, tissue.n_vertices) if capacity is None else capacity
     topology = tissue.topology
     no, sides = jnp.zeros(n, bool), jnp.zeros((2, n), topology.twin.dtype)
     contacts = Contacts(

@@ -267,7 +267,9 @@ class Search(eqx.Module):
             )
             y = jax.tree.map(partway, before.configuration, goal.configuration, rows)
             point = before.with_configuration(y)
-            swept, counts, length_fraction = point, state.counts, last.length_fraction
+            swept, counts = point, state.counts
+            ends = take(frozen, before.topology.edge_vertices)
+            length_fraction = jnp.where(ends[:, 0] | ends[:, 1], 0, last.length_fraction)
             if rule is not None:
                 swept, counts = rule.sweep(point, energy, state.counts, length_fraction)
             contacts, overlapping = last.contacts, no
@@ -302,9 +304,9 @@ class Search(eqx.Module):
         end = jax.lax.while_loop(unfinished, iterate, arrays)
         rejected = guarded & any_of(end.overlapping)
         nothing = eqx.tree_at(
-            lambda f: (f.tissue, f.contacts, f.counts, f.fraction),
+            lambda f: (f.tissue, f.contacts, f.counts, f.fraction, f.overlapping),
             end,
-            eqx.filter((before, state.contacts, state.counts, 0 * end.fraction), eqx.is_array),
+            eqx.filter((before, state.contacts, state.counts, 0 * end.fraction, no), eqx.is_array),
         )
         return eqx.combine(choose(rejected, nothing, end), static)
 
