@@ -40,6 +40,8 @@ class SearchState(eqx.Module):
     stiffness: Float[Array, ""]
     """A typical second derivative of the energy, see `Units`; 1 before it is measured."""
     contacts: Contacts | None
+    preconditioner: Preconditioner
+    """Of steps from the iterate."""
     overlaps: Bool[Array, ""]
     """Whether the tissue overlaps, as it has since the start."""
     counts: Int[Array, "*rules edges"]
@@ -119,6 +121,7 @@ class Search(eqx.Module):
             iteration,
             stiffness,
             contacts,
+            _empty(eqx.filter_eval_shape(self._preconditioner, *args)),
             no,
             counts,
             infinite,
@@ -198,13 +201,20 @@ class Search(eqx.Module):
         num_below = jnp.where(changed, 0, num_below)
         finished = (num_below >= self.consecutive_steps) | jnp.isnan(progress.force)
         active = progress.accepted & ~changed & ~finished
-        options = options | {"preconditioner": self._preconditioner(tissue, active)}
+        preconditioner = state.preconditioner
+        if not preconditioner.is_diagonal:
+            arrays, static = eqx.partition(preconditioner, eqx.is_array)
+            build = lambda: eqx.filter(self._preconditioner(tissue, energy, contacts), eqx.is_array)
+            arrays = jax.lax.cond(active, build, lambda: arrays)
+            preconditioner = eqx.combine(arrays, static)
+        options = options | {"preconditioner": preconditioner}
         return SearchState(
             tissue=tissue,
             origin=choose(flipped, tissue.configuration, state.origin),
             iteration=iteration.propose(model, options, minimiser, active),
             stiffness=stiffness,
             contacts=contacts,
+            preconditioner=preconditioner,
             overlaps=jnp.where(arrives, any_of(feasible.overlapping), state.overlaps),
             counts=feasible.counts,
             force=progress.force,
@@ -214,16 +224,14 @@ class Search(eqx.Module):
             finished=finished,
         )
 
-    def _preconditioner(self, tissue: Tissue, active: Bool[Array, ""]) -> Preconditioner:
-        """The preconditioner of a step, if there is to be one."""
-        build = lambda: Preconditioner(None, collective_of(tissue, self.known_hessian))
-        struct = eqx.filter_eval_shape(build)
-        if struct.is_diagonal or not isinstance(self.iteration, NewtonCG):
+    def _preconditioner(
+        self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
+    ) -> Preconditioner:
+        """The preconditioner of steps from a tissue, and of their corrections."""
+        if not isinstance(self.iteration, NewtonCG):
             return Preconditioner(None, None)
-        arrays, static = eqx.partition(struct, lambda x: isinstance(x, jax.ShapeDtypeStruct))
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), arrays)
-        built = jax.lax.cond(active, lambda: eqx.filter(build(), eqx.is_array), lambda: zeros)
-        return eqx.combine(built, static)
+        blocks = blocks_of(tissue, energy, contacts)
+        return Preconditioner(blocks, collective_of(tissue, self.known_hessian))
 
     def _feasible(
         self, state: SearchState, goal: Tissue, energy: AbstractEnergy, arrives: Bool[Array, ""]
@@ -337,6 +345,12 @@ def dilated(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, "
     if m.n_faces > m.n_cells:
         corners &= m.cell < m.n_cells
     return vertices | corners[::3] | corners[1::3] | corners[2::3]
+
+
+def _empty(tree: PyTree) -> PyTree:
+    """Zeros for the arrays of a pytree of which only their shapes are known."""
+    is_shape = lambda x: isinstance(x, jax.ShapeDtypeStruct)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_shape(x) else x, tree)
 
 
 def _column(rows: Float[Array, " rows"], x: Array) -> Array:
