@@ -280,9 +280,9 @@ class Search(eqx.Module):
             length_fraction = jnp.where(ends[:, 0] | ends[:, 1], 0, last.length_fraction)
             if rule is not None:
                 swept, counts = rule.sweep(point, energy, state.counts, length_fraction)
-            contacts, overlapping = last.contacts, no
-            if last.contacts is not None:
-                contacts, overlapping = last.contacts.updated(point, swept, counts == state.counts)
+            contacts, overlapping = state.contacts, no
+            if contacts is not None:
+                contacts, overlapping = contacts.updated(point, swept, counts == state.counts)
                 flips = (counts != state.counts).reshape(-1, n_edges)
                 flips = functools.reduce(jnp.logical_or, list(flips))
                 ends = take(overlapping, swept.topology.edge_vertices)
