@@ -24,6 +24,12 @@ def max_of(x: Float[Array, "*shape"]) -> Float[Array, ""]:
     )
 
 
+def number_of(x: Bool[Array, "*shape"]) -> Float[Array, ""]:
+    """How many are true."""
+    ones = jnp.ones(x.size, jnp.float32)
+    return jnp.dot(x.reshape(-1).astype(jnp.float32), ones)
+
+
 def indices_of(
     mask: Bool[Array, " n"], size: int
 ) -> tuple[Int[Array, " size"], Bool[Array, " size"]]:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.reductions import any_of, indices_of
+from vertax._base.reductions import any_of, indices_of, number_of
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
 from vertax.mesh._sides import Sides, dot
@@ -131,8 +131,9 @@ class Contacts(eqx.Module):
         m, (_, size) = tissue.topology, self.sides.shape
         overlapping, nearest, gaps = overlaps_and_nearest(m, tissue.sides, tissue.areas, measure)
         near = (gaps < _MARGIN**2).reshape(-1)
-        which, valid = indices_of(near, size + 1)
-        overflow, which, valid = self.overflow | valid[size], which[:size], valid[:size]
+        # (A slice of its results would make XLA sort instead.)
+        which, valid = indices_of(near, size)
+        overflow = self.overflow | (number_of(near) > size)
         which = which.astype(m.twin.dtype)
         corner = jax.lax.rem(which, jnp.asarray(m.n_half_edges, which.dtype))
         sides = jnp.where(valid, jnp.stack([corner, take(nearest.reshape(-1), which)]), 0)
