@@ -167,17 +167,21 @@ def _independent(
     """The candidates that are the shortest of all candidates at each of their four cells.
 
     Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute. (An edge lies
-    between two faces, so sharing the exterior is no harm.)
+    between two faces, so sharing the exterior is no harm.) Of those of one length the first one counts.
     """
     cells, n_edges = frames.cells, candidates.size
-    length = jnp.where(candidates, frames.length, jnp.inf)
-    order = jnp.argsort(length)
-    rank = jnp.zeros_like(order).at[order].set(jnp.arange(n_edges))
-    rank = jnp.where(candidates, rank, n_edges)
-    first = jnp.full(n_cells, n_edges).at[cells].min(rank[:, None], mode="drop")
-    shortest = first.at[cells].get(mode="fill", fill_value=n_edges) == rank[:, None]
-    shortest |= cells == n_cells
-    return candidates & functools.reduce(jnp.logical_and, (shortest[:, k] for k in range(4)))
+
+    def least(values: Array, largest: float, some: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
+        """Which of some edges have the least value at each of their cells."""
+        values = jnp.where(some, values, largest)
+        of_cells = jnp.full(n_cells, largest, values.dtype)
+        of_cells = of_cells.at[cells].min(values[:, None], mode="drop")
+        there = of_cells.at[cells].get(mode="clip")
+        is_least = (there == values[:, None]) | (cells == n_cells)
+        return some & functools.reduce(jnp.logical_and, (is_least[:, k] for k in range(4)))
+
+    shortest = least(frames.length, jnp.inf, candidates)
+    return least(jnp.arange(n_edges), n_edges, shortest)
 
 
 def _local_costs(
