@@ -40,17 +40,22 @@ class Contacts(eqx.Module):
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The energy of the barriers."""
-        if tissue.arcs is None:
-            of_pairs = barrier_energy(self.pairs, self.plan.positions(tissue))
-            return of_pairs + self._upheld(tissue)
 
         def energy() -> Float[Array, ""]:
-            one, other = map(tissue.sides_of, self.sides)
-            return jnp.sum(self.pairs.heights(one, other)) + self._upheld(tissue)
+            if tissue.arcs is None:
+                of_pairs = barrier_energy(self.pairs, self.plan.positions(tissue))
+            else:
+                one, other = map(tissue.sides_of, self.sides)
+                of_pairs = jnp.sum(self.pairs.heights(one, other))
+            return of_pairs + self._upheld(tissue)
 
-        # The barrier of arcs takes thirty times as long as that of straight sides.
-        some = jnp.any(self.pairs.valid) | self.upheld.any
-        return jax.lax.cond(some, energy, lambda: jnp.zeros((), tissue.vertices.dtype))
+        # Most tissues have no contacts most of the time, and then these take longer than the energy.
+        return jax.lax.cond(self.some, energy, lambda: jnp.zeros((), tissue.vertices.dtype))
+
+    @property
+    def some(self) -> Bool[Array, ""]:
+        """Whether there are any."""
+        return any_of(self.pairs.valid) | self.upheld.any
 
     def _upheld(self, tissue: Tissue) -> Float[Array, ""]:
         return barrier_energy(self.upheld, self.upheld_plan.positions(tissue))
