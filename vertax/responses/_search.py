@@ -207,7 +207,11 @@ class Search(eqx.Module):
             build = lambda: eqx.filter(self._preconditioner(tissue, energy, contacts), eqx.is_array)
             arrays = jax.lax.cond(active, build, lambda: arrays)
             preconditioner = eqx.combine(arrays, static)
-        options = options | {"preconditioner": preconditioner}
+        if self.known_hessian is not None:
+            known = self.known_hessian.seen_from(tissue.configuration)
+            options = options | {"preconditioner": Preconditioner(preconditioner.edges, known)}
+        else:
+            options = options | {"preconditioner": preconditioner}
         return SearchState(
             tissue=tissue,
             origin=choose(flipped, tissue.configuration, state.origin),
@@ -227,11 +231,11 @@ class Search(eqx.Module):
     def _preconditioner(
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
     ) -> Preconditioner:
-        """The preconditioner of steps from a tissue, and of their corrections."""
+        """What is computed where a step begins, for the step and its corrections."""
         if not isinstance(self.iteration, NewtonCG):
             return Preconditioner(None, None)
-        blocks = blocks_of(tissue, energy, contacts)
-        return Preconditioner(blocks, collective_of(tissue, self.known_hessian))
+        coarse = None if self.known_hessian is not None else LongWaves.of(tissue)
+        return Preconditioner(blocks_of(tissue, energy, contacts), coarse)
 
     def _feasible(
         self, state: SearchState, goal: Tissue, energy: AbstractEnergy, arrives: Bool[Array, ""]

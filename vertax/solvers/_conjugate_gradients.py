@@ -60,8 +60,8 @@ class _State(NamedTuple):
     """The squared norm of the last residual; 0 where the iteration begins anew."""
     first: Float[Array, ""]
     """The squared norm of the first residual."""
-    rayleigh: Float[Array, ""]
-    """The curvature along the last direction."""
+    curvature: Float[Array, ""]
+    """$d \\cdot (H + \\Lambda) d$ of the last direction."""
     damping: Float[Array, " rows"]
     factors: PyTree[Array]
     phase: Int[Array, ""]
@@ -129,45 +129,55 @@ class TruncatedCG(eqx.Module):
             small = ~clips & (s.num_products > 0) & (rz <= forcing**2 * first)
             # One iteration, unless the residual is small.
             beta = jnp.where(fresh, 0, rz / jnp.where(fresh, 1, s.last))
-            short = self.clip / jnp.maximum(sizes(s.step * apart), self.clip)
-            d = jnp.where(clips, (short - 1)[:, None] * s.step, beta * s.direction - z)
+
+            def back() -> Table:
+                short = self.clip / jnp.maximum(sizes(s.step * apart), self.clip)
+                return (short - 1)[:, None] * s.step
+
+            d = jax.lax.cond(clips, back, lambda: beta * s.direction - z)
             hd = jax.lax.cond(small, jnp.zeros_like, product, d)
             damped = hd + s.damping[:, None] * d
             curvature = inner(d, damped)
+            more = s.num_rounds < self.max_rounds
             convex = curvature > 0
+            concave = ~small & ~clips & ~convex
             alpha = jnp.where(convex & ~small, rz / jnp.where(convex, curvature, 1), 0)
             # (Along a negative curvature: to the bounds.)
-            alpha = jnp.where(
-                clips | (~convex & ~small & (s.num_rounds >= self.max_rounds)), 1, alpha
-            )
-            reached = sizes((s.step + alpha * d) * apart)
-            furthest = max_of(reached)
-            more = s.num_rounds < self.max_rounds
-            concave = ~small & ~clips & ~convex
+            alpha = jnp.where(clips | (concave & ~more), 1, alpha)
+            furthest = max_of(sizes((s.step + alpha * d) * apart))
             refused = ~small & ~clips & more & (furthest > self.overshoot)
+            tried = alpha
             alpha = jnp.where(refused, 0, alpha)
             step, residual = s.step + alpha * d, s.residual + alpha * damped
             # More damping where the step is too long or the curvature negative.
             far = furthest > jnp.where(small, self.overshoot_solved, self.overshoot)
             wants = concave | (~clips & far)
             again = wants & more
-            rayleigh = curvature / jnp.maximum(inner(d, d), tiny)
-            rayleigh = jnp.where(small, s.rayleigh, rayleigh)
-            tighter = jnp.maximum(reached - 1, 0) * (s.damping + rayleigh)
-            negative = -2 * jnp.minimum(row_inner(d, hd), 0) / jnp.maximum(row_inner(d, d), tiny)
-            extra = jnp.where(again, jnp.where(concave, negative, tighter), 0)
+            curvature = jnp.where(small, s.curvature, curvature)
+
+            def damp() -> tuple[Table, Float[Array, " rows"]]:
+                last = jnp.where(small, s.direction, d)
+                rayleigh = curvature / jnp.maximum(inner(last, last), tiny)
+                reached = sizes((s.step + tried * d) * apart)
+                tighter = jnp.maximum(reached - 1, 0) * (s.damping + rayleigh)
+                concavity = -jnp.minimum(row_inner(d, hd), 0)
+                negative = 2 * concavity / jnp.maximum(row_inner(d, d), tiny)
+                extra = jnp.where(concave, negative, tighter)
+                return residual + extra[:, None] * step, s.damping + extra
+
+            residual, damping = jax.lax.cond(again, damp, lambda: (residual, s.damping))
             num_products = s.num_products + jnp.where(small, 0, 1)
             ends = ((small | wants) & ~again) | (num_products >= max_products)
             clip_next = ends & (furthest > self.clip)
             after = jnp.where(ends, jnp.where(clip_next, _CLIP, _END), _SOLVE)
             return _State(
                 step,
-                residual + extra[:, None] * step,
+                residual,
                 d,
                 jnp.where(again, 0, rz),
                 first,
-                rayleigh,
-                s.damping + extra,
+                curvature,
+                damping,
                 factors,
                 jnp.where(clips, _END, after),
                 num_products,

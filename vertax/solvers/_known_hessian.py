@@ -87,20 +87,12 @@ class KnownHessian(eqx.Module):
         measured: tuple[()],
         shift: Float[Array, ""] | float = 0.0,
         shares: Rows | None = None,
-    ) -> _Compliance:
-        """How all gives way if each row hands on a share of its force, and goes as much; all by default."""
-        roots = None if shares is None else jax.tree.map(jnp.sqrt, shares)
-        return _Compliance(self.inverse, roots)
+    ) -> Rows | None:
+        """What `added` needs if each row hands on a share of its force, and moves as much; all by default."""
+        return None if shares is None else jax.tree.map(jnp.sqrt, shares)
 
-
-class _Compliance(eqx.Module):
-    inverse: Float[Array, "n n"]
-    roots: Rows | None
-
-    def added(self, near: PyTree, force: PyTree) -> PyTree:
-        """How all gives way to a force, whatever is thought of what is `near`."""
-        flat, unravel = ravel_pytree(self._shared(force))
-        return self._shared(unravel(self.inverse @ flat))
-
-    def _shared(self, x: PyTree) -> PyTree:
-        return x if self.roots is None else jax.tree.map(times, self.roots, x)
+    def added(self, roots: Rows | None, near: PyTree, force: PyTree) -> PyTree:
+        """The response to a force, in place of that of what is `near`."""
+        share = lambda x: x if roots is None else jax.tree.map(times, roots, x)
+        flat, unravel = ravel_pytree(share(force))
+        return share(unravel(self.inverse @ flat))

@@ -175,6 +175,12 @@ class LongWaves(eqx.Module):
         mirrored = scale * (along - across) * turned
         return Compliance(self.indices, weights, scale * (along + across), mirrored)
 
+    def added(self, compliance: Compliance, near: PyTree, force: PyTree) -> PyTree:
+        """How vertices give way near by, as parts of a configuration, and how the medium does besides."""
+        first, *rest = jax.tree.leaves(near)
+        first = first + compliance(jax.tree.leaves(force)[0])
+        return jax.tree.unflatten(jax.tree.structure(near), [first, *rest])
+
 
 class Stiffness(NamedTuple):
     """What waves in a tissue resist with; see `LongWaves`."""
@@ -193,12 +199,6 @@ class Compliance(eqx.Module):
     """What comes of each wave along its own wave vector,"""
     mirrored: Complex[Array, "size size"]
     """and of the one in the opposite direction."""
-
-    def added(self, near: PyTree, force: PyTree) -> PyTree:
-        """How vertices give way near by, as parts of a configuration, and how the medium does besides."""
-        first, *rest = jax.tree.leaves(near)
-        first = first + self(jax.tree.leaves(force)[0])
-        return jax.tree.unflatten(jax.tree.structure(near), [first, *rest])
 
     def __call__(self, force: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
         """How it gives way to forces on vertices."""

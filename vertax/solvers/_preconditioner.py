@@ -83,10 +83,11 @@ class TissueInverse(AbstractInverse):
         return small, large.compliance(self.medium, held, shares)
 
     def apply(self, factors: PyTree[Array], residual: Table) -> Table:
-        small, large = factors
+        small, medium = factors
         r = point_of(residual, self.like)
         plain = self.preconditioner.edges is None
         z = jax.tree.map(times, small, r) if plain else small(r)
+        large = self.preconditioner.coarse
         if large is not None:
-            z = jax.lax.cond(self.coarse, lambda: large.added(z, r), lambda: z)
+            z = jax.lax.cond(self.coarse, lambda: large.added(medium, z, r), lambda: z)
         return table_of(z)
