@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from vertax._base.sums import total
 from vertax.mesh import Tissue
 from vertax.mesh._topology import Topology, source, take
 
@@ -145,5 +146,6 @@ def _gradient(
 def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     barrier, positions = primals
     block = barrier.expansion(barrier.vectors(positions)).block
-    change = jnp.sum(block * barrier.vectors(tangents[1])[None], axis=1)
+    # (A sum over an axis of four takes ten times as long.)
+    change = total(block[:, j] * row for j, row in enumerate(barrier.vectors(tangents[1])))
     return _gradient(*primals), barrier.forces(change)

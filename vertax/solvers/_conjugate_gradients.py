@@ -19,10 +19,11 @@ _SOLVE, _CLIP, _END = range(3)
 
 
 class Proposal(NamedTuple):
-    """A step, its product with the Hessian, and the products with the Hessian that it took."""
+    """A step, its product with the Hessian, its damping, and the number of products that it took."""
 
     step: Table
     product: Table
+    damping: Float[Array, " rows"]
     num_products: Int[Array, ""]
 
 
@@ -193,4 +194,4 @@ class TruncatedCG(eqx.Module):
         )
         end = jax.lax.while_loop(lambda s: s.phase != _END, iterate, begin)
         hp = end.residual - gradient - end.damping[:, None] * end.step
-        return Proposal(end.step, hp, end.num_products)
+        return Proposal(end.step, hp, end.damping, end.num_products)

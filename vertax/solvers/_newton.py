@@ -139,7 +139,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             base_value=infinite,
             value=infinite,
             gradient=zero,
-            proposal=Proposal(zero, zero, none),
+            proposal=Proposal(zero, zero, rows, none),
             predicted=jnp.zeros_like(infinite),
             error=rows,
             radii=rows + reach,
@@ -246,7 +246,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         useful = jnp.minimum(0.1, 0.9 * (s.typical / jnp.where(s.previous > 0, s.previous, 1)) ** 2)
         useful = jnp.where(jnp.isfinite(s.previous), useful, 0)
         forcing = jnp.minimum(self.forcing, jnp.maximum(self._finest(s.typical, unit), useful))
-        damping = sizes(s.gradient) / s.radii
+        damping = jnp.where(corrects, s.proposal.damping, sizes(s.gradient) / s.radii)
         bounds = jnp.minimum(s.radii, jnp.where(corrects, self.correction_displacement, 1) * reach)
         bounds = jnp.where(corrects, bounds, s.radii)
         near = self._finest(s.typical, unit) < self.forcing
