@@ -38,8 +38,14 @@ def units_of(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Units:
 
 
 def cell_size(tissue: Tissue) -> Float[Array, ""]:
-    """The root mean cell area."""
+    """The root mean cell area. Arcs that are nearly full circles, or beyond, count as shorter ones."""
+    if tissue.angles is not None:
+        tissue = tissue.with_angles(jnp.clip(tissue.angles, -_LARGEST_ANGLE, _LARGEST_ANGLE))
     return jnp.sqrt(mean_area(tissue))
+
+
+# Half of the angle that an arc spans. (The segment of a circle has 8 times the area of the half disc then.)
+_LARGEST_ANGLE = 2.5
 
 
 def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:

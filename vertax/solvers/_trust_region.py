@@ -37,6 +37,8 @@ class VertexTrustRegion(eqx.Module):
     few: float = 0.1
     min_radius: float = 1e-10
     collapsed: float = 1e-9
+    shortest: float = 1e-6
+    """A radius that steps cut short have made shorter than this, in units of the largest one, begins anew."""
 
     def error(
         self,
@@ -98,7 +100,7 @@ class VertexTrustRegion(eqx.Module):
     ) -> Float[Array, " rows"]:
         """The radii after a step of which rows could take only a fraction."""
         quarter = self.shrink * jnp.minimum(sizes(step), radii)
-        quarter = jnp.where(quarter < 1e-3 * largest, largest, quarter)
+        quarter = jnp.where(quarter < self.shortest * largest, largest, quarter)
         return self.restarted(jnp.where(fraction < 1, quarter, radii), largest)
 
     def restarted(

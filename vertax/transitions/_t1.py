@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -171,7 +172,7 @@ def _independent(
     """
     cells, n_edges = frames.cells, candidates.size
 
-    def least(values: Array, largest: float, some: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
+    def least(values: Array, largest: Any, some: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
         """Which of some edges have the least value at each of their cells."""
         values = jnp.where(some, values, largest)
         of_cells = jnp.full(n_cells, largest, values.dtype)
