@@ -53,7 +53,7 @@ def test_it_is_symmetric_and_positive_whatever_the_hessian(seed, offset):
     hessian = KnownHessian.at(product, place, jnp.ones(()))
     shares = jnp.asarray(rng.uniform(0.1, 1, 6))
     for compliance in (hessian.compliance(()), hessian.compliance((), 0.0, shares)):
-        yields = lambda f, c=compliance: c.added(f, f)
+        yields = lambda f, c=compliance: hessian.added(c, f, f)
         a, b = jnp.asarray(rng.normal(size=(2, 6, 2)))
         np.testing.assert_allclose(jnp.vdot(a, yields(b)), jnp.vdot(b, yields(a)), rtol=1e-9)
         assert jnp.vdot(a, yields(a)) > 0
@@ -62,7 +62,7 @@ def test_it_is_symmetric_and_positive_whatever_the_hessian(seed, offset):
 def test_of_a_minimum_it_is_the_inverse(at_rest, known):
     slope = jax.grad(lambda v: energy_of(0)(at_rest.with_vertices(v)))
     force = jax.jvp(slope, (at_rest.vertices,), (random_like(at_rest.vertices, 1),))[1]
-    moved = known.compliance(()).added(force, force)
+    moved = known.added(known.compliance(()), force, force)
     back = jax.jvp(slope, (at_rest.vertices,), (moved,))[1]
     np.testing.assert_allclose(back, force, atol=1e-8)
 

@@ -61,6 +61,8 @@ class _State(NamedTuple):
     """The squared norm of the last residual; 0 where the iteration begins anew."""
     first: Float[Array, ""]
     """The squared norm of the first residual."""
+    furthest: Float[Array, ""]
+    """The length of the longest row of the step, in units of its bound."""
     curvature: Float[Array, ""]
     """$d \\cdot (H + \\Lambda) d$ of the last direction."""
     damping: Float[Array, " rows"]
@@ -126,8 +128,10 @@ class TruncatedCG(eqx.Module):
                 factors = s.damping
             z = inverse.apply(factors, s.residual)
             rz = inner(s.residual, z)
-            first = jnp.where(s.num_products == 0, rz, s.first)
-            small = ~clips & (s.num_products > 0) & (rz <= forcing**2 * first)
+            # (More damping makes a residual smaller; without a step that is no progress.)
+            still = s.furthest == 0
+            first = jnp.where(still, rz, s.first)
+            small = ~clips & ~still & (rz <= forcing**2 * first)
             # One iteration, unless the residual is small.
             beta = jnp.where(fresh, 0, rz / jnp.where(fresh, 1, s.last))
 
@@ -146,9 +150,10 @@ class TruncatedCG(eqx.Module):
             # (Along a negative curvature: to the bounds.)
             alpha = jnp.where(clips | (concave & ~more), 1, alpha)
             furthest = max_of(sizes((s.step + alpha * d) * apart))
-            refused = ~small & ~clips & more & (furthest > self.overshoot)
-            tried = alpha
-            alpha = jnp.where(refused, 0, alpha)
+            tried, beyond = alpha, ~small & ~clips & more & (furthest > self.overshoot)
+            # (Not further than the limit: where there is hardly any curvature that may be very far.)
+            room = (self.overshoot - s.furthest) / jnp.maximum(furthest - s.furthest, tiny)
+            alpha *= jnp.where(beyond, jnp.clip(room, 0, 1), 1)
             step, residual = s.step + alpha * d, s.residual + alpha * damped
             # More damping where the step is too long or the curvature negative.
             far = furthest > jnp.where(small, self.overshoot_solved, self.overshoot)
@@ -177,6 +182,7 @@ class TruncatedCG(eqx.Module):
                 d,
                 jnp.where(again, 0, rz),
                 first,
+                jnp.where(beyond, self.overshoot, furthest),
                 curvature,
                 damping,
                 factors,
@@ -190,7 +196,7 @@ class TruncatedCG(eqx.Module):
         shapes = jax.eval_shape(inverse.factors, damping)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         begin = _State(
-            zero, gradient, zero, nothing, nothing, nothing, damping, factors, phase, none, none
+            zero, gradient, zero, nothing, nothing, nothing, nothing, damping, factors, phase, none, none
         )
         end = jax.lax.while_loop(lambda s: s.phase != _END, iterate, begin)
         hp = end.residual - gradient - end.damping[:, None] * end.step
