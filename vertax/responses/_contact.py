@@ -96,7 +96,11 @@ class Contacts(eqx.Module):
         return eqx.tree_at(lambda c: (c.pairs.strength, c.upheld.force), self, (strength, force))
 
     def updated(
-        self, point: Tissue, tissue: Tissue, unflipped: Bool[Array, "*rules edges"]
+        self,
+        point: Tissue,
+        tissue: Tissue,
+        unflipped: Bool[Array, "*rules edges"],
+        holds: Bool[Array, ""],
     ) -> tuple[Contacts, Bool[Array, " vertices"]]:
         """The contacts of a tissue, and the vertices of cells that overlap.
 
@@ -105,6 +109,7 @@ class Contacts(eqx.Module):
         - `point`: the tissue before transitions.
         - `tissue`: after them.
         - `unflipped`: which edges have not taken part.
+        - `holds`: whether upheld edges that turned around count as overlaps.
         """
         contacts, overlapping = self.found(tissue)
         m = tissue.topology
@@ -116,7 +121,7 @@ class Contacts(eqx.Module):
         # An edge that turned around, and has not flipped, was put upright.
         turned = (dot(old, new) < 0) & jnp.all(unflipped.reshape(-1, tissue.n_edges), axis=0)
         # If its barrier is on, the step has jumped over it.
-        over = turned & self.upheld.held
+        over = turned & self.upheld.held & holds
         overlapping = overlapping.at[jnp.stack([start, end])].max(over)
         upheld = self.upheld.updated(turned, dot(new, new))
         return contacts.holding(m, upheld), overlapping

@@ -286,7 +286,9 @@ class Search(eqx.Module):
                 swept, counts = rule.sweep(point, energy, state.counts, length_fraction)
             contacts, overlapping = state.contacts, no
             if contacts is not None:
-                contacts, overlapping = contacts.updated(point, swept, counts == state.counts)
+                contacts, overlapping = contacts.updated(
+                    point, swept, counts == state.counts, last.num_attempts < self.max_shortenings
+                )
                 flips = (counts != state.counts).reshape(-1, n_edges)
                 flips = functools.reduce(jnp.logical_or, list(flips))
                 ends = take(overlapping, swept.topology.edge_vertices)

@@ -37,7 +37,7 @@ class VertexTrustRegion(eqx.Module):
     few: float = 0.1
     min_radius: float = 1e-10
     collapsed: float = 1e-9
-    shortest: float = 1e-6
+    shortest: float = 1e-3
     """A radius that steps cut short have made shorter than this, in units of the largest one, begins anew."""
 
     def error(
@@ -99,7 +99,7 @@ class VertexTrustRegion(eqx.Module):
         largest: Float[Array, ""] | float,
     ) -> Float[Array, " rows"]:
         """The radii after a step of which rows could take only a fraction."""
-        quarter = self.shrink * jnp.minimum(sizes(step), radii)
+        quarter = self.shrink * radii
         quarter = jnp.where(quarter < self.shortest * largest, largest, quarter)
         return self.restarted(jnp.where(fraction < 1, quarter, radii), largest)
 
