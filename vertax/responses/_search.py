@@ -317,12 +317,14 @@ class Search(eqx.Module):
 
         end = jax.lax.while_loop(unfinished, iterate, arrays)
         rejected = guarded & any_of(end.overlapping)
-        nothing = eqx.tree_at(
-            lambda f: (f.tissue, f.contacts, f.counts, f.fraction, f.overlapping),
-            end,
-            eqx.filter((before, state.contacts, state.counts, 0 * end.fraction, no), eqx.is_array),
-        )
-        return eqx.combine(choose(rejected, nothing, end), static)
+
+        def nothing() -> Feasible:
+            stays = (before, state.contacts, state.counts, jnp.zeros_like(end.fraction), no)
+            same = lambda f: (f.tissue, f.contacts, f.counts, f.fraction, f.overlapping)
+            return eqx.tree_at(same, end, eqx.filter(stays, eqx.is_array))
+
+        # (A selection would be a kernel for each array.)
+        return eqx.combine(jax.lax.cond(rejected, nothing, lambda: end), static)
 
 
 def mean_curvature(product: Callable[[Table], Table], tissue: Tissue) -> Float[Array, ""]:
