@@ -9,10 +9,11 @@ from free_helpers import cluster
 from helpers import fine_difference, random_tissue
 
 import vertax as vx
+from vertax.mesh._topology import edge_neighbourhood, take
 from vertax.responses._contact import Contacts, no_contacts
 from vertax.responses._local import barrier
 from vertax.responses._upheld import _FADE, _LONG, _OFTEN, REACH, Upheld
-from vertax.transitions._edge_frames import EdgeFrames, edge_axes
+from vertax.transitions._edge_frames import EdgeFrames, edge_axis
 
 NUMBER = 4
 
@@ -23,6 +24,15 @@ def with_edge(tissue: vx.Tissue, length: float, across: float = 0.0) -> vx.Tissu
     which = jnp.arange(tissue.n_edges) == NUMBER
     way = corner.along + across * corner.across
     return corner.place(tissue, which, way, jnp.full(tissue.n_edges, length))
+
+
+def edge_axes(tissue: vx.Tissue) -> jax.Array:
+    """Which way each edge ought to point."""
+    m = tissue.topology
+    outward = take(tissue.edge_vectors, m.edge)
+    outward = jnp.where(m.forward[:, None], outward, -outward)
+    _, *neighbours = edge_neighbourhood(m)
+    return edge_axis(tissue.edge_vectors, *(take(outward, h) for h in neighbours))
 
 
 def held(tissue: vx.Tissue, times: int = _OFTEN) -> Upheld:

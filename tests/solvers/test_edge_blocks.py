@@ -167,7 +167,7 @@ def test_contacts_count_as_their_hessian_does():
     tissue = foam(100, seed=2)
     energy = vx.energies.ShapeFactorEnergy(4.3)
     search = vx.Relaxation(contact_range=0.05).search(tissue, energy)
-    state = search.advance(search.begin(tissue, energy), energy, 12)
+    state = search.advance(search.begin(tissue, energy), energy, 8)
     contacts, there = state.contacts, state.tissue
     assert contacts is not None
     assert contacts(there) > 0

@@ -71,32 +71,6 @@ def find_overlaps(topology: Topology, sides: Sides, areas: Float[Array, " cells"
     return _overlaps(topology, areas, crossed)
 
 
-def faces_crossed(
-    m: Topology,
-    sides_of: Callable[[Int[Array, " some"]], Sides],
-    here: Int[Array, " some"],
-    there: Bool[Array, " some"],
-) -> Bool[Array, " faces"]:
-    """The faces in which some sides cross any other; no others are looked at.
-
-    **Arguments:**
-
-    - `m`: the topology.
-    - `sides_of`: the sides that half-edges are, see `Tissue.sides_of`.
-    - `here`: half-edges.
-    - `there`: which of them count.
-    """
-    cell = take(m.cell, here)
-    last = jnp.where(there, take(_number_of_sides(m), cell) - 2, 0)
-    crosses = jnp.zeros_like(there)
-    mine = sides_of(here)
-    if mine.shape[-1] > 4:  # an arc may cross even the one that it follows on
-        crosses = there & sides_cross(sides_of(take(m.previous, here)), mine, jnp.array(True))
-    body = lambda pair, crosses: crosses | _crosses(pair)
-    crosses = around(sides_of, m.next, here, last, body, crosses, few_long=m.exterior)
-    return jnp.zeros(m.n_faces, bool).at[cell].max(crosses, mode="drop")
-
-
 def crossed_sides(
     sides: Sides,
     following: Int[Array, " halfedges"],

@@ -196,7 +196,18 @@ class TruncatedCG(eqx.Module):
         shapes = jax.eval_shape(inverse.factors, damping)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         begin = _State(
-            zero, gradient, zero, nothing, nothing, nothing, nothing, damping, factors, phase, none, none
+            zero,
+            gradient,
+            zero,
+            nothing,
+            nothing,
+            nothing,
+            nothing,
+            damping,
+            factors,
+            phase,
+            none,
+            none,
         )
         end = jax.lax.while_loop(lambda s: s.phase != _END, iterate, begin)
         hp = end.residual - gradient - end.damping[:, None] * end.step

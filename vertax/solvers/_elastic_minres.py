@@ -75,7 +75,9 @@ def _solve(
     def attempt(last: _Attempt) -> _Attempt:
         def approximate_inverse(r: PyTree[Array]) -> PyTree[Array]:
             alone = jax.tree.map(lambda x: x / solver.stiffness, r)
-            helped = lambda: solver.collective.added(medium, alone if edges is None else edges(r), r)
+            helped = lambda: solver.collective.added(
+                medium, alone if edges is None else edges(r), r
+            )
             return jax.lax.cond(last.helped, helped, lambda: alone)
 
         preconditioner = lx.FunctionLinearOperator(

@@ -19,7 +19,6 @@ class EdgeFrames(eqx.Module):
     **Arguments:**
 
     - `tissue`: the tissue.
-    - `edges`: numbers of the edges, one for each row; None for all of them.
     """
 
     start: Int[Array, " rows"]
@@ -37,10 +36,10 @@ class EdgeFrames(eqx.Module):
     free: Bool[Array, " rows"]  # neither end is pinned
     can_flip: Bool[Array, " rows"]
 
-    def __init__(self, tissue: Tissue, edges: Int[Array, " rows"] | None = None):
+    def __init__(self, tissue: Tissue):
         m = tissue.topology
-        h = m.half_edge if edges is None else take(m.half_edge, edges)
-        t, a, b, c, d = edge_neighbourhood(m, edges)
+        h = m.half_edge
+        t, a, b, c, d = edge_neighbourhood(m)
         self.start, self.end = source(h), source(t)
         self.cells = take(m.cell, jnp.stack([h, t, a, c], axis=-1))
         self.edges = take(m.edge, jnp.stack([h, a, b, c, d], axis=-1))
@@ -112,28 +111,6 @@ class EdgeFrames(eqx.Module):
         return jnp.where(which[:, None], 0.5 * (direction * length[:, None] - self.vector), 0)
 
 
-def suspects(tissue: Tissue, threshold: Float[Array, ""]) -> Bool[Array, " edges"]:
-    """Edges that are short, or at whose ends edges are out of order: among others all that may flip."""
-    m, sides = tissue.topology, tissue.sides
-    short = jnp.sqrt(dot(sides[:, 2:4], sides[:, 2:4])) * _stretches(sides) < threshold
-    disordered = _disordered(*(sides[k::3] for k in range(3)))
-    ends = (take(disordered, source(h)) for h in (m.half_edge, take(m.twin, m.half_edge)))
-    start, end = ends
-    return take(short, m.half_edge) | (start & end)
-
-
-def edge_axes(tissue: Tissue) -> Float[Array, "edges 2"]:
-    """Which way each edge ought to point, of no special length, as the far ends of its neighbours show.
-
-    A short edge's own vector may have shrunk to nothing or turned around; it has no influence here.
-    """
-    m = tissue.topology
-    _, *neighbours = edge_neighbourhood(m)
-    outward = take(tissue.edge_vectors, m.edge)
-    outward = jnp.where(m.forward[:, None], outward, -outward)
-    return edge_axis(tissue.edge_vectors, *(take(outward, h) for h in neighbours))
-
-
 def edge_axis(
     vector: Float[Array, "rows 2"],
     a: Float[Array, "rows 2"],
@@ -141,7 +118,15 @@ def edge_axis(
     c: Float[Array, "rows 2"],
     d: Float[Array, "rows 2"],
 ) -> Float[Array, "rows 2"]:
-    """The same of edges whose vectors are given, and those of their neighbours as they leave."""
+    """Which way edges ought to point, of no special length, as the far ends of their neighbours show.
+
+    A short edge's own vector may have shrunk to nothing or turned around; it has no influence here.
+
+    **Arguments:**
+
+    - `vector`: of the edges.
+    - `a`, `b`, `c`, `d`: of their neighbours as they leave, see `edge_neighbourhood`.
+    """
     return c + d - a - b + 2 * vector
 
 
