@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -77,10 +78,12 @@ CASES: dict[str, tuple[Case, int]] = {
 """Cases with their numbers of seeds."""
 
 
-@eqx.filter_jit
-def relax(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.Equilibrium:
+def equilibrium(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.Equilibrium:
     """A relaxation of at most 2000 steps."""
     return vx.equilibrate(tissue, energy, throw=False)
+
+
+relax: Any = eqx.filter_jit(equilibrium)
 
 
 def row(name: str, case: Case, n_seeds: int) -> str:

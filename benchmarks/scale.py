@@ -47,7 +47,7 @@ def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str
     def relax(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> tuple:
         search = vx.Relaxation(tolerance=TOLERANCE).search(tissue, energy)
         end = search.advance(search.begin(tissue, energy), energy, 2000)
-        counts = end.num_steps, end.num_t1, end.minimiser.inner.num_products
+        counts = end.num_steps, end.num_t1, end.iteration.num_products
         return end.tissue, counts
 
     def tissue_and_energy(seed: int) -> tuple[vx.Tissue, vx.AbstractEnergy]:
