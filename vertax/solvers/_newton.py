@@ -125,7 +125,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         return self._begin(y, options, f_struct)
 
     def unevaluated(self, fn: Any, y: Any, args: Any, options: Any) -> NewtonState:
-        return self._begin(y, options, jax.eval_shape(fn, y, args)[0])
+        return self._begin(y, options, eqx.filter_eval_shape(fn, y, args)[0])
 
     def _begin(self, y: Any, options: Any, struct: Any) -> NewtonState:
         table = table_of(y)

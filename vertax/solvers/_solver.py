@@ -163,7 +163,7 @@ class Stepwise(AbstractIteration[_StepwiseState]):
     solver: AbstractSolver
 
     def unevaluated(self, fn: Any, y: Any, args: Any, options: Any) -> _StepwiseState:
-        value, aux = jax.eval_shape(fn, y, args)
+        value, aux = eqx.filter_eval_shape(fn, y, args)
         init = lambda y, args: self.solver.init(fn, y, args, options, value, aux, frozenset())
         inner = _zeros(eqx.filter_eval_shape(init, y, args))
         progress = Progress.none(jnp.full(value.shape, jnp.inf, value.dtype))
@@ -172,7 +172,7 @@ class Stepwise(AbstractIteration[_StepwiseState]):
     def evaluate(
         self, fn: Any, y: Any, args: Any, options: Any, state: _StepwiseState
     ) -> tuple[Any, _StepwiseState, None, Any]:
-        value, aux = jax.eval_shape(fn, y, args)
+        value, aux = eqx.filter_eval_shape(fn, y, args)
         arrays, static = eqx.partition(state.inner, eqx.is_array)
 
         def restart() -> tuple[Any, Any]:
