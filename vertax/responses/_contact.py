@@ -179,12 +179,16 @@ def no_contacts(
     - `reach`: the range in units of the size of a cell.
     - `length`: the size of a cell.
     - `tissue`: for which tissue.
-    - `capacity`: most pairs; by default a quarter of the number of vertices, and at least 64.
+    - `capacity`: most pairs; by default the number of vertices up to 2000, then a quarter of it.
     """
     reach = jnp.maximum(jnp.asarray(reach, length.dtype), 1e-9)
     slope, strength = SLOPE * reach, jnp.ones_like(length)
     upheld = Upheld.none(tissue, jnp.minimum(reach, REACH) * length, length)
-    n = max(64, tissue.n_vertices) if capacity is None else capacity
+    n = (
+        max(64, min(tissue.n_vertices, 2000), tissue.n_vertices // 4)
+        if capacity is None
+        else capacity
+    )
     topology = tissue.topology
     no, sides = jnp.zeros(n, bool), jnp.zeros((2, n), topology.twin.dtype)
     contacts = Contacts(
