@@ -51,7 +51,8 @@ FAMILIES = {
     "responses": "AbstractResponse AbstractSimulator Edges Equilibrium Evolution Evolved External "
     "Ledger Material Relaxation Relaxed SimulatorError StepControl SurfaceEvolver Trajectory "
     "equilibrate evolve record_relaxation run_program",
-    "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax TruncatedCG VertexTrustRegion Wrapped",
+    "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
+    "TruncatedCG VertexTrustRegion Wrapped",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",
 }
 
