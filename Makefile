@@ -9,7 +9,7 @@ NEWEST := .venv-newest
 WORKERS ?= 2
 # What `make test-newest` runs: the parts that depend most on the version of JAX, in about ten minutes on two
 # cores. Others by `make test-newest CORE="costs io"`.
-CORE ?= _base mesh energies adjoints solvers fitting responses/test_relaxation.py project/test_compilations.py
+CORE ?= _base mesh energies adjoints solvers fitting relax/test_relaxation.py project/test_compilations.py
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vertax as vx
-from vertax.responses import AbstractSimulator, External, Relaxed, SurfaceEvolver
+from vertax.external import AbstractSimulator, External, Relaxed, SurfaceEvolver
 
 jax.config.update("jax_enable_x64", True)
 

@@ -18,11 +18,11 @@ from _arguments import count
 from _timing import first_and_best
 
 import vertax as vx
-import vertax.responses._search as search_module
-from vertax.solvers._long_waves import LongWaves
+import vertax.relax._loop as search_module
+from vertax.precondition._elastic_medium import ElasticMedium
 
 jax.config.update("jax_enable_x64", True)
-FEWEST = LongWaves.min_cells
+FEWEST = ElasticMedium.min_cells
 FEWEST_FOR_EDGES = search_module._FEWEST_CELLS
 TOLERANCE = 1e-8
 
@@ -39,7 +39,7 @@ def energy_of(kind: str, tissue: vx.Tissue, seed: int = 0) -> vx.AbstractEnergy:
 
 def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str:
     """What relaxations and a gradient take if tissues from this number of cells on are preconditioned."""
-    LongWaves.min_cells = fewest
+    ElasticMedium.min_cells = fewest
     search_module._FEWEST_CELLS = max(fewest, FEWEST_FOR_EDGES)
     jax.clear_caches()
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 import scipy.optimize as so
 
-from vertax.responses import AbstractSimulator, Edges, Relaxed
+from vertax.external import AbstractSimulator, Edges, Relaxed
 
 
 class Foam(AbstractSimulator):

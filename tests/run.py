@@ -30,17 +30,17 @@ CACHE = {
 # seven seconds to begin. What takes longest begins first, and the others fill up the end.
 TOGETHER = (
     ("fitting",),
-    ("adjoints", "responses/test_external.py", "responses/test_evolver.py"),
-    ("responses",),
-    ("responses/test_evolution.py", "responses/test_long_runs.py", "activities"),
-    ("responses/test_free_equilibrium.py", "responses/test_relaxation.py"),
+    ("adjoints", "external"),
+    ("relax",),
+    ("dynamics", "activities"),
+    ("relax/test_free_equilibrium.py", "relax/test_relaxation.py"),
     ("experiments",),
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
     ("_base", "mesh", "energies", "dissipations", "initialise"),
     ("transitions", "growth"),
     ("runs", "inference"),
     ("costs", "mechanics"),
-    ("project", "plotting", "io", "solvers"),
+    ("project", "plotting", "io", "solvers", "precondition"),
 )
 NOTHING_SELECTED = 5
 

@@ -3,7 +3,9 @@ from . import (
     adjoints as adjoints,
     costs as costs,
     dissipations as dissipations,
+    dynamics as dynamics,
     energies as energies,
+    external as external,
     fitting as fitting,
     growth as growth,
     inference as inference,
@@ -12,7 +14,7 @@ from . import (
     mechanics as mechanics,
     mesh as mesh,
     plotting as plotting,
-    responses as responses,
+    relax as relax,
     runs as runs,
     solvers as solvers,
     transitions as transitions,
@@ -27,10 +29,12 @@ from .adjoints import (
 )
 from .costs import AbstractCost as AbstractCost
 from .dissipations import AbstractDissipation as AbstractDissipation
+from .dynamics import Evolution as Evolution, evolve as evolve
 from .energies import (
     AbstractEnergy as AbstractEnergy,
     AbstractLocalEnergy as AbstractLocalEnergy,
 )
+from .external import External as External
 from .fitting import (
     Checkpoint as Checkpoint,
     Evaluation as Evaluation,
@@ -57,14 +61,11 @@ from .plotting import (
     plot_recovery as plot_recovery,
     plot_tissue as plot_tissue,
 )
-from .responses import (
+from .relax import (
     AbstractResponse as AbstractResponse,
     Equilibrium as Equilibrium,
-    Evolution as Evolution,
-    External as External,
     Relaxation as Relaxation,
     equilibrate as equilibrate,
-    evolve as evolve,
 )
 from .solvers import MINRES as MINRES
 from .transitions import T1 as T1, T2 as T2, AbstractTransitions as AbstractTransitions

@@ -17,14 +17,14 @@ FRICTION = vx.dissipations.SubstrateFriction(1.0)
 COST = vx.costs.VertexDistance(TISSUE)
 ENTRIES = {
     "equilibrate": lambda e: vx.equilibrate(TISSUE, e),
-    "record": lambda e: vx.responses.record_relaxation(TISSUE, e),
+    "record": lambda e: vx.relax.record_relaxation(TISSUE, e),
     "evolve": lambda e: vx.evolve(TISSUE, e, FRICTION, [0.0, 1.0]),
-    "material": lambda e: vx.responses.Material(e, FRICTION),
+    "material": lambda e: vx.dynamics.Material(e, FRICTION),
     "problem": lambda e: vx.InverseProblem(TISSUE, e, COST),
     "evaluation": lambda e: vx.InverseProblem(TISSUE, ENERGY, COST)(e),
     "stress": lambda e: vx.mechanics.stress(TISSUE, e),
     "velocities": lambda e: vx.mechanics.velocities(TISSUE, e, FRICTION),
-    "external": lambda e: vx.External(vx.responses.SurfaceEvolver())(TISSUE, e),
+    "external": lambda e: vx.External(vx.external.SurfaceEvolver())(TISSUE, e),
 }
 
 

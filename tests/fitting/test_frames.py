@@ -13,8 +13,8 @@ from helpers import LEAST_SQUARES, STILL, central_difference, random_like, rando
 import vertax as vx
 from vertax.costs import Frames, VertexDistance
 from vertax.dissipations import SubstrateFriction
+from vertax.dynamics import Material
 from vertax.energies import ShapeFactorEnergy
-from vertax.responses import Material
 
 CELLS = 6
 TIMES = (0.0, 0.2, 0.5)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 import vertax as vx
 from vertax.io import load_energy, load_problem, save_energy, save_problem
 from vertax.io._module_file import _public_classes, _save
-from vertax.solvers._patience import AtRest
+from vertax.solvers._stop_at_rest import AtRest
 
 
 class Contractility(vx.AbstractEnergy):

@@ -19,7 +19,7 @@ def tissue():
 def test_files_keep_them_bit_for_bit(tissue, tmp_path):
     vx.save_tissue(tmp_path / "tissue.npz", tissue)
     assert eqx.tree_equal(vx.load_tissue(tmp_path / "tissue.npz"), tissue)
-    trajectory = vx.responses.Trajectory()
+    trajectory = vx.mesh.Trajectory()
     for frame in (random_tissue(6, 3).with_capacity(9), tissue):
         trajectory.append(frame, time=0.0)
     vx.io.save_trajectory(tmp_path / "movie.npz", trajectory)

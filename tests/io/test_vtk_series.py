@@ -11,7 +11,7 @@ from vertax.io import write_vtk_series
 
 @pytest.fixture
 def movie():
-    trajectory = vx.responses.Trajectory()
+    trajectory = vx.mesh.Trajectory()
     tissue = vx.initialise.periodic_voronoi(6, key=0)
     for time in (0.0, 0.25, 1.0):
         trajectory.append(tissue.with_vertices(tissue.vertices + time), time=time)
@@ -35,6 +35,6 @@ def test_bad_input(tmp_path, movie, as_a_user):
     with pytest.raises(ValueError, match=r"must end in \.pvd"):
         write_vtk_series(tmp_path / "movie.vtu", movie)
     with pytest.raises(ValueError, match="at least one frame"):
-        write_vtk_series(tmp_path / "movie.pvd", vx.responses.Trajectory())
+        write_vtk_series(tmp_path / "movie.pvd", vx.mesh.Trajectory())
     with pytest.raises(ValueError, match="a row for each of 3 frames"):
         write_vtk_series(tmp_path / "movie.pvd", movie, cells={"strain": np.zeros(6)})

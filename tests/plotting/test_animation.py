@@ -85,7 +85,7 @@ def test_the_bar_says_what_it_cuts_off(way, tmp_path, monkeypatch):
 
 def test_values_may_be_a_function_and_clusters_have_arcs(tmp_path):
     tissue = cluster(5)
-    way = vx.responses.Trajectory()
+    way = vx.mesh.Trajectory()
     for scale in (1.0, 1.1):
         way.append(tissue.with_vertices(scale * tissue.vertices))
     vx.animate(way, tmp_path / "free.gif", lambda t: t.areas, dpi=60)

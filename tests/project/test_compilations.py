@@ -132,12 +132,12 @@ def test_epochs_after_the_first_compile_nothing():
 
 
 def test_equilibrium_gradient_and_fit_share_the_relaxation(monkeypatch):
-    from vertax.responses import _search
+    from vertax.relax import _loop
 
     traces = []
-    advance = _search.Search.advance
+    advance = _loop.Search.advance
     record = lambda *args: (traces.append(None), advance(*args))[1]
-    monkeypatch.setattr(_search.Search, "advance", record)
+    monkeypatch.setattr(_loop.Search, "advance", record)
     jax.clear_caches()
     eqx.clear_caches()
     tissue, energy = random_tissue(N, 2), ShapeFactorEnergy(jnp.full(N, 3.65))

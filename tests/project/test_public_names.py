@@ -6,12 +6,12 @@ import vertax as vx
 NAMES = """
 AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy
 AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiation Checkpoint
-Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free GradientOutcome
-History ImplicitDifferentiation InverseProblem MINRES Periodic Record Relaxation T1 T2 Tissue
-Topology Uncertainty activities adjoints animate costs dissipations enable_compilation_cache
-energies equilibrate evolve fit fitting growth inference initialise io load_tissue mechanics mesh
-plot_history plot_recovery plot_tissue plotting responses runs save_tissue solvers transitions
-uncertainty
+Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free
+GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic Record Relaxation
+T1 T2 Tissue Topology Uncertainty activities adjoints animate costs dissipations dynamics
+enable_compilation_cache energies equilibrate evolve external fit fitting growth inference
+initialise io load_tissue mechanics mesh plot_history plot_recovery plot_tissue plotting relax
+runs save_tissue solvers transitions uncertainty
 """
 
 FAMILIES = {
@@ -43,14 +43,15 @@ FAMILIES = {
     "complex_modulus deformed density_of_states elastic_tensor modes pressures "
     "principal pure_shear ramp recoil self_stresses shear_modulus simple_shear "
     "spectrum stress tensions velocities youngs_modulus zero_modes",
-    "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology cell_polygons pad",
+    "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology Trajectory cell_polygons pad",
     "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
     "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tissue "
     "plot_tissues same_limits scale_bar series_colours tension_layer",
-    "responses": "AbstractResponse AbstractSimulator Edges Equilibrium Evolution Evolved External "
-    "Ledger Material Relaxation Relaxed SimulatorError StepControl SurfaceEvolver Trajectory "
-    "equilibrate evolve record_relaxation run_program",
+    "dynamics": "Evolution Evolved Material StepControl evolve",
+    "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
+    "run_program",
+    "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
     "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "TruncatedCG VertexTrustRegion Wrapped",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",

@@ -24,9 +24,9 @@ from vertax.adjoints._adjoint import (
     materialise,
     settle,
 )
+from vertax.precondition._elastic_minres import ElasticMINRES
+from vertax.precondition._recycled_hessian import RecycledHessian
 from vertax.solvers import MINRES
-from vertax.solvers._elastic_minres import ElasticMINRES
-from vertax.solvers._known_hessian import KnownHessian
 
 _REASONS = (
     "The gradient through the equilibrium cannot be trusted: the linear solve with the Hessian failed. "
@@ -95,7 +95,7 @@ class ImplicitDifferentiation(AbstractAdjoint):
         adjoint = cast(ImplicitDifferentiation, self.without_outcome())
         known = minimisation.options
         collective = known.get("collective")
-        if isinstance(collective, KnownHessian) and self.mode == "sensitivity":
+        if isinstance(collective, RecycledHessian) and self.mode == "sensitivity":
             collective = None  # for a batch of systems a dense matrix is no bargain
         if collective is not None and isinstance(self.linear_solver, MINRES):
             parts = (known[name] for name in ("edge_blocks", "collective", "stiffness"))

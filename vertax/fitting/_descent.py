@@ -29,7 +29,7 @@ from vertax.fitting._epoch import (
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import Evaluation, InverseProblem
 from vertax.mesh import Tissue
-from vertax.solvers._known_hessian import KnownHessian
+from vertax.precondition._recycled_hessian import RecycledHessian
 
 # When the Hessian is worked out: that takes as long as a few epochs, and to compile it as long as hundreds.
 _FIRST_LOOK = 100
@@ -45,7 +45,7 @@ class State(eqx.Module):
     best: Best
     going: Bool[Array, "*batch"]
     """False once an epoch was not sound."""
-    hessian: KnownHessian | None
+    hessian: RecycledHessian | None
     """That of an equilibrium some epochs ago;"""
     looked: Int[Array, "*batch"]
     """how many epochs had passed then,"""
@@ -71,7 +71,7 @@ class Descent(AbstractMethod):
             return _evaluate_batch(problem, self.constants, state)
         # Made anew only if something has changed: it takes as long as an epoch of a small tissue.
         if not self.recent or self.recent[0] is not problem or self.recent[1] is not state.hessian:
-            response = problem.response.knowing(state.hessian)
+            response = problem.response.with_preconditioner(state.hessian)
             known = eqx.tree_at(lambda p: p.response, problem, response)
             self.recent[:] = [problem, state.hessian, known.bare(state.tissue)]
         shift = no_shift(problem)
@@ -147,7 +147,7 @@ def _start(
     def start(problem: InverseProblem, parameters: PyTree[Array]) -> State:
         fitted = cast(optax.Params, (parameters, no_shift(problem)))
         best = unbeaten(problem, parameters)
-        unknown = problem.response.hessian_at(problem.tissue, None)
+        unknown = problem.response.preconditioner_at(problem.tissue, None)
         state, yes = traced(optimiser.init(fitted), problem.tissue.vertices.dtype), jnp.array(True)
         none = jnp.zeros((), jnp.result_type(int))
         return State(parameters, state, problem.tissue, best, yes, unknown, none, stale=yes)
@@ -157,7 +157,7 @@ def _start(
 
 def _evaluation(problem: InverseProblem, constants: PyTree, state: State) -> Evaluation:
     """Cost and gradient of an epoch, by the compiled functions that `value_and_gradient` shares."""
-    response = problem.response.knowing(state.hessian)
+    response = problem.response.with_preconditioner(state.hessian)
     problem = eqx.tree_at(lambda p: p.response, problem, response)
     energy = eqx.combine(state.parameters, constants)
     return problem.value_and_gradient(energy, state.tissue, no_shift(problem), throw=False)
@@ -183,7 +183,7 @@ def _update(
         state: State,
         evaluation: Evaluation,
         following: Tissue,
-        hessian: KnownHessian | None,
+        hessian: RecycledHessian | None,
         true: PyTree[Array] | None,
         guidance: Float[Array, ""],
     ) -> tuple[State, Record]:
@@ -229,13 +229,13 @@ def _update(
 @announced_jit
 def _hessian_at(
     problem: InverseProblem, constants: PyTree, state: State, batched: bool
-) -> KnownHessian | None:
+) -> RecycledHessian | None:
     """The Hessian where an epoch begins, for each of the batch."""
 
-    def one(problem: InverseProblem, constants: PyTree, state: State) -> KnownHessian | None:
+    def one(problem: InverseProblem, constants: PyTree, state: State) -> RecycledHessian | None:
         energy = eqx.combine(state.parameters, constants)
         pulled = problem.pulled(state.tissue, energy, no_shift(problem))
-        return problem.response.hessian_at(state.tissue, pulled)
+        return problem.response.preconditioner_at(state.tissue, pulled)
 
     return (eqx.filter_vmap(one) if batched else one)(problem, constants, state)
 

@@ -25,11 +25,12 @@ from vertax.adjoints import (
 from vertax.adjoints._adjoint import frozen, settle
 from vertax.adjoints._propagation import AbstractNudging, cost_by_nudging
 from vertax.costs import AbstractCost
+from vertax.dynamics import Evolved
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy, instance_hint
 from vertax.energies._units import mean_stiffness, units_of
 from vertax.mesh import Tissue
-from vertax.responses import AbstractResponse, Equilibrium, Evolved, Relaxation
+from vertax.relax import AbstractResponse, Equilibrium, Relaxation
 
 Energy = TypeVar("Energy", bound=AbstractEnergy)
 
@@ -66,7 +67,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     - `response`: how the tissue answers to its energy, a [`Relaxation`][vertax.Relaxation], or an
         [`Evolution`][vertax.Evolution] if it is on its way. Then the cost sees the last frame, or all if it
         is of [`Frames`][vertax.costs.Frames]; and the energy may be a
-        [`Material`][vertax.responses.Material], of which what resists and what drives are fitted as well.
+        [`Material`][vertax.dynamics.Material], of which what resists and what drives are fitted as well.
     - `adjoint`: how to differentiate, one of `vertax.adjoints`.
     - `guidance`: strength $\kappa$, energy per cost. If given, the tissue minimises $E + \kappa C$:
         the cost pulls it, through T1 transitions too, towards what it asks for, while the parameters

@@ -17,12 +17,12 @@ from vertax._base.checks import as_key, check_whole, increasing, named
 from vertax._base.modules import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
+from vertax.dynamics._incremental_potential import Incremental
 from vertax.energies import AbstractEnergy
 from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, died_at, divided_at, founded
-from vertax.mesh import Tissue
-from vertax.responses import Relaxation, Trajectory
-from vertax.responses._step import Incremental
+from vertax.mesh import Tissue, Trajectory
+from vertax.relax import Relaxation
 from vertax.transitions import T1, T2
 from vertax.transitions._division import divided
 

@@ -25,7 +25,7 @@ from vertax.initialise import (
 )
 from vertax.initialise._mask_arguments import check_zero
 from vertax.mesh import Tissue
-from vertax.responses import Equilibrium, Relaxation
+from vertax.relax import Equilibrium, Relaxation
 
 _POINTS_PER_EDGE = 48
 

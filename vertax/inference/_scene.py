@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Key
 from vertax.energies import ShapeFactorEnergy
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
-from vertax.responses import Relaxation
+from vertax.relax import Relaxation
 
 
 class Scene(eqx.Module):

@@ -22,9 +22,11 @@ from vertax import (
     adjoints,
     costs,
     dissipations,
+    dynamics,
     energies,
+    external,
     mechanics,
-    responses,
+    relax,
     solvers,
 )
 from vertax._base.archive import as_jax, read_archive, write_archive
@@ -204,7 +206,18 @@ def _public_classes() -> dict[str, type[eqx.Module]]:
     """The classes of vertax by the name that a file knows them by."""
     single = (Arcs, Free, InTurn, InverseProblem, Periodic, T1, T2, Tissue, Topology)
     classes: dict[str, type[eqx.Module]] = {cls.__name__: cls for cls in single}
-    families = (activities, adjoints, costs, dissipations, energies, mechanics, responses, solvers)
+    families = (
+        activities,
+        adjoints,
+        costs,
+        dissipations,
+        dynamics,
+        energies,
+        external,
+        mechanics,
+        relax,
+        solvers,
+    )
     for family in families:
         for name, cls in vars(family).items():
             if (

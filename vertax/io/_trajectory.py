@@ -9,8 +9,7 @@ import numpy as np
 
 from vertax._base.archive import read_archive, write_archive
 from vertax.io._tissue_file import tissue_arrays, tissue_from
-from vertax.mesh import Topology
-from vertax.responses import Trajectory
+from vertax.mesh import Topology, Trajectory
 
 _VERSION = 1
 _TOPOLOGY = ("twin", "cell", "frame", "edge", "half_edge")

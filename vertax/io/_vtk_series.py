@@ -12,7 +12,7 @@ import numpy as np
 from vertax._base.atomic import atomic_write
 from vertax.io._data_tables import Column
 from vertax.io._vtk import write_vtk
-from vertax.responses import Trajectory
+from vertax.mesh import Trajectory
 
 
 def write_vtk_series(

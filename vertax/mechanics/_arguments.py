@@ -14,7 +14,7 @@ from vertax._base.modules import is_concrete
 from vertax.dissipations import AbstractDissipation
 from vertax.energies._energy import check_energy
 from vertax.mesh import Periodic, Tissue
-from vertax.responses import Relaxation
+from vertax.relax import Relaxation
 
 
 def check_system(tissue: Any, energy: Any, *, box: str | None = None) -> None:

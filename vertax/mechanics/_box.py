@@ -21,7 +21,7 @@ from vertax.mechanics._elasticity import elastic_tensor
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue
-from vertax.responses import AbstractResponse, Equilibrium, Relaxation
+from vertax.relax import AbstractResponse, Equilibrium, Relaxation
 
 # Orthogonal directions of strain, in components xx, yy and γ = 2 xy.
 _FREEDOMS = {

@@ -17,7 +17,7 @@ from vertax.mechanics._arguments import as_matrix, check_relaxation, check_syste
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue
-from vertax.responses import Relaxation
+from vertax.relax import Relaxation
 
 Deformation = Callable[[Float[Array, ""]], Float[Array, "2 2"]]
 

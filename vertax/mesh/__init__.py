@@ -10,3 +10,4 @@ from vertax.mesh._overlaps import Overlaps as Overlaps
 from vertax.mesh._padding import pad as pad
 from vertax.mesh._tissue import Tissue as Tissue
 from vertax.mesh._topology import Topology as Topology
+from vertax.mesh._trajectory import Trajectory as Trajectory

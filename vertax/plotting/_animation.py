@@ -50,13 +50,13 @@ def animate(
     have just flipped (T1 transitions) are marked.
 
     ```python
-    _, way = vx.responses.record_relaxation(tissue, energy)
+    _, way = vx.relax.record_relaxation(tissue, energy)
     vx.animate(way, "relaxation.gif", lambda t: t.shape_factors, label="shape factor")
     ```
 
     **Arguments:**
 
-    - `trajectory`: the tissues, of one size: a [`Trajectory`][vertax.responses.Trajectory] of a relaxation
+    - `trajectory`: the tissues, of one size: a [`Trajectory`][vertax.mesh.Trajectory] of a relaxation
         or of a fit, or a list.
     - `path`: the file, which is complete or not there at all: a GIF if it ends in `.gif`; a film if it ends
         in `.mp4`, for which Matplotlib has to find the program ffmpeg.

@@ -30,7 +30,7 @@ from vertax.inference import (
 from vertax.initialise import Cellpose, Watershed, periodic_voronoi
 from vertax.io import read_image
 from vertax.mesh import Tissue
-from vertax.responses import Relaxation as Response
+from vertax.relax import Relaxation as Response
 from vertax.runs._config import Section
 from vertax.runs._errors import ConfigError
 from vertax.transitions import T1
@@ -57,7 +57,7 @@ class Relaxation(Section):
     """Whether cells keep out of one another; if not, they may overlap."""
     contact_range: float = Field(default=float(Response().contact_range or 0), ge=0)
     """How near a corner comes to a side before it is held off, in units of the root of the mean cell area."""
-    patience: int = Field(default=int(Response().patience), ge=1)
+    consecutive_steps: int = Field(default=int(Response().consecutive_steps), ge=1)
     """Number of consecutive steps for which the force must stay below the tolerance."""
     max_steps: int = Field(default=int(Response().max_steps), ge=1)
     """Most steps of the minimiser."""
@@ -72,7 +72,7 @@ class Relaxation(Section):
             transitions=T1(self.t1_threshold, self.max_flips) if self.transitions else None,
             tolerance=self.tolerance,
             contact_range=self.contact_range if self.contacts else None,
-            patience=self.patience,
+            consecutive_steps=self.consecutive_steps,
             max_steps=self.max_steps,
         )
 

@@ -74,7 +74,7 @@ def fit(
     problem: vx.InverseProblem[vx.AbstractEnergy], folder: Path, epochs: int
 ) -> vx.Fit[vx.AbstractEnergy]:
     """Solve the problem, and leave everything in a folder."""
-    trajectory = vx.responses.Trajectory()
+    trajectory = vx.mesh.Trajectory()
     optimiser = optax.adam(1e-2)
     outcome = vx.fit(problem, optimiser, epochs, progress=False, callback=trajectory)
     vx.save_tissue(folder / "tissue.npz", outcome.tissue)

@@ -21,7 +21,7 @@ from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import InverseProblem, stack
 from vertax.inference import Scene
-from vertax.responses import Relaxation as Response
+from vertax.relax import Relaxation as Response
 from vertax.runs import Relaxation, RunFolder
 
 from . import figures
@@ -84,7 +84,9 @@ def _gradient_error(response: Response) -> Callable[..., jax.Array]:
 def accuracy(config: Config, folder: RunFolder) -> dict[str, Any]:
     """Error of each gradient against the force at which the relaxation stopped."""
     # A first-order solver ends just below the tolerance; Newton's method would overshoot it.
-    relaxation = config.equilibrium.unrolled.model_copy(update={"max_steps": 50_000, "patience": 1})
+    relaxation = config.equilibrium.unrolled.model_copy(
+        update={"max_steps": 50_000, "consecutive_steps": 1}
+    )
     error = _gradient_error(relaxation.build())
     # "As it is usually done": no more steps than the tissue itself needs, and nudged tissues are
     # relaxed no better than the tissue.

@@ -13,7 +13,7 @@ from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import Fit, InverseProblem
 from vertax.inference import Scene, pearson, relative_error, same_neighbours, shape_factor_scene
-from vertax.responses import Relaxation as Response
+from vertax.relax import Relaxation as Response
 from vertax.runs import (
     ExperimentConfig,
     Fitting,

@@ -22,10 +22,10 @@ from pydantic import Field
 
 from vertax.activities import SelfPropulsion
 from vertax.dissipations import SubstrateFriction
+from vertax.dynamics import Evolution
 from vertax.energies import ShapeFactorEnergy
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
-from vertax.responses import Evolution
 from vertax.runs import (
     ExperimentConfig,
     Relaxation,

@@ -28,12 +28,13 @@ from pydantic import Field, field_validator
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.costs import AbstractLeastSquaresCost, VertexDistance
 from vertax.energies import AbstractEnergy, AreaElasticity, LineTension
+from vertax.external import External, SurfaceEvolver
 from vertax.fitting import InverseProblem
 from vertax.inference import pearson
 from vertax.initialise import periodic_voronoi
 from vertax.io import read_surface_evolver
 from vertax.mesh import Tissue
-from vertax.responses import External, Relaxation, SurfaceEvolver
+from vertax.relax import Relaxation
 from vertax.runs import (
     ConfigError,
     ExperimentConfig,

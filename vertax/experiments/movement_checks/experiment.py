@@ -25,11 +25,12 @@ from pydantic import Field
 from vertax.activities import ThermalNoise
 from vertax.adjoints import EquilibriumPropagation, ImplicitDifferentiation
 from vertax.dissipations import SubstrateFriction
+from vertax.dynamics import StepControl, evolve
 from vertax.energies import ShapeFactorEnergy
 from vertax.initialise import periodic_voronoi
 from vertax.mechanics import modes
 from vertax.mesh import Tissue
-from vertax.responses import Relaxation, StepControl, evolve
+from vertax.relax import Relaxation
 from vertax.runs import ExperimentConfig, RunFolder, TissueSection
 
 from . import figures

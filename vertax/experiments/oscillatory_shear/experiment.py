@@ -21,11 +21,11 @@ from jaxtyping import Array, Complex, Float
 from pydantic import Field, field_validator
 
 from vertax.dissipations import SubstrateFriction
+from vertax.dynamics import Evolution
 from vertax.energies import AbstractEnergy, AreaElasticity, PerimeterElasticity
 from vertax.initialise import hexagonal, periodic_voronoi
 from vertax.mechanics import complex_modulus, stress
 from vertax.mesh import Periodic, Tissue
-from vertax.responses import Evolution
 from vertax.runs import ExperimentConfig, Relaxation, RunFolder, side_by_side
 
 from . import figures

@@ -24,7 +24,7 @@ from pydantic import Field
 from vertax.energies import ShapeFactorEnergy
 from vertax.inference import Transition, fit_onset, fit_transition
 from vertax.mesh import Tissue
-from vertax.responses import Relaxation as Response
+from vertax.relax import Relaxation as Response
 from vertax.runs import (
     ExperimentConfig,
     Relaxation,

@@ -21,11 +21,11 @@ from pydantic import Field
 
 from vertax.costs import AspectRatio, Frames, aspect_ratio
 from vertax.dissipations import SubstrateFriction
+from vertax.dynamics import Evolution, Evolved, Material
 from vertax.energies import AbstractEnergy, AreaElasticity, LineTension
 from vertax.fitting import InverseProblem
 from vertax.initialise import free_voronoi
 from vertax.mesh import Tissue
-from vertax.responses import Evolution, Evolved, Material
 from vertax.runs import (
     ExperimentConfig,
     Fitting,

@@ -26,7 +26,7 @@ from pydantic import Field
 from vertax.energies import ShapeFactorEnergy
 from vertax.mechanics import bulk_modulus, shear_modulus, stress
 from vertax.mesh import Tissue
-from vertax.responses import Relaxation as Response
+from vertax.relax import Relaxation as Response
 from vertax.runs import ExperimentConfig, Relaxation, RunFolder, TissueSection, scan
 
 from . import figures

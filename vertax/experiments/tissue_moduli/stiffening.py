@@ -30,7 +30,7 @@ from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import member
 from vertax.mechanics import ramp, shear_modulus
 from vertax.mesh import Tissue
-from vertax.responses import Relaxation as Response
+from vertax.relax import Relaxation as Response
 from vertax.runs import RunFolder, Section, TissueSection, scan, spread_of
 
 from . import figures

@@ -21,7 +21,7 @@ from vertax.costs import CellStress
 from vertax.energies import AreaElasticity, BoundedTension, LocalSum, PerimeterElasticity
 from vertax.initialise import periodic_voronoi
 from vertax.mechanics import cell_stress
-from vertax.responses import Relaxation as Response
+from vertax.relax import Relaxation as Response
 from vertax.runs import (
     ConfigError,
     ExperimentConfig,

@@ -1,0 +1,123 @@
+"""Steps whose length follows their error."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import LOOSE, STILL, central_difference, random_like, random_tissue, relaxed
+
+import vertax as vx
+from vertax.dissipations import SubstrateFriction
+from vertax.dynamics import StepControl
+from vertax.energies import ShapeFactorEnergy
+
+FRICTION = SubstrateFriction(1.0)
+
+
+@functools.cache
+def bent():
+    """A tissue a little away from rest, and its energy."""
+    tissue, energy = relaxed(9, 1, 3.5)
+    tissue = STILL(tissue, energy).tissue
+    return tissue.with_vertices(tissue.vertices + 0.02 * random_like(tissue.vertices, 7)), energy
+
+
+def moved(order=1, **settings):
+    tissue, energy = bent()
+    return vx.evolve(
+        tissue, energy, FRICTION, [0.0, 0.05, 1.0], order=order, relaxation=STILL, **settings
+    )
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_error_follows_the_tolerance(order):
+    exact = moved(2, substeps=300).tissue.vertices
+    tolerances = np.array([1e-3, 1e-4, 1e-5])
+    runs = [moved(order, control=StepControl(tolerance, most=200)) for tolerance in tolerances]
+    errors = np.array([jnp.max(jnp.abs(run.tissue.vertices - exact)) for run in runs])
+    counts = np.array([(run.steps > 0).sum() for run in runs])
+    # Errors of one step are asked for, so that at the end goes by the power p / (p + 1).
+    slope = np.polyfit(np.log(tolerances), np.log(errors), 1)[0]
+    # (Stiff modes, which are damped and not followed, leave the second order a little less.)
+    np.testing.assert_allclose(slope, order / (order + 1), atol=0.2 if order == 1 else 0.3)
+    assert (errors < 10 * tolerances ** (order / (order + 1))).all()
+    assert (np.diff(counts) > 0).all()
+    for run in runs:
+        np.testing.assert_allclose(run.steps.sum(axis=1)[1:], jnp.diff(run.times), rtol=1e-9)
+        assert (jnp.diff(run.energies) < 0).all() or order == 2
+        # Later, when all is slow, steps are longer.
+        steps = np.asarray(run.steps[-1])
+        steps = steps[steps > 0]
+        assert steps.max() > 3 * run.steps[1, 0]
+
+
+@pytest.mark.thorough
+def test_its_gradient_is_that_of_the_steps_that_were_taken():
+    tissue, energy = bent()
+    weights = random_like(tissue.vertices, 8)
+    # What is left of the force is an error of the finite difference.
+    still = vx.Relaxation(transitions=None, contact_range=None, tolerance=1e-12)
+
+    @eqx.filter_jit
+    def cost(friction, control):
+        movie = vx.evolve(
+            tissue,
+            energy,
+            SubstrateFriction(friction),
+            [0.0, 0.4],
+            relaxation=still,
+            control=control,
+            throw=False,
+        )
+        return jnp.sum(weights * movie.tissue.vertices**2), movie.steps[1]
+
+    # So few steps, so coarse, that a small change of friction changes none of their lengths.
+    control = StepControl(1.0, first=0.05, most=8)
+    friction = jnp.linspace(0.8, 1.2, tissue.n_vertices)
+    gradient, steps = jax.grad(cost, has_aux=True)(friction, control)
+    assert 1 < (steps > 0).sum() < 8
+    direction = random_like(friction)
+    np.testing.assert_allclose(
+        jnp.sum(gradient * direction),
+        central_difference(lambda f: cost(f, control)[0], friction, direction),
+        rtol=1e-6,
+    )
+
+
+@pytest.mark.thorough
+def test_through_transitions_refused_steps_leave_nothing_behind():
+    tissue, energy = random_tissue(9, 0), ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
+    times = [0.0, 0.1, 0.3]
+    control = StepControl(2e-3, first=0.1, most=60)
+    run = vx.evolve(tissue, energy, FRICTION, times, relaxation=LOOSE, control=control)
+    assert run.refused.sum() > 0  # the first step is far too long
+    assert run.num_t1 == run.transitions.sum() > 0
+    assert (jnp.diff(run.energies) < 0).all()
+    fixed = vx.evolve(tissue, energy, FRICTION, times, relaxation=LOOSE, substeps=100)
+    np.testing.assert_array_equal(run.transitions, fixed.transitions)
+    np.testing.assert_allclose(run.energy, fixed.energy, rtol=0.02)
+
+
+class TestBadInput:
+    def test_numbers(self):
+        for settings in ({"tolerance": 0.0}, {"first": -1.0}, {"most": 0}):
+            with pytest.raises(ValueError, match=next(iter(settings))):
+                StepControl(**settings)  # pyright: ignore[reportArgumentType]
+
+    def test_what_does_not_go_with_it(self, as_a_user):
+        control = StepControl()
+        with pytest.raises(ValueError, match="does not go with `substeps`"):
+            vx.Evolution(FRICTION, [0.0, 1.0], control=control, substeps=2)
+        noise = vx.activities.ThermalNoise(0.1)
+        with pytest.raises(ValueError, match="does not go with `activity`: random numbers"):
+            vx.Evolution(FRICTION, [0.0, 1.0], control=control, activity=noise, key=0)
+        with pytest.raises(TypeError, match="`control` must be a"):
+            vx.Evolution(FRICTION, [0.0, 1.0], control=0.1)  # pyright: ignore[reportArgumentType]
+
+    def test_too_few_steps(self):
+        with pytest.raises(RuntimeError, match="a greater `most`"):
+            moved(control=StepControl(1e-6, most=3))

@@ -1,0 +1,359 @@
+"""Responses that another program computes: one of NumPy and SciPy, against vertax itself."""
+
+import dataclasses
+import re
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from external_helpers import Foam
+from helpers import central_difference
+
+import vertax as vx
+from vertax.external import Edges, SimulatorError
+from vertax.external._host import Job, Request, ask
+
+ADAM = optax.adam(3e-3)
+FOAM = Foam()
+
+
+def foam_energy(tensions):
+    return vx.energies.AreaElasticity(10.0, 1.0) + vx.energies.LineTension(jnp.asarray(tensions))
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A tissue at rest, its energy, and a cost of other positions."""
+    tissue = vx.initialise.periodic_voronoi(6, key=jax.random.key(3), softening=0.0)
+    tensions = 0.3 + 0.04 * np.sin(1.7 * np.arange(tissue.n_edges))
+    tissue = vx.External(FOAM)(tissue, foam_energy(tensions)).tissue
+    away = 0.03 * np.cos(np.arange(tissue.vertices.size)).reshape(-1, 2)
+    cost = vx.costs.VertexDistance(tissue.with_vertices(tissue.vertices + away))
+    return tissue, foam_energy(1.02 * tensions), cost
+
+
+def problem(case, **settings):
+    tissue, energy, cost = case
+    adjoint = settings.pop("adjoint", vx.EquilibriumPropagation())
+    return vx.InverseProblem(
+        tissue, energy, cost, response=vx.External(FOAM, **settings), adjoint=adjoint
+    )
+
+
+@pytest.fixture(scope="module")
+def implicit(case):
+    """The gradient by the implicit function theorem, with a dense pseudo-inverse."""
+    tissue, energy, cost = case
+    there = vx.External(FOAM)(tissue, energy).tissue
+    return _implicit(there, energy.terms[1].tension, cost)
+
+
+@eqx.filter_jit
+def _derivatives(tissue, tensions, cost):
+    there = lambda x: tissue.with_vertices(x.reshape(-1, 2))
+    value = lambda x, tensions: foam_energy(tensions)(there(x))
+    x = tissue.vertices.ravel()
+    pull = jax.grad(lambda x: cost(there(x), foam_energy(tensions)))(x)
+    return pull, jax.hessian(value)(x, tensions), jax.jacobian(jax.grad(value), 1)(x, tensions)
+
+
+def _implicit(*args):
+    pull, hessian, mixed = map(np.asarray, _derivatives(*args))
+    return -mixed.T @ np.linalg.pinv(hessian, rcond=1e-10) @ pull
+
+
+@eqx.filter_jit
+def evaluated(problem):
+    return problem.value_and_gradient(throw=False)
+
+
+def gradient_of(problem):
+    evaluation = evaluated(problem)
+    return np.asarray(evaluation.gradient.terms[1].tension), evaluation
+
+
+def error(found, expected):
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+def test_edges_know_lengths_and_areas(case):
+    for tissue in (case[0], vx.initialise.free_voronoi(5, key=jax.random.key(0))):
+        straight = vx.Tissue(tissue.vertices, tissue.topology, tissue.boundary, 0.0)
+        edges = Edges.of(straight)
+        vertices = np.asarray(straight.vertices)
+        lengths = np.hypot(*edges.vectors(vertices).T)
+        np.testing.assert_allclose(lengths, straight.edge_lengths, rtol=1e-12)
+        np.testing.assert_allclose(edges.areas(vertices), straight.areas, rtol=1e-12)
+
+
+def test_gradient_is_that_of_implicit_differentiation(case, implicit):
+    gradient, evaluation = gradient_of(problem(case))
+    assert error(gradient, implicit) < 1e-6
+    cosine = gradient @ implicit / np.linalg.norm(gradient) / np.linalg.norm(implicit)
+    assert cosine > 1 - 1e-10
+    assert evaluation.equilibrium.converged
+    assert evaluation.outcome.trusted
+
+
+def test_one_sided_error_is_of_first_order(case, implicit):
+    def gradient(beta):
+        adjoint = vx.EquilibriumPropagation(jnp.array(beta), centred=False)
+        return gradient_of(problem(case, adjoint=adjoint))[0]
+
+    errors = [error(gradient(beta), implicit) for beta in (1e-4, 1e-3)]
+    assert errors[1] / errors[0] == pytest.approx(10, rel=0.3)
+
+
+def test_gradient_by_derivatives_of_the_program(case, implicit):
+    gradient, evaluation = gradient_of(problem(case, slope="program", stiffness=10.0))
+    assert error(gradient, implicit) < 1e-6
+    assert evaluation.equilibrium.energy == pytest.approx(
+        float(case[1](evaluation.equilibrium.tissue)), rel=1e-12
+    )
+
+
+def test_gradient_is_that_of_differences(case):
+    inverse = problem(case)
+    tensions = case[1].terms[1].tension
+    gradient, _ = gradient_of(inverse)
+    direction = np.cos(np.arange(tensions.size))
+    cost = lambda tensions: inverse(foam_energy(tensions))[0]
+    slope = central_difference(cost, tensions, direction, step=1e-4)
+    assert gradient @ direction == pytest.approx(float(slope), rel=1e-5)
+
+
+def numpy_request(case, forces=None):
+    tissue, energy, _ = jax.tree.map(np.asarray, case)
+    return Request(tissue, energy, forces, None)
+
+
+def test_differences_of_the_energy_are_its_derivatives(case):
+    request = numpy_request(case)
+    jobs = [Job(FOAM, request, slope, 1e-4) for slope in ("program", "differences")]
+    (known, found), reason = ask(jobs, 2, False, True)
+    assert reason is None
+    assert known is not None
+    assert found is not None
+    lengths = known.slope.terms[1].tension
+    np.testing.assert_allclose(found.slope.terms[1].tension, lengths, rtol=1e-8)
+    there = case[0].with_vertices(jnp.asarray(known.vertices))
+    np.testing.assert_allclose(lengths, there.edge_lengths, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("mood", "says"),
+    [
+        ("raises", "OSError: the reactor is too hot"),
+        ("shape", r"`vertices` as an array of shape \(11, 2\)"),
+        ("nan", "`vertices` with NaN"),
+        ("text", "must hold real numbers"),
+    ],
+)
+def test_what_goes_wrong_is_an_error_with_its_reason(case, mood, says):
+    answers, reason = ask(
+        [Job(Foam(mood=mood), numpy_request(case), "energy", 1e-4)], 1, False, True
+    )
+    assert answers == [None]
+    assert isinstance(reason, SimulatorError)
+    assert re.search(says, str(reason))
+
+
+def test_an_energy_that_is_not_finite_has_no_differences(case):
+    job = Job(Foam(mood="endless"), numpy_request(case), "differences", 1e-4)
+    answers, reason = ask([job], 1, False, True)
+    assert answers == [None]
+    assert "The energy by the program is nan" in str(reason)
+
+
+def test_what_is_not_finite_is_not_asked(case):
+    request = numpy_request(case, forces=np.full_like(case[0].vertices, np.nan))
+    answers, reason = ask([Job(FOAM, request, "energy", 1e-4)], 1, False, True)
+    assert answers == [None]
+    assert reason is None
+
+
+@pytest.fixture
+def moody(monkeypatch):
+    """Puts the program into a mood, for the length of a test: nothing is compiled for it."""
+    return lambda mood: monkeypatch.setattr(FOAM, "mood", mood)
+
+
+def test_a_program_that_fails_says_so_everywhere(case, moody):
+    tissue, energy, _ = case
+    response = vx.External(FOAM)
+    moody("raises")
+    failed = response.ledger.failed
+    with pytest.raises(SimulatorError, match="Foam failed: OSError: the reactor is too hot"):
+        response(tissue, energy)
+    assert response.ledger.failed == failed + 1
+    silent = response(tissue, energy, throw=False)
+    assert not silent.converged
+    assert np.isnan(silent.tissue.vertices).all()
+    assert "too hot" in str(response.complaint())
+    with pytest.raises(Exception, match="the reactor is too hot"):
+        eqx.filter_jit(lambda e: response(tissue, e).energy)(energy).block_until_ready()
+
+
+def test_what_is_not_at_rest_is_no_equilibrium(case, moody):
+    tissue, energy, _ = case
+    moody("no rest")
+    with pytest.raises(RuntimeError, match="not at rest by the energy"):
+        vx.External(FOAM)(tissue, energy)
+
+
+def test_a_failure_under_the_nudge_is_no_gradient(case, moody):
+    moody("when pulled")
+    lenient = problem(case, adjoint=vx.EquilibriumPropagation(throw=False))
+    evaluation = evaluated(lenient)
+    assert evaluation.equilibrium.converged
+    assert not evaluation.outcome.trusted
+
+
+@pytest.mark.thorough
+def test_fits_find_tensions_and_go_on_from_a_checkpoint(case, tmp_path, moody):
+    tissue, energy, _ = case
+    target = vx.External(FOAM)(tissue, foam_energy(energy.terms[1].tension[::-1])).tissue
+    inverse = problem((tissue, energy, vx.costs.VertexDistance(target)))
+    whole = vx.fit(inverse, ADAM, 4, progress=False)
+    assert whole.history.cost[-1] < whole.history.cost[0]
+    vx.fit(inverse, ADAM, 2, progress=False, checkpoint=tmp_path / "fit.npz")
+    continued = vx.fit(inverse, ADAM, 4, progress=False, checkpoint=tmp_path / "fit.npz")
+    np.testing.assert_array_equal(continued.history.cost, whole.history.cost)
+    moody("raises")
+    with pytest.raises(vx.FitError, match="Foam failed: OSError: the reactor is too hot"):
+        vx.fit(inverse, ADAM, 4, progress=False)
+
+
+def test_batches_run_side_by_side_and_fail_one_by_one(case):
+    tissue, energy, _ = case
+    tensions = energy.terms[1].tension
+    batch = jnp.stack([tensions, tensions.at[0].set(-1.0), 1.1 * tensions])
+    response = vx.External(FOAM, workers=3)
+    relax = lambda tensions: response(tissue, foam_energy(tensions), throw=False)
+    runs = response.ledger.runs
+    equilibria = eqx.filter_vmap(relax)(batch)
+    assert response.ledger.runs == runs + 3
+    np.testing.assert_array_equal(equilibria.converged, [True, False, True])
+    alone = vx.External(FOAM)(tissue, foam_energy(batch[2])).tissue
+    np.testing.assert_allclose(equilibria.tissue.vertices[2], alone.vertices, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_processes_do_as_threads_do(case):
+    jobs = [Job(FOAM, numpy_request(case), "program", 1e-4)] * 2
+    here, _ = ask(jobs, 2, False, True)
+    there, reason = ask(jobs, 2, True, True)
+    assert reason is None
+    for a, b in zip(jax.tree.leaves(here), jax.tree.leaves(there), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+def test_processes_hang_and_die_one_by_one(case):
+    tissue, energy, _ = numpy_request(case)[:3]
+    first = [0.05, 0.15, 0.3, 0.3]
+    energies = [
+        eqx.tree_at(lambda e: e.terms[1].tension, energy, energy.terms[1].tension.copy())
+        for _ in first
+    ]
+    for number, value in enumerate(first):
+        energies[number].terms[1].tension[0] = value
+    jobs = [Job(Foam(mood="ill"), Request(tissue, e, None, None), "energy", 1e-4) for e in energies]
+    began = time.perf_counter()
+    answers, _ = ask(jobs, 4, True, True, 60.0)
+    assert [answer is None for answer in answers] == [True, True, False, False]
+    assert time.perf_counter() - began < 300
+    for job, says in zip(jobs, ("ran the program died", "not done after 2 s"), strict=False):
+        assert says in str(ask([job], 1, True, True, 2.0)[1])
+    # What a simulator raises is its own, and its process goes on.
+    moody = Job(Foam(mood="times out"), numpy_request(case), "energy", 1e-4)
+    _, reason = ask([moody], 1, True, True, 60.0)
+    assert "TimeoutError: the reactor does not answer" in str(reason)
+    # The next one has a process again.
+    (again,), _ = ask(jobs[2:3], 1, True, True, 60.0)
+    assert again is not None
+
+
+@pytest.mark.slow
+def test_a_fit_in_processes(case):
+    tissue, energy, cost = case
+    response = vx.External(Foam(), workers=2, processes=True, timeout=120.0)
+    adjoint = vx.EquilibriumPropagation()
+    inverse = vx.InverseProblem(tissue, energy, cost, response=response, adjoint=adjoint)
+    beside = problem(case)
+    fits = [vx.fit(p, ADAM, 2, progress=False) for p in (inverse, beside)]
+    np.testing.assert_allclose(fits[0].history.cost, fits[1].history.cost, rtol=1e-12)
+    hangs = dataclasses.replace(
+        inverse, response=vx.External(Foam(mood="hangs"), processes=True, timeout=1.0)
+    )
+    with pytest.raises(vx.FitError, match="not done after 1 s"):
+        vx.fit(hangs, ADAM, 2, progress=False)
+
+
+@pytest.mark.slow
+def test_gradient_in_single_precision(case, implicit):
+    single = jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, case)
+    gradient, evaluation = gradient_of(problem(single))
+    assert gradient.dtype == np.float32
+    assert evaluation.equilibrium.converged
+    assert error(gradient, implicit) < 1e-2
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "says"),
+    [
+        (vx.ImplicitDifferentiation(), "ImplicitDifferentiation needs derivatives of what relaxes"),
+        (vx.adjoints.AutomaticDifferentiation(), "AutomaticDifferentiation needs derivatives"),
+        (vx.EquilibriumPropagation(nudge="cost"), "which an external program does not know"),
+    ],
+)
+def test_only_equilibrium_propagation_goes_with_it(case, adjoint, says):
+    with pytest.raises(ValueError, match=says):
+        problem(case, adjoint=adjoint)
+    with pytest.raises(ValueError, match=says):
+        vx.External(FOAM)(case[0], case[1], adjoint=adjoint)
+
+
+def test_no_guidance(case):
+    with pytest.raises(ValueError, match="`guidance` lets the tissue relax the cost too"):
+        dataclasses.replace(problem(case), guidance=1.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "kind", "says"),
+    [
+        ({"simulator": 1}, TypeError, "simulator"),
+        ({"slope": "guess"}, (ValueError, TypeError), "slope"),
+        ({"slope": "program"}, ValueError, "`stiffness` is missing"),
+        ({"tolerance": 0.0}, ValueError, "`tolerance` must be positive"),
+        ({"workers": 0}, ValueError, "`workers` must be at least 1"),
+        ({"simulator": Foam}, TypeError, "simulator"),
+        ({"timeout": 0.0, "processes": True}, ValueError, "`timeout` must be positive"),
+        ({"timeout": 5.0}, ValueError, "`timeout` needs processes=True"),
+    ],
+)
+def test_settings_are_checked(settings, kind, says):
+    with pytest.raises(kind, match=says):
+        vx.External(**({"simulator": FOAM} | settings))
+
+
+def test_arcs_are_pulled_by_programs_that_can(case):
+    tissue, energy, _ = numpy_request(case)[:3]
+    torques = np.ones(len(energy.terms[1].tension))
+    job = Job(FOAM, Request(tissue, energy, 0 * tissue.vertices, torques), "energy", 1e-4)
+    _, reason = ask([job], 1, False, True)
+    assert "this program cannot be told to pull on them" in str(reason)
+
+
+def test_what_a_simulator_lacks_is_named(case):
+    class Bare(vx.external.AbstractSimulator):
+        def relax(self, tissue, energy, forces):
+            return np.asarray(tissue.vertices)
+
+    for slope, says in (("program", "has no `parameter_gradient`"), ("differences", "no `energy`")):
+        _, reason = ask([Job(Bare(), numpy_request(case), slope, 1e-4)], 1, False, True)
+        assert says in str(reason)

@@ -1,0 +1,224 @@
+"""Cells never overlap on the way to equilibrium, and rest against each other smoothly."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+from helpers import fine_difference
+from hypothesis import example, given, settings, strategies as st
+from tilings import faces_that_overlap
+
+import vertax as vx
+from vertax.relax._contacts import no_contacts
+
+N = 20
+relaxed = vx.Relaxation(max_steps=300)
+
+
+def tissue_of(seed: int) -> vx.Tissue:
+    return vx.initialise.periodic_voronoi(n_cells=N, key=seed)
+
+
+def shape_factors(seed: int, low: float = 3.3, high: float = 4.9) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(low, high, N)
+
+
+def shapes(targets) -> vx.AbstractEnergy:
+    return vx.energies.ShapeFactorEnergy(jnp.asarray(targets))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6), low=st.floats(3.0, 4.5), spread=st.floats(0, 0.5))
+def test_a_random_tissue_stays_valid(seed, low, spread):
+    energy = shapes(shape_factors(seed, low, low + spread + 1e-9))
+    equilibrium = relaxed(tissue_of(seed % 100), energy, throw=False)
+    assert equilibrium.valid
+    assert faces_that_overlap(equilibrium.tissue) == []
+
+
+@pytest.mark.slow
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), inner_arcs=st.booleans())
+# A bulge meets a flat side, and the arcs of a cell with four sides meet.
+@example(seed=11, inner_arcs=True)
+def test_a_random_cluster_stays_valid(seed, inner_arcs):
+    tissue = cluster(12, seed % 100, inner_arcs=inner_arcs)
+    tension = np.random.default_rng(seed).uniform(0.06, 0.6, tissue.n_edges)
+    energy = vx.energies.AreaElasticity(2.0, 1.0) + vx.energies.LineTension(jnp.asarray(tension))
+    equilibrium = relaxed(tissue, energy, throw=False)
+    assert equilibrium.valid
+    assert faces_that_overlap(equilibrium.tissue, 200) == []
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param(vx.solvers.FIRE(), id="FIRE", marks=pytest.mark.slow),
+        pytest.param(vx.solvers.LBFGS(), id="LBFGS", marks=pytest.mark.thorough),
+    ],
+)
+def test_steps_of_any_solver_are_undone_where_cells_would_overlap(solver):
+    response = vx.Relaxation(solver, tolerance=1e-6, max_steps=400)
+    for seed in range(3):
+        equilibrium = response(tissue_of(seed), shapes(np.full(N, 4.5)), throw=False)
+        assert faces_that_overlap(equilibrium.tissue) == []
+
+
+class _Spoiler(vx.transitions.AbstractTransitions):
+    """Where anything has moved, a vertex ends up far away."""
+
+    start: jax.Array
+    where: jax.Array
+    vertex: int
+
+    def init(self, tissue):
+        return jnp.zeros(tissue.n_edges, jnp.int32)
+
+    def sweep(self, tissue, energy, counts, length_fraction=1.0):
+        moved = (tissue.vertices != self.start).any(axis=1)
+        far = jnp.where((self.where & moved).any(), 2.0, 0.0)
+        return tissue.with_vertices(tissue.vertices.at[self.vertex].add(far)), counts
+
+
+def test_what_cannot_go_on_holds_back_only_what_is_around():
+    tissue = vx.initialise.periodic_voronoi(60, key=jax.random.key(2), lloyd_steps=3)
+    cells = np.asarray(tissue.topology.cell).reshape(-1, 3)
+    # The neighbours of the vertex's cells as well, which would not overlap.
+    around = lambda vertices: np.isin(cells, cells[vertices]).any(axis=1)
+    held = around(around([7]))
+    response = vx.Relaxation(transitions=_Spoiler(tissue.vertices, jnp.asarray(held), 7))
+    energy = shapes(np.full(60, 3.6))
+
+    @eqx.filter_jit
+    def step(tissue, energy):
+        search = response.search(tissue, energy)
+        return search.advance(search.begin(tissue, energy), energy, 1)
+
+    state = step(tissue, energy)
+    moved = np.asarray((state.tissue.vertices != tissue.vertices).any(axis=1))
+    assert not moved[held].any()
+    assert moved[~around(around(held))].all()
+    assert 0.2 < moved.mean() < 0.8
+    assert state.iteration.value < energy(tissue)
+    # What stays because of others is to be shorter next time as well.
+    radii = np.asarray(state.iteration.radii)
+    assert radii[~moved].max() < radii[moved].min()
+
+
+@pytest.mark.thorough
+def test_what_stays_does_not_stay_for_ever():
+    """A vertex that nothing blamed came to those that stayed, again and again."""
+    tissue = vx.initialise.periodic_voronoi(1000, key=jax.random.key(1001))
+    factors = 3.5 + 0.1 * jax.random.normal(jax.random.key(2001), (1000,))
+    response = vx.Relaxation(tolerance=1e-8, max_steps=150)
+    assert eqx.filter_jit(response)(tissue, shapes(factors), throw=False).converged
+
+
+@pytest.mark.thorough
+def test_what_cannot_go_on_is_not_tried_as_far_again():
+    """Steps that are foreseen well, and lead to overlaps: regions grew again as fast as they shrank there."""
+    relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=200))
+    # The first one took 212 steps then; the second one never ends if regions only shrink.
+    for seed in (294, 711):
+        tissue = vx.initialise.periodic_voronoi(64, key=jax.random.key(seed))
+        factors = 4.1 + 0.1 * jax.random.normal(jax.random.key(1 + seed), (64,))
+        assert relax(tissue, shapes(factors)).num_steps < 100
+
+
+def test_without_contact_cells_overlap_and_that_is_refused():
+    response = vx.Relaxation(contact_range=None)
+    energy = shapes(np.full(N, 4.7))
+    equilibrium = response(tissue_of(3), energy, throw=False)
+    bad = faces_that_overlap(equilibrium.tissue)
+    assert bad
+    assert not equilibrium.valid
+    assert not equilibrium.converged
+    with pytest.raises(RuntimeError, match=rf"overlap: cell {bad[0]}\b.*contact_range"):
+        response(tissue_of(3), energy)
+
+
+def test_a_tissue_that_overlaps_from_the_start_is_named():
+    tissue = tissue_of(2)
+    overlapping = tissue.with_vertices(tissue.vertices.at[0].add(2.5))
+    with pytest.raises(RuntimeError, match="vertices"):
+        vx.equilibrate(overlapping, shapes(np.full(N, 3.7)), max_steps=1)
+
+
+def test_nothing_changes_where_nothing_touches():
+    energy = shapes(np.full(N, 3.6))
+    start = vx.equilibrate(tissue_of(2), energy).tissue
+    pushed = shapes(np.linspace(3.55, 3.65, N))
+    held, free = (vx.Relaxation(contact_range=r)(start, pushed) for r in (0.01, None))
+    assert held.num_steps == free.num_steps
+    np.testing.assert_allclose(held.tissue.vertices, free.tissue.vertices, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-3])
+def test_an_edge_that_vanishes_along_another_side_has_a_moderate_curvature(offset):
+    tissue = tissue_of(0)
+    m = tissue.topology
+    # The edge from a to b folds back onto the side of the same face that ends at a.
+    side = int(m.previous[0])
+    along = np.asarray(tissue.sides[side, 2:4])
+    away = 1e-7 * (offset * np.array([-along[1], along[0]]) - along)
+    b = int(m.next[0]) // 3
+    there = tissue.with_vertices(tissue.vertices.at[b].add(away - tissue.sides[0, 2:4]))
+    one = jnp.asarray(1.0)
+    contacts, _ = no_contacts(0.01, one, there).found(there)
+    assert [int(m.next[0]), side] in contacts.sides.T.tolist()
+    own = lambda x: contacts(there.with_vertices(there.vertices.at[b].set(x)))
+    curvature = jax.hessian(own)(there.vertices[b])
+    assert np.abs(curvature).max() < 1e5 * contacts.pairs.strength
+
+
+def test_a_negative_range_is_refused():
+    with pytest.raises(ValueError, match="contact_range"):
+        vx.Relaxation(contact_range=-0.1)
+
+
+@functools.cache
+def in_contact() -> tuple[vx.Tissue, np.ndarray]:
+    """A tissue at rest whose cells, of very different target shape factors, press corners against sides."""
+    exerted = eqx.filter_jit(lambda t, e: jax.grad(lambda v: e(t.with_vertices(v)))(t.vertices))
+    for seed in range(40, 100):
+        targets = shape_factors(seed)
+        found = relaxed(tissue_of(seed), shapes(targets), throw=False)
+        # What the energy exerts there and contacts bear.
+        if found.converged and np.max(np.abs(exerted(found.tissue, shapes(targets)))) > 1e-3:
+            return found.tissue, targets
+    raise AssertionError("no tissue ends in contact")
+
+
+@eqx.filter_jit
+def cost_and_slope(targets, start, adjoint):
+    """A cost of the equilibrium, and its gradient."""
+
+    def cost(targets):
+        energy = vx.energies.ShapeFactorEnergy(targets)
+        found = vx.equilibrate(start, energy, adjoint=adjoint, tolerance=1e-11)
+        return jnp.sum(jnp.sin(3 * found.tissue.edge_lengths))
+
+    return jax.value_and_grad(cost)(targets)
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "rtol"),
+    [
+        (vx.ImplicitDifferentiation(), 1e-6),
+        # What it propagates is the same; the tests of adjoints have it without contacts.
+        pytest.param(vx.EquilibriumPropagation(beta=1e-6), 1e-5, marks=pytest.mark.slow),
+    ],
+    ids=["implicit", "propagation"],
+)
+def test_hypergradients_of_a_tissue_in_contact(adjoint, rtol):
+    start, targets = in_contact()
+    direction = np.random.default_rng(0).normal(size=N)
+    # By one program for all adjoints: that of the first, which compiles least.
+    at = lambda t: cost_and_slope(t, start, vx.ImplicitDifferentiation())[0]
+    expected = fine_difference(at, targets, direction, 3e-5)
+    slope = cost_and_slope(jnp.asarray(targets), start, adjoint)[1]
+    np.testing.assert_allclose(slope @ direction, expected, rtol=rtol)

@@ -1,0 +1,160 @@
+"""Trajectories: a tissue on its way through a relaxation or a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol, overload, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Shaped
+
+from vertax.mesh import Tissue
+
+
+@runtime_checkable
+class _Record(Protocol):
+    """What a trajectory takes down of an epoch of a fit."""
+
+    tissue: Tissue
+    cost: Array
+    max_force: Array
+    num_t1: Array
+
+
+class Trajectory(Sequence[Tissue]):
+    """A sequence of tissues of one size, its frames, each with some numbers.
+
+    T1 transitions change the topology, so every frame has its own. As the callback of a fit it records
+    the equilibrium of each epoch:
+
+    ```python
+    trajectory = vx.mesh.Trajectory(every=10)
+    vx.fit(problem, optimiser, epochs=200, callback=trajectory)
+    vx.io.save_trajectory("fit.npz", trajectory)
+    for tissue, cost in zip(trajectory, trajectory.values["cost"]):
+        ...
+    ```
+
+    [`record_relaxation`][vertax.relax.record_relaxation] records a relaxation. Frames are kept in the
+    memory of the host, not of the device.
+
+    **Arguments:**
+
+    - `every`: as a callback, record every so many epochs, beginning with the first.
+
+    **Raises:**
+
+    - `ValueError` if `every` is less than 1.
+    """
+
+    every: int
+
+    def __init__(self, *, every: int = 1):
+        if every < 1:
+            raise ValueError(f"Argument `every` must be at least 1, but is {every}.")
+        self.every = every
+        self._frames: list[Tissue] = []
+        self._values: dict[str, list[int | float]] = {}
+
+    def append(self, tissue: Tissue, **values: ArrayLike) -> None:
+        """Add a frame.
+
+        **Arguments:**
+
+        - `tissue`: a single tissue of the same sizes, kind and precision as the frames before.
+        - `values`: numbers by name that go with it (a time, a cost), of the same names in each frame.
+
+        **Raises:**
+
+        - `ValueError` for a tissue that does not go with those before, for other names, or for a value
+            that is not one number.
+        """
+        if tissue.vertices.ndim != 2:
+            raise ValueError(
+                "Argument `tissue` must be a single tissue, but its vertices have shape "
+                f"{tissue.vertices.shape}. Record the members of a batch one by one."
+            )
+        frame: Tissue = jax.tree.map(np.asarray, tissue)
+        numbers = {name: _number(name, value) for name, value in values.items()}
+        if self._frames:
+            last = self._frames[-1]
+            if _kind(frame) != _kind(last):
+                raise ValueError(
+                    "Argument `tissue` must have the sizes, the boundary and the precision of the frames "
+                    f"before it ({_sizes(last)}), but does not ({_sizes(frame)})."
+                )
+            if numbers.keys() != self._values.keys():
+                raise ValueError(
+                    f"A frame must have the values of those before it ({', '.join(self._values)}), but "
+                    f"has: {', '.join(numbers)}."
+                )
+            if eqx.tree_equal(frame.topology, last.topology):
+                frame = frame.with_topology(last.topology)  # the same arrays, held once
+        self._frames.append(frame)
+        for name, value in numbers.items():
+            self._values.setdefault(name, []).append(value)
+
+    def __call__(self, epoch: int, record: _Record) -> None:
+        """Add the equilibrium of an epoch; the callback of [`fit`][vertax.fit].
+
+        **Arguments:**
+
+        - `epoch`: its number, which is recorded too.
+        - `record`: what the fit knows of it, of which cost, largest force and number of T1 transitions
+            are recorded.
+        """
+        if epoch % self.every == 0:
+            self.append(
+                record.tissue,
+                epoch=epoch,
+                cost=record.cost,
+                max_force=record.max_force,
+                num_t1=record.num_t1,
+            )
+
+    @property
+    def values(self) -> dict[str, Shaped[np.ndarray, " frames"]]:
+        """The numbers of all frames by name."""
+        return {name: np.asarray(values) for name, values in self._values.items()}
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @overload
+    def __getitem__(self, index: int) -> Tissue: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Trajectory: ...
+
+    def __getitem__(self, index: int | slice) -> Tissue | Trajectory:
+        if isinstance(index, slice):
+            part = Trajectory(every=self.every)
+            part._frames = self._frames[index]
+            part._values = {name: values[index] for name, values in self._values.items()}
+            return part
+        return jax.tree.map(jnp.asarray, self._frames[index])
+
+    def __iter__(self) -> Iterator[Tissue]:
+        return (self[i] for i in range(len(self)))
+
+
+def _number(name: str, value: Any) -> int | float:
+    array = np.asarray(value)
+    if array.shape != () or array.dtype.kind not in "iuf":
+        raise ValueError(f"Value `{name}` must be one number, but is {value!r}.")
+    return array.item()
+
+
+def _kind(frame: Tissue) -> tuple:
+    leaves, structure = jax.tree.flatten(frame)
+    return structure, [(leaf.shape, leaf.dtype) for leaf in leaves]
+
+
+def _sizes(frame: Tissue) -> str:
+    return (
+        f"{frame.n_cells} cells, {frame.n_vertices} vertices, {type(frame.boundary).__name__}, "
+        f"{frame.vertices.dtype}"
+    )

@@ -1,0 +1,202 @@
+"""Contact: barriers between corners and sides of a cell, and barriers of short edges against inversion."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax._base.reductions import any_of, indices_of, number_of
+from vertax.mesh import Tissue
+from vertax.mesh._overlaps import overlaps_and_nearest
+from vertax.mesh._sides import Sides, dot
+from vertax.mesh._topology import Topology, take
+from vertax.precondition._edge_blocks import Symmetric
+from vertax.relax._barrier import GatherPlan, barrier_energy
+from vertax.relax._inversion_barrier import REACH, InversionBarrier
+from vertax.relax._pair_barrier import PairBarrier
+
+
+class Contacts(eqx.Module):
+    """The barriers of a tissue in one topology.
+
+    **Arguments:**
+
+    - `pairs`: of corners and sides that are near.
+    - `sides`: their half-edges: the corner is the source of the first one. The same twice after the last one.
+    - `plan`: where their positions are: the corner, the start and the end of the side.
+    - `inversion`: short edges that would turn inside out.
+    - `inversion_plan`: where their positions are.
+    - `overflow`: whether there are more pairs than rows, in any step so far.
+    """
+
+    pairs: PairBarrier
+    sides: Int[Array, "2 pairs"]
+    plan: GatherPlan
+    inversion: InversionBarrier
+    inversion_plan: GatherPlan
+    overflow: Bool[Array, ""]
+
+    def __call__(self, tissue: Tissue) -> Float[Array, ""]:
+        """The energy of the barriers."""
+
+        def energy() -> Float[Array, ""]:
+            if tissue.arcs is None:
+                of_pairs = barrier_energy(self.pairs, self.plan.positions(tissue))
+            else:
+                one, other = map(tissue.sides_of, self.sides)
+                of_pairs = jnp.sum(self.pairs.heights(one, other))
+            return of_pairs + self._inversion_energy(tissue)
+
+        # Most tissues have no contacts most of the time, and then these take longer than the energy.
+        return jax.lax.cond(self.some, energy, lambda: jnp.zeros((), tissue.vertices.dtype))
+
+    @property
+    def some(self) -> Bool[Array, ""]:
+        """Whether there are any."""
+        return any_of(self.pairs.valid) | self.inversion.any
+
+    def _inversion_energy(self, tissue: Tissue) -> Float[Array, ""]:
+        return barrier_energy(self.inversion, self.inversion_plan.positions(tissue))
+
+    def differ(self, other: Contacts) -> Bool[Array, ""]:
+        """Whether these are others."""
+        changed = any_of(self.sides != other.sides)
+        return changed | any_of(self.inversion.edges != other.inversion.edges)
+
+    def resistance(self, tissue: Tissue) -> Symmetric:
+        """The stiffness of the pairs where one vertex moves alone, without negative eigenvalues.
+
+        For a preconditioner: of straight sides.
+        """
+        vectors = self.pairs.vectors(self.plan.positions(tissue))
+        rows = self.pairs.expansion(vectors).block
+        # The corner moves the first vector, the end of the side its chord, and its start both.
+        part = lambda i, j: Symmetric(rows[i, j], rows[i, j + 1], rows[i + 1, j + 1])
+        corner, chord = part(0, 0), part(2, 2)
+        start = Symmetric(
+            *(
+                rows[i, j] + rows[i, j + 2] + rows[i + 2, j] + rows[i + 2, j + 2]
+                for i, j in ((0, 0), (0, 1), (1, 1))
+            )
+        )
+        nothing = jnp.zeros(tissue.n_vertices, tissue.vertices.dtype)
+        gathered = lambda *blocks: nothing.at[self.plan.vertices].add(jnp.stack(blocks))
+        blocks = (block.positive for block in (corner, start, chord))
+        return Symmetric(*(gathered(*each) for each in zip(*blocks, strict=True)))
+
+    def with_stiffness(self, stiffness: Float[Array, ""]) -> Contacts:
+        """The same contacts in a material of another stiffness."""
+        # The barrier must not depend on the parameters of the energy, not even through its strength: that
+        # would be one more derivative. So it is a power of 16.
+        step = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0))
+        strength = step / self.pairs.slope
+        force = step * self.pairs.distance / self.pairs.slope * SLOPE
+        return eqx.tree_at(lambda c: (c.pairs.strength, c.inversion.force), self, (strength, force))
+
+    def updated(
+        self,
+        point: Tissue,
+        tissue: Tissue,
+        unflipped: Bool[Array, "*rules edges"],
+        holds: Bool[Array, ""],
+    ) -> tuple[Contacts, Bool[Array, " vertices"]]:
+        """The contacts of a tissue, and the vertices of cells that overlap.
+
+        **Arguments:**
+
+        - `point`: the tissue before transitions.
+        - `tissue`: after them.
+        - `unflipped`: which edges have not taken part.
+        - `holds`: whether an edge that turned around although its barrier is on counts as an overlap.
+        """
+        contacts, overlapping = self.found(tissue)
+        m = tissue.topology
+        start, end = m.edge_vertices.T
+        both = jnp.concatenate([point.vertices, tissue.vertices], axis=1)
+        offset = tissue.boundary.translation(take(m.offset, m.half_edge))
+        vectors = take(both, end) - take(both, start) + jnp.concatenate([offset, offset], axis=1)
+        old, new = vectors[:, :2], vectors[:, 2:]
+        # An edge that turned around, and has not flipped, was put upright.
+        turned = (dot(old, new) < 0) & jnp.all(unflipped.reshape(-1, tissue.n_edges), axis=0)
+        # If its barrier is on, the step has jumped over it.
+        over = turned & self.inversion.held & holds
+        overlapping = overlapping.at[jnp.stack([start, end])].max(over)
+        inversion = self.inversion.updated(turned, dot(new, new))
+        return contacts.holding(m, inversion), overlapping
+
+    def holding(self, topology: Topology, inversion: InversionBarrier) -> Contacts:
+        """The same with other edges whose barrier is on, in a topology."""
+        new = (inversion, inversion.plan(topology))
+        return eqx.tree_at(lambda c: (c.inversion, c.inversion_plan), self, new)
+
+    def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, " vertices"]]:
+        """The contacts in a tissue, and the vertices of cells that overlap."""
+
+        def measure(one: Sides, other: Sides, after: Array, before: Array) -> Array:
+            near = [near for near, _ in self.pairs.nearness(one, other, after, before)]
+            return near[0] if len(near) == 1 else jnp.minimum(*near)
+
+        m, (_, size) = tissue.topology, self.sides.shape
+        overlapping, nearest, gaps = overlaps_and_nearest(m, tissue.sides, tissue.areas, measure)
+        near = (gaps < _MARGIN**2).reshape(-1)
+        # (A slice of its results would make XLA sort instead.)
+        which, valid = indices_of(near, size)
+        overflow = self.overflow | (number_of(near) > size)
+        which = which.astype(m.twin.dtype)
+        corner = jax.lax.rem(which, jnp.asarray(m.n_half_edges, which.dtype))
+        sides = jnp.where(valid, jnp.stack([corner, take(nearest.reshape(-1), which)]), 0)
+        corner, side = sides
+        end = take(m.next, side)
+        after, before = take(m.next, corner) == side, take(m.next, end) == corner
+        plan = GatherPlan.of(m, jnp.stack([corner, side, end]))
+        pairs = eqx.tree_at(
+            lambda p: (p.after, p.before, p.valid), self.pairs, (after, before, valid)
+        )
+        new = (pairs, sides, plan, overflow)
+        contacts = eqx.tree_at(lambda c: (c.pairs, c.sides, c.plan, c.overflow), self, new)
+        return contacts, overlapping
+
+
+# Pairs are listed below so many ranges: the others may come into range in the next step.
+_MARGIN = 2
+SLOPE = 5.0
+"""The range between sides that are next to each other, over the distance from their common end, in units of
+the range in cells: both are the same at a fifth of a cell from the end."""
+
+
+def no_contacts(
+    reach: float | Float[Array, ""],
+    length: Float[Array, ""],
+    tissue: Tissue,
+    capacity: int | None = None,
+) -> Contacts:
+    """Contacts that are not found yet, in a material of stiffness 1.
+
+    **Arguments:**
+
+    - `reach`: the range in units of the size of a cell.
+    - `length`: the size of a cell.
+    - `tissue`: for which tissue.
+    - `capacity`: most pairs; by default the number of vertices up to 2000, then a quarter of it.
+    """
+    reach = jnp.maximum(jnp.asarray(reach, length.dtype), 1e-9)
+    slope, strength = SLOPE * reach, jnp.ones_like(length)
+    inversion = InversionBarrier.none(tissue, jnp.minimum(reach, REACH) * length, length)
+    n = (
+        max(64, min(tissue.n_vertices, 2000), tissue.n_vertices // 4)
+        if capacity is None
+        else capacity
+    )
+    topology = tissue.topology
+    no, sides = jnp.zeros(n, bool), jnp.zeros((2, n), topology.twin.dtype)
+    contacts = Contacts(
+        PairBarrier(reach * length, slope, strength, no, no, no),
+        sides,
+        GatherPlan.none(topology, (3, n)),
+        inversion,
+        GatherPlan.none(topology, (6, len(inversion.edges))),
+        jnp.array(False),
+    )
+    return contacts.with_stiffness(strength)

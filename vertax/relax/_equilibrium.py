@@ -1,0 +1,165 @@
+"""A relaxation in two parts: the search for the equilibrium, and a solve that can be differentiated there."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from vertax.adjoints import AbstractAdjoint
+from vertax.adjoints._adjoint import frozen
+from vertax.energies import AbstractEnergy
+from vertax.energies._units import Units
+from vertax.mesh import Tissue
+from vertax.precondition._recycled_hessian import RecycledHessian
+from vertax.relax._contacts import Contacts
+from vertax.relax._loop import Search, SearchState, blocks_of, collective_of, objective
+from vertax.relax._response import Equilibrium
+from vertax.solvers._stop_at_rest import AtRest, StopAtRest
+
+
+class SearchEnd(eqx.Module):
+    """Where a search ended, not differentiable."""
+
+    tissue: Tissue
+    origin: PyTree[Array]
+    """The configuration right after the last transition, or the first one."""
+    contacts: Contacts | None
+    units: Units
+    tolerance: Float[Array, ""]
+    max_force: Float[Array, ""]
+    num_steps: Int[Array, ""]
+    num_t1: Int[Array, ""]
+    overlaps: Bool[Array, ""] | None
+    """Whether the tissue overlaps; None if that is not looked for."""
+    result: optx.RESULTS
+
+    @classmethod
+    def of(cls, search: Search, state: SearchState) -> SearchEnd:
+        """The end of a search that is not to go on."""
+        options = search.options(state.stiffness)
+        return cls(
+            tissue=state.tissue,
+            origin=state.origin,
+            contacts=state.contacts,
+            units=Units(options["length_scale"], options["stiffness"]),
+            tolerance=options["tolerance"],
+            max_force=state.force,
+            num_steps=state.num_steps,
+            num_t1=state.num_t1,
+            overlaps=None if state.contacts is None else state.overlaps,
+            result=search.result(state),
+        )
+
+
+def conclude(
+    end: SearchEnd,
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    adjoint: AbstractAdjoint,
+    minimiser: StopAtRest,
+    max_steps: int | Int[Array, ""],
+    preconditioner: RecycledHessian | None,
+) -> Equilibrium:
+    """The equilibrium that a search from `tissue` ended at, differentiable.
+
+    `minimiser`, `max_steps` and `preconditioner` are for adjoints that relax the tissue again.
+    """
+    relaxed, units = end.tissue, end.units
+    free = free_motions(relaxed, frozen(energy), units)
+    # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
+    # unless the energy has something to say about where the tissue is.
+    settled = _choose(
+        jnp.all(free), relaxed.settled(frozen(tissue)), _recentred(relaxed, tissue, free)
+    )
+    moved = settled.held_as(_choose(jnp.all(free), tissue, relaxed))
+    springs = jnp.ones_like(moved.drift(settled.configuration)).at[: len(free)].set(free)
+    options = {
+        "length_scale": units.length,
+        "stiffness": units.stiffness,
+        "tolerance": end.tolerance,
+        "relaxation": minimiser,
+        "start": end.origin,
+        "max_steps": jnp.asarray(max_steps),
+        "edge_blocks": blocks_of(settled, energy, end.contacts),
+        "collective": collective_of(settled, preconditioner),
+    }
+    # This solve starts at rest and takes no step: it is there to be differentiated.
+    solution = optx.minimise(
+        _pinned_energy,
+        AtRest(),
+        settled.configuration,
+        (moved, energy, frozen(end.contacts), units.stiffness * springs),
+        frozen(options),
+        max_steps=None,
+        adjoint=adjoint,
+        throw=False,
+    )
+    final = follow_start(moved.with_configuration(solution.value), tissue, free)
+    return Equilibrium(
+        tissue=final,
+        energy=energy(final),
+        max_force=end.max_force,
+        num_steps=end.num_steps,
+        num_t1=end.num_t1,
+        valid=~final.overlaps.any if end.overlaps is None else ~end.overlaps,
+        result=end.result,
+    )
+
+
+def follow_start(relaxed: Tissue, start: Tissue, free: Bool[Array, " modes"]) -> Tissue:
+    """The same tissue, whose place depends on that of `start` when differentiated.
+
+    A relaxation keeps what the energy does not determine: the centroid of the start, and the orientation of a
+    free tissue. The adjoint differentiates the shape in a fixed place. Here that place is differentiated, by
+    the formula that determines it, so that every adjoint has the derivative with respect to the start. Where
+    only some motions are free, their translations are followed.
+    """
+    settled = relaxed.settled(start).vertices
+    # (All but the derivative stays as it is, to the last bit.)
+    settled = settled + jax.lax.stop_gradient(relaxed.vertices - settled)
+    there = start.gathered(start.vertices)
+    moved = jnp.mean(there - jax.lax.stop_gradient(there), axis=0) * free[:2]
+    if start.pinned is not None:
+        moved = jnp.where(jnp.any(start.pinned), 0, moved)
+    return relaxed.with_vertices(jnp.where(jnp.all(free), settled, relaxed.vertices + moved))
+
+
+def _recentred(relaxed: Tissue, start: Tissue, free: Bool[Array, " modes"]) -> Tissue:
+    """The same tissue, moved to the centroid of `start` along the translations that are free."""
+    drift = jnp.mean(start.gathered(start.vertices) - relaxed.gathered(relaxed.vertices), axis=0)
+    drift = jax.lax.stop_gradient(drift) * free[:2]
+    if start.pinned is not None:
+        drift = jnp.where(jnp.any(start.pinned), 0, drift)
+    return relaxed.with_vertices(relaxed.vertices + drift)
+
+
+def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
+    """The vertices of one tissue or another; pinned ones are where the first has them."""
+    if one.pinned is not None:
+        condition = condition | one.pinned[:, None]
+    return one.with_vertices(jnp.where(condition, one.vertices, other.vertices))
+
+
+def free_motions(tissue: Tissue, energy: AbstractEnergy, units: Units) -> Bool[Array, " modes"]:
+    """Which motions of the whole cost nothing: all, unless the energy knows positions."""
+    there = tissue.boundary.motions(tissue.vertices, 0.3 * units.length)
+    places = jnp.concatenate([tissue.vertices[None], there])
+    energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(places)
+    here = energies[0]
+    rounding = jnp.finfo(here.dtype).eps ** 0.6
+    size = jnp.abs(here) + units.stiffness * units.length**2
+    return jnp.abs(energies[1:] - here) <= rounding * size
+
+
+def _pinned_energy(
+    configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Contacts | None, Array]
+) -> Array:
+    """The energy, and a term that pins the motions which cost nothing."""
+    # Motions of the whole are zero modes. They make the Hessian singular, and a nudged relaxation would
+    # drift along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
+    tissue, energy, contacts, gauge = args
+    drift = tissue.drift(configuration)
+    return objective(configuration, (tissue, energy, contacts))[0] + 0.5 * jnp.sum(gauge * drift**2)

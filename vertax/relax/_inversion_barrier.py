@@ -1,0 +1,165 @@
+"""What keeps short edges from turning inside out."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax._base.reductions import indices_of
+from vertax._base.sums import total
+from vertax.mesh import Tissue
+from vertax.mesh._topology import Topology, edge_neighbourhood, take
+from vertax.relax._barrier import (
+    FLOOR,
+    AbstractBarrier,
+    Expansion,
+    GatherPlan,
+    barrier_energy,
+    composed,
+    outer,
+    profile,
+)
+
+# Where an energy presses the ends of an edge together, the edge opens once it has flipped. Forces can press
+# it from all sides: then four cells meet in a point, flipped or not, and the energy is least where the edge
+# points a little the wrong way. A barrier holds it, as of contacts, where the share of the edge that points
+# the way it ought to is below a range.
+REACH = 2e-3
+"""That range, in units of the size of a cell."""
+# And in units of it the length from which on the barrier is nothing at all.
+_FADE = 8.0
+
+
+class InversionBarrier(AbstractBarrier):
+    """The barrier of those edges that a relaxation had to put upright.
+
+    **Arguments:**
+
+    - `edges`: their numbers, and that of no edge after the last one.
+    - `counts`: how often each edge was put upright.
+    - `reach`: its range, a length.
+    - `force`: about what it resists with at a third of that.
+    """
+
+    edges: Int[Array, " some"]
+    counts: Int[Array, " edges"]
+    reach: Float[Array, ""]
+    force: Float[Array, ""]
+
+    @classmethod
+    def none(
+        cls, tissue: Tissue, reach: Float[Array, ""], force: Float[Array, ""]
+    ) -> InversionBarrier:
+        """Of no edge yet."""
+        n = tissue.n_edges
+        some = min(n, max(_FEWEST, n // _SHARE))
+        none = jnp.full(some, n, tissue.topology.edge.dtype)
+        return cls(none, jnp.zeros(n, jnp.int32), reach, force)
+
+    @property
+    def any(self) -> Bool[Array, ""]:
+        """Whether there are any."""
+        return jnp.any(self.edges < len(self.counts))
+
+    @property
+    def held(self) -> Bool[Array, " edges"]:
+        """Which edges these are."""
+        return jnp.zeros(len(self.counts), bool).at[self.edges].set(True, mode="drop")
+
+    def plan(self, topology: Topology) -> GatherPlan:
+        """The two ends of each edge, and the far ends of its four neighbours, in one frame."""
+        m = topology
+        edges = jnp.minimum(self.edges, m.n_edges - 1)
+        _, *neighbours = edge_neighbourhood(m, edges)
+        leaving = jnp.stack([take(m.half_edge, edges), *neighbours])
+        here, there = GatherPlan.of(m, leaving), GatherPlan.of(m, take(m.next, leaving))
+        start, end = here.images[:1], there.images[:1]
+        offsets = there.images - here.images
+        images = [start, end, start + offsets[1:3], end + offsets[3:]]
+        vertices = jnp.concatenate([here.vertices[:1], there.vertices])
+        return GatherPlan(vertices, jnp.concatenate(images))
+
+    def vectors(self, positions: Float[Array, "6 some 2"]) -> Float[Array, "4 some"]:
+        """The edge, and the direction that it ought to have, of the points of `plan`."""
+        start, end, a, b, c, d = positions
+        # (Of `edge_axis`, in which the ends of the edge cancel.)
+        return jnp.concatenate([end - start, c + d - a - b], axis=-1).T
+
+    def forces(self, slopes: Float[Array, "4 some"]) -> Float[Array, "6 some 2"]:
+        """The transpose of `vectors`."""
+        edge, axis = slopes[:2].T, slopes[2:].T
+        return jnp.stack([-edge, edge, -axis, -axis, axis, axis])
+
+    def expansion(self, vectors: Float[Array, "4 some"]) -> Expansion:
+        """The energy of each row, $F r\\, f(s)\\, \\varphi(w)$, and its derivatives."""
+        u, a = vectors[:2], vectors[2:]
+        s = total(u * u)
+        squared = total(a * a)
+        axis = jax.lax.rsqrt(jnp.where(squared > 0, squared, 1))
+        n = a * axis
+        root = jax.lax.rsqrt(s + (FLOOR * self.reach) ** 2)
+        along = total(u * n)
+        half = 0.5 / self.reach
+        w = half * ((s + (FLOOR * self.reach) ** 2) * root + along)
+        scale = 1 / (_FADE * self.reach) ** 2
+        fade = jnp.maximum(1 - scale * s, 0)
+        f, df, ddf = fade**3, -3 * scale * fade**2, 6 * scale**2 * fade
+        b = profile(w)
+        strength = jnp.where(self.edges < len(self.counts), self.force * self.reach, 0)
+        zero = jnp.zeros_like(u)
+        eye = jnp.eye(2, dtype=u.dtype)[:, :, None]
+        across = eye - outer(n, n)
+        pull = total(across[:, j] * u[j] for j in range(2))  # u less its part along the axis
+        uu = half * (eye * root - outer(u, u) * root**3)
+        ua = half * axis * across
+        aa = -half * axis**2 * (along * across + outer(pull, n) + outer(n, pull))
+        wide = lambda uu, ua, aa: jnp.concatenate(
+            [jnp.concatenate([uu, ua], 1), jnp.concatenate([ua, aa], 1)]
+        )
+        none = jnp.zeros_like(across)
+        return composed(
+            strength * f * b.value,
+            (strength * df * b.value, strength * f * b.first),
+            (strength * ddf * b.value, strength * df * b.first, strength * f * b.second),
+            (
+                jnp.concatenate([2 * u, zero]),
+                half * jnp.concatenate([u * root + n, axis * pull]),
+            ),
+            (wide(2 * eye + none, none, none), wide(uu, ua, aa)),
+        )
+
+    def updated(
+        self, turned: Bool[Array, " edges"], squared: Float[Array, " edges"]
+    ) -> InversionBarrier:
+        """With edges that were put upright, and without those that have grown.
+
+        **Arguments:**
+
+        - `turned`: which edges were put upright.
+        - `squared`: their squared lengths.
+        """
+        n = turned.size
+        counts = self.counts + turned
+        held = self.held & (squared < (_LONG * self.reach) ** 2)
+        held |= turned & (counts >= _OFTEN)
+        edges, valid = indices_of(held, len(self.edges))
+        edges = jnp.where(valid, edges, n)
+        return InversionBarrier(edges.astype(self.edges.dtype), counts, self.reach, self.force)
+
+
+# An edge is held until it is so long: one step could turn it again from where its barrier ends.
+_LONG = 4 * _FADE
+# An edge is held once it was put upright so often. (Edges under high tension often turn on their way.)
+_OFTEN = 8
+# So many edges are held at most, or one of so many.
+_FEWEST, _SHARE = 16, 256
+
+
+def inversion_energy_of_all(
+    tissue: Tissue, reach: Float[Array, ""], force: Float[Array, ""]
+) -> Array:
+    """The energy of the barrier of all edges."""
+    edges = jnp.arange(tissue.n_edges, dtype=tissue.topology.edge.dtype)
+    every = InversionBarrier(edges, jnp.zeros_like(edges), reach, force)
+    return barrier_energy(every, every.plan(tissue.topology).positions(tissue))

@@ -1,0 +1,167 @@
+"""The barrier between corners and sides of a face."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vertax._base.extremes import lesser
+from vertax._base.reciprocal import reciprocal
+from vertax._base.sums import total
+from vertax.mesh._sides import (
+    Sides,
+    bulge_gap,
+    circle_of,
+    dot,
+    squared_distance_to_arc,
+    squared_distance_to_segment,
+    wedge,
+)
+from vertax.relax._barrier import (
+    AbstractBarrier,
+    Expansion,
+    barrier,
+    composed,
+    outer,
+    profile,
+)
+
+
+class PairBarrier(AbstractBarrier):
+    r"""The barrier between corners and sides that are near.
+
+    A face overlaps itself where a corner reaches a side that it does not end. The energy of a corner at the
+    distance $D$ from a side, with the range $d$ and $s = D^2 / d^2$, is
+
+    $$-S d^2 (1 - s)^2 \ln s \quad \text{if } s < 1, \text{ otherwise } 0,$$
+
+    twice differentiable, and nearly infinite at $s = 0$ (Li et al. 2020, doi:10.1145/3386569.3392425; the
+    logarithm is that of $s + 10^{-4}$: an edge that shrinks to nothing may point anywhere, also along
+    another side, and an infinite curvature would hide all others).
+
+    Corners that share a short edge are near each other and not in contact. So for a side next to one of the
+    corner's own sides the range is $1 / d^2 = 1 / d_0^2 + 1 / (m r)^2$ with the distance $r$ from their
+    common end: there the angle counts.
+
+    **Arguments:**
+
+    - `distance`: the range $d_0$, a length.
+    - `slope`: $m$.
+    - `strength`: $S$, energy per length squared.
+    - `after`, `before`: whether the side of each pair comes after that which leaves the corner, or before
+        that which arrives there.
+    - `valid`: which rows are pairs.
+    """
+
+    distance: Float[Array, ""]
+    slope: Float[Array, ""]
+    strength: Float[Array, ""]
+    after: Bool[Array, " pairs"]
+    before: Bool[Array, " pairs"]
+    valid: Bool[Array, " pairs"]
+
+    def vectors(self, positions: Float[Array, "3 pairs 2"]) -> Float[Array, "4 pairs"]:
+        """The corner from the start of the side, and the chord."""
+        corner, start, end = positions
+        return jnp.concatenate([corner - start, end - start], axis=-1).T
+
+    def forces(self, slopes: Float[Array, "4 pairs"]) -> Float[Array, "3 pairs 2"]:
+        """The transpose of `vectors`."""
+        corner, end = slopes[:2].T, slopes[2:].T
+        return jnp.stack([corner, -corner - end, end])
+
+    def expansion(self, vectors: Float[Array, "4 pairs"]) -> Expansion:
+        r"""The energies of pairs of straight sides, $S / I\, \varphi(u I)$, and their derivatives.
+
+        With the corner at $x$ and the side from 0 to $c$, $u = |x - t c|^2$ is the squared distance,
+        $v = |x - e c|^2$ that of the nearer end, and $I(v) = 1 / d_0^2 + b / v$ the inverse squared range.
+        Inside of the side the derivative of $u$ by $t$ vanishes; at its ends $t$ is fixed.
+        """
+        x, c = vectors[:2], vectors[2:]
+        squared = total(c * c)
+        inverse_squared = 1 / jnp.where(squared > 0, squared, 1)
+        along = total(x * c)
+        t = jnp.clip(along * inverse_squared, 0, 1)
+        inside = (t > 0) & (t < 1)
+        e = (along > 0.5 * squared).astype(x.dtype)
+        way, arm = x - t * c, x - e * c
+        u, v = total(way * way), total(arm * arm)
+        inverse_v = 1 / jnp.where(v > 0, v, 1)
+        joined = (self.after | self.before) & (v > 0)
+        b = jnp.where(joined, inverse_v / self.slope**2, 0)
+        inverse = 1 / self.distance**2 + b
+        square = 1 / inverse
+        s = jnp.where(self.valid, u * inverse, 1)
+        f = profile(s)
+        # By I: of φ(u I) / I.
+        by_i = (f.first * s - f.value) * square**2
+        by_ii = (2 * f.value - 2 * f.first * s + f.second * s**2) * square**3
+        d1, d2 = -b * inverse_v, 2 * b * inverse_v**2
+        eye = jnp.eye(2, dtype=x.dtype)[:, :, None]
+
+        def quadratic(t: Float[Array, " pairs"]) -> Float[Array, "4 4 pairs"]:
+            """The second derivative of $|x - t c|^2$ for a fixed t."""
+            first = jnp.concatenate([2 * eye * (1 + 0 * t), -2 * eye * t], axis=1)
+            return jnp.concatenate([first, jnp.concatenate([-2 * eye * t, 2 * eye * t**2], axis=1)])
+
+        turn = jnp.where(inside, 1, 0) * jnp.concatenate([-2 * c, 2 * t * c - 2 * way])
+        scale = lambda f: self.strength * f
+        return composed(
+            scale(f.value * square),
+            (scale(f.first), scale(by_i * d1)),
+            (
+                scale(f.second * inverse),
+                scale(f.second * s * square * d1),
+                scale(by_ii * d1**2 + by_i * d2),
+            ),
+            (
+                jnp.concatenate([2 * way, -2 * t * way]),
+                jnp.concatenate([2 * arm, -2 * e * arm]),
+            ),
+            (quadratic(t) - 0.5 * inverse_squared * outer(turn, turn), quadratic(e)),
+        )
+
+    def heights(self, one: Sides, other: Sides) -> Float[Array, " pairs"]:
+        """The energies of pairs of sides that may be arcs."""
+        heights = jnp.zeros(len(one), one.dtype)
+        for near, squared in self.nearness(one, other, self.after, self.before):
+            # (A side that is far away may be at an infinite distance.)
+            valid = self.valid & (near < 1)
+            heights += squared * barrier(jnp.where(valid, near, 1))
+        return self.strength * heights
+
+    def nearness(
+        self, one: Sides, other: Sides, after: Bool[Array, " n"], before: Bool[Array, " n"]
+    ) -> list[tuple[Float[Array, " n"], Float[Array, " n"]]]:
+        """Squared distance over squared range, and the squared range times a weight.
+
+        The distance is that of the start of one side from the other; of arcs also that between the two, or
+        the angle if one follows on the other.
+        """
+        apart = jnp.broadcast_to(reciprocal(self.distance**2), after.shape)
+
+        def inverse_square(arm: Float[Array, " n"], where: Bool[Array, " n"]) -> Float[Array, " n"]:
+            """Of the range, where a side is next to another one with a squared distance to its end."""
+            where &= arm > 0
+            return apart + jnp.where(where, reciprocal(self.slope**2 * jnp.where(where, arm, 1)), 0)
+
+        first = one[:, :2] - other[:, :2]
+        last = first - other[:, 2:4]
+        inverse = inverse_square(lesser(dot(first, first), dot(last, last)), after | before)
+        squared = reciprocal(inverse)
+        if one.shape[-1] == 4:
+            return [(squared_distance_to_segment(one[:, :2], other) * inverse, squared)]
+        circles = circle_of(one), circle_of(other)
+        near = [(squared_distance_to_arc(one[:, :2], other, circles[1]) * inverse, squared)]
+        sine, cosine = wedge(one, circles)
+        acute = after & (cosine > 0) & (sine > 0)
+        arms = dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])
+        # (The corner's other side is next to the one before. This one is not, and may come near anywhere.)
+        inverse = inverse_square(lesser(*arms), after)
+        angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
+        gap, weight = bulge_gap(one, other, circles, self.distance)
+        far = jnp.isinf(gap)
+        gap = jnp.where(far, jnp.inf, jnp.where(far, 1, gap) ** 2 * inverse)
+        weight = reciprocal(inverse) * jnp.where(after, 1, weight)
+        near.append((jnp.where(after, angle, gap), weight))
+        return near

@@ -1,0 +1,344 @@
+"""Mechanical equilibrium: relaxation with topology changes, then one differentiable solve."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float, Int, PyTree
+
+from vertax._base.announce import announced_jit
+from vertax._base.checks import check_number, named
+from vertax._base.memory_maps import warn_of_memory_maps
+from vertax._base.modules import differs_between_devices, is_concrete, traced
+from vertax._base.vmapping import one_at_a_time
+from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
+from vertax.adjoints._adjoint import frozen
+from vertax.energies import AbstractEnergy
+from vertax.energies._energy import check_energy
+from vertax.energies._units import cell_size, units_of
+from vertax.mesh import Tissue
+from vertax.precondition._elastic_medium import ElasticMedium
+from vertax.precondition._recycled_hessian import RecycledHessian
+from vertax.relax._equilibrium import SearchEnd, conclude
+from vertax.relax._loop import Search, objective
+from vertax.relax._response import AbstractResponse, Equilibrium
+from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
+from vertax.solvers._optimistix import check_solver
+from vertax.solvers._solver import AbstractIteration, Stepwise
+from vertax.solvers._stop_at_rest import StopAtRest
+from vertax.transitions import T1, AbstractTransitions
+
+
+class Relaxation(AbstractResponse):
+    r"""The tissue comes to rest, $X^* \in \arg\min_X E(X, \theta)$ (paper, Methods).
+
+    Call it with a tissue and an energy, or give it to an
+    [`InverseProblem`][vertax.InverseProblem]; [`equilibrate`][vertax.equilibrate] does both in one line.
+
+    Defaults know the units of the tissue, so it relaxes alike in micrometres, in pixels and in cells of
+    area 1: lengths are measured in the root mean cell area $\ell$, forces in $k \ell$ with $k$ the mean
+    eigenvalue of the Hessian where the relaxation starts.
+
+    **Arguments:**
+
+    - `solver`: a minimiser of `vertax.solvers` or of Optimistix; [`NewtonCG`][vertax.solvers.NewtonCG]
+        by default, which reaches true equilibria.
+    - `transitions`: the rule for topology changes, or None to keep the topology.
+    - `tolerance`: largest force (component of $\nabla_X E$) that counts as equilibrium, in units of
+        energy per length; by default $10^{-10}\,k \ell$ in float64 and $10^{-5}\,k \ell$ in float32.
+    - `consecutive_steps`: number of consecutive steps for which the force must stay below the tolerance.
+    - `max_steps`: most steps of the minimiser.
+    - `contact_range`: how near a corner comes to a side of the same cell (or of the outline) before a
+        barrier holds it off, in units of the size of a cell; see [Contact](../concepts.md#contact). 0 leaves
+        the barrier out, and steps that would make cells overlap are still refused; None lets them overlap.
+    - `preconditioner`: the Hessian of a nearby equilibrium, see `with_preconditioner`. It changes the time of
+        a relaxation, not its result.
+
+    `tolerance`, `consecutive_steps`, `max_steps`, `contact_range` and the numbers of `transitions` and of an
+    energy are data: another number compiles nothing anew. The solver and the adjoint are parts of the program.
+
+    **Raises:**
+
+    - `TypeError` for a solver, or transitions, that are none.
+    - `ValueError` for a tolerance or number of steps that is not positive, or a negative
+        contact range.
+    """
+
+    solver: optx.AbstractMinimiser[Any, Any, Any] = eqx.field(default_factory=NewtonCG)
+    transitions: AbstractTransitions | None = T1()
+    tolerance: float | Float[Array, ""] | None = None
+    consecutive_steps: int | Int[Array, ""] = 1
+    max_steps: int | Int[Array, ""] = 2000
+    contact_range: float | Float[Array, ""] | None = 0.01
+    preconditioner: RecycledHessian | None = eqx.field(default=None, kw_only=True, repr=False)
+
+    def __check_init__(self):
+        check_solver(self.solver)
+        if not isinstance(self.transitions, AbstractTransitions | None):
+            raise TypeError(
+                "Argument `transitions` must be a rule for topology changes, e.g. vertax.T1(), or None, "
+                f"but is {self.transitions!r}."
+            )
+        for name in ("tolerance", "consecutive_steps", "max_steps"):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), above=0, many=True)
+        if self.contact_range is not None:
+            check_number("contact_range", self.contact_range, least=0, many=True)
+        if not isinstance(self.preconditioner, RecycledHessian | None):
+            raise TypeError(
+                "Argument `preconditioner` must be a result of `preconditioner_at` of a relaxation, or None, but "
+                f"is {named(self.preconditioner)}."
+            )
+
+    def __call__(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        *,
+        adjoint: AbstractAdjoint | None = None,
+        throw: bool = True,
+    ) -> Equilibrium:
+        """Relax a tissue.
+
+        **Arguments:**
+
+        - `tissue`: where the relaxation starts.
+        - `energy`: what to minimise.
+        - `adjoint`: how to differentiate, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
+            default.
+        - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
+
+        **Returns:** an [`Equilibrium`][vertax.Equilibrium].
+
+        **Raises:** as [`equilibrate`][vertax.equilibrate].
+        """
+        adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
+        self.check(tissue, energy, adjoint)
+        warn_of_memory_maps()
+        tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
+        if all(map(is_concrete, jax.tree.leaves((tissue, energy, self, adjoint)))):
+            # Nothing is differentiated: one program serves all adjoints.
+            adjoint = ImplicitDifferentiation()
+        equilibrium = self.attach(self.primal(tissue, energy), tissue, energy, adjoint)
+        # An error that is raised within a compiled program calls back to the host, and JAX keeps no such
+        # program in its cache on disk.
+        return equilibrium.checked() if throw else equilibrium
+
+    def check(self, tissue: Tissue, energy: Any, adjoint: AbstractAdjoint) -> None:
+        """Refuse what does not go together.
+
+        **Raises:**
+
+        - `TypeError` for an energy that is no function, or an adjoint that is none.
+        - `ValueError` for one that does not go with the solver, or a `jax.shard_map` that this does not.
+        """
+        check_energy(energy)
+        known, size = self.preconditioner, sum(map(jnp.size, jax.tree.leaves(tissue.configuration)))
+        if known is not None and known.inverse.shape != (size, size):
+            raise ValueError(
+                f"Argument `preconditioner` is that of a tissue with {len(known.inverse)} coordinates, but "
+                f"this one has {size}. Take `preconditioner_at` of a tissue like it, or None."
+            )
+        _check_adjoint(adjoint, self._solver)
+        _check_sharding((tissue, energy))
+
+    def primal(self, tissue: Tissue, energy: AbstractEnergy) -> SearchEnd:
+        """The relaxed tissue, by the compiled function that all callers share."""
+        return _search(*frozen((tissue, energy, self.completed(tissue))))
+
+    def attach(
+        self, primal: SearchEnd, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
+    ) -> Equilibrium:
+        return _compiled_attachment(primal, tissue, energy, self.completed(tissue), adjoint)
+
+    def solve(
+        self,
+        tissue: Tissue,
+        energy: AbstractEnergy,
+        adjoint: AbstractAdjoint,
+        *,
+        thrifty: bool = False,
+    ) -> Equilibrium:
+        """Relax a tissue as a part of a larger compiled function: nothing is checked.
+
+        If `thrifty`, a gradient keeps little of it and evaluates the rest again: for one of many in a row.
+        """
+        end = one_at_a_time(search)(*frozen((tissue, energy, self)))
+        finish = eqx.filter_checkpoint(attached) if thrifty else attached
+        return finish(end, tissue, energy, self, adjoint)
+
+    def finer(self, tolerance: Float[Array, ""]) -> Relaxation:
+        """The same, at rest only where the largest force is below this tolerance too."""
+        if self.tolerance is not None:
+            tolerance = jnp.minimum(tolerance, self.tolerance)
+        return dataclasses.replace(self, tolerance=tolerance)
+
+    def preconditioner_at(
+        self, tissue: Tissue, energy: AbstractEnergy | None
+    ) -> RecycledHessian | None:
+        # (What is large has waves, and too many numbers to square; other solvers have no use for it.)
+        if not self._knows_hessians(tissue):
+            return None
+        start = tissue.configuration
+        if energy is None:
+            return RecycledHessian.unknown(start)
+        slope = jax.grad(lambda y: objective(y, (tissue, energy, None))[0])
+        product = lambda v: jax.jvp(slope, (start,), (v,))[1]
+        return RecycledHessian.at(product, start, cell_size(tissue))
+
+    def _knows_hessians(self, tissue: Tissue) -> bool:
+        return tissue.n_cells < ElasticMedium.min_cells and isinstance(self.solver, NewtonCG)
+
+    def with_preconditioner(self, hessian: RecycledHessian | None) -> Relaxation:
+        return dataclasses.replace(self, preconditioner=hessian)
+
+    @property
+    def minimiser(self) -> StopAtRest:
+        """The solver, judged by its largest force."""
+        return StopAtRest(solver=self._solver, consecutive_steps=self.consecutive_steps)
+
+    @property
+    def _solver(self) -> AbstractSolver:
+        return self.solver if isinstance(self.solver, AbstractSolver) else Wrapped(self.solver)
+
+    def completed(self, tissue: Tissue) -> Relaxation:
+        """As `traced`, with a placeholder for a Hessian that is not known."""
+        relaxation = self if eqx.is_array(self.max_steps) else self.traced()
+        if relaxation.preconditioner is not None or not self._knows_hessians(tissue):
+            return relaxation
+        return dataclasses.replace(relaxation, preconditioner=self.preconditioner_at(tissue, None))
+
+    def traced(self) -> Relaxation:
+        """The same with its numbers as arrays, of which another one compiles nothing anew."""
+        names = ("transitions", "tolerance", "consecutive_steps", "max_steps", "contact_range")
+        numbers = {name: traced(getattr(self, name), integers=True) for name in names}
+        return dataclasses.replace(self, **numbers)
+
+    def search(self, tissue: Tissue, energy: AbstractEnergy) -> Search:
+        """The search for an equilibrium, step by step, in the units of a tissue."""
+        solver = self._solver
+        native = isinstance(solver, NewtonCG)
+        # (NewtonCG measures the stiffness itself.)
+        stiffness = None if native else units_of(tissue, energy).stiffness
+        tolerance = self.tolerance
+        if tolerance is not None:
+            tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
+        return Search(
+            solver if isinstance(solver, AbstractIteration) else Stepwise(solver),
+            self.transitions,
+            frozen(cell_size(tissue)),
+            frozen(stiffness),
+            frozen(tolerance),
+            self.consecutive_steps,
+            self.contact_range,
+            frozen(self.preconditioner),
+        )
+
+
+def equilibrate(
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    *,
+    solver: optx.AbstractMinimiser[Any, Any, Any] | None = None,
+    adjoint: AbstractAdjoint | None = None,
+    transitions: AbstractTransitions | None = T1(),
+    tolerance: float | Float[Array, ""] | None = None,
+    consecutive_steps: int | Int[Array, ""] = 1,
+    max_steps: int | Int[Array, ""] = 2000,
+    contact_range: float | Float[Array, ""] | None = 0.01,
+    throw: bool = True,
+) -> Equilibrium:
+    r"""Relax a tissue to mechanical equilibrium, $X^* \in \arg\min_X E(X, \theta)$ (paper, Methods).
+
+    The relaxation and its T1 transitions find the final topology and positions; the gradient is that
+    of the equilibrium in this topology, by the method that `adjoint` names. Works under `jax.jit`,
+    `jax.vmap` (over tissues of one size, and over parameters) and `jax.grad` with respect to the energy,
+    the boundary, pinned vertices and the start. (The equilibrium keeps the centroid of the start, and the
+    orientation of a free tissue, unless the energy or pins determine them. Otherwise it does not depend on
+    the start, if it is unique.)
+
+    **Arguments:**
+
+    - `tissue`: where the relaxation starts.
+    - `energy`: what to minimise.
+    - `adjoint`: how to differentiate, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
+        default.
+    - `solver`, `transitions`, `tolerance`, `consecutive_steps`, `max_steps`, `contact_range`: see
+        [`Relaxation`][vertax.Relaxation], whose convenient form this is.
+    - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
+
+    **Returns:** an [`Equilibrium`][vertax.Equilibrium].
+
+    **Raises:**
+
+    - `ValueError` for a tolerance or number of steps that is not positive.
+    - `ValueError` within `jax.shard_map` that checks which values differ between devices: pass
+        `check_vma=False`.
+    - `TypeError` for an adjoint that is none of `vertax.adjoints`, or a solver that is no minimiser.
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge, or
+        its cells overlap, as they already did in `tissue`.
+    """
+    solver = NewtonCG() if solver is None else solver
+    response = Relaxation(
+        solver, transitions, tolerance, consecutive_steps, max_steps, contact_range
+    )
+    return response(tissue, energy, adjoint=adjoint, throw=throw)
+
+
+def search(tissue: Tissue, energy: AbstractEnergy, relaxation: Relaxation) -> SearchEnd:
+    """Relax a tissue, step by step."""
+    search = relaxation.search(tissue, energy)
+    state = search.advance(search.begin(tissue, energy), energy, relaxation.max_steps)
+    return SearchEnd.of(search, state)
+
+
+def attached(
+    end: SearchEnd,
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    relaxation: Relaxation,
+    adjoint: AbstractAdjoint,
+) -> Equilibrium:
+    """The equilibrium at the end of a search by `relaxation`, differentiable."""
+    parts = relaxation.minimiser, relaxation.max_steps, relaxation.preconditioner
+    return conclude(end, tissue, energy, adjoint, *parts)
+
+
+_search = announced_jit(one_at_a_time(search))
+_compiled_attachment = announced_jit(attached)
+
+
+def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
+    if not isinstance(adjoint, AbstractAdjoint):
+        raise TypeError(
+            "Argument `adjoint` must be one of vertax.adjoints, e.g. ImplicitDifferentiation(), but is "
+            f"{type(adjoint).__name__}."
+        )
+    if adjoint.unrolls and not solver.unrollable:
+        inner = solver.solver if isinstance(solver, Wrapped) else solver
+        raise ValueError(
+            f"{type(adjoint).__name__} differentiates the steps of the solver, which line searches and "
+            f"inner loops do not allow, so it does not go with {type(inner).__name__}. Pass e.g. "
+            "solver=vertax.solvers.GradientDescent() or Optax(optax.sgd(1e-2, momentum=0.9)), or "
+            "keep the solver and use ImplicitDifferentiation or EquilibriumPropagation."
+        )
+    if isinstance(adjoint, EquilibriumPropagation) and adjoint.nudge == "cost":
+        raise ValueError(
+            "EquilibriumPropagation(nudge='cost') needs to know the cost: use it in an InverseProblem, "
+            "or nudge='linear' here."
+        )
+
+
+def _check_sharding(tree: PyTree) -> None:
+    # Within `shard_map` JAX tells apart what differs from device to device and what does not, and a loop
+    # that begins with a plain 0 and counts is refused. The loops of Optimistix and Equinox do.
+    if any(differs_between_devices(x) for x in jax.tree.leaves(tree) if eqx.is_array(x)):
+        raise ValueError(
+            "A relaxation within jax.shard_map needs jax.shard_map(..., check_vma=False): its loops begin "
+            "with numbers that are the same on all devices."
+        )
