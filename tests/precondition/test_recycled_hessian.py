@@ -92,7 +92,7 @@ def test_large_tissues_and_other_responses_have_none():
 
 
 def test_what_is_none_or_that_of_another_tissue_is_refused(known, as_a_user):
-    with pytest.raises(TypeError, match="`preconditioner` must be what `preconditioner_at`"):
+    with pytest.raises(TypeError, match="`preconditioner` must be a result of `preconditioner_at`"):
         RELAXATION.with_preconditioner("soft")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="a tissue with 64 coordinates, but this one has 32"):
         RELAXATION.with_preconditioner(known)(random_tissue(8), ShapeFactorEnergy(3.7))

@@ -59,7 +59,7 @@ class Relaxation(AbstractResponse):
     - `preconditioner`: the Hessian of a nearby equilibrium, see `with_preconditioner`. It changes the time of
         a relaxation, not its result.
 
-    `tolerance`, `consecutive_steps`, `max_steps`, `contact_range` and the numbers of `transitions` and of an
+    `tolerance`, `consecutive_steps`, `max_steps`, `contact_range`, numbers of `transitions` and numbers of an
     energy are data: another number compiles nothing anew. The solver and the adjoint are parts of the program.
 
     **Raises:**
@@ -91,7 +91,7 @@ class Relaxation(AbstractResponse):
             check_number("contact_range", self.contact_range, least=0, many=True)
         if not isinstance(self.preconditioner, RecycledHessian | None):
             raise TypeError(
-                "Argument `preconditioner` must be a result of `preconditioner_at` of a relaxation, or None, but "
+                "Argument `preconditioner` must be a result of `preconditioner_at`, or None, but "
                 f"is {named(self.preconditioner)}."
             )
 
