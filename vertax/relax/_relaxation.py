@@ -60,7 +60,7 @@ class Relaxation(AbstractResponse):
         a relaxation, not its result.
 
     `tolerance`, `consecutive_steps`, `max_steps`, `contact_range`, numbers of `transitions` and numbers of an
-    energy are data: another number compiles nothing anew. The solver and the adjoint are parts of the program.
+    energy are data: another number compiles nothing. The solver and the adjoint are static.
 
     **Raises:**
 
