@@ -17,7 +17,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from _arguments import count
 
 import vertax as vx
@@ -52,7 +51,7 @@ def row(name: str, cases: list[tuple[vx.Tissue, vx.AbstractEnergy]]) -> None:
             began = time.perf_counter()
             found.append(jax.block_until_ready(relax(tissue, energy, reach)))
             seconds.append(time.perf_counter() - began)
-        at_rest = np.mean([bool(e.result == optx.RESULTS.successful) for e in found])
+        at_rest = np.mean([bool(e.result == vx.RESULTS.successful) for e in found])
         overlap = np.mean([bool(faces_that_overlap(e.tissue)) for e in found])
         steps = np.array([int(e.num_steps) for e in found])
         medians.append(np.median(seconds))

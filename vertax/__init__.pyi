@@ -62,6 +62,7 @@ from .plotting import (
     plot_tissue as plot_tissue,
 )
 from .relax import (
+    RESULTS as RESULTS,
     AbstractResponse as AbstractResponse,
     Equilibrium as Equilibrium,
     Relaxation as Relaxation,

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 from free_helpers import cluster
 from helpers import (
@@ -94,7 +93,7 @@ class TestWithoutActivity:
         """The message of a batch is that of the member which fails in the earliest frame."""
         of_frame = jnp.arange(6)
         late = dataclasses.replace(
-            movie, sound=of_frame < 4, result=optx.RESULTS.nonlinear_max_steps_reached
+            movie, sound=of_frame < 4, result=vx.RESULTS.nonlinear_max_steps_reached
         )
         early = dataclasses.replace(
             movie,
@@ -104,7 +103,7 @@ class TestWithoutActivity:
             max_force=jnp.array(0.5),
         )
         broken = dataclasses.replace(
-            late, max_force=jnp.array(jnp.nan), result=optx.RESULTS.nonfinite
+            late, max_force=jnp.array(jnp.nan), result=vx.RESULTS.nonfinite
         )
         with pytest.raises(RuntimeError, match=r"time 0.04 \(frame 4\) a step in time did not"):
             late.checked()

@@ -7,7 +7,7 @@ NAMES = """
 AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy
 AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiation Checkpoint
 Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free
-GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic Record Relaxation
+GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic RESULTS Record Relaxation
 T1 T2 Tissue Topology Uncertainty activities adjoints animate costs dissipations dynamics
 enable_compilation_cache energies equilibrate evolve external fit fitting growth inference
 initialise io load_tissue mechanics mesh plot_history plot_recovery plot_tissue plotting relax
@@ -51,7 +51,7 @@ FAMILIES = {
     "dynamics": "Evolution Evolved Material StepControl evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
-    "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
+    "relax": "AbstractResponse Equilibrium RESULTS Relaxation equilibrate record_relaxation",
     "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "TruncatedCG VertexTrustRegion Wrapped",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",

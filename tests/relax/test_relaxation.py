@@ -256,7 +256,7 @@ def test_no_convergence_is_an_error_by_default_and_a_result_otherwise():
     found = vx.equilibrate(tissue, energy, max_steps=2, throw=False)
     assert not found.converged
     assert found.num_steps == 2
-    assert found.result == optx.RESULTS.nonlinear_max_steps_reached
+    assert found.result == vx.RESULTS.nonlinear_max_steps_reached
 
 
 def test_a_parameter_that_is_not_a_number_is_reported():
@@ -264,7 +264,7 @@ def test_a_parameter_that_is_not_a_number_is_reported():
     p0 = lambda e: e.target_shape_factor
     energy = eqx.tree_at(p0, ShapeFactorEnergy(jnp.full(12, 3.7)), jnp.full(12, jnp.nan))
     found = vx.equilibrate(random_tissue(12, 0), energy, throw=False)
-    assert found.result == optx.RESULTS.nonfinite
+    assert found.result == vx.RESULTS.nonfinite
     assert found.num_steps == 0
     message = "broke down: its forces are not finite. The parameters of the energy must be finite"
     with pytest.raises(RuntimeError, match=message):
@@ -284,7 +284,7 @@ def equilibrium(**outcome):
         num_steps=jnp.array(3),
         num_t1=jnp.array(0),
         valid=jnp.array(True),
-        result=optx.RESULTS.successful,
+        result=vx.RESULTS.successful,
     )
     return dataclasses.replace(converged, **outcome)
 
@@ -292,9 +292,9 @@ def equilibrium(**outcome):
 @pytest.mark.parametrize(
     ("outcome", "message"),
     [
-        ({"result": optx.RESULTS.nonlinear_max_steps_reached}, "reached no equilibrium"),
+        ({"result": vx.RESULTS.nonlinear_max_steps_reached}, "reached no equilibrium"),
         ({"valid": jnp.array(False)}, "Cells of the relaxed tissue overlap"),
-        ({"max_force": jnp.array(jnp.nan), "result": optx.RESULTS.nonfinite}, "must be finite"),
+        ({"max_force": jnp.array(jnp.nan), "result": vx.RESULTS.nonfinite}, "must be finite"),
     ],
 )
 def test_messages_in_compiled_programs_name_the_cause(outcome, message):
@@ -318,7 +318,7 @@ def test_a_relaxation_ends_where_an_energy_ignores_a_coordinate_that_is_nan():
     tissue = tissue.with_vertices(tissue.vertices.at[0].set(jnp.nan))
     found = dataclasses.replace(STILL, max_steps=20)(tissue, _Blind(), throw=False)
     assert found.num_steps <= 20
-    assert found.result == optx.RESULTS.nonfinite
+    assert found.result == vx.RESULTS.nonfinite
 
 
 @pytest.mark.parametrize(

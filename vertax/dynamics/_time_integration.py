@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
@@ -20,7 +19,7 @@ from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._incremental_potential import Incremental, flipped_as
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Periodic, Tissue
-from vertax.relax._response import Equilibrium
+from vertax.relax import RESULTS, Equilibrium
 
 # Of a method of second order with two stages of this share of a step each (SDIRK: Alexander 1977,
 # doi:10.1137/0714068), which damps what is fast as the implicit Euler method does.
@@ -53,16 +52,16 @@ class State(eqx.Module):
             self.num_steps + step.num_steps,
             self.num_t1 + step.num_t1,
             self.valid & step.valid & _right_handed(step.tissue.boundary),
-            self.arrived & (step.result == optx.RESULTS.successful),
+            self.arrived & (step.result == RESULTS.successful),
         )
 
     @property
-    def result(self) -> optx.RESULTS:
+    def result(self) -> RESULTS:
         """The outcome of all steps."""
-        reached = optx.RESULTS.where(
-            self.arrived, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+        reached = RESULTS.where(
+            self.arrived, RESULTS.successful, RESULTS.nonlinear_max_steps_reached
         )
-        return optx.RESULTS.where(jnp.isfinite(self.max_force), reached, optx.RESULTS.nonfinite)
+        return RESULTS.where(jnp.isfinite(self.max_force), reached, RESULTS.nonfinite)
 
 
 class Frames(NamedTuple):

@@ -24,6 +24,7 @@ from vertax.external._external_gradient import Rest, at_rest, force_of
 from vertax.external._host import Answer, Job, Request, ask, stacked
 from vertax.external._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
 from vertax.mesh import Tissue
+from vertax.relax import RESULTS
 from vertax.relax._equilibrium import follow_start, free_motions
 from vertax.relax._response import AbstractResponse, Equilibrium
 
@@ -307,9 +308,7 @@ def _answered(
     )
 
 
-def _result(
-    tissue: Tissue, force: Float[Array, ""], response: External, units: Units
-) -> optx.RESULTS:
+def _result(tissue: Tissue, force: Float[Array, ""], response: External, units: Units) -> RESULTS:
     still = jnp.array(True)
     if response.slope == "energy":
         tolerance = response.tolerance
@@ -317,11 +316,9 @@ def _result(
             precise = tissue.vertices.dtype == jnp.float64
             tolerance = (1e-6 if precise else 1e-3) * units.force
         still = force <= tolerance
-    result = optx.RESULTS.where(
-        still, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
-    )
+    result = RESULTS.where(still, RESULTS.successful, RESULTS.nonlinear_max_steps_reached)
     finite = jnp.all(jnp.isfinite(tissue.vertices))
-    return optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
+    return RESULTS.where(finite, result, RESULTS.nonfinite)
 
 
 def _n_motions(tissue: Tissue) -> int:

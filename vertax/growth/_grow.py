@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.announce import announce_compilations, announced_jit
@@ -22,7 +21,7 @@ from vertax.energies import AbstractEnergy
 from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, died_at, divided_at, founded
 from vertax.mesh import Tissue, Trajectory
-from vertax.relax import Relaxation
+from vertax.relax import RESULTS, Relaxation
 from vertax.transitions import T1, T2
 from vertax.transitions._division import divided
 
@@ -280,7 +279,7 @@ def _grow(
         moved = relaxation.solve(before, potential, adjoint, thrifty=True)
         gone = before.alive & ~moved.tissue.alive
         lineage, number = died_at(state.lineage, state.number, gone, end)
-        sound = state.sound & (moved.result == optx.RESULTS.successful) & moved.valid
+        sound = state.sound & (moved.result == RESULTS.successful) & moved.valid
         overdue = moved.tissue.alive & cycle.overdue(state.cells, moved.tissue)
         return _State(
             tissue=moved.tissue,

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.checks import as_real, check_number, check_whole
@@ -21,7 +20,7 @@ from vertax.mechanics._elasticity import elastic_tensor
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue
-from vertax.relax import AbstractResponse, Equilibrium, Relaxation
+from vertax.relax import RESULTS, AbstractResponse, Equilibrium, Relaxation
 
 # Orthogonal directions of strain, in components xx, yy and γ = 2 xy.
 _FREEDOMS = {
@@ -228,7 +227,7 @@ def _relax_box(
     amount = jnp.linalg.solve(end.stiffness, missing(stress(here.tissue, energy), response))
     box = deformed(end.tissue, _gradient(amount @ basis)).boundary
     final = response.relaxation.solve(here.tissue.carried(box), energy, adjoint)
-    result = optx.RESULTS.where(done(end), final.result, optx.RESULTS.nonlinear_max_steps_reached)
+    result = RESULTS.where(done(end), final.result, RESULTS.nonlinear_max_steps_reached)
     return Equilibrium(
         tissue=final.tissue,
         energy=final.energy,
@@ -236,7 +235,7 @@ def _relax_box(
         num_steps=end.num_steps + here.num_steps + final.num_steps,
         num_t1=end.num_t1 + here.num_t1 + final.num_t1,
         valid=final.valid,
-        result=cast(optx.RESULTS, result),
+        result=cast(RESULTS, result),
     )
 
 

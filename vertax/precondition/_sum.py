@@ -43,6 +43,7 @@ class Preconditioner(eqx.Module):
         like: PyTree,
         stiffness: Float[Array, ""],
         coarse: Bool[Array, ""],
+        identity: Bool[Array, ""] | bool = False,
     ) -> TissueInverse:
         """The approximate inverse of the damped Hessian.
 
@@ -52,13 +53,14 @@ class Preconditioner(eqx.Module):
         - `like`: a gradient.
         - `stiffness`: the mean stiffness.
         - `coarse`: whether to use the part in the large.
+        - `identity`: whether to use neither.
         """
         medium: Any = None
         if self.coarse is not None:
             large, coarse = self.coarse, coarse & self.coarse.ready
             measure = lambda: large.measured(product, like, stiffness)
             medium = jax.lax.cond(coarse, measure, lambda: large.unmeasured)
-        return TissueInverse(self, medium, stiffness, coarse, like)
+        return TissueInverse(self, medium, stiffness, coarse, jnp.asarray(identity), like)
 
 
 class TissueInverse(AbstractInverse):
@@ -68,6 +70,7 @@ class TissueInverse(AbstractInverse):
     medium: Any
     stiffness: Float[Array, ""]
     coarse: Bool[Array, ""]
+    identity: Bool[Array, ""]
     like: PyTree
 
     def factors(self, damping: Float[Array, " rows"]) -> PyTree[Array]:
@@ -91,4 +94,4 @@ class TissueInverse(AbstractInverse):
         large = self.preconditioner.coarse
         if large is not None:
             z = jax.lax.cond(self.coarse, lambda: large.added(medium, z, r), lambda: z)
-        return table_of(z)
+        return jnp.where(self.identity, residual, table_of(z))

@@ -6,3 +6,4 @@ from vertax.relax._response import (
     AbstractResponse as AbstractResponse,
     Equilibrium as Equilibrium,
 )
+from vertax.relax._results import RESULTS as RESULTS

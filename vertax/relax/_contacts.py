@@ -28,7 +28,7 @@ class Contacts(eqx.Module):
     - `plan`: where their positions are: the corner, the start and the end of the side.
     - `inversion`: short edges that would turn inside out.
     - `inversion_plan`: where their positions are.
-    - `overflow`: whether there are more pairs than rows, in any step so far.
+    - `overflow`: whether more pairs are near than there are rows.
     """
 
     pairs: PairBarrier
@@ -51,6 +51,11 @@ class Contacts(eqx.Module):
 
         # Most tissues have no contacts most of the time, and then these take longer than the energy.
         return jax.lax.cond(self.some, energy, lambda: jnp.zeros((), tissue.vertices.dtype))
+
+    @property
+    def capacity(self) -> int:
+        """The number of rows for pairs."""
+        return self.sides.shape[-1]
 
     @property
     def some(self) -> Bool[Array, ""]:
@@ -138,12 +143,12 @@ class Contacts(eqx.Module):
             near = [near for near, _ in self.pairs.nearness(one, other, after, before)]
             return near[0] if len(near) == 1 else jnp.minimum(*near)
 
-        m, (_, size) = tissue.topology, self.sides.shape
+        m, size = tissue.topology, self.capacity
         overlapping, nearest, gaps = overlaps_and_nearest(m, tissue.sides, tissue.areas, measure)
         near = (gaps < _MARGIN**2).reshape(-1)
         # (A slice of its results would make XLA sort instead.)
         which, valid = indices_of(near, size)
-        overflow = self.overflow | (number_of(near) > size)
+        overflow = number_of(near) > size
         which = which.astype(m.twin.dtype)
         corner = jax.lax.rem(which, jnp.asarray(m.n_half_edges, which.dtype))
         sides = jnp.where(valid, jnp.stack([corner, take(nearest.reshape(-1), which)]), 0)

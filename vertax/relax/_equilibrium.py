@@ -15,8 +15,10 @@ from vertax.energies._units import Units
 from vertax.mesh import Tissue
 from vertax.precondition._recycled_hessian import RecycledHessian
 from vertax.relax._contacts import Contacts
-from vertax.relax._loop import Search, SearchState, blocks_of, collective_of, objective
+from vertax.relax._loop import Search, SearchState
+from vertax.relax._objective import coarse_preconditioner, edge_preconditioner, objective
 from vertax.relax._response import Equilibrium
+from vertax.relax._results import RESULTS
 from vertax.solvers._stop_at_rest import AtRest, StopAtRest
 
 
@@ -34,12 +36,12 @@ class SearchEnd(eqx.Module):
     num_t1: Int[Array, ""]
     overlaps: Bool[Array, ""] | None
     """Whether the tissue overlaps; None if that is not looked for."""
-    result: optx.RESULTS
+    result: RESULTS
 
     @classmethod
     def of(cls, search: Search, state: SearchState) -> SearchEnd:
         """The end of a search that is not to go on."""
-        options = search.options(state.stiffness)
+        options = search.options(state)
         return cls(
             tissue=state.tissue,
             origin=state.origin,
@@ -83,8 +85,8 @@ def conclude(
         "relaxation": minimiser,
         "start": end.origin,
         "max_steps": jnp.asarray(max_steps),
-        "edge_blocks": blocks_of(settled, energy, end.contacts),
-        "collective": collective_of(settled, preconditioner),
+        "edge_blocks": edge_preconditioner(settled, energy, end.contacts),
+        "collective": coarse_preconditioner(settled, preconditioner),
     }
     # This solve starts at rest and takes no step: it is there to be differentiated.
     solution = optx.minimise(

@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -25,8 +26,11 @@ from vertax.mesh import Tissue
 from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.precondition._recycled_hessian import RecycledHessian
 from vertax.relax._equilibrium import SearchEnd, conclude
-from vertax.relax._loop import Search, objective
+from vertax.relax._feasibility import Feasibility
+from vertax.relax._loop import Search
+from vertax.relax._objective import objective
 from vertax.relax._response import AbstractResponse, Equilibrium
+from vertax.relax._results import RESULTS
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
 from vertax.solvers._optimistix import check_solver
 from vertax.solvers._solver import AbstractIteration, Stepwise
@@ -56,6 +60,9 @@ class Relaxation(AbstractResponse):
     - `contact_range`: how near a corner comes to a side of the same cell (or of the outline) before a
         barrier holds it off, in units of the size of a cell; see [Contact](../concepts.md#contact). 0 leaves
         the barrier out, and steps that would make cells overlap are still refused; None lets them overlap.
+    - `max_contacts`: most corners that may be near a side of the same cell at once; by default as many as
+        there are vertices (a quarter of them above 8000). Where there are more, a call outside of `jax.jit`
+        repeats the relaxation with more room, and otherwise the `result` says so.
     - `preconditioner`: the Hessian of a nearby equilibrium, see `with_preconditioner`. It changes the time of
         a relaxation, not its result.
 
@@ -75,6 +82,7 @@ class Relaxation(AbstractResponse):
     consecutive_steps: int | Int[Array, ""] = 1
     max_steps: int | Int[Array, ""] = 2000
     contact_range: float | Float[Array, ""] | None = 0.01
+    max_contacts: int | None = eqx.field(static=True, default=None, kw_only=True)
     preconditioner: RecycledHessian | None = eqx.field(default=None, kw_only=True, repr=False)
 
     def __check_init__(self):
@@ -84,7 +92,7 @@ class Relaxation(AbstractResponse):
                 "Argument `transitions` must be a rule for topology changes, e.g. vertax.T1(), or None, "
                 f"but is {self.transitions!r}."
             )
-        for name in ("tolerance", "consecutive_steps", "max_steps"):
+        for name in ("tolerance", "consecutive_steps", "max_steps", "max_contacts"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0, many=True)
         if self.contact_range is not None:
@@ -148,8 +156,18 @@ class Relaxation(AbstractResponse):
         _check_sharding((tissue, energy))
 
     def primal(self, tissue: Tissue, energy: AbstractEnergy) -> SearchEnd:
-        """The relaxed tissue, by the compiled function that all callers share."""
-        return _search(*frozen((tissue, energy, self.completed(tissue))))
+        """The relaxed tissue, by the compiled function that all callers share.
+
+        It is relaxed again, with more room for contacts, as long as there are too many.
+        """
+        end = _search(*frozen((tissue, energy, self.completed(tissue))))
+        while is_concrete(end.num_steps) and end.contacts is not None:
+            if not np.any(end.result == RESULTS.too_many_contacts):
+                break
+            room = _MORE_ROOM * end.contacts.capacity
+            wider = dataclasses.replace(self, max_contacts=room)
+            end = _search(*frozen((tissue, energy, wider.completed(tissue))))
+        return end
 
     def attach(
         self, primal: SearchEnd, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
@@ -230,14 +248,19 @@ class Relaxation(AbstractResponse):
             tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
         return Search(
             solver if isinstance(solver, AbstractIteration) else Stepwise(solver),
-            self.transitions,
+            Feasibility(self.transitions),
             frozen(cell_size(tissue)),
             frozen(stiffness),
             frozen(tolerance),
             self.consecutive_steps,
             self.contact_range,
+            self.max_contacts,
             frozen(self.preconditioner),
         )
+
+
+_MORE_ROOM = 4
+"""Factor of `max_contacts` where they are too few."""
 
 
 def equilibrate(

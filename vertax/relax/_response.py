@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import is_concrete
@@ -16,6 +15,7 @@ from vertax.adjoints import AbstractAdjoint
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.precondition._recycled_hessian import RecycledHessian
+from vertax.relax._results import RESULTS
 
 
 class Equilibrium(eqx.Module):
@@ -33,13 +33,13 @@ class Equilibrium(eqx.Module):
     """Transitions on the way: T1, and T2 if the rule has them."""
     valid: Bool[Array, "*batch"]
     """Whether its cells tile the plane; `tissue.overlaps` says where they do not."""
-    result: optx.RESULTS
-    """Outcome of the minimiser; `optimistix.RESULTS[result]` is its message."""
+    result: RESULTS
+    """Outcome of the relaxation; `vertax.RESULTS[result]` is its message."""
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:
         """Whether the largest force fell below the tolerance, in a tissue without overlaps."""
-        return (self.result == optx.RESULTS.successful) & self.valid
+        return (self.result == RESULTS.successful) & self.valid
 
     def checked(self) -> Equilibrium:
         """The same, if it converged.
@@ -56,8 +56,11 @@ class Equilibrium(eqx.Module):
                 f"The relaxation reached no equilibrium. {_REMEDY}",
                 f"Cells of the relaxed tissue overlap. {_UNTANGLE}",
                 f"The relaxation broke down: {_NOT_FINITE}",
+                RESULTS[RESULTS.too_many_contacts],
             )
-            which = jnp.where(jnp.isfinite(self.max_force), jnp.where(self.valid, 0, 1), 2)
+            which = jnp.where(self.result == RESULTS.too_many_contacts, 3, 0)
+            which = jnp.where(self.valid, which, 1)
+            which = jnp.where(jnp.isfinite(self.max_force), which, 2)
             which = jnp.where(converged, 0, which)
             return eqx.branched_error_if(self, ~converged, which, messages)
         if np.all(converged):
@@ -70,6 +73,8 @@ class Equilibrium(eqx.Module):
             raise RuntimeError(
                 f"Cells of the relaxed tissue overlap{members}: {self._first_overlap()}. {_UNTANGLE}"
             )
+        if np.any(self.result == RESULTS.too_many_contacts):
+            raise RuntimeError(f"{RESULTS[RESULTS.too_many_contacts]}{members}")
         raise RuntimeError(
             f"The relaxation reached no equilibrium{members} in {np.max(self.num_steps)} steps (largest "
             f"force {np.max(forces):.1e}). {_REMEDY}"

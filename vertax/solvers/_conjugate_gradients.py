@@ -19,11 +19,14 @@ _SOLVE, _CLIP, _END = range(3)
 
 
 class Proposal(NamedTuple):
-    """A step, its product with the Hessian, its damping, and the number of products that it took."""
+    """A step within bounds."""
 
     step: Table
     product: Table
+    """Of the step with the Hessian."""
     damping: Float[Array, " rows"]
+    curvature: Float[Array, ""]
+    """$d \\cdot (H + \\Lambda) d$ of the last direction of conjugate gradients."""
     num_products: Int[Array, ""]
 
 
@@ -211,4 +214,4 @@ class TruncatedCG(eqx.Module):
         )
         end = jax.lax.while_loop(lambda s: s.phase != _END, iterate, begin)
         hp = end.residual - gradient - end.damping[:, None] * end.step
-        return Proposal(end.step, hp, end.damping, end.num_products)
+        return Proposal(end.step, hp, end.damping, end.curvature, end.num_products)

@@ -30,8 +30,8 @@ from vertax.solvers._rows import (
 from vertax.solvers._solver import AbstractIteration, AbstractSolver, Progress, value_and_gradient
 from vertax.solvers._trust_region import VertexTrustRegion
 
-# What the next evaluation is for.
-_EVALUATE, _STEP, _CORRECTION, _RETURN = range(4)
+# The purpose of the next evaluation.
+_MEASURE, _EVALUATE, _STEP, _CORRECTION, _RETURN = range(5)
 
 
 class Model(NamedTuple):
@@ -62,6 +62,8 @@ class NewtonState(eqx.Module):
     error: Float[Array, " rows"]
     """The error of the predicted forces after the step."""
     radii: Float[Array, " rows"]
+    stiffness: Float[Array, ""]
+    """A typical second derivative."""
     typical: Float[Array, ""]
     """The typical force at the iterate,"""
     previous: Float[Array, ""]
@@ -133,16 +135,17 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         none, infinite = jnp.array(0), jnp.full(struct.shape, jnp.inf, struct.dtype)
         reach = self.max_displacement * options.get("length_scale", 1.0)
         return NewtonState(
-            phase=none,
+            phase=jnp.array(_MEASURE if "probe" in options else _EVALUATE),
             trial=zero,
             base=zero,
             base_value=infinite,
             value=infinite,
             gradient=zero,
-            proposal=Proposal(zero, zero, rows, none),
+            proposal=Proposal(zero, zero, rows, jnp.zeros_like(infinite), none),
             predicted=jnp.zeros_like(infinite),
             error=rows,
             radii=rows + reach,
+            stiffness=jnp.asarray(options.get("stiffness", 1.0), table.dtype),
             typical=infinite,
             previous=infinite,
             num_corrections=none,
@@ -174,10 +177,11 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     def _judged(self, model: Model, options: Any, s: NewtonState) -> NewtonState:
         """Accept or reject the trial point, or correct the step."""
         value, g = model.value, model.gradient
-        length, unit = self._units(options)
+        length, unit = self._units(options, s)
         squared = inner(g, g)
         finite = jnp.isfinite(value) & jnp.isfinite(squared)
-        anew, first = s.phase == _EVALUATE, s.phase == _STEP
+        measures = s.phase == _MEASURE
+        anew, first = measures | (s.phase == _EVALUATE), s.phase == _STEP
         corrected = s.phase == _CORRECTION
         typical = typical_size(g)
         gained = s.value - value
@@ -210,8 +214,9 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         force = jnp.where(accepted, max_size(g), s.progress.force)
         zero = jnp.zeros_like(g)
         now, before = jnp.where(corrects, s.trial, s.base), jnp.where(accepted, g, s.gradient)
+        evaluate = jnp.where(measures, _MEASURE, _EVALUATE)
         return NewtonState(
-            phase=jnp.where(corrects, _CORRECTION, jnp.where(returns, _RETURN, _EVALUATE)),
+            phase=jnp.where(corrects, _CORRECTION, jnp.where(returns, _RETURN, evaluate)),
             trial=jnp.where(corrects | returns, now, zero),
             base=now,
             base_value=jnp.where(corrects, value, s.base_value),
@@ -221,6 +226,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             predicted=s.predicted,
             error=error,
             radii=jnp.where(judged, radii, s.radii),
+            stiffness=s.stiffness,
             typical=jnp.where(accepted, typical, s.typical),
             previous=jnp.where(accepted & ~anew, s.typical, s.previous),
             num_corrections=jnp.where(judged, 0, s.num_corrections + corrects),
@@ -239,37 +245,53 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         - `active`: whether that point is the iterate, and a step from it is wanted.
         """
         s = state
-        length, unit = self._units(options)
+        length, unit = self._units(options, s)
         reach = self.max_displacement * length
-        corrects = s.phase == _CORRECTION
-        solves = active | corrects
+        measures, corrects = s.phase == _MEASURE, s.phase == _CORRECTION
+        solves = active | corrects | measures
+        gradient = model.gradient
+        if "probe" in options:
+            gradient = jnp.where(measures, options["probe"], gradient)
         useful = jnp.minimum(0.1, 0.9 * (s.typical / jnp.where(s.previous > 0, s.previous, 1)) ** 2)
         useful = jnp.where(jnp.isfinite(s.previous), useful, 0)
         forcing = jnp.minimum(self.forcing, jnp.maximum(self._finest(s.typical, unit), useful))
         damping = jnp.where(corrects, s.proposal.damping, sizes(s.gradient) / s.radii)
+        damping = jnp.where(measures, 0, damping)
         bounds = jnp.minimum(s.radii, jnp.where(corrects, self.correction_displacement, 1) * reach)
         bounds = jnp.where(corrects, bounds, s.radii)
         near = self._finest(s.typical, unit) < self.forcing
-        inverse = self._inverse(model, options, near & active)
+        inverse = self._inverse(model, options, s.stiffness, near & active, measures)
+        max_products = jnp.where(corrects, self.correction_products, self.max_products)
         proposal = self.conjugate_gradients(
             model.product,
-            model.gradient,
+            gradient,
             damping,
             bounds,
             inverse,
             jnp.where(corrects, self.correction_forcing, forcing),
-            jnp.where(corrects, self.correction_products, self.max_products),
+            jnp.where(measures, 1, max_products),
             solves,
         )
         steps = active & ~corrects
         p, hp = proposal.step, proposal.product
         predicted = -inner(p, model.gradient + 0.5 * hp)
         trial = jnp.where(corrects, s.base + p, jnp.where(steps, p, s.trial))
+        stiffness = jnp.abs(proposal.curvature) / inner(gradient, gradient)
+        stiffness = jnp.where(jnp.isfinite(stiffness) & (stiffness > 0), stiffness, 1)
         return eqx.tree_at(
-            lambda s: (s.phase, s.trial, s.proposal, s.predicted, s.base, s.num_products),
+            lambda s: (
+                s.phase,
+                s.stiffness,
+                s.trial,
+                s.proposal,
+                s.predicted,
+                s.base,
+                s.num_products,
+            ),
             s,
             (
-                jnp.where(steps, _STEP, s.phase),
+                jnp.where(steps, _STEP, jnp.where(measures, _EVALUATE, s.phase)),
+                jnp.where(measures, stiffness, s.stiffness),
                 trial,
                 choose(steps, proposal, s.proposal),
                 jnp.where(steps, predicted, s.predicted),
@@ -278,14 +300,21 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             ),
         )
 
-    def _inverse(self, model: Model, options: Any, coarse: Bool[Array, ""]) -> AbstractInverse:
-        """The preconditioner."""
-        stiffness = options.get("stiffness", 1.0)
+    def _inverse(
+        self,
+        model: Model,
+        options: Any,
+        stiffness: Float[Array, ""],
+        coarse: Bool[Array, ""],
+        measures: Bool[Array, ""],
+    ) -> AbstractInverse:
+        """The preconditioner; the identity to measure the stiffness."""
         preconditioner = options.get("preconditioner")
         if preconditioner is None or preconditioner.is_diagonal:
             return DiagonalInverse(stiffness)
         product = lambda v: model.point(model.product(table_of(v)))
-        return preconditioner.inverse(product, model.point(model.gradient), stiffness, coarse)
+        like = model.point(model.gradient)
+        return preconditioner.inverse(product, like, stiffness, coarse, measures)
 
     def moved(
         self,
@@ -300,6 +329,9 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         radii = self.trust_region.cut(state.radii, state.proposal.step, rows, reach)
         return eqx.tree_at(lambda s: s.radii, state, jnp.where(changed, radii, state.radii))
 
+    def stiffness(self, state: NewtonState) -> Float[Array, ""]:
+        return state.stiffness
+
     def gradient(self, state: NewtonState) -> Table:
         return state.gradient
 
@@ -312,9 +344,9 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         at_rest = state.progress.accepted & (state.progress.force < self.atol)
         return at_rest, optx.RESULTS.successful
 
-    def _units(self, options: Any) -> tuple[Any, Any]:
+    def _units(self, options: Any, state: NewtonState) -> tuple[Any, Any]:
         length = options.get("length_scale", 1.0)
-        return length, options.get("stiffness", 1.0) * length
+        return length, state.stiffness * length
 
     def _finest(self, typical: Float[Array, ""], unit: Any) -> Float[Array, ""]:
         # (14: the ratio of the norm of all forces and the typical force in a tissue of a hundred cells.)
