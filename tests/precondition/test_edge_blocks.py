@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import vertax as vx
-from vertax.precondition._edge_blocks import EdgeBlocks, EdgeCompliance, Symmetric
+from vertax.precondition._edge_blocks import EdgeBlocks, EdgeInverse, Symmetric
 from vertax.relax._loop import objective
 from vertax.solvers._solver import value_and_gradient
 
@@ -35,7 +35,7 @@ def dense_hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> np.ndarray:
     return np.asarray(jax.jit(jax.hessian(at))(tissue.vertices)).reshape(2 * n, 2 * n)
 
 
-def both_ends(blocks: EdgeBlocks | EdgeCompliance, edge: int) -> np.ndarray:
+def both_ends(blocks: EdgeBlocks | EdgeInverse, edge: int) -> np.ndarray:
     """The block of an edge, four rows."""
     x, y, b = blocks.first, blocks.second, blocks.between
     off = np.array([[b.xx[edge], b.xy[edge]], [b.yx[edge], b.yy[edge]]])
@@ -91,14 +91,14 @@ def test_they_give_way_symmetrically_and_in_the_direction_of_a_force(seed, low, 
 
 @eqx.filter_jit
 def _compliance(tissue, energy, shift):
-    return blocks_of(tissue, energy).compliance(shift)
+    return blocks_of(tissue, energy).approximate_inverse(shift)
 
 
 def test_the_inverse_is_that_of_each_block():
     tissue = foam()
     blocks = blocks_of(tissue, tense(tissue))
     shift = jnp.linspace(0.1, 2.0, tissue.n_vertices)
-    compliance = blocks.compliance(shift)
+    compliance = blocks.approximate_inverse(shift)
     for edge, ends in enumerate(np.asarray(tissue.topology.edge_vertices)):
         more = np.repeat(np.asarray(shift)[ends] + float(blocks.softest), 2)
         expected = np.linalg.inv(both_ends(blocks, edge) + np.diag(more))
@@ -114,7 +114,7 @@ def test_an_edge_of_no_length_under_tension_leaves_it_finite_and_positive(dtype)
         lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x,
         tissue.with_vertices(onto),
     )
-    compliance = blocks_of(tissue, tense(tissue)).compliance()
+    compliance = blocks_of(tissue, tense(tissue)).approximate_inverse()
     for seed in range(5):
         force = np.random.default_rng(seed).normal(size=(tissue.n_vertices, 2))
         moved = compliance(jnp.asarray(force, dtype))
@@ -126,11 +126,11 @@ def test_an_edge_of_no_length_under_tension_leaves_it_finite_and_positive(dtype)
 def test_what_is_held_does_not_give_way():
     held = jnp.arange(foam().n_vertices) % 7 == 0
     tissue = eqx.tree_at(lambda t: t.pinned, foam(), held, is_leaf=lambda x: x is None)
-    moved = blocks_of(tissue, tense(tissue)).compliance()(jnp.ones_like(tissue.vertices))
+    moved = blocks_of(tissue, tense(tissue)).approximate_inverse()(jnp.ones_like(tissue.vertices))
     assert jnp.all(moved[held] == 0)
     assert jnp.all(jnp.isfinite(moved))
     spare = foam().with_capacity(40)
-    moved = blocks_of(spare, tense(spare)).compliance()(jnp.ones_like(spare.vertices))
+    moved = blocks_of(spare, tense(spare)).approximate_inverse()(jnp.ones_like(spare.vertices))
     assert jnp.all(jnp.isfinite(moved))
     assert jnp.all(moved[spare.held] == 0)
 
@@ -201,7 +201,7 @@ def test_conjugate_gradients_take_far_fewer_steps_under_tensions():
     args = (relaxed, energy, None)
     force = lambda y: value_and_gradient(objective, y, args)[1]
     _, product = jax.linearize(force, relaxed.vertices)
-    edges = blocks_of(relaxed, energy).compliance()
+    edges = blocks_of(relaxed, energy).approximate_inverse()
 
     @eqx.filter_jit
     def steps(preconditioner, rhs):

@@ -10,7 +10,7 @@ import pytest
 import vertax as vx
 from vertax.precondition._edge_blocks import EdgeBlocks
 from vertax.precondition._elastic_medium import ElasticMedium
-from vertax.precondition._elastic_minres import ElasticMINRES
+from vertax.precondition._preconditioned_minres import PreconditionedMINRES
 
 SIDE = 18
 STIFFNESS = jnp.asarray(6.0)
@@ -68,9 +68,9 @@ def test_smallest_preconditioned_tissue_is_set_in_one_place(monkeypatch):
 def test_it_is_symmetric_and_positive_whatever_the_hessian(tissue, curvature):
     waves = waves_of(tissue)
     hessian = lambda v: jax.tree.map(lambda x: curvature * x, v)
-    medium = waves.measured(hessian, tissue.configuration, STIFFNESS)
+    medium = waves.set_up(hessian, tissue.configuration, STIFFNESS)
     a, b = random_vectors(0, tissue)
-    compliance = waves.compliance(medium, 0.1)
+    compliance = waves.approximate_inverse(medium, 0.1)
     yields = jax.jit(lambda f: compliance(f))
     np.testing.assert_allclose(jnp.vdot(a, yields(b)), jnp.vdot(b, yields(a)), rtol=1e-9)
     for seed in range(1, 5):
@@ -88,7 +88,7 @@ def crystal():
     force = lambda y, _: jax.grad(lambda y: energy(tissue.with_configuration(y)))(y)
     plain = vx.solvers.MINRES()
     edges = EdgeBlocks.of(tissue, energy)
-    elastic = ElasticMINRES(plain, edges, waves_of(tissue), STIFFNESS)
+    elastic = PreconditionedMINRES(plain, edges, waves_of(tissue), STIFFNESS)
 
     @eqx.filter_jit
     def solve(rhs, solver):

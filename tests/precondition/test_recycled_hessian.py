@@ -52,8 +52,11 @@ def test_it_is_symmetric_and_positive_whatever_the_hessian(seed, offset):
     product = lambda v: (matrix @ v.ravel()).reshape(v.shape)
     hessian = RecycledHessian.at(product, place, jnp.ones(()))
     shares = jnp.asarray(rng.uniform(0.1, 1, 6))
-    for compliance in (hessian.compliance(()), hessian.compliance((), 0.0, shares)):
-        yields = lambda f, c=compliance: hessian.added(c, f, f)
+    for compliance in (
+        hessian.approximate_inverse(()),
+        hessian.approximate_inverse((), 0.0, shares),
+    ):
+        yields = lambda f, c=compliance: hessian.apply(c, f, f)
         a, b = jnp.asarray(rng.normal(size=(2, 6, 2)))
         np.testing.assert_allclose(jnp.vdot(a, yields(b)), jnp.vdot(b, yields(a)), rtol=1e-9)
         assert jnp.vdot(a, yields(a)) > 0
@@ -62,17 +65,17 @@ def test_it_is_symmetric_and_positive_whatever_the_hessian(seed, offset):
 def test_of_a_minimum_it_is_the_inverse(at_rest, known):
     slope = jax.grad(lambda v: energy_of(0)(at_rest.with_vertices(v)))
     force = jax.jvp(slope, (at_rest.vertices,), (random_like(at_rest.vertices, 1),))[1]
-    moved = known.added(known.compliance(()), force, force)
+    moved = known.apply(known.approximate_inverse(()), force, force)
     back = jax.jvp(slope, (at_rest.vertices,), (moved,))[1]
     np.testing.assert_allclose(back, force, atol=1e-8)
 
 
 def test_it_holds_near_by_and_wherever_the_whole_has_gone(at_rest, known):
-    assert known.seen_from(at_rest.configuration).ready
+    assert known.near(at_rest.configuration).ready
     whole = at_rest.with_vertices(at_rest.vertices + jnp.array([3.0, -1.0]))
-    assert known.seen_from(whole.configuration).ready
+    assert known.near(whole.configuration).ready
     elsewhere = at_rest.vertices + 0.1 * random_like(at_rest.vertices, 0)
-    assert not known.seen_from(at_rest.with_vertices(elsewhere).configuration).ready
+    assert not known.near(at_rest.with_vertices(elsewhere).configuration).ready
     assert not RecycledHessian.unknown(at_rest.configuration).ready
 
 

@@ -24,8 +24,9 @@ from vertax.adjoints._adjoint import (
     materialise,
     settle,
 )
-from vertax.precondition._elastic_minres import ElasticMINRES
+from vertax.precondition._preconditioned_minres import PreconditionedMINRES
 from vertax.precondition._recycled_hessian import RecycledHessian
+from vertax.precondition._sum import Preconditioner
 from vertax.solvers import MINRES
 
 _REASONS = (
@@ -93,16 +94,20 @@ class ImplicitDifferentiation(AbstractAdjoint):
         root, residual = minimisation.run()
         root, residual = frozen(root), jax.tree.map(eqxi.nondifferentiable_backward, residual)
         adjoint = cast(ImplicitDifferentiation, self.without_outcome())
-        known = minimisation.options
-        collective = known.get("collective")
-        if isinstance(collective, RecycledHessian) and self.mode == "sensitivity":
-            collective = None  # for a batch of systems a dense matrix is no bargain
-        if collective is not None and isinstance(self.linear_solver, MINRES):
-            parts = (known[name] for name in ("edge_blocks", "collective", "stiffness"))
-            solver = ElasticMINRES(self.linear_solver, *parts)
+        options = minimisation.options
+        preconditioner = options.get("preconditioner", Preconditioner(None, None))
+        coarse = preconditioner.coarse
+        # (For a batch of systems products with a dense matrix take more time than they save.)
+        dense = isinstance(coarse, RecycledHessian) and self.mode == "sensitivity"
+        if coarse is not None and not dense and isinstance(self.linear_solver, MINRES):
+            solver = PreconditionedMINRES(self.linear_solver, preconditioner, options["stiffness"])
             adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
         system = _System(
-            adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag}, _least_stiffness(known, root)
+            adjoint,
+            rewrite_fn,
+            residual,
+            tags | {lx.symmetric_tag},
+            _least_stiffness(options, root),
         )
         if self.outcome is None:
             return _follow(inputs, root, system), residual

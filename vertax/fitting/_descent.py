@@ -216,7 +216,7 @@ def _update(
         )
         stale = state.stale
         if hessian is not None:
-            stale = ~hessian.seen_from(following.configuration).ready
+            stale = ~hessian.near(following.configuration).ready
         moved = State(
             parameters, optimiser_state, following, best, going, None, state.looked, stale
         )

@@ -1,4 +1,4 @@
-"""A preconditioner that knows what a tissue is in the small: each edge with its two ends."""
+"""The local part of a preconditioner: each edge with its two ends."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from vertax.mesh._measured import Measured
 from vertax.mesh._tissue import Known
 from vertax.mesh._topology import Topology, take
 
-# What a block resists with at least, in units of the mean of all. (From a tenth to three times of that the
-# steps are as many.)
+# The least stiffness of a block, in units of the mean. (Between 0.1 and 3 times this number the number of
+# steps is the same.)
 _SOFTEST = 1e-2
 
 
@@ -31,16 +31,16 @@ class Symmetric(NamedTuple):
     yy: Float[Array, " n"]
 
     def stiffened(self, more: Float[Array, "*n"]) -> Symmetric:
-        """With more on the diagonal."""
+        """The sum with a multiple of the identity."""
         return Symmetric(self.xx + more, self.xy, self.yy + more)
 
     @property
     def positive(self) -> Symmetric:
-        """Without what is negative in them."""
+        """The matrices with negative eigenvalues replaced by 0."""
         mean = 0.5 * (self.xx + self.yy)
         half = jnp.sqrt(0.25 * (self.xx - self.yy) ** 2 + self.xy**2)
         least, most = mean - half, mean + half
-        # Of two eigenvalues of different sign only the larger one stays, with its own direction.
+        # If the eigenvalues have different signs, only the part of the positive one is kept.
         share = jnp.maximum(most, 0) / jnp.where(half > 0, 2 * half, 1)
         part = Symmetric(share * (self.xx - least), share * self.xy, share * (self.yy - least))
         return Symmetric(*(jnp.where(least >= 0, x, y) for x, y in zip(self, part, strict=True)))
@@ -62,32 +62,32 @@ class Square(NamedTuple):
 
 
 class EdgeBlocks(eqx.Module):
-    r"""The Hessian of a tissue, as far as the two ends of each edge feel it while all others stay.
+    r"""The blocks of the Hessian of the two ends of each edge.
 
-    Conjugate gradients and MINRES take many steps where neighbouring vertices resist very differently: a
-    short edge under tension resists a turn a thousand times as much as a cell a change of its shape. So each
-    edge gives way on its own, its two ends together, and what all edges say of a vertex is added. (Additive
-    Schwarz method: Xu 1992, doi:10.1137/1034116, with subspaces of two vertices that overlap.)
+    Conjugate gradients and MINRES take many iterations where the stiffness differs between neighbouring
+    vertices: a short edge under tension resists rotation a thousand times more than a cell resists a change
+    of its shape. So the 4 x 4 block of each edge is inverted, and the results are added (additive Schwarz
+    method with overlapping subspaces of two vertices: Xu 1992, doi:10.1137/1034116).
 
-    Blocks are those of the energy as a function of lengths $l$, areas $A$ and perimeters $P$,
+    The blocks are those of the energy as a function of lengths $l$, areas $A$ and perimeters $P$,
 
     $$\sum_c \begin{pmatrix} \nabla A_c & \nabla P_c \end{pmatrix} K_c
     \begin{pmatrix} \nabla A_c & \nabla P_c \end{pmatrix}^T
     + \sum_e \left( T_e \nabla^2 l_e + l''_e \nabla l_e \nabla l_e^T \right),$$
 
-    with the second derivatives $K_c$ and $l''_e$ of the energy and the tensions $T_e$, each made positive
-    (and without pressures). What an energy says of vertices directly, as friction does, counts by its
-    mean. So blocks are positive definite whatever the Hessian is, and change the number of steps and not
-    where they lead.
+    with the second derivatives $K_c$ and $l''_e$ of the energy and the tensions $T_e$, without negative
+    eigenvalues and without the terms of pressures. A direct dependence of the energy on vertices, as of
+    friction, counts by the mean of its second derivatives. So the blocks are positive definite whatever the
+    Hessian is: they change the number of iterations, not the solution.
     """
 
     ends: Ends
     first: Symmetric
-    """How each first end resists if it moves alone,"""
+    """The block of the first end of each edge."""
     second: Symmetric
-    """and the second one;"""
+    """The block of the second end."""
     between: Square
-    """which force on the first end comes of the second one's motion."""
+    """The force on the first end for a displacement of the second end."""
     moves: Bool[Array, " vertices"] | None
     softest: Float[Array, ""]
 
@@ -95,13 +95,13 @@ class EdgeBlocks(eqx.Module):
     def of(
         cls, tissue: Tissue, energy: AbstractEnergy, more: Symmetric | None = None
     ) -> EdgeBlocks | None:
-        """Those of a tissue as it is now; None if edges are arcs, which give way with their angles.
+        """The blocks of a tissue; None if its edges are arcs.
 
         **Arguments:**
 
         - `tissue`: the tissue.
         - `energy`: its energy.
-        - `more`: how vertices resist besides, each on its own.
+        - `more`: additional stiffness of single vertices.
         """
         if tissue.arcs is not None:
             return None
@@ -121,10 +121,10 @@ class EdgeBlocks(eqx.Module):
         moves = None if tissue.held is None else ~tissue.held
         return cls(ends, first, second, between, moves, softest)
 
-    def compliance(self, shift: Float[Array, " vertices"] | float = 0.0) -> EdgeCompliance:
-        """How edges give way if a spring of stiffness `shift` holds each vertex besides."""
-        shift = jnp.broadcast_to(shift, self.ends.slots.shape[1:])
-        one, other = (take(shift, end) + self.softest for end in self.ends.vertices)
+    def approximate_inverse(self, damping: Float[Array, " vertices"] | float = 0.0) -> EdgeInverse:
+        """The inverse of the damped blocks."""
+        damping = jnp.broadcast_to(damping, self.ends.slots.shape[1:])
+        one, other = (take(damping, end) + self.softest for end in self.ends.vertices)
         b, p = self.between, self.first.stiffened(one).inverse
         # With the Schur complement of the first end.
         q = Square(
@@ -150,11 +150,11 @@ class EdgeBlocks(eqx.Module):
             p.xy - (between.xx * q.yx + between.xy * q.yy),
             p.yy - (between.yx * q.yx + between.yy * q.yy),
         )
-        return EdgeCompliance(self.ends, first, second, between, self.moves)
+        return EdgeInverse(self.ends, first, second, between, self.moves)
 
 
-class EdgeCompliance(eqx.Module):
-    """How edges give way to forces on vertices."""
+class EdgeInverse(eqx.Module):
+    """The inverse of `EdgeBlocks` for one damping."""
 
     ends: Ends
     first: Symmetric
@@ -163,7 +163,7 @@ class EdgeCompliance(eqx.Module):
     moves: Bool[Array, " vertices"] | None
 
     def __call__(self, force: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
-        """How they give way to forces on vertices."""
+        """The displacement of vertices by forces on them."""
         x, y, to_x, to_y = self.ends.look(force)
         a, b, c = self.first, self.second, self.between
         moved = self.ends.back(
@@ -172,13 +172,13 @@ class EdgeCompliance(eqx.Module):
             c.xx * x + c.yx * y + b.xx * to_x + b.xy * to_y,
             c.xy * x + c.yy * y + b.xy * to_x + b.yy * to_y,
         )
-        # Three edges speak of each vertex.
+        # (Each vertex is an end of three edges.)
         moved = moved / 3
         return moved if self.moves is None else jnp.where(self.moves[:, None], moved, 0)
 
 
 class _Response(NamedTuple):
-    """How an energy answers to changes of what it asks of a tissue, nowhere softer than nothing."""
+    """Derivatives of an energy by lengths, areas and perimeters; second derivatives are not negative."""
 
     tension: Float[Array, " edges"]
     stretch: Float[Array, " edges"]
@@ -191,9 +191,9 @@ class _Response(NamedTuple):
         slope, change = jax.linearize(
             jax.grad(lambda known: energy(Measured(tissue, known))), known
         )
-        none = jax.tree.map(jnp.zeros_like, known)
+        zero = jax.tree.map(jnp.zeros_like, known)
         # All areas at once, and so on: the terms of an energy are those of single cells and edges.
-        along = lambda **one: change(none._replace(**one))
+        along = lambda **one: change(zero._replace(**one))
         by_length = along(lengths=jnp.ones_like(known.lengths))
         by_area = along(areas=jnp.ones_like(known.areas))
         by_perimeter = along(perimeters=jnp.ones_like(known.perimeters))
@@ -215,7 +215,7 @@ def _resistances(tissue: Tissue, response: _Response) -> tuple[Symmetric, Square
     length = jnp.where(length > 0, length, 1)
     unit = vectors / length
     stiff = response.tension / length
-    own = Symmetric(
+    of_edges = Symmetric(
         *(
             (stiff if i == j else 0) + (response.stretch - stiff) * unit[i] * unit[j]
             for i, j in _PAIRS
@@ -229,14 +229,14 @@ def _resistances(tissue: Tissue, response: _Response) -> tuple[Symmetric, Square
     pull = [by_area * a + mixed * p for a, p in zip(areas, perimeters, strict=True)]
     drag = [mixed * a + by_perimeter * p for a, p in zip(areas, perimeters, strict=True)]
 
-    def around(i: int, j: int, edges: Float[Array, " edges"]) -> Float[Array, " vertices"]:
+    def at_vertices(i: int, j: int, edges: Float[Array, " edges"]) -> Float[Array, " vertices"]:
         each = pull[i] * areas[j] + drag[i] * perimeters[j] + take(edges, m.edge)
         return total(each[slot::3] for slot in range(3))
 
-    diagonal = Symmetric(*(around(*pair, x) for pair, x in zip(_PAIRS, own, strict=True)))
-    here, there = m.half_edge, take(m.twin, m.half_edge)
+    diagonal = Symmetric(*(at_vertices(*pair, x) for pair, x in zip(_PAIRS, of_edges, strict=True)))
+    forward, backward = m.half_edge, take(m.twin, m.half_edge)
     # (A cell's corner at the second end comes after the one at the first, or before it.)
-    sides = ((here, take(m.next, here)), (take(m.next, there), there))
+    sides = ((forward, take(m.next, forward)), (take(m.next, backward), backward))
     both = [
         total(
             take(pull[i], one) * take(areas[j], other)
@@ -246,7 +246,7 @@ def _resistances(tissue: Tissue, response: _Response) -> tuple[Symmetric, Square
         for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))
     ]
     xx, xy, yx, yy = both
-    return diagonal, Square(xx - own.xx, xy - own.xy, yx - own.xy, yy - own.yy)
+    return diagonal, Square(xx - of_edges.xx, xy - of_edges.xy, yx - of_edges.xy, yy - of_edges.yy)
 
 
 _PAIRS = ((0, 0), (0, 1), (1, 1))
@@ -269,8 +269,8 @@ def _of_cells(values: Float[Array, " cells"], cells: Array) -> Array:
 
 
 def _directly(tissue: Tissue, energy: AbstractEnergy, known: Known) -> Float[Array, ""]:
-    """The mean resistance to motions of vertices that change nothing else that is known."""
-    # (Mostly there is none, and JAX knows it.)
+    """The mean second derivative by vertices at fixed lengths, areas and perimeters."""
+    # (Zero for most energies; JAX then compiles nothing.)
     slope = jax.grad(lambda vertices: energy(Measured(tissue.with_vertices(vertices), known)))
     direction = probe(tissue.vertices)
     _, response = jax.jvp(slope, (tissue.vertices,), (direction,))

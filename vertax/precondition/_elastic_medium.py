@@ -1,4 +1,4 @@
-"""A preconditioner that knows what a tissue is in the large: an elastic medium."""
+"""The coarse part of a preconditioner: an elastic medium."""
 
 from __future__ import annotations
 
@@ -15,51 +15,52 @@ from vertax._base.sums import total
 from vertax.mesh import Periodic, Tissue
 from vertax.mesh._boundary import inverse_of
 from vertax.mesh._topology import take
+from vertax.precondition._coarse import AbstractCoarseLevel
 from vertax.solvers._rows import Rows
 
-# (A point for four cells takes a quarter more products with the Hessian of a gradient.)
-_CELLS_A_POINT = 1
+# (With one point for four cells a gradient takes a quarter more products with the Hessian.)
+_CELLS_PER_POINT = 1
 
 
-class ElasticMedium(eqx.Module):
+class ElasticMedium(AbstractCoarseLevel):
     r"""An approximate inverse of the Hessian of a tissue, for conjugate gradients and MINRES.
 
-    Krylov methods take as many steps as the wave length of the softest motion is long, in cells: in a tissue
-    of $10^4$ cells a thousand. Long waves are those of an elastic medium, though, which Fourier transforms
-    solve. So the residual goes to a grid of about a point for each cell, is divided there by
+    The number of iterations of a Krylov method is proportional to the wave length of the softest mode, in
+    cells: about a thousand for $10^4$ cells. At long wave lengths a tissue is an elastic medium, which is
+    diagonal in Fourier space:
 
-    $$a + \mu k^2 \text{ (transverse waves)}, \qquad a + \lambda k^2 \text{ (longitudinal waves)},$$
+    1. Distribute the residual to a grid with about one point for each cell.
+    2. Divide transverse waves by $a + \mu k^2$ and longitudinal waves by $a + \lambda k^2$.
+    3. Interpolate the result at the vertices, and add the response of the local part.
 
-    and comes back; to this is added the residual over the mean stiffness, for all that is as small as
-    cells. Stiffnesses $a, \mu, \lambda$ are those of waves in this tissue, from two products with its
-    Hessian. It is symmetric and positive definite whatever the Hessian is, so it changes the number of steps
-    and not where they lead.
+    $a$, $\mu$ and $\lambda$ are measured by two products with the Hessian. The inverse is symmetric and
+    positive definite whatever the Hessian is, so it changes the number of iterations, not the solution.
 
     (Additive two-level method: Bramble, Pasciak & Xu 1990, doi:10.1090/S0025-5718-1990-1023042-6, with the
     coarse level solved by Fourier transforms.)
     """
 
     indices: Int[Array, "vertices 4"]
-    """The points of the grid around each vertex,"""
+    """The points of the grid around each vertex."""
     weights: Float[Array, "vertices 4"]
-    """and how much each of them counts; 0 for vertices that do not move."""
+    """Their weights; 0 for pinned vertices."""
     places: Float[Array, "vertices 2"]
     """Vertices in units of the box."""
     reciprocal: Float[Array, "2 2"]
     """The reciprocal lattice vectors, as rows."""
     vectors: Float[Array, "size size 2"]
-    """The wave vectors that the grid knows."""
+    """The wave vectors of the grid."""
     filled: Float[Array, ""]
     """Vertices for each point of the grid."""
     size: int = eqx.field(static=True)
 
     min_cells: ClassVar[int] = 150
-    """The smallest tissue that is preconditioned: smaller ones have no slow waves, so it costs more than it
-    saves. (A class attribute, because a benchmark changes it: a module constant could have copies.)"""
+    """In smaller tissues it takes more time than it saves. (A class attribute, because a benchmark changes
+    it.)"""
 
     @classmethod
     def of(cls, tissue: Tissue) -> ElasticMedium | None:
-        """Those of a tissue as it is now; None if it is small."""
+        """The medium of a tissue; None if the tissue is small."""
         if tissue.n_cells < cls.min_cells:
             return None
         size = _good_size(tissue.n_cells)
@@ -69,76 +70,67 @@ class ElasticMedium(eqx.Module):
         places = x[:, None] * inverse[0] + y[:, None] * inverse[1]
         scaled = size * places
         corner = jnp.floor(scaled)
-        beyond, corner = scaled - corner, corner.astype(int)
-        near = jnp.stack([corner, corner + 1], axis=-1) % size
-        shares = jnp.stack([1 - beyond, beyond], axis=-1)
-        indices = size * near[:, 0, :, None] + near[:, 1, None, :]
+        offset, corner = scaled - corner, corner.astype(int)
+        points = jnp.stack([corner, corner + 1], axis=-1) % size
+        shares = jnp.stack([1 - offset, offset], axis=-1)
+        indices = size * points[:, 0, :, None] + points[:, 1, None, :]
         weights = shares[:, 0, :, None] * shares[:, 1, None, :]
-        moves = jnp.ones(tissue.n_vertices) if tissue.held is None else ~tissue.held
-        moves = moves.astype(weights.dtype)
+        free = jnp.ones(tissue.n_vertices) if tissue.held is None else ~tissue.held
+        free = free.astype(weights.dtype)
         numbers = np.fft.fftfreq(size, 1 / size)[:, None]
         reciprocal = 2 * jnp.pi * inverse.T
         first, second = (numbers * row for row in reciprocal)
-        # Of an open tissue's box a part is empty.
+        # (A part of the box of an open tissue is empty.)
         fill = jnp.sum(tissue.areas) / jnp.abs(jnp.linalg.det(lattice))
         return cls(
             indices=indices.reshape(-1, 4),
-            weights=moves[:, None] * weights.reshape(-1, 4),
+            weights=free[:, None] * weights.reshape(-1, 4),
             places=places,
             reciprocal=reciprocal,
             vectors=(first[:, None] + second).astype(weights.dtype),
-            filled=jnp.sum(moves) / (fill * size**2),
+            filled=jnp.sum(free) / (fill * size**2),
             size=size,
         )
 
     @property
     def ready(self) -> Bool[Array, ""]:
-        """Whether there is anything to precondition with: always."""
         return jnp.array(True)
 
     @property
-    def unmeasured(self) -> Stiffness:
-        """What stands for what is not measured."""
+    def blank(self) -> Stiffness:
         one = jnp.ones_like(self.filled)
         return Stiffness(one, one, one)
 
-    def measured(
-        self, hessian: Callable[[PyTree], PyTree], like: PyTree, mean: Float[Array, ""]
+    def set_up(
+        self, hessian: Callable[[PyTree], PyTree], like: PyTree, stiffness: Float[Array, ""]
     ) -> Stiffness:
-        """The stiffness of waves in a tissue.
-
-        **Arguments:**
-
-        - `hessian`: its products with vectors.
-        - `like`: a configuration, or its shapes.
-        - `mean`: the mean stiffness of a vertex; no wave is taken to be much softer.
-        """
+        """The stiffness of waves in a tissue; bounded from below by 1e-4 of that of a vertex."""
         squares = jnp.sum(self.reciprocal**2, axis=-1)
-        floor = 1e-4 * mean / (jnp.max(squares) * (self.size / 2) ** 2)
+        floor = 1e-4 * stiffness / (jnp.max(squares) * (self.size / 2) ** 2)
         directions = self.reciprocal / jnp.sqrt(squares)[:, None]
         across = jnp.stack([-directions[:, 1], directions[:, 0]], axis=-1)
-        moves = jnp.sum(self.weights, axis=-1, keepdims=True)
+        free = jnp.sum(self.weights, axis=-1, keepdims=True)
         shapes = jax.tree.leaves(like)[1:]
 
         long, short = 1, max(2, self.size // 8)
 
         def waves(number: int, polarisations: Float[Array, "2 2"]) -> Float[Array, "vertices 2"]:
             phases = number * self.places + jnp.array([0.05, 0.18])
-            return moves * total(_wave(phases[:, i, None]) * polarisations[i] for i in (0, 1))
+            return free * total(_wave(phases[:, i, None]) * polarisations[i] for i in (0, 1))
 
-        # All of one polarisation in one product, for they hardly feel each other.
-        def stiffness(each: Float[Array, "kinds vertices 2"]) -> Float[Array, " kinds"]:
+        # Both wave lengths of one polarisation in one product: they are nearly orthogonal.
+        def measure(each: Float[Array, "kinds vertices 2"]) -> Float[Array, " kinds"]:
             rest = [jnp.zeros(x.shape, x.dtype) for x in shapes]
             leaves = [total(each), *rest]
             product = hessian(jax.tree.unflatten(jax.tree.structure(like), leaves))
             force = jax.tree.leaves(product)[0]
             return jnp.stack([jnp.vdot(wave, force) / jnp.vdot(wave, wave) for wave in each])
 
-        # (One after the other, so that the Hessian is compiled once.)
+        # (In a loop, so that the product is compiled once.)
         each = jnp.stack(
             [jnp.stack([waves(n, way) for n in (long, short)]) for way in (directions, across)]
         )
-        (far, near), (far_across, near_across) = jax.lax.map(stiffness, each)
+        (far, near), (far_across, near_across) = jax.lax.map(measure, each)
         square = jnp.mean(squares)
 
         def law(far: Array, near: Array, least: Array) -> tuple[Array, Array]:
@@ -149,59 +141,54 @@ class ElasticMedium(eqx.Module):
         other, shear = law(far_across, near_across, jnp.maximum(floor, 1e-3 * compression))
         return Stiffness(jnp.minimum(offset, other), shear, compression)
 
-    def compliance(
+    def approximate_inverse(
         self,
-        stiffness: Stiffness,
-        shift: Float[Array, ""] | float = 0.0,
+        measured: Stiffness,
+        damping: Float[Array, ""] | float = 0.0,
         shares: Rows | None = None,
-    ) -> Compliance:
-        """How the medium gives way if a spring of stiffness `shift` holds each vertex besides.
-
-        Vertices hand on a share of their force to the medium, and go with it as much; all by default.
-        """
-        # Vectors are complex numbers, so half the transforms do. If Z(k) is a transform, the part of the
-        # vectors' transform along k is (Z(k) + κ/κ* Z*(-k)) / 2 with κ = k_x + i k_y, the rest across.
-        offset, shear, compression = stiffness
+    ) -> MediumInverse:
+        # Vectors are complex numbers: that halves the number of transforms. If Z(k) is a transform, its
+        # longitudinal part is (Z(k) + κ/κ* Z*(-k)) / 2 with κ = k_x + i k_y; the rest is transverse.
+        offset, shear, compression = measured
         x, y = self.vectors[..., 0], self.vectors[..., 1]
         squared = x**2 + y**2
-        whole = squared == 0
-        squared = jnp.where(whole, 1, squared)
-        along, across = (1 / (offset + shift + c * squared) for c in (compression, shear))
-        scale = jnp.where(whole, 0, 0.5 / self.filled)
+        uniform = squared == 0
+        squared = jnp.where(uniform, 1, squared)
+        along, across = (1 / (offset + damping + c * squared) for c in (compression, shear))
+        scale = jnp.where(uniform, 0, 0.5 / self.filled)
         turned = jax.lax.complex(x**2 - y**2, 2 * x * y) / squared
         weights = self.weights
         if shares is not None:
             weights *= jax.tree.leaves(shares)[0][:, None]
         mirrored = scale * (along - across) * turned
-        return Compliance(self.indices, weights, scale * (along + across), mirrored)
+        return MediumInverse(self.indices, weights, scale * (along + across), mirrored)
 
-    def added(self, compliance: Compliance, near: PyTree, force: PyTree) -> PyTree:
-        """How vertices give way near by, as parts of a configuration, and how the medium does besides."""
-        first, *rest = jax.tree.leaves(near)
-        first = first + compliance(jax.tree.leaves(force)[0])
-        return jax.tree.unflatten(jax.tree.structure(near), [first, *rest])
+    def apply(self, inverse: MediumInverse, local: PyTree, force: PyTree) -> PyTree:
+        first, *rest = jax.tree.leaves(local)
+        first = first + inverse(jax.tree.leaves(force)[0])
+        return jax.tree.unflatten(jax.tree.structure(local), [first, *rest])
 
 
 class Stiffness(NamedTuple):
-    """What waves in a tissue resist with; see `ElasticMedium`."""
+    """The stiffness $a$, $\\mu$ and $\\lambda$ of waves, see `ElasticMedium`."""
 
     offset: Float[Array, ""]
     shear: Float[Array, ""]
     compression: Float[Array, ""]
 
 
-class Compliance(eqx.Module):
-    """How a medium gives way to forces on vertices."""
+class MediumInverse(eqx.Module):
+    """The approximate inverse of `ElasticMedium` for one damping."""
 
     indices: Int[Array, "vertices 4"]
     weights: Float[Array, "vertices 4"]
     direct: Float[Array, "size size"]
-    """What comes of each wave along its own wave vector,"""
+    """The factor of each wave."""
     mirrored: Complex[Array, "size size"]
-    """and of the one in the opposite direction."""
+    """The factor of the complex conjugate of the wave in the opposite direction."""
 
     def __call__(self, force: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
-        """How it gives way to forces on vertices."""
+        """The displacement of vertices by forces on them."""
         spread = self.weights[:, :, None] * force[:, None, :]
         grid = jnp.zeros((self.direct.size, 2), force.dtype).at[self.indices].add(spread)
         grid = jax.lax.complex(grid[:, 0], grid[:, 1]).reshape(self.direct.shape)
@@ -213,7 +200,7 @@ class Compliance(eqx.Module):
 
 
 def _wave(phase: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """A cosine to one part in a hundred, of a phase in turns: the cosine itself takes ten times as long."""
+    """The cosine of a phase in turns to 1 %, ten times as fast."""
     t = 2 * jnp.abs(phase - jnp.round(phase))
     return 1 - t**2 * (6 - 4 * t)
 
@@ -228,11 +215,11 @@ def _box(tissue: Tissue) -> tuple[Float[Array, "2 2"], Float[Array, "2"]]:
 
 
 def _good_size(n_cells: int) -> int:
-    """How many points a side has: an odd number with small factors.
+    """The number of points of a side: odd, with small factors.
 
-    (Without a highest wave, which is its own mirror image.)
+    (An even number has a highest wave that is its own mirror image.)
     """
-    size = int(np.ceil(np.sqrt(n_cells / _CELLS_A_POINT))) | 1
+    size = int(np.ceil(np.sqrt(n_cells / _CELLS_PER_POINT))) | 1
     while _rest(size) > 1:
         size += 2
     return size

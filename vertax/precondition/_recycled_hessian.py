@@ -1,4 +1,4 @@
-"""A preconditioner for relaxations that come to rest near one another: the Hessian of one of them."""
+"""A preconditioner for relaxations that end near one another: the inverse Hessian of one of them."""
 
 from __future__ import annotations
 
@@ -10,35 +10,36 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from vertax.precondition._coarse import AbstractCoarseLevel
 from vertax.solvers._direct import as_matrix
 from vertax.solvers._rows import Rows, row_inner, times
 
-# No motion is taken to be softer than this, in units of the mean stiffness: some cost nothing, or next to it.
+# Eigenvalues below this fraction of the mean stiffness are replaced by it: there are zero modes.
 _SOFTEST = 1e-3
-# Where vertices are further from where they were then, typically, products with the inverse cost more time
-# than they save; in units of the length scale.
+# If the root mean square displacement since then is larger, in units of the length scale, products with the
+# inverse cost more time than they save.
 _NEAR = 0.04
 
 
-class RecycledHessian(eqx.Module):
-    """The inverse of a Hessian that is not far from the one at hand, for conjugate gradients and MINRES.
+class RecycledHessian(AbstractCoarseLevel):
+    """The inverse of the Hessian at a nearby equilibrium, for conjugate gradients and MINRES.
 
-    In a fit each epoch comes to rest near the last one, with almost the same Hessian, which a small tissue
-    can afford to invert once in many epochs. It is positive definite, or not known: so it changes the number
-    of steps and not where they lead, however far the Hessian has gone meanwhile.
+    Each epoch of a fit ends near the equilibrium of the last one, with almost the same Hessian. For small
+    tissues the Hessian is inverted once in many epochs. The inverse is positive definite, so it changes the
+    number of iterations, not the solution. It replaces the local part of a preconditioner.
     """
 
     inverse: Float[Array, "n n"]
     place: Float[Array, "vertices 2"]
-    """Where vertices were then."""
+    """The vertices of that equilibrium."""
     reach: Float[Array, ""]
-    """How far they may be from there."""
+    """The largest root mean square displacement from there."""
     ready: Bool[Array, ""]
-    """Whether it is known at all, and of use."""
+    """Whether it has been computed, and can be used."""
 
     @classmethod
     def unknown(cls, configuration: PyTree[Array]) -> RecycledHessian:
-        """That of a configuration of which nothing is known yet."""
+        """A placeholder with the shapes of a configuration."""
         flat, _ = ravel_pytree(configuration)
         place = jax.tree.leaves(configuration)[0]
         nothing = jnp.zeros((flat.size, flat.size), flat.dtype)
@@ -51,12 +52,12 @@ class RecycledHessian(eqx.Module):
         configuration: PyTree[Array],
         length: Float[Array, ""],
     ) -> RecycledHessian:
-        """The one of a configuration; what has negative curvature counts as what has positive.
+        """The inverse of the absolute value of the Hessian at a configuration.
 
         **Arguments:**
 
-        - `hessian`: multiplies by it.
-        - `configuration`: where it is.
+        - `hessian`: multiplies by the Hessian.
+        - `configuration`: the configuration.
         - `length`: the length scale.
         """
         matrix = as_matrix(hessian, configuration)
@@ -67,32 +68,30 @@ class RecycledHessian(eqx.Module):
         place = jax.tree.leaves(configuration)[0]
         return cls(jnp.where(ready, inverse, 0), place, _NEAR * length, ready)
 
-    def seen_from(self, configuration: PyTree[Array]) -> RecycledHessian:
-        """The same, and not ready if vertices have moved far, other than all together."""
+    def near(self, configuration: PyTree[Array]) -> RecycledHessian:
+        """A copy that is ready only if vertices have not moved far, apart from a common translation."""
         moved = jax.tree.leaves(configuration)[0] - self.place
         moved -= jnp.mean(moved, axis=0)
         near = jnp.mean(row_inner(moved, moved)) < self.reach**2
         return eqx.tree_at(lambda h: h.ready, self, self.ready & near)
 
     @property
-    def unmeasured(self) -> tuple[()]:
+    def blank(self) -> tuple[()]:
         return ()
 
-    def measured(self, hessian: Callable, like: PyTree, mean: Float[Array, ""]) -> tuple[()]:
-        """Nothing, for it is known."""
+    def set_up(self, hessian: Callable, like: PyTree, stiffness: Float[Array, ""]) -> tuple[()]:
+        """No set-up is needed."""
         return ()
 
-    def compliance(
+    def approximate_inverse(
         self,
         measured: tuple[()],
-        shift: Float[Array, ""] | float = 0.0,
+        damping: Float[Array, ""] | float = 0.0,
         shares: Rows | None = None,
     ) -> Rows | None:
-        """What `added` needs if each row hands on a share of its force, and moves as much; all by default."""
         return None if shares is None else jax.tree.map(jnp.sqrt, shares)
 
-    def added(self, roots: Rows | None, near: PyTree, force: PyTree) -> PyTree:
-        """The response to a force, in place of that of what is `near`."""
-        share = lambda x: x if roots is None else jax.tree.map(times, roots, x)
+    def apply(self, inverse: Rows | None, local: PyTree, force: PyTree) -> PyTree:
+        share = lambda x: x if inverse is None else jax.tree.map(times, inverse, x)
         flat, unravel = ravel_pytree(share(force))
         return share(unravel(self.inverse @ flat))

@@ -10,19 +10,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from vertax.precondition._coarse import AbstractCoarseLevel
 from vertax.precondition._edge_blocks import EdgeBlocks
-from vertax.precondition._elastic_medium import ElasticMedium
-from vertax.precondition._recycled_hessian import RecycledHessian
 from vertax.solvers._conjugate_gradients import AbstractInverse
 from vertax.solvers._rows import Table, point_of, rows_of, table_of, times
 
 
 class Preconditioner(eqx.Module):
-    r"""The sum of two approximate inverses: of the Hessian in the small, and in the large.
+    r"""The sum of two approximate inverses of the Hessian: a local and a coarse one.
 
-    1. In the small: the edges, each with its two ends ([`EdgeBlocks`]), or else the diagonal
+    1. Local: the edges, each with its two ends ([`EdgeBlocks`]), or else the diagonal
         $1 / (k + \lambda)$ with the mean stiffness $k$ and the damping $\lambda$ of a vertex.
-    2. In the large: an elastic medium ([`ElasticMedium`]); or, in place of both, the Hessian of a nearby
+    2. Coarse: an elastic medium ([`ElasticMedium`]); or, in place of both, the Hessian of a nearby
         equilibrium ([`RecycledHessian`]). It is used only near an equilibrium: elsewhere soft modes may have
         negative curvature.
 
@@ -30,7 +29,7 @@ class Preconditioner(eqx.Module):
     """
 
     edges: EdgeBlocks | None
-    coarse: ElasticMedium | RecycledHessian | None
+    coarse: AbstractCoarseLevel | None
 
     @property
     def is_diagonal(self) -> bool:
@@ -52,14 +51,14 @@ class Preconditioner(eqx.Module):
         - `product`: multiplies by the Hessian.
         - `like`: a gradient.
         - `stiffness`: the mean stiffness.
-        - `coarse`: whether to use the part in the large.
+        - `coarse`: whether to use the coarse part.
         - `identity`: whether to use neither.
         """
         medium: Any = None
         if self.coarse is not None:
-            large, coarse = self.coarse, coarse & self.coarse.ready
-            measure = lambda: large.measured(product, like, stiffness)
-            medium = jax.lax.cond(coarse, measure, lambda: large.unmeasured)
+            level, coarse = self.coarse, coarse & self.coarse.ready
+            measure = lambda: level.set_up(product, like, stiffness)
+            medium = jax.lax.cond(coarse, measure, lambda: level.blank)
         return TissueInverse(self, medium, stiffness, coarse, jnp.asarray(identity), like)
 
 
@@ -77,21 +76,21 @@ class TissueInverse(AbstractInverse):
         rows, stiffness = rows_of(damping, self.like), self.stiffness
         yielding = jax.tree.map(lambda s: 1 / (stiffness + s), rows)
         of_vertices = jax.tree.leaves(rows)[0]
-        edges, large = self.preconditioner.edges, self.preconditioner.coarse
-        small: Any = yielding if edges is None else edges.compliance(of_vertices)
-        if large is None:
-            return small, None
+        edges, coarse = self.preconditioner.edges, self.preconditioner.coarse
+        local: Any = yielding if edges is None else edges.approximate_inverse(of_vertices)
+        if coarse is None:
+            return local, None
         # A vertex that is held tightly must not hold the others, nor move them.
         held = jnp.mean(jnp.minimum(of_vertices, stiffness))
         shares = jax.tree.map(lambda y: stiffness * y, yielding)
-        return small, large.compliance(self.medium, held, shares)
+        return local, coarse.approximate_inverse(self.medium, held, shares)
 
     def apply(self, factors: PyTree[Array], residual: Table) -> Table:
-        small, medium = factors
+        local, medium = factors
         r = point_of(residual, self.like)
-        plain = self.preconditioner.edges is None
-        z = jax.tree.map(times, small, r) if plain else small(r)
-        large = self.preconditioner.coarse
-        if large is not None:
-            z = jax.lax.cond(self.coarse, lambda: large.added(medium, z, r), lambda: z)
+        diagonal = self.preconditioner.edges is None
+        z = jax.tree.map(times, local, r) if diagonal else local(r)
+        coarse = self.preconditioner.coarse
+        if coarse is not None:
+            z = jax.lax.cond(self.coarse, lambda: coarse.apply(medium, z, r), lambda: z)
         return jnp.where(self.identity, residual, table_of(z))

@@ -14,6 +14,7 @@ from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units
 from vertax.mesh import Tissue
 from vertax.precondition._recycled_hessian import RecycledHessian
+from vertax.precondition._sum import Preconditioner
 from vertax.relax._contacts import Contacts
 from vertax.relax._loop import Search, SearchState
 from vertax.relax._objective import coarse_preconditioner, edge_preconditioner, objective
@@ -85,8 +86,10 @@ def conclude(
         "relaxation": minimiser,
         "start": end.origin,
         "max_steps": jnp.asarray(max_steps),
-        "edge_blocks": edge_preconditioner(settled, energy, end.contacts),
-        "collective": coarse_preconditioner(settled, preconditioner),
+        "preconditioner": Preconditioner(
+            edge_preconditioner(settled, energy, end.contacts),
+            coarse_preconditioner(settled, preconditioner),
+        ),
     }
     # This solve starts at rest and takes no step: it is there to be differentiated.
     solution = optx.minimise(

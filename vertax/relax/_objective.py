@@ -35,7 +35,7 @@ def coarse_preconditioner(
     """A preconditioner for long waves; None for a small tissue without a recycled Hessian."""
     if recycled_hessian is None:
         return ElasticMedium.of(tissue)
-    return recycled_hessian.seen_from(tissue.configuration)
+    return recycled_hessian.near(tissue.configuration)
 
 
 def edge_preconditioner(
