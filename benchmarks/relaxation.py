@@ -30,7 +30,7 @@ Case = Callable[[int], tuple[vx.Tissue, vx.AbstractEnergy]]
 
 
 def shapes(n_cells: int, shape_factor: float) -> Case:
-    """A periodic tissue whose target shape factors have a standard deviation of 0.1."""
+    """A periodic tissue; its target shape factors have a standard deviation of 0.1."""
 
     def case(seed: int) -> tuple[vx.Tissue, vx.AbstractEnergy]:
         tissue = vx.initialise.periodic_voronoi(n_cells, key=jax.random.key(seed))

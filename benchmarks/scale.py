@@ -18,12 +18,12 @@ from _arguments import count
 from _timing import first_and_best
 
 import vertax as vx
-import vertax.relax._loop as search_module
+import vertax.relax._objective as objective_module
 from vertax.precondition._elastic_medium import ElasticMedium
 
 jax.config.update("jax_enable_x64", True)
 FEWEST = ElasticMedium.min_cells
-FEWEST_FOR_EDGES = search_module._FEWEST_CELLS
+FEWEST_FOR_EDGES = objective_module.MIN_CELLS_OF_EDGE_BLOCKS
 TOLERANCE = 1e-8
 
 
@@ -40,7 +40,7 @@ def energy_of(kind: str, tissue: vx.Tissue, seed: int = 0) -> vx.AbstractEnergy:
 def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str:
     """What relaxations and a gradient take if tissues from this number of cells on are preconditioned."""
     ElasticMedium.min_cells = fewest
-    search_module._FEWEST_CELLS = max(fewest, FEWEST_FOR_EDGES)
+    objective_module.MIN_CELLS_OF_EDGE_BLOCKS = max(fewest, FEWEST_FOR_EDGES)
     jax.clear_caches()
 
     @eqx.filter_jit

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 import vertax as vx
 from vertax.precondition._edge_blocks import EdgeBlocks, EdgeInverse, Symmetric
-from vertax.relax._loop import objective
+from vertax.relax._objective import objective
 from vertax.solvers._solver import value_and_gradient
 
 
@@ -52,7 +52,7 @@ class Contractility(vx.AbstractEnergy):
 
 
 class Friction(vx.AbstractEnergy):
-    """One that knows vertices alone."""
+    """An energy of vertices alone."""
 
     def __call__(self, tissue):
         return 0.5 * 7.0 * jnp.sum(tissue.vertices**2)
@@ -80,7 +80,7 @@ def test_blocks_are_those_of_the_hessian_without_pressures(energy):
     factor=st.floats(2.5, 5.0),
     shift=st.floats(0, 10),
 )
-def test_they_give_way_symmetrically_and_in_the_direction_of_a_force(seed, low, factor, shift):
+def test_the_inverse_is_symmetric_and_positive(seed, low, factor, shift):
     tissue = foam(seed=seed % 7)
     energy = tense(tissue, low, low + 1) + vx.energies.ShapeFactorEnergy(factor)
     yields = _compliance(tissue, energy, jnp.full(tissue.n_vertices, shift))
@@ -106,7 +106,7 @@ def test_the_inverse_is_that_of_each_block():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_an_edge_of_no_length_under_tension_leaves_it_finite_and_positive(dtype):
+def test_an_edge_of_zero_length_keeps_it_finite_and_positive(dtype):
     tissue = foam()
     i, j = tissue.topology.edge_vertices[5]
     onto = tissue.vertices.at[j].add(tissue.edge_vectors[5] * -1)
@@ -123,7 +123,7 @@ def test_an_edge_of_no_length_under_tension_leaves_it_finite_and_positive(dtype)
     assert i != j
 
 
-def test_what_is_held_does_not_give_way():
+def test_pinned_vertices_do_not_move():
     held = jnp.arange(foam().n_vertices) % 7 == 0
     tissue = eqx.tree_at(lambda t: t.pinned, foam(), held, is_leaf=lambda x: x is None)
     moved = blocks_of(tissue, tense(tissue)).approximate_inverse()(jnp.ones_like(tissue.vertices))
@@ -135,7 +135,7 @@ def test_what_is_held_does_not_give_way():
     assert jnp.all(moved[spare.held] == 0)
 
 
-def test_what_an_energy_says_of_vertices_directly_counts_by_its_mean():
+def test_direct_dependence_on_vertices_counts_by_its_mean():
     tissue = foam()
     energy = tense(tissue)
     without, with_friction = blocks_of(tissue, energy), blocks_of(tissue, energy + Friction())
@@ -150,41 +150,41 @@ def test_arcs_have_none():
 
 @settings(deadline=None)
 @given(st.lists(st.floats(-10, 10), min_size=3, max_size=3))
-def test_of_a_symmetric_matrix_only_what_is_positive_stays(entries):
+def test_negative_eigenvalues_are_removed(entries):
     xx, xy, yy = entries
-    found = Symmetric(*(jnp.array([x]) for x in entries)).positive
+    result = Symmetric(*(jnp.array([x]) for x in entries)).positive
     values, vectors = np.linalg.eigh([[xx, xy], [xy, yy]])
     expected = (vectors * np.maximum(values, 0)) @ vectors.T
     np.testing.assert_allclose(
-        [found.xx[0], found.xy[0], found.yy[0]],
+        [result.xx[0], result.xy[0], result.yy[0]],
         [expected[0, 0], expected[0, 1], expected[1, 1]],
         atol=1e-9,
     )
 
 
-def test_contacts_count_as_their_hessian_does():
+def test_contacts_add_their_hessian():
     # Of a corner that comes near a side: three vertices, each with a block on the diagonal.
     tissue = foam(100, seed=2)
     energy = vx.energies.ShapeFactorEnergy(4.3)
     search = vx.Relaxation(contact_range=0.05).search(tissue, energy)
     state = search.advance(search.begin(tissue, energy), energy, 8)
-    contacts, there = state.contacts, state.tissue
+    contacts, tissue = state.contacts, state.tissue
     assert contacts is not None
-    assert contacts(there) > 0
+    assert contacts(tissue) > 0
     hessian = jax.jit(jax.hessian(lambda x: contacts(there.with_vertices(x))))(there.vertices)
-    found = contacts.resistance(there)
-    several = np.bincount(_vertices_of(contacts, there), minlength=there.n_vertices)
+    result = contacts.resistance(tissue)
+    several = np.bincount(_vertices_of(contacts, tissue), minlength=there.n_vertices)
     checked = 0
     for vertex in np.flatnonzero(several == 1):
         values, vectors = np.linalg.eigh(hessian[vertex, :, vertex])
         block = (vectors * np.maximum(values, 0)) @ vectors.T
-        mine = [found.xx[vertex], found.xy[vertex], found.yy[vertex]]
+        mine = [result.xx[vertex], result.xy[vertex], result.yy[vertex]]
         expected = [block[0, 0], block[0, 1], block[1, 1]]
         np.testing.assert_allclose(mine, expected, atol=1e-8 * float(jnp.abs(hessian).max()))
         checked += np.abs(block).max() > 0
     assert checked > 0
     untouched = several == 0
-    assert not jnp.any(jnp.where(untouched, found.xx + found.yy, 0))
+    assert not jnp.any(jnp.where(untouched, result.xx + result.yy, 0))
 
 
 def _vertices_of(contacts, tissue) -> np.ndarray:
@@ -194,7 +194,7 @@ def _vertices_of(contacts, tissue) -> np.ndarray:
     return np.concatenate([corner[real], side[real], after[real]]) // 3
 
 
-def test_conjugate_gradients_take_far_fewer_steps_under_tensions():
+def test_conjugate_gradients_take_fewer_iterations_under_tensions():
     tissue = foam(200, seed=3)
     energy = tense(tissue)
     relaxed = vx.equilibrate(tissue, energy, tolerance=1e-8, throw=False).tissue
@@ -225,6 +225,6 @@ def test_conjugate_gradients_take_far_fewer_steps_under_tensions():
 
     rhs = jnp.asarray(np.random.default_rng(0).normal(size=relaxed.vertices.shape))
     plain, many = steps(lambda r: r, rhs)
-    found, few = steps(edges, rhs)
-    np.testing.assert_allclose(found, plain, rtol=0, atol=1e-3 * float(jnp.abs(plain).max()))
+    result, few = steps(edges, rhs)
+    np.testing.assert_allclose(result, plain, rtol=0, atol=1e-3 * float(jnp.abs(plain).max()))
     assert few < 0.3 * many

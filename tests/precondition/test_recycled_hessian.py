@@ -1,4 +1,4 @@
-"""What is known of an equilibrium near by: it changes how long a solution takes, and not the solution."""
+"""What is recycled of an equilibrium near by: it changes how long a solution takes, and not the solution."""
 
 import dataclasses
 
@@ -38,7 +38,7 @@ def at_rest():
 
 
 @pytest.fixture(scope="module")
-def known(at_rest) -> RecycledHessian:
+def recycled(at_rest) -> RecycledHessian:
     return worked_out(RELAXATION, at_rest, energy_of(0))
 
 
@@ -62,24 +62,24 @@ def test_it_is_symmetric_and_positive_whatever_the_hessian(seed, offset):
         assert jnp.vdot(a, yields(a)) > 0
 
 
-def test_of_a_minimum_it_is_the_inverse(at_rest, known):
+def test_at_a_minimum_it_is_the_inverse_hessian(at_rest, recycled):
     slope = jax.grad(lambda v: energy_of(0)(at_rest.with_vertices(v)))
     force = jax.jvp(slope, (at_rest.vertices,), (random_like(at_rest.vertices, 1),))[1]
-    moved = known.apply(known.approximate_inverse(()), force, force)
+    moved = recycled.apply(recycled.approximate_inverse(()), force, force)
     back = jax.jvp(slope, (at_rest.vertices,), (moved,))[1]
     np.testing.assert_allclose(back, force, atol=1e-8)
 
 
-def test_it_holds_near_by_and_wherever_the_whole_has_gone(at_rest, known):
-    assert known.near(at_rest.configuration).ready
-    whole = at_rest.with_vertices(at_rest.vertices + jnp.array([3.0, -1.0]))
-    assert known.near(whole.configuration).ready
+def test_it_is_ready_nearby_and_after_translations(at_rest, recycled):
+    assert recycled.near(at_rest.configuration).ready
+    translated = at_rest.with_vertices(at_rest.vertices + jnp.array([3.0, -1.0]))
+    assert recycled.near(translated.configuration).ready
     elsewhere = at_rest.vertices + 0.1 * random_like(at_rest.vertices, 0)
-    assert not known.near(at_rest.with_vertices(elsewhere).configuration).ready
+    assert not recycled.near(at_rest.with_vertices(elsewhere).configuration).ready
     assert not RecycledHessian.unknown(at_rest.configuration).ready
 
 
-def test_nothing_is_known_of_what_is_no_number(at_rest):
+def test_a_nan_hessian_is_not_ready(at_rest):
     nan = at_rest.with_vertices(at_rest.vertices.at[0, 0].set(jnp.nan))
     hessian = worked_out(RELAXATION, nan, energy_of(0))
     assert not hessian.ready
@@ -94,15 +94,15 @@ def test_large_tissues_and_other_responses_have_none():
     assert evolution.with_preconditioner(None) is evolution
 
 
-def test_what_is_none_or_that_of_another_tissue_is_refused(known, as_a_user):
+def test_wrong_types_and_sizes_are_refused(recycled, as_a_user):
     with pytest.raises(TypeError, match="`preconditioner` must be a result of `preconditioner_at`"):
         RELAXATION.with_preconditioner("soft")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="a tissue with 64 coordinates, but this one has 32"):
-        RELAXATION.with_preconditioner(known)(random_tissue(8), ShapeFactorEnergy(3.7))
+        RELAXATION.with_preconditioner(recycled)(random_tissue(8), ShapeFactorEnergy(3.7))
 
 
 @eqx.filter_jit
-def _found(relaxation, tissue, energy):
+def _results(relaxation, tissue, energy):
     """Where a tissue comes to rest, a gradient there, and what both have taken."""
     search = relaxation.search(tissue, energy)
     end = search.advance(search.begin(tissue, energy), energy, jnp.asarray(200))
@@ -113,13 +113,13 @@ def _found(relaxation, tissue, energy):
     return rest, evaluation.gradient, products, evaluation.outcome.num_steps
 
 
-def test_solutions_are_those_without_and_take_less(at_rest, known):
+def test_solutions_are_the_same_with_fewer_products(at_rest, recycled):
     without = RELAXATION.with_preconditioner(RecycledHessian.unknown(at_rest.configuration))
-    rest, gradient, products, steps = _found(without, at_rest, energy_of(1))
+    rest, gradient, products, steps = _results(without, at_rest, energy_of(1))
     plain = eqx.filter_jit(RELAXATION)(at_rest, energy_of(1)).tissue.vertices
     np.testing.assert_allclose(rest, plain, atol=1e-8)
-    same, other, fewer_products, fewer_steps = _found(
-        RELAXATION.with_preconditioner(known), at_rest, energy_of(1)
+    same, other, fewer_products, fewer_steps = _results(
+        RELAXATION.with_preconditioner(recycled), at_rest, energy_of(1)
     )
     np.testing.assert_allclose(same, rest, atol=1e-8)
     for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(other), strict=True):
@@ -130,7 +130,7 @@ def test_solutions_are_those_without_and_take_less(at_rest, known):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["arcs", "pinned", "spare slots", "float32"])
-def test_it_goes_with_every_tissue(kind):
+def test_it_works_for_every_kind_of_tissue(kind):
     relaxation = dataclasses.replace(STILL, tolerance=1e-3 if kind == "float32" else 1e-8)
     tissue = vx.initialise.free_voronoi(8, key=1) if kind == "arcs" else random_tissue(8)
     energy = ShapeFactorEnergy(shape_factors(8, 3.6, 0.02))
@@ -145,11 +145,11 @@ def test_it_goes_with_every_tissue(kind):
     else:
         single = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
         tissue, energy = jax.tree.map(single, (tissue, energy))
-    there = relaxation(tissue, energy)
-    hessian = worked_out(relaxation, there.tissue, energy)
+    equilibrium = relaxation(tissue, energy)
+    hessian = worked_out(relaxation, equilibrium.tissue, energy)
     stiffer = jax.tree.map(lambda x: 1.01 * x if eqx.is_inexact_array(x) else x, energy)
-    plain = relaxation(there.tissue, stiffer)
-    helped = relaxation.with_preconditioner(hessian)(there.tissue, stiffer)
+    plain = relaxation(equilibrium.tissue, stiffer)
+    helped = relaxation.with_preconditioner(hessian)(equilibrium.tissue, stiffer)
     assert hessian.ready
     assert hessian.inverse.dtype == tissue.vertices.dtype
     tolerance = 1e-2 if kind == "float32" else 1e-6

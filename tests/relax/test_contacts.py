@@ -61,7 +61,7 @@ def test_a_random_cluster_stays_valid(seed, inner_arcs):
         pytest.param(vx.solvers.LBFGS(), id="LBFGS", marks=pytest.mark.thorough),
     ],
 )
-def test_steps_of_any_solver_are_undone_where_cells_would_overlap(solver):
+def test_every_solver_avoids_overlaps(solver):
     response = vx.Relaxation(solver, tolerance=1e-6, max_steps=400)
     for seed in range(3):
         equilibrium = response(tissue_of(seed), shapes(np.full(N, 4.5)), throw=False)
@@ -84,12 +84,12 @@ class _Spoiler(vx.transitions.AbstractTransitions):
         return tissue.with_vertices(tissue.vertices.at[self.vertex].add(far)), counts
 
 
-def test_what_cannot_go_on_holds_back_only_what_is_around():
+def test_only_the_neighbourhood_of_an_overlap_is_frozen():
     tissue = vx.initialise.periodic_voronoi(60, key=jax.random.key(2), lloyd_steps=3)
     cells = np.asarray(tissue.topology.cell).reshape(-1, 3)
     # The neighbours of the vertex's cells as well, which would not overlap.
-    around = lambda vertices: np.isin(cells, cells[vertices]).any(axis=1)
-    held = around(around([7]))
+    grown = lambda vertices: np.isin(cells, cells[vertices]).any(axis=1)
+    held = grown(grown([7]))
     response = vx.Relaxation(transitions=_Spoiler(tissue.vertices, jnp.asarray(held), 7))
     energy = shapes(np.full(60, 3.6))
 
@@ -101,7 +101,7 @@ def test_what_cannot_go_on_holds_back_only_what_is_around():
     state = step(tissue, energy)
     moved = np.asarray((state.tissue.vertices != tissue.vertices).any(axis=1))
     assert not moved[held].any()
-    assert moved[~around(around(held))].all()
+    assert moved[~grown(grown(held))].all()
     assert 0.2 < moved.mean() < 0.8
     assert state.iteration.value < energy(tissue)
     # What stays because of others is to be shorter next time as well.
@@ -110,8 +110,8 @@ def test_what_cannot_go_on_holds_back_only_what_is_around():
 
 
 @pytest.mark.thorough
-def test_what_stays_does_not_stay_for_ever():
-    """A vertex that nothing blamed came to those that stayed, again and again."""
+def test_frozen_vertices_are_released():
+    """A vertex without an overlap joined the frozen ones again and again."""
     tissue = vx.initialise.periodic_voronoi(1000, key=jax.random.key(1001))
     factors = 3.5 + 0.1 * jax.random.normal(jax.random.key(2001), (1000,))
     response = vx.Relaxation(tolerance=1e-8, max_steps=150)
@@ -119,8 +119,8 @@ def test_what_stays_does_not_stay_for_ever():
 
 
 @pytest.mark.thorough
-def test_what_cannot_go_on_is_not_tried_as_far_again():
-    """Steps that are foreseen well, and lead to overlaps: regions grew again as fast as they shrank there."""
+def test_radii_of_frozen_vertices_stay_short():
+    """Well-predicted steps that lead to overlaps: radii grew again as fast as they had shrunk."""
     relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=200))
     # The first one took 212 steps then; the second one never ends if regions only shrink.
     for seed in (294, 711):
@@ -129,7 +129,7 @@ def test_what_cannot_go_on_is_not_tried_as_far_again():
         assert relax(tissue, shapes(factors)).num_steps < 100
 
 
-def test_without_contact_cells_overlap_and_that_is_refused():
+def test_without_contacts_cells_overlap_and_an_error_is_raised():
     response = vx.Relaxation(contact_range=None)
     energy = shapes(np.full(N, 4.7))
     equilibrium = response(tissue_of(3), energy, throw=False)
@@ -141,14 +141,14 @@ def test_without_contact_cells_overlap_and_that_is_refused():
         response(tissue_of(3), energy)
 
 
-def test_a_tissue_that_overlaps_from_the_start_is_named():
+def test_the_error_names_the_cells_of_an_initial_overlap():
     tissue = tissue_of(2)
     overlapping = tissue.with_vertices(tissue.vertices.at[0].add(2.5))
     with pytest.raises(RuntimeError, match="vertices"):
         vx.equilibrate(overlapping, shapes(np.full(N, 3.7)), max_steps=1)
 
 
-def test_nothing_changes_where_nothing_touches():
+def test_contacts_do_not_change_a_tissue_without_contacts():
     energy = shapes(np.full(N, 3.6))
     start = vx.equilibrate(tissue_of(2), energy).tissue
     pushed = shapes(np.linspace(3.55, 3.65, N))
@@ -166,12 +166,12 @@ def test_an_edge_that_vanishes_along_another_side_has_a_moderate_curvature(offse
     along = np.asarray(tissue.sides[side, 2:4])
     away = 1e-7 * (offset * np.array([-along[1], along[0]]) - along)
     b = int(m.next[0]) // 3
-    there = tissue.with_vertices(tissue.vertices.at[b].add(away - tissue.sides[0, 2:4]))
+    displaced = tissue.with_vertices(tissue.vertices.at[b].add(away - tissue.sides[0, 2:4]))
     one = jnp.asarray(1.0)
-    contacts, _ = no_contacts(0.01, one, there).found(there)
+    contacts, _ = no_contacts(0.01, one, displaced).updated_pairs(displaced)
     assert [int(m.next[0]), side] in contacts.sides.T.tolist()
-    own = lambda x: contacts(there.with_vertices(there.vertices.at[b].set(x)))
-    curvature = jax.hessian(own)(there.vertices[b])
+    energy_at = lambda x: contacts(displaced.with_vertices(displaced.vertices.at[b].set(x)))
+    curvature = jax.hessian(energy_at)(displaced.vertices[b])
     assert np.abs(curvature).max() < 1e5 * contacts.pairs.strength
 
 
@@ -182,14 +182,17 @@ def test_a_negative_range_is_refused():
 
 @functools.cache
 def in_contact() -> tuple[vx.Tissue, np.ndarray]:
-    """A tissue at rest whose cells, of very different target shape factors, press corners against sides."""
+    """A tissue at rest in which corners press against sides: target shape factors differ much."""
     exerted = eqx.filter_jit(lambda t, e: jax.grad(lambda v: e(t.with_vertices(v)))(t.vertices))
     for seed in range(40, 100):
         targets = shape_factors(seed)
-        found = relaxed(tissue_of(seed), shapes(targets), throw=False)
+        equilibrium = relaxed(tissue_of(seed), shapes(targets), throw=False)
         # What the energy exerts there and contacts bear.
-        if found.converged and np.max(np.abs(exerted(found.tissue, shapes(targets)))) > 1e-3:
-            return found.tissue, targets
+        if (
+            equilibrium.converged
+            and np.max(np.abs(exerted(equilibrium.tissue, shapes(targets)))) > 1e-3
+        ):
+            return equilibrium.tissue, targets
     raise AssertionError("no tissue ends in contact")
 
 
@@ -199,8 +202,8 @@ def cost_and_slope(targets, start, adjoint):
 
     def cost(targets):
         energy = vx.energies.ShapeFactorEnergy(targets)
-        found = vx.equilibrate(start, energy, adjoint=adjoint, tolerance=1e-11)
-        return jnp.sum(jnp.sin(3 * found.tissue.edge_lengths))
+        equilibrium = vx.equilibrate(start, energy, adjoint=adjoint, tolerance=1e-11)
+        return jnp.sum(jnp.sin(3 * equilibrium.tissue.edge_lengths))
 
     return jax.value_and_grad(cost)(targets)
 

@@ -123,12 +123,12 @@ def test_young_laplace_and_force_balance_in_random_clusters(inner_arcs):
         start = cluster(n, k, inner_arcs=inner_arcs, softening=1e-6)
         tension = 0.6 + 0.3 * np.random.default_rng(k).random(start.n_edges)
         energy = drops(tension, target)
-        found = vx.equilibrate(start, energy, tolerance=1e-10)
-        found.tissue.topology.validate()
-        assert imbalance(found.tissue, jnp.asarray(tension), target) < 1e-7
-        force, torque = forces(found.tissue, energy)
+        equilibrium = vx.equilibrate(start, energy, tolerance=1e-10)
+        equilibrium.tissue.topology.validate()
+        assert imbalance(equilibrium.tissue, jnp.asarray(tension), target) < 1e-7
+        force, torque = forces(equilibrium.tissue, energy)
         assert max(np.abs(force).max(), np.abs(torque).max()) < 1e-9
-        num_t1 += int(found.num_t1)
+        num_t1 += int(equilibrium.num_t1)
     assert num_t1 > 0
 
 
@@ -138,10 +138,10 @@ def test_all_solvers_reach_the_same_drop(solver, force):
     energy = AreaElasticity(0.2 * K, target) + LineTension(0.2 * tension)
     start = relax(doublet(inner_arcs=True), drops(tension, 0.9 * target), transitions=None)
     options = {"solver": solver, "tolerance": 10 * force, "max_steps": 3000, "transitions": None}
-    found = equilibrate(start, energy, throw=False, **options)
-    assert found.converged, (found.max_force, found.num_steps)
+    equilibrium = equilibrate(start, energy, throw=False, **options)
+    assert equilibrium.converged, (equilibrium.max_force, equilibrium.num_steps)
     exact = relax(start, energy, transitions=None)
-    np.testing.assert_allclose(found.tissue.areas, exact.areas, atol=100 * force)
+    np.testing.assert_allclose(equilibrium.tissue.areas, exact.areas, atol=100 * force)
 
 
 @pytest.mark.thorough
@@ -159,7 +159,7 @@ def test_units_of_length_do_not_matter_to_the_solver():
 
 
 @pytest.mark.parametrize("angles", [(3.6, 0.0, 3.6), (5.0, 0.0, 1.0)])
-def test_overstretched_arcs_find_back(angles):
+def test_overstretched_arcs_relax(angles):
     start = with_angles(doublet(), jnp.array(angles))
     tissue = relax(start, drops([1.0, 1.0, 1.0], jnp.ones(2)), transitions=None)
     np.testing.assert_allclose(tissue.edge_angles[jnp.array([0, 2])], 2 * np.pi / 3, atol=1e-8)
@@ -172,9 +172,9 @@ def hypergradient_problem(tissue, seed=0, **options):
     def loss(tension, start=tissue, adjoint=None):
         energy = drops(tension)
         settings = {"tolerance": 1e-12, "adjoint": adjoint, "throw": False} | options
-        found = equilibrate(start, energy, **settings)
-        at = found.tissue
-        return VertexDistance(target)(at, energy) + jnp.sum(jnp.sin(at.edge_angles)), found
+        equilibrium = equilibrate(start, energy, **settings)
+        at = equilibrium.tissue
+        return VertexDistance(target)(at, energy) + jnp.sum(jnp.sin(at.edge_angles)), equilibrium
 
     return loss, 0.7 + 0.2 * jax.random.uniform(jax.random.key(seed), (tissue.n_edges,))
 
@@ -186,8 +186,8 @@ def test_hypergradient_from_far_away_against_central_differences(inner_arcs):
     # must not depend on the solver's way there, or the gradient would miss that.
     loss, tension = hypergradient_problem(cluster(8, 4, inner_arcs=inner_arcs))
     evaluate = jax.jit(jax.value_and_grad(loss, has_aux=True))
-    (_, found), gradient = evaluate(tension)
-    assert found.converged
+    (_, equilibrium), gradient = evaluate(tension)
+    assert equilibrium.converged
     direction = random_like(tension)
     difference = central_difference(lambda g: evaluate(g)[0][0], tension, direction)
     assert jnp.sum(gradient * direction) == pytest.approx(float(difference), rel=1e-6)
@@ -206,10 +206,10 @@ def test_pinned_vertices_stay_and_are_differentiable(n_pinned, seed):
         return loss(tension, tissue.with_vertices(vertices))
 
     evaluate = jax.jit(jax.value_and_grad(of_pins, has_aux=True))
-    (_, found), gradient = evaluate(tissue.vertices)
-    assert found.converged
-    np.testing.assert_array_equal(found.tissue.vertices[pinned], tissue.vertices[pinned])
-    assert jnp.abs(found.tissue.vertices - tissue.vertices)[~pinned].max() > 1e-3
+    (_, equilibrium), gradient = evaluate(tissue.vertices)
+    assert equilibrium.converged
+    np.testing.assert_array_equal(equilibrium.tissue.vertices[pinned], tissue.vertices[pinned])
+    assert jnp.abs(equilibrium.tissue.vertices - tissue.vertices)[~pinned].max() > 1e-3
     np.testing.assert_array_equal(gradient[~pinned], 0)
     direction = random_like(tissue.vertices)
     difference = central_difference(lambda x: evaluate(x)[0][0], tissue.vertices, direction)
@@ -218,20 +218,20 @@ def test_pinned_vertices_stay_and_are_differentiable(n_pinned, seed):
 
 @pytest.mark.thorough
 def test_pinned_vertices_of_a_periodic_tissue():
-    whole = vx.initialise.periodic_voronoi(9, key=jax.random.key(2))
+    crystal = vx.initialise.periodic_voronoi(9, key=jax.random.key(2))
     pinned = jnp.zeros(18, bool).at[jnp.array([0, 7])].set(True)
-    tissue = vx.Tissue(whole.vertices, whole.topology, whole.boundary, pinned=pinned)
+    tissue = vx.Tissue(crystal.vertices, crystal.topology, crystal.boundary, pinned=pinned)
 
     def loss(p):
         energy = vx.energies.ShapeFactorEnergy(p)
-        found = equilibrate(tissue, energy, transitions=None, tolerance=1e-12)
-        return jnp.sum(found.tissue.vertices), found
+        equilibrium = equilibrate(tissue, energy, transitions=None, tolerance=1e-12)
+        return jnp.sum(equilibrium.tissue.vertices), equilibrium
 
     evaluate = jax.jit(jax.value_and_grad(loss, has_aux=True))
-    (_, found), slope = evaluate(jnp.array(3.6))
-    np.testing.assert_array_equal(found.tissue.vertices[pinned], whole.vertices[pinned])
+    (_, equilibrium), slope = evaluate(jnp.array(3.6))
+    np.testing.assert_array_equal(equilibrium.tissue.vertices[pinned], crystal.vertices[pinned])
     # The gauge, which no pinned tissue needs, must not hold the centroid: it is pulled along.
-    assert jnp.abs(jnp.mean(found.tissue.vertices - whole.vertices, axis=0)).max() > 1e-4
+    assert jnp.abs(jnp.mean(equilibrium.tissue.vertices - crystal.vertices, axis=0)).max() > 1e-4
     difference = central_difference(lambda p: evaluate(p)[0][0], jnp.array(3.6), 1.0)
     assert slope == pytest.approx(float(difference), rel=1e-6)
 
@@ -270,10 +270,10 @@ def test_float32():
     tissue = cluster(8, 4)
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     small = jax.tree.map(to32, tissue)
-    found, exact = equilibrate(small, drops(0.8)), equilibrate(tissue, drops(0.8))
-    assert found.tissue.vertices.dtype == angles_of(found.tissue).dtype == jnp.float32
-    np.testing.assert_allclose(found.tissue.areas, exact.tissue.areas, rtol=1e-3)
-    np.testing.assert_allclose(found.tissue.edge_angles, exact.tissue.edge_angles, atol=5e-3)
+    equilibrium, exact = equilibrate(small, drops(0.8)), equilibrate(tissue, drops(0.8))
+    assert equilibrium.tissue.vertices.dtype == angles_of(equilibrium.tissue).dtype == jnp.float32
+    np.testing.assert_allclose(equilibrium.tissue.areas, exact.tissue.areas, rtol=1e-3)
+    np.testing.assert_allclose(equilibrium.tissue.edge_angles, exact.tissue.edge_angles, atol=5e-3)
 
 
 @pytest.mark.slow  # designs of clusters fit tensions, too

@@ -37,7 +37,7 @@ def edge_axes(tissue: vx.Tissue) -> jax.Array:
 
 def held(tissue: vx.Tissue, times: int = _OFTEN) -> InversionBarrier:
     """Its edge of that number put upright so often."""
-    inversion = InversionBarrier.none(tissue, jnp.asarray(REACH), jnp.asarray(2.0))
+    inversion = InversionBarrier.empty(tissue, jnp.asarray(REACH), jnp.asarray(2.0))
     for _ in range(times):
         inversion = updated(inversion, tissue, jnp.arange(tissue.n_edges) == NUMBER)
     return inversion
@@ -59,7 +59,7 @@ def numbers(inversion: InversionBarrier, tissue: vx.Tissue) -> list[int]:
     return [e for e in inversion.edges.tolist() if e < tissue.n_edges]
 
 
-def test_an_edge_is_held_from_so_many_times_until_it_has_grown():
+def test_the_barrier_of_an_edge_turns_on_by_counts_and_off_by_length():
     short = with_edge(random_tissue(12, 3), REACH)
     assert numbers(held(short, _OFTEN - 1), short) == []
     inversion = held(short)
@@ -78,9 +78,9 @@ def test_an_edge_is_held_from_so_many_times_until_it_has_grown():
     assert numbers(again, short) == [NUMBER]
 
 
-def test_of_more_edges_than_there_is_room_for_some_are_held():
+def test_more_edges_than_rows_keep_some_barriers():
     tissue = random_tissue(12, 3)
-    inversion = InversionBarrier.none(tissue, jnp.asarray(REACH), jnp.asarray(2.0))
+    inversion = InversionBarrier.empty(tissue, jnp.asarray(REACH), jnp.asarray(2.0))
     for _ in range(_OFTEN):
         inversion = updated(inversion, tissue, jnp.ones(tissue.n_edges, bool))
     assert len(numbers(inversion, tissue)) == len(inversion.edges) < tissue.n_edges
@@ -89,11 +89,11 @@ def test_of_more_edges_than_there_is_room_for_some_are_held():
 
 @pytest.mark.parametrize("arcs", [False, True], ids=["straight", "arcs"])
 @pytest.mark.parametrize("across", [0.0, 0.5])
-def test_its_derivatives(across, arcs):
+def test_derivatives_agree_with_finite_differences(across, arcs):
     tissue = cluster(12, 3, inner_arcs=True) if arcs else random_tissue(12, 3)
-    there = with_edge(tissue, 0.4 * REACH, across)
-    inversion = held(there)
-    assert numbers(inversion, there) == [NUMBER]
+    nearly = with_edge(tissue, 0.4 * REACH, across)
+    inversion = held(nearly)
+    assert numbers(inversion, nearly) == [NUMBER]
     way = np.random.default_rng(0).normal(size=there.vertices.shape)
 
     def plain(x):
@@ -105,7 +105,7 @@ def test_its_derivatives(across, arcs):
         fade = (1 - squared / (_FADE * REACH) ** 2) ** 3
         return 2.0 * REACH * fade * barrier(upright)
 
-    contacts = holding(there, inversion)
+    contacts = holding(nearly, inversion)
     energy = lambda x: contacts(there.with_vertices(x))
     assert energy(there.vertices) > 0
     both = lambda f: jax.jvp(jax.value_and_grad(f), (there.vertices,), (jnp.asarray(way),))
@@ -118,20 +118,20 @@ def test_its_derivatives(across, arcs):
 
 
 @pytest.mark.parametrize("times", [0, _OFTEN], ids=["free", "held"])
-def test_a_step_that_jumps_over_its_barrier_goes_less_far(times):
-    """Or the edge would be put upright and turned, in turn, for ever."""
+def test_a_step_across_a_barrier_is_shortened(times):
+    """Otherwise the edge would be inverted and corrected again and again."""
     tissue = with_edge(random_tissue(20, 0), 2 * _FADE * REACH)
     energy = vx.energies.ShapeFactorEnergy(jnp.full(20, 3.7))
     search = vx.Relaxation().search(tissue, energy)
     state = search.begin(tissue, energy)
     assert state.contacts is not None
     contacts = state.contacts.holding(tissue.topology, held(tissue, times))
-    state = eqx.tree_at(lambda s: (s.contacts, s.started), state, (contacts, jnp.array(True)))
+    start, true = search.feasibility.start(tissue, contacts, state.counts), jnp.array(True)
     ends = tissue.topology.edge_vertices[NUMBER]
     edge = tissue.edge_vectors[NUMBER]
     # A little beyond its middle, both from one end and from the other.
     goal = tissue.with_vertices(tissue.vertices.at[ends].add(0.6 * jnp.stack([edge, -edge])))
-    arrived = search._feasible(state, goal, energy, jnp.array(True))
+    arrived = search.feasibility(start, goal, energy, true, true)
     assert not arrived.overlapping.any()
     other = jnp.ones(tissue.n_vertices, bool).at[ends].set(False)
     assert (arrived.fraction[other] == 1).all()
@@ -141,7 +141,7 @@ def test_a_step_that_jumps_over_its_barrier_goes_less_far(times):
 
 
 class Turning(vx.AbstractEnergy):
-    """An edge is pressed to point the other way, however its neighbours lie and whether it flips."""
+    """A force that inverts an edge whether it has flipped or not."""
 
     force: jax.Array
 
@@ -150,12 +150,12 @@ class Turning(vx.AbstractEnergy):
         return self.force * jnp.dot(edge, axis) / jnp.linalg.norm(axis)
 
 
-def test_an_edge_that_is_pressed_to_turn_comes_to_rest():
+def test_a_compressed_edge_relaxes():
     tissue = random_tissue(20, 0)
     energy = vx.energies.ShapeFactorEnergy(jnp.full(20, 3.7)) + Turning(jnp.asarray(1.0))
-    found = vx.equilibrate(tissue, energy, tolerance=1e-8, max_steps=150)
-    assert found.valid
-    edge, axis = found.tissue.edge_vectors[NUMBER], edge_axes(found.tissue)[NUMBER]
+    equilibrium = vx.equilibrate(tissue, energy, tolerance=1e-8, max_steps=150)
+    assert equilibrium.valid
+    edge, axis = equilibrium.tissue.edge_vectors[NUMBER], edge_axes(equilibrium.tissue)[NUMBER]
     length = jnp.linalg.norm(edge)
     share = (length + edge @ axis / jnp.linalg.norm(axis)) / 2
     assert length < _FADE * REACH
@@ -163,7 +163,7 @@ def test_an_edge_that_is_pressed_to_turn_comes_to_rest():
 
 
 @pytest.mark.parametrize("seed", [35, 170])
-def test_a_fluid_tissue_comes_to_rest_around_such_points(seed):
+def test_a_fluid_tissue_with_fourfold_vertices_relaxes(seed):
     tissue = vx.initialise.periodic_voronoi(100, key=seed)
     noise = jax.random.normal(jax.random.key(1 + seed), (100,))
     energy = vx.energies.ShapeFactorEnergy(3.9 + 0.1 * noise)
@@ -171,7 +171,7 @@ def test_a_fluid_tissue_comes_to_rest_around_such_points(seed):
 
 
 @pytest.mark.thorough
-def test_held_edges_of_a_large_tissue_do_not_turn_for_ever():
+def test_edges_of_a_large_tissue_stop_turning():
     """A step turned one, the sweep put it upright, and so on with period two."""
     relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=150))
     for seed in range(4):

@@ -33,11 +33,11 @@ def lattice():
 def test_perimeter_of_the_sheared_hexagonal_lattice(lattice, p0, epsilon):
     # Relaxed at fixed area, P = P_hex cosh ε on the rigid side.
     start = strained(lattice, pure_shear(epsilon))
-    found = vx.equilibrate(
+    equilibrium = vx.equilibrate(
         start, ShapeFactorEnergy(p0), transitions=None, contact_range=None, tolerance=1e-11
     )
-    np.testing.assert_allclose(found.tissue.perimeters, C * np.cosh(epsilon), rtol=1e-9)
-    np.testing.assert_allclose(found.tissue.areas, 1, rtol=1e-9)
+    np.testing.assert_allclose(equilibrium.tissue.perimeters, C * np.cosh(epsilon), rtol=1e-9)
+    np.testing.assert_allclose(equilibrium.tissue.areas, 1, rtol=1e-9)
 
 
 @pytest.mark.parametrize("p0", [3.2, 3.6])
@@ -48,8 +48,10 @@ def test_shear_modulus_of_the_hexagonal_lattice(lattice, p0):
 
     def relaxed(epsilon):
         start = strained(lattice, pure_shear(epsilon))
-        found = vx.equilibrate(start, energy, transitions=None, contact_range=None, tolerance=1e-11)
-        return found.energy / lattice.n_cells
+        equilibrium = vx.equilibrate(
+            start, energy, transitions=None, contact_range=None, tolerance=1e-11
+        )
+        return equilibrium.energy / lattice.n_cells
 
     affine = lambda epsilon: per_cell(strained(lattice, pure_shear(epsilon)))
     # Pure shear by ε is a shear angle of 2 ε: e = 2 G ε².
@@ -105,14 +107,14 @@ def zero_modes(tissue, energy):
 def test_zero_modes_count_rigid_and_fluid_states():
     n = 16
     rigid = ShapeFactorEnergy(shape_factors(n, 3.6, 0.05))
-    found = vx.equilibrate(random_tissue(n, 1), rigid, tolerance=1e-10)
-    assert found.energy > 1e-2
-    assert zero_modes(found.tissue, rigid) == 2  # the translations
+    equilibrium = vx.equilibrate(random_tissue(n, 1), rigid, tolerance=1e-10)
+    assert equilibrium.energy > 1e-2
+    assert zero_modes(equilibrium.tissue, rigid) == 2  # the translations
 
     fluid = ShapeFactorEnergy(jnp.full(n, 4.1))
-    found = vx.equilibrate(random_tissue(n, 1), fluid, tolerance=1e-10)
-    assert found.energy < 1e-15
-    assert zero_modes(found.tissue, fluid) == 2 * n + 1
+    equilibrium = vx.equilibrate(random_tissue(n, 1), fluid, tolerance=1e-10)
+    assert equilibrium.energy < 1e-15
+    assert zero_modes(equilibrium.tissue, fluid) == 2 * n + 1
 
 
 @pytest.mark.thorough
@@ -122,7 +124,7 @@ def test_tissues_are_rigid_at_low_and_fluid_at_high_target_shape_factor():
     # between, a quench leaves a few of those and a little energy.
     batch = jax.tree.map(lambda *x: jnp.stack(x), *[random_tissue(64, s) for s in range(8)])
     energy_of = lambda t, p0: vx.equilibrate(t, ShapeFactorEnergy(p0), throw=False).energy
-    # One by one, lest all wait for the slowest.
+    # (One by one: a batch would wait for the slowest.)
     relaxed = jax.jit(lambda p0: jax.lax.map(lambda t: energy_of(t, p0), batch))
     assert (relaxed(3.7) > 1e-2).all()
     assert (relaxed(4.1) < 1e-12).all()
@@ -162,7 +164,7 @@ def test_stress_from_tensions_and_pressures_is_the_derivative_by_the_strain_of_t
     # σ = (1/A_box) [Σ K_A (A - A0) A I + Σ_edges T l⊗l/|l|], T = γ + Σ over both cells K_P (P - P0).
     k_a, a_0, k_p, p_0, gamma = values = jnp.array([3.0, 1.1, 1.4, p0, 0.2])
     energy = AreaElasticity(k_a, a_0) + PerimeterElasticity(k_p, p_0) + LineTension(gamma)
-    # Vertices that nearly meet would be held apart by contacts, which the formula does not know.
+    # Vertices that nearly meet would be held apart by contacts, which the formula does not contain.
     tissue = vx.equilibrate(
         random_tissue(16, 2), energy, transitions=None, contact_range=None, tolerance=1e-11
     ).tissue
@@ -180,5 +182,5 @@ def test_forces_sum_to_zero_and_areas_to_the_box(seed):
     energy = ShapeFactorEnergy(shape_factors(16, 3.7, 0.2, seed))
     tissue = random_tissue(16, seed)
     np.testing.assert_allclose(np.sum(forces(tissue, energy), axis=0), 0, atol=1e-10)
-    found = vx.equilibrate(tissue, energy, tolerance=1e-10)
-    assert np.sum(found.tissue.areas) == pytest.approx(16, rel=1e-12)
+    equilibrium = vx.equilibrate(tissue, energy, tolerance=1e-10)
+    assert np.sum(equilibrium.tissue.areas) == pytest.approx(16, rel=1e-12)

@@ -44,8 +44,8 @@ def load():
         vertices, half_edges, faces = (data[f"{state}_{name}"] for name in names)
         box = float(data["width"]), float(data["height"])
         tables = Tables(vertices, half_edges, faces, *box)
-        own = {k.removeprefix(state + "_"): v for k, v in data.items() if k.startswith(state)}
-        return tables, own, data
+        values = {k.removeprefix(state + "_"): v for k, v in data.items() if k.startswith(state)}
+        return tables, values, data
 
     return state_of
 
@@ -309,9 +309,9 @@ class TestBoundedReference:
     @pytest.fixture(params=["start", "relaxed"])
     def state(self, request, data):
         prefix = request.param + "_"
-        own = {k.removeprefix(prefix): v for k, v in data.items() if k.startswith(prefix)}
+        values = {k.removeprefix(prefix): v for k, v in data.items() if k.startswith(prefix)}
         names = ("vertTable", "angTable", "heTable", "faceTable")
-        return BoundedTables(*(own[name] for name in names)), own
+        return BoundedTables(*(values[name] for name in names)), own
 
     def test_geometry(self, state):
         tables, expected = state

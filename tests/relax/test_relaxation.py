@@ -45,7 +45,7 @@ def pull_of(tissue, energy):
 @each_solver(*(name for name, *_ in SOLVERS))
 def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
     start, energy, reference = disturbed
-    found = vx.equilibrate(
+    equilibrium = vx.equilibrate(
         start,
         energy,
         solver=solver,
@@ -54,26 +54,26 @@ def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
         tolerance=force,
         max_steps=3000,
     )
-    assert found.converged
-    assert found.max_force < force
-    assert np.abs(force_of(found.tissue, energy)).max() < force
-    assert found.energy == pytest.approx(float(energy(reference)), abs=10 * force**2 + 1e-9)
+    assert equilibrium.converged
+    assert equilibrium.max_force < force
+    assert np.abs(force_of(equilibrium.tissue, energy)).max() < force
+    assert equilibrium.energy == pytest.approx(float(energy(reference)), abs=10 * force**2 + 1e-9)
 
 
 @each_solver("newton_cg", "lbfgs")
 def test_every_solver_works_in_float32(solver, force, disturbed):
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     start, energy, reference = disturbed
-    found = vx.equilibrate(
+    equilibrium = vx.equilibrate(
         *jax.tree.map(to32, (start, energy)),
         solver=solver,
         transitions=None,
         contact_range=None,
         tolerance=5e-3,
     )
-    assert found.tissue.vertices.dtype == jnp.float32
-    assert found.max_force < 5e-3
-    assert found.energy == pytest.approx(float(energy(reference)), rel=1e-3)
+    assert equilibrium.tissue.vertices.dtype == jnp.float32
+    assert equilibrium.max_force < 5e-3
+    assert equilibrium.energy == pytest.approx(float(energy(reference)), rel=1e-3)
 
 
 @eqx.filter_jit
@@ -97,13 +97,13 @@ def test_random_tissues_reach_true_equilibria(p0):
     batch = [random_tissue(64, s) for s in range(6)]
     tissues = jax.tree.map(lambda *x: jnp.stack(x), *batch)
     targets = jnp.stack([shape_factors(64, p0, 0.1, s) for s in range(6)])
-    found = relaxed_one_by_one(tissues, targets)
-    assert found.converged.all()
-    assert (found.max_force < 1e-8).all()
-    assert found.num_t1.sum() > 30
+    equilibrium = relaxed_one_by_one(tissues, targets)
+    assert equilibrium.converged.all()
+    assert (equilibrium.max_force < 1e-8).all()
+    assert equilibrium.num_t1.sum() > 30
     by_themselves = 0
     for k in range(6):
-        one = jax.tree.map(lambda x, k=k: x[k], found.tissue)
+        one = jax.tree.map(lambda x, k=k: x[k], equilibrium.tissue)
         one.topology.validate()
         assert one.areas.sum() == pytest.approx(64)
         energy = ShapeFactorEnergy(targets[k])
@@ -145,8 +145,10 @@ def test_vmap_and_single_runs_agree():
 
 def test_relaxation_does_not_drift():
     tissue = random_tissue(12, 3)
-    found = vx.equilibrate(tissue, ShapeFactorEnergy(jnp.full(12, 3.7)))
-    np.testing.assert_allclose(found.tissue.vertices.mean(0), tissue.vertices.mean(0), atol=1e-12)
+    equilibrium = vx.equilibrate(tissue, ShapeFactorEnergy(jnp.full(12, 3.7)))
+    np.testing.assert_allclose(
+        equilibrium.tissue.vertices.mean(0), tissue.vertices.mean(0), atol=1e-12
+    )
 
 
 def test_equilibrium_does_not_depend_on_where_the_box_is():
@@ -184,7 +186,7 @@ def test_units_do_not_matter(solver):
         assert abs(int(b.num_steps) - int(a.num_steps)) <= 0.1 * a.num_steps + 1
 
 
-def test_what_is_a_number_compiles_once():
+def test_another_number_compiles_nothing():
     tissue = random_tissue(12, 0)
 
     def relax(p0: float, tolerance: float, max_steps: int, threshold: float, adjoint=None):
@@ -203,7 +205,7 @@ def test_what_is_a_number_compiles_once():
     assert not compiled
 
 
-def test_what_is_compiled_can_be_kept_on_disk():
+def test_the_compiled_relaxation_is_cached_on_disk():
     # JAX keeps no program that calls back to the host, as an error raised within it does.
     tissue = random_tissue(6, 0)
     equilibrate = lambda factor: vx.equilibrate(tissue, ShapeFactorEnergy(factor), throw=False)
@@ -211,7 +213,7 @@ def test_what_is_compiled_can_be_kept_on_disk():
     assert "callback" not in program
 
 
-def test_patience_counts_consecutive_steps():
+def test_consecutive_steps_are_counted():
     tissue, energy = relaxed(12, seed=1)
     run = lambda consecutive_steps: vx.equilibrate(
         tissue,
@@ -226,8 +228,8 @@ def test_patience_counts_consecutive_steps():
     assert run(10).num_steps == 9
 
 
-def test_the_protocol_of_the_paper_runs_and_says_that_it_did_not_converge():
-    found = vx.equilibrate(
+def test_the_protocol_of_the_paper_reports_no_convergence():
+    equilibrium = vx.equilibrate(
         random_tissue(12, 0),
         ShapeFactorEnergy(shape_factors(12, 3.7, 0.1)),
         solver=vx.solvers.GradientDescent(1e-2),
@@ -238,8 +240,8 @@ def test_the_protocol_of_the_paper_runs_and_says_that_it_did_not_converge():
         contact_range=None,
         throw=False,
     )
-    assert found.num_steps <= 1000
-    assert found.converged == (found.max_force < 1e-3)
+    assert equilibrium.num_steps <= 1000
+    assert equilibrium.converged == (equilibrium.max_force < 1e-3)
 
 
 def test_no_convergence_is_an_error_by_default_and_a_result_otherwise():
@@ -253,19 +255,19 @@ def test_no_convergence_is_an_error_by_default_and_a_result_otherwise():
     )
     with pytest.raises(Exception, match="reached no equilibrium"):
         jax.jit(lambda t: few(t, energy).energy)(lattice).block_until_ready()
-    found = vx.equilibrate(tissue, energy, max_steps=2, throw=False)
-    assert not found.converged
-    assert found.num_steps == 2
-    assert found.result == vx.RESULTS.nonlinear_max_steps_reached
+    equilibrium = vx.equilibrate(tissue, energy, max_steps=2, throw=False)
+    assert not equilibrium.converged
+    assert equilibrium.num_steps == 2
+    assert equilibrium.result == vx.RESULTS.nonlinear_max_steps_reached
 
 
-def test_a_parameter_that_is_not_a_number_is_reported():
+def test_a_nan_parameter_is_reported():
     # An energy refuses NaN when it is made; an optimiser may make it later.
     p0 = lambda e: e.target_shape_factor
     energy = eqx.tree_at(p0, ShapeFactorEnergy(jnp.full(12, 3.7)), jnp.full(12, jnp.nan))
-    found = vx.equilibrate(random_tissue(12, 0), energy, throw=False)
-    assert found.result == vx.RESULTS.nonfinite
-    assert found.num_steps == 0
+    equilibrium = vx.equilibrate(random_tissue(12, 0), energy, throw=False)
+    assert equilibrium.result == vx.RESULTS.nonfinite
+    assert equilibrium.num_steps == 0
     message = "broke down: its forces are not finite. The parameters of the energy must be finite"
     with pytest.raises(RuntimeError, match=message):
         vx.equilibrate(random_tissue(12, 0), energy)
@@ -316,9 +318,9 @@ class _Blind(vx.AbstractEnergy):
 def test_a_relaxation_ends_where_an_energy_ignores_a_coordinate_that_is_nan():
     tissue = random_tissue(3, 1)
     tissue = tissue.with_vertices(tissue.vertices.at[0].set(jnp.nan))
-    found = dataclasses.replace(STILL, max_steps=20)(tissue, _Blind(), throw=False)
-    assert found.num_steps <= 20
-    assert found.result == vx.RESULTS.nonfinite
+    equilibrium = dataclasses.replace(STILL, max_steps=20)(tissue, _Blind(), throw=False)
+    assert equilibrium.num_steps <= 20
+    assert equilibrium.result == vx.RESULTS.nonfinite
 
 
 @pytest.mark.parametrize(
@@ -355,7 +357,7 @@ def test_no_retracing_between_calls():
 
 
 class Substrate(vx.AbstractEnergy):
-    """Springs from each vertex to a place of its own: an energy that knows where the tissue is."""
+    """Springs from vertices to fixed positions: an energy that depends on absolute positions."""
 
     home: jax.Array
     stiffness: float = 0.3
@@ -367,17 +369,17 @@ class Substrate(vx.AbstractEnergy):
 
 @pytest.mark.parametrize("boundary", ["periodic", "free"])
 @pytest.mark.thorough
-def test_an_energy_may_know_where_the_tissue_is(boundary):
+def test_an_energy_may_depend_on_absolute_positions(boundary):
     tissue = random_tissue(9, 1) if boundary == "periodic" else cluster(6, 1, lloyd_steps=2)
     home = tissue.vertices + jnp.array([0.4, -0.2])
     # A cluster without tensions on its outline would overlap.
     contacts = 0.01 if boundary == "free" else None
     relax = vx.Relaxation(transitions=None, contact_range=contacts)
-    found = relax(tissue, Substrate(home))
-    assert found.converged
-    assert float(np.max(np.abs(pull_of(found.tissue, Substrate(home))))) < 1e-8
+    equilibrium = relax(tissue, Substrate(home))
+    assert equilibrium.converged
+    assert float(np.max(np.abs(pull_of(equilibrium.tissue, Substrate(home))))) < 1e-8
     # Inner forces move no centroid, so that of the springs decides.
-    np.testing.assert_allclose(jnp.mean(found.tissue.vertices - home, axis=0), 0, atol=1e-8)
+    np.testing.assert_allclose(jnp.mean(equilibrium.tissue.vertices - home, axis=0), 0, atol=1e-8)
     # Without springs the whole stays where it was.
     stays = relax(tissue, Substrate(home, 0.0)).tissue
     np.testing.assert_allclose(jnp.mean(stays.vertices - tissue.vertices, axis=0), 0, atol=1e-9)

@@ -44,7 +44,7 @@ def judged(g, proposal, product, bounds):
 
 
 @pytest.mark.parametrize("concave", [0, 0.25, 0.75])
-def test_steps_go_downhill_and_stay_within_their_bounds(concave):
+def test_steps_descend_within_their_bounds(concave):
     def one(key):
         g, matrix, bounds = model(key, concave)
         return judged(g, *step(g, matrix, bounds), bounds)
@@ -56,7 +56,7 @@ def test_steps_go_downhill_and_stay_within_their_bounds(concave):
 
 
 @pytest.mark.parametrize("forcing", [1e-2, 1e-6])
-def test_within_wide_bounds_it_is_the_step_of_newton(forcing):
+def test_within_wide_bounds_it_is_the_newton_step(forcing):
     g, matrix, _ = model(jax.random.key(2))
     matrix = matrix @ matrix
     matrix = matrix / jnp.linalg.norm(matrix, 2) + jnp.eye(2 * N)
@@ -65,7 +65,7 @@ def test_within_wide_bounds_it_is_the_step_of_newton(forcing):
     assert jnp.max(jnp.abs(proposal.step - exact)) < forcing * jnp.max(jnp.abs(exact))
 
 
-def test_rows_beyond_their_bounds_are_clipped_and_no_others():
+def test_only_rows_beyond_their_bounds_are_clipped():
     """Independent rows, of which one may go less far."""
     g, bounds = -jnp.ones((N, 2)), jnp.full(N, 10.0).at[3].set(0.05)
     proposal, product = step(g, jnp.eye(2 * N), bounds, 1e-8, damped=False, max_rounds=0)

@@ -23,8 +23,8 @@ def test_a_singular_indefinite_matrix():
     many = matrix @ jax.random.normal(jax.random.key(1), (8, 5))
     operator = lx.MatrixLinearOperator(matrix, lx.symmetric_tag)
     solve = lambda b: lx.linear_solve(operator, b, Direct()).value
-    found = jax.jit(jax.vmap(solve, in_axes=1, out_axes=1))(many)
-    np.testing.assert_allclose(found, jnp.linalg.pinv(matrix) @ many, atol=2e-6)
+    result = jax.jit(jax.vmap(solve, in_axes=1, out_axes=1))(many)
+    np.testing.assert_allclose(result, jnp.linalg.pinv(matrix) @ many, atol=2e-6)
 
 
 def test_derivative_of_a_singular_system_whose_null_space_is_fixed():
@@ -43,10 +43,10 @@ def test_derivative_of_a_singular_system_whose_null_space_is_fixed():
     np.testing.assert_allclose(jax.jacfwd(solve)(0.0), exact, atol=2e-6)
 
 
-def test_what_has_no_solution_is_told():
+def test_an_inconsistent_system_is_reported():
     operator = lx.MatrixLinearOperator(jnp.diag(jnp.array([1.0, 0.0])), lx.symmetric_tag)
-    told = lx.linear_solve(operator, jnp.ones(2), Direct(), throw=False)
-    assert told.result == lx.RESULTS.singular
+    solution = lx.linear_solve(operator, jnp.ones(2), Direct(), throw=False)
+    assert solution.result == lx.RESULTS.singular
     with pytest.raises(ValueError, match="must be symmetric"):
         lx.linear_solve(lx.MatrixLinearOperator(jnp.eye(2)), jnp.ones(2), Direct())
 
@@ -60,8 +60,8 @@ def test_sensitivities_are_those_of_minres():
 
     jacobian = eqx.filter_jit(lambda solver: jax.jacfwd(lambda p: perimeters(p, solver))(p0))
     expected = jacobian(vx.MINRES())
-    found = jacobian(Direct())
-    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+    result = jacobian(Direct())
+    np.testing.assert_allclose(result, expected, atol=1e-6 * np.abs(expected).max())
     gradient = eqx.filter_jit(jax.grad(lambda p: perimeters(p, Direct()).sum()))
     np.testing.assert_allclose(gradient(p0), expected.sum(axis=0), atol=1e-6)
 

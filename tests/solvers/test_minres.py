@@ -289,7 +289,7 @@ def test_vmap_over_operators_and_vectors():
     assert solution.stats["num_steps"][3] == 1
 
 
-def test_vmap_keeps_a_nan_to_its_lane():
+def test_vmap_confines_a_nan_to_its_entry():
     a, _ = matrix(INDEFINITE)
     b = np.stack([random_vector(40), np.full(40, np.nan)])
     solution = jax.vmap(partial(solve, throw=False), in_axes=(None, 0))(a, b)
@@ -415,7 +415,7 @@ def test_operator_norm_is_a_close_lower_bound():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("null", [0, 2])
 @pytest.mark.parametrize("seed", range(4))
-def test_negative_curvature_is_seen_exactly_if_there_is_some(dtype, null, seed):
+def test_negative_curvature_is_detected(dtype, null, seed):
     rng = np.random.default_rng(seed)
     positive = np.concatenate([np.zeros(null), 10 ** rng.uniform(-2, 0, 40 - null)])
     mixed = positive.copy()
@@ -426,7 +426,7 @@ def test_negative_curvature_is_seen_exactly_if_there_is_some(dtype, null, seed):
         assert solve(a.astype(dtype), b).stats["negative_curvature"] == np.any(eigenvalues < 0)
 
 
-def test_negative_curvature_outside_the_krylov_space_is_not_seen():
+def test_negative_curvature_outside_the_krylov_space_is_not_detected():
     a = np.diag(np.concatenate([[-1.0], np.linspace(1, 2, 39)]))
     assert not solve(a, np.eye(40)[5] + np.eye(40)[3]).stats["negative_curvature"]
 
@@ -461,11 +461,11 @@ def test_too_few_steps():
 
 
 @pytest.mark.parametrize("condition", [1e7, 1e15])
-def test_hopeless_condition_is_told(condition):
+def test_hopeless_condition_is_reported(condition):
     a, _ = matrix(np.logspace(0, -np.log10(condition), 40))
     solution = solve(a.astype(np.float32), random_vector(40).astype(np.float32), throw=False)
-    told = solution.stats["stagnated"] | solution.stats["inconsistent"]
-    assert told | (solution.result != lx.RESULTS.successful)
+    reported = solution.stats["stagnated"] | solution.stats["inconsistent"]
+    assert reported | (solution.result != lx.RESULTS.successful)
     assert solution.stats["residual_norm"] > 1e-3
 
 

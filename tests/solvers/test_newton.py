@@ -44,17 +44,17 @@ def steps(fn, y, args, n, solver: Any = NEWTON, **options):
     return run(n)
 
 
-def test_one_difficult_place_does_not_hold_back_the_others():
+def test_one_difficult_region_does_not_slow_the_others():
     start = jnp.zeros((N, 2))
     radii = np.array([steps(landscape, start, 1.0, n)[1].radii for n in range(1, 12)])
     assert radii[:, 0].min() < 0.02
     assert radii[:, 0].min() < 0.5 * radii[:, 1:].min()
     y, _ = steps(landscape, start, 1.0, 6)
     np.testing.assert_allclose(y[1:], PLACES[1:], atol=1e-3)
-    found = optx.minimise(
+    solution = optx.minimise(
         landscape, vx.solvers.NewtonCG(atol=1e-10), start, 1.0, has_aux=True, max_steps=200
     )
-    np.testing.assert_allclose(found.value, PLACES, atol=1e-8)
+    np.testing.assert_allclose(solution.value, PLACES, atol=1e-8)
 
 
 def test_a_rejected_step_shrinks_the_radii_of_wrong_vertices_alone():
@@ -88,29 +88,29 @@ def needed(fn, start, radius=0.2, **settings):
     return n
 
 
-def test_regions_grow_fast_where_steps_are_foreseen():
+def test_radii_grow_fast_where_predictions_are_right():
     fn, start = lambda y, _: landscape(y, 0.0), jnp.zeros((N, 2))
     assert needed(fn, start, 1e-4) <= needed(fn, start) + 5  # 11 doublings
 
 
-def test_regions_do_not_grow_where_steps_were_cut_short():
+def test_radii_do_not_grow_where_steps_were_shortened():
     """The model predicted those steps well, and would propose them again without end."""
     solver: Any = vx.solvers.NewtonCG()
     far = lambda y, _: (0.5 * jnp.sum((y - 9.0) ** 2), None)
     _, after = steps(far, jnp.zeros((N, 2)), None, 3)
     fraction = jnp.where(jnp.arange(N) < 3, 0.0, 1.0)
-    no, yes = jnp.array(False), jnp.array(True)
-    cut = solver.moved(after, fraction, no, yes, {})
+    false, true = jnp.array(False), jnp.array(True)
+    cut = solver.moved(after, fraction, false, true, {})
     assert (cut.radii[:3] <= 0.25 * after.radii[:3]).all()
     np.testing.assert_array_equal(cut.radii[3:], after.radii[3:])
     # If short steps do not help either, they start again with the largest radius.
     for _ in range(8):
-        cut = solver.moved(cut, fraction, no, yes, {})
+        cut = solver.moved(cut, fraction, false, true, {})
     assert (cut.radii[:3] > 1e-3 * 0.2).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_copies_side_by_side_go_as_one_alone(n):
+def test_disjoint_copies_take_the_steps_of_one(n):
     """How far a step is solved does not depend on the size of a tissue."""
     springs = jnp.logspace(0, 3, N)[:, None]
 
@@ -124,14 +124,14 @@ def test_copies_side_by_side_go_as_one_alone(n):
     np.testing.assert_allclose(together.reshape(4, N, 2), jnp.stack(4 * [alone]), atol=1e-12)
 
 
-def test_a_step_that_leaves_much_of_the_force_is_corrected():
+def test_a_step_with_large_remaining_force_is_corrected():
     """Soft springs, which vertices may not follow to their ends in one step."""
     soft = lambda y, _: (0.5e-3 * jnp.sum((y - 2.0) ** 2), None)
     start = jnp.zeros((N, 2))
     assert needed(soft, start) <= 0.75 * needed(soft, start, max_corrections=0)
 
 
-def test_a_cheap_step_leaves_little():
+def test_a_cheap_step_is_corrected_earlier():
     """One wall that begins with the cube of the distance, as a contact, and others at rest."""
 
     def wall(y, _):
@@ -143,7 +143,7 @@ def test_a_cheap_step_leaves_little():
     assert needed(wall, start) < 0.75 * needed(wall, start, cheap_products=0)
 
 
-def test_few_large_forces_count_little():
+def test_typical_force_ignores_outliers():
     forces = jnp.zeros((101, 2)).at[:100, 0].set(1e-3).at[0, 0].set(1.0)
     assert np.mean(_rows.sizes(forces)) > 1e-2
     assert _rows.typical_size(forces) < 2e-3
@@ -152,7 +152,7 @@ def test_few_large_forces_count_little():
     assert _rows.typical_size(0 * forces) == 0
 
 
-def test_no_row_goes_far_in_a_step():
+def test_steps_are_bounded_by_the_largest_displacement():
     hill = lambda y, _: (jnp.sum(jnp.cos(y)), None)  # concave where it starts
     start = 0.05 * jnp.ones((N, 2))
     y, _ = steps(hill, start, None, 1, length_scale=0.5)
@@ -161,8 +161,8 @@ def test_no_row_goes_far_in_a_step():
     assert hill(y, None)[0] < hill(start, None)[0]
 
 
-def test_rows_that_go_too_far_are_clipped_and_no_others():
-    """A long lever, whose end goes a hundred times as far as what is pushed."""
+def test_only_long_rows_are_clipped():
+    """A long lever: its end moves a hundred times as far as the point where the force acts."""
     solver = vx.solvers.NewtonCG(
         forcing=1e-6, max_corrections=0, conjugate_gradients=TruncatedCG(max_rounds=0)
     )
@@ -183,7 +183,7 @@ def test_rows_that_go_too_far_are_clipped_and_no_others():
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
-def test_the_unit_of_energy_does_not_matter(scale):
+def test_steps_do_not_depend_on_the_unit_of_energy(scale):
     start = jnp.zeros((N, 2))
     scaled = lambda y, args: (scale * landscape(y, args)[0], None)
     y, _ = steps(scaled, start, 1.0, 5, stiffness=scale)
@@ -191,7 +191,7 @@ def test_the_unit_of_energy_does_not_matter(scale):
     np.testing.assert_allclose(y, expected, atol=1e-9)
 
 
-def test_the_rounding_of_an_energy_far_below_its_unit_does_not_matter():
+def test_rounding_of_an_energy_far_below_its_unit_is_ignored():
     """Lengths are almost what they should be: so their differences are known less well than themselves."""
     far = jnp.array([[1.0, 0.2], [-0.6, 0.9], [-0.3, -1.1]])
     lengths = lambda y: jnp.sum(jnp.linalg.norm(y[:, None] - far, axis=-1), axis=-1)
@@ -220,15 +220,15 @@ def test_steps_follow_a_curved_valley():
 
     angles = jnp.linspace(1.0, 2.5, N)
     start = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-    found = optx.minimise(
+    solution = optx.minimise(
         valley, vx.solvers.NewtonCG(atol=1e-10), start, has_aux=True, max_steps=400
     )
-    np.testing.assert_allclose(found.value[:, 0], 1 + tilt, atol=1e-6)
+    np.testing.assert_allclose(solution.value[:, 0], 1 + tilt, atol=1e-6)
     assert needed(valley, start) < 0.75 * needed(valley, start, max_corrections=0)
 
 
 @pytest.mark.thorough
-def test_fluid_tissues_come_to_rest_without_creeping():
+def test_fluid_tissues_relax_without_creeping():
     relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=600))
     for seed in (22, 49, 66, 71, 105, 106):  # 170 to 560 steps each without corrections
         tissue = vx.initialise.periodic_voronoi(64, key=jax.random.key(1000 + seed))

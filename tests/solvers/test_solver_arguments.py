@@ -41,6 +41,6 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
         ),
     ],
 )
-def test_what_solvers_are_made_of(make, error, message):
+def test_arguments_of_solvers_are_checked(make, error, message):
     with pytest.raises(error, match=message):
         make()

@@ -43,9 +43,9 @@ KINDS = {
 def swept(tissue, rule):
     """Transitions, without those that make cells overlap."""
     search = vx.Relaxation(transitions=rule, tolerance=1e-30).search(tissue, ENERGY)
-    state = search.begin(tissue, ENERGY)
-    state = eqx.tree_at(lambda s: s.started, state, jnp.array(True))
-    return search._feasible(state, tissue, ENERGY, jnp.array(True)).tissue
+    state, true = search.begin(tissue, ENERGY), jnp.array(True)
+    start = search.feasibility.start(tissue, state.contacts, state.counts)
+    return search.feasibility(start, tissue, ENERGY, true, true).tissue
 
 
 @eqx.filter_jit

@@ -187,7 +187,7 @@ class Evolution(AbstractResponse):
                 evolved = evolve_at_once(*given)
         return evolved.checked() if throw else evolved
 
-    def goes_with(
+    def check_compatible(
         self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
     ) -> None:
         """Refuse what goes with tissues at rest alone.
@@ -210,7 +210,7 @@ class Evolution(AbstractResponse):
                 )
 
     @property
-    def goes_on(self) -> bool:
+    def supports_warm_start(self) -> bool:
         """Each epoch of a fit begins at the first of the times."""
         return False
 

@@ -120,7 +120,7 @@ def march(
         potential = Incremental(
             pulls, evolution.dissipation, before, end - start, strained, flips, pressed
         )
-        return state.after(evolution.relaxation.solve(there, potential, adjoint, thrifty=True))
+        return state.after(evolution.relaxation.solve(there, potential, adjoint, recompute=True))
 
     def step(state: State, start: Any, end: Any) -> State:
         before, acts, dt = state.tissue, None, end - start

@@ -130,7 +130,7 @@ class External(AbstractResponse):
         - `energy`: holds the parameters.
         - `adjoint`: [`EquilibriumPropagation`][vertax.EquilibriumPropagation], with a linear nudge.
         - `throw`: raise an error if the program fails, or reaches no equilibrium. If False, look at
-            `converged`, and at `complaint()`.
+            `converged`, and at `last_error_message()`.
 
         **Returns:** an [`Equilibrium`][vertax.Equilibrium].
 
@@ -144,7 +144,7 @@ class External(AbstractResponse):
         if isinstance(energy, type):  # (A program may take parameters that are no function.)
             check_energy(energy)
         adjoint = EquilibriumPropagation() if adjoint is None else adjoint
-        self.goes_with(adjoint)
+        self.check_compatible(adjoint)
         assert isinstance(adjoint, EquilibriumPropagation)
         inputs = (tissue, energy, self, adjoint)
         concrete = all(map(is_concrete, jax.tree.leaves(inputs)))
@@ -159,7 +159,7 @@ class External(AbstractResponse):
         if not throw:
             return equilibrium
         if concrete and self.ledger.failed > failed:
-            raise SimulatorError(self.complaint())
+            raise SimulatorError(self.last_error_message())
         if concrete and not np.all(equilibrium.converged) and np.all(equilibrium.valid):
             raise RuntimeError(
                 "What the program returned is not at rest by the energy (largest force "
@@ -167,7 +167,7 @@ class External(AbstractResponse):
             )
         return equilibrium.checked()
 
-    def goes_with(
+    def check_compatible(
         self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
     ) -> None:
         """Refuse all adjoints but equilibrium propagation by constant forces.
@@ -191,7 +191,7 @@ class External(AbstractResponse):
                 "EquilibriumPropagation(), whose nudge is a constant force, and no guidance."
             )
 
-    def complaint(self) -> str | None:
+    def last_error_message(self) -> str | None:
         """Why the program failed last; None if it never did."""
         failures = self.ledger.failures
         return f"{type(self.simulator).__name__} failed: {failures[-1]}" if failures else None

@@ -136,7 +136,7 @@ def fit(
         method = Descent(optimiser, problem, parameters, constants, true, batched, guidance)
     keeper = Keeper(checkpoint, lambda: _identity_of(given, true, method.description(), batched))
     done, stopped, interrupted = _run(method, keeper, epochs, progress, callback)
-    complaint = given.response.complaint()
+    complaint = given.response.last_error_message()
     if stopped is not None and complaint is not None:
         stopped = f"{stopped}. {complaint.rstrip('.')}"
     if not done.rows:

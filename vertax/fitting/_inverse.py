@@ -108,10 +108,10 @@ class InverseProblem(eqx.Module, Generic[Energy]):
                     f"Argument `{name}` must be {example}, but is {named(value)}.{remedy}"
                 )
         check_energy(self.energy)
-        self.response.goes_with(
+        self.response.check_compatible(
             self.adjoint, guided=self.guidance is not None, placed=self.fit_position
         )
-        if self.response.goes_on and self.cost.of_frames:
+        if self.response.supports_warm_start and self.cost.of_frames:
             raise ValueError(
                 "Argument `cost` is one of several frames, and a relaxation has one: pass "
                 "response=vertax.Evolution(dissipation, times)."
@@ -199,7 +199,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
 
     def onward(self, reached: Tissue) -> Tissue:
         """Where the next epoch starts after one has reached an equilibrium, or the end of a movement."""
-        return reached if self.response.goes_on else self.tissue
+        return reached if self.response.supports_warm_start else self.tissue
 
     def value_and_gradient(
         self,

@@ -276,7 +276,7 @@ def _grow(
         before, potential = state.tissue, energy(state.cells)
         if dissipation is not None:
             potential = Incremental(potential, dissipation, before, end - start)
-        moved = relaxation.solve(before, potential, adjoint, thrifty=True)
+        moved = relaxation.solve(before, potential, adjoint, recompute=True)
         gone = before.alive & ~moved.tissue.alive
         lineage, number = died_at(state.lineage, state.number, gone, end)
         sound = state.sound & (moved.result == RESULTS.successful) & moved.valid

@@ -119,11 +119,11 @@ class BoxRelaxation(AbstractResponse):
         check_system(tissue, energy, box="a BoxRelaxation")
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.relaxation.check(tissue, energy, adjoint)
-        self.goes_with(adjoint)
+        self.check_compatible(adjoint)
         found = _relax_box(*traced((tissue, energy), tissue.vertices.dtype), self.traced(), adjoint)
         return found.checked() if throw else found
 
-    def goes_with(
+    def check_compatible(
         self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
     ) -> None:
         """Refuse adjoints that unroll a relaxation.

@@ -154,7 +154,7 @@ def _ramp(
     def step(arrays: Tissue, strain: Array) -> tuple[Tissue, tuple]:
         box = deformed(tissue, deformation(strain)).boundary
         there = eqx.combine(arrays, static).carried(box)
-        rest = relaxation.solve(there, energy, adjoint, thrifty=True)
+        rest = relaxation.solve(there, energy, adjoint, recompute=True)
         arrays = eqx.filter(rest.tissue, eqx.is_array)
         known = (arrays, rest.energy, stress(rest.tissue, energy), rest.num_t1, rest.converged)
         return arrays, known

@@ -105,11 +105,11 @@ class EdgeBlocks(eqx.Module):
         """
         if tissue.arcs is not None:
             return None
-        m, known = tissue.topology, tissue.measured()
-        response = _Response.of(energy, tissue, known)
+        m, geometry = tissue.topology, tissue.measured()
+        response = _Response.of(energy, tissue, geometry)
         diagonal, between = _resistances(tissue, response)
         mean = 0.5 * jnp.mean(diagonal.xx + diagonal.yy)
-        softest = _SOFTEST * mean + _directly(tissue, energy, known)
+        softest = _SOFTEST * mean + _directly(tissue, energy, geometry)
         softest = jnp.where(softest > 0, softest, 1)
         if more is not None:
             diagonal = Symmetric(*(x + y for x, y in zip(diagonal, more, strict=True)))
@@ -187,16 +187,16 @@ class _Response(NamedTuple):
     perimeter: Float[Array, " cells"]
 
     @classmethod
-    def of(cls, energy: AbstractEnergy, tissue: Tissue, known: Known) -> _Response:
+    def of(cls, energy: AbstractEnergy, tissue: Tissue, geometry: Known) -> _Response:
         slope, change = jax.linearize(
-            jax.grad(lambda known: energy(Measured(tissue, known))), known
+            jax.grad(lambda geometry: energy(Measured(tissue, geometry))), geometry
         )
-        zero = jax.tree.map(jnp.zeros_like, known)
+        zero = jax.tree.map(jnp.zeros_like, geometry)
         # All areas at once, and so on: the terms of an energy are those of single cells and edges.
         along = lambda **one: change(zero._replace(**one))
-        by_length = along(lengths=jnp.ones_like(known.lengths))
-        by_area = along(areas=jnp.ones_like(known.areas))
-        by_perimeter = along(perimeters=jnp.ones_like(known.perimeters))
+        by_length = along(lengths=jnp.ones_like(geometry.lengths))
+        by_area = along(areas=jnp.ones_like(geometry.areas))
+        by_perimeter = along(perimeters=jnp.ones_like(geometry.perimeters))
         finite = lambda x: jnp.where(jnp.isfinite(x), x, 0)
         positive = lambda x: jnp.maximum(finite(x), 0)
         area, perimeter = positive(by_area.areas), positive(by_perimeter.perimeters)
@@ -268,10 +268,10 @@ def _of_cells(values: Float[Array, " cells"], cells: Array) -> Array:
     return values.at[cells].get(mode="fill", fill_value=0)
 
 
-def _directly(tissue: Tissue, energy: AbstractEnergy, known: Known) -> Float[Array, ""]:
+def _directly(tissue: Tissue, energy: AbstractEnergy, geometry: Known) -> Float[Array, ""]:
     """The mean second derivative by vertices at fixed lengths, areas and perimeters."""
     # (Zero for most energies; JAX then compiles nothing.)
-    slope = jax.grad(lambda vertices: energy(Measured(tissue.with_vertices(vertices), known)))
+    slope = jax.grad(lambda vertices: energy(Measured(tissue.with_vertices(vertices), geometry)))
     direction = probe(tissue.vertices)
     _, response = jax.jvp(slope, (tissue.vertices,), (direction,))
     mean = jnp.sum(direction * response) / jnp.sum(direction**2)

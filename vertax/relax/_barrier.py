@@ -95,8 +95,8 @@ class GatherPlan(eqx.Module):
         return cls(source(half_edges), take(topology.frame, half_edges))
 
     @classmethod
-    def none(cls, topology: Topology, shape: tuple[int, int]) -> GatherPlan:
-        """Of no special vertices."""
+    def empty(cls, topology: Topology, shape: tuple[int, int]) -> GatherPlan:
+        """A placeholder."""
         index = topology.twin.dtype
         return cls(jnp.zeros(shape, index), jnp.zeros((*shape, 2), topology.frame.dtype))
 

@@ -49,7 +49,7 @@ class Contacts(eqx.Module):
                 of_pairs = jnp.sum(self.pairs.heights(one, other))
             return of_pairs + self._inversion_energy(tissue)
 
-        # Most tissues have no contacts most of the time, and then these take longer than the energy.
+        # (Most of the time there are no contacts, and the barriers take longer than the energy.)
         return jax.lax.cond(self.some, energy, lambda: jnp.zeros((), tissue.vertices.dtype))
 
     @property
@@ -59,25 +59,25 @@ class Contacts(eqx.Module):
 
     @property
     def some(self) -> Bool[Array, ""]:
-        """Whether there are any."""
+        """Whether any barrier is on."""
         return any_of(self.pairs.valid) | self.inversion.any
 
     def _inversion_energy(self, tissue: Tissue) -> Float[Array, ""]:
         return barrier_energy(self.inversion, self.inversion_plan.positions(tissue))
 
     def differ(self, other: Contacts) -> Bool[Array, ""]:
-        """Whether these are others."""
+        """Whether the rows differ."""
         changed = any_of(self.sides != other.sides)
         return changed | any_of(self.inversion.edges != other.inversion.edges)
 
     def resistance(self, tissue: Tissue) -> Symmetric:
-        """The stiffness of the pairs where one vertex moves alone, without negative eigenvalues.
+        """The diagonal blocks of the Hessian of the pairs, without negative eigenvalues.
 
-        For a preconditioner: of straight sides.
+        For a preconditioner, and for straight sides.
         """
         vectors = self.pairs.vectors(self.plan.positions(tissue))
         rows = self.pairs.expansion(vectors).block
-        # The corner moves the first vector, the end of the side its chord, and its start both.
+        # The corner moves the first vector, the end of the side moves its chord, the start moves both.
         part = lambda i, j: Symmetric(rows[i, j], rows[i, j + 1], rows[i + 1, j + 1])
         corner, chord = part(0, 0), part(2, 2)
         start = Symmetric(
@@ -93,8 +93,7 @@ class Contacts(eqx.Module):
 
     def with_stiffness(self, stiffness: Float[Array, ""]) -> Contacts:
         """The same contacts in a material of another stiffness."""
-        # The barrier must not depend on the parameters of the energy, not even through its strength: that
-        # would be one more derivative. So it is a power of 16.
+        # (The strength is a power of 16: otherwise it would depend on the parameters of the energy.)
         step = 16.0 ** jnp.round(jnp.log(stiffness) / jnp.log(16.0))
         strength = step / self.pairs.slope
         force = step * self.pairs.distance / self.pairs.slope * SLOPE
@@ -116,28 +115,28 @@ class Contacts(eqx.Module):
         - `unflipped`: which edges have not taken part.
         - `holds`: whether an edge that turned around although its barrier is on counts as an overlap.
         """
-        contacts, overlapping = self.found(tissue)
+        contacts, overlapping = self.updated_pairs(tissue)
         m = tissue.topology
         start, end = m.edge_vertices.T
         both = jnp.concatenate([point.vertices, tissue.vertices], axis=1)
         offset = tissue.boundary.translation(take(m.offset, m.half_edge))
         vectors = take(both, end) - take(both, start) + jnp.concatenate([offset, offset], axis=1)
         old, new = vectors[:, :2], vectors[:, 2:]
-        # An edge that turned around, and has not flipped, was put upright.
+        # An edge that has turned without a flip is inverted.
         turned = (dot(old, new) < 0) & jnp.all(unflipped.reshape(-1, tissue.n_edges), axis=0)
-        # If its barrier is on, the step has jumped over it.
-        over = turned & self.inversion.held & holds
-        overlapping = overlapping.at[jnp.stack([start, end])].max(over)
+        # If its barrier is on, the step has jumped across it.
+        jumped = turned & self.inversion.held & holds
+        overlapping = overlapping.at[jnp.stack([start, end])].max(jumped)
         inversion = self.inversion.updated(turned, dot(new, new))
         return contacts.holding(m, inversion), overlapping
 
     def holding(self, topology: Topology, inversion: InversionBarrier) -> Contacts:
-        """The same with other edges whose barrier is on, in a topology."""
+        """A copy with the barrier on for other edges, in a topology."""
         new = (inversion, inversion.plan(topology))
         return eqx.tree_at(lambda c: (c.inversion, c.inversion_plan), self, new)
 
-    def found(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, " vertices"]]:
-        """The contacts in a tissue, and the vertices of cells that overlap."""
+    def updated_pairs(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, " vertices"]]:
+        """The contacts with the pairs of a tissue, and the vertices of cells that overlap."""
 
         def measure(one: Sides, other: Sides, after: Array, before: Array) -> Array:
             near = [near for near, _ in self.pairs.nearness(one, other, after, before)]
@@ -164,11 +163,11 @@ class Contacts(eqx.Module):
         return contacts, overlapping
 
 
-# Pairs are listed below so many ranges: the others may come into range in the next step.
+# Pairs are listed up to this distance, in units of the range: a step may bring them into range.
 _MARGIN = 2
 SLOPE = 5.0
-"""The range between sides that are next to each other, over the distance from their common end, in units of
-the range in cells: both are the same at a fifth of a cell from the end."""
+"""Between adjacent sides the range is this number times `contact_range` times the distance from their common
+end: the two ranges agree at a fifth of a cell from the end."""
 
 
 def no_contacts(
@@ -177,31 +176,32 @@ def no_contacts(
     tissue: Tissue,
     capacity: int | None = None,
 ) -> Contacts:
-    """Contacts that are not found yet, in a material of stiffness 1.
+    """No contacts, in a material of stiffness 1.
 
     **Arguments:**
 
     - `reach`: the range in units of the size of a cell.
     - `length`: the size of a cell.
     - `tissue`: for which tissue.
-    - `capacity`: most pairs; by default the number of vertices up to 2000, then a quarter of it.
+    - `capacity`: the number of rows; by default the number of vertices, at least 64; above 2000 vertices 2000
+        or, if that is more, a quarter of the number of vertices.
     """
     reach = jnp.maximum(jnp.asarray(reach, length.dtype), 1e-9)
     slope, strength = SLOPE * reach, jnp.ones_like(length)
-    inversion = InversionBarrier.none(tissue, jnp.minimum(reach, REACH) * length, length)
+    inversion = InversionBarrier.empty(tissue, jnp.minimum(reach, REACH) * length, length)
     n = (
         max(64, min(tissue.n_vertices, 2000), tissue.n_vertices // 4)
         if capacity is None
         else capacity
     )
     topology = tissue.topology
-    no, sides = jnp.zeros(n, bool), jnp.zeros((2, n), topology.twin.dtype)
+    false, sides = jnp.zeros(n, bool), jnp.zeros((2, n), topology.twin.dtype)
     contacts = Contacts(
-        PairBarrier(reach * length, slope, strength, no, no, no),
+        PairBarrier(reach * length, slope, strength, false, false, false),
         sides,
-        GatherPlan.none(topology, (3, n)),
+        GatherPlan.empty(topology, (3, n)),
         inversion,
-        GatherPlan.none(topology, (6, len(inversion.edges))),
+        GatherPlan.empty(topology, (6, len(inversion.edges))),
         jnp.array(False),
     )
     return contacts.with_stiffness(strength)

@@ -36,12 +36,12 @@ class SearchEnd(eqx.Module):
     num_steps: Int[Array, ""]
     num_t1: Int[Array, ""]
     overlaps: Bool[Array, ""] | None
-    """Whether the tissue overlaps; None if that is not looked for."""
+    """Whether the tissue overlaps; None without contacts."""
     result: RESULTS
 
     @classmethod
     def of(cls, search: Search, state: SearchState) -> SearchEnd:
-        """The end of a search that is not to go on."""
+        """The end of a search."""
         options = search.options(state)
         return cls(
             tissue=state.tissue,
@@ -72,8 +72,7 @@ def conclude(
     """
     relaxed, units = end.tissue, end.units
     free = free_motions(relaxed, frozen(energy), units)
-    # What the solver did to the whole (turned it a little, say) depends on its way there: undo that,
-    # unless the energy has something to say about where the tissue is.
+    # Rigid motions of the relaxation depend on its path: undo them, unless the energy depends on them.
     settled = _choose(
         jnp.all(free), relaxed.settled(frozen(tissue)), _recentred(relaxed, tissue, free)
     )
@@ -91,7 +90,7 @@ def conclude(
             coarse_preconditioner(settled, preconditioner),
         ),
     }
-    # This solve starts at rest and takes no step: it is there to be differentiated.
+    # This solve takes no step: it is differentiated.
     solution = optx.minimise(
         _pinned_energy,
         AtRest(),
@@ -115,18 +114,18 @@ def conclude(
 
 
 def follow_start(relaxed: Tissue, start: Tissue, free: Bool[Array, " modes"]) -> Tissue:
-    """The same tissue, whose place depends on that of `start` when differentiated.
+    """The same tissue, with the derivative of its position by that of `start`.
 
-    A relaxation keeps what the energy does not determine: the centroid of the start, and the orientation of a
-    free tissue. The adjoint differentiates the shape in a fixed place. Here that place is differentiated, by
-    the formula that determines it, so that every adjoint has the derivative with respect to the start. Where
-    only some motions are free, their translations are followed.
+    A relaxation keeps the centroid of the start, and the orientation of a free tissue, unless the energy
+    determines them. The adjoint differentiates the shape at a fixed position. This function differentiates
+    the position, so that every adjoint has the derivative with respect to the start. If only some rigid
+    motions are zero modes, only translations are followed.
     """
     settled = relaxed.settled(start).vertices
-    # (All but the derivative stays as it is, to the last bit.)
+    # (Only the derivative changes, no bit of the value.)
     settled = settled + jax.lax.stop_gradient(relaxed.vertices - settled)
-    there = start.gathered(start.vertices)
-    moved = jnp.mean(there - jax.lax.stop_gradient(there), axis=0) * free[:2]
+    gathered = start.gathered(start.vertices)
+    moved = jnp.mean(gathered - jax.lax.stop_gradient(gathered), axis=0) * free[:2]
     if start.pinned is not None:
         moved = jnp.where(jnp.any(start.pinned), 0, moved)
     return relaxed.with_vertices(jnp.where(jnp.all(free), settled, relaxed.vertices + moved))
@@ -149,22 +148,24 @@ def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
 
 
 def free_motions(tissue: Tissue, energy: AbstractEnergy, units: Units) -> Bool[Array, " modes"]:
-    """Which motions of the whole cost nothing: all, unless the energy knows positions."""
-    there = tissue.boundary.motions(tissue.vertices, 0.3 * units.length)
-    places = jnp.concatenate([tissue.vertices[None], there])
-    energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(places)
-    here = energies[0]
-    rounding = jnp.finfo(here.dtype).eps ** 0.6
-    size = jnp.abs(here) + units.stiffness * units.length**2
-    return jnp.abs(energies[1:] - here) <= rounding * size
+    """Which rigid motions are zero modes: all, unless the energy depends on absolute positions."""
+    displaced = tissue.boundary.motions(tissue.vertices, 0.3 * units.length)
+    positions = jnp.concatenate([tissue.vertices[None], displaced])
+    energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(positions)
+    value = energies[0]
+    rounding = jnp.finfo(value.dtype).eps ** 0.6
+    size = jnp.abs(value) + units.stiffness * units.length**2
+    return jnp.abs(energies[1:] - value) <= rounding * size
 
 
 def _pinned_energy(
     configuration: PyTree[Array], args: tuple[Tissue, AbstractEnergy, Contacts | None, Array]
 ) -> Array:
-    """The energy, and a term that pins the motions which cost nothing."""
-    # Motions of the whole are zero modes. They make the Hessian singular, and a nudged relaxation would
-    # drift along them for ever. A spring to the positions in `tissue` removes them and changes no shape.
+    """The energy, and springs that fix rigid motions that are zero modes.
+
+    Zero modes make the Hessian singular, and a nudged relaxation would drift along them. Springs to the
+    positions in `tissue` remove them and change no shape.
+    """
     tissue, energy, contacts, gauge = args
     drift = tissue.drift(configuration)
     return objective(configuration, (tissue, energy, contacts))[0] + 0.5 * jnp.sum(gauge * drift**2)

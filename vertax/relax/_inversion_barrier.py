@@ -1,4 +1,4 @@
-"""What keeps short edges from turning inside out."""
+"""The barrier of short edges against inversion."""
 
 from __future__ import annotations
 
@@ -21,25 +21,27 @@ from vertax.relax._barrier import (
     profile,
 )
 
-# Where an energy presses the ends of an edge together, the edge opens once it has flipped. Forces can press
-# it from all sides: then four cells meet in a point, flipped or not, and the energy is least where the edge
-# points a little the wrong way. A barrier holds it, as of contacts, where the share of the edge that points
-# the way it ought to is below a range.
 REACH = 2e-3
-"""That range, in units of the size of a cell."""
-# And in units of it the length from which on the barrier is nothing at all.
+"""The range $r$ of the barrier, in units of the size of a cell."""
 _FADE = 8.0
+"""The length from which on the barrier is zero, in units of its range."""
 
 
 class InversionBarrier(AbstractBarrier):
-    """The barrier of those edges that a relaxation had to put upright.
+    r"""The barrier of short edges against inversion.
+
+    If forces press the ends of an edge together whether it has flipped or not, four cells meet in a point.
+    The energy would be least where the edge points the wrong way. With the edge vector $u$, its length
+    $\sqrt s$ and the unit vector $n$ in which it must point, the energy is $F r f(s) \varphi(w)$ with
+    $w = (\sqrt s + u \cdot n) / 2 r$, the barrier $\varphi$ of contacts and a factor $f$ that is 0 for long
+    edges. It is on only for edges that have been inverted repeatedly.
 
     **Arguments:**
 
-    - `edges`: their numbers, and that of no edge after the last one.
-    - `counts`: how often each edge was put upright.
-    - `reach`: its range, a length.
-    - `force`: about what it resists with at a third of that.
+    - `edges`: the numbers of edges with the barrier on; the number of edges in unused rows.
+    - `counts`: how often each edge was inverted.
+    - `reach`: the range $r$, a length.
+    - `force`: the scale $F$ of the force.
     """
 
     edges: Int[Array, " some"]
@@ -48,23 +50,23 @@ class InversionBarrier(AbstractBarrier):
     force: Float[Array, ""]
 
     @classmethod
-    def none(
+    def empty(
         cls, tissue: Tissue, reach: Float[Array, ""], force: Float[Array, ""]
     ) -> InversionBarrier:
-        """Of no edge yet."""
+        """The barrier of no edge."""
         n = tissue.n_edges
         some = min(n, max(_FEWEST, n // _SHARE))
-        none = jnp.full(some, n, tissue.topology.edge.dtype)
-        return cls(none, jnp.zeros(n, jnp.int32), reach, force)
+        unused = jnp.full(some, n, tissue.topology.edge.dtype)
+        return cls(unused, jnp.zeros(n, jnp.int32), reach, force)
 
     @property
     def any(self) -> Bool[Array, ""]:
-        """Whether there are any."""
+        """Whether the barrier of any edge is on."""
         return jnp.any(self.edges < len(self.counts))
 
     @property
     def held(self) -> Bool[Array, " edges"]:
-        """Which edges these are."""
+        """The edges with the barrier on."""
         return jnp.zeros(len(self.counts), bool).at[self.edges].set(True, mode="drop")
 
     def plan(self, topology: Topology) -> GatherPlan:
@@ -73,15 +75,15 @@ class InversionBarrier(AbstractBarrier):
         edges = jnp.minimum(self.edges, m.n_edges - 1)
         _, *neighbours = edge_neighbourhood(m, edges)
         leaving = jnp.stack([take(m.half_edge, edges), *neighbours])
-        here, there = GatherPlan.of(m, leaving), GatherPlan.of(m, take(m.next, leaving))
-        start, end = here.images[:1], there.images[:1]
-        offsets = there.images - here.images
+        sources, targets = GatherPlan.of(m, leaving), GatherPlan.of(m, take(m.next, leaving))
+        start, end = sources.images[:1], targets.images[:1]
+        offsets = targets.images - sources.images
         images = [start, end, start + offsets[1:3], end + offsets[3:]]
-        vertices = jnp.concatenate([here.vertices[:1], there.vertices])
+        vertices = jnp.concatenate([sources.vertices[:1], targets.vertices])
         return GatherPlan(vertices, jnp.concatenate(images))
 
     def vectors(self, positions: Float[Array, "6 some 2"]) -> Float[Array, "4 some"]:
-        """The edge, and the direction that it ought to have, of the points of `plan`."""
+        """The edge, and the direction in which it must point, of the points of `plan`."""
         start, end, a, b, c, d = positions
         # (Of `edge_axis`, in which the ends of the edge cancel.)
         return jnp.concatenate([end - start, c + d - a - b], axis=-1).T
@@ -117,7 +119,7 @@ class InversionBarrier(AbstractBarrier):
         wide = lambda uu, ua, aa: jnp.concatenate(
             [jnp.concatenate([uu, ua], 1), jnp.concatenate([ua, aa], 1)]
         )
-        none = jnp.zeros_like(across)
+        zeros = jnp.zeros_like(across)
         return composed(
             strength * f * b.value,
             (strength * df * b.value, strength * f * b.first),
@@ -126,17 +128,17 @@ class InversionBarrier(AbstractBarrier):
                 jnp.concatenate([2 * u, zero]),
                 half * jnp.concatenate([u * root + n, axis * pull]),
             ),
-            (wide(2 * eye + none, none, none), wide(uu, ua, aa)),
+            (wide(2 * eye + zeros, zeros, zeros), wide(uu, ua, aa)),
         )
 
     def updated(
         self, turned: Bool[Array, " edges"], squared: Float[Array, " edges"]
     ) -> InversionBarrier:
-        """With edges that were put upright, and without those that have grown.
+        """With edges that were inverted, and without those that have grown.
 
         **Arguments:**
 
-        - `turned`: which edges were put upright.
+        - `turned`: which edges were inverted.
         - `squared`: their squared lengths.
         """
         n = turned.size
@@ -148,12 +150,13 @@ class InversionBarrier(AbstractBarrier):
         return InversionBarrier(edges.astype(self.edges.dtype), counts, self.reach, self.force)
 
 
-# An edge is held until it is so long: one step could turn it again from where its barrier ends.
 _LONG = 4 * _FADE
-# An edge is held once it was put upright so often. (Edges under high tension often turn on their way.)
+"""The length at which the barrier of an edge turns off, in units of its range: a step could invert a shorter
+edge again."""
 _OFTEN = 8
-# So many edges are held at most, or one of so many.
+"""The number of inversions that turns the barrier on: edges under high tension often invert in passing."""
 _FEWEST, _SHARE = 16, 256
+"""The number of rows: 16, or the number of edges over 256."""
 
 
 def inversion_energy_of_all(

@@ -130,7 +130,7 @@ class Search(eqx.Module):
     def advance(
         self, state: SearchState, energy: AbstractEnergy, num_steps: int | Int[Array, ""]
     ) -> SearchState:
-        """Continue until the tissue is at rest, or after so many steps in all."""
+        """Continue until the tissue is at rest, or after `num_steps` steps in all."""
         # Minimisers may keep functions in their state, which a loop cannot carry.
         arrays, static = eqx.partition(state, eqx.is_array)
 

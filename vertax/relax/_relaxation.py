@@ -71,7 +71,7 @@ class Relaxation(AbstractResponse):
 
     **Raises:**
 
-    - `TypeError` for a solver, or transitions, that are none.
+    - `TypeError` for a solver that is no minimiser, or transitions that are no rule.
     - `ValueError` for a tolerance or number of steps that is not positive, or a negative
         contact range.
     """
@@ -138,19 +138,23 @@ class Relaxation(AbstractResponse):
         return equilibrium.checked() if throw else equilibrium
 
     def check(self, tissue: Tissue, energy: Any, adjoint: AbstractAdjoint) -> None:
-        """Refuse what does not go together.
+        """Raise an error for arguments that do not work together.
 
         **Raises:**
 
         - `TypeError` for an energy that is no function, or an adjoint that is none.
-        - `ValueError` for one that does not go with the solver, or a `jax.shard_map` that this does not.
+        - `ValueError` for an adjoint that the solver excludes, a preconditioner of another size, or a
+            `jax.shard_map` with checks.
         """
         check_energy(energy)
-        known, size = self.preconditioner, sum(map(jnp.size, jax.tree.leaves(tissue.configuration)))
-        if known is not None and known.inverse.shape != (size, size):
+        recycled, size = (
+            self.preconditioner,
+            sum(map(jnp.size, jax.tree.leaves(tissue.configuration))),
+        )
+        if recycled is not None and recycled.inverse.shape != (size, size):
             raise ValueError(
-                f"Argument `preconditioner` is that of a tissue with {len(known.inverse)} coordinates, but "
-                f"this one has {size}. Take `preconditioner_at` of a tissue like it, or None."
+                f"Argument `preconditioner` must be of this tissue, but has {len(recycled.inverse)} "
+                f"coordinates for {size}. Take `preconditioner_at` of a tissue like it, or None."
             )
         _check_adjoint(adjoint, self._solver)
         _check_sharding((tissue, energy))
@@ -180,18 +184,18 @@ class Relaxation(AbstractResponse):
         energy: AbstractEnergy,
         adjoint: AbstractAdjoint,
         *,
-        thrifty: bool = False,
+        recompute: bool = False,
     ) -> Equilibrium:
-        """Relax a tissue as a part of a larger compiled function: nothing is checked.
+        """Relax a tissue as a part of a larger compiled function, without checks.
 
-        If `thrifty`, a gradient keeps little of it and evaluates the rest again: for one of many in a row.
+        With `recompute` the backward pass recomputes intermediate results: for one of many steps in a row.
         """
         end = one_at_a_time(search)(*frozen((tissue, energy, self)))
-        finish = eqx.filter_checkpoint(attached) if thrifty else attached
+        finish = eqx.filter_checkpoint(attached) if recompute else attached
         return finish(end, tissue, energy, self, adjoint)
 
     def finer(self, tolerance: Float[Array, ""]) -> Relaxation:
-        """The same, at rest only where the largest force is below this tolerance too."""
+        """A copy with a tolerance that is at most this one."""
         if self.tolerance is not None:
             tolerance = jnp.minimum(tolerance, self.tolerance)
         return dataclasses.replace(self, tolerance=tolerance)
@@ -199,8 +203,8 @@ class Relaxation(AbstractResponse):
     def preconditioner_at(
         self, tissue: Tissue, energy: AbstractEnergy | None
     ) -> RecycledHessian | None:
-        # (What is large has waves, and too many numbers to square; other solvers have no use for it.)
-        if not self._knows_hessians(tissue):
+        # (Large tissues have the elastic medium; other solvers use no preconditioner.)
+        if not self._recycles(tissue):
             return None
         start = tissue.configuration
         if energy is None:
@@ -209,7 +213,7 @@ class Relaxation(AbstractResponse):
         product = lambda v: jax.jvp(slope, (start,), (v,))[1]
         return RecycledHessian.at(product, start, cell_size(tissue))
 
-    def _knows_hessians(self, tissue: Tissue) -> bool:
+    def _recycles(self, tissue: Tissue) -> bool:
         return tissue.n_cells < ElasticMedium.min_cells and isinstance(self.solver, NewtonCG)
 
     def with_preconditioner(self, hessian: RecycledHessian | None) -> Relaxation:
@@ -217,7 +221,7 @@ class Relaxation(AbstractResponse):
 
     @property
     def minimiser(self) -> StopAtRest:
-        """The solver, judged by its largest force."""
+        """The solver, stopped by the largest force."""
         return StopAtRest(solver=self._solver, consecutive_steps=self.consecutive_steps)
 
     @property
@@ -225,14 +229,14 @@ class Relaxation(AbstractResponse):
         return self.solver if isinstance(self.solver, AbstractSolver) else Wrapped(self.solver)
 
     def completed(self, tissue: Tissue) -> Relaxation:
-        """As `traced`, with a placeholder for a Hessian that is not known."""
+        """As `traced`, with a placeholder for a recycled Hessian: one program serves with and without."""
         relaxation = self if eqx.is_array(self.max_steps) else self.traced()
-        if relaxation.preconditioner is not None or not self._knows_hessians(tissue):
+        if relaxation.preconditioner is not None or not self._recycles(tissue):
             return relaxation
         return dataclasses.replace(relaxation, preconditioner=self.preconditioner_at(tissue, None))
 
     def traced(self) -> Relaxation:
-        """The same with its numbers as arrays, of which another one compiles nothing anew."""
+        """A copy with its numbers as arrays: another number compiles nothing."""
         names = ("transitions", "tolerance", "consecutive_steps", "max_steps", "contact_range")
         numbers = {name: traced(getattr(self, name), integers=True) for name in names}
         return dataclasses.replace(self, **numbers)

@@ -1,4 +1,4 @@
-"""What every response of a tissue to its energy has in common."""
+"""The base class of relaxations and other responses, and their result."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vertax.relax._results import RESULTS
 
 
 class Equilibrium(eqx.Module):
-    """A relaxed tissue and how it got there; under `jax.vmap` one entry for each of the batch."""
+    """A relaxed tissue; under `jax.vmap` with one entry for each of the batch."""
 
     tissue: Tissue
     """The relaxed tissue, differentiable with respect to the parameters of the energy."""
@@ -30,7 +30,7 @@ class Equilibrium(eqx.Module):
     num_steps: Int[Array, "*batch"]
     """Steps of the minimiser."""
     num_t1: Int[Array, "*batch"]
-    """Transitions on the way: T1, and T2 if the rule has them."""
+    """Number of transitions: T1, and T2 if the rule has them."""
     valid: Bool[Array, "*batch"]
     """Whether its cells tile the plane; `tissue.overlaps` says where they do not."""
     result: RESULTS
@@ -81,7 +81,7 @@ class Equilibrium(eqx.Module):
         )
 
     def _first_overlap(self) -> str:
-        """Where the first tissue of a batch overlaps that does."""
+        """The overlap of the first overlapping tissue of a batch."""
         ndim, number = np.ndim(self.valid), int(np.argmin(np.ravel(self.valid)))
         one = lambda x: x.reshape(-1, *x.shape[ndim:])[number] if eqx.is_array(x) else x
         return jax.tree.map(one, self.tissue).overlaps.describe()
@@ -102,11 +102,11 @@ _REMEDY = (
 
 
 class AbstractResponse(eqx.Module):
-    """How a tissue answers to its energy."""
+    """A map from a tissue and its energy to an equilibrium: a relaxation, a time step, another program."""
 
     @property
-    def goes_on(self) -> bool:
-        """Whether the next epoch of a fit may begin where this one ended, as it may at rest."""
+    def supports_warm_start(self) -> bool:
+        """Whether the next epoch of a fit may start from the result of this one (warm start)."""
         return True
 
     @abc.abstractmethod
@@ -118,16 +118,14 @@ class AbstractResponse(eqx.Module):
         adjoint: AbstractAdjoint | None = None,
         throw: bool = True,
     ) -> Equilibrium:
-        """Let the tissue answer.
+        """The equilibrium.
 
         **Arguments:**
 
-        - `tissue`: where it starts.
-        - `energy`: what it answers to.
+        - `tissue`: the initial tissue.
+        - `energy`: its energy.
         - `adjoint`: how to differentiate.
-        - `throw`: raise an error if it reaches no equilibrium.
-
-        **Returns:** where it ends.
+        - `throw`: raise an error if no equilibrium is reached.
         """
 
     @property
@@ -142,8 +140,8 @@ class AbstractResponse(eqx.Module):
 
         **Arguments:**
 
-        - `tissue`: where it starts.
-        - `energy`: what it answers to.
+        - `tissue`: the initial tissue.
+        - `energy`: its energy.
 
         **Returns:** the first argument of `attach`; None if the response does not separate the two parts.
         """
@@ -152,7 +150,7 @@ class AbstractResponse(eqx.Module):
     def attach(
         self, primal: PyTree, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
     ) -> Equilibrium:
-        """The response as a differentiable function, where `primal` has led; nothing is raised.
+        """The response as a differentiable function at the result of `primal`; no error is raised.
 
         **Arguments:**
 
@@ -163,24 +161,24 @@ class AbstractResponse(eqx.Module):
         """
         return self(tissue, energy, adjoint=adjoint, throw=False)
 
-    def goes_with(
+    def check_compatible(
         self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
     ) -> None:
-        """Refuse an adjoint, or a cost that pulls the tissue, that this response has no use for.
+        """Raise an error for an adjoint, or a guiding cost, that this response does not support.
 
         **Arguments:**
 
-        - `adjoint`: how an inverse problem is to differentiate.
-        - `guided`: whether its cost is to pull the tissue, see `guidance` there.
-        - `placed`: whether it is to fit where the whole tissue lies.
+        - `adjoint`: the adjoint of an inverse problem.
+        - `guided`: whether its cost pulls the tissue, see `guidance` there.
+        - `placed`: whether it fits the position of the tissue.
 
         **Raises:**
 
         - `ValueError` with the reason, and with what to take instead.
         """
 
-    def complaint(self) -> str | None:
-        """What went wrong last, in words, if it keeps them."""
+    def last_error_message(self) -> str | None:
+        """The message of the last error, if it is kept."""
         return None
 
     def preconditioner_at(
@@ -191,22 +189,22 @@ class AbstractResponse(eqx.Module):
         **Arguments:**
 
         - `tissue`: a tissue at rest.
-        - `energy`: its energy; None for what stands for a Hessian that is not known yet.
+        - `energy`: its energy; None for a placeholder.
         """
         return None
 
     def with_preconditioner(self, hessian: RecycledHessian | None) -> AbstractResponse:
-        """The same with the Hessian of an equilibrium near by, which makes it faster and nothing else."""
+        """A copy with a preconditioner: it changes the time, not the result."""
         return self
 
     @abc.abstractmethod
     def traced(self) -> AbstractResponse:
-        """The same with its numbers as arrays, of which another one compiles nothing anew."""
+        """A copy with its numbers as arrays: another number compiles nothing."""
 
     def completed(self, tissue: Tissue) -> AbstractResponse:
-        """As `traced`, with all that is optional, so that one compiled function serves with and without."""
+        """As `traced`, with placeholders for optional parts, so that one program serves with and without."""
         return self.traced()
 
     @abc.abstractmethod
     def finer(self, tolerance: Float[Array, ""]) -> AbstractResponse:
-        """The same, at rest only where the largest force is below this tolerance too."""
+        """A copy with a tolerance that is at most this one."""

@@ -132,9 +132,9 @@ class TruncatedCG(eqx.Module):
             z = inverse.apply(factors, s.residual)
             rz = inner(s.residual, z)
             # (More damping makes a residual smaller; without a step that is no progress.)
-            still = s.furthest == 0
-            first = jnp.where(still, rz, s.first)
-            small = ~clips & ~still & (rz <= forcing**2 * first)
+            no_step = s.furthest == 0
+            first = jnp.where(no_step, rz, s.first)
+            small = ~clips & ~no_step & (rz <= forcing**2 * first)
             # One iteration, unless the residual is small.
             beta = jnp.where(fresh, 0, rz / jnp.where(fresh, 1, s.last))
 
@@ -194,7 +194,7 @@ class TruncatedCG(eqx.Module):
                 s.num_rounds + again,
             )
 
-        zero, none, nothing = jnp.zeros_like(gradient), jnp.array(0), jnp.zeros((), gradient.dtype)
+        zero, number, scalar = jnp.zeros_like(gradient), jnp.array(0), jnp.zeros((), gradient.dtype)
         phase = jnp.where(active & (inner(gradient, gradient) > 0), _SOLVE, _END)
         shapes = jax.eval_shape(inverse.factors, damping)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
@@ -202,15 +202,15 @@ class TruncatedCG(eqx.Module):
             zero,
             gradient,
             zero,
-            nothing,
-            nothing,
-            nothing,
-            nothing,
+            scalar,
+            scalar,
+            scalar,
+            scalar,
             damping,
             factors,
             phase,
-            none,
-            none,
+            number,
+            number,
         )
         end = jax.lax.while_loop(lambda s: s.phase != _END, iterate, begin)
         hp = end.residual - gradient - end.damping[:, None] * end.step

@@ -92,7 +92,7 @@ def as_matrix(product: Callable[[PyTree], PyTree], like: PyTree) -> Float[Array,
     """The matrix of a symmetric operator, from its products with vectors of the shapes of `like`."""
     zero, unravel = _flat(like)
     column = lambda v: ravel_pytree(product(unravel(v)))[0]
-    # (Without a smaller last batch, which would be compiled besides.)
+    # (A smaller last batch would be compiled as well.)
     batches = -(-zero.size // _BATCH)
     unit_vectors = jnp.eye(batches * _BATCH, zero.size, dtype=zero.dtype)
     each = jax.lax.map(jax.vmap(column), unit_vectors.reshape(batches, _BATCH, zero.size))

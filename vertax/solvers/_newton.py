@@ -132,7 +132,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     def _begin(self, y: Any, options: Any, struct: Any) -> NewtonState:
         table = table_of(y)
         zero, rows = jnp.zeros_like(table), jnp.zeros(len(table), table.dtype)
-        none, infinite = jnp.array(0), jnp.full(struct.shape, jnp.inf, struct.dtype)
+        number, infinite = jnp.array(0), jnp.full(struct.shape, jnp.inf, struct.dtype)
         reach = self.max_displacement * options.get("length_scale", 1.0)
         return NewtonState(
             phase=jnp.array(_MEASURE if "probe" in options else _EVALUATE),
@@ -141,16 +141,16 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             base_value=infinite,
             value=infinite,
             gradient=zero,
-            proposal=Proposal(zero, zero, rows, jnp.zeros_like(infinite), none),
+            proposal=Proposal(zero, zero, rows, jnp.zeros_like(infinite), number),
             predicted=jnp.zeros_like(infinite),
             error=rows,
             radii=rows + reach,
             stiffness=jnp.asarray(options.get("stiffness", 1.0), table.dtype),
             typical=infinite,
             previous=infinite,
-            num_corrections=none,
-            num_products=none,
-            progress=Progress.none(infinite),
+            num_corrections=number,
+            num_products=number,
+            progress=Progress.initial(infinite),
         )
 
     def step(

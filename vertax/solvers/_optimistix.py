@@ -39,7 +39,7 @@ class Wrapped(AbstractSolver):
 
     [`equilibrate`][vertax.equilibrate] wraps Optimistix minimisers by itself. The minimiser's own
     termination is ignored. The force costs one gradient a step, except for quasi-Newton minimisers,
-    whose state already holds it.
+    with a state that already holds it.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""What every minimiser here knows: the force at the point it returns."""
+"""The base classes of minimisers."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Progress(eqx.Module):
     """The largest component of the gradient at the iterate."""
 
     @classmethod
-    def none(cls, force: Float[Array, ""]) -> Progress:
-        """Before the first evaluation."""
-        no = jnp.array(False)
-        return cls(no, no, no, force)
+    def initial(cls, force: Float[Array, ""]) -> Progress:
+        """The progress before the first evaluation."""
+        false = jnp.array(False)
+        return cls(false, false, false, force)
 
 
 class AbstractIteration(eqx.Module, Generic[State]):
@@ -98,8 +98,8 @@ class AbstractIteration(eqx.Module, Generic[State]):
 class AbstractSolver(optx.AbstractMinimiser):
     """An Optimistix minimiser that judges convergence by the largest force.
 
-    Its state holds the gradient at the point that the last step returned, so the force is known there
-    and costs nothing extra. It stops when the norm of the gradient (by default the largest component)
+    Its state holds the gradient at the point that the last step returned. It stops
+    when the norm of the gradient (by default the largest component)
     falls below `atol`; [`equilibrate`][vertax.equilibrate] uses its own `tolerance` instead.
     """
 
@@ -113,8 +113,7 @@ class AbstractSolver(optx.AbstractMinimiser):
     def unrollable(self) -> bool:
         """Whether its steps can be differentiated one by one, as automatic differentiation does.
 
-        Not so for line searches and inner loops, which decide by comparisons: the derivative of what
-        they return is not the derivative of where they lead.
+        The steps of line searches and inner loops depend on comparisons, which have no derivative.
         """
         return False
 
@@ -124,8 +123,8 @@ class AbstractSolver(optx.AbstractMinimiser):
 
     def progress(self, state: Any) -> Progress:
         """The result of the last step."""
-        yes = jnp.array(True)
-        return Progress(yes, yes, yes, self.norm(self.gradient(state)))
+        true = jnp.array(True)
+        return Progress(true, true, true, self.norm(self.gradient(state)))
 
     def reevaluated(self, fresh: Any, old: Any) -> Any:
         """The old state with the value and the gradient of `fresh`; `fresh` if they are inseparable."""
@@ -173,7 +172,7 @@ class Stepwise(AbstractIteration[_StepwiseState]):
         value, aux = eqx.filter_eval_shape(fn, y, args)
         init = lambda y, args: self.solver.init(fn, y, args, options, value, aux, frozenset())
         inner = _zeros(eqx.filter_eval_shape(init, y, args))
-        progress = Progress.none(jnp.full(value.shape, jnp.inf, value.dtype))
+        progress = Progress.initial(jnp.full(value.shape, jnp.inf, value.dtype))
         return _StepwiseState(inner, jnp.array(_FRESH), progress)
 
     def evaluate(
@@ -195,10 +194,10 @@ class Stepwise(AbstractIteration[_StepwiseState]):
         anew = state.restart != _NO
         y, arrays = jax.lax.cond(anew, restart, step)
         inner = eqx.combine(arrays, static)
-        force, yes = self.solver.norm(self.solver.gradient(inner)), jnp.array(True)
+        force, true = self.solver.norm(self.solver.gradient(inner)), jnp.array(True)
         return (
             y,
-            _StepwiseState(inner, jnp.array(_NO), Progress(yes, ~anew, ~anew, force)),
+            _StepwiseState(inner, jnp.array(_NO), Progress(true, ~anew, ~anew, force)),
             None,
             aux,
         )

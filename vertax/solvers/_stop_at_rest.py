@@ -1,4 +1,4 @@
-"""The minimisers that a relaxation runs: to come to rest, and to stay there."""
+"""A stopping rule for minimisers: the largest force."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from vertax.solvers._solver import AbstractSolver
 
 
-class PatientState(eqx.Module):
+class StopAtRestState(eqx.Module):
     """State of a `StopAtRest`."""
 
     inner: PyTree
@@ -25,9 +25,8 @@ class PatientState(eqx.Module):
 class StopAtRest(optx.AbstractMinimiser):
     """A solver that is at rest when the largest force has stayed below a tolerance for some steps.
 
-    Besides those of the solver it knows three options: `tolerance`, the largest force at rest;
-    `max_steps`, after which it stops, at rest or not; and `num_steps`, after which it stops, neither
-    sooner nor later.
+    Options in addition to those of the solver: `tolerance`, the largest force at rest; `max_steps`, the
+    largest number of steps; `num_steps`, an exact number of steps, whatever the force is.
 
     **Arguments:**
 
@@ -43,19 +42,19 @@ class StopAtRest(optx.AbstractMinimiser):
 
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
-    ) -> PatientState:
+    ) -> StopAtRestState:
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
         state = self._judge(inner, options, jnp.array(0), jnp.array(0))
         return eqx.tree_at(lambda s: s.num_steps, state, jnp.array(0))
 
     def step(
-        self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any
-    ) -> tuple[Any, PatientState, Any]:
+        self, fn: Any, y: Any, args: Any, options: Any, state: StopAtRestState, tags: Any
+    ) -> tuple[Any, StopAtRestState, Any]:
         y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
         return y, self._judge(inner, options, state.n_below, state.num_steps), aux
 
     def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: PatientState, tags: Any
+        self, fn: Any, y: Any, args: Any, options: Any, state: StopAtRestState, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         if "num_steps" in options:
             done = state.num_steps >= options["num_steps"]
@@ -69,25 +68,25 @@ class StopAtRest(optx.AbstractMinimiser):
     ) -> tuple[Any, Any, dict[str, Any]]:
         return y, aux, {}
 
-    def at_rest(self, state: PatientState) -> Bool[Array, ""]:
+    def at_rest(self, state: StopAtRestState) -> Bool[Array, ""]:
         """Whether the force has been below the tolerance for long enough."""
         return state.n_below >= self.consecutive_steps
 
-    def gradient(self, state: PatientState) -> PyTree[Float[Array, "..."]]:
+    def gradient(self, state: StopAtRestState) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
         return self.solver.gradient(state.inner)
 
     def _judge(
         self, inner: Any, options: Any, n_below: Int[Array, ""], num_steps: Int[Array, ""]
-    ) -> PatientState:
+    ) -> StopAtRestState:
         progress = self.solver.progress(inner)
         below = jnp.where(progress.force < options["tolerance"], n_below + 1, 0)
         n_below = jnp.where(progress.accepted, below, n_below)
-        return PatientState(inner, progress.force, n_below, num_steps + progress.stepped)
+        return StopAtRestState(inner, progress.force, n_below, num_steps + progress.stepped)
 
 
 class AtRest(optx.AbstractMinimiser):
-    """Returns the point it is given, which is known to be a minimum."""
+    """Returns its initial point, which is a minimum."""
 
     rtol: float = 0.0
     atol: float = 0.0

@@ -20,7 +20,7 @@ class VertexTrustRegion(eqx.Module):
     - Accepted: the radius of a vertex grows by `target_error` over its error (2 to `max_growth` times) if
       its error is small or the gain is at least `good_gain` times the predicted one. It shrinks if its error
       is above `large_error`.
-    - Rejected: the radii of vertices whose error is not small shrink by `shrink`; and the other radii
+    - Rejected: radii of vertices with an error that is not small shrink by `shrink`; the other radii
       halve, unless fewer than the fraction `few` of the vertices shrink.
 
     All radii start at the largest displacement, and return there if all of them have become shorter than
