@@ -171,9 +171,9 @@ def test_contacts_add_their_hessian():
     contacts, tissue = state.contacts, state.tissue
     assert contacts is not None
     assert contacts(tissue) > 0
-    hessian = jax.jit(jax.hessian(lambda x: contacts(there.with_vertices(x))))(there.vertices)
+    hessian = jax.jit(jax.hessian(lambda x: contacts(tissue.with_vertices(x))))(tissue.vertices)
     result = contacts.resistance(tissue)
-    several = np.bincount(_vertices_of(contacts, tissue), minlength=there.n_vertices)
+    several = np.bincount(_vertices_of(contacts, tissue), minlength=tissue.n_vertices)
     checked = 0
     for vertex in np.flatnonzero(several == 1):
         values, vectors = np.linalg.eigh(hessian[vertex, :, vertex])

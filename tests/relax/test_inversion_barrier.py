@@ -94,10 +94,10 @@ def test_derivatives_agree_with_finite_differences(across, arcs):
     nearly = with_edge(tissue, 0.4 * REACH, across)
     inversion = held(nearly)
     assert numbers(inversion, nearly) == [NUMBER]
-    way = np.random.default_rng(0).normal(size=there.vertices.shape)
+    way = np.random.default_rng(0).normal(size=nearly.vertices.shape)
 
     def plain(x):
-        tissue = there.with_vertices(x)
+        tissue = nearly.with_vertices(x)
         edge, axis = tissue.edge_vectors[NUMBER], edge_axes(tissue)[NUMBER]
         squared = edge @ edge
         length = jnp.sqrt(squared + (1e-4 * REACH) ** 2)
@@ -106,15 +106,15 @@ def test_derivatives_agree_with_finite_differences(across, arcs):
         return 2.0 * REACH * fade * barrier(upright)
 
     contacts = holding(nearly, inversion)
-    energy = lambda x: contacts(there.with_vertices(x))
-    assert energy(there.vertices) > 0
-    both = lambda f: jax.jvp(jax.value_and_grad(f), (there.vertices,), (jnp.asarray(way),))
+    energy = lambda x: contacts(nearly.with_vertices(x))
+    assert energy(nearly.vertices) > 0
+    both = lambda f: jax.jvp(jax.value_and_grad(f), (nearly.vertices,), (jnp.asarray(way),))
     for one, other in zip(*map(jax.tree.leaves, (both(energy), both(plain))), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * float(jnp.abs(other).max()))
     at = lambda x: energy(jnp.asarray(x))
     scale = REACH * way
-    slope = jnp.sum(jax.grad(energy)(there.vertices) * scale)
-    np.testing.assert_allclose(slope, fine_difference(at, there.vertices, scale), rtol=1e-6)
+    slope = jnp.sum(jax.grad(energy)(nearly.vertices) * scale)
+    np.testing.assert_allclose(slope, fine_difference(at, nearly.vertices, scale), rtol=1e-6)
 
 
 @pytest.mark.parametrize("times", [0, _OFTEN], ids=["free", "held"])

@@ -46,7 +46,7 @@ class PreconditionedMINRES(lx.AbstractLinearSolver[_State]):
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> _State:
         linear = self.plain.init(operator, options)
-        like = operator.in_structure()
+        like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), operator.in_structure())
         inverse = self.preconditioner.inverse(linear.mv, like, self.stiffness, jnp.array(True))
         n_rows = sum(x.shape[0] if x.ndim else 1 for x in jax.tree.leaves(like))
         return _State(linear, inverse, inverse.factors(jnp.zeros(n_rows, self.stiffness.dtype)))

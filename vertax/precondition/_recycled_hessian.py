@@ -34,7 +34,7 @@ class RecycledHessian(AbstractCoarseLevel):
     """The vertices of that equilibrium."""
     reach: Float[Array, ""]
     """The largest root mean square displacement from there."""
-    ready: Bool[Array, ""]
+    usable: Bool[Array, ""]
     """Whether it has been computed, and can be used."""
 
     @classmethod
@@ -73,7 +73,11 @@ class RecycledHessian(AbstractCoarseLevel):
         moved = jax.tree.leaves(configuration)[0] - self.place
         moved -= jnp.mean(moved, axis=0)
         near = jnp.mean(row_inner(moved, moved)) < self.reach**2
-        return eqx.tree_at(lambda h: h.ready, self, self.ready & near)
+        return eqx.tree_at(lambda h: h.usable, self, self.usable & near)
+
+    @property
+    def ready(self) -> Bool[Array, ""]:
+        return self.usable
 
     @property
     def blank(self) -> tuple[()]:
