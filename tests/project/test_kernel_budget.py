@@ -1,13 +1,14 @@
 """Compile time is proportional to the number of kernels of a program: each program has a budget.
 
-A kernel is a fusion of the program that XLA has optimised for CPUs. Their number depends on shapes through size
-classes only, and a little on the version of XLA.
+A kernel is a fusion of the program that XLA has optimised for CPUs. Their number depends on shapes only
+through size classes, and a little on the version of XLA.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,7 +31,8 @@ def cluster(n: int) -> tuple[vx.Tissue, vx.AbstractEnergy]:
 
 def kernels(function: Callable, *args) -> int:
     """The number of kernels of a function of these arguments."""
-    compiled = eqx.filter_jit(function).lower(*args).compile().compiled
+    jitted: Any = eqx.filter_jit(function)
+    compiled = jitted.lower(*args).compile().compiled
     return len(re.findall(r" = [^=]*? fusion\(", compiled.as_text()))
 
 
@@ -43,7 +45,7 @@ def slope(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.AbstractEnergy:
     return eqx.filter_grad(cost)(energy)
 
 
-def step(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.Evolution:
+def step(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.dynamics.Evolved:
     friction = vx.dissipations.SubstrateFriction(1.0)
     return vx.evolve(tissue, energy, friction, jnp.array([0.0, 0.1]), throw=False)
 

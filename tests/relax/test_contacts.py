@@ -225,3 +225,23 @@ def test_hypergradients_of_a_tissue_in_contact(adjoint, rtol):
     expected = fine_difference(at, targets, direction, 3e-5)
     slope = cost_and_slope(jnp.asarray(targets), start, adjoint)[1]
     np.testing.assert_allclose(slope @ direction, expected, rtol=rtol)
+
+
+def test_contacts_beyond_the_room_are_reported_and_repeated_with_more_room(in_contact_case):
+    tissue, energy = in_contact_case
+    narrow = vx.Relaxation(contact_range=0.05, max_contacts=1)
+    wide = vx.Relaxation(contact_range=0.05)(tissue, energy)
+    repeated = narrow(tissue, energy)
+    np.testing.assert_allclose(repeated.tissue.vertices, wide.tissue.vertices, atol=1e-8)
+    inside = eqx.filter_jit(lambda: narrow(tissue, energy, throw=False))()
+    assert inside.result == vx.RESULTS.too_many_contacts
+    assert not inside.converged
+    with pytest.raises(RuntimeError, match="Raise `max_contacts`"):
+        inside.checked()
+
+
+@pytest.fixture(scope="module")
+def in_contact_case() -> tuple[vx.Tissue, vx.AbstractEnergy]:
+    """A fluid tissue with a wide barrier: many contacts."""
+    factors = 4.3 + 0.3 * jax.random.normal(jax.random.key(1), (64,))
+    return vx.initialise.periodic_voronoi(64, key=jax.random.key(40)), shapes(factors)

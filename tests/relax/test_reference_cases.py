@@ -311,7 +311,7 @@ class TestBoundedReference:
         prefix = request.param + "_"
         values = {k.removeprefix(prefix): v for k, v in data.items() if k.startswith(prefix)}
         names = ("vertTable", "angTable", "heTable", "faceTable")
-        return BoundedTables(*(values[name] for name in names)), own
+        return BoundedTables(*(values[name] for name in names)), values
 
     def test_geometry(self, state):
         tables, expected = state
