@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import zeta
 
-from vertax._base.extremes import greater
+from vertax._base.minimum_maximum import maximum
 
 # An arc is given by its chord c and the angle α between the chord and the tangent at its ends (half
 # the angle that it spans), positive if it bulges to the right of the chord. Then c = 2 R sin α, and
@@ -122,7 +122,7 @@ LARGEST_FREE_ANGLE = 0.98 * np.pi
 
 def bounded(angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """The angle itself up to 0.98 π, and always less than π."""
-    beyond = greater(jnp.abs(angle) - LARGEST_FREE_ANGLE, 0)
+    beyond = maximum(jnp.abs(angle) - LARGEST_FREE_ANGLE, 0)
     width = np.pi - LARGEST_FREE_ANGLE
     limited = LARGEST_FREE_ANGLE + width * beyond / jnp.sqrt(width**2 + beyond**2)
     return jnp.where(beyond > 0, jnp.sign(angle) * limited, angle)

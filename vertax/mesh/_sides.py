@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vertax._base.extremes import greater, lesser
+from vertax._base.minimum_maximum import maximum, minimum
 
 # A side is a row of a table: where it begins, its chord and, if there are arcs, its angle α, positive if it
 # bulges to the right, which is out of the face. With the unit vector e along the chord c and n to its left,
@@ -135,7 +135,7 @@ def _way_to_segment(
     """The way from the nearest point of each side, and at which share of it that is."""
     first, chord = point - side[:, :2], side[:, 2:4]
     squared = dot(chord, chord)
-    share = lesser(greater(dot(first, chord) / jnp.where(squared > 0, squared, 1), 0), 1)
+    share = minimum(maximum(dot(first, chord) / jnp.where(squared > 0, squared, 1), 0), 1)
     return first - share[:, None] * chord, share
 
 
@@ -154,7 +154,7 @@ def squared_distance_to_arc(
     before_end = curvature * cross(first, chord) + cross(g, last) >= 0
     wide = jnp.abs(side[:, 4]) > 0.5 * jnp.pi
     faces = jnp.where(wide, past_start | before_end, past_start & before_end) & (centred > 0)
-    ends = lesser(dot(first, first), dot(last, last))
+    ends = minimum(dot(first, first), dot(last, last))
     return jnp.where(faces, distance**2, ends)
 
 
@@ -198,13 +198,13 @@ def _inner(
     """1 for a point on the inner part of an arc, and less near its ends."""
     x, chord = jnp.where(where[:, None], x, 1), jnp.where(where[:, None], side[:, 2:4], 3)
     last, squared = x - chord, dot(chord, chord)
-    near = lesser(0.1 * jnp.sqrt(squared), reach)
+    near = minimum(0.1 * jnp.sqrt(squared), reach)
     return _rise(jnp.sqrt(dot(x, x) * dot(last, last) / squared) / near)
 
 
 def _rise(x: Float[Array, " n"]) -> Float[Array, " n"]:
     """From 0 at 0 to 1 at 1, twice differentiable."""
-    x = lesser(greater(x, 0), 1)
+    x = minimum(maximum(x, 0), 1)
     return (10 + (6 * x - 15) * x) * x**3
 
 

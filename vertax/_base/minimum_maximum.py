@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 
-def lesser(a: Float[Array, "..."], b: ArrayLike) -> Float[Array, "..."]:
+def minimum(a: Float[Array, "..."], b: ArrayLike) -> Float[Array, "..."]:
     """The lesser of two numbers; with the derivative of the second where they are equal."""
     return jnp.where(a >= b, b, a)
 
 
-def greater(a: Float[Array, "..."], b: ArrayLike) -> Float[Array, "..."]:
+def maximum(a: Float[Array, "..."], b: ArrayLike) -> Float[Array, "..."]:
     """The greater of two numbers; with the derivative of the second where they are equal."""
     return jnp.where(a <= b, b, a)
