@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vertax._base.probe import probe
+from vertax._base.probe_vector import probe_vector
 from vertax._base.sums import total
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -272,7 +272,7 @@ def _directly(tissue: Tissue, energy: AbstractEnergy, known: Known) -> Float[Arr
     """The mean resistance to motions of vertices that change nothing else that is known."""
     # (Mostly there is none, and JAX knows it.)
     slope = jax.grad(lambda vertices: energy(Measured(tissue.with_vertices(vertices), known)))
-    direction = probe(tissue.vertices)
+    direction = probe_vector(tissue.vertices)
     _, response = jax.jvp(slope, (tissue.vertices,), (direction,))
     mean = jnp.sum(direction * response) / jnp.sum(direction**2)
     return jnp.where(jnp.isfinite(mean), jnp.maximum(mean, 0), 0)

@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import choose
-from vertax._base.probe import probe
+from vertax._base.probe_vector import probe_vector
 from vertax._base.reductions import any_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -336,7 +336,7 @@ def mean_curvature(product: Callable[[Table], Table], tissue: Tissue) -> Float[A
     - `tissue`: at which it is.
     """
     like = table_of(tissue.configuration)
-    direction = probe(like)
+    direction = probe_vector(like)
     if tissue.topology.spare:  # what cannot move must not make the rest look soft
         alive = tissue.by_row(tissue.topology.alive_vertices.astype(like.dtype))
         direction *= table_of(alive)

@@ -12,7 +12,7 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import choose
-from vertax._base.probe import probe
+from vertax._base.probe_vector import probe_vector
 from vertax._base.vmapping import one_at_a_time
 from vertax.solvers._lanczos import (
     BREAKDOWN,
@@ -240,7 +240,7 @@ def _solve(
     # |A| must be known before Lanczos can tell it: if b is a null vector, A b is rounding
     # error, and this shows only in comparison with |A|. With no pattern in g, the mean square
     # of |A g|/|g| is that of the eigenvalues.
-    g = probe(b)
+    g = probe_vector(b)
     norm_g = norm(g, precondition(g))
 
     # Solve 0 is the system itself; solve -1 solves nothing, and has A P g looked at instead. If the

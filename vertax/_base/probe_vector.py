@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def probe(like: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def probe_vector(like: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Numbers between -1 and 1 that look random, always the same ones.
 
     For the mean eigenvalue of an operator they are as good as random numbers, which take longer to compile
