@@ -15,7 +15,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 from jaxtyping import Array, Int, PyTree
 
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 
 
 class Minimisation(eqx.Module):
@@ -51,7 +51,7 @@ class Minimisation(eqx.Module):
 
     def run_as_constant(self) -> tuple[PyTree[Array], PyTree]:
         """The same, not differentiable; on a CPU members of a `jax.vmap` run one after another."""
-        return one_at_a_time(Minimisation.run)(self)
+        return sequential_vmap_on_cpu(Minimisation.run)(self)
 
     def but(self, **changes: Any) -> Minimisation:
         """The same with some of its parts replaced."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.modules import choose
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
@@ -31,7 +31,7 @@ class Best(eqx.Module):
 def over_members(function: Callable[..., Any], problem: InverseProblem) -> Callable[..., Any]:
     """A function, which takes derivatives inside, of each member of a batch of problems."""
     batched = problem.response.prefers_batching
-    return eqx.filter_vmap(function if batched else one_at_a_time(function))
+    return eqx.filter_vmap(function if batched else sequential_vmap_on_cpu(function))
 
 
 class AbstractMethod(eqx.Module):

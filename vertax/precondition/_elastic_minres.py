@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax.precondition._edge_blocks import EdgeBlocks, EdgeCompliance
 from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.precondition._recycled_hessian import RecycledHessian
@@ -52,7 +52,7 @@ class ElasticMINRES(lx.AbstractLinearSolver[tuple[Any, Any, EdgeCompliance | Non
         vector: PyTree[Array],
         options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        return one_at_a_time(_solve)(self, state, vector, options)
+        return sequential_vmap_on_cpu(_solve)(self, state, vector, options)
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options

@@ -15,7 +15,7 @@ from vertax._base.announce import announced_jit
 from vertax._base.checks import check_number, named
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.modules import differs_between_devices, is_concrete, traced
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
@@ -168,7 +168,7 @@ class Relaxation(AbstractResponse):
 
         If `thrifty`, a gradient keeps little of it and evaluates the rest again: for one of many in a row.
         """
-        end = one_at_a_time(search)(*frozen((tissue, energy, self)))
+        end = sequential_vmap_on_cpu(search)(*frozen((tissue, energy, self)))
         finish = eqx.filter_checkpoint(attached) if thrifty else attached
         return finish(end, tissue, energy, self, adjoint)
 
@@ -309,7 +309,7 @@ def attached(
     return conclude(end, tissue, energy, adjoint, *parts)
 
 
-_search = announced_jit(one_at_a_time(search))
+_search = announced_jit(sequential_vmap_on_cpu(search))
 _compiled_attachment = announced_jit(attached)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.modules import choose
 from vertax._base.probe_vector import probe_vector
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax.solvers._lanczos import (
     BREAKDOWN,
     CONVERGED,
@@ -185,7 +185,7 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         """Solves the system for one vector; see the class."""
-        return one_at_a_time(_solve)(self, state, vector, options)
+        return sequential_vmap_on_cpu(_solve)(self, state, vector, options)
 
     def transpose(
         self, state: lx.AbstractLinearOperator, options: dict[str, Any]

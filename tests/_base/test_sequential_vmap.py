@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertax._base import vmapping
-from vertax._base.vmapping import one_at_a_time
+from vertax._base import sequential_vmap
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 
 
 def halvings(x, settings):
@@ -23,12 +23,12 @@ NUMBERS = jnp.array([0.5, 3.0, 100.0])
 
 @pytest.fixture(params=["cpu", "gpu"])
 def platform(request, monkeypatch):
-    monkeypatch.setattr(vmapping, "_platform", lambda: request.param)
+    monkeypatch.setattr(sequential_vmap, "_platform", lambda: request.param)
     return request.param
 
 
 def test_a_batch_holds_the_results_of_its_members(platform):
-    function = one_at_a_time(halvings)
+    function = sequential_vmap_on_cpu(halvings)
     batch = eqx.filter_vmap(function, in_axes=(0, None))(NUMBERS, SETTINGS)
     members = [halvings(x, SETTINGS) for x in NUMBERS]
     assert batch["name"] == "static"
@@ -37,20 +37,20 @@ def test_a_batch_holds_the_results_of_its_members(platform):
 
 
 def test_nested_batches_hold_the_results_of_their_members(platform):
-    function = one_at_a_time(lambda x, y: halvings(x * y, SETTINGS)["n"])
+    function = sequential_vmap_on_cpu(lambda x, y: halvings(x * y, SETTINGS)["n"])
     table = jax.vmap(lambda y: jax.vmap(lambda x: function(x, y))(NUMBERS))(NUMBERS)
     expected = [[halvings(x * y, SETTINGS)["n"] for x in NUMBERS] for y in NUMBERS]
     np.testing.assert_array_equal(table, expected)
 
 
 def test_the_program_of_a_batch_is_a_loop_on_a_cpu_and_batched_elsewhere(platform):
-    function = one_at_a_time(lambda x: halvings(x, SETTINGS)["n"])
+    function = sequential_vmap_on_cpu(lambda x: halvings(x, SETTINGS)["n"])
     program = str(jax.make_jaxpr(jax.vmap(function))(NUMBERS))
     assert ("scan" in program) == (platform == "cpu")
 
 
 def test_constants_of_a_differentiation_pass_through():
-    function = one_at_a_time(lambda x: halvings(x, SETTINGS)["value"])
+    function = sequential_vmap_on_cpu(lambda x: halvings(x, SETTINGS)["value"])
     loss = lambda x: jnp.sum(x * jax.vmap(function)(jax.lax.stop_gradient(x)))
     gradient = jax.jit(jax.grad(loss))(NUMBERS)
     np.testing.assert_allclose(gradient, jax.vmap(function)(NUMBERS))

@@ -13,7 +13,7 @@ from jaxtyping import Array
 Result = TypeVar("Result")
 
 
-def one_at_a_time(function: Callable[..., Result]) -> Callable[..., Result]:
+def sequential_vmap_on_cpu(function: Callable[..., Result]) -> Callable[..., Result]:
     """A function whose `jax.vmap` is a loop over the batch on a CPU, and a batched program elsewhere.
 
     Members of a batch need different numbers of iterations. Batched, a `while` loop runs until the slowest
