@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vertax._base.linear import linear_pair
+from vertax._base.custom_transpose import linear_with_transpose
 from vertax._base.sums import total
 from vertax.mesh._topology import Topology, source, take
 
@@ -66,4 +66,4 @@ def _summed(
     return (jnp.stack([total(take(part, slot) for slot in slots) for part in both], axis=-1),)
 
 
-_looked = linear_pair("at_ends", _looked_up, _summed)
+_looked = linear_with_transpose("at_ends", _looked_up, _summed)

@@ -15,7 +15,7 @@ from jaxtyping import Array
 Several = tuple[Array, ...]
 
 
-def linear_pair(
+def linear_with_transpose(
     name: str, there: Callable[..., Several], back: Callable[..., Several]
 ) -> Callable[..., Several]:
     """The first of two functions that are each other's transpose, as JAX is to know it.
