@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.checks import as_real, check_number
-from vertax._base.fields import check_fields
+from vertax._base.field_checks import check_fields
 from vertax.mesh import Tissue
 
 
