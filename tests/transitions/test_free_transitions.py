@@ -8,7 +8,7 @@ import pytest
 from free_helpers import angles_of, cluster, doublet, outline_length, with_angles
 
 import vertax as vx
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import LineTension, ShapeFactorEnergy
 
 

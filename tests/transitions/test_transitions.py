@@ -7,7 +7,7 @@ from helpers import edge_cell_sets, random_tissue, shape_factors, tissues
 from hypothesis import given, settings, strategies as st
 
 import vertax as vx
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import LineTension, ShapeFactorEnergy
 
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 
 Tree = TypeVar("Tree", bound=Any)
 

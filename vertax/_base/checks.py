@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, Shaped
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 
 _SEED_BITS = 64
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from vertax._base.checks import as_doubles, as_real, check_number, check_whole
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue

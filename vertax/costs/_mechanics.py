@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from vertax import mechanics
 from vertax._base.checks import as_real, check_number, check_whole, named
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import as_matrix

@@ -17,7 +17,7 @@ from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import Checkpoint
 from vertax._base.checks import as_key, check_whole, increasing, named
 from vertax._base.memory_maps import warn_of_memory_maps
-from vertax._base.modules import is_concrete, traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation, AbstractViscosity

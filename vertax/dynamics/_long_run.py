@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import Checkpoint, Keeper, Progress, Row, digest, without_addresses
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._time_integration import Frames, State, begin, evolved, first_frame, march

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import named
-from vertax._base.modules import choose
+from vertax._base.tracing import choose
 from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractViscosity

@@ -14,7 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from vertax._base.checks import check_number, check_whole, named
-from vertax._base.modules import is_concrete, traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy

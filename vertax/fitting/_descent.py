@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
-from vertax._base.modules import choose, traced
+from vertax._base.tracing import choose, traced
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from vertax._base.modules import choose
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
+from vertax._base.tracing import choose
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue

@@ -27,7 +27,7 @@ from vertax._base.checkpoints import (
     digest,
     without_addresses,
 )
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._arguments import check_arguments
 from vertax.fitting._descent import Descent

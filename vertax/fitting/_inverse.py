@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from vertax._base.announce import announced_jit
 from vertax._base.checks import named
 from vertax._base.memory_maps import warn_of_memory_maps
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.adjoints import (
     AbstractAdjoint,
     EquilibriumPropagation,

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
-from vertax._base.modules import choose
+from vertax._base.tracing import choose
 from vertax.adjoints import ImplicitDifferentiation
 from vertax.fitting._epoch import (
     AbstractMethod,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.checks import as_real, named
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
 from vertax.energies._energy import check_energy
 from vertax.mesh import Periodic, Tissue

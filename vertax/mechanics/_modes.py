@@ -14,7 +14,7 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vertax._base.checks import as_doubles, check_concrete, check_number, check_whole
-from vertax._base.modules import is_concrete, traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mechanics._arguments import check_system
 from vertax.mechanics._hessian import (

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 from scipy.sparse import diags_array
 
 from vertax._base.checks import as_real, check_number
-from vertax._base.modules import is_concrete, traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mechanics._arguments import check_dissipation, check_system

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vertax._base.checks import check_whole
-from vertax._base.modules import is_concrete, traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import check_dissipation, check_linear_solver, check_system

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from vertax._base.checks import named
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 
 
 class AbstractBoundary(eqx.Module):

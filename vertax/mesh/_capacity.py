@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from vertax._base.checks import check_concrete, check_whole
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.mesh._topology import Topology
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Int, Shaped
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vertax._base.modules import compiled_property, is_concrete
+from vertax._base.tracing import compiled_property, is_concrete
 from vertax.mesh._half_edges import check_arrays
 
 

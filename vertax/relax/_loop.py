@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import choose
 from vertax._base.probe_vector import probe_vector
 from vertax._base.reductions import any_of
+from vertax._base.tracing import choose
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._measured import Measured

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, Int, PyTree
 from vertax._base.announce import announced_jit
 from vertax._base.checks import check_number, named
 from vertax._base.memory_maps import warn_of_memory_maps
-from vertax._base.modules import differs_between_devices, is_concrete, traced
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
+from vertax._base.tracing import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy

@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue

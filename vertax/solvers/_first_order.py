@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float, PyTree
 
 from vertax._base.checks import check_number, check_whole, named
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.solvers._solver import AbstractSolver, value_and_gradient, with_value_and_gradient
 
 

@@ -11,9 +11,9 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import choose
 from vertax._base.probe_vector import probe_vector
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
+from vertax._base.tracing import choose
 from vertax.solvers._lanczos import (
     BREAKDOWN,
     CONVERGED,

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import choose
+from vertax._base.tracing import choose
 from vertax.solvers._conjugate_gradients import (
     AbstractInverse,
     DiagonalInverse,

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
-from vertax._base.modules import choose
+from vertax._base.tracing import choose
 from vertax.solvers._rows import Rows
 
 State = TypeVar("State")

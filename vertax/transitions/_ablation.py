@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
 from vertax._base.checks import named
-from vertax._base.modules import choose, is_concrete
+from vertax._base.tracing import choose, is_concrete
 from vertax.energies import Ablated, AbstractEnergy, AbstractLocalEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._surgery import merge_cells

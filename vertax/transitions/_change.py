@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from vertax._base.axes import AXES, gather
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 

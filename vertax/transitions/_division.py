@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.checks import as_real, check_whole
-from vertax._base.modules import choose, is_concrete
+from vertax._base.tracing import choose, is_concrete
 from vertax.mesh import Tissue, Topology
 from vertax.mesh._surgery import Slot, spare_slot, split_cell
 from vertax.mesh._topology import take

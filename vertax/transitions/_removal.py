@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vertax._base.modules import choose
+from vertax._base.tracing import choose
 from vertax.mesh import Tissue
 from vertax.transitions._change import Change, raised_if, unchanged
 from vertax.transitions._division import check_cell

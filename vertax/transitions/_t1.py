@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.modules import is_concrete
 from vertax._base.reductions import any_of
 from vertax._base.sums import total
+from vertax._base.tracing import is_concrete
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.checks import check_number
-from vertax._base.modules import choose
+from vertax._base.tracing import choose
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._surgery import collapse_triangle, merge_cells
