@@ -42,7 +42,7 @@ def differs_between_devices(array: jax.typing.ArrayLike) -> bool:
     return bool(newer or getattr(kind, "vma", None))
 
 
-def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
+def tree_where(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
     """`jnp.where` of two pytrees that may hold more than arrays, with the types of the old one."""
     pick = lambda x, y: jnp.where(condition, x, y).astype(y.dtype) if eqx.is_array(x) else x
     return jax.tree.map(pick, new, old)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
-from vertax._base.tracing import choose
+from vertax._base.tracing import tree_where
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
@@ -98,7 +98,7 @@ def better(
     lower = (guidance < best.guidance) | (
         (guidance == best.guidance) & (facts.cost < best.facts.cost)
     )
-    return choose(ok & lower, new, best)
+    return tree_where(ok & lower, new, best)
 
 
 def guidance_of(problem: InverseProblem) -> Float[Array, "*batch"]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.probe_vector import probe_vector
 from vertax._base.reductions import any_of
-from vertax._base.tracing import choose
+from vertax._base.tracing import tree_where
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._measured import Measured
@@ -214,7 +214,7 @@ class Search(eqx.Module):
             options = options | {"preconditioner": preconditioner}
         return SearchState(
             tissue=tissue,
-            origin=choose(flipped, tissue.configuration, state.origin),
+            origin=tree_where(flipped, tissue.configuration, state.origin),
             iteration=iteration.propose(model, options, minimiser, active),
             stiffness=stiffness,
             contacts=contacts,

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.probe_vector import probe_vector
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
-from vertax._base.tracing import choose
+from vertax._base.tracing import tree_where
 from vertax.solvers._lanczos import (
     BREAKDOWN,
     CONVERGED,
@@ -315,7 +315,7 @@ def _solve(
             more=more | probing,
             rhs=jnp.where(probing, r_0, jnp.where(first, seen.a_r, change)),
             target=jnp.where(first, finest, target),
-            last=choose(probing, solve.last, seen),
+            last=tree_where(probing, solve.last, seen),
             step=end.step,
             status=seen.status,
             operator_norm=operator_norm,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
 from vertax._base.checks import named
-from vertax._base.tracing import choose, is_concrete
+from vertax._base.tracing import is_concrete, tree_where
 from vertax.energies import Ablated, AbstractEnergy, AbstractLocalEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._surgery import merge_cells
@@ -104,7 +104,7 @@ def _merged(tissue: Tissue, holes: Bool[Array, " cells"]) -> tuple[Tissue, Bool[
         h = take(tissue.topology.half_edge, edge)
         new = tissue.with_topology(merge_cells(tissue.topology, h, jnp.array(True)))
         good = _is_sound(new, tissue)
-        return choose(good, new, tissue), jnp.where(good, False, refused | (edges == edge))
+        return tree_where(good, new, tissue), jnp.where(good, False, refused | (edges == edge))
 
     start = (tissue, jnp.zeros(tissue.n_edges, bool))
     unfinished = lambda carry: jnp.any(between(carry[0]) & ~carry[1])

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.checks import as_real, check_whole
-from vertax._base.tracing import choose, is_concrete
+from vertax._base.tracing import is_concrete, tree_where
 from vertax.mesh import Tissue, Topology
 from vertax.mesh._surgery import Slot, spare_slot, split_cell
 from vertax.mesh._topology import take
@@ -135,7 +135,7 @@ def divided(
     )
     edge, other = take(m.edge, out), take(m.edge, into)
     return Change(
-        choose(good, new, tissue),
+        tree_where(good, new, tissue),
         put(none.cells, slot.cell, cell),
         put(none.edges, jnp.stack(slot.edges), jnp.stack([edge, other, edge])),
         put(none.vertices, jnp.stack(slot.vertices), take(m.source, both)),

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vertax._base.tracing import choose
+from vertax._base.tracing import tree_where
 from vertax.mesh import Tissue
 from vertax.transitions._change import Change, raised_if, unchanged
 from vertax.transitions._division import check_cell
@@ -98,7 +98,7 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     go = do & can_vanish(reduced)[cell]
     gone = vanished(reduced, cell, go)
     done = go & ~has_new_overlaps(gone, tissue)
-    return Change(choose(done, gone, tissue), none.cells, none.edges, none.vertices, done)
+    return Change(tree_where(done, gone, tissue), none.cells, none.edges, none.vertices, done)
 
 
 def flipped(
@@ -119,4 +119,4 @@ def flipped(
     again = lambda carry: carry[1] & (carry[0] < len(_SHARES))
     tries, bad = jax.lax.while_loop(again, crowded, (jnp.array(0), jnp.array(True)))
     good = ~bad & jnp.any(which)
-    return choose(good, with_share(tries - 1), tissue), good
+    return tree_where(good, with_share(tries - 1), tissue), good

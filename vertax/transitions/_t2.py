@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.checks import check_number
-from vertax._base.tracing import choose
+from vertax._base.tracing import tree_where
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._surgery import collapse_triangle, merge_cells
@@ -84,7 +84,7 @@ class T2(AbstractTransitions):
             accepted &= ~has_new_overlaps(gone, tissue)
             h = jnp.argmax(tissue.topology.cell == cell)
             edge = jnp.where(accepted, take(tissue.topology.edge, h), tissue.n_edges)
-            tissue = choose(accepted, gone, tissue)
+            tissue = tree_where(accepted, gone, tissue)
             todo = candidates(tissue, todo & (jnp.arange(tissue.n_cells) != cell))
             return tissue, counts.at[edge].add(1, mode="drop"), todo
 
