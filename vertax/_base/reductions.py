@@ -24,13 +24,13 @@ def max_of(x: Float[Array, "*shape"]) -> Float[Array, ""]:
     )
 
 
-def number_of(x: Bool[Array, "*shape"]) -> Float[Array, ""]:
+def count_true(x: Bool[Array, "*shape"]) -> Float[Array, ""]:
     """How many are true."""
     ones = jnp.ones(x.size, jnp.float32)
     return jnp.dot(x.reshape(-1).astype(jnp.float32), ones)
 
 
-def indices_of(
+def indices_of_true(
     mask: Bool[Array, " n"], size: int
 ) -> tuple[Int[Array, " size"], Bool[Array, " size"]]:
     """The first indices at which a mask is true, in their order, and which of them are any.
