@@ -131,10 +131,10 @@ with contextlib.suppress(SystemExit):
 
 
 def test_an_import_that_fails_for_another_reason_says_so():
-    from vertax._base.extras import needing
+    from vertax._base.extras import requires_extra
 
     said = r"VTK needs what the extra \[files\] brings.*broken library"
-    with pytest.raises(ImportError, match=said), needing("files", "VTK"):
+    with pytest.raises(ImportError, match=said), requires_extra("files", "VTK"):
         raise ImportError("broken library")
-    with pytest.raises(ImportError, match=r"^a fault of ours$"), needing("files", "VTK"):
+    with pytest.raises(ImportError, match=r"^a fault of ours$"), requires_extra("files", "VTK"):
         raise ImportError("a fault of ours", name="vertax.io")

@@ -10,11 +10,11 @@ _PACKAGES = {"skimage": "scikit-image", "PIL": "pillow", "tomli_w": "tomli-w"}
 
 
 @contextlib.contextmanager
-def needing(extra: str, who: str) -> Iterator[None]:
+def requires_extra(extra: str, who: str) -> Iterator[None]:
     """Around imports of what an extra brings: if it is missing, say how to install it.
 
     ```python
-    with needing("files", "Writing VTK files"):
+    with requires_extra("files", "Writing VTK files"):
         import meshio
     ```
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from vertax._base.checks import check_whole
-from vertax._base.extras import needing
+from vertax._base.extras import requires_extra
 
 _TIFF = (".tif", ".tiff")
 
@@ -83,7 +83,7 @@ def _read(file: Path) -> tuple[np.ndarray, str]:
 
 
 def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
-    with needing("image", "Reading TIFF files"):
+    with requires_extra("image", "Reading TIFF files"):
         import tifffile
     with tifffile.TiffFile(file) as tiff:
         series = tiff.series[0]
@@ -95,7 +95,7 @@ def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
 
 
 def _read_picture(file: Path) -> tuple[np.ndarray, str]:
-    with needing("image", "Reading pictures"):
+    with requires_extra("image", "Reading pictures"):
         from PIL import Image
 
     with Image.open(file) as picture:
