@@ -47,9 +47,9 @@ def check_number(
     # Booleans are numbers to Python, but no length or strength.
     if dtype is None or not (dtype.kind in "iu" or _floating(dtype)):
         what = "hold real numbers" if many else "be one real number"
-        raise TypeError(f"Argument `{name}` must {what}, but is {named(value)}.")
+        raise TypeError(f"Argument `{name}` must {what}, but is {describe(value)}.")
     if np.shape(value) != () and not many:
-        raise ValueError(f"Argument `{name}` must be one number, but is {named(value)}.")
+        raise ValueError(f"Argument `{name}` must be one number, but is {describe(value)}.")
     if not is_concrete(value):
         return
     numbers_given = np.asarray(value).astype(float)
@@ -82,7 +82,7 @@ def check_whole(name: str, value: Any, *, least: int | None = None) -> None:
     wanted = "a whole number" if least is None else f"at least {least}"
     if not isinstance(value, numbers.Integral) or isinstance(value, bool | np.bool_):
         raise TypeError(
-            f"Argument `{name}` must be {wanted} (a Python integer), but is {named(value)}."
+            f"Argument `{name}` must be {wanted} (a Python integer), but is {describe(value)}."
         )
     if least is not None and value < least:
         raise ValueError(f"Argument `{name}` must be {wanted}, but is {value}.")
@@ -133,7 +133,7 @@ def as_key(key: PRNGKeyArray | int) -> PRNGKeyArray:
     if not isinstance(key, jax.Array | np.ndarray):
         raise TypeError(
             "Argument `key` must be a key from jax.random.key(seed) or a seed, but is "
-            f"{named(key)}."
+            f"{describe(key)}."
         )
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     if typed and key.shape == ():
@@ -189,7 +189,7 @@ def as_doubles(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray
 def _check_real(name: str, value: Any) -> None:
     dtype = _dtype(value)
     if dtype is None or dtype.kind == "c":
-        was = named(value) if dtype is None else f"an array of type {dtype}"
+        was = describe(value) if dtype is None else f"an array of type {dtype}"
         raise TypeError(f"Argument `{name}` must hold real numbers, but is {was}.")
     if is_concrete(value) and not np.isfinite(np.asarray(value)).all():
         raise ValueError(f"Argument `{name}` must be finite, but holds NaN or infinity.")
@@ -211,7 +211,7 @@ def _floating(dtype: np.dtype) -> bool:
     return bool(jnp.issubdtype(dtype, jnp.floating))
 
 
-def named(value: Any) -> str:
+def describe(value: Any) -> str:
     """What a message says of a value that is of the wrong type: itself if it is short."""
     if isinstance(value, type):
         return f"the class {value.__name__}"

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertax._base.checks import named
+from vertax._base.checks import describe
 
 
 def check_fields(module: eqx.Module) -> None:
@@ -35,7 +35,7 @@ def check_fields(module: eqx.Module) -> None:
                 check_fields(leaf)
             elif isinstance(leaf, np.ndarray) and not _numeric(leaf.dtype):
                 raise TypeError(
-                    f"Field {what} must hold numbers, but holds {named(leaf)}. Give text as a tuple: "
+                    f"Field {what} must hold numbers, but holds {describe(leaf)}. Give text as a tuple: "
                     "tuple(array.tolist())."
                 )
 
@@ -45,7 +45,7 @@ def _check_static(what: str, value: Any) -> None:
         hash(value)
     except TypeError as error:
         raise TypeError(
-            f"Field {what} must have a hash, because it is static, but holds {named(value)} ({error}). For "
+            f"Field {what} must have a hash, because it is static, but holds {describe(value)} ({error}). For "
             "an array leave out static=True (a NumPy array is not fitted); give a list as a tuple."
         ) from error
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vertax import mechanics
-from vertax._base.checks import as_real, check_number, check_whole, named
+from vertax._base.checks import as_real, check_number, check_whole, describe
 from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
@@ -69,7 +69,7 @@ class CellStress(AbstractLeastSquaresCost):
     def __check_init__(self):
         if self.cells is not None and not jnp.issubdtype(self.cells.dtype, jnp.integer):
             raise TypeError(
-                f"Argument `cells` must hold whole numbers, but is {named(self.cells)}."
+                f"Argument `cells` must hold whole numbers, but is {describe(self.cells)}."
             )
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:

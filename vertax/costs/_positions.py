@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.checks import check_whole, named
+from vertax._base.checks import check_whole, describe
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -183,7 +183,7 @@ def _meeting_cells(tissue: Tissue) -> Int[Array, "vertices 3"]:
 def check_target(who: str, target: Tissue) -> None:
     """Refuse a target that is no tissue with a `TypeError`."""
     if not isinstance(target, Tissue):
-        raise TypeError(f"The target of {who} must be a Tissue, but is {named(target)}.")
+        raise TypeError(f"The target of {who} must be a Tissue, but is {describe(target)}.")
 
 
 def check_equal(

@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax._base.tracing import tree_where
 from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
@@ -257,7 +257,7 @@ def _energy_at(energy: Any, time: Any) -> AbstractEnergy:
     if not isinstance(found, AbstractEnergy):
         raise TypeError(
             "Argument `energy` must be an energy, or a function of time that returns one, but returned "
-            f"{named(found)}."
+            f"{describe(found)}."
         )
     return found
 

@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from vertax._base.checks import check_number, check_whole, named
+from vertax._base.checks import check_number, check_whole, describe
 from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.adjoints._adjoint import frozen
@@ -85,7 +85,7 @@ class External(AbstractResponse):
         if not isinstance(self.simulator, AbstractSimulator):
             raise TypeError(
                 "Argument `simulator` must be a subclass of vertax.external.AbstractSimulator, made by "
-                f"calling it, but is {named(self.simulator)}."
+                f"calling it, but is {describe(self.simulator)}."
             )
         if self.slope not in ("energy", "program", "differences"):
             raise ValueError(

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.announce import announce_compilations, announced_jit
-from vertax._base.checks import as_key, check_whole, increasing, named
+from vertax._base.checks import as_key, check_whole, describe, increasing
 from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
@@ -174,13 +174,13 @@ def grow(
         ("relaxation", relaxation, Relaxation | None),
     ):
         if not isinstance(value, kind):
-            raise TypeError(f"Argument `{name}` is of a wrong kind: {named(value)}.")
+            raise TypeError(f"Argument `{name}` is of a wrong kind: {describe(value)}.")
     wrong = isinstance(energy, AbstractEnergy) or not callable(energy)
     if wrong or (isinstance(energy, type) and issubclass(energy, AbstractEnergy)):
         name = energy.__name__ if isinstance(energy, type) else "energy"
         raise TypeError(
             "Argument `energy` must be a function of what cells know of themselves that returns an energy, "
-            f"but is {named(energy)}. Pass such a function, e.g. lambda cells: {name}"
+            f"but is {describe(energy)}. Pass such a function, e.g. lambda cells: {name}"
             f"{'(...)' if isinstance(energy, type) else ''}."
         )
     if not tissue.topology.spare:

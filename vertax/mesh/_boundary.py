@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax._base.tracing import is_concrete
 
 
@@ -216,7 +216,7 @@ class Free(AbstractBoundary):
 def _of_another_kind(one: AbstractBoundary, other: AbstractBoundary) -> TypeError:
     return TypeError(
         f"A tissue in a {type(one).__name__} boundary needs another such boundary to go to, not "
-        f"{named(other) if not isinstance(other, AbstractBoundary) else type(other).__name__}."
+        f"{describe(other) if not isinstance(other, AbstractBoundary) else type(other).__name__}."
     )
 
 

@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import check_number, named
+from vertax._base.checks import check_number, describe
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import differs_between_devices, is_concrete, traced
@@ -92,7 +92,7 @@ class Relaxation(AbstractResponse):
         if not isinstance(self.preconditioner, RecycledHessian | None):
             raise TypeError(
                 "Argument `preconditioner` must be a result of `preconditioner_at`, or None, but "
-                f"is {named(self.preconditioner)}."
+                f"is {describe(self.preconditioner)}."
             )
 
     def __call__(

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.energies import Ablated, AbstractEnergy, AbstractLocalEnergy
 from vertax.mesh import Tissue
@@ -55,7 +55,7 @@ def ablate(
     if not isinstance(energy, AbstractLocalEnergy):
         raise TypeError(
             "Argument `energy` must be a sum over cells and edges, an AbstractLocalEnergy, but is "
-            f"{named(energy)}."
+            f"{describe(energy)}."
         )
     if edges is None and cells is None:
         raise ValueError("Argument `edges` or `cells` must say what is ablated, but both are None.")
