@@ -65,7 +65,7 @@ def check_number(
         raise ValueError(f"Argument `{name}` must be {wanted}{finite}, but is {_shown(value)}.")
 
 
-def check_whole(name: str, value: Any, *, least: int | None = None) -> None:
+def check_integer(name: str, value: Any, *, least: int | None = None) -> None:
     """Refuse what is no whole number, or too small.
 
     **Arguments:**
@@ -170,7 +170,7 @@ def as_real(name: str, value: ArrayLike | Sequence[Any]) -> Array:
     return array if _floating(array.dtype) else array.astype(jnp.result_type(float))
 
 
-def as_doubles(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray, "..."]:
+def as_float64(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray, "..."]:
     """Finite real numbers as float64 of NumPy, whatever the precision of the device is.
 
     **Arguments:**
@@ -228,7 +228,7 @@ def _shown(value: Any) -> str:
     return str(value) if array.shape == () else f"from {array.min()} to {array.max()}"
 
 
-def increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
+def as_times(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
     """The argument `times` as an array.
 
     **Raises:**

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vertax import mechanics
-from vertax._base.checks import as_real, check_number, check_whole, describe
+from vertax._base.checks import as_real, check_integer, check_number, describe
 from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
@@ -177,7 +177,7 @@ class SpectralGap(AbstractLeastSquaresCost):
     below: int = eqx.field(static=True, default=2)
 
     def __check_init__(self):
-        check_whole("below", self.below, least=1)
+        check_integer("below", self.below, at_least=1)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The difference."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
 from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import Checkpoint
-from vertax._base.checks import as_key, check_whole, describe, increasing
+from vertax._base.checks import as_key, as_times, check_integer, describe
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.tracing import is_concrete, traced
 from vertax.activities import AbstractActivity
@@ -125,7 +125,7 @@ class Evolution(AbstractResponse):
                     f"Argument `{name}` must be a function of time, but is {describe(function)}. For one that "
                     "stays, leave it out."
                 )
-        check_whole("substeps", substeps, least=1)
+        check_integer("substeps", substeps, at_least=1)
         if order not in (1, 2):
             raise ValueError(f"Argument `order` must be 1 or 2, but is {order!r}.")
         if order == 2 and not isinstance(dissipation, AbstractViscosity):
@@ -149,7 +149,7 @@ class Evolution(AbstractResponse):
                 )
             )
         self.dissipation, self.control = dissipation, control
-        self.times = increasing(times)
+        self.times = as_times(times)
         self.substeps, self.order = substeps, order
         self.boundary, self.pins = boundary, pins
 

@@ -7,7 +7,7 @@ from typing import Any
 import optax
 import optimistix as optx
 
-from vertax._base.checks import check_whole, describe
+from vertax._base.checks import check_integer, describe
 from vertax.fitting._inverse import InverseProblem
 
 
@@ -26,7 +26,7 @@ def check_arguments(
             f"Argument `problem` must be a vertax.InverseProblem, but is {describe(problem)}."
         )
     _check_optimiser(optimiser)
-    check_whole("epochs", epochs, least=1)
+    check_integer("epochs", epochs, at_least=1)
     if guidance is not None and not callable(guidance):
         raise TypeError(
             "Argument `guidance` must be a function of the epoch, such as "

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from vertax._base.checks import as_key, check_concrete, check_whole
+from vertax._base.checks import as_key, check_concrete, check_integer
 from vertax.initialise._order import spatial_order
 from vertax.initialise._tidy import without_overlaps
 from vertax.initialise._voronoi import tessellate
@@ -54,8 +54,8 @@ def free_voronoi(
             "tissue, and a single free cell has none. Begin with two cells, or with one in a periodic box: "
             "vx.initialise.periodic_voronoi(1, key=0)."
         )
-    check_whole("n_cells", n_cells, least=2)
-    check_whole("lloyd_steps", lloyd_steps, least=0)
+    check_integer("n_cells", n_cells, at_least=2)
+    check_integer("lloyd_steps", lloyd_steps, at_least=0)
     dtype = jnp.result_type(float)
     # A periodic box of seeds, so that no cell is unbounded, with a margin of three cells.
     n_seeds = int(np.ceil((2 * np.sqrt(n_cells / np.pi) + 6) ** 2))

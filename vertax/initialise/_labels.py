@@ -137,7 +137,7 @@ def from_labels(
     """
     check_concrete("from_labels", mask, pixel_size)
     check_options(boundary, pixel_size)
-    check_number("gap_width", gap_width, least=0)
+    check_number("gap_width", gap_width, at_least=0)
     values, image, background = checked_mask(mask, background)
     if boundary == "free":
         if gap_width > max(image.shape):

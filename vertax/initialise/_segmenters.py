@@ -227,7 +227,7 @@ def estimate_cell_size(image: Float[np.ndarray, "rows columns"]) -> float:
 def _check_size(name: str, value: float | None, *, zero: bool) -> None:
     if value is None:
         return
-    check_number(name, value, least=0) if zero else check_number(name, value, above=0)
+    check_number(name, value, at_least=0) if zero else check_number(name, value, above=0)
 
 
 def _check_version(package: str, least: int) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray
 from scipy.spatial import Delaunay, KDTree
 
-from vertax._base.checks import as_doubles, as_key, check_concrete, check_number, check_whole
+from vertax._base.checks import as_float64, as_key, check_concrete, check_integer, check_number
 from vertax.initialise._order import spatial_order
 from vertax.mesh import Periodic, Tissue, Topology
 
@@ -53,12 +53,12 @@ def periodic_voronoi(
     if (n_cells is None) == (seeds is None):
         raise ValueError("Give either `n_cells` (with `key`) or `seeds`, and not both.")
     if n_cells is not None:
-        check_whole("n_cells", n_cells, least=1)
-    check_whole("lloyd_steps", lloyd_steps, least=0)
+        check_integer("n_cells", n_cells, at_least=1)
+    check_integer("lloyd_steps", lloyd_steps, at_least=0)
     dtype = jnp.result_type(float)
     points = np.zeros((0, 2))
     if seeds is not None:
-        points = as_doubles("seeds", seeds)
+        points = as_float64("seeds", seeds)
         if points.ndim != 2 or points.shape[1] != 2:
             raise ValueError(
                 f"Argument `seeds` must have shape (cells, 2), but has {points.shape}."
@@ -68,7 +68,7 @@ def periodic_voronoi(
         raise ValueError(f"A tissue needs at least one cell, but got {n_cells} seeds.")
     box = np.sqrt(n_cells) * np.eye(2)
     if lattice is not None:
-        box = as_doubles("lattice", lattice)
+        box = as_float64("lattice", lattice)
     boundary = Periodic(jnp.asarray(box, dtype))
     if seeds is None:
         if key is None:
@@ -100,8 +100,8 @@ def hexagonal(nx: int, ny: int, *, area: float = 1.0, softening: float | None = 
     - `ValueError` for fewer than one cell or row, or an area that is not positive.
     """
     check_concrete("hexagonal", area)
-    check_whole("nx", nx, least=1)
-    check_whole("ny", ny, least=1)
+    check_integer("nx", nx, at_least=1)
+    check_integer("ny", ny, at_least=1)
     check_number("area", area, above=0)
     spacing = np.sqrt(2 * area / np.sqrt(3))
     column, row = np.meshgrid(np.arange(nx), np.arange(ny))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 
-from vertax._base.checks import check_whole
+from vertax._base.checks import check_integer
 from vertax._base.extras import requires_extra
 
 _TIFF = (".tif", ".tiff")
@@ -46,7 +46,7 @@ def read_image(
         )
     for name, index in (("channel", channel), ("plane", plane)):
         if index is not None:
-            check_whole(name, index)
+            check_integer(name, index)
     pixels, axes = _read(file)
     if pixels.dtype.kind not in "biuf":
         raise ValueError(

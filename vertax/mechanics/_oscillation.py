@@ -83,7 +83,7 @@ def complex_modulus(
     """
     check_system(tissue, energy, box="a complex modulus")
     check_dissipation(dissipation)
-    check_number("frequencies", frequencies, least=0, many=True)
+    check_number("frequencies", frequencies, at_least=0, many=True)
     omegas = jnp.atleast_1d(as_real("frequencies", frequencies)).astype(tissue.vertices.dtype)
     if omegas.ndim != 1 or omegas.size == 0:
         raise ValueError(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from vertax._base.checks import check_concrete, check_whole
+from vertax._base.checks import check_concrete, check_integer
 from vertax._base.tracing import is_concrete
 from vertax.mesh._topology import Topology
 
@@ -22,7 +22,7 @@ def size_class(n_cells: int) -> int:
 
 def with_slots(m: Topology, n_cells: int) -> Topology:
     """The same with spare slots, so many that there is room for a number of cells."""
-    check_whole("n_cells", n_cells)
+    check_integer("n_cells", n_cells)
     have = m.n_cells
     if n_cells < have:
         raise ValueError(

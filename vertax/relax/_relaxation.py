@@ -88,7 +88,7 @@ class Relaxation(AbstractResponse):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0, many=True)
         if self.contact_range is not None:
-            check_number("contact_range", self.contact_range, least=0, many=True)
+            check_number("contact_range", self.contact_range, at_least=0, many=True)
         if not isinstance(self.preconditioner, RecycledHessian | None):
             raise TypeError(
                 "Argument `preconditioner` must be a result of `preconditioner_at`, or None, but "

@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PyTree
 
-from vertax._base.checks import check_number, check_whole, describe
+from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.tracing import is_concrete
 from vertax.solvers._solver import AbstractSolver, value_and_gradient, with_value_and_gradient
 
@@ -157,7 +157,7 @@ def LBFGS(history: int = 10) -> Optax:
 
     - `ValueError` for less than one.
     """
-    check_whole("history", history, least=1)
+    check_integer("history", history, at_least=1)
     return Optax(optax.lbfgs(memory_size=history))
 
 

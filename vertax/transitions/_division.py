@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._base.checks import as_real, check_whole
+from vertax._base.checks import as_real, check_integer
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.mesh import Tissue, Topology
 from vertax.mesh._surgery import Slot, spare_slot, split_cell
@@ -84,7 +84,7 @@ def check_cell(tissue: Tissue, cell: int | Int[Array, ""]) -> None:
     """Refuse what is no cell, or one that is not there, if that can be seen."""
     array = isinstance(cell, jax.Array | np.ndarray) and cell.ndim == 0
     if not (array and jnp.issubdtype(jnp.result_type(cell), jnp.integer)):
-        check_whole("cell", cell)
+        check_integer("cell", cell)
     if not is_concrete(cell) or not is_concrete(tissue.topology.cell):
         return
     there = 0 <= int(cell) < tissue.n_cells and int(cell) in np.asarray(tissue.topology.cell)
