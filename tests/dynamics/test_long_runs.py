@@ -50,14 +50,14 @@ class Interrupt:
 
     def __init__(self, monkeypatch, after):
         calls = itertools.count(1)
-        write = vx._base.checkpoints.Keeper.note
+        write = vx._base.checkpoints.CheckpointFile.note
 
-        def note(keeper, progress):
-            write(keeper, progress)
+        def note(file, progress):
+            write(file, progress)
             if next(calls) == after:
                 raise KeyboardInterrupt
 
-        monkeypatch.setattr(vx._base.checkpoints.Keeper, "note", note)
+        monkeypatch.setattr(vx._base.checkpoints.CheckpointFile, "note", note)
 
 
 @pytest.mark.thorough

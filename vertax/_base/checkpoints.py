@@ -69,7 +69,7 @@ class Progress(NamedTuple):
     notes: tuple[Row, ...] = ()
 
 
-class Keeper:
+class CheckpointFile:
     """Reads and writes the checkpoints of one fit, or of one movement in time.
 
     **Arguments:**
@@ -105,7 +105,7 @@ class Keeper:
             return Progress(start)
         return _load(self._checkpoint.path, self._identity, start, self._what)
 
-    def note(self, progress: Progress) -> None:
+    def save_if_due(self, progress: Progress) -> None:
         """Write it, if it is time to."""
         if self._checkpoint is None or time.perf_counter() < self._due:
             return
