@@ -53,12 +53,12 @@ class Minimisation(eqx.Module):
         """The same, not differentiable; on a CPU members of a `jax.vmap` run one after another."""
         return sequential_vmap_on_cpu(Minimisation.run)(self)
 
-    def but(self, **changes: Any) -> Minimisation:
+    def replaced(self, **changes: Any) -> Minimisation:
         """The same with some of its parts replaced."""
         return dataclasses.replace(self, **changes)
 
 
-def steps_of(residual: PyTree) -> Int[Array, ""]:
+def num_steps_of(residual: PyTree) -> Int[Array, ""]:
     """How many steps a minimisation took."""
     num_steps, *_ = residual
     return num_steps

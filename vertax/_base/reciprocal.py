@@ -21,14 +21,14 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
-def inverse_root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def inverse_square_root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """1 / √x."""
     return 1 / jnp.sqrt(x)
 
 
-@inverse_root.defjvp
+@inverse_square_root.defjvp
 def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    y = inverse_root(*primals)
+    y = inverse_square_root(*primals)
     return y, -0.5 * y * y * y * tangents[0]
 
 
