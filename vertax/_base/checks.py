@@ -21,7 +21,7 @@ def check_number(
     value: Any,
     *,
     above: float | int | None = None,
-    least: float | int | None = None,
+    at_least: float | int | None = None,
     many: bool = False,
 ) -> None:
     """Refuse what is no real number, or not in range. The value of a traced number is not looked at.
@@ -30,7 +30,7 @@ def check_number(
 
     - `name`: of the argument, or what the message is to say of it.
     - `value`: a number, or an array of no dimension.
-    - `above`, `least`: what it must exceed, or at least be.
+    - `above`, `at_least`: what it must exceed, or at least be.
     - `many`: whether it may be an array, all entries of which are checked.
 
     **Raises:**
@@ -41,8 +41,8 @@ def check_number(
     wanted = "finite"
     if above is not None:
         wanted = "positive" if above == 0 else f"above {above:g}"
-    elif least is not None:
-        wanted = f"at least {least:g}"
+    elif at_least is not None:
+        wanted = f"at least {at_least:g}"
     dtype = _dtype(value)
     # Booleans are numbers to Python, but no length or strength.
     if dtype is None or not (dtype.kind in "iu" or _floating(dtype)):
@@ -56,8 +56,8 @@ def check_number(
     inside = ~np.isnan(numbers_given)
     if above is not None:
         inside &= numbers_given > above
-    if least is not None:
-        inside &= numbers_given >= least
+    if at_least is not None:
+        inside &= numbers_given >= at_least
     if not inside.all():
         raise ValueError(f"Argument `{name}` must be {wanted}, but is {_shown(value)}.")
     if np.isinf(numbers_given).any():
@@ -65,26 +65,26 @@ def check_number(
         raise ValueError(f"Argument `{name}` must be {wanted}{finite}, but is {_shown(value)}.")
 
 
-def check_integer(name: str, value: Any, *, least: int | None = None) -> None:
+def check_integer(name: str, value: Any, *, at_least: int | None = None) -> None:
     """Refuse what is no whole number, or too small.
 
     **Arguments:**
 
     - `name`: of the argument.
     - `value`: an integer of Python or NumPy.
-    - `least`: what it must at least be.
+    - `at_least`: what it must at least be.
 
     **Raises:**
 
     - `TypeError` for what is no whole number.
     - `ValueError` for one that is too small.
     """
-    wanted = "a whole number" if least is None else f"at least {least}"
+    wanted = "a whole number" if at_least is None else f"at least {at_least}"
     if not isinstance(value, numbers.Integral) or isinstance(value, bool | np.bool_):
         raise TypeError(
             f"Argument `{name}` must be {wanted} (a Python integer), but is {describe(value)}."
         )
-    if least is not None and value < least:
+    if at_least is not None and value < at_least:
         raise ValueError(f"Argument `{name}` must be {wanted}, but is {value}.")
 
 
