@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 from jaxtyping import Array, Float
 
-from vertax.mesh._tissue import Known, Tissue
+from vertax.mesh._tissue import Measurements, Tissue
 
 
 class Measured(Tissue):
@@ -23,10 +23,10 @@ class Measured(Tissue):
     - `known`: what is known of it; None to work it out.
     """
 
-    known: Known
+    known: Measurements
     of: list[Array]
 
-    def __init__(self, tissue: Tissue, known: Known | None = None):
+    def __init__(self, tissue: Tissue, known: Measurements | None = None):
         for name in Tissue.__dataclass_fields__:
             setattr(self, name, getattr(tissue, name))
         self.known = tissue.measured() if known is None else known

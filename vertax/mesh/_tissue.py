@@ -20,7 +20,7 @@ from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
 
 
-class Known(NamedTuple):
+class Measurements(NamedTuple):
     """What most energies ask of a tissue."""
 
     lengths: Float[Array, " edges"]
@@ -523,7 +523,7 @@ class Tissue(eqx.Module):
         bulge = (dx**2 + dy**2) * area_factor(self.edge_angles)
         return left + bulge, right - bulge
 
-    def measured(self) -> Known:
+    def measured(self) -> Measurements:
         """`edge_lengths`, `areas` and `perimeters`, from one look at the vertices."""
         segments = self._segments()
         lengths = self._chords(segments)
@@ -532,7 +532,7 @@ class Tissue(eqx.Module):
         if self.arcs is not None:
             lengths = lengths * length_factor(self.edge_angles)
         areas = self.cell_sums(self._area_shares(segments))
-        return Known(lengths, areas, self.cell_sums((lengths, lengths)))
+        return Measurements(lengths, areas, self.cell_sums((lengths, lengths)))
 
     def cell_sums(
         self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]

@@ -15,7 +15,7 @@ from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._ends import Ends
 from vertax.mesh._measured import Measured
-from vertax.mesh._tissue import Known
+from vertax.mesh._tissue import Measurements
 from vertax.mesh._topology import Topology, take
 
 # What a block resists with at least, in units of the mean of all. (From a tenth to three times of that the
@@ -187,7 +187,7 @@ class _Response(NamedTuple):
     perimeter: Float[Array, " cells"]
 
     @classmethod
-    def of(cls, energy: AbstractEnergy, tissue: Tissue, known: Known) -> _Response:
+    def of(cls, energy: AbstractEnergy, tissue: Tissue, known: Measurements) -> _Response:
         slope, change = jax.linearize(
             jax.grad(lambda known: energy(Measured(tissue, known))), known
         )
@@ -268,7 +268,7 @@ def _of_cells(values: Float[Array, " cells"], cells: Array) -> Array:
     return values.at[cells].get(mode="fill", fill_value=0)
 
 
-def _directly(tissue: Tissue, energy: AbstractEnergy, known: Known) -> Float[Array, ""]:
+def _directly(tissue: Tissue, energy: AbstractEnergy, known: Measurements) -> Float[Array, ""]:
     """The mean resistance to motions of vertices that change nothing else that is known."""
     # (Mostly there is none, and JAX knows it.)
     slope = jax.grad(lambda vertices: energy(Measured(tissue.with_vertices(vertices), known)))
