@@ -14,7 +14,7 @@ from vertax._base.sums import total
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._ends import Ends
-from vertax.mesh._measured import Measured
+from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._tissue import Measurements
 from vertax.mesh._topology import Topology, take
 
@@ -189,7 +189,7 @@ class _Response(NamedTuple):
     @classmethod
     def of(cls, energy: AbstractEnergy, tissue: Tissue, known: Measurements) -> _Response:
         slope, change = jax.linearize(
-            jax.grad(lambda known: energy(Measured(tissue, known))), known
+            jax.grad(lambda known: energy(MeasuredTissue(tissue, known))), known
         )
         none = jax.tree.map(jnp.zeros_like, known)
         # All areas at once, and so on: the terms of an energy are those of single cells and edges.
@@ -271,7 +271,7 @@ def _of_cells(values: Float[Array, " cells"], cells: Array) -> Array:
 def _directly(tissue: Tissue, energy: AbstractEnergy, known: Measurements) -> Float[Array, ""]:
     """The mean resistance to motions of vertices that change nothing else that is known."""
     # (Mostly there is none, and JAX knows it.)
-    slope = jax.grad(lambda vertices: energy(Measured(tissue.with_vertices(vertices), known)))
+    slope = jax.grad(lambda vertices: energy(MeasuredTissue(tissue.with_vertices(vertices), known)))
     direction = probe_vector(tissue.vertices)
     _, response = jax.jvp(slope, (tissue.vertices,), (direction,))
     mean = jnp.sum(direction * response) / jnp.sum(direction**2)

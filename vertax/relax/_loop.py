@@ -16,7 +16,7 @@ from vertax._base.reductions import any_of
 from vertax._base.tracing import tree_where
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._measured import Measured
+from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._topology import take
 from vertax.precondition._edge_blocks import EdgeBlocks
 from vertax.precondition._elastic_medium import ElasticMedium
@@ -377,7 +377,7 @@ def objective(
     """The energy of a configuration and of its contacts, as Optimistix wants it."""
     tissue, energy, contacts = args
     there = tissue.with_configuration(configuration)
-    value = energy(Measured(there))
+    value = energy(MeasuredTissue(there))
     return value if contacts is None else value + contacts(there), None
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from vertax.mesh._tissue import Measurements, Tissue
 
 
-class Measured(Tissue):
+class MeasuredTissue(Tissue):
     """A tissue that knows its lengths and areas.
 
     Each property of a tissue is a function of its vertices, and so is its derivative, on its own. Here they

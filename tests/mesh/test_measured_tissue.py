@@ -8,7 +8,7 @@ import pytest
 from free_helpers import cluster
 
 import vertax as vx
-from vertax.mesh._measured import Measured
+from vertax.mesh._measured_tissue import MeasuredTissue
 
 TISSUES = {
     "periodic": lambda: vx.initialise.periodic_voronoi(12, key=0),
@@ -32,7 +32,7 @@ def test_properties_and_two_derivatives_are_those_of_the_tissue(kind):
         at = lambda x: energy(wrap(tissue.with_configuration(x)))
         return jax.jit(lambda x: (at(x), *jax.jvp(jax.grad(at), (x,), (way,))))(start)
 
-    known, plain = looked_at(Measured), looked_at(lambda t: t)
+    known, plain = looked_at(MeasuredTissue), looked_at(lambda t: t)
     for one, other in zip(jax.tree.leaves(known), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10 * np.abs(other).max())
 
@@ -42,7 +42,7 @@ def test_what_is_known_counts_for_the_very_same_arrays_only():
     moved = 1.1 * tissue.vertices
     wide = vx.Periodic(1.1 * tissue.boundary.lattice)
     both = lambda t: (t.vertices, t.boundary)
-    grown, measured = eqx.tree_at(both, tissue, (moved, wide)), Measured(tissue)
+    grown, measured = eqx.tree_at(both, tissue, (moved, wide)), MeasuredTissue(tissue)
     elsewhere = {
         "method": eqx.tree_at(lambda t: t.boundary, measured.with_vertices(moved), wide),
         "tree_at": eqx.tree_at(both, measured, (moved, wide)),
