@@ -15,7 +15,7 @@ from vertax._base.tracing import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free, Periodic
 from vertax.mesh._capacity import size_class, with_slots, without_slots
-from vertax.mesh._ends import at_ends
+from vertax.mesh._edge_ends import gather_at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
 
@@ -491,7 +491,7 @@ class Tissue(eqx.Module):
         m = self.topology
         following = edge_neighbourhood(m)[-1]
         offset = self.boundary.translation(take(m.frame, following) - take(m.frame, m.half_edge))
-        x, y, to_x, to_y = at_ends(m, self.vertices)
+        x, y, to_x, to_y = gather_at_ends(m, self.vertices)
         return x, y, to_x + offset[:, 0] - x, to_y + offset[:, 1] - y
 
     def _chords(self, segments: tuple[Float[Array, " edges"], ...]) -> Float[Array, " edges"]:

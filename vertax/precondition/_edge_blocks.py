@@ -13,7 +13,7 @@ from vertax._base.probe_vector import probe_vector
 from vertax._base.sums import total
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._ends import Ends
+from vertax.mesh._edge_ends import EdgeEnds
 from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._tissue import Measurements
 from vertax.mesh._topology import Topology, take
@@ -81,7 +81,7 @@ class EdgeBlocks(eqx.Module):
     where they lead.
     """
 
-    ends: Ends
+    ends: EdgeEnds
     first: Symmetric
     """How each first end resists if it moves alone,"""
     second: Symmetric
@@ -116,7 +116,7 @@ class EdgeBlocks(eqx.Module):
         # (Rounding must not make a block indefinite, however stiff the edge.)
         rounding = 20 * jnp.finfo(mean.dtype).eps * (diagonal.xx + diagonal.yy)
         diagonal = diagonal.stiffened(rounding)
-        ends = Ends.of(m)
+        ends = EdgeEnds.of(m)
         first, second = (Symmetric(*(take(x, end) for x in diagonal)) for end in ends.vertices)
         moves = None if tissue.held is None else ~tissue.held
         return cls(ends, first, second, between, moves, softest)
@@ -156,7 +156,7 @@ class EdgeBlocks(eqx.Module):
 class EdgeCompliance(eqx.Module):
     """How edges give way to forces on vertices."""
 
-    ends: Ends
+    ends: EdgeEnds
     first: Symmetric
     second: Symmetric
     between: Square
@@ -164,9 +164,9 @@ class EdgeCompliance(eqx.Module):
 
     def __call__(self, force: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
         """How they give way to forces on vertices."""
-        x, y, to_x, to_y = self.ends.look(force)
+        x, y, to_x, to_y = self.ends.gather(force)
         a, b, c = self.first, self.second, self.between
-        moved = self.ends.back(
+        moved = self.ends.scatter_add(
             a.xx * x + a.xy * y + c.xx * to_x + c.xy * to_y,
             a.xy * x + a.yy * y + c.yx * to_x + c.yy * to_y,
             c.xx * x + c.yx * y + b.xx * to_x + b.xy * to_y,

@@ -13,7 +13,7 @@ from vertax._base.sums import total
 from vertax.mesh._topology import Topology, source, take
 
 
-class Ends(NamedTuple):
+class EdgeEnds(NamedTuple):
     """Which vertices are at the ends of each edge, and which edges are at each vertex."""
 
     vertices: Int[Array, "2 edges"]
@@ -22,27 +22,27 @@ class Ends(NamedTuple):
     """The three edges of each vertex: as one of the first ends, or after those as one of the second."""
 
     @classmethod
-    def of(cls, topology: Topology) -> Ends:
+    def of(cls, topology: Topology) -> EdgeEnds:
         """Those of all edges."""
         m = topology
         vertices = source(jnp.stack([m.half_edge, take(m.twin, m.half_edge)]))
         slots = jnp.where(m.forward, m.edge, m.edge + m.n_edges).reshape(-1, 3).T
         return cls(vertices, slots)
 
-    def look(self, values: Float[Array, "vertices 2"]) -> tuple[Float[Array, " edges"], ...]:
+    def gather(self, values: Float[Array, "vertices 2"]) -> tuple[Float[Array, " edges"], ...]:
         """The x and y of a vector of each vertex, at the first end of each edge, and then at the second."""
         return _looked((values,), *self)
 
-    def back(self, *parts: Float[Array, " edges"]) -> Float[Array, "vertices 2"]:
+    def scatter_add(self, *parts: Float[Array, " edges"]) -> Float[Array, "vertices 2"]:
         """The transpose of that: what all edges have at a vertex, in all."""
         return _summed(parts, *self)[0]
 
 
-def at_ends(
+def gather_at_ends(
     topology: Topology, values: Float[Array, "vertices 2"]
 ) -> tuple[Float[Array, " edges"], ...]:
     """The x and y of a vector of each vertex, at the first end of each edge, and then at the second."""
-    return Ends.of(topology).look(values)
+    return EdgeEnds.of(topology).gather(values)
 
 
 def _looked_up(
@@ -66,4 +66,4 @@ def _summed(
     return (jnp.stack([total(take(part, slot) for slot in slots) for part in both], axis=-1),)
 
 
-_looked = linear_with_transpose("at_ends", _looked_up, _summed)
+_looked = linear_with_transpose("gather_at_ends", _looked_up, _summed)

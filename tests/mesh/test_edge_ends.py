@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vertax as vx
-from vertax.mesh._ends import at_ends
+from vertax.mesh._edge_ends import gather_at_ends
 
 TISSUES = {
     "periodic": vx.initialise.periodic_voronoi(12, key=0),
@@ -17,7 +17,7 @@ of_each_tissue = pytest.mark.parametrize("tissue", TISSUES.values(), ids=TISSUES
 
 
 def looked_up(topology: vx.mesh.Topology, values: jax.Array) -> jax.Array:
-    return jnp.stack(at_ends(topology, values))
+    return jnp.stack(gather_at_ends(topology, values))
 
 
 def indexed(tissue: vx.Tissue, values: jax.Array) -> jax.Array:
@@ -84,7 +84,7 @@ def test_what_uses_one_part_alone_has_derivatives_as_well():
     tissue = TISSUES["periodic"]
     x, v = random(6, tissue.n_vertices, 2), random(7, tissue.n_vertices, 2)
     first = lambda look: lambda x: jnp.sum(look(x)[0] ** 3)
-    ours = first(lambda x: at_ends(tissue.topology, x))
+    ours = first(lambda x: gather_at_ends(tissue.topology, x))
     plain = first(lambda x: indexed(tissue, x))
     for derivative in (
         jax.grad,
