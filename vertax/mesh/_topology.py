@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from vertax._base.tracing import compiled_property, is_concrete
-from vertax.mesh._half_edges import check_arrays
+from vertax.mesh._topology_checks import check_half_edge_arrays
 
 
 # Every vertex joins exactly three edges, so half-edge h = 3 v + k is the k-th edge leaving vertex v in
@@ -90,7 +90,7 @@ class Topology(eqx.Module):
         known = all(is_concrete(x) for x in (twin, cell, frame, edge))
         xp = np if known else jnp
         twin, cell, frame = (xp.asarray(x) for x in (twin, cell, frame))
-        check_arrays(twin, cell, frame, known=known)
+        check_half_edge_arrays(twin, cell, frame, known=known)
         h = xp.arange(twin.size)
         if edge is None:
             edge = (xp.cumsum(h < twin) - 1)[xp.minimum(h, twin)]

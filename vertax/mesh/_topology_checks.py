@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 
-def check_arrays(
+def check_half_edge_arrays(
     twin: Shaped[Array | np.ndarray, "..."],
     cell: Shaped[Array | np.ndarray, "..."],
     frame: Shaped[Array | np.ndarray, "..."],
