@@ -11,7 +11,7 @@ from vertax._base.checks import describe
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.energies import Ablated, AbstractEnergy, AbstractLocalEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._surgery import merge_cells
+from vertax.mesh._euler_operators import merge_cells
 from vertax.mesh._topology import take
 from vertax.transitions._t1 import has_new_overlaps
 from vertax.transitions._t2 import face_sides

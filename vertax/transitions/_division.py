@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from vertax._base.checks import as_real, check_integer
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.mesh import Tissue, Topology
-from vertax.mesh._surgery import Slot, spare_slot, split_cell
+from vertax.mesh._euler_operators import Slot, spare_slot, split_cell
 from vertax.mesh._topology import take
 from vertax.transitions._change import Change, raised_if, unchanged
 from vertax.transitions._cut import Cut, find_cut, points_at
