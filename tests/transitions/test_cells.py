@@ -321,7 +321,7 @@ def sound(tissue, box):
     """Every invariant of a mesh that a compiled program can look at."""
     m = tissue.topology
     h = jnp.arange(m.n_half_edges)
-    nowhere = m.cell == m.nowhere
+    nowhere = m.cell == m.spare_label
     conditions = [
         m.twin[m.twin] == h,
         m.twin != h,

@@ -136,7 +136,7 @@ def _freed(m: Topology, vertices: tuple[Index, Index], edges: tuple, do: Yes) ->
     return _with(
         m,
         twin=_put(m.twin, do, *pairs),
-        cell=_put(m.cell, do, *((h, jnp.asarray(m.nowhere)) for h in slots)),
+        cell=_put(m.cell, do, *((h, jnp.asarray(m.spare_label)) for h in slots)),
         frame=_put(m.frame, do, *((h, zero) for h in slots)),
         edge=_put(m.edge, do, *zip(slots, [*edges, *edges], strict=True)),
         half_edge=_put(m.half_edge, do, *zip(edges, here, strict=True)),

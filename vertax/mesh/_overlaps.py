@@ -170,7 +170,7 @@ def _last(topology: Topology) -> Int[Array, " halfedges"]:
 
 def _number_of_sides(topology: Topology) -> Int[Array, " faces"]:
     n_sides = jax.ops.segment_sum(jnp.ones_like(topology.cell), topology.cell, topology.n_faces)
-    return n_sides.at[topology.nowhere].set(0) if topology.spare else n_sides
+    return n_sides.at[topology.spare_label].set(0) if topology.spare else n_sides
 
 
 class Pairs(NamedTuple):

@@ -146,7 +146,7 @@ class Topology(eqx.Module):
         return self.n_cells + (2 if self.spare else self.exterior)
 
     @property
-    def nowhere(self) -> int:
+    def spare_label(self) -> int:
         """The label of the half-edges of spare slots."""
         return self.n_cells + 1
 
@@ -158,12 +158,12 @@ class Topology(eqx.Module):
     @property
     def alive_vertices(self) -> Bool[Array, " vertices"]:
         """Which vertices belong to no spare slot."""
-        return self.cell.reshape(-1, 3)[:, 0] != self.nowhere
+        return self.cell.reshape(-1, 3)[:, 0] != self.spare_label
 
     @property
     def alive_edges(self) -> Bool[Array, " edges"]:
         """Which edges belong to no spare slot."""
-        return take(self.cell, self.half_edge) != self.nowhere
+        return take(self.cell, self.half_edge) != self.spare_label
 
     @compiled_property
     def source(self) -> Int[Array, " halfedges"]:
@@ -244,7 +244,7 @@ class Topology(eqx.Module):
         require(edge.shape == (n_half,), "`edge` must have one entry a half-edge")
         require(half_edge.shape == (n_half // 2,), "`half_edge` must have one entry an edge")
         require(0 < n_faces <= n_half, "there must be cells, and no more than half-edges")
-        nowhere = cell == self.nowhere if self.spare else np.zeros(n_half, bool)
+        nowhere = cell == self.spare_label if self.spare else np.zeros(n_half, bool)
         for name, index, bound, at in (
             ("twin", twin, n_half, "half-edges"),
             ("edge", edge, n_half // 2, "half-edges"),
