@@ -72,7 +72,7 @@ def unchanged(tissue: Tissue) -> Change:
     )
 
 
-def raised_if(change: Change, wrong: Bool[Array, ""], reason: str) -> Change:
+def raise_if(change: Change, wrong: Bool[Array, ""], reason: str) -> Change:
     """The change, or an error."""
     if not is_concrete(wrong):
         return eqx.error_if(change, wrong, reason)

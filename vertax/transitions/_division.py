@@ -15,7 +15,7 @@ from vertax._base.tracing import is_concrete, tree_where
 from vertax.mesh import Tissue, Topology
 from vertax.mesh._euler_operators import Slot, spare_slot, split_cell
 from vertax.mesh._topology import take
-from vertax.transitions._change import Change, raised_if, unchanged
+from vertax.transitions._change import Change, raise_if, unchanged
 from vertax.transitions._cut import Cut, find_cut, points_at
 from vertax.transitions._t1 import has_new_overlaps
 
@@ -72,8 +72,8 @@ def divide(
         f"The cell cannot divide: the tissue has a capacity of {tissue.n_cells} cells, and all are alive. "
         "Make room with tissue.with_capacity(...) before."
     )
-    change = raised_if(change, full, reason)
-    return raised_if(
+    change = raise_if(change, full, reason)
+    return raise_if(
         change,
         ~change.done,
         "The cell cannot be cut in two there. Try another axis, or throw=False.",

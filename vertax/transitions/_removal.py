@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Int
 
 from vertax._base.tracing import tree_where
 from vertax.mesh import Tissue
-from vertax.transitions._change import Change, raised_if, unchanged
+from vertax.transitions._change import Change, raise_if, unchanged
 from vertax.transitions._division import check_cell
 from vertax.transitions._edge_frames import EdgeFrames
 from vertax.transitions._t1 import has_new_overlaps, overlapping_faces
@@ -52,7 +52,7 @@ def remove(tissue: Tissue, cell: int | Int[Array, ""], *, throw: bool = True) ->
         "The cell cannot be removed: a neighbour would be left with too few sides, cells would overlap, or a "
         "corner is pinned. With throw=False `done` tells."
     )
-    return raised_if(change, ~change.done, reason) if throw else change
+    return raise_if(change, ~change.done, reason) if throw else change
 
 
 @eqx.filter_jit
