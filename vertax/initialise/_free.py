@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from vertax._base.checks import as_key, check_concrete, check_integer
-from vertax.initialise._order import spatial_order
-from vertax.initialise._tidy import without_overlaps
+from vertax.initialise._overlap_repair import repair_overlaps
+from vertax.initialise._spatial_order import spatial_order
 from vertax.initialise._voronoi import tessellate
 from vertax.mesh import Free, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
@@ -79,7 +79,7 @@ def free_voronoi(
         return Tissue(vertices, topology, Free(), softening, angles=angles, inner_arcs=inner_arcs)
 
     tissue = made(jnp.asarray(vertices, dtype), jnp.asarray(angles, dtype))
-    tidy = without_overlaps(tissue)
+    tidy = repair_overlaps(tissue)
     return tissue if tidy is tissue else made(tidy.vertices, tidy.angles)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, PRNGKeyArray
 from scipy.spatial import Delaunay, KDTree
 
 from vertax._base.checks import as_float64, as_key, check_concrete, check_integer, check_number
-from vertax.initialise._order import spatial_order
+from vertax.initialise._spatial_order import spatial_order
 from vertax.mesh import Periodic, Tissue, Topology
 
 # Beyond, what is left of the digits of a position tells little of where in the box it is.

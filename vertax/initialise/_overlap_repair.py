@@ -14,7 +14,7 @@ from vertax.mesh._overlaps import crossed_sides
 _ROUNDS = 60
 
 
-def without_overlaps(tissue: Tissue) -> Tissue:
+def repair_overlaps(tissue: Tissue) -> Tissue:
     """The same tissue, mended where its cells overlap, and only there.
 
     Arcs are made flatter; and where straight edges cross, corners move towards their neighbours.
