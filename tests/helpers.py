@@ -30,8 +30,8 @@ SOLVERS = [
 # JAX knows an optimiser by identity: fits of one kind of problem with this one share what is compiled.
 ADAM = optax.adam(1e-2)
 # Contact and transitions have tests of their own: with them twice as much is compiled.
-STILL = vx.Relaxation(transitions=None, contact_range=None)
-LOOSE = vx.Relaxation(contact_range=None)
+FIXED_TOPOLOGY = vx.Relaxation(transitions=None, contact_range=None)
+NO_CONTACT = vx.Relaxation(contact_range=None)
 LEAST_SQUARES = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
 
 
@@ -72,7 +72,7 @@ def shape_factors(n_cells: int, mean: float, deviation: float, seed: int = 0) ->
 
 def relaxed(n_cells: int, seed: int = 0, mean: float = 3.7) -> tuple[vx.Tissue, vx.AbstractEnergy]:
     energy = vx.energies.ShapeFactorEnergy(shape_factors(n_cells, mean, 0.1, seed))
-    return LOOSE(random_tissue(n_cells, seed), energy).tissue, energy
+    return NO_CONTACT(random_tissue(n_cells, seed), energy).tissue, energy
 
 
 def central_difference(f, x, direction, step=1e-5):

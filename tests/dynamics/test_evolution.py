@@ -11,8 +11,8 @@ import optimistix as optx
 import pytest
 from free_helpers import cluster
 from helpers import (
-    LOOSE,
-    STILL,
+    FIXED_TOPOLOGY,
+    NO_CONTACT,
     central_difference,
     counted_compilations,
     dense_hessian,
@@ -35,7 +35,7 @@ CELLS = 12
 def solid():
     """A relaxed tissue and its energy."""
     tissue, energy = relaxed(CELLS, 1, 3.5)
-    return STILL(tissue, energy).tissue, energy
+    return FIXED_TOPOLOGY(tissue, energy).tissue, energy
 
 
 class TestDecay:
@@ -175,7 +175,7 @@ class TestGradients:
                 [0.0, 0.1, 0.4],
                 substeps=2,
                 order=order,
-                relaxation=dataclasses.replace(STILL, tolerance=1e-12),
+                relaxation=dataclasses.replace(FIXED_TOPOLOGY, tolerance=1e-12),
                 adjoint=adjoint,
                 throw=False,
             )
@@ -213,7 +213,7 @@ class TestGradients:
             target,
             energy,
             vx.costs.VertexDistance(tissue),
-            response=vx.Evolution(FRICTION, [0.0, 0.2], relaxation=STILL),
+            response=vx.Evolution(FRICTION, [0.0, 0.2], relaxation=FIXED_TOPOLOGY),
         )
         found = eqx.filter_jit(lambda p: p.value_and_gradient(throw=False))(problem)
         direction = random_like(energy.target_shape_factor)
@@ -241,7 +241,7 @@ def test_a_step_strain_of_the_hexagonal_lattice():
         [0.0, 1e-7, 40.0],
         substeps=4,
         boundary=lambda time: sheared(strain),
-        relaxation=STILL,
+        relaxation=FIXED_TOPOLOGY,
     )
 
     def stress(frame):
@@ -270,7 +270,7 @@ def test_pinned_vertices_go_where_they_are_told():
         FRICTION,
         [0.0, 0.5, 1.0],
         pins=lambda time: tissue.vertices + time * velocity,
-        relaxation=STILL,
+        relaxation=FIXED_TOPOLOGY,
     )
     moved = movie.frames.vertices - tissue.vertices
     np.testing.assert_allclose(moved[:, :2], movie.times[:, None, None] * jnp.stack([velocity] * 2))
@@ -311,7 +311,7 @@ def test_an_energy_and_a_dissipation_of_ones_own():
 def test_other_numbers_compile_nothing_and_batches_agree():
     tissue, _ = solid()
     go = lambda friction, times: vx.evolve(
-        tissue, ShapeFactorEnergy(3.3), SubstrateFriction(friction), times, relaxation=LOOSE
+        tissue, ShapeFactorEnergy(3.3), SubstrateFriction(friction), times, relaxation=NO_CONTACT
     )
     first = go(1.0, [0.0, 0.1, 0.2])
     names: list[str] = []
@@ -327,7 +327,7 @@ def test_a_cluster_with_arcs_rounds_up_and_stays_where_it_is():
     tissue = cluster(9, 2)
     energy = AreaElasticity(2.0, 1.0) + LineTension(jnp.full(tissue.n_edges, 0.3))
     movie = vx.evolve(
-        tissue, energy, FRICTION + AreaViscosity(0.5), [0.0, 1.0, 30.0], relaxation=LOOSE
+        tissue, energy, FRICTION + AreaViscosity(0.5), [0.0, 1.0, 30.0], relaxation=NO_CONTACT
     )
     # Forces that add up to zero move no centre of friction.
     np.testing.assert_allclose(

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import LEAST_SQUARES, STILL, central_difference, random_like, random_tissue, relaxed
+from helpers import (
+    FIXED_TOPOLOGY,
+    LEAST_SQUARES,
+    central_difference,
+    random_like,
+    random_tissue,
+    relaxed,
+)
 
 import vertax as vx
 from vertax.costs import Frames, VertexDistance
@@ -26,7 +33,7 @@ def seen():
     tissue, energy = relaxed(CELLS, 1, 3.5)
     p0 = energy.target_shape_factor
     truth = Material(ShapeFactorEnergy(p0 + 0.1 * random_like(p0, 3)), SubstrateFriction(2.0))
-    evolution = vx.Evolution(SubstrateFriction(1.0), TIMES, relaxation=STILL)
+    evolution = vx.Evolution(SubstrateFriction(1.0), TIMES, relaxation=FIXED_TOPOLOGY)
     movie = evolution(tissue, truth)
     guess = Material(ShapeFactorEnergy(p0), SubstrateFriction(1.0))
     cost = Frames([VertexDistance(frame) for frame in movie.trajectory[1:]])

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from free_helpers import cluster
-from helpers import STILL, random_tissue
+from helpers import FIXED_TOPOLOGY, random_tissue
 
 import vertax as vx
 from vertax import mechanics
@@ -14,7 +14,7 @@ from vertax.energies import ShapeFactorEnergy
 from vertax.mechanics import BoxRelaxation
 
 N = 9
-PRECISE = eqx.tree_at(lambda r: r.tolerance, STILL, 1e-11, is_leaf=lambda x: x is None)
+PRECISE = eqx.tree_at(lambda r: r.tolerance, FIXED_TOPOLOGY, 1e-11, is_leaf=lambda x: x is None)
 start = random_tissue(N, 1)
 p0 = jnp.linspace(3.5, 3.7, N)
 direction = np.cos(np.arange(N))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from free_helpers import cluster
-from helpers import ADAM, LOOSE, STILL, random_tissue, rewritten
+from helpers import ADAM, FIXED_TOPOLOGY, NO_CONTACT, random_tissue, rewritten
 
 import vertax as vx
 from vertax.io import load_trajectory, save_trajectory
@@ -93,7 +93,7 @@ class TestRelaxation:
     @pytest.mark.thorough
     def test_a_free_cluster_does_not_turn(self):
         tissue = cluster(5)
-        equilibrium, way = record_relaxation(tissue, tension(tissue), LOOSE, every=5)
+        equilibrium, way = record_relaxation(tissue, tension(tissue), NO_CONTACT, every=5)
         assert same_bits(way[-1], equilibrium.tissue)
         assert len(way) > 2
         for frame in way:
@@ -153,7 +153,7 @@ class TestRelaxation:
             record_relaxation(jax.tree.map(lambda x: jnp.stack([x, x]), tissue), energy)
         with pytest.raises(ValueError, match="`tolerance` must be positive"):
             record_relaxation(tissue, energy, vx.Relaxation(tolerance=0.0))
-        few = dataclasses.replace(STILL, max_steps=3)
+        few = dataclasses.replace(FIXED_TOPOLOGY, max_steps=3)
         with pytest.raises(RuntimeError, match=r"no equilibrium in 3 steps.*throw=False"):
             record_relaxation(tissue, energy, few, every=2)
         found, way = record_relaxation(tissue, energy, few, every=2, throw=False)
@@ -164,12 +164,12 @@ class TestRelaxation:
 class TestFit:
     @pytest.mark.thorough
     def test_a_trajectory_is_a_callback(self):
-        target = STILL(random_tissue(4), vx.energies.ShapeFactorEnergy(3.6)).tissue
+        target = FIXED_TOPOLOGY(random_tissue(4), vx.energies.ShapeFactorEnergy(3.6)).tissue
         problem = vx.InverseProblem(
             target,
             vx.energies.ShapeFactorEnergy(jnp.full(4, 3.7)),
             vx.costs.VertexDistance(target),
-            response=STILL,
+            response=FIXED_TOPOLOGY,
         )
         way = Trajectory(every=2)
         fit = vx.fit(problem, ADAM, 5, callback=way)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import STILL, random_like, random_tissue, shape_factors
+from helpers import FIXED_TOPOLOGY, random_like, random_tissue, shape_factors
 from hypothesis import given, settings, strategies as st
 
 import vertax as vx
@@ -128,7 +128,7 @@ def test_solutions_are_those_without_and_take_less(at_rest, known):
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["arcs", "pinned", "spare slots", "float32"])
 def test_it_goes_with_every_tissue(kind):
-    relaxation = dataclasses.replace(STILL, tolerance=1e-3 if kind == "float32" else 1e-8)
+    relaxation = dataclasses.replace(FIXED_TOPOLOGY, tolerance=1e-3 if kind == "float32" else 1e-8)
     tissue = vx.initialise.free_voronoi(8, key=1) if kind == "arcs" else random_tissue(8)
     energy = ShapeFactorEnergy(shape_factors(8, 3.6, 0.02))
     if kind == "arcs":
