@@ -38,7 +38,7 @@ def _few_compiled_functions():
 
 
 @pytest.fixture
-def as_a_user():
+def without_type_checks():
     """Without the type checks that the tests add to every function: what a user sees of a wrong type."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield

@@ -113,7 +113,7 @@ class TestThermalNoise:
         difference = central_difference(cost, jnp.array(1e-3), jnp.array(1.0), 1e-6)
         np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
-    def test_bad_arguments(self, as_a_user):
+    def test_bad_arguments(self, without_type_checks):
         class Own(vx.AbstractDissipation):
             def __call__(self, tissue, before, dt):
                 return jnp.sum((tissue.vertices - before.vertices) ** 2) / dt

@@ -354,7 +354,7 @@ class TestBadInput:
         with pytest.raises(ValueError, match=r"2 of 24 vertices \(3, 5\)"):
             vx.evolve(tissue, energy, some, [0.0, 1.0])
 
-    def test_an_energy_that_is_none(self, as_a_user):
+    def test_an_energy_that_is_none(self, without_type_checks):
         tissue, _ = solid()
         with pytest.raises(TypeError, match="function of time that returns one, but returned"):
             vx.evolve(tissue, lambda time: 3.0 * time, FRICTION, [0.0, 1.0])  # pyright: ignore
@@ -377,7 +377,7 @@ class TestBadInput:
             with pytest.raises(ValueError, match="`drive` does not go with this"):
                 vx.evolve(tissue, energy, FRICTION, [0, 1], activity=moving, drive=drive)
 
-    def test_settings(self, as_a_user):
+    def test_settings(self, without_type_checks):
         class Own(vx.AbstractDissipation):
             def __call__(self, tissue, before, dt):
                 return jnp.sum((tissue.vertices - before.vertices) ** 2) / dt
@@ -393,7 +393,7 @@ class TestBadInput:
         with pytest.raises(TypeError, match="`boundary` must be a function of time"):
             vx.Evolution(FRICTION, [0.0, 1.0], boundary=vx.Free())  # pyright: ignore[reportArgumentType]
 
-    def test_what_does_not_go_with_the_tissue(self, as_a_user):
+    def test_what_does_not_go_with_the_tissue(self, without_type_checks):
         tissue, energy = solid()
         still = lambda time: tissue.vertices
         with pytest.raises(ValueError, match=r"`pins` .*the tissue has none"):

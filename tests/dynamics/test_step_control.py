@@ -121,7 +121,7 @@ class TestBadInput:
             with pytest.raises(ValueError, match=next(iter(settings))):
                 StepControl(**settings)  # pyright: ignore[reportArgumentType]
 
-    def test_what_does_not_go_with_it(self, as_a_user):
+    def test_what_does_not_go_with_it(self, without_type_checks):
         control = StepControl()
         with pytest.raises(ValueError, match="does not go with `substeps`"):
             vx.Evolution(FRICTION, [0.0, 1.0], control=control, substeps=2)

@@ -456,7 +456,7 @@ def test_shape_factors_in_float32(hidden):
         ({"callback": "print"}, TypeError, "`callback` must be a function"),
     ],
 )
-def test_arguments_of_another_kind_are_answered(changes, error, message, as_a_user):
+def test_arguments_of_another_kind_are_answered(changes, error, message, without_type_checks):
     tissue = random_tissue(6)
     energy = ShapeFactorEnergy(jnp.full(6, 3.7))
     given = {

@@ -103,7 +103,7 @@ class TestBadInput:
             with pytest.raises(ValueError, match=f"{what}.* goes with a tissue at rest"):
                 vx.InverseProblem(*arguments, response=problem.response, **wrong)  # pyright: ignore[reportArgumentType]
 
-    def test_costs_of_frames(self, as_a_user):
+    def test_costs_of_frames(self, without_type_checks):
         cost = VertexDistance(random_tissue(CELLS))
         with pytest.raises(TypeError, match="number 1 is"):
             Frames([cost, 1.0])  # pyright: ignore[reportArgumentType]
@@ -114,7 +114,7 @@ class TestBadInput:
         with pytest.raises(ValueError, match="1 costs, so it must see 2 frames"):
             Frames([VertexDistance(movie.tissue)])(movie.frames, truth)
 
-    def test_materials(self, as_a_user):
+    def test_materials(self, without_type_checks):
         with pytest.raises(TypeError, match="`dissipation` of Material must be an AbstractDiss"):
             Material(ShapeFactorEnergy(3.5), 1.0)  # pyright: ignore[reportArgumentType]
         with pytest.raises(TypeError, match="function of time"):

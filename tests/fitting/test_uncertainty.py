@@ -180,7 +180,7 @@ def test_a_fitted_position_adds_to_the_uncertainty(hidden):
     assert float(jnp.max(p0_of(unknown.deviation) / p0_of(known.deviation))) < 3
 
 
-def test_bad_arguments_are_refused(hidden, as_a_user):
+def test_bad_arguments_are_refused(hidden, without_type_checks):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, VertexDistance(tissue))
     every: Any = "all"

@@ -104,7 +104,7 @@ def test_the_lineage_is_a_forest(grown):
     assert sorted(alive[alive >= 0]) == np.flatnonzero(fate == 0).tolist()
 
 
-def test_a_full_pool_and_bad_arguments_are_named(grown, as_a_user):
+def test_a_full_pool_and_bad_arguments_are_named(grown, without_type_checks):
     cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 5, 6)
     with pytest.raises(RuntimeError, match="capacity of 9 cells"):
         eqx.tree_at(lambda g: g.full, grown, jnp.array(True)).checked()

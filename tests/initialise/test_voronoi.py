@@ -102,7 +102,7 @@ def test_bad_hexagonal_lattices_are_refused(nx, ny, area):
         vx.initialise.hexagonal(nx, ny, area=area)
 
 
-def test_a_seed_is_a_key(as_a_user):
+def test_a_seed_is_a_key(without_type_checks):
     for make in (periodic_voronoi, free_voronoi):
         by_seed, by_key = (make(5, key=key) for key in (3, jax.random.key(3)))
         np.testing.assert_array_equal(by_seed.vertices, by_key.vertices)
@@ -133,7 +133,7 @@ def test_a_seed_is_a_key(as_a_user):
     ],
 )
 @pytest.mark.parametrize("make", [periodic_voronoi, free_voronoi])
-def test_wrong_arguments_are_named(make, options, error, message, as_a_user):
+def test_wrong_arguments_are_named(make, options, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         make(**{"n_cells": 5, "key": jax.random.key(0)} | options)
 
@@ -149,18 +149,18 @@ def test_wrong_arguments_are_named(make, options, error, message, as_a_user):
         ({"n_cells": 5, "key": 0, "lattice": 5.0}, ValueError, r"`lattice` must .* shape \(2, 2\)"),
     ],
 )
-def test_wrong_seeds_and_boxes_are_named(options, error, message, as_a_user):
+def test_wrong_seeds_and_boxes_are_named(options, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         periodic_voronoi(**options)
 
 
 @pytest.mark.parametrize("arguments", [(2.5, 4), (4, "4"), (True, 2)])
-def test_a_lattice_has_whole_numbers_of_cells(arguments, as_a_user):
+def test_a_lattice_has_whole_numbers_of_cells(arguments, without_type_checks):
     with pytest.raises(TypeError, match="a Python integer"):
         hexagonal(*arguments)
 
 
-def test_inside_transformations_the_remedy_is_told(as_a_user):
+def test_inside_transformations_the_remedy_is_told(without_type_checks):
     keys = jax.random.split(jax.random.key(0), 2)
     for make in (lambda key: periodic_voronoi(5, key=key), lambda key: free_voronoi(5, key=key)):
         for transformed in (eqx.filter_vmap(make), lambda keys, f=make: eqx.filter_jit(f)(keys[0])):

@@ -111,7 +111,7 @@ def test_gradient_of_a_relaxed_box_against_differences(adjoint):
     assert slope == pytest.approx(wanted, rel=1e-6 if "Implicit" in str(adjoint) else 1e-3)
 
 
-def test_what_is_refused(as_a_user):
+def test_what_is_refused(without_type_checks):
     energy = ShapeFactorEnergy(p0)
     with pytest.raises(ValueError, match="must be periodic"):
         mechanics.ramp(cluster(4, 1), energy, np.array([0.0, 0.1]))

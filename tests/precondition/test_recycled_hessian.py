@@ -91,7 +91,7 @@ def test_large_tissues_and_other_responses_have_none():
     assert evolution.with_preconditioner(None) is evolution
 
 
-def test_what_is_none_or_that_of_another_tissue_is_refused(known, as_a_user):
+def test_what_is_none_or_that_of_another_tissue_is_refused(known, without_type_checks):
     with pytest.raises(TypeError, match="`preconditioner` must be a result of `preconditioner_at`"):
         RELAXATION.with_preconditioner("soft")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="a tissue with 64 coordinates, but this one has 32"):

@@ -56,7 +56,7 @@ def test_cells_become_one_hole_without_energy():
     )
 
 
-def test_holes_that_cannot_become_one_are_refused(as_a_user):
+def test_holes_that_cannot_become_one_are_refused(without_type_checks):
     energy = vx.energies.AreaElasticity(1.0, 1.0)
     cluster = vx.initialise.free_voronoi(8, key=0, lloyd_steps=5).with_capacity(8)
     touching = np.asarray(cluster.topology.edge_cells)
@@ -85,7 +85,7 @@ def test_a_pin_goes_with_its_vertex():
     np.testing.assert_array_equal(wounded.pinned, wounded.topology.alive_vertices)
 
 
-def test_bad_arguments_are_named(as_a_user):
+def test_bad_arguments_are_named(without_type_checks):
     tissue = random_tissue(6, 1)
     energy, _ = foam(tissue.n_edges)
     with pytest.raises(ValueError, match="with_capacity"):

@@ -229,7 +229,7 @@ class Undeclared(vx.AbstractEnergy):
         return jnp.sum(self.strength * tissue.perimeters)
 
 
-def test_what_is_not_declared_is_refused_by_name(as_a_user):
+def test_what_is_not_declared_is_refused_by_name(without_type_checks):
     change = divide(random_tissue(6, 3).with_capacity(8), 2)
     with pytest.raises(TypeError, match="`strength` of Undeclared must declare"):
         change.inherited(Undeclared(jnp.ones(8)))
@@ -242,7 +242,7 @@ def test_what_is_not_declared_is_refused_by_name(as_a_user):
         change.inherited(Undeclared(jnp.ones(5)), axis="faces")
 
 
-def test_a_full_pool_names_its_capacity(as_a_user):
+def test_a_full_pool_names_its_capacity(without_type_checks):
     tissue = random_tissue(6, 3).with_capacity(7)
     full = divide(tissue, 0).tissue
     with pytest.raises(RuntimeError, match="capacity of 7 cells"):
@@ -275,7 +275,7 @@ def test_a_cell_goes_and_its_neighbours_close_the_gap(kind):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 2), (3, 1), (1, 3), (2, 2)])
-def test_removal_from_a_small_box_ends(shape, as_a_user):
+def test_removal_from_a_small_box_ends(shape, without_type_checks):
     # A cell that meets itself gains a side at one end of an edge for one that it loses.
     tissue = vx.initialise.hexagonal(*shape)
     tissue = tissue.with_capacity(tissue.n_cells)
