@@ -1,7 +1,7 @@
 """No first tissue overlaps itself."""
 
 import pytest
-from tilings import faces_that_overlap
+from brute_force_overlaps import faces_that_overlap
 
 import vertax as vx
 

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brute_force_overlaps import faces_that_overlap
 from free_helpers import cluster
 from hypothesis import given, settings, strategies as st
-from tilings import faces_that_overlap
 
 import vertax as vx
 from vertax.mesh._overlaps import _last, around, crossed_sides

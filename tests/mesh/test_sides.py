@@ -1,8 +1,8 @@
 import jax.numpy as jnp
 import numpy as np
+from brute_force_overlaps import piece
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.distance import cdist
-from tilings import piece
 
 from vertax.mesh._sides import bulge_gap, circle_of
 
