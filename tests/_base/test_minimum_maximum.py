@@ -1,4 +1,4 @@
-"""Minima and maxima that are differentiated."""
+"""Values and derivatives of minimum and maximum."""
 
 import jax
 import jax.numpy as jnp

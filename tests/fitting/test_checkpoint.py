@@ -180,9 +180,9 @@ def test_foreign_files_are_refused(path):
     ("changes", "message"),
     [
         ({"version": 2}, "version 2 of the checkpoint format.*Update vertax"),
-        ({"state_0": None}, "is broken: its state does not go with the fit"),
-        ({"state_0": np.zeros(3)}, "is broken: its state does not go with the fit"),
-        ({"epochs": 3}, "is broken: its state does not go with the fit"),
+        ({"state_0": None}, "is broken: its state does not match the fit"),
+        ({"state_0": np.zeros(3)}, "is broken: its state does not match the fit"),
+        ({"epochs": 3}, "is broken: its state does not match the fit"),
         ({"identity": "{"}, "is the checkpoint of a fit with another problem"),
     ],
 )

@@ -1,8 +1,8 @@
-"""The lesser and the greater of two numbers, where that is differentiated.
+"""Minimum and maximum with derivatives that do not depend on rounding.
 
-JAX asks of the derivative of a minimum which of the two equals it. A compiler that works one of them out
-again in another place may round it otherwise; then neither does, and the derivative is lost.
-(If the first is not a number, neither is what comes of it.)
+JAX finds the derivative of `jnp.minimum(a, b)` by comparing the result with `a` and `b`. XLA may recompute
+one of them with another rounding; then neither is equal and the derivative is 0. The functions below compare
+`a` and `b` only. NaN in `a` propagates.
 """
 
 import jax.numpy as jnp
@@ -10,10 +10,10 @@ from jaxtyping import Array, ArrayLike, Float
 
 
 def minimum(a: Float[Array, "..."], b: ArrayLike) -> Float[Array, "..."]:
-    """The lesser of two numbers; with the derivative of the second where they are equal."""
+    """min(a, b); where a = b, the derivative is that of `b`."""
     return jnp.where(a >= b, b, a)
 
 
 def maximum(a: Float[Array, "..."], b: ArrayLike) -> Float[Array, "..."]:
-    """The greater of two numbers; with the derivative of the second where they are equal."""
+    """max(a, b); where a = b, the derivative is that of `b`."""
     return jnp.where(a <= b, b, a)

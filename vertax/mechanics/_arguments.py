@@ -87,7 +87,9 @@ def check_relaxation(relaxation: Any) -> None:
     """
     if not isinstance(relaxation, Relaxation):
         raise TypeError(
-            "Argument `relaxation` must be a vertax.Relaxation, but is " + describe(relaxation) + "."
+            "Argument `relaxation` must be a vertax.Relaxation, but is "
+            + describe(relaxation)
+            + "."
         )
 
 
