@@ -105,8 +105,8 @@ def check_concrete(function: str, *arguments: Any) -> None:
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves(arguments)):
         raise TypeError(
             f"{function} needs arrays with concrete values, so it does not work inside jax.jit, "
-            "jax.vmap or jax.grad. Call it outside, once for each tissue; tissues of one size make a batch by "
-            "jax.tree.map(lambda *x: jax.numpy.stack(x), *tissues)."
+            "jax.vmap or jax.grad. Call it outside, once for each tissue; tissues of one size make a batch "
+            "by jax.tree.map(lambda *x: jax.numpy.stack(x), *tissues)."
         )
 
 

@@ -122,8 +122,8 @@ class Evolution(AbstractResponse):
         for name, function in (("boundary", boundary), ("pins", pins)):
             if function is not None and not callable(function):
                 raise TypeError(
-                    f"Argument `{name}` must be a function of time, but is {describe(function)}. For one that "
-                    "stays, leave it out."
+                    f"Argument `{name}` must be a function of time, but is {describe(function)}. For one "
+                    "that stays, leave it out."
                 )
         check_integer("substeps", substeps, at_least=1)
         if order not in (1, 2):

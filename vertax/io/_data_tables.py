@@ -222,7 +222,7 @@ def _text(name: str, value: Any) -> str:
     known = str | bool | np.bool_ | numbers.Real | np.datetime64 | datetime.date | datetime.time
     if not isinstance(value, known) and not isinstance(value, os.PathLike):
         raise TypeError(
-            f"Column `{name}` must hold numbers, booleans or text, but holds {describe(value)}. Write the parts "
-            "of what is more (the real and the imaginary one, say) as columns of their own."
+            f"Column `{name}` must hold numbers, booleans or text, but holds {describe(value)}. Write the "
+            "parts of what is more (the real and the imaginary one, say) as columns of their own."
         )
     return str(value)
