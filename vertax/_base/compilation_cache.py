@@ -26,7 +26,7 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
 
     The command `vertax`, the notebooks and the napari widget call it; the library does not, because the
     cache is a setting of JAX for the whole process. Call it before the first computation. A cached function
-    is used if its code, the shapes and dtypes of its arguments, the version of JAX and the device are the same.
+    is used if its code, the shapes and dtypes of its arguments, the version of JAX and the device are equal.
     Above 2 GB the least recently used functions are removed.
 
     **Arguments:**

@@ -106,7 +106,7 @@ def divided(
     m, sides = tissue.topology, tissue.sides
     cut = find_cut(tissue, m.cell == cell, axis)
     slot = spare_slot(m)
-    done = do & slot.there & cut.possible
+    done = do & slot.available & cut.possible
 
     out, into = cut.out, cut.into
     both = jnp.stack([out, into])
