@@ -4,7 +4,7 @@ import gc
 import os
 from importlib.metadata import version
 
-# Compilation takes most of the time of the tests; without optimisation it takes a third. Read when JAX starts.
+# Tests spend most time on compilation; without optimisation it takes a third. Read when JAX starts.
 FLAGS = ["--xla_backend_optimization_level=0"]
 if version("jaxlib").startswith("0.10."):
     # (XLA exits at unknown flags.)

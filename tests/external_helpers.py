@@ -13,8 +13,8 @@ from vertax.external import AbstractSimulator, Edges, Relaxed
 class Foam(AbstractSimulator):
     """Area elasticity and line tensions, minimised by SciPy.
 
-    `noise` displaces the result, like a program that stops too early. A `failure` other than "" is the name of a
-    failure to simulate. A negative first tension is always an error.
+    `noise` displaces the result, like a program that stops too early. A `failure` other than "" is the name
+    of a failure to simulate. A negative first tension is always an error.
     """
 
     def __init__(self, noise=0.0, failure=""):

@@ -47,7 +47,7 @@ def rotated(tissue: vx.Tissue, angle: float, shift=(0.0, 0.0)) -> vx.Tissue:
 
 
 def relabelled(tissue: vx.Tissue, seed: int) -> tuple[vx.Tissue, np.ndarray, np.ndarray]:
-    """Renumber vertices, slots, cells and edges at random; also return the new number of each cell and edge."""
+    """Renumber vertices, slots, cells and edges at random; also return the new cell and edge numbers."""
     rng, m = np.random.default_rng(seed), tissue.topology
     vertex, cell, edge = (rng.permutation(n) for n in (m.n_vertices, m.n_cells, m.n_edges))
     slot = (np.arange(3) + rng.integers(3, size=(m.n_vertices, 1))) % 3

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-# Points per arc of the polygons that are tested for crossings; the second number only if the first ones cross.
+# Points per arc in tests for crossings; the second number is used only if the first polygons cross.
 _POINTS = (24, 1000)
 
 

@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
-# Compilation takes 80 % of the time. Processes and later runs share compiled functions through this cache; its
+# Compilation takes 80 % of the time. Processes and later runs share compiled functions in this cache; its
 # keys contain the code of the function, the flags and the versions.
 CACHE = {
     "JAX_COMPILATION_CACHE_DIR": str(FOLDER.parent / ".cache" / "tests"),

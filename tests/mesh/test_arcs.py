@@ -21,7 +21,7 @@ ANGLES = [1e-8, 1e-3, 0.1, 0.4999, 0.5001, 1.0, np.pi / 2, 2.5, 3.0]
 
 
 def by_quadrature(angle):
-    """Length, area and moment of an arc with the chord from (0, 0) to (1, 0), positive on the right (below)."""
+    """Length, area and moment of an arc with the chord from (0, 0) to (1, 0), positive below."""
     # In polar coordinates about the centre of the circle; 200 Gauss points are exact to rounding.
     nodes, weights = np.polynomial.legendre.leggauss(200)
     phi, weights = angle * nodes, angle * weights
