@@ -164,7 +164,7 @@ def test_daughters_inherit_parameters():
 
 
 class Network(vx.AbstractEnergy):
-    """An energy whose weights have as many rows as there are cells, or edges."""
+    """An energy with weights that have as many rows as there are cells or edges."""
 
     layer: eqx.nn.Linear
     rows: Float[Array, "hidden"]

@@ -221,7 +221,7 @@ def _periodic_delaunay(
 def _dual(
     seeds: np.ndarray, lattice: np.ndarray, ids: np.ndarray, image: np.ndarray
 ) -> tuple[np.ndarray, Topology]:
-    """The trivalent mesh whose vertices are the circumcentres of the triangles."""
+    """The trivalent mesh with the circumcentres of the triangles as vertices."""
     vertices = _circumcentres(seeds[ids] + image @ lattice)
     box = np.floor(vertices @ np.linalg.inv(lattice) + 1e-12).astype(int)
     vertices = vertices - box @ lattice
