@@ -214,9 +214,9 @@ class Free(AbstractBoundary):
 
 
 def _boundary_type_error(one: AbstractBoundary, other: AbstractBoundary) -> TypeError:
+    name = describe(other) if not isinstance(other, AbstractBoundary) else type(other).__name__
     return TypeError(
-        f"A tissue in a {type(one).__name__} boundary needs another such boundary to go to, not "
-        f"{describe(other) if not isinstance(other, AbstractBoundary) else type(other).__name__}."
+        f"Argument `boundary` must be of the class {type(one).__name__}, as that of the tissue, but is {name}."
     )
 
 
