@@ -216,7 +216,8 @@ class Free(AbstractBoundary):
 def _boundary_type_error(one: AbstractBoundary, other: AbstractBoundary) -> TypeError:
     name = describe(other) if not isinstance(other, AbstractBoundary) else type(other).__name__
     return TypeError(
-        f"Argument `boundary` must be of the class {type(one).__name__}, as that of the tissue, but is {name}."
+        f"Argument `boundary` must be of the class {type(one).__name__}, like that of the tissue, but is "
+        f"{name}."
     )
 
 
