@@ -22,7 +22,7 @@ from _arguments import count
 import vertax as vx
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from tilings import faces_that_overlap  # pyright: ignore[reportMissingImports]
+from brute_force_overlaps import faces_that_overlap  # pyright: ignore[reportMissingImports]
 
 jax.config.update("jax_enable_x64", True)
 

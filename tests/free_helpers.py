@@ -1,4 +1,4 @@
-"""Free tissues for the tests, and what must hold of them."""
+"""Free tissues for the tests, and functions of them."""
 
 import equinox as eqx
 import jax
@@ -47,7 +47,7 @@ def rotated(tissue: vx.Tissue, angle: float, shift=(0.0, 0.0)) -> vx.Tissue:
 
 
 def relabelled(tissue: vx.Tissue, seed: int) -> tuple[vx.Tissue, np.ndarray, np.ndarray]:
-    """Vertices, their slots, cells and edges numbered anew; and the new number of each cell and edge."""
+    """Renumber vertices, slots, cells and edges at random; also return the new cell and edge numbers."""
     rng, m = np.random.default_rng(seed), tissue.topology
     vertex, cell, edge = (rng.permutation(n) for n in (m.n_vertices, m.n_cells, m.n_edges))
     slot = (np.arange(3) + rng.integers(3, size=(m.n_vertices, 1))) % 3
@@ -60,7 +60,7 @@ def relabelled(tissue: vx.Tissue, seed: int) -> tuple[vx.Tissue, np.ndarray, np.
         edge[np.asarray(m.edge)][back],
         exterior=m.exterior,
     )
-    # Directions of inner edges are chosen anew, and with them the signs of their angles.
+    # The directions of inner edges may change, and with them the signs of their angles.
     same = np.asarray(topology.half_edge)[edge] == half_edge[np.asarray(m.half_edge)]
     angles = np.where(same, 1, -1) * np.asarray(tissue.angles)
     new = vx.Tissue(
@@ -77,7 +77,7 @@ def relabelled(tissue: vx.Tissue, seed: int) -> tuple[vx.Tissue, np.ndarray, np.
 
 @eqx.filter_jit
 def forces(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> tuple[jax.Array, jax.Array]:
-    """Derivatives of the energy by vertices and by angles."""
+    """Derivatives of the energy with respect to vertices and angles."""
     at = lambda v, a: energy(with_angles(tissue.with_vertices(v), a))
     return jax.grad(at, argnums=(0, 1))(tissue.vertices, tissue.angles)
 

@@ -1,4 +1,4 @@
-"""Shared by the tests: tissues, the list of solvers, finite differences."""
+"""Shared by the tests: tissues, the table of solvers, finite differences."""
 
 import contextlib
 import functools
@@ -16,7 +16,7 @@ from jax import Array
 
 import vertax as vx
 
-# A new solver is one row here: (name, solver, force that it reaches within 3000 steps).
+# Add a row for a new solver: (name, solver, largest force after at most 3000 steps).
 SOLVERS = [
     ("newton_cg", vx.solvers.NewtonCG(), 1e-10),
     ("lbfgs", vx.solvers.LBFGS(), 1e-6),
@@ -27,16 +27,16 @@ SOLVERS = [
     ("optimistix_nonlinear_cg", optx.NonlinearCG(rtol=0.0, atol=0.0), 1e-5),
 ]
 
-# JAX knows an optimiser by identity: fits of one kind of problem with this one share what is compiled.
+# JAX compares optimisers by identity: fits with this one share compiled functions.
 ADAM = optax.adam(1e-2)
-# Contact and transitions have tests of their own: with them twice as much is compiled.
-STILL = vx.Relaxation(transitions=None, contact_range=None)
-LOOSE = vx.Relaxation(contact_range=None)
+# Contacts and T1 transitions have their own tests; without them compilation takes half the time.
+FIXED_TOPOLOGY = vx.Relaxation(transitions=None, contact_range=None)
+NO_CONTACT = vx.Relaxation(contact_range=None)
 LEAST_SQUARES = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
 
 
 def each_solver(*quick: str) -> pytest.MarkDecorator:
-    """All solvers, of which those named are tried on every change and all of them by `test-slow`."""
+    """Parametrise a test by all solvers; those not in `quick` are marked as slow."""
     rows = [
         pytest.param(solver, force, marks=() if name in quick else (pytest.mark.slow,), id=name)
         for name, solver, force in SOLVERS
@@ -46,7 +46,7 @@ def each_solver(*quick: str) -> pytest.MarkDecorator:
 
 @contextlib.contextmanager
 def counted_compilations(names: list[str]):
-    """Adds the name of each function that XLA compiles meanwhile."""
+    """Append the name of each function that XLA compiles in this context to `names`."""
     logger = logging.getLogger("jax._src.interpreters.pxla")
     handler = logging.Handler()
     handler.emit = lambda record: names.append(record.getMessage().split()[1])
@@ -72,19 +72,19 @@ def shape_factors(n_cells: int, mean: float, deviation: float, seed: int = 0) ->
 
 def relaxed(n_cells: int, seed: int = 0, mean: float = 3.7) -> tuple[vx.Tissue, vx.AbstractEnergy]:
     energy = vx.energies.ShapeFactorEnergy(shape_factors(n_cells, mean, 0.1, seed))
-    return LOOSE(random_tissue(n_cells, seed), energy).tissue, energy
+    return NO_CONTACT(random_tissue(n_cells, seed), energy).tissue, energy
 
 
 def central_difference(f, x, direction, step=1e-5):
     """Derivative of `f` at the pytree `x` along `direction`."""
-    # By NumPy, for which nothing is compiled.
+    # NumPy, to avoid compilation.
     moved = lambda a, b, s: jnp.asarray(np.asarray(a) + s * np.asarray(b))
     at = lambda s: np.asarray(f(jax.tree.map(lambda a, b: moved(a, b, s), x, direction)))
     return (at(step) - at(-step)) / (2 * step)
 
 
 def fine_difference(f, x, direction, step=1e-4):
-    """The same from four values: steps may be longer, and rounding and rests count for less."""
+    """Fourth-order central difference (Richardson extrapolation): larger steps, less rounding error."""
     over = lambda h: central_difference(f, x, direction, h)
     return (4 * over(step) - over(2 * step)) / 3
 
@@ -115,7 +115,7 @@ def lattices(draw, n_cells: int):
 
 @st.composite
 def tissues(draw, min_cells: int = 1, max_cells: int = 30):
-    """Recipes of random Voronoi tissues in boxes of all kinds: call one to make its tissue."""
+    """Functions that create random Voronoi tissues in boxes of different shapes."""
     n = draw(st.sampled_from([n for n in (1, 3, 12) if min_cells <= n <= max_cells]))
     seed, lattice = draw(st.integers(0, 2**16)), draw(lattices(n))
     return functools.partial(random_tissue, n, seed, lattice=lattice)
@@ -133,7 +133,7 @@ def p0_of(energy: vx.AbstractEnergy) -> jax.Array:
     return jnp.asarray(energy.target_shape_factor)
 
 
-# Compiled once for all tissues of a size, and energies and costs of a kind.
+# Compiled once for each tissue size and class of energy and cost.
 @eqx.filter_jit
 def _hessian(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> Array:
     f = lambda y: energy(tissue.with_configuration(y.reshape(tissue.vertices.shape)))
@@ -168,7 +168,7 @@ def dense_hypergradient(
 
 @eqx.filter_jit
 def value_of(cost: vx.AbstractCost, tissue: vx.Tissue, energy: vx.AbstractEnergy) -> Array:
-    """A cost, compiled once for all of a kind."""
+    """The value of a cost, compiled once for each class."""
     return cost(tissue, energy)
 
 
@@ -182,7 +182,7 @@ def hexagon_index() -> float:
 
 
 def rewritten(path, **changes):
-    """An archive with some of its arrays replaced, or removed where None."""
+    """Replace arrays of an archive, or remove those that are None."""
     with np.load(path) as archive:
         arrays = dict(archive) | changes
     np.savez(path, **{k: v for k, v in arrays.items() if v is not None})

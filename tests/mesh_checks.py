@@ -1,8 +1,8 @@
-"""What every tissue must be, checked by NumPy alone: nothing of vertax but its arrays is used."""
+"""Invariants of a tissue, checked in NumPy from its arrays, independently of vertax."""
 
 import numpy as np
 
-# Points of an arc, where its crossings with others are sought: few at first, and many if those cross.
+# Points per arc in tests for crossings; the second number is used only if the first polygons cross.
 _POINTS = (24, 1000)
 
 
@@ -13,7 +13,7 @@ def check_tissue(tissue, rtol=1e-9):
     edge, half_edge = np.asarray(m.edge), np.asarray(m.half_edge)
     n = tissue.n_cells
     h = np.arange(twin.size)
-    assert (twin[twin] == h).all(), "twin is no involution"
+    assert (twin[twin] == h).all(), "twin is not an involution"
     assert (twin != h).all()
     assert (edge[twin] == edge).all()
     assert (edge[half_edge] == np.arange(half_edge.size)).all()
@@ -22,24 +22,24 @@ def check_tissue(tissue, rtol=1e-9):
     labels = [{int(cell[h]) for h in face} for face in faces]
     assert all(len(label) == 1 for label in labels), "a face of several cells"
     number = np.array([label.pop() for label in labels])
-    real = number < n + m.exterior
-    assert len(set(number[real].tolist())) == real.sum(), "a cell in several pieces"
-    spare = int(np.sum(~real))
-    assert all(len(faces[i]) == 2 for i in np.flatnonzero(~real))
-    n_vertices = len({v // 3 for i in np.flatnonzero(real) for v in faces[i]})
-    n_edges = len({int(edge[k]) for i in np.flatnonzero(real) for k in faces[i]})
-    assert n_vertices + 2 * (spare // 3) == twin.size // 3
-    assert n_vertices - n_edges + real.sum() == (2 if m.exterior else 0), "Euler characteristic"
-    living = np.zeros(n, bool)
-    living[number[real & (number < n)]] = True
-    assert (living == np.asarray(tissue.alive)).all()
+    used = number < n + m.exterior
+    assert len(set(number[used].tolist())) == used.sum(), "a cell with several faces"
+    n_spare_faces = int(np.sum(~used))
+    assert all(len(faces[i]) == 2 for i in np.flatnonzero(~used))
+    n_vertices = len({v // 3 for i in np.flatnonzero(used) for v in faces[i]})
+    n_edges = len({int(edge[k]) for i in np.flatnonzero(used) for k in faces[i]})
+    assert n_vertices + 2 * (n_spare_faces // 3) == twin.size // 3
+    assert n_vertices - n_edges + used.sum() == (2 if m.exterior else 0), "Euler characteristic"
+    alive = np.zeros(n, bool)
+    alive[number[used & (number < n)]] = True
+    assert (alive == np.asarray(tissue.alive)).all()
 
     positions = np.repeat(np.asarray(tissue.vertices, float), 3, axis=0)
     assert np.isfinite(positions).all()
     if not m.exterior:
         positions = positions + frame @ np.asarray(tissue.boundary.lattice, float)
     angles = _angles(tissue, twin, cell, edge, half_edge)
-    areas, outside = np.zeros(n), 0.0
+    areas, tissue_area = np.zeros(n), 0.0
     for face, label in zip(faces, number, strict=True):
         if label > n or (label == n and not m.exterior):
             continue
@@ -48,25 +48,25 @@ def check_tissue(tissue, rtol=1e-9):
         crossing = all(_crossing(_outline(*parts, n_points)[1]) for n_points in _POINTS)
         assert not crossing, f"face {label} crosses itself"
         if label == n:
-            outside = -area
+            tissue_area = -area
         else:
             assert area > 0, f"cell {label} is inside out"
             areas[label] = area
-    total = outside if m.exterior else np.linalg.det(np.asarray(tissue.boundary.lattice, float))
-    size = np.sqrt(np.mean(areas[living]))
-    far = 1 + np.abs(positions).max() / size
-    np.testing.assert_allclose(areas, tissue.areas, rtol=rtol, atol=rtol * far * size**2)
-    assert abs(areas.sum() - total) <= rtol * far * total, "cells do not fill the tissue"
+    total = tissue_area if m.exterior else np.linalg.det(np.asarray(tissue.boundary.lattice, float))
+    size = np.sqrt(np.mean(areas[alive]))
+    distance = 1 + np.abs(positions).max() / size  # from the origin; scales the rounding error
+    np.testing.assert_allclose(areas, tissue.areas, rtol=rtol, atol=rtol * distance * size**2)
+    assert abs(areas.sum() - total) <= rtol * distance * total, "cells do not fill the tissue"
 
 
 def _faces(following):
-    seen, faces = np.zeros(following.size, bool), []
+    visited, faces = np.zeros(following.size, bool), []
     for start in range(following.size):
-        if seen[start]:
+        if visited[start]:
             continue
         face, h = [], start
-        while not seen[h]:
-            seen[h] = True
+        while not visited[h]:
+            visited[h] = True
             face.append(h)
             h = int(following[h])
         assert h == start
@@ -75,14 +75,14 @@ def _faces(following):
 
 
 def _angles(tissue, twin, cell, edge, half_edge):
-    """The angle of each half-edge, positive where it bulges to its right."""
+    """The angle of each half-edge, positive if it bulges to its right."""
     if tissue.angles is None:
         return np.zeros(twin.size)
     angle = np.asarray(tissue.angles, float)
     largest, width = 0.98 * np.pi, 0.02 * np.pi
-    beyond = np.maximum(np.abs(angle) - largest, 0)
-    bounded = largest + width * beyond / np.hypot(width, beyond)
-    angle = np.where(beyond > 0, np.sign(angle) * bounded, angle)
+    excess = np.maximum(np.abs(angle) - largest, 0)
+    bounded = largest + width * excess / np.hypot(width, excess)
+    angle = np.where(excess > 0, np.sign(angle) * bounded, angle)
     if not tissue.inner_arcs:
         outer = (cell[half_edge] == tissue.n_cells) | (cell[twin[half_edge]] == tissue.n_cells)
         angle = np.where(outer, angle, 0)
@@ -91,17 +91,17 @@ def _angles(tissue, twin, cell, edge, half_edge):
 
 
 def _outline(positions, following, angles, face, n_points):
-    """The area of a face by triangles and segments of circles, and points around it."""
+    """The area of a face from triangles and circular segments, and the points of its outline."""
     area, points = 0.0, []
     for h in face:
-        # (Of a cell in a periodic box all corners are in one frame.)
+        # (All corners of a cell are in one frame.)
         start, end = positions[h], positions[following[h]]
         chord, a = end - start, angles[h]
         length = np.linalg.norm(chord)
         origin = positions[face[0]]
         p, q = start - origin, end - origin
         area += 0.5 * (p[0] * q[1] - p[1] * q[0])
-        # The sector of a circle without its triangle; or the first terms of that in the angle.
+        # The area of the circular segment; for small angles its power series.
         if abs(a) < 0.01:
             area += length**2 * (a / 6 + a**3 / 45)
         else:
@@ -121,16 +121,17 @@ def _outline(positions, following, angles, face, n_points):
 
 
 def _crossing(points):
-    """Whether two sides of a polygon that are no neighbours cross."""
+    """Whether two sides of a polygon cross that are not adjacent."""
     p, q = points, np.roll(points, -1, axis=0)
     n = len(p)
     d = q - p
     cross = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    one = cross(d[:, None], p[None] - p[:, None])  # where other sides begin, seen from each
-    two = cross(d[:, None], q[None] - p[:, None])
+    # Whether the line of each side separates the ends of each other side.
+    start = cross(d[:, None], p[None] - p[:, None])
+    end = cross(d[:, None], q[None] - p[:, None])
     scale = 1e-9 * np.abs(d).max() ** 2
-    splits = (np.minimum(one, two) < -scale) & (np.maximum(one, two) > scale)
-    crosses = splits & splits.T
+    separates = (np.minimum(start, end) < -scale) & (np.maximum(start, end) > scale)
+    crosses = separates & separates.T
     i, j = np.nonzero(crosses)
     apart = np.minimum((i - j) % n, (j - i) % n) > 1
     return bool(apart.any())

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 
 VERSIONS = ("3.14", "3.13", "3.12")
 TIMEOUT = 30.0
-"""Seconds after which a program is taken for one that does not work."""
+"""Seconds after which a program is stopped and skipped."""
 
 
 def newest_python() -> str | None:
-    """The path of the newest Python that works and is newer than this one."""
+    """The path of the newest working Python that is newer than this one; None if there is none."""
     for version in VERSIONS:
         if tuple(map(int, version.split("."))) <= sys.version_info[:2]:
             return None
@@ -29,12 +29,12 @@ def newest_python() -> str | None:
 
 
 def _candidates(name: str) -> Iterator[str]:
-    """Programs of this name in the folders of PATH, and those of pyenv."""
+    """Paths of programs with this name in the folders of PATH and in pyenv."""
     for folder in os.get_exec_path():
         path = shutil.which(name, path=folder)
         if path is not None:
             yield path
-    # pyenv puts a shim into PATH for each version; it fails unless the user has activated that version.
+    # pyenv adds a shim for each version to PATH, which fails unless that version is activated.
     if shutil.which("pyenv") is not None:
         for version in reversed(_output(["pyenv", "whence", name]).split()):
             yield _output(["pyenv", "which", name], PYENV_VERSION=version)
@@ -51,7 +51,7 @@ def _executable(path: str, version: str) -> str | None:
 
 
 def _output(command: list[str], **environment: str) -> str:
-    """What a program prints; nothing if it fails."""
+    """The standard output of a program; empty if it fails."""
     try:
         process = subprocess.run(
             command,

@@ -1,8 +1,8 @@
 """Run the tests in several processes: `python tests/run.py [--workers 2] [options of pytest]`.
 
-Tests compile a lot, and a process that has compiled very much dies in the compiler. So the folders of tests
-are shared out among processes, of which `--workers` run at a time. What they print comes in one piece, when
-they are done.
+A process that compiles too many functions runs out of memory maps and crashes in the compiler. Therefore the
+folders of tests are distributed over processes, of which `--workers` run at the same time. The output of each
+process is printed when it ends.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
-# Four fifths of the time goes into compiling. What one process has compiled the others find, and the next
-# run of the tests as well; the key of each function is all of its code, flags and versions included.
+# Compilation takes 80 % of the time. Processes and later runs share compiled functions in this cache; its
+# keys contain the code of the function, the flags and the versions.
 CACHE = {
     "JAX_COMPILATION_CACHE_DIR": str(FOLDER.parent / ".cache" / "tests"),
     "JAX_COMPILATION_CACHE_MAX_SIZE": str(2 * 1024**3),
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
 }
-# What shares a process: folders, and files of which the others of their folder do without. A process takes
-# seven seconds to begin. What takes longest begins first, and the others fill up the end.
+# Each row is a process: folders, and single files that are taken out of their folder. A process takes seven
+# seconds to start. The longest ones come first.
 TOGETHER = (
     ("fitting",),
     ("adjoints", "external"),
@@ -68,7 +68,7 @@ def run(files: list[Path], options: list[str]) -> tuple[int, str]:
     """The exit code of pytest, and the line that counts its tests."""
     names = [str(file.relative_to(FOLDER.parent)) for file in files]
     command = [sys.executable, "-m", "pytest", "-p", "no:xdist", *options, *names]
-    outcome = subprocess.run(
+    process = subprocess.run(
         command,
         cwd=FOLDER.parent,
         env=CACHE | os.environ,
@@ -78,8 +78,8 @@ def run(files: list[Path], options: list[str]) -> tuple[int, str]:
     )
     folders = ", ".join(sorted({str(Path(name).parent) for name in names}))
     what = names[0] if len(names) == 1 else f"{folders} ({len(names)} files)"
-    print(f"\n--- {what}\n{outcome.stdout.rstrip()}", flush=True)
-    return outcome.returncode, (outcome.stdout.rstrip().splitlines() or [""])[-1]
+    print(f"\n--- {what}\n{process.stdout.rstrip()}", flush=True)
+    return process.returncode, (process.stdout.rstrip().splitlines() or [""])[-1]
 
 
 def main() -> int:
@@ -101,18 +101,18 @@ def main() -> int:
     chosen, options = parser.parse_known_args()
     began = time.perf_counter()
     with ThreadPoolExecutor(chosen.workers) as pool:
-        outcomes = list(
+        results = list(
             pool.map(lambda files: run(files, options), groups(chosen.only, chosen.without))
         )
     count: Counter[str] = Counter()
-    for _, line in outcomes:
+    for _, line in results:
         for number, what in re.findall(
             r"(\d+) (passed|failed|skipped|xfailed|deselected|errors?)", line
         ):
             count[what] += int(number)
-    failed = [code for code, _ in outcomes if code not in (0, NOTHING_SELECTED)]
+    failed = [code for code, _ in results if code not in (0, NOTHING_SELECTED)]
     total = ", ".join(f"{number} {what}" for what, number in count.items())
-    broken = f"; {len(failed)} of {len(outcomes)} processes failed" if failed else ""
+    broken = f"; {len(failed)} of {len(results)} processes failed" if failed else ""
     print(f"\n{total} in {time.perf_counter() - began:.0f} s{broken}")
     return 1 if failed or not count["passed"] else 0
 

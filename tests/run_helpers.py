@@ -1,4 +1,4 @@
-"""Runs of experiments for the tests, and what they leave."""
+"""Run experiments in the tests, and read their results."""
 
 import csv
 import json

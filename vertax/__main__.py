@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 
-from vertax._base.extras import needing
+from vertax._base.extras import requires_extra
 
 _INTERRUPTED = 130  # the exit code of a program that SIGINT ended, 128 + 2
 
@@ -20,7 +20,7 @@ def main() -> None:
     # it runs last: pools of processes are shut down and log files are flushed before it.
     atexit.register(_skip_finalisation, interrupted)
     try:
-        with needing("run", "The command `vertax`"):
+        with requires_extra("run", "The command `vertax`"):
             from vertax.runs.command_line import app
         app()
     except SystemExit as stop:

@@ -1,4 +1,4 @@
-"""Users read that a function is being compiled, if that takes long."""
+"""Messages during long compilations."""
 
 import time
 
@@ -10,7 +10,7 @@ from vertax._base.announce import announce_compilations, announced_jit
 
 
 @pytest.fixture(autouse=True)
-def _at_once(monkeypatch):
+def _short_delay(monkeypatch):
     monkeypatch.setattr(announce, "DELAY", 0.01)
     monkeypatch.setattr(announce, "_label_of_process", ["the default"])
 
@@ -24,21 +24,21 @@ def slow():
     return announced_jit(slow_to_trace)
 
 
-def test_a_long_compilation_is_announced_once(slow, capsys):
+def test_long_compilation_is_announced_once(slow, capsys):
     with announce_compilations("a sum"):
         slow(jnp.ones(3))
         slow(jnp.ones(3))
     assert capsys.readouterr().err.count("Compiling a sum") == 1
 
 
-def test_each_size_is_announced(slow, capsys):
+def test_compilation_for_each_shape_is_announced(slow, capsys):
     with announce_compilations("a sum"):
         slow(jnp.ones(3))
         slow(jnp.ones(4))
     assert capsys.readouterr().err.count("Compiling a sum") == 2
 
 
-def test_a_compiled_function_that_runs_long_is_not_announced(slow, capsys):
+def test_long_execution_is_not_announced(slow, capsys):
     slow(jnp.ones(3))
     capsys.readouterr()
     with announce_compilations("a sum"):
@@ -47,7 +47,7 @@ def test_a_compiled_function_that_runs_long_is_not_announced(slow, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_a_function_inside_another_is_announced_with_it(slow, capsys):
+def test_nested_functions_are_announced_once(slow, capsys):
     outer = announced_jit(lambda x: slow(x) * 2)
     with announce_compilations("a product"):
         outer(jnp.ones(3))
@@ -55,7 +55,7 @@ def test_a_function_inside_another_is_announced_with_it(slow, capsys):
     assert "a sum" not in capsys.readouterr().err
 
 
-def test_nothing_is_printed_unless_announced(slow, capsys, monkeypatch):
+def test_nothing_is_printed_without_a_terminal(slow, capsys, monkeypatch):
     monkeypatch.setattr(announce, "_label_of_process", [])
     slow(jnp.ones(3))
     with announce_compilations("a sum"):  # no terminal

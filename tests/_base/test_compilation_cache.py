@@ -1,4 +1,4 @@
-"""Compiled functions are kept on disk where that is wanted, and only there."""
+"""The folder and the settings of the persistent compilation cache."""
 
 import os
 import subprocess
@@ -22,7 +22,7 @@ SETTINGS = [
 
 @pytest.fixture(autouse=True)
 def home(tmp_path, monkeypatch):
-    """A user of its own, for whom nothing is set; the settings of JAX are back afterwards."""
+    """An empty home directory without settings; the settings of JAX are restored afterwards."""
     before = {name: getattr(jax.config, name) for name in SETTINGS}
     jax.config.update("jax_compilation_cache_dir", None)
     for name in ("VERTAX_CACHE", "XDG_CACHE_HOME"):
@@ -34,7 +34,7 @@ def home(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other folders")
-def test_it_lies_in_the_users_cache_folder(home, monkeypatch):
+def test_default_folder_is_the_cache_folder_of_the_user(home, monkeypatch):
     assert enable_compilation_cache() == home / ".cache/vertax"
     assert (home / ".cache/vertax").stat().st_mode & 0o777 == 0o700
     assert jax.config.jax_compilation_cache_dir == str(home / ".cache/vertax")
@@ -43,7 +43,7 @@ def test_it_lies_in_the_users_cache_folder(home, monkeypatch):
     assert enable_compilation_cache() == home / "elsewhere/vertax"
 
 
-def test_the_environment_switches_it_off_or_names_a_folder(home, monkeypatch):
+def test_environment_variable_disables_the_cache_or_sets_its_folder(home, monkeypatch):
     for off in ("off", "OFF", "0", "no"):
         monkeypatch.setenv("VERTAX_CACHE", off)
         assert enable_compilation_cache() is None
@@ -53,13 +53,13 @@ def test_the_environment_switches_it_off_or_names_a_folder(home, monkeypatch):
     assert enable_compilation_cache() == home / "mine"
 
 
-def test_a_folder_that_was_set_for_jax_is_left_alone(home):
+def test_folder_set_in_jax_has_priority_over_the_default(home):
     jax.config.update("jax_compilation_cache_dir", str(home / "of the user"))
     assert enable_compilation_cache() == home / "of the user"
     assert enable_compilation_cache(home / "asked for") == home / "asked for"
 
 
-def test_a_folder_that_cannot_be_used_is_an_error_only_if_it_was_asked_for(home, monkeypatch):
+def test_unusable_folder_is_an_error_only_if_given(home, monkeypatch):
     (home / "file").write_text("")
     with pytest.raises(ValueError, match=r"Cannot keep compiled functions in .*VERTAX_CACHE=off"):
         enable_compilation_cache(home / "file")
@@ -68,22 +68,22 @@ def test_a_folder_that_cannot_be_used_is_an_error_only_if_it_was_asked_for(home,
     assert jax.config.jax_compilation_cache_dir is None
 
 
-def test_halves_are_forgotten(home):
+def test_incomplete_files_are_removed(home):
     folder = home / "kept"
     folder.mkdir()
     old = time.time() - 3600
-    for name in ("whole-cache", "whole-atime", "half-cache", "fresh-cache"):
+    for name in ("complete-cache", "complete-atime", "incomplete-cache", "fresh-cache"):
         (folder / name).write_bytes(b"x")
         if not name.startswith("fresh"):
             os.utime(folder / name, (old, old))
-    enable_compilation_cache(folder)  # JAX does not write times of use there
-    assert (folder / "half-cache").exists()
+    enable_compilation_cache(folder)  # without `.lockfile` JAX writes no `-atime` files
+    assert (folder / "incomplete-cache").exists()
     (folder / ".lockfile").touch()
     enable_compilation_cache(folder)
     assert sorted(path.name for path in folder.glob("*-*")) == [
+        "complete-atime",
+        "complete-cache",
         "fresh-cache",
-        "whole-atime",
-        "whole-cache",
     ]
 
 
@@ -99,16 +99,16 @@ print(hits.count("/jax/compilation_cache/cache_hits"), hits.count("/jax/compilat
 """
 
 
-def test_another_process_does_not_compile_again(home):
+def test_second_process_reads_the_cache(home):
     def counts():
         environment = os.environ | {"VERTAX_CACHE": str(home / "kept")}
-        environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # what these tests share
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # set by tests/run.py
         command = [sys.executable, "-c", CODE]
-        outcome = subprocess.run(
+        process = subprocess.run(
             command, capture_output=True, text=True, check=True, cwd=ROOT, env=environment
         )
-        assert outcome.stderr == ""
-        return [int(n) for n in outcome.stdout.split()]
+        assert process.stderr == ""
+        return [int(n) for n in process.stdout.split()]
 
     hits, misses = counts()
     assert hits == 0

@@ -1,4 +1,4 @@
-"""A process is warned before compiled functions hold too many memory maps."""
+"""The warning before the memory maps of the process run out."""
 
 import warnings
 
@@ -11,12 +11,12 @@ from vertax._base.memory_maps import warn_of_memory_maps
 
 
 @pytest.fixture(autouse=True)
-def _at_once(monkeypatch):
+def _fresh_state(monkeypatch):
     monkeypatch.setattr(memory_maps, "INTERVAL", 0.0)
     monkeypatch.setattr(memory_maps, "_has_warned", False)
 
 
-def test_the_warning_names_the_remedy_and_comes_once(monkeypatch):
+def test_warning_is_given_once_with_a_remedy(monkeypatch):
     if not memory_maps.MAPS.exists():
         pytest.skip("this system does not list the memory maps of a process")
     square = eqx.filter_jit(lambda x: x**2)
@@ -45,7 +45,7 @@ def test_no_warning_inside_a_trace(monkeypatch):
         assert eqx.filter_jit(square)(jnp.asarray(3.0)) == 9
 
 
-def test_maps_are_counted_at_most_once_in_an_interval(monkeypatch):
+def test_maps_are_counted_at_most_once_per_interval(monkeypatch):
     monkeypatch.setattr(memory_maps, "FRACTION", 0.0)
     monkeypatch.setattr(memory_maps, "_last_count", float("inf"))
     with warnings.catch_warnings():
@@ -53,7 +53,7 @@ def test_maps_are_counted_at_most_once_in_an_interval(monkeypatch):
         warn_of_memory_maps()
 
 
-def test_no_warning_where_the_system_does_not_list_maps(monkeypatch, tmp_path):
+def test_no_warning_without_proc_self_maps(monkeypatch, tmp_path):
     monkeypatch.setattr(memory_maps, "FRACTION", 0.0)
     monkeypatch.setattr(memory_maps, "MAPS", tmp_path / "maps")
     with warnings.catch_warnings():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from free_helpers import cluster
-from helpers import STILL, central_difference, dense_hessian, relaxed
+from helpers import FIXED_TOPOLOGY, central_difference, dense_hessian, relaxed
 
 import vertax as vx
 from vertax.activities import FluctuatingTensions, Push, SelfPropulsion, ThermalNoise
@@ -23,7 +23,7 @@ KEY = jax.random.key(0)
 @functools.cache
 def solid():
     tissue, energy = relaxed(CELLS, 1, 3.5)
-    return STILL(tissue, energy).tissue, energy
+    return FIXED_TOPOLOGY(tissue, energy).tissue, energy
 
 
 def evolve(
@@ -41,7 +41,7 @@ def evolve(
         times,
         activity=activity,
         key=key,
-        relaxation=STILL,
+        relaxation=FIXED_TOPOLOGY,
         **settings,
     )
 
@@ -113,7 +113,7 @@ class TestThermalNoise:
         difference = central_difference(cost, jnp.array(1e-3), jnp.array(1.0), 1e-6)
         np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
-    def test_bad_arguments(self, as_a_user):
+    def test_bad_arguments(self, without_type_checks):
         class Own(vx.AbstractDissipation):
             def __call__(self, tissue, before, dt):
                 return jnp.sum((tissue.vertices - before.vertices) ** 2) / dt
@@ -173,7 +173,13 @@ class TestSelfPropulsion:
         energy = ShapeFactorEnergy(jnp.full(9, 3.4))
         activity = SelfPropulsion(0.3, 0.5)
         movie = vx.evolve(
-            tissue, energy, FRICTION, [0.0, 0.1], activity=activity, key=3, relaxation=STILL
+            tissue,
+            energy,
+            FRICTION,
+            [0.0, 0.1],
+            activity=activity,
+            key=3,
+            relaxation=FIXED_TOPOLOGY,
         )
         angles, _ = movie.drive[0]
         force = 0.3 * np.stack([np.cos(angles), np.sin(angles)], axis=-1).sum(axis=0)

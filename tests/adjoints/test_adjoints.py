@@ -12,8 +12,8 @@ import optax
 import optimistix as optx
 import pytest
 from helpers import (
+    FIXED_TOPOLOGY,
     SOLVERS,
-    STILL,
     central_difference,
     dense_hypergradient,
     random_like,
@@ -30,14 +30,14 @@ from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 
 CELLS = 8  # in all tests, which share what is compiled for them
 SGD = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
-STILL = STILL.traced()
-MOMENTUM = dataclasses.replace(STILL, solver=SGD, max_steps=jnp.asarray(20_000))
+FIXED_TOPOLOGY = FIXED_TOPOLOGY.traced()
+MOMENTUM = dataclasses.replace(FIXED_TOPOLOGY, solver=SGD, max_steps=jnp.asarray(20_000))
 
 # (name, adjoint, how to relax, relative error that it may have in float64)
 ADJOINTS = [
-    ("implicit", vx.ImplicitDifferentiation(), STILL, 1e-6),
-    ("sensitivity", vx.ImplicitDifferentiation(mode="sensitivity"), STILL, 1e-6),
-    ("propagation", vx.EquilibriumPropagation(), STILL, 1e-4),
+    ("implicit", vx.ImplicitDifferentiation(), FIXED_TOPOLOGY, 1e-6),
+    ("sensitivity", vx.ImplicitDifferentiation(mode="sensitivity"), FIXED_TOPOLOGY, 1e-6),
+    ("propagation", vx.EquilibriumPropagation(), FIXED_TOPOLOGY, 1e-4),
     ("automatic", vx.AutomaticDifferentiation(), MOMENTUM, 1e-4),
 ]
 
@@ -215,7 +215,9 @@ def test_float32(adjoint, response, rtol):
         tissue_32, energy_32, cost_32, adjoint, response
     ).gradient.target_shape_factor
     assert gradient.dtype == jnp.float32
-    reference = evaluate(tissue, energy, cost, vx.ImplicitDifferentiation(), STILL).gradient
+    reference = evaluate(
+        tissue, energy, cost, vx.ImplicitDifferentiation(), FIXED_TOPOLOGY
+    ).gradient
     assert distance(gradient.astype(jnp.float64), reference) < 0.03
 
 
@@ -237,7 +239,9 @@ def test_every_solver_that_an_adjoint_takes(adjoint, rtol, name, solver, reach):
     tissue, _, cost = start_and_cost()
     energy = ShapeFactorEnergy(shape_factors(CELLS, 3.6, 0.1, 3))
     response = vx.Relaxation(solver, transitions=None, tolerance=10 * reach, max_steps=20_000)
-    reference = evaluate(tissue, energy, cost, vx.ImplicitDifferentiation(), STILL).gradient
+    reference = evaluate(
+        tissue, energy, cost, vx.ImplicitDifferentiation(), FIXED_TOPOLOGY
+    ).gradient
     if isinstance(adjoint, vx.EquilibriumPropagation):
         # The nudge has to stand out from the force at which the solver stalls.
         adjoint = vx.EquilibriumPropagation(beta=max(1e-5, reach), throw=False)
@@ -263,7 +267,9 @@ def test_an_unrolled_relaxation_that_starts_at_rest_still_has_a_gradient():
     unrolled = evaluate(*at, vx.AutomaticDifferentiation(), MOMENTUM)
     assert unrolled.found.num_steps == 0
     assert (
-        distance(unrolled.gradient, evaluate(*at, vx.ImplicitDifferentiation(), STILL).gradient)
+        distance(
+            unrolled.gradient, evaluate(*at, vx.ImplicitDifferentiation(), FIXED_TOPOLOGY).gradient
+        )
         < 1e-4
     )
 
@@ -281,7 +287,7 @@ def implicit_loss(mode):
         return cost(found.tissue, e)
 
     p0 = shape_factors(CELLS, 3.65, 0.05, 1)
-    gradient = evaluate(tissue, ShapeFactorEnergy(p0), cost, adjoint, STILL).gradient
+    gradient = evaluate(tissue, ShapeFactorEnergy(p0), cost, adjoint, FIXED_TOPOLOGY).gradient
     return loss, p0, gradient.target_shape_factor
 
 
@@ -356,7 +362,7 @@ def test_one_default_nudge_suits_costs_of_any_size():
     tissue, energy, cost = start_and_cost()
     for weight in (1e-9, 1.0, 1e9):
         estimate, exact = (
-            evaluate(tissue, energy, weight * cost, adjoint, STILL).gradient
+            evaluate(tissue, energy, weight * cost, adjoint, FIXED_TOPOLOGY).gradient
             for adjoint in (vx.EquilibriumPropagation(), vx.ImplicitDifferentiation())
         )
         assert distance(estimate, exact) < 1e-4
@@ -383,10 +389,12 @@ class TestOutcome:
     @pytest.mark.parametrize(
         ("adjoint", "response"),
         [
-            pytest.param(vx.ImplicitDifferentiation(linear_solver=HASTY), STILL, id="implicit"),
+            pytest.param(
+                vx.ImplicitDifferentiation(linear_solver=HASTY), FIXED_TOPOLOGY, id="implicit"
+            ),
             pytest.param(
                 vx.ImplicitDifferentiation("sensitivity", linear_solver=HASTY),
-                STILL,
+                FIXED_TOPOLOGY,
                 id="sensitivity",
                 marks=pytest.mark.slow,
             ),
@@ -415,7 +423,9 @@ class TestOutcome:
         tissue, (_, _, cost) = vx.initialise.hexagonal(2, 4), start_and_cost()
         for p0, is_saddle in ((3.9, True), (3.6, False)):
             energy = ShapeFactorEnergy(np.full(CELLS, p0))
-            outcome = evaluate(tissue, energy, cost, vx.ImplicitDifferentiation(), STILL).outcome
+            outcome = evaluate(
+                tissue, energy, cost, vx.ImplicitDifferentiation(), FIXED_TOPOLOGY
+            ).outcome
             assert outcome.negative_curvature == is_saddle
 
 
@@ -435,7 +445,7 @@ class TestDegenerateEquilibrium:
     def test_gradient_of_a_cost_of_positions_is_rejected(self, adjoint):
         for function in (evaluate, plain_gradient):
             with pytest.raises(RuntimeError, match=r"equilibrium is not unique\..*zero_modes"):
-                jax.block_until_ready(function(*fluid(), adjoint, STILL))
+                jax.block_until_ready(function(*fluid(), adjoint, FIXED_TOPOLOGY))
 
     @pytest.mark.parametrize(
         "adjoint",
@@ -445,16 +455,16 @@ class TestDegenerateEquilibrium:
         ],
     )
     def test_outcome_reports_it(self, adjoint):
-        outcome = evaluate(*fluid(), adjoint, STILL).outcome
+        outcome = evaluate(*fluid(), adjoint, FIXED_TOPOLOGY).outcome
         assert outcome.degenerate == 1
         assert not outcome.trusted
-        outcome = evaluate(*start_and_cost(), adjoint, STILL).outcome
+        outcome = evaluate(*start_and_cost(), adjoint, FIXED_TOPOLOGY).outcome
         assert outcome.degenerate == 0
         assert outcome.trusted
 
     def test_gradient_of_a_cost_of_shapes_is_exact(self):
         tissue, energy, _ = fluid()
-        found = evaluate(tissue, energy, TotalCubes(), vx.ImplicitDifferentiation(), STILL)
+        found = evaluate(tissue, energy, TotalCubes(), vx.ImplicitDifferentiation(), FIXED_TOPOLOGY)
         # Each perimeter is its target: the derivative of the sum of cubes is 3 p0².
         expected = 3 * energy.target_shape_factor**2
         np.testing.assert_allclose(found.gradient.target_shape_factor, expected, rtol=1e-6)
@@ -491,8 +501,10 @@ class TestNudgeByTheCost:
     def test_it_agrees_with_implicit_differentiation(self):
         tissue, energy, cost = start_and_cost()
         adjoint = vx.EquilibriumPropagation(nudge="cost")
-        problem = vx.InverseProblem(tissue, energy, cost, response=STILL, adjoint=adjoint)
-        reference = evaluate(tissue, energy, cost, vx.ImplicitDifferentiation(), STILL).gradient
+        problem = vx.InverseProblem(tissue, energy, cost, response=FIXED_TOPOLOGY, adjoint=adjoint)
+        reference = evaluate(
+            tissue, energy, cost, vx.ImplicitDifferentiation(), FIXED_TOPOLOGY
+        ).gradient
         by_cost = value_and_gradient(problem)
         assert by_cost.cost == pytest.approx(
             float(cost(by_cost.equilibrium.tissue, energy)), rel=1e-12

@@ -13,16 +13,16 @@ import numpy as np
 import optax
 import pytest
 from free_helpers import cluster
-from helpers import STILL, central_difference, random_like, random_tissue
+from helpers import FIXED_TOPOLOGY, central_difference, random_like, random_tissue
 from jaxtyping import Array, Float
 
 import vertax as vx
 from vertax.dissipations import PerimeterViscosity, SubstrateFriction
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 
-PRECISE = dataclasses.replace(STILL, tolerance=jnp.asarray(1e-13))
+PRECISE = dataclasses.replace(FIXED_TOPOLOGY, tolerance=jnp.asarray(1e-13))
 SGD = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
-MOMENTUM = dataclasses.replace(STILL, solver=SGD, max_steps=jnp.asarray(20_000))
+MOMENTUM = dataclasses.replace(FIXED_TOPOLOGY, solver=SGD, max_steps=jnp.asarray(20_000))
 IMPLICIT = vx.ImplicitDifferentiation()
 TILE, TILE_ENERGY = random_tissue(8, 2), ShapeFactorEnergy(jnp.linspace(3.5, 3.7, 8))
 DROP, DROP_ENERGY = cluster(7, 6), AreaElasticity(10.0, 1.0) + LineTension(jnp.array(0.8))

@@ -15,7 +15,7 @@ from vertax import costs
 
 CELLS = 6
 NAN, INF = float("nan"), float("inf")
-pytestmark = pytest.mark.usefixtures("as_a_user")
+pytestmark = pytest.mark.usefixtures("without_type_checks")
 
 
 @pytest.fixture(scope="module")

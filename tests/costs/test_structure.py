@@ -9,8 +9,8 @@ import optimistix as optx
 import pytest
 from free_helpers import cluster
 from helpers import (
-    LOOSE,
-    STILL,
+    FIXED_TOPOLOGY,
+    NO_CONTACT,
     central_difference,
     dense_hypergradient,
     edge_cell_sets,
@@ -281,7 +281,7 @@ def crossing():
     draw = lambda k: vx.energies.ShapeFactorEnergy(3.7 + 0.2 * jax.random.normal(k, (20,)))
     truth, guess = draw(keys[0]), draw(keys[1])
     first = vx.initialise.periodic_voronoi(20, key=keys[2])
-    target, initial = (LOOSE(first, e).tissue for e in (truth, guess))
+    target, initial = (NO_CONTACT(first, e).tissue for e in (truth, guess))
     assert mismatched_neighbours(initial, target) >= 4
     cost = 0.99 * CentroidDistance(target) + 0.01 * IndexAwareStructural(target)
     return truth, target, vx.InverseProblem(initial, guess, cost)
@@ -312,13 +312,13 @@ def test_guidance_leads_through_t1s_to_the_hidden_parameters(crossing):
 def test_gradients_under_guidance(adjoint):
     target, _ = relaxed(12, 3)
     guess = vx.energies.ShapeFactorEnergy(shape_factors(12, 3.7, 0.1, 5))
-    tissue = STILL(target, guess).tissue
+    tissue = FIXED_TOPOLOGY(target, guess).tissue
     cost = CentroidDistance(target)
     problem = vx.InverseProblem(
         tissue,
         guess,
         cost,
-        response=STILL,
+        response=FIXED_TOPOLOGY,
         adjoint=adjoint,
         guidance=3.0,
     )
@@ -332,14 +332,14 @@ def test_gradients_under_guidance(adjoint):
     accuracy = 1e-5 if isinstance(adjoint, vx.ImplicitDifferentiation) else 1e-3
     assert slope == pytest.approx(expected, rel=accuracy)
     # Guided, the tissue comes closer than of itself.
-    free = vx.InverseProblem(tissue, problem.energy, cost, response=STILL)
+    free = vx.InverseProblem(tissue, problem.energy, cost, response=FIXED_TOPOLOGY)
     assert value < 0.9 * float(free()[0])
 
 
 def test_bad_guidance_is_refused():
     tissue = random_tissue(6)
     guess = vx.energies.ShapeFactorEnergy(jnp.full(6, 3.7))
-    problem = vx.InverseProblem(tissue, guess, CentroidDistance(tissue), response=STILL)
+    problem = vx.InverseProblem(tissue, guess, CentroidDistance(tissue), response=FIXED_TOPOLOGY)
     with pytest.raises(ValueError, match=r"`guidance` must give one number that is not negative"):
         vx.fit(problem, optax.adam(1e-2), 2, guidance=lambda epoch: -1.0, progress=False)
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)

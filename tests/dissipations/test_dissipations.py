@@ -90,7 +90,7 @@ def test_a_box_that_deforms_carries_the_substrate():
     np.testing.assert_allclose(sheared.areas.sum(), before.areas.sum())
 
 
-def test_bad_arguments(as_a_user):
+def test_bad_arguments(without_type_checks):
     for kind in (SubstrateFriction, EdgeViscosity, PerimeterViscosity, AreaViscosity):
         with pytest.raises(ValueError, match="must be at least 0"):
             kind(-1.0)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LOOSE, STILL, counted_compilations, random_tissue
+from helpers import FIXED_TOPOLOGY, NO_CONTACT, counted_compilations, random_tissue
 
 import vertax as vx
 from vertax.activities import SelfPropulsion, ThermalNoise
@@ -30,7 +30,7 @@ def driven(times=TIMES, key=3, **settings):
         times,
         activity=activity,
         key=key,
-        relaxation=LOOSE,
+        relaxation=NO_CONTACT,
         **settings,
     )
 
@@ -50,14 +50,14 @@ class Interrupt:
 
     def __init__(self, monkeypatch, after):
         calls = itertools.count(1)
-        write = vx._base.checkpoints.Keeper.note
+        write = vx._base.checkpoints.CheckpointFile.note
 
-        def note(keeper, progress):
-            write(keeper, progress)
+        def note(file, progress):
+            write(file, progress)
             if next(calls) == after:
                 raise KeyboardInterrupt
 
-        monkeypatch.setattr(vx._base.checkpoints.Keeper, "note", note)
+        monkeypatch.setattr(vx._base.checkpoints.CheckpointFile, "note", note)
 
 
 @pytest.mark.thorough
@@ -99,7 +99,7 @@ def test_without_noise_and_with_a_control_of_steps(tmp_path):
         ENERGY,
         FRICTION,
         [0, 0.1, 0.2],
-        relaxation=STILL,
+        relaxation=FIXED_TOPOLOGY,
         control=control,
         **settings,
     )
@@ -111,7 +111,7 @@ def test_without_noise_and_with_a_control_of_steps(tmp_path):
 def test_times_equal_up_to_rounding_continue(tmp_path):
     file = tmp_path / "run.npz"
     run = lambda times: vx.evolve(
-        random_tissue(9, 0), ENERGY, FRICTION, times, relaxation=STILL, checkpoint=file
+        random_tissue(9, 0), ENERGY, FRICTION, times, relaxation=FIXED_TOPOLOGY, checkpoint=file
     )
     computed = np.arange(4) * 0.1
     written = [0, 0.1, 0.2, 0.3, 0.4]

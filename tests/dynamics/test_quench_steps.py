@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LOOSE, random_tissue
+from helpers import NO_CONTACT, random_tissue
 
 import vertax as vx
 from vertax.dissipations import SubstrateFriction
@@ -21,7 +21,7 @@ def quenched(n_steps, duration=0.4):
         ShapeFactorEnergy(p0),
         SubstrateFriction(1.0),
         times,
-        relaxation=LOOSE,
+        relaxation=NO_CONTACT,
         progress=True,
     )
     frames, edges = np.nonzero(np.asarray(movie.flipped))

@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LOOSE, STILL, central_difference, random_like, random_tissue, relaxed
+from helpers import (
+    FIXED_TOPOLOGY,
+    NO_CONTACT,
+    central_difference,
+    random_like,
+    random_tissue,
+    relaxed,
+)
 
 import vertax as vx
 from vertax.dissipations import SubstrateFriction
@@ -21,14 +28,20 @@ FRICTION = SubstrateFriction(1.0)
 def bent():
     """A tissue a little away from rest, and its energy."""
     tissue, energy = relaxed(9, 1, 3.5)
-    tissue = STILL(tissue, energy).tissue
+    tissue = FIXED_TOPOLOGY(tissue, energy).tissue
     return tissue.with_vertices(tissue.vertices + 0.02 * random_like(tissue.vertices, 7)), energy
 
 
 def moved(order=1, **settings):
     tissue, energy = bent()
     return vx.evolve(
-        tissue, energy, FRICTION, [0.0, 0.05, 1.0], order=order, relaxation=STILL, **settings
+        tissue,
+        energy,
+        FRICTION,
+        [0.0, 0.05, 1.0],
+        order=order,
+        relaxation=FIXED_TOPOLOGY,
+        **settings,
     )
 
 
@@ -93,11 +106,11 @@ def test_through_transitions_refused_steps_leave_nothing_behind():
     tissue, energy = random_tissue(9, 0), ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
     times = [0.0, 0.1, 0.3]
     control = StepControl(2e-3, first=0.1, most=60)
-    run = vx.evolve(tissue, energy, FRICTION, times, relaxation=LOOSE, control=control)
+    run = vx.evolve(tissue, energy, FRICTION, times, relaxation=NO_CONTACT, control=control)
     assert run.refused.sum() > 0  # the first step is far too long
     assert run.num_t1 == run.transitions.sum() > 0
     assert (jnp.diff(run.energies) < 0).all()
-    fixed = vx.evolve(tissue, energy, FRICTION, times, relaxation=LOOSE, substeps=100)
+    fixed = vx.evolve(tissue, energy, FRICTION, times, relaxation=NO_CONTACT, substeps=100)
     np.testing.assert_array_equal(run.transitions, fixed.transitions)
     np.testing.assert_allclose(run.energy, fixed.energy, rtol=0.02)
 
@@ -108,7 +121,7 @@ class TestBadInput:
             with pytest.raises(ValueError, match=next(iter(settings))):
                 StepControl(**settings)  # pyright: ignore[reportArgumentType]
 
-    def test_what_does_not_go_with_it(self, as_a_user):
+    def test_what_does_not_go_with_it(self, without_type_checks):
         control = StepControl()
         with pytest.raises(ValueError, match="does not go with `substeps`"):
             vx.Evolution(FRICTION, [0.0, 1.0], control=control, substeps=2)

@@ -57,7 +57,7 @@ from vertax.energies import (
         ),
     ],
 )
-def test_what_is_no_parameter_is_named(make, error, message, as_a_user):
+def test_what_is_no_parameter_is_named(make, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         make()
 

@@ -29,7 +29,7 @@ ENTRIES = {
 
 
 @pytest.mark.parametrize("name", ENTRIES)
-def test_class_of_energies_is_rejected(as_a_user, name):
+def test_class_of_energies_is_rejected(without_type_checks, name):
     message = (
         r"`energy` must be an energy, .* but is the class ShapeFactorEnergy\. "
         r"Pass an instance, ShapeFactorEnergy\(target_shape_factor\)"
@@ -38,12 +38,12 @@ def test_class_of_energies_is_rejected(as_a_user, name):
         ENTRIES[name](ShapeFactorEnergy)
 
 
-def test_sum_with_a_class_is_rejected(as_a_user):
+def test_sum_with_a_class_is_rejected(without_type_checks):
     with pytest.raises(TypeError, match=r"the class LineTension\. Pass an instance, LineTension\("):
         _ = ENERGY + LineTension  # pyright: ignore[reportOperatorIssue]
 
 
-def test_growth_rejects_a_class_of_energies(as_a_user):
+def test_growth_rejects_a_class_of_energies(without_type_checks):
     roomy = TISSUE.with_capacity(12)
     with pytest.raises(TypeError, match=r"Pass such a function, e\.g\. lambda cells: ShapeFactor"):
         grow(roomy, ShapeFactorEnergy, GrowAndDivide(0.1, 1.5), jnp.array([0.0, 1.0]), key=0)
@@ -60,6 +60,6 @@ def test_growth_rejects_a_class_of_energies(as_a_user):
         ({"adjoint": "implicit"}, "`adjoint` must be an adjoint, .* but is 'implicit'"),
     ],
 )
-def test_inverse_problem_rejects_arguments_of_another_type(as_a_user, changes, message):
+def test_inverse_problem_rejects_arguments_of_another_type(without_type_checks, changes, message):
     with pytest.raises(TypeError, match=message):
         vx.InverseProblem(**({"tissue": TISSUE, "energy": ENERGY, "cost": COST} | changes))

@@ -145,7 +145,7 @@ def test_differences_of_the_energy_are_its_derivatives(case):
 
 
 @pytest.mark.parametrize(
-    ("mood", "says"),
+    ("failure", "says"),
     [
         ("raises", "OSError: the reactor is too hot"),
         ("shape", r"`vertices` as an array of shape \(11, 2\)"),
@@ -153,9 +153,9 @@ def test_differences_of_the_energy_are_its_derivatives(case):
         ("text", "must hold real numbers"),
     ],
 )
-def test_what_goes_wrong_is_an_error_with_its_reason(case, mood, says):
+def test_what_goes_wrong_is_an_error_with_its_reason(case, failure, says):
     answers, reason = ask(
-        [Job(Foam(mood=mood), numpy_request(case), "energy", 1e-4)], 1, False, True
+        [Job(Foam(failure=failure), numpy_request(case), "energy", 1e-4)], 1, False, True
     )
     assert answers == [None]
     assert isinstance(reason, SimulatorError)
@@ -163,7 +163,7 @@ def test_what_goes_wrong_is_an_error_with_its_reason(case, mood, says):
 
 
 def test_an_energy_that_is_not_finite_has_no_differences(case):
-    job = Job(Foam(mood="endless"), numpy_request(case), "differences", 1e-4)
+    job = Job(Foam(failure="endless"), numpy_request(case), "differences", 1e-4)
     answers, reason = ask([job], 1, False, True)
     assert answers == [None]
     assert "The energy by the program is nan" in str(reason)
@@ -178,8 +178,8 @@ def test_what_is_not_finite_is_not_asked(case):
 
 @pytest.fixture
 def moody(monkeypatch):
-    """Puts the program into a mood, for the length of a test: nothing is compiled for it."""
-    return lambda mood: monkeypatch.setattr(FOAM, "mood", mood)
+    """Puts the program into a failure, for the length of a test: nothing is compiled for it."""
+    return lambda failure: monkeypatch.setattr(FOAM, "failure", failure)
 
 
 def test_a_program_that_fails_says_so_everywhere(case, moody):
@@ -262,7 +262,9 @@ def test_processes_hang_and_die_one_by_one(case):
     ]
     for number, value in enumerate(first):
         energies[number].terms[1].tension[0] = value
-    jobs = [Job(Foam(mood="ill"), Request(tissue, e, None, None), "energy", 1e-4) for e in energies]
+    jobs = [
+        Job(Foam(failure="ill"), Request(tissue, e, None, None), "energy", 1e-4) for e in energies
+    ]
     began = time.perf_counter()
     answers, _ = ask(jobs, 4, True, True, 60.0)
     assert [answer is None for answer in answers] == [True, True, False, False]
@@ -270,7 +272,7 @@ def test_processes_hang_and_die_one_by_one(case):
     for job, says in zip(jobs, ("ran the program died", "not done after 2 s"), strict=False):
         assert says in str(ask([job], 1, True, True, 2.0)[1])
     # What a simulator raises is its own, and its process goes on.
-    moody = Job(Foam(mood="times out"), numpy_request(case), "energy", 1e-4)
+    moody = Job(Foam(failure="times out"), numpy_request(case), "energy", 1e-4)
     _, reason = ask([moody], 1, True, True, 60.0)
     assert "TimeoutError: the reactor does not answer" in str(reason)
     # The next one has a process again.
@@ -288,7 +290,7 @@ def test_a_fit_in_processes(case):
     fits = [vx.fit(p, ADAM, 2, progress=False) for p in (inverse, beside)]
     np.testing.assert_allclose(fits[0].history.cost, fits[1].history.cost, rtol=1e-12)
     hangs = dataclasses.replace(
-        inverse, response=vx.External(Foam(mood="hangs"), processes=True, timeout=1.0)
+        inverse, response=vx.External(Foam(failure="hangs"), processes=True, timeout=1.0)
     )
     with pytest.raises(vx.FitError, match="not done after 1 s"):
         vx.fit(hangs, ADAM, 2, progress=False)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import ADAM, LEAST_SQUARES, STILL, random_like, relaxed, rewritten
+from helpers import ADAM, FIXED_TOPOLOGY, LEAST_SQUARES, random_like, relaxed, rewritten
 
 import vertax as vx
 from vertax.costs import VertexDistance
@@ -18,7 +18,7 @@ from vertax.fitting import _descent, stack
 EPOCHS = 6
 
 
-def problem_of(seed=0, response=STILL):
+def problem_of(seed=0, response=FIXED_TOPOLOGY):
     target, truth = relaxed(10, 1)
     guess = ShapeFactorEnergy(jnp.full(10, 3.7) + 0.05 * random_like(jnp.zeros(10), seed))
     cost = VertexDistance(target)
@@ -138,7 +138,7 @@ def test_a_short_fit_is_written_once(path, monkeypatch):
 OTHERS = {
     "with another optimiser": {"optimiser": optax.adam(2e-2)},
     "sizes.*: the default and not max_steps=300": {
-        "problem": problem_of(response=dataclasses.replace(STILL, max_steps=300))[0]
+        "problem": problem_of(response=dataclasses.replace(FIXED_TOPOLOGY, max_steps=300))[0]
     },
     "numbers in its arrays": {"problem": problem_of(2)[0]},
     "another `guidance`: nan and not 10.0 in epoch 0": {"guidance": kappa},
@@ -180,9 +180,9 @@ def test_foreign_files_are_refused(path):
     ("changes", "message"),
     [
         ({"version": 2}, "version 2 of the checkpoint format.*Update vertax"),
-        ({"state_0": None}, "is broken: its state does not go with the fit"),
-        ({"state_0": np.zeros(3)}, "is broken: its state does not go with the fit"),
-        ({"epochs": 3}, "is broken: its state does not go with the fit"),
+        ({"state_0": None}, "is broken: its state does not match the fit"),
+        ({"state_0": np.zeros(3)}, "is broken: its state does not match the fit"),
+        ({"epochs": 3}, "is broken: its state does not match the fit"),
         ({"identity": "{"}, "is the checkpoint of a fit with another problem"),
     ],
 )

@@ -12,9 +12,9 @@ import optimistix as optx
 import pytest
 from helpers import (
     ADAM,
+    FIXED_TOPOLOGY,
     LEAST_SQUARES,
-    LOOSE,
-    STILL,
+    NO_CONTACT,
     central_difference,
     random_like,
     random_tissue,
@@ -27,7 +27,7 @@ from vertax.costs import MeshImage, VertexDistance, render
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 from vertax.fitting import _descent, stack
 
-inverse_problem = functools.partial(vx.InverseProblem, response=STILL)
+inverse_problem = functools.partial(vx.InverseProblem, response=FIXED_TOPOLOGY)
 
 
 @eqx.filter_jit
@@ -42,7 +42,7 @@ def hidden():
     """A relaxed tissue with hidden shape factors, and where inference begins."""
     target, truth = relaxed(10, 1)
     guess = ShapeFactorEnergy(jnp.full(10, 3.7, float))
-    return target, truth, guess, LOOSE(target, guess).tissue
+    return target, truth, guess, NO_CONTACT(target, guess).tissue
 
 
 def test_shape_factors_are_recovered_from_vertices(hidden):
@@ -79,7 +79,7 @@ def test_shape_factors_are_recovered_from_an_image_of_a_displaced_tissue(hidden)
 def test_the_loss_without_the_helper_is_plain_jax(hidden):
     target, _, guess, start = hidden
     cost, adjoint = VertexDistance(target), vx.ImplicitDifferentiation()
-    loss = lambda energy: cost(STILL(start, energy, adjoint=adjoint).tissue, energy)
+    loss = lambda energy: cost(FIXED_TOPOLOGY(start, energy, adjoint=adjoint).tissue, energy)
     by_hand = jax.grad(loss)(guess)
     _, by_problem = cost_and_slope(guess, start, cost)
     np.testing.assert_allclose(
@@ -121,9 +121,9 @@ def test_the_users_own_energy_is_fitted_like_any_other():
     area = AreaElasticity(20.0, 1.0)
     strength = 0.3 + 0.1 * jax.random.uniform(jax.random.key(3), (10,))
     truth = area + Contractility(strength)
-    target = STILL(random_tissue(10, 4), truth).tissue
+    target = FIXED_TOPOLOGY(random_tissue(10, 4), truth).tissue
     guess = area + Contractility(jnp.full(10, 0.35))
-    start = STILL(target, guess).tissue
+    start = FIXED_TOPOLOGY(target, guess).tissue
     fit = vx.fit(
         inverse_problem(start, guess, VertexDistance(target)),
         ADAM,
@@ -251,7 +251,7 @@ def batch(hidden):
     for k in range(3):
         noise = 0.05 * random_like(guess.target_shape_factor, k)
         energy = ShapeFactorEnergy(guess.target_shape_factor + noise)
-        start = LOOSE(target, energy).tissue
+        start = NO_CONTACT(target, energy).tissue
         problems.append(inverse_problem(start, energy, VertexDistance(target)))
     stacked = stack(problems)
     return problems, stacked, truth, stack([truth] * 3)
@@ -411,7 +411,7 @@ def test_a_diverging_fit_stops_and_hands_over_what_it_has(hidden):
 
 def test_a_fit_without_any_equilibrium_is_an_error(hidden):
     target, truth, guess, _ = hidden
-    hasty = dataclasses.replace(STILL, max_steps=1)
+    hasty = dataclasses.replace(FIXED_TOPOLOGY, max_steps=1)
     problem = inverse_problem(random_tissue(10, 8), guess, VertexDistance(target), response=hasty)
     with pytest.raises(vx.FitError, match="No epoch of the fit reached equilibrium"):
         vx.fit(problem, ADAM, 2, truth=truth, progress=False)
@@ -456,7 +456,7 @@ def test_shape_factors_in_float32(hidden):
         ({"callback": "print"}, TypeError, "`callback` must be a function"),
     ],
 )
-def test_arguments_of_another_kind_are_answered(changes, error, message, as_a_user):
+def test_arguments_of_another_kind_are_answered(changes, error, message, without_type_checks):
     tissue = random_tissue(6)
     energy = ShapeFactorEnergy(jnp.full(6, 3.7))
     given = {

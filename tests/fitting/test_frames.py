@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import LEAST_SQUARES, STILL, central_difference, random_like, random_tissue, relaxed
+from helpers import (
+    FIXED_TOPOLOGY,
+    LEAST_SQUARES,
+    central_difference,
+    random_like,
+    random_tissue,
+    relaxed,
+)
 
 import vertax as vx
 from vertax.costs import Frames, VertexDistance
@@ -26,7 +33,7 @@ def seen():
     tissue, energy = relaxed(CELLS, 1, 3.5)
     p0 = energy.target_shape_factor
     truth = Material(ShapeFactorEnergy(p0 + 0.1 * random_like(p0, 3)), SubstrateFriction(2.0))
-    evolution = vx.Evolution(SubstrateFriction(1.0), TIMES, relaxation=STILL)
+    evolution = vx.Evolution(SubstrateFriction(1.0), TIMES, relaxation=FIXED_TOPOLOGY)
     movie = evolution(tissue, truth)
     guess = Material(ShapeFactorEnergy(p0), SubstrateFriction(1.0))
     cost = Frames([VertexDistance(frame) for frame in movie.trajectory[1:]])
@@ -96,7 +103,7 @@ class TestBadInput:
             with pytest.raises(ValueError, match=f"{what}.* goes with a tissue at rest"):
                 vx.InverseProblem(*arguments, response=problem.response, **wrong)  # pyright: ignore[reportArgumentType]
 
-    def test_costs_of_frames(self, as_a_user):
+    def test_costs_of_frames(self, without_type_checks):
         cost = VertexDistance(random_tissue(CELLS))
         with pytest.raises(TypeError, match="number 1 is"):
             Frames([cost, 1.0])  # pyright: ignore[reportArgumentType]
@@ -107,7 +114,7 @@ class TestBadInput:
         with pytest.raises(ValueError, match="1 costs, so it must see 2 frames"):
             Frames([VertexDistance(movie.tissue)])(movie.frames, truth)
 
-    def test_materials(self, as_a_user):
+    def test_materials(self, without_type_checks):
         with pytest.raises(TypeError, match="`dissipation` of Material must be an AbstractDiss"):
             Material(ShapeFactorEnergy(3.5), 1.0)  # pyright: ignore[reportArgumentType]
         with pytest.raises(TypeError, match="function of time"):

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
-from helpers import STILL, p0_of, relaxed
+from helpers import FIXED_TOPOLOGY, p0_of, relaxed
 
 import vertax as vx
 from vertax.costs import MeshImage, VertexDistance, render
@@ -26,7 +26,7 @@ AT_REST = optax.adam(1e-12)
 
 def fitted(tissue, energy, cost):
     """A problem, and a fit that leaves the energy as it is."""
-    problem = vx.InverseProblem(tissue, energy, cost, response=STILL)
+    problem = vx.InverseProblem(tissue, energy, cost, response=FIXED_TOPOLOGY)
     return problem, vx.fit(problem, AT_REST, 1, progress=False)
 
 
@@ -45,7 +45,7 @@ def test_it_is_the_scatter_of_repeated_fits(hidden):
 
     keys = jax.random.split(jax.random.key(0), 60)
     problems = eqx.filter_vmap(
-        lambda key: vx.InverseProblem(tissue, truth, once(key), response=STILL),
+        lambda key: vx.InverseProblem(tissue, truth, once(key), response=FIXED_TOPOLOGY),
         out_axes=eqx.if_array(0),
     )(keys)
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
@@ -164,14 +164,14 @@ def test_a_fitted_position_adds_to_the_uncertainty(hidden):
     image = image + 0.05 * image.max() * np.random.default_rng(0).normal(size=image.shape)
     cost = MeshImage(image, width)
     fit = vx.fit(
-        vx.InverseProblem(tissue, truth, cost, response=STILL),
+        vx.InverseProblem(tissue, truth, cost, response=FIXED_TOPOLOGY),
         optax.adam(1e-3),
         2,
         progress=False,
     )
     known, unknown = (
         vx.uncertainty(
-            vx.InverseProblem(tissue, truth, cost, response=STILL, fit_position=moves),
+            vx.InverseProblem(tissue, truth, cost, response=FIXED_TOPOLOGY, fit_position=moves),
             fit,
         )
         for moves in (False, True)
@@ -180,7 +180,7 @@ def test_a_fitted_position_adds_to_the_uncertainty(hidden):
     assert float(jnp.max(p0_of(unknown.deviation) / p0_of(known.deviation))) < 3
 
 
-def test_bad_arguments_are_refused(hidden, as_a_user):
+def test_bad_arguments_are_refused(hidden, without_type_checks):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, VertexDistance(tissue))
     every: Any = "all"

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import STILL, central_difference, random_tissue
+from helpers import FIXED_TOPOLOGY, central_difference, random_tissue
 
 import vertax as vx
 from vertax.growth import GrowAndDivide, grow
@@ -27,7 +27,7 @@ def founders(capacity=9):
 
 # With contacts and transitions several times as much is compiled.
 RELAXATIONS = [
-    pytest.param(STILL, id="still"),
+    pytest.param(FIXED_TOPOLOGY, id="still"),
     pytest.param(None, id="default", marks=pytest.mark.slow),
 ]
 
@@ -55,7 +55,9 @@ def test_cells_divide_and_the_tissue_stays_sound(grown):
 
 def test_growth_from_two_free_cells_counts_what_could_not_happen():
     tissue, times = vx.initialise.free_voronoi(2, key=0).with_capacity(5), jnp.linspace(0, 10, 9)
-    run = lambda cycle: grow(tissue, energy_of, cycle, times, key=1, relaxation=STILL, throw=False)
+    run = lambda cycle: grow(
+        tissue, energy_of, cycle, times, key=1, relaxation=FIXED_TOPOLOGY, throw=False
+    )
     grown = run(GrowAndDivide(0.2, 1.5))
     assert grown.n_alive[0] == 2
     assert grown.n_alive[-1] == 5
@@ -80,7 +82,7 @@ def test_growth_from_two_free_cells_counts_what_could_not_happen():
 def test_growth_from_one_periodic_cell():
     tissue, times = random_tissue(1).with_capacity(5), jnp.linspace(0, 8, 9)
     cycle = GrowAndDivide(0.2, 1.5)
-    grown = grow(tissue, energy_of, cycle, times, key=1, relaxation=STILL)
+    grown = grow(tissue, energy_of, cycle, times, key=1, relaxation=FIXED_TOPOLOGY)
     assert grown.n_alive[0] == 1
     assert grown.n_alive[-1] > 2
     assert grown.tissue.areas.sum() == pytest.approx(1)
@@ -102,7 +104,7 @@ def test_the_lineage_is_a_forest(grown):
     assert sorted(alive[alive >= 0]) == np.flatnonzero(fate == 0).tolist()
 
 
-def test_a_full_pool_and_bad_arguments_are_named(grown, as_a_user):
+def test_a_full_pool_and_bad_arguments_are_named(grown, without_type_checks):
     cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 5, 6)
     with pytest.raises(RuntimeError, match="capacity of 9 cells"):
         eqx.tree_at(lambda g: g.full, grown, jnp.array(True)).checked()

@@ -29,7 +29,7 @@ def test_the_mean_is_that_of_the_values_and_its_gradient_that_of_the_expectation
     assert jax.grad(mean)(p, False) == pytest.approx(2 * 0.09, rel=0.05)
 
 
-def test_what_does_not_go_together_is_named(as_a_user):
+def test_what_does_not_go_together_is_named(without_type_checks):
     with pytest.raises(ValueError, match="one entry a run"):
         score_function(jnp.ones(3), jnp.ones(2))
     with pytest.raises(ValueError, match="`baseline`"):

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LOOSE, relaxed
+from helpers import NO_CONTACT, relaxed
 
 import vertax as vx
 from vertax.inference import Microscope, PinnedEnergy, micrograph_problem
@@ -20,7 +20,7 @@ def image():
 
 @pytest.fixture(scope="module")
 def pinned(image):
-    return micrograph_problem(image, border="pinned", pixels=96, response=LOOSE)
+    return micrograph_problem(image, border="pinned", pixels=96, response=NO_CONTACT)
 
 
 @pytest.mark.thorough

@@ -147,7 +147,7 @@ def test_the_movie_of_surface_evolver():
     assert np.mean(np.abs(relative - 1)) < 0.01
 
 
-@pytest.mark.usefixtures("as_a_user")
+@pytest.mark.usefixtures("without_type_checks")
 class TestBadInput:
     def test_frames(self):
         cluster, chains, _ = drawn()

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LOOSE, random_tissue
+from helpers import NO_CONTACT, random_tissue
 
 import vertax as vx
 from vertax.costs import mismatched_neighbours
@@ -30,7 +30,7 @@ def force(tissue, energy):
 
 def scene_of(**options):
     """Relaxed without contacts, which compiles less: the experiments have scenes with them."""
-    options |= {"response": LOOSE, "target_response": LOOSE}
+    options |= {"response": NO_CONTACT, "target_response": NO_CONTACT}
     return shape_factor_scene(8, key=jax.random.key(0), mean=3.7, deviation=0.05, **options)
 
 

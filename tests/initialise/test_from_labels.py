@@ -232,7 +232,7 @@ def test_a_background_that_cells_cross_is_named():
         ("1", TypeError, "`background` must be a whole number"),
     ],
 )
-def test_a_wrong_background_is_refused(background, error, message, as_a_user):
+def test_a_wrong_background_is_refused(background, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         from_labels(honeycomb(), background=background)
 
@@ -291,7 +291,7 @@ def test_labels_beyond_63_bits_are_refused():
         ({"pixel_size": 1j}, TypeError, "`pixel_size` must be one real number"),
     ],
 )
-def test_wrong_sizes_are_named(options, error, message, as_a_user):
+def test_wrong_sizes_are_named(options, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         from_labels(honeycomb(), **options)
 

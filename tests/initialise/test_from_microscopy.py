@@ -330,7 +330,9 @@ def test_read_image_refuses_complex_numbers(tmp_path):
 
 @pytest.mark.parametrize("name", ["channel", "plane"])
 @pytest.mark.parametrize("index", ["red", 1.5, True])
-def test_read_image_refuses_an_index_that_is_none(tmp_path, small, name, index, as_a_user):
+def test_read_image_refuses_an_index_that_is_none(
+    tmp_path, small, name, index, without_type_checks
+):
     path = tmp_path / "image.png"
     skimage_io.imsave(path, small[0], check_contrast=False)
     with pytest.raises(TypeError, match=f"`{name}` must be a whole number"):
@@ -338,7 +340,7 @@ def test_read_image_refuses_an_index_that_is_none(tmp_path, small, name, index, 
 
 
 @pytest.mark.parametrize("segmenter", ["watershed", Watershed])
-def test_what_is_no_segmenter_is_refused(small, segmenter, as_a_user):
+def test_what_is_no_segmenter_is_refused(small, segmenter, without_type_checks):
     with pytest.raises(TypeError, match=r"`segmenter` must be a segmenter, such as Watershed\(\)"):
         from_microscopy(small[0], segmenter=segmenter)
 

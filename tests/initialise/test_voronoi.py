@@ -16,7 +16,7 @@ voronoi = vx.initialise.periodic_voronoi
 
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from([1, 2, 3, 6, 17, 40]), st.integers(0, 10**6), st.data())
-def test_vertices_are_equally_far_from_three_seeds_and_no_other_is_closer(n, seed, data):
+def test_vertices_are_circumcentres_of_empty_circles(n, seed, data):
     lattice = data.draw(lattices(n))
     seeds = np.random.default_rng(seed).random((n, 2)) @ lattice
     tissue = voronoi(seeds=seeds, lattice=lattice)
@@ -26,10 +26,10 @@ def test_vertices_are_equally_far_from_three_seeds_and_no_other_is_closer(n, see
         np.linalg.norm(np.asarray(tissue.vertices)[:, None] - images, axis=-1), axis=1
     )
     np.testing.assert_allclose(distance[:, 2], distance[:, 0], atol=1e-9)
-    # and the cell at each corner is the one of the seed that close, in the frame of the cell
+    # The cell of each corner is that of the nearest seed, in the frame of the cell.
     cell = np.asarray(tissue.topology.cell)
-    own = np.linalg.norm(np.asarray(tissue.corners) - seeds[cell], axis=1)
-    np.testing.assert_allclose(own, np.repeat(distance[:, 0], 3), atol=1e-9)
+    distance_to_seed = np.linalg.norm(np.asarray(tissue.corners) - seeds[cell], axis=1)
+    np.testing.assert_allclose(distance_to_seed, np.repeat(distance[:, 0], 3), atol=1e-9)
 
 
 def test_vertices_lie_in_the_box():
@@ -49,14 +49,14 @@ def test_the_same_key_gives_the_same_tissue():
 
 
 @pytest.mark.parametrize("n", [1, 3, 5])
-def test_a_square_lattice_of_seeds_is_degenerate_but_works(n):
+def test_a_square_lattice_of_seeds_gives_square_cells(n):
     seeds = np.stack(np.meshgrid(np.arange(n), np.arange(n)), -1).reshape(-1, 2).astype(float)
     tissue = voronoi(seeds=seeds, softening=0.0)
     np.testing.assert_allclose(tissue.areas, 1, rtol=1e-12)
     np.testing.assert_allclose(tissue.perimeters, 4, rtol=1e-12)
 
 
-def test_lloyd_steps_even_the_areas_out():
+def test_lloyd_steps_reduce_the_variance_of_areas():
     spread = [float(jnp.std(random_tissue(100, 2, lloyd_steps=k).areas)) for k in (0, 2, 10)]
     assert spread[0] > 1.3 * spread[1] > 1.6 * spread[2]
 
@@ -89,7 +89,7 @@ def test_memory_order_follows_space():
         ({"n_cells": 3, "key": jax.random.key(0), "lloyd_steps": -1}, "`lloyd_steps`"),
     ],
 )
-def test_bad_arguments_are_named(options, message):
+def test_missing_or_contradictory_arguments_are_rejected(options, message):
     with pytest.raises(ValueError, match=message):
         voronoi(**options)
 
@@ -97,12 +97,12 @@ def test_bad_arguments_are_named(options, message):
 @pytest.mark.parametrize(
     ("nx", "ny", "area"), [(0, 3, 1.0), (2, -1, 1.0), (2, 2, 0.0), (2, 2, np.nan)]
 )
-def test_bad_hexagonal_lattices_are_refused(nx, ny, area):
+def test_invalid_hexagonal_lattices_are_rejected(nx, ny, area):
     with pytest.raises(ValueError, match="must be"):
         vx.initialise.hexagonal(nx, ny, area=area)
 
 
-def test_a_seed_is_a_key(as_a_user):
+def test_an_integer_seed_is_a_key(without_type_checks):
     for make in (periodic_voronoi, free_voronoi):
         by_seed, by_key = (make(5, key=key) for key in (3, jax.random.key(3)))
         np.testing.assert_array_equal(by_seed.vertices, by_key.vertices)
@@ -133,7 +133,7 @@ def test_a_seed_is_a_key(as_a_user):
     ],
 )
 @pytest.mark.parametrize("make", [periodic_voronoi, free_voronoi])
-def test_wrong_arguments_are_named(make, options, error, message, as_a_user):
+def test_arguments_of_wrong_type_are_rejected(make, options, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         make(**{"n_cells": 5, "key": jax.random.key(0)} | options)
 
@@ -149,32 +149,32 @@ def test_wrong_arguments_are_named(make, options, error, message, as_a_user):
         ({"n_cells": 5, "key": 0, "lattice": 5.0}, ValueError, r"`lattice` must .* shape \(2, 2\)"),
     ],
 )
-def test_wrong_seeds_and_boxes_are_named(options, error, message, as_a_user):
+def test_invalid_seeds_and_lattices_are_rejected(options, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         periodic_voronoi(**options)
 
 
 @pytest.mark.parametrize("arguments", [(2.5, 4), (4, "4"), (True, 2)])
-def test_a_lattice_has_whole_numbers_of_cells(arguments, as_a_user):
+def test_hexagonal_takes_integers_only(arguments, without_type_checks):
     with pytest.raises(TypeError, match="a Python integer"):
         hexagonal(*arguments)
 
 
-def test_inside_transformations_the_remedy_is_told(as_a_user):
+def test_tracers_are_rejected_with_a_remedy(without_type_checks):
     keys = jax.random.split(jax.random.key(0), 2)
     for make in (lambda key: periodic_voronoi(5, key=key), lambda key: free_voronoi(5, key=key)):
         for transformed in (eqx.filter_vmap(make), lambda keys, f=make: eqx.filter_jit(f)(keys[0])):
             with pytest.raises(TypeError, match=r"does not work inside jax.jit.*jax.numpy.stack"):
                 transformed(keys)
-    with pytest.raises(TypeError, match="hexagonal needs arrays whose numbers"):
+    with pytest.raises(TypeError, match="hexagonal needs arrays with concrete values"):
         jax.vmap(lambda area: hexagonal(4, 4, area=area))(jnp.ones(2))
-    # What the message says.
+    # The remedy of the message.
     tissues = [periodic_voronoi(5, key=key) for key in keys]
     batch = jax.tree.map(lambda *x: jax.numpy.stack(x), *tissues)
     assert eqx.filter_vmap(lambda tissue: tissue.areas)(batch).shape == (2, 5)
 
 
-def test_seeds_out_of_reach_are_refused():
+def test_seeds_far_from_the_origin_are_rejected():
     seeds = np.random.default_rng(0).random((5, 2))
     with pytest.raises(ValueError, match=r"`seeds` must lie within 1e.08 boxes of the origin"):
         periodic_voronoi(seeds=seeds * 1e300)

@@ -274,7 +274,7 @@ def test_what_is_not_known_is_an_empty_field(tmp_path):
         ({"a": [[1], [2, 3]]}, ValueError, "Column `a` must hold one entry a row"),
     ],
 )
-def test_what_is_no_table_is_refused(tmp_path, table, error, message, as_a_user):
+def test_what_is_no_table_is_refused(tmp_path, table, error, message, without_type_checks):
     path = tmp_path / "table.csv"
     with pytest.raises(error, match=message):
         vx.io.write_csv(path, table)
@@ -282,7 +282,7 @@ def test_what_is_no_table_is_refused(tmp_path, table, error, message, as_a_user)
 
 
 @pytest.mark.parametrize("read", [vx.io.cell_table, vx.io.edge_table])
-def test_tables_are_of_one_tissue(read, as_a_user):
+def test_tables_are_of_one_tissue(read, without_type_checks):
     tissue = random_tissue(5)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
     with pytest.raises(ValueError, match=r"one by one: jax.tree.map\(lambda x: x\[0\], tissue\)"):
@@ -309,7 +309,7 @@ def test_tables_are_of_one_tissue(read, as_a_user):
         ({"points_per_arc": 1.5}, TypeError, "`points_per_arc` must be at least 1"),
     ],
 )
-def test_what_has_no_place_in_geojson(tmp_path, options, error, message, as_a_user):
+def test_what_has_no_place_in_geojson(tmp_path, options, error, message, without_type_checks):
     path = tmp_path / "cells.geojson"
     with pytest.raises(error, match=message):
         vx.io.write_geojson(path, random_tissue(5), **options)
@@ -325,7 +325,7 @@ def test_dates_are_text_in_geojson(tmp_path):
 
 
 @pytest.mark.parametrize("write", [vx.io.save_tissue, lambda path, tissue: vx.io.to_tables(tissue)])
-def test_what_is_no_tissue_is_not_written(tmp_path, write, as_a_user):
+def test_what_is_no_tissue_is_not_written(tmp_path, write, without_type_checks):
     with pytest.raises(TypeError, match=r"`tissue` must be a vertax.Tissue, but is 'tissue'"):
         write(tmp_path / "tissue.npz", "tissue")
 
@@ -344,7 +344,7 @@ def test_what_is_no_tissue_is_not_written(tmp_path, write, as_a_user):
         (lambda t: t._replace(height=np.nan), ValueError, "`height` must be positive"),
     ],
 )
-def test_what_are_no_tables_is_named(change, error, message, as_a_user):
+def test_what_are_no_tables_is_named(change, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         vx.io.from_tables(change(vx.io.to_tables(random_tissue(5))))
 
@@ -352,7 +352,7 @@ def test_what_are_no_tables_is_named(change, error, message, as_a_user):
 @pytest.mark.parametrize(
     "classes", [["a"], vx.energies.LineTension, [vx.energies.LineTension(1.0)]]
 )
-def test_what_are_no_classes_is_named(tmp_path, classes, as_a_user):
+def test_what_are_no_classes_is_named(tmp_path, classes, without_type_checks):
     path = tmp_path / "energy.npz"
     vx.io.save_energy(path, vx.energies.LineTension(1.0))
     with pytest.raises(TypeError, match="`classes` must"):

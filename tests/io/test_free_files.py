@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from free_helpers import cluster
-from helpers import LOOSE
+from helpers import NO_CONTACT
 from label_helpers import honeycomb
 from matplotlib.collections import PolyCollection
 
@@ -129,17 +129,17 @@ def test_a_cluster_from_a_real_skeleton():
     pixels = np.bincount(labels.ravel())[made.labels] * made.pixel_size**2
     np.testing.assert_allclose(tissue.areas, pixels, rtol=0.15)
     energy = vx.energies.AreaElasticity(20.0, pixels) + vx.energies.LineTension(1.0)
-    assert LOOSE(tissue, energy).tissue.areas.min() > 0.3
+    assert NO_CONTACT(tissue, energy).tissue.areas.min() > 0.3
 
 
 def test_from_microscopy_passes_the_boundary_on():
     mask = round_cells(0)
 
-    class Known(vx.initialise.AbstractSegmenter):
+    class FixedLabels(vx.initialise.AbstractSegmenter):
         def __call__(self, image):
             return mask
 
-    made = from_microscopy(mask.astype(float), segmenter=Known(), boundary="free")
+    made = from_microscopy(mask.astype(float), segmenter=FixedLabels(), boundary="free")
     assert isinstance(made.tissue.boundary, vx.Free)
 
 

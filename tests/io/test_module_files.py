@@ -13,7 +13,7 @@ import numpy as np
 import optax
 import pytest
 from free_helpers import cluster
-from helpers import STILL, random_tissue, rewritten
+from helpers import FIXED_TOPOLOGY, random_tissue, rewritten
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from jaxtyping import Array, Float
@@ -239,7 +239,7 @@ class TestRoundTrip:
 
     @pytest.mark.thorough
     def test_a_loaded_problem_has_the_same_gradient(self, path, tissues):
-        problem = problem_of(tissues["periodic"], response=STILL, guidance=None)
+        problem = problem_of(tissues["periodic"], response=FIXED_TOPOLOGY, guidance=None)
         save_problem(path, problem)
         gradient = eqx.filter_jit(lambda p: p.value_and_gradient().gradient)
         assert same(gradient(load_problem(path)), gradient(problem))

@@ -31,7 +31,7 @@ def test_each_time_has_a_file_with_its_frame(tmp_path, movie):
     assert len({mesh.points.tobytes() for mesh in meshes}) == 3
 
 
-def test_bad_input(tmp_path, movie, as_a_user):
+def test_bad_input(tmp_path, movie, without_type_checks):
     with pytest.raises(ValueError, match=r"must end in \.pvd"):
         write_vtk_series(tmp_path / "movie.vtu", movie)
     with pytest.raises(ValueError, match="at least one frame"):

@@ -43,7 +43,7 @@ TAKE_BOTH = [
 
 
 @pytest.mark.parametrize("function", TAKE_BOTH)
-def test_each_function_wants_one_tissue_and_an_energy(as_a_user, function):
+def test_each_function_wants_one_tissue_and_an_energy(without_type_checks, function):
     for nothing in (None, 3.6, vx.energies.ShapeFactorEnergy):
         with pytest.raises(TypeError, match=ENERGY):
             function(tissue, nothing)
@@ -160,7 +160,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_wrong_values_are_named(as_a_user, name):
+def test_wrong_values_are_named(without_type_checks, name):
     call, message = WRONG[name]
     with pytest.raises((ValueError, TypeError), match=message.replace("(", r"\(")):
         call()

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from free_helpers import cluster
-from helpers import STILL, random_tissue
+from helpers import FIXED_TOPOLOGY, random_tissue
 
 import vertax as vx
 from vertax import mechanics
@@ -14,7 +14,7 @@ from vertax.energies import ShapeFactorEnergy
 from vertax.mechanics import BoxRelaxation
 
 N = 9
-PRECISE = eqx.tree_at(lambda r: r.tolerance, STILL, 1e-11, is_leaf=lambda x: x is None)
+PRECISE = eqx.tree_at(lambda r: r.tolerance, FIXED_TOPOLOGY, 1e-11, is_leaf=lambda x: x is None)
 start = random_tissue(N, 1)
 p0 = jnp.linspace(3.5, 3.7, N)
 direction = np.cos(np.arange(N))
@@ -111,7 +111,7 @@ def test_gradient_of_a_relaxed_box_against_differences(adjoint):
     assert slope == pytest.approx(wanted, rel=1e-6 if "Implicit" in str(adjoint) else 1e-3)
 
 
-def test_what_is_refused(as_a_user):
+def test_what_is_refused(without_type_checks):
     energy = ShapeFactorEnergy(p0)
     with pytest.raises(ValueError, match="must be periodic"):
         mechanics.ramp(cluster(4, 1), energy, np.array([0.0, 0.1]))

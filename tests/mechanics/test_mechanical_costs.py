@@ -5,14 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import STILL, random_tissue, shape_factors
+from helpers import FIXED_TOPOLOGY, random_tissue, shape_factors
 
 import vertax as vx
 from vertax import costs, mechanics
 from vertax.energies import AreaElasticity, PerimeterElasticity
 
 N = 16
-PRECISE = eqx.tree_at(lambda r: r.tolerance, STILL, 1e-11, is_leaf=lambda x: x is None)
+PRECISE = eqx.tree_at(lambda r: r.tolerance, FIXED_TOPOLOGY, 1e-11, is_leaf=lambda x: x is None)
 
 
 def elastic(p0):
@@ -92,7 +92,7 @@ def test_hypergradient_of_a_modulus_by_equilibrium_propagation():
 @pytest.mark.slow
 def test_a_shear_modulus_is_designed():
     problem = vx.InverseProblem(
-        tissue=tissue, energy=elastic(p0), cost=costs.ShearModulus(0.3), response=STILL
+        tissue=tissue, energy=elastic(p0), cost=costs.ShearModulus(0.3), response=FIXED_TOPOLOGY
     )
     import optax
 

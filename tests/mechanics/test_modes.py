@@ -128,7 +128,7 @@ def test_the_count_of_a_rigid_tissue_and_of_a_fluid_one():
         assert mechanics.zero_modes(rest, energy, tolerance=1e-7) == zero
 
 
-def test_what_is_refused(as_a_user):
+def test_what_is_refused(without_type_checks):
     with pytest.raises(ValueError, match="must be at most"):
         mechanics.modes(tissue, ENERGY, 49)
     with pytest.raises(ValueError, match='"dense" or "sparse"'):

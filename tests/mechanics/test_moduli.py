@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from free_helpers import cluster
-from helpers import STILL, hexagon_index, random_tissue, shape_factors
+from helpers import FIXED_TOPOLOGY, hexagon_index, random_tissue, shape_factors
 
 import vertax as vx
 from vertax import mechanics
@@ -14,7 +14,7 @@ from vertax.energies import AreaElasticity, PerimeterElasticity, ShapeFactorEner
 
 C = hexagon_index()
 N = 16
-PRECISE = eqx.tree_at(lambda r: r.tolerance, STILL, 1e-11, is_leaf=lambda x: x is None)
+PRECISE = eqx.tree_at(lambda r: r.tolerance, FIXED_TOPOLOGY, 1e-11, is_leaf=lambda x: x is None)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import STILL, hexagon_index, random_tissue, shape_factors
+from helpers import FIXED_TOPOLOGY, hexagon_index, random_tissue, shape_factors
 
 import vertax as vx
 from vertax import mechanics
@@ -116,7 +116,7 @@ def test_recoil_against_a_dense_solution():
 def test_recoil_at_rest_is_the_first_motion_of_a_tissue_without_that_tension():
     n = 12
     energy = ShapeFactorEnergy(shape_factors(n, 3.5, 0.1))
-    tissue = STILL(random_tissue(n, 1), energy).tissue
+    tissue = FIXED_TOPOLOGY(random_tissue(n, 1), energy).tissue
     friction = SubstrateFriction(2.0) + PerimeterViscosity(0.3)
     velocity = mechanics.recoil(tissue, energy, 5, friction)
     # Only the four vertices near the cut move much, and its ends move apart.
@@ -129,7 +129,9 @@ def test_recoil_at_rest_is_the_first_motion_of_a_tissue_without_that_tension():
         cut,
         friction,
         [0.0, 1e-5],
-        relaxation=eqx.tree_at(lambda r: r.tolerance, STILL, 1e-9, is_leaf=lambda x: x is None),
+        relaxation=eqx.tree_at(
+            lambda r: r.tolerance, FIXED_TOPOLOGY, 1e-9, is_leaf=lambda x: x is None
+        ),
     )
     moved = np.asarray(movie.tissue.vertices - tissue.vertices) / 1e-5
     np.testing.assert_allclose(moved, velocity, atol=2e-3 * np.abs(velocity).max())

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import STILL, central_difference, random_like, random_tissue
+from helpers import FIXED_TOPOLOGY, central_difference, random_like, random_tissue
 
 import vertax as vx
 from vertax.dissipations import PerimeterViscosity, SubstrateFriction
@@ -52,7 +52,7 @@ def test_pinned_vertices_stand_still_and_gradients_are_right():
 
 @pytest.mark.thorough
 def test_explicit_steps_of_diffrax_go_where_implicit_ones_go():
-    tissue = STILL(random_tissue(9, 4), ENERGY).tissue
+    tissue = FIXED_TOPOLOGY(random_tissue(9, 4), ENERGY).tissue
     start = tissue.with_vertices(tissue.vertices + 0.02 * random_like(tissue.vertices, 7))
     friction = SubstrateFriction(1.5)
     move = lambda t, x, args: velocities(start.with_vertices(x), ENERGY, friction, throw=False)
@@ -69,7 +69,13 @@ def test_explicit_steps_of_diffrax_go_where_implicit_ones_go():
     errors = []
     for substeps in (10, 20):
         implicit = vx.evolve(
-            start, ENERGY, friction, [0.0, 0.2], order=2, substeps=substeps, relaxation=STILL
+            start,
+            ENERGY,
+            friction,
+            [0.0, 0.2],
+            order=2,
+            substeps=substeps,
+            relaxation=FIXED_TOPOLOGY,
         )
         errors.append(float(jnp.max(jnp.abs(implicit.tissue.vertices - explicit.ys[-1]))))
     assert errors[1] < 1e-4

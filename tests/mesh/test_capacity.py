@@ -1,3 +1,5 @@
+"""Spare slots of tissues."""
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,7 @@ each_kind = pytest.mark.parametrize(
 
 
 @each_kind
-def test_spare_slots_are_valid_and_come_off_again(kind):
+def test_adding_and_removing_spare_slots_is_the_identity(kind):
     tissue = KINDS[kind]()
     roomy = tissue.with_capacity(10)
     roomy.topology.validate()
@@ -44,7 +46,7 @@ def test_spare_slots_are_valid_and_come_off_again(kind):
 
 
 @each_kind
-def test_energy_and_forces_do_not_see_spare_slots(kind):
+def test_energy_and_forces_do_not_depend_on_spare_slots(kind):
     tissue = KINDS[kind]()
     roomy = tissue.with_capacity(9)
     energy = (
@@ -67,7 +69,7 @@ def test_energy_and_forces_do_not_see_spare_slots(kind):
 
 @settings(max_examples=5, deadline=None)
 @given(shift=st.floats(-3, 3), turn=st.floats(-1, 1))
-def test_drift_of_the_whole_is_that_of_what_lives(shift, turn):
+def test_spare_vertices_do_not_change_rigid_motions(shift, turn):
     tissue = KINDS["free"]()
     roomy = tissue.with_capacity(9)
 
@@ -80,7 +82,7 @@ def test_drift_of_the_whole_is_that_of_what_lives(shift, turn):
     np.testing.assert_allclose(back.vertices[alive], roomy.vertices[alive], atol=1e-12)
 
 
-def test_broken_slots_are_found():
+def test_invalid_spare_slots_are_rejected():
     m = random_tissue(6, 3).with_capacity(8).topology
     twin = np.array(m.twin)
     a, b = twin.size - 12, twin.size - 6  # of two slots
@@ -91,14 +93,14 @@ def test_broken_slots_are_found():
         vx.Topology(m.twin, m.cell, m.frame, m.edge)
 
 
-def test_room_for_fewer_is_refused():
-    with pytest.raises(ValueError, match="room for"):
+def test_smaller_capacity_is_rejected():
+    with pytest.raises(ValueError, match="capacity of the tissue"):
         random_tissue(6).with_capacity(5)
     with pytest.raises(TypeError, match=r"jax\.jit"):
         jax.jit(lambda t: t.without_spare())(random_tissue(6).with_capacity(7))
 
 
-def test_pins_and_arcs_keep_their_places():
+def test_pinned_vertices_stay_pinned():
     pinned = free_tissue()
     pinned = eqx.tree_at(
         lambda t: t.pinned, pinned, jnp.arange(pinned.n_vertices) < 2, is_leaf=lambda x: x is None

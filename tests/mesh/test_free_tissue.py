@@ -1,4 +1,4 @@
-"""Free tissues: an exterior, arcs, and their geometry."""
+"""Free tissues: exterior, arcs and geometry."""
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ import vertax as vx
 from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity, ShapeFactorEnergy
 
 few = settings(max_examples=10, deadline=None)
-clusters = st.builds(  # recipes: call one to make its tissue
+clusters = st.builds(  # functions that create a tissue
     lambda n, seed, curved: lambda: cluster(n, seed, random_angles=True, inner_arcs=curved),
     st.sampled_from([2, 9]),
     st.integers(0, 2**16),
@@ -45,7 +45,7 @@ def geometry(tissue):
 
 @few
 @given(clusters, st.floats(0, 6.3), st.floats(-30, 30))
-def test_rigid_motions_change_no_shape(recipe, angle, x):
+def test_geometry_is_invariant_under_rigid_motions(recipe, angle, x):
     tissue = recipe()
     before, after = geometry(tissue), geometry(rotated(tissue, angle, (x, -0.3 * x)))
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -57,19 +57,19 @@ def test_rigid_motions_change_no_shape(recipe, angle, x):
 
 @few
 @given(clusters, st.integers(0, 1000))
-def test_relabelling_changes_no_shape(recipe, seed):
+def test_geometry_is_invariant_under_relabelling(recipe, seed):
     tissue = recipe()
     new, cell, edge = relabelled(tissue, seed)
     before, after = geometry(tissue), geometry(new)
     for name in PER_CELL:
-        # Not to rounding: sums are in another order, and small cells are differences of large numbers.
+        # Not exactly: the order of sums differs, and small areas are differences of large numbers.
         np.testing.assert_allclose(after[name][cell], before[name], rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(after["edge_lengths"][edge], before["edge_lengths"], rtol=1e-12)
 
 
 @few
 @given(clusters, st.floats(0.01, 100))
-def test_units_of_length_change_no_shape(recipe, unit):
+def test_geometry_scales_with_the_unit_of_length(recipe, unit):
     tissue = recipe()
     vertices = jnp.asarray(unit * np.asarray(tissue.vertices))
     scaled = vx.Tissue(
@@ -114,12 +114,12 @@ def test_geometry_agrees_with_fine_polygons(inner_arcs):
     np.testing.assert_allclose(tissue.edge_curvatures * length, 2 * angle, atol=1e-12)
 
 
-def test_arcs_out_of_the_tissue_are_positive_and_enlarge_it():
+def test_positive_angles_on_the_outline_increase_the_area():
     tissue = cluster(8, 1)
     total = lambda angle: with_angles(tissue, jnp.full(tissue.n_edges, angle)).areas.sum()
     assert total(-0.5) < total(0.0) < total(0.5)
     straight = vx.Tissue(tissue.vertices, tissue.topology, vx.Free())
-    # (One of the cells has no area, up to rounding.)
+    # (One of the cells has area 0 up to rounding.)
     flat = with_angles(tissue, 0 * angles_of(tissue))
     np.testing.assert_allclose(flat.areas, straight.areas, atol=1e-14)
     assert isinstance(straight.configuration, jax.Array)
@@ -127,8 +127,8 @@ def test_arcs_out_of_the_tissue_are_positive_and_enlarge_it():
     np.testing.assert_array_equal(straight.edge_angles, 0)
 
 
-def test_a_disc_of_two_cells():
-    tissue = with_angles(doublet(), jnp.full(3, np.pi / 2))  # the interface's angle does not count
+def test_geometry_of_a_disc_of_two_cells():
+    tissue = with_angles(doublet(), jnp.full(3, np.pi / 2))  # the angle of the interface is ignored
     np.testing.assert_allclose(tissue.areas, np.pi / 8, rtol=1e-14)
     np.testing.assert_allclose(tissue.perimeters, np.pi / 2 + 1, rtol=1e-14)
     np.testing.assert_allclose(
@@ -137,7 +137,7 @@ def test_a_disc_of_two_cells():
     np.testing.assert_allclose(tissue.edge_curvatures, [2, 0, 2], rtol=1e-14)
 
 
-def test_inactive_angles_do_not_count_and_do_not_move():
+def test_angles_of_straight_edges_are_ignored_and_fixed():
     tissue = cluster(6, 2)
     inner = ~tissue.is_arc
     other = with_angles(tissue, jnp.where(inner, 17.0, angles_of(tissue)))
@@ -159,7 +159,7 @@ def derivatives(tissue, energy, y, direction):
 
 @pytest.mark.parametrize("inner_arcs", [False, True])
 @pytest.mark.parametrize("angle", [None, 0.0, -0.7, 2.0])
-def test_forces_and_second_derivatives_against_finite_differences(inner_arcs, angle):
+def test_forces_and_hessian_agree_with_finite_differences(inner_arcs, angle):
     tissue = cluster(5, 4, inner_arcs=inner_arcs)
     if angle is not None:  # exactly straight, concave, beyond a semicircle
         tissue = with_angles(tissue, jnp.full(tissue.n_edges, angle))
@@ -192,7 +192,7 @@ def test_forces_and_torque_sum_to_zero(curved):
     assert jnp.sum(x[:, 0] * force[:, 1] - x[:, 1] * force[:, 0]) == pytest.approx(0, abs=1e-11)
 
 
-def test_periodic_tissues_may_have_arcs():
+def test_periodic_tissue_with_arcs():
     straight = random_tissue(9, 1)
     tissue = vx.Tissue(
         straight.vertices,
@@ -208,7 +208,7 @@ def test_periodic_tissues_may_have_arcs():
     assert (bent.edge_lengths > straight.edge_lengths).all()
 
 
-def test_topologies_with_an_exterior():
+def test_euler_formula_of_a_topology_with_an_exterior():
     tissue = cluster(20, 0)
     m = tissue.topology
     assert (m.n_cells, m.n_faces) == (20, 21)
@@ -218,13 +218,13 @@ def test_topologies_with_an_exterior():
     np.testing.assert_array_equal(m.edge_cells[:, 1] == 20, m.on_outline)
 
 
-def test_broken_topologies_with_an_exterior_are_refused():
+def test_invalid_topologies_with_an_exterior_are_rejected():
     m = cluster(6, 0).topology
     twin, cell, frame = (np.array(x) for x in (m.twin, m.cell, m.frame))
     frame[0] = 1
     with pytest.raises(ValueError, match="`frame`"):
         vx.Topology(twin, cell, frame, exterior=True)
-    # Two clusters with one exterior: two pieces.
+    # Two clusters with one exterior.
     n = len(twin)
     both = np.where(cell < 6, cell + 6, 12)
     with pytest.raises(ValueError, match=r"one face|one piece"):
@@ -234,7 +234,7 @@ def test_broken_topologies_with_an_exterior_are_refused():
             np.zeros((2 * n, 2), int),
             exterior=True,
         )
-    # A torus has no exterior: there is a cell too many.
+    # The Euler characteristic of a torus is not that of a sphere.
     periodic = random_tissue(6).topology
     with pytest.raises(ValueError, match="must be 1 for a free tissue, but is -1"):
         vx.Topology(periodic.twin, periodic.cell, periodic.frame, exterior=True)
@@ -242,7 +242,7 @@ def test_broken_topologies_with_an_exterior_are_refused():
         vx.Topology(m.twin, m.cell, m.frame)
 
 
-def test_arguments_are_checked():
+def test_invalid_arguments_are_rejected():
     free, periodic = cluster(4), random_tissue(4)
     n_edges, n_vertices = free.n_edges, free.n_vertices
     make = lambda **options: vx.Tissue(free.vertices, free.topology, vx.Free(), **options)
@@ -268,13 +268,13 @@ def test_arguments_are_checked():
 
 @few
 @given(st.sampled_from([2, 9, 60]), st.integers(0, 2**16), st.integers(0, 2))
-@example(60, 1, 0)  # its random arcs overlap at first
-def test_free_voronoi_clusters_are_whole_and_keep_their_areas(n, seed, lloyd_steps):
+@example(60, 1, 0)  # before the repair its arcs overlap
+def test_free_voronoi_clusters_are_valid(n, seed, lloyd_steps):
     tissue = cluster(n, seed, lloyd_steps=lloyd_steps)
     tissue.topology.validate()
     assert (tissue.n_cells, tissue.n_vertices) == (n, 2 * n - 2)
     assert (tissue.areas > 0).all()
-    # A circle over a very short chord would be larger than what is left of some cells.
+    # The angle is limited, because a circle over a very short chord may be larger than its cell.
     assert jnp.abs(tissue.edge_angles).max() <= 0.9 * np.pi
     random = cluster(n, seed, lloyd_steps=lloyd_steps, random_angles=True)
     np.testing.assert_array_equal(random.vertices, tissue.vertices)

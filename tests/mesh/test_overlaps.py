@@ -1,16 +1,16 @@
-"""Where tissues overlap, against brute force."""
+"""Overlaps agree with a brute-force test."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brute_force_overlaps import faces_that_overlap
 from free_helpers import cluster
 from hypothesis import given, settings, strategies as st
-from tilings import faces_that_overlap
 
 import vertax as vx
-from vertax.mesh._overlaps import _last, around, crossed_sides
+from vertax.mesh._overlaps import _last, crossed_sides, loop_over_side_pairs
 
 overlaps_of = eqx.filter_jit(lambda tissue: tissue.overlaps)
 PERIODIC = vx.initialise.periodic_voronoi(n_cells=12, key=1)
@@ -24,7 +24,7 @@ def faces(overlaps) -> list[int]:
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), size=st.floats(0, 0.6), sheared=st.booleans())
-def test_periodic_tissues_against_brute_force(seed, size, sheared):
+def test_overlaps_of_periodic_tissues_agree_with_brute_force(seed, size, sheared):
     lattice = np.asarray(PERIODIC.boundary.lattice) @ np.array([[1.0, 0.0], [0.4 * sheared, 1.0]])
     vertices = np.asarray(PERIODIC.vertices) @ np.array([[1.0, 0.0], [0.4 * sheared, 1.0]])
     moves = size * np.random.default_rng(seed).normal(size=vertices.shape)
@@ -38,17 +38,17 @@ def test_periodic_tissues_against_brute_force(seed, size, sheared):
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), size=st.floats(0, 0.5), bend=st.floats(0, 1.2))
-def test_free_tissues_with_arcs_against_brute_force(seed, size, bend):
+def test_overlaps_of_free_tissues_agree_with_brute_force(seed, size, bend):
     rng = np.random.default_rng(seed)
     moves = size * rng.normal(size=FREE.vertices.shape)
     angles = np.clip(np.asarray(FREE.angles) + bend * rng.normal(size=FREE.n_edges), -2.8, 2.8)
     tissue = FREE.with_vertices(FREE.vertices + moves).with_angles(jnp.asarray(angles))
-    found = faces(overlaps_of(tissue))
-    # Arcs that hardly touch need fine polygons (seed 446, size 0, bend 1.0486: more than 600 points).
-    assert found in (faces_that_overlap(tissue, points) for points in (160, 600, 2000))
+    overlapping = faces(overlaps_of(tissue))
+    # Arcs that barely touch need fine polygons (seed 446, size 0, bend 1.0486: more than 600 points).
+    assert overlapping in (faces_that_overlap(tissue, points) for points in (160, 600, 2000))
 
 
-def test_a_corner_that_moved_through_the_opposite_side():
+def test_a_corner_beyond_the_opposite_side_is_an_overlap():
     tissue = vx.initialise.hexagonal(2, 2)
     assert not overlaps_of(tissue).any
     assert overlaps_of(tissue).describe() == ""
@@ -65,15 +65,15 @@ def test_a_corner_that_moved_through_the_opposite_side():
     assert f"{cell[0] // 3}" in overlaps.describe()
 
 
-def test_sides_in_one_line_do_not_cross():
-    # Every other edge of a row of bricks lies in one line with the next, up to rounding.
+def test_collinear_sides_do_not_cross():
+    # In a row of bricks, consecutive edges are collinear up to rounding.
     tissue = vx.initialise.hexagonal(4, 4)
     lines = np.round(np.asarray(tissue.vertices)[:, 1] / 0.31) * 0.31
     bricks = tissue.with_vertices(tissue.vertices.at[:, 1].set(lines))
     assert faces(overlaps_of(bricks)) == faces_that_overlap(bricks)
 
 
-def test_a_tissue_inside_out_is_seen():
+def test_cells_inside_out_are_overlaps():
     tissue = PERIODIC
     mirrored = eqx.tree_at(
         lambda t: (t.vertices, t.boundary.lattice),
@@ -88,7 +88,7 @@ def test_a_tissue_inside_out_is_seen():
     assert not np.any(overlaps.sides)
 
 
-def test_a_batch_has_overlaps_of_its_own():
+def test_overlaps_vmap_over_tissues():
     moved = PERIODIC.with_vertices(PERIODIC.vertices.at[3].add(2.0))
     both = jax.tree.map(lambda *x: jnp.stack(x), PERIODIC, moved)
     overlaps = eqx.filter_vmap(lambda t: t.overlaps)(both)
@@ -99,15 +99,14 @@ def test_a_batch_has_overlaps_of_its_own():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_first_tissues_do_not_overlap(dtype):
+def test_initial_tissues_do_not_overlap(dtype):
     for tissue in (PERIODIC, FREE):
         cast = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tissue)
         assert not overlaps_of(cast).any
 
 
 @pytest.mark.parametrize("spare", [0, 3])
-def test_walking_in_pieces_is_walking(spare):
-    """Faces with very many sides are walked to their end by themselves."""
+def test_loop_over_side_pairs_in_pieces_agrees_with_one_loop(spare):
     tissue = cluster(30, seed=2).with_capacity(30 + spare)
     shaken = tissue.vertices + 0.25 * jax.random.normal(jax.random.key(0), tissue.vertices.shape)
     tissue = tissue.with_vertices(shaken)
@@ -118,13 +117,15 @@ def test_walking_in_pieces_is_walking(spare):
 
     def visited(few_long):
         def body(pair, carry):
-            met, total = carry
-            apart = pair.other != pair.here
-            seen = jnp.sum(pair.mine[:, :2] * pair.theirs[:, 2:4], axis=-1)
-            return met + apart, total + jnp.where(apart, pair.k * pair.other + seen, 0.0)
+            count, total = carry
+            paired = pair.other != pair.half_edge
+            product = jnp.sum(pair.side[:, :2] * pair.other_side[:, 2:4], axis=-1)
+            return count + paired, total + jnp.where(paired, pair.k * pair.other + product, 0.0)
 
-        start, here = (jnp.zeros(n, int), jnp.zeros(n)), jnp.arange(n, dtype=m.next.dtype)
-        return around(tissue.sides_of, m.next, here, last, body, start, few_long=few_long)
+        start, half_edges = (jnp.zeros(n, int), jnp.zeros(n)), jnp.arange(n, dtype=m.next.dtype)
+        return loop_over_side_pairs(
+            tissue.sides_of, m.next, half_edges, last, body, start, few_long=few_long
+        )
 
     both = [jax.jit(visited, static_argnums=0)(few_long) for few_long in (False, True)]
     np.testing.assert_array_equal(both[0][0], jnp.maximum(last, 0))

@@ -1,4 +1,4 @@
-"""Tissues of nearly the same size are brought to one size."""
+"""Padding of tissues to size classes."""
 
 import equinox as eqx
 import jax
@@ -18,17 +18,17 @@ N = 9
 
 
 @given(st.integers(1, 100_000))
-def test_a_size_class_is_at_most_a_quarter_more_and_belongs_to_itself(n):
+def test_size_class_adds_at_most_a_quarter_and_is_idempotent(n):
     size = size_class(n)
     assert n <= size <= 1.25 * n
     assert size_class(size) == size
 
 
-def test_sizes_within_a_fifth_have_two_classes_at_most():
+def test_similar_sizes_share_size_classes():
     assert len({size_class(n) for n in range(90, 111)}) == 2
 
 
-def test_a_padded_tissue_relaxes_as_it_does_alone():
+def test_relaxation_does_not_depend_on_padding():
     tissue, energy = random_tissue(N), vx.energies.ShapeFactorEnergy(jnp.linspace(3.6, 3.8, N))
     padded, longer = pad(tissue, energy)
     assert padded.n_cells == len(longer.target_shape_factor) == 11
@@ -39,7 +39,7 @@ def test_a_padded_tissue_relaxes_as_it_does_alone():
     np.testing.assert_allclose(together.without_spare().vertices, alone.vertices, atol=1e-7)
 
 
-def test_what_is_padded_is_what_fields_declare():
+def test_only_declared_axes_are_padded():
     class Network(eqx.Module):
         weights: Float[Array, "cells"]
         by_edge: Float[Array, "knots edges"]
@@ -55,7 +55,7 @@ def test_what_is_padded_is_what_fields_declare():
     assert eqx.tree_equal(longer.matrix, network.matrix)
 
 
-def test_an_array_that_may_be_one_a_cell_must_declare_it():
+def test_undeclared_axes_of_matching_size_are_rejected():
     class Vague(eqx.Module):
         weights: Array
 
@@ -65,13 +65,13 @@ def test_an_array_that_may_be_one_a_cell_must_declare_it():
         pad(random_tissue(N), vx.energies.ShapeFactorEnergy(jnp.ones(8)))
 
 
-def test_padding_needs_numbers():
+def test_padding_inside_jit_is_rejected():
     with pytest.raises(TypeError, match=r"does not work inside jax\.jit"):
         eqx.filter_jit(pad)(random_tissue(N))
 
 
 @pytest.mark.parametrize("arcs", [None, False, True])
-def test_the_geometry_in_numpy_is_that_of_the_tissue(arcs):
+def test_numpy_geometry_agrees_with_the_tissue(arcs):
     if arcs is None:
         tissue = random_tissue(N)
     else:

@@ -1,8 +1,10 @@
+"""Distances between pairs of sides."""
+
 import jax.numpy as jnp
 import numpy as np
+from brute_force_overlaps import side_points
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.distance import cdist
-from tilings import piece
 
 from vertax.mesh._sides import bulge_gap, circle_of
 
@@ -25,19 +27,21 @@ def gap_between(one, other):
     middle=st.tuples(st.floats(0.1, 0.9), st.floats(0.01, 2)),
     half=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
 )
-def test_the_gap_between_an_arc_and_another_side_is_the_least_distance(bulge, angle, middle, half):
+def test_bulge_gap_is_the_minimum_distance(bulge, angle, middle, half):
     start, end = np.subtract(middle, half), np.add(middle, half)
     one, other = side([0.0, 0.0], [1.0, 0.0], -bulge), side(start, end, angle)
     gap, weight = gap_between(one, other)
     if weight == 0:
         return
-    points = piece(np.zeros(2), np.array([1.0, 0.0]), -bulge, 800)
-    others = np.linspace(start, end, 800) if abs(angle) < 1e-9 else piece(start, end, angle, 800)
+    points = side_points(np.zeros(2), np.array([1.0, 0.0]), -bulge, 800)
+    others = (
+        np.linspace(start, end, 800) if abs(angle) < 1e-9 else side_points(start, end, angle, 800)
+    )
     np.testing.assert_allclose(gap, cdist(points, others).min(), rtol=1e-2, atol=1e-4)
 
 
-def test_a_bulge_meets_a_flat_side_between_its_ends():
-    one = side([0.0, 0.0], [1.0, 0.0], -0.5 * np.pi)  # a half circle, upwards
+def test_bulge_gap_to_a_straight_or_flat_side():
+    one = side([0.0, 0.0], [1.0, 0.0], -0.5 * np.pi)  # a semicircle above its chord
     for angle in (0.0, 1e-5, -1e-5):
         gap, weight = gap_between(one, side([1.5, 0.6], [-0.5, 0.6], angle))
         np.testing.assert_allclose((gap, weight), (0.1, 1), atol=1e-4)

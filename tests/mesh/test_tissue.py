@@ -1,3 +1,5 @@
+"""Geometry of periodic tissues."""
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,14 +25,14 @@ def compiled_shape(tissue, vertices):
 
 
 def shape(tissue, vertices=None):
-    """Areas, perimeters, centroids, and more, perhaps with other vertices."""
+    """Areas, perimeters, centroids, numbers of sides and corners, for given vertices."""
     vertices = tissue.vertices if vertices is None else jnp.asarray(vertices)
     return [np.asarray(x) for x in compiled_shape(tissue, vertices)]
 
 
 @many
 @given(tissues())
-def test_areas_sum_to_the_box(recipe):
+def test_areas_sum_to_the_area_of_the_box(recipe):
     tissue = recipe()
     areas = shape(tissue)[0]
     assert areas.sum() == pytest.approx(np.linalg.det(tissue.boundary.lattice), rel=1e-12)
@@ -39,7 +41,7 @@ def test_areas_sum_to_the_box(recipe):
 
 @many
 @given(tissues(), st.floats(-30, 30), st.floats(-30, 30))
-def test_translation_changes_no_shape(recipe, x, y):
+def test_geometry_is_invariant_under_translation(recipe, x, y):
     tissue = recipe()
     areas, perimeters, centroids, *_ = shape(tissue)
     moved = shape(tissue, np.asarray(tissue.vertices) + np.array([x, y]))
@@ -50,7 +52,7 @@ def test_translation_changes_no_shape(recipe, x, y):
 
 @many
 @given(tissues(), st.floats(0, 6.3))
-def test_rotation_changes_no_shape(recipe, angle):
+def test_geometry_is_invariant_under_rotation(recipe, angle):
     tissue = recipe()
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     turned = with_lattice(tissue, np.asarray(tissue.boundary.lattice) @ turn)
@@ -61,7 +63,7 @@ def test_rotation_changes_no_shape(recipe, angle):
 
 @many
 @given(tissues(min_cells=2), st.randoms(use_true_random=False))
-def test_relabelling_the_seeds_relabels_the_cells(recipe, random):
+def test_cells_have_the_order_of_their_seeds(recipe, random):
     tissue = recipe()
     seeds = np.random.default_rng(random.randrange(1000)).random((tissue.n_cells, 2)) @ np.asarray(
         tissue.boundary.lattice
@@ -76,9 +78,9 @@ def test_relabelling_the_seeds_relabels_the_cells(recipe, random):
 
 @many
 @given(tissues(max_cells=12))
-def test_geometry_of_each_cell_agrees_with_its_polygon(recipe):
+def test_geometry_agrees_with_polygon_formulas(recipe):
     tissue = recipe()
-    # The polygons, walked in Python from corner to corner, with the plain shoelace formula.
+    # The polygons from a loop over corners in Python, with the shoelace formula.
     m, (areas, perimeters, centroids, neighbour_counts, corners) = tissue.topology, shape(tissue)
     following, cell = np.asarray(m.next), np.asarray(m.cell)
     for c in range(tissue.n_cells):
@@ -101,7 +103,7 @@ def test_geometry_of_each_cell_agrees_with_its_polygon(recipe):
 
 @pytest.mark.parametrize("sides", [3, 4, 5, 6, 7])
 def test_shape_factor_of_a_regular_polygon(sides):
-    # Lay the corners of one cell with that many sides on a circle.
+    # Move the corners of a cell with this number of sides to a circle.
     for seed in range(30):
         tissue = random_tissue(30, seed, softening=0.0)
         cells = np.flatnonzero(np.asarray(tissue.neighbour_counts) == sides)
@@ -124,7 +126,7 @@ def test_shape_factor_of_a_regular_polygon(sides):
     pytest.fail(f"no cell with {sides} sides among the test tissues")
 
 
-def test_hexagonal_lattice():
+def test_geometry_of_the_hexagonal_lattice():
     tissue = vx.initialise.hexagonal(4, 6, area=2.5, softening=0.0)
     np.testing.assert_allclose(tissue.areas, 2.5, rtol=1e-12)
     np.testing.assert_allclose(tissue.shape_factors, 3.7224194364083982, rtol=1e-12)
@@ -138,14 +140,14 @@ def test_hexagonal_lattice():
 
 
 @pytest.mark.parametrize("n_cells", [1, 2, 3])
-def test_cells_that_span_the_box(n_cells):
+def test_cells_as_wide_as_the_box(n_cells):
     tissue = random_tissue(n_cells, 5, lattice=np.array([[1.0, 0.0], [0.3, n_cells]]))
     assert tissue.areas.sum() == pytest.approx(n_cells)
-    # Every cell is as wide as the box or wider: it touches its own image.
+    # A cell touches its own image.
     assert any(a == b for a, b in np.asarray(tissue.topology.edge_cells).tolist())
 
 
-def test_vertices_may_leave_the_box_one_by_one():
+def test_geometry_does_not_depend_on_the_images_of_vertices():
     tissue = random_tissue(9, 1)
     jumps = np.random.default_rng(0).integers(-2, 3, (tissue.n_vertices, 2))
     m = tissue.topology
@@ -159,7 +161,7 @@ def test_vertices_may_leave_the_box_one_by_one():
     np.testing.assert_allclose(moved.edge_vectors, tissue.edge_vectors, atol=1e-12)
 
 
-def test_derivatives_of_geometry():
+def test_derivatives_of_geometry_agree_with_finite_differences():
     tissue = random_tissue(6, 2)
     names = ("areas", "perimeters", "shape_factors", "centroids", "edge_lengths")
 
@@ -194,7 +196,7 @@ def test_derivatives_are_finite_at_a_four_fold_vertex(softening):
         assert jnp.isfinite(second).all()
 
 
-def test_softening_changes_lengths_by_parts_in_a_million():
+def test_default_softening_changes_lengths_by_a_millionth():
     soft, sharp = random_tissue(50, 1), random_tissue(50, 1, softening=0.0)
     exact = jnp.linalg.norm(sharp.edge_vectors, axis=1)
     np.testing.assert_allclose(sharp.edge_lengths, exact, rtol=1e-14)
@@ -204,7 +206,7 @@ def test_softening_changes_lengths_by_parts_in_a_million():
     )
 
 
-def test_float32_tissues_stay_float32():
+def test_geometry_of_float32_tissues_is_float32():
     tissue = random_tissue(400, 0)
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     small = jax.tree.map(to32, tissue)
@@ -215,7 +217,7 @@ def test_float32_tissues_stay_float32():
         )
 
 
-def test_bad_tissues_are_refused():
+def test_invalid_tissues_are_rejected():
     tissue = random_tissue(5)
     with pytest.raises(ValueError, match="`vertices` must have shape"):
         vx.Tissue(tissue.vertices[:-1], tissue.topology, tissue.boundary)
@@ -236,7 +238,7 @@ def test_bad_tissues_are_refused():
 
 @many
 @given(tissues(), st.integers(-3, 3), st.integers(-3, 3), st.integers(0, 100))
-def test_shortest_displacement_is_the_shortest_image(recipe, i, j, seed):
+def test_shortest_displacement_agrees_with_brute_force(recipe, i, j, seed):
     tissue = recipe()
     boundary = tissue.boundary
     d = np.random.default_rng(seed).uniform(-1, 1, (5, 2)) @ np.asarray(boundary.lattice)

@@ -1,3 +1,5 @@
+"""The half-edge mesh: invariants, validation, edge flips."""
+
 import copy
 from typing import Any
 
@@ -35,7 +37,7 @@ def test_rotation_system_is_consistent(recipe):
     assert m.neighbour_counts.sum() == m.n_half_edges
 
 
-def test_slots_turn_around_their_vertex():
+def test_rotations_around_a_vertex():
     h = jnp.arange(30, dtype=jnp.int32)
     np.testing.assert_array_equal(clockwise(counter_clockwise(h)), h)
     np.testing.assert_array_equal(clockwise(h) // 3, h // 3)
@@ -90,7 +92,7 @@ def _set(index, value):
         ({"twin": _set(0, 2**40)}, "involution"),
         ({"twin": _set(0, -1)}, "involution"),
         ({"frame": lambda f: f + 0.5}, "`frame` must hold integers"),
-        ({"frame": _set((0, 1), 2**40)}, "`frame` must hold lattice images that 32 bits"),
+        ({"frame": _set((0, 1), 2**40)}, "`frame` must hold lattice images in the range of 32-bit"),
         ({"edge": _set(0, 2**40)}, "`edge` must give each half-edge a number"),
         ({"edge": lambda e: e + 0.0}, "`edge` must give each half-edge a number"),
         ({"frame": _set((0, 1), 7)}, "opposite lattice offsets"),
@@ -99,12 +101,12 @@ def _set(index, value):
         ({"edge": lambda e: e + 1}, "`edge`"),
     ],
 )
-def test_broken_invariants_are_named(changes, message):
+def test_violated_invariants_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         _break(random_tissue(8), **changes)()
 
 
-def test_two_separate_tissues_are_refused():
+def test_disconnected_meshes_are_rejected():
     m = random_tissue(8).topology
     n = m.n_half_edges
     with pytest.raises(ValueError, match="in one piece"):
@@ -115,8 +117,8 @@ def test_two_separate_tissues_are_refused():
         )
 
 
-def test_a_two_sided_cell_is_refused():
-    # Flip an edge of a three-sided cell by hand: the transition rule would refuse it.
+def test_a_cell_with_two_sides_is_rejected():
+    # Flip an edge of a cell with three sides, which the T1 rule would not flip.
     for seed in range(50):
         m = random_tissue(20, seed).topology
         cells = np.asarray(m.edge_cells)
@@ -127,7 +129,7 @@ def test_a_two_sided_cell_is_refused():
             with pytest.raises(ValueError, match="at least three sides"):
                 broken.validate()
             return
-    pytest.fail("no three-sided cell among the test tissues")
+    pytest.fail("no cell with three sides among the test tissues")
 
 
 def _flippable(m):
@@ -142,7 +144,7 @@ def _flippable(m):
 
 @settings(max_examples=10, deadline=None)
 @given(tissues(min_cells=5), st.lists(st.integers(0, 10**6), min_size=1, max_size=8))
-def test_flips_keep_every_invariant(recipe, choices):
+def test_flips_preserve_all_invariants(recipe, choices):
     tissue = recipe()
     area = float(tissue.areas.sum())
     for choice in choices:
@@ -154,14 +156,14 @@ def test_flips_keep_every_invariant(recipe, choices):
         assert set(np.asarray(flipped.edge_cells)[edge]) == set(ends[edge])
         others = np.arange(m.n_edges) != edge
         before, after = np.asarray(m.edge_cells), np.asarray(flipped.edge_cells)
-        # All other edges stay between their cells, and carry their numbers along.
+        # All other edges keep their cells and their numbers.
         assert (np.sort(before[others]) == np.sort(after[others])).all()
         tissue = tissue.with_topology(flipped)
         assert float(tissue.areas.sum()) == pytest.approx(area, rel=1e-12)
 
 
 @pytest.mark.parametrize("edge", [0, 7, 31])
-def test_a_flip_and_its_inverse_are_the_identity(edge):
+def test_four_flips_are_the_identity(edge):
     m = random_tissue(16, 3).topology
     mark = jnp.arange(m.n_edges) == edge
     twice = flip(flip(m, mark), mark)
@@ -172,7 +174,7 @@ def test_a_flip_and_its_inverse_are_the_identity(edge):
         assert (getattr(again, name) == getattr(m, name)).all(), name
 
 
-def test_flipping_nothing_changes_nothing():
+def test_flipping_no_edge_is_the_identity():
     m = random_tissue(16, 3).topology
     same = flip(m, jnp.zeros(m.n_edges, bool))
     assert all(jax.tree.leaves(jax.tree.map(lambda a, b: bool((a == b).all()), m, same)))
@@ -186,10 +188,10 @@ def _same(one, other):
 
 @pytest.mark.parametrize("numbered", [False, True])
 @pytest.mark.parametrize("free", [False, True])
-def test_inside_jit_and_vmap_it_is_the_same(free, numbered):
+def test_construction_in_jit_and_vmap_agrees(free, numbered):
     make = vx.initialise.free_voronoi if free else vx.initialise.periodic_voronoi
     topologies = [make(9, key=jax.random.key(seed)).topology for seed in (1, 2)]
-    # (Free clusters of as many cells need not have as many vertices.)
+    # (Free clusters with the same number of cells may differ in their number of vertices.)
     topologies = topologies if not free else topologies[:1] * 2
     arrays = lambda m: (m.twin, m.cell, m.frame) + ((m.edge,) if numbered else ())
     build = lambda *arrays: vx.Topology(*arrays, exterior=free)
@@ -202,7 +204,7 @@ def test_inside_jit_and_vmap_it_is_the_same(free, numbered):
         _same(jax.tree.map(lambda x, k=k: x[k], many), plain[k])
 
 
-def test_inside_jit_shapes_and_types_are_checked():
+def test_shapes_and_dtypes_are_checked_inside_jit():
     m = random_tissue(8).topology
     build = jax.jit(vx.Topology)
     with pytest.raises(ValueError, match="`twin` must list three half-edges"):
@@ -220,15 +222,15 @@ def test_inside_jit_shapes_and_types_are_checked():
 @pytest.mark.parametrize(
     ("field", "value"), [("half_edge", 2**30), ("half_edge", -1), ("twin", 2**30), ("edge", -7)]
 )
-def test_numbers_out_of_range_are_found(field, value):
+def test_indices_out_of_range_are_rejected(field, value):
     m = random_tissue(8).topology
     broken = eqx.tree_at(lambda m: getattr(m, field), m, getattr(m, field).at[3].set(value))
     with pytest.raises(ValueError, match=f"`{field}` must lie in 0 … "):
         broken.validate()
 
 
-def test_a_number_of_cells_out_of_range_is_found():
+def test_a_number_of_cells_out_of_range_is_rejected():
     m = copy.copy(random_tissue(8).topology)
-    object.__setattr__(m, "n_cells", 10**12)  # as a file may have it
+    object.__setattr__(m, "n_cells", 10**12)  # as in a damaged file
     with pytest.raises(ValueError, match="no more than half-edges"):
         m.validate()

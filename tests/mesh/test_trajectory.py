@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from free_helpers import cluster
-from helpers import ADAM, LOOSE, STILL, random_tissue, rewritten
+from helpers import ADAM, FIXED_TOPOLOGY, NO_CONTACT, random_tissue, rewritten
 
 import vertax as vx
 from vertax.io import load_trajectory, save_trajectory
@@ -39,69 +39,71 @@ def tension(tissue):
 
 
 @pytest.fixture(scope="module")
-def flowing():
-    """A relaxation on whose way there are T1 transitions."""
+def relaxation():
+    """A relaxation with T1 transitions."""
     tissue, energy = random_tissue(12, 3), vx.energies.ShapeFactorEnergy(jnp.full(12, 3.9))
     return tissue, energy, *record_relaxation(tissue, energy, every=2)
 
 
 @pytest.fixture
 def path(tmp_path):
-    return tmp_path / "way.npz"
+    return tmp_path / "trajectory.npz"
 
 
 class TestRelaxation:
-    def test_it_goes_from_the_tissue_to_its_equilibrium(self, flowing):
-        tissue, energy, equilibrium, way = flowing
-        assert same_bits(way[0], tissue)
-        assert same_bits(way[-1], equilibrium.tissue)
-        assert way.values["num_steps"][-1] == equilibrium.num_steps
-        assert way.values["num_t1"][-1] == equilibrium.num_t1
-        assert way.values["max_force"][-1] < 1e-9
-        assert set(np.diff(way.values["num_steps"][:-1])) == {2}
-        # Being watched changes nothing but the rounding, since another program is compiled. (Tissues that
-        # are nearly fluid have soft modes, along which rounding decides where they come to rest.)
-        unwatched = vx.equilibrate(tissue, energy)
-        assert unwatched.num_steps == equilibrium.num_steps
-        assert same_bits(unwatched.tissue.topology, equilibrium.tissue.topology)
-        assert unwatched.energy == pytest.approx(float(equilibrium.energy), rel=1e-4)
+    def test_trajectory_begins_at_the_tissue_and_ends_at_its_equilibrium(self, relaxation):
+        tissue, energy, equilibrium, trajectory = relaxation
+        assert same_bits(trajectory[0], tissue)
+        assert same_bits(trajectory[-1], equilibrium.tissue)
+        assert trajectory.values["num_steps"][-1] == equilibrium.num_steps
+        assert trajectory.values["num_t1"][-1] == equilibrium.num_t1
+        assert trajectory.values["max_force"][-1] < 1e-9
+        assert set(np.diff(trajectory.values["num_steps"][:-1])) == {2}
+        # Recording changes only the rounding, because another program is compiled. (A tissue near the fluid
+        # transition has soft modes, along which the equilibrium depends on rounding.)
+        unrecorded = vx.equilibrate(tissue, energy)
+        assert unrecorded.num_steps == equilibrium.num_steps
+        assert same_bits(unrecorded.tissue.topology, equilibrium.tissue.topology)
+        assert unrecorded.energy == pytest.approx(float(equilibrium.energy), rel=1e-4)
         np.testing.assert_allclose(
-            unwatched.tissue.vertices, equilibrium.tissue.vertices, rtol=0, atol=1e-2
+            unrecorded.tissue.vertices, equilibrium.tissue.vertices, rtol=0, atol=1e-2
         )
 
-    def test_frames_have_their_own_topology_energy_and_force(self, flowing):
-        _, energy, equilibrium, way = flowing
+    def test_values_agree_with_the_frames(self, relaxation):
+        _, energy, equilibrium, trajectory = relaxation
         assert equilibrium.num_t1 > 0
-        assert not eqx.tree_equal(way[0].topology, way[-1].topology)
+        assert not eqx.tree_equal(trajectory[0].topology, trajectory[-1].topology)
         slope = eqx.filter_jit(jax.grad(lambda v, t: energy(t.with_vertices(v))))
-        for k, frame in enumerate(way):
+        for k, frame in enumerate(trajectory):
             frame.topology.validate()
             value, force = energy(frame), jnp.abs(slope(frame.vertices, frame)).max()
-            np.testing.assert_allclose(value, way.values["energy"][k], rtol=1e-9, atol=1e-15)
-            np.testing.assert_allclose(force, way.values["max_force"][k], rtol=1e-5, atol=1e-10)
-        flips = np.diff(way.values["num_t1"])
-        changed = [not eqx.tree_equal(a.topology, b.topology) for a, b in pairwise(way)]
+            np.testing.assert_allclose(value, trajectory.values["energy"][k], rtol=1e-9, atol=1e-15)
+            np.testing.assert_allclose(
+                force, trajectory.values["max_force"][k], rtol=1e-5, atol=1e-10
+            )
+        flips = np.diff(trajectory.values["num_t1"])
+        changed = [not eqx.tree_equal(a.topology, b.topology) for a, b in pairwise(trajectory)]
         np.testing.assert_array_equal(flips > 0, changed)
 
-    def test_fewer_frames_are_some_of_more(self, flowing):
-        tissue, energy, _, way = flowing
+    def test_frames_do_not_depend_on_the_interval(self, relaxation):
+        tissue, energy, _, trajectory = relaxation
         _, sparse = record_relaxation(tissue, energy, every=4)
-        numbers = way.values["num_steps"].tolist()
+        numbers = trajectory.values["num_steps"].tolist()
         for k, frame in zip(sparse.values["num_steps"].tolist(), sparse, strict=True):
-            assert same_bits(frame, way[numbers.index(k)])
+            assert same_bits(frame, trajectory[numbers.index(k)])
 
     @pytest.mark.thorough
-    def test_a_free_cluster_does_not_turn(self):
+    def test_frames_of_a_free_cluster_have_no_drift(self):
         tissue = cluster(5)
-        equilibrium, way = record_relaxation(tissue, tension(tissue), LOOSE, every=5)
-        assert same_bits(way[-1], equilibrium.tissue)
-        assert len(way) > 2
-        for frame in way:
+        equilibrium, trajectory = record_relaxation(tissue, tension(tissue), NO_CONTACT, every=5)
+        assert same_bits(trajectory[-1], equilibrium.tissue)
+        assert len(trajectory) > 2
+        for frame in trajectory:
             drift = frame.boundary.drift(frame.vertices, tissue.vertices)
             np.testing.assert_allclose(drift, 0, atol=1e-12)
 
     @pytest.mark.thorough
-    def test_an_energy_that_knows_positions_may_move_the_whole(self):
+    def test_an_energy_of_positions_may_translate_the_tissue(self):
         class Trap(vx.AbstractEnergy):
             stiffness: float = 1.0
 
@@ -110,24 +112,24 @@ class TestRelaxation:
 
         tissue = cluster(3)
         energy = tension(tissue) + Trap()
-        found, way = record_relaxation(
+        equilibrium, trajectory = record_relaxation(
             tissue, energy, vx.Relaxation(vx.solvers.FIRE(), None, contact_range=None)
         )
-        np.testing.assert_allclose(found.tissue.vertices.mean(axis=0), 9.0, atol=1e-6)
-        steps = np.diff([np.asarray(frame.vertices.mean(axis=0)) for frame in way], axis=0)
+        np.testing.assert_allclose(equilibrium.tissue.vertices.mean(axis=0), 9.0, atol=1e-6)
+        steps = np.diff([np.asarray(frame.vertices.mean(axis=0)) for frame in trajectory], axis=0)
         assert np.abs(steps).max() < 0.2
 
-    def test_at_rest_there_is_one_frame(self, flowing):
-        _, energy, equilibrium, _ = flowing
-        # (The default tolerance is in units of the stiffness where a relaxation begins.)
+    def test_relaxation_of_an_equilibrium_has_one_frame(self, relaxation):
+        _, energy, equilibrium, _ = relaxation
+        # (The default tolerance is in units of the stiffness at the start.)
         relax = vx.Relaxation(tolerance=1e-9)
-        again, way = record_relaxation(equilibrium.tissue, energy, relax)
+        again, trajectory = record_relaxation(equilibrium.tissue, energy, relax)
         assert again.converged
-        assert len(way) == 1
+        assert len(trajectory) == 1
 
-    def test_options(self):
+    def test_options_are_those_of_the_relaxation(self):
         tissue = single(random_tissue(4))
-        found, way = record_relaxation(
+        equilibrium, trajectory = record_relaxation(
             tissue,
             vx.energies.ShapeFactorEnergy(3.7),
             vx.Relaxation(
@@ -139,11 +141,11 @@ class TestRelaxation:
             ),
             every=100,
         )
-        assert found.converged
-        assert found.max_force < 1e-2
-        assert way.values["num_t1"].max() == 0
-        assert way[1].vertices.dtype == jnp.float32
-        assert same_bits(way[0].topology, way[-1].topology)
+        assert equilibrium.converged
+        assert equilibrium.max_force < 1e-2
+        assert trajectory.values["num_t1"].max() == 0
+        assert trajectory[1].vertices.dtype == jnp.float32
+        assert same_bits(trajectory[0].topology, trajectory[-1].topology)
 
     def test_refusals(self):
         tissue, energy = random_tissue(4), vx.energies.ShapeFactorEnergy(3.7)
@@ -153,74 +155,76 @@ class TestRelaxation:
             record_relaxation(jax.tree.map(lambda x: jnp.stack([x, x]), tissue), energy)
         with pytest.raises(ValueError, match="`tolerance` must be positive"):
             record_relaxation(tissue, energy, vx.Relaxation(tolerance=0.0))
-        few = dataclasses.replace(STILL, max_steps=3)
+        few = dataclasses.replace(FIXED_TOPOLOGY, max_steps=3)
         with pytest.raises(RuntimeError, match=r"no equilibrium in 3 steps.*throw=False"):
             record_relaxation(tissue, energy, few, every=2)
-        found, way = record_relaxation(tissue, energy, few, every=2, throw=False)
-        assert not found.converged
-        assert way.values["num_steps"].tolist() == [0, 2, 3]
+        equilibrium, trajectory = record_relaxation(tissue, energy, few, every=2, throw=False)
+        assert not equilibrium.converged
+        assert trajectory.values["num_steps"].tolist() == [0, 2, 3]
 
 
 class TestFit:
     @pytest.mark.thorough
     def test_a_trajectory_is_a_callback(self):
-        target = STILL(random_tissue(4), vx.energies.ShapeFactorEnergy(3.6)).tissue
+        target = FIXED_TOPOLOGY(random_tissue(4), vx.energies.ShapeFactorEnergy(3.6)).tissue
         problem = vx.InverseProblem(
             target,
             vx.energies.ShapeFactorEnergy(jnp.full(4, 3.7)),
             vx.costs.VertexDistance(target),
-            response=STILL,
+            response=FIXED_TOPOLOGY,
         )
-        way = Trajectory(every=2)
-        fit = vx.fit(problem, ADAM, 5, callback=way)
-        assert way.values["epoch"].tolist() == [0, 2, 4]
-        np.testing.assert_array_equal(way.values["cost"], fit.history.cost[::2])
-        np.testing.assert_array_equal(way.values["num_t1"], fit.history.num_t1[::2])
-        cost = problem.cost(way[1], problem.energy)
-        np.testing.assert_allclose(cost, way.values["cost"][1], rtol=1e-12)
+        trajectory = Trajectory(every=2)
+        fit = vx.fit(problem, ADAM, 5, callback=trajectory)
+        assert trajectory.values["epoch"].tolist() == [0, 2, 4]
+        np.testing.assert_array_equal(trajectory.values["cost"], fit.history.cost[::2])
+        np.testing.assert_array_equal(trajectory.values["num_t1"], fit.history.num_t1[::2])
+        cost = problem.cost(trajectory[1], problem.energy)
+        np.testing.assert_allclose(cost, trajectory.values["cost"][1], rtol=1e-12)
 
 
 class TestSequence:
-    def test_items_slices_and_iteration(self, flowing):
-        *_, way = flowing
-        assert [same_bits(way[i], frame) for i, frame in enumerate(way)] == [True] * len(way)
-        part = way[1::2]
+    def test_items_slices_and_iteration(self, relaxation):
+        *_, trajectory = relaxation
+        assert [same_bits(trajectory[i], frame) for i, frame in enumerate(trajectory)] == [
+            True
+        ] * len(trajectory)
+        part = trajectory[1::2]
         assert isinstance(part, Trajectory)
-        assert same_bits(part[0], way[1])
-        np.testing.assert_array_equal(part.values["energy"], way.values["energy"][1::2])
+        assert same_bits(part[0], trajectory[1])
+        np.testing.assert_array_equal(part.values["energy"], trajectory.values["energy"][1::2])
         with pytest.raises(IndexError):
-            way[len(way)]
+            trajectory[len(trajectory)]
 
     def test_refusals(self):
-        way = Trajectory()
-        way.append(random_tissue(4), time=0.0)
+        trajectory = Trajectory()
+        trajectory.append(random_tissue(4), time=0.0)
         with pytest.raises(ValueError, match=r"\(4 cells.*\(5 cells, 10 vertices, Periodic"):
-            way.append(random_tissue(5), time=1.0)
+            trajectory.append(random_tissue(5), time=1.0)
         with pytest.raises(ValueError, match=r"4 cells.*float64.*4 cells.*float32"):
-            way.append(single(random_tissue(4)), time=1.0)
+            trajectory.append(single(random_tissue(4)), time=1.0)
         with pytest.raises(ValueError, match=r"values of those before it \(time\).*has: cost"):
-            way.append(random_tissue(4), cost=1.0)
+            trajectory.append(random_tissue(4), cost=1.0)
         with pytest.raises(ValueError, match="Value `time` must be one number"):
-            way.append(random_tissue(4), time=jnp.ones(2))
+            trajectory.append(random_tissue(4), time=jnp.ones(2))
         batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_tissue(4))
         with pytest.raises(ValueError, match="single tissue"):
-            way.append(batch, time=1.0)
-        assert len(way) == len(way.values["time"]) == 1
+            trajectory.append(batch, time=1.0)
+        assert len(trajectory) == len(trajectory.values["time"]) == 1
         with pytest.raises(ValueError, match="`every` must be at least 1"):
             Trajectory(every=0)
 
 
 class TestFile:
-    def test_round_trip_across_transitions(self, flowing, path):
-        *_, way = flowing
-        save_trajectory(path, way)
+    def test_round_trip_across_transitions(self, relaxation, path):
+        *_, trajectory = relaxation
+        save_trajectory(path, trajectory)
         loaded = load_trajectory(path)
-        assert same(loaded, way)
-        for name, values in way.values.items():
+        assert same(loaded, trajectory)
+        for name, values in trajectory.values.items():
             np.testing.assert_array_equal(loaded.values[name], values)
             assert loaded.values[name].dtype == values.dtype
         with np.load(path) as archive:
-            assert len(archive["twin"]) < len(archive["vertices"]) == len(way)
+            assert len(archive["twin"]) < len(archive["vertices"]) == len(trajectory)
 
     @pytest.mark.parametrize("precision", ["float32", "float64"])
     def test_free_tissues_with_arcs_and_pins(self, path, precision):
@@ -234,7 +238,7 @@ class TestFile:
             pinned=jnp.arange(tissue.n_vertices) == 2,
         )
         tissue = tissue if precision == "float64" else single(tissue)
-        way = Trajectory()
+        trajectory = Trajectory()
         # An edge between cells that can spare a side.
         spare = np.min(np.asarray(tissue.neighbour_counts)[tissue.topology.edge_cells % 9], axis=1)
         edge = np.argmax(np.where(tissue.topology.on_outline, 0, spare))
@@ -242,43 +246,43 @@ class TestFile:
             flip = jnp.arange(tissue.n_edges) == edge
             topology = flip_edges(tissue.topology, flip) if k == 2 else tissue.topology
             tissue = tissue.with_vertices(tissue.vertices + 0.1).with_topology(topology)
-            way.append(tissue)
-        save_trajectory(path, way)
-        assert same(load_trajectory(path), way)
+            trajectory.append(tissue)
+        save_trajectory(path, trajectory)
+        assert same(load_trajectory(path), trajectory)
         with jax.enable_x64(precision == "float64"):
-            assert same(load_trajectory(path), way)
+            assert same(load_trajectory(path), trajectory)
 
-    def test_a_box_that_changes(self, path):
-        tissue, way = random_tissue(3), Trajectory()
+    def test_frames_with_different_boxes(self, path):
+        tissue, trajectory = random_tissue(3), Trajectory()
         for k in range(3):
             box = vx.Periodic(tissue.boundary.lattice * (1 + 0.1 * k))
-            way.append(eqx.tree_at(lambda t: t.boundary, tissue, box), stretch=0.1 * k)
-        save_trajectory(path, way)
-        assert same(load_trajectory(path), way)
+            trajectory.append(eqx.tree_at(lambda t: t.boundary, tissue, box), stretch=0.1 * k)
+        save_trajectory(path, trajectory)
+        assert same(load_trajectory(path), trajectory)
 
-    def test_refused_to_save(self, path):
+    def test_empty_trajectories_are_not_saved(self, path):
         with pytest.raises(ValueError, match="at least one frame"):
             save_trajectory(path, Trajectory())
         assert os.listdir(path.parent) == []
 
     @pytest.mark.parametrize("kept", [0.0, 0.01, 0.5, 0.999])
-    def test_truncated(self, flowing, path, kept):
-        save_trajectory(path, flowing[-1])
+    def test_truncated_files_are_rejected(self, relaxation, path, kept):
+        save_trajectory(path, relaxation[-1])
         content = path.read_bytes()
         path.write_bytes(content[: int(kept * len(content))])
-        with pytest.raises(ValueError, match=r"way\.npz is truncated or damaged"):
+        with pytest.raises(ValueError, match=r"trajectory\.npz is truncated or damaged"):
             load_trajectory(path)
 
-    def test_foreign_files(self, flowing, path):
+    def test_other_files_are_rejected(self, relaxation, path):
         with pytest.raises(FileNotFoundError):
             load_trajectory(path)
-        vx.save_tissue(path, flowing[0])
-        with pytest.raises(ValueError, match=r"way\.npz is not a vertax trajectory file"):
+        vx.save_tissue(path, relaxation[0])
+        with pytest.raises(ValueError, match=r"trajectory\.npz is not a vertax trajectory file"):
             load_trajectory(path)
-        save_trajectory(path, flowing[-1])
-        with pytest.raises(ValueError, match=r"way\.npz is not a vertax tissue file"):
+        save_trajectory(path, relaxation[-1])
+        with pytest.raises(ValueError, match=r"trajectory\.npz is not a vertax tissue file"):
             vx.load_tissue(path)
-        with jax.enable_x64(False), pytest.raises(ValueError, match=r"way.*jax_enable_x64"):
+        with jax.enable_x64(False), pytest.raises(ValueError, match=r"trajectory.*jax_enable_x64"):
             load_trajectory(path)
 
     @pytest.mark.parametrize(
@@ -296,24 +300,24 @@ class TestFile:
             ({"boundary": "sphere"}, "unknown kind"),
         ],
     )
-    def test_contradictions(self, flowing, path, changes, message):
-        save_trajectory(path, flowing[-1])
+    def test_inconsistent_arrays_are_rejected(self, relaxation, path, changes, message):
+        save_trajectory(path, relaxation[-1])
         rewritten(path, **changes)
-        with pytest.raises(ValueError, match=rf"way\.npz.*{message}"):
+        with pytest.raises(ValueError, match=rf"trajectory\.npz.*{message}"):
             load_trajectory(path)
 
-    def test_broken_frames(self, flowing, path):
-        *_, way = flowing
-        save_trajectory(path, way)
-        vertices = np.stack([frame.vertices for frame in way])
+    def test_invalid_frames_are_rejected(self, relaxation, path):
+        *_, trajectory = relaxation
+        save_trajectory(path, trajectory)
+        vertices = np.stack([frame.vertices for frame in trajectory])
         vertices[-1, 3] = np.nan
         rewritten(path, vertices=vertices)
-        with pytest.raises(ValueError, match=r"way\.npz is broken: .*must be finite"):
+        with pytest.raises(ValueError, match=r"trajectory\.npz is broken: .*must be finite"):
             load_trajectory(path)
-        save_trajectory(path, way)
+        save_trajectory(path, trajectory)
         with np.load(path) as archive:
             twin = archive["twin"].copy()
         twin[-1] = 0
         rewritten(path, twin=twin)
-        with pytest.raises(ValueError, match=r"way\.npz is broken: .*involution"):
+        with pytest.raises(ValueError, match=r"trajectory\.npz is broken: .*involution"):
             load_trajectory(path)

@@ -86,7 +86,7 @@ def test_stress_over_strain_breaks_at_plastic_events():
     np.testing.assert_allclose(np.asarray(ax.lines[0].get_ydata()), [3, 3, np.nan, 3, 3, np.nan])
 
 
-def test_what_is_refused(as_a_user):
+def test_what_is_refused(without_type_checks):
     with pytest.raises(ValueError, match="`stresses` must have shape"):
         plot_stress(tissue, np.zeros((4, 2, 2)))
     with pytest.raises(ValueError, match="`scale` must be positive"):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import STILL, random_like, random_tissue, shape_factors
+from helpers import FIXED_TOPOLOGY, random_like, random_tissue, shape_factors
 from hypothesis import given, settings, strategies as st
 
 import vertax as vx
@@ -94,7 +94,7 @@ def test_large_tissues_and_other_responses_have_none():
     assert evolution.with_preconditioner(None) is evolution
 
 
-def test_wrong_types_and_sizes_are_refused(recycled, as_a_user):
+def test_wrong_types_and_sizes_are_refused(recycled, without_type_checks):
     with pytest.raises(TypeError, match="`preconditioner` must be a result of `preconditioner_at`"):
         RELAXATION.with_preconditioner("soft")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="has 64 coordinates for 32"):
@@ -131,7 +131,7 @@ def test_solutions_are_the_same_with_fewer_products(at_rest, recycled):
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["arcs", "pinned", "spare slots", "float32"])
 def test_it_works_for_every_kind_of_tissue(kind):
-    relaxation = dataclasses.replace(STILL, tolerance=1e-3 if kind == "float32" else 1e-8)
+    relaxation = dataclasses.replace(FIXED_TOPOLOGY, tolerance=1e-3 if kind == "float32" else 1e-8)
     tissue = vx.initialise.free_voronoi(8, key=1) if kind == "arcs" else random_tissue(8)
     energy = ShapeFactorEnergy(shape_factors(8, 3.6, 0.02))
     if kind == "arcs":

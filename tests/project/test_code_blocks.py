@@ -1,8 +1,8 @@
-"""The code in the README and in the documentation runs as it stands there.
+"""The code blocks in the README and in the documentation run without errors.
 
 The blocks marked as `python` of a page run from top to bottom, in one namespace and an empty folder, and
-they bring their imports. A block whose last line is a comment `# raises NAME` must raise that. What is not to
-be run is marked otherwise: `text`, `sh`, `toml`.
+contain their imports. A block with a last line `# raises NAME` must raise that exception. Blocks that are not
+run have another mark: `text`, `sh`, `toml`.
 """
 
 import re
@@ -21,7 +21,7 @@ BLOCK = re.compile(r"^([ ]*)```python\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 
 
 def blocks(page: Path) -> list[tuple[int, str]]:
-    """The Python of a page, with the lines that it begins in."""
+    """The Python blocks of a page, each with its first line."""
     text = page.read_text(encoding="utf-8")
     return [(text[: m.start(2)].count("\n"), textwrap.dedent(m[2])) for m in BLOCK.finditer(text)]
 
@@ -35,13 +35,13 @@ PAGES = [
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Runs a page, and returns its names."""
+    """A function that runs a page and returns its namespace."""
     monkeypatch.chdir(tmp_path)
 
     def run(page: str) -> dict:
         names = {"__name__": "__main__"}
         for line, source in blocks(ROOT / page):
-            # Empty lines before it, so that a traceback shows the line of the page.
+            # Empty lines first, so that a traceback shows the line number of the page.
             code = compile("\n" * line + source, str(ROOT / page), "exec")
             raises = re.search(r"^# raises ([\w.]+)\s*\Z", source, re.MULTILINE)
             with pytest.raises(eval(raises[1], names)) if raises else nullcontext():
@@ -52,7 +52,7 @@ def run(tmp_path, monkeypatch):
     plt.close("all")
 
 
-# Those that compile much: for `make test-slow`. The others are for `make test-docs`.
+# Pages with long compilations run in `make test-slow`, the others in `make test-docs`.
 SLOW = {
     "docs/adjoints.md",
     "docs/cells.md",
@@ -69,8 +69,8 @@ SLOW = {
     "docs/tyssue.md",
 }
 
-# What a page promises beside its code.
-PROMISES = {
+# Results that the text of a page states.
+STATED_RESULTS = {
     "README.md": lambda names: (
         names["fit"].history.relative_error[-1] < 1e-5
         and jnp.all(jnp.isfinite(names["gradient"].terms[1].strength))
@@ -100,16 +100,16 @@ PROMISES = {
         for page in PAGES
     ],
 )
-def test_its_code_runs_as_printed(page, run):
+def test_code_of_the_page_runs(page, run):
     names = run(page)
-    assert PROMISES.get(page, lambda names: True)(names)
+    assert STATED_RESULTS.get(page, lambda names: True)(names)
 
 
-def test_what_is_said_of_pages_is_said_of_pages():
-    assert SLOW | PROMISES.keys() <= set(PAGES)
+def test_listed_pages_exist():
+    assert SLOW | STATED_RESULTS.keys() <= set(PAGES)
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_fences_name_their_language(page):
+def test_code_blocks_have_a_language(page):
     opened = re.findall(r"^ *```(\w*)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
     assert set(opened[::2]) <= {"python", "sh", "text", "toml"}

@@ -1,4 +1,4 @@
-"""Each function compiles once for its shapes."""
+"""Each function compiles once for its shapes and dtypes."""
 
 import contextlib
 
@@ -31,7 +31,7 @@ jax.monitoring.register_event_duration_secs_listener(_listen)
 
 
 class Count:
-    """Number of programs that were compiled, or read from the cache of programs."""
+    """Number of programs that were compiled, or read from the compilation cache."""
 
     n = 0
 
@@ -51,7 +51,7 @@ def _fresh():
 
 def problem(**options):
     tissue = random_tissue(N, 0)
-    # Weakly typed, as users write it.
+    # Weakly typed, as in code of users.
     return vx.InverseProblem(
         tissue, ShapeFactorEnergy(jnp.full(N, 3.7)), vx.costs.VertexDistance(tissue), **options
     )
@@ -74,7 +74,7 @@ def grow():
 
 
 def bricks():
-    """A mask of nine cells in three rows, shifted against each other."""
+    """A mask of nine cells in three shifted rows."""
     rows = [[3 * r + 1, 3 * r + 2, 3 * r + 3, 0] for r in range(3)]
     shifted = [np.roll(np.repeat(row, 20), 10 * (r % 2)) for r, row in enumerate(rows)]
     return np.pad(np.repeat(np.array(shifted), 20, axis=0), 6)
@@ -98,7 +98,7 @@ CALLS = {
 }
 
 
-# These compile for a quarter of a minute each.
+# These compile for 15 seconds each.
 LONG = ("fit of a batch", "fit of a batch by least squares", "grow", "uncertainty")
 MARKS = {name: [pytest.mark.thorough] for name in LONG}
 
@@ -113,7 +113,7 @@ def test_a_second_call_compiles_nothing(call):
     assert second.n == 0
 
 
-def test_a_relaxed_tissue_has_the_types_of_the_initial_one():
+def test_relaxation_preserves_shapes_and_dtypes():
     kind = lambda x: (jnp.shape(x), jnp.result_type(x), jax.typeof(x).weak_type)
     starts = [random_tissue(N, 1), vx.initialise.free_voronoi(N, key=jax.random.key(0))]
     for start in starts:
@@ -123,15 +123,15 @@ def test_a_relaxed_tissue_has_the_types_of_the_initial_one():
 
 def test_epochs_after_the_first_compile_nothing():
     counts = []
-    for epochs in (1, 1, 3):  # the first fit of the process compiles what all fits share
+    for epochs in (1, 1, 3):  # the first fit compiles functions that all fits share
         with compilations() as count:
             vx.fit(problem(), optax.sgd(1e-3), epochs, progress=False)
         counts.append(count.n)
-    # A new optimiser compiles its update, once for all epochs.
+    # A new optimiser compiles its update once.
     assert counts[1] == counts[2] > 0
 
 
-def test_equilibrium_gradient_and_fit_share_the_relaxation(monkeypatch):
+def test_equilibrate_gradient_and_fit_share_the_relaxation(monkeypatch):
     from vertax.relax import _loop
 
     traces = []
@@ -152,11 +152,11 @@ def test_equilibrium_gradient_and_fit_share_the_relaxation(monkeypatch):
     assert len(traces) == 1
 
 
-def test_a_lenient_adjoint_shares_the_program_of_a_strict_one():
+def test_adjoints_with_and_without_throw_share_the_program():
     problem().value_and_gradient()
-    lenient = vx.ImplicitDifferentiation(throw=False)
+    without_throw = vx.ImplicitDifferentiation(throw=False)
     with compilations() as count:
-        problem(adjoint=lenient).value_and_gradient()
+        problem(adjoint=without_throw).value_and_gradient()
     assert count.n == 0
 
 
@@ -164,13 +164,13 @@ def test_another_optimiser_compiles_only_its_update():
     FIT(problem(), OPTIMISER)
     with compilations() as count:
         FIT(problem(), optax.adam(1e-2))
-    assert count.n <= 2  # its state, and its update
+    assert count.n <= 2  # initial state and update
 
 
-def test_gradients_of_shared_programs_are_those_of_one_program():
+def test_gradient_agrees_with_one_compiled_program():
     p = problem()
     shared = p.value_and_gradient()
-    whole = eqx.filter_jit(lambda: p.value_and_gradient(throw=False))()
-    np.testing.assert_allclose(shared.cost, whole.cost, rtol=1e-12)
-    pair = shared.gradient.target_shape_factor, whole.gradient.target_shape_factor
+    single = eqx.filter_jit(lambda: p.value_and_gradient(throw=False))()
+    np.testing.assert_allclose(shared.cost, single.cost, rtol=1e-12)
+    pair = shared.gradient.target_shape_factor, single.gradient.target_shape_factor
     np.testing.assert_allclose(*pair, rtol=1e-9)

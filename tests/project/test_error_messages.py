@@ -1,4 +1,4 @@
-"""The page on errors quotes messages that the program has, and pages agree on how many things there are."""
+"""The messages on the page of errors exist in the program, and numbers on pages are right."""
 
 import ast
 import functools
@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-ANY = "…"  # any text, in a quotation and in place of what a program fills in
+ANY = "…"  # any text, in a quotation and for the fields of an f-string
 PAGE = (ROOT / "docs/errors.md").read_text(encoding="utf-8")
 HEADINGS = re.findall(r'^\?\?\? failure "(.*)"$', PAGE, re.MULTILINE)
 QUOTED = [message for heading in HEADINGS for message in heading.split('" and "')]
 
 
 def templates(source: str) -> Iterator[str]:
-    """The texts in a program, with … for what it fills in."""
+    """The strings in a program, with … for the fields of f-strings."""
     tree = ast.parse(source)
     inside: set[ast.AST] = set()
     for node in ast.walk(tree):
@@ -33,7 +33,7 @@ def templates(source: str) -> Iterator[str]:
 
 @functools.cache
 def sources() -> list[tuple[str, frozenset[str]]]:
-    """All texts of vertax, and of the libraries whose errors come through; and the words of each."""
+    """All strings of vertax, Equinox and Optimistix; and the words of each."""
     folders = [ROOT / "vertax"]
     for name in ("equinox", "optimistix"):
         spec = importlib.util.find_spec(name)
@@ -54,22 +54,23 @@ def words(text: str) -> frozenset[str]:
 
 
 def agreement(quoted: str, template: str) -> float:
-    """Share of the letters of a quotation that are those of a template; 0 if it is none of its messages.
+    """Fraction of the letters of a quotation that match a template; 0 if it is not one of its messages.
 
-    Both are patterns; … stands for any text. A table over all beginnings of both, as for the edit distance.
+    Both are patterns; … matches any text. Dynamic programming over the prefixes of both, as for the edit
+    distance.
     """
     impossible = -1
     row = [0] + [impossible] * len(template)
     for j, letter in enumerate(template):
         row[j + 1] = row[j] if letter == ANY else impossible
-    for mine in quoted:
+    for character in quoted:
         above, row = row, [impossible] * (len(template) + 1)
-        row[0] = above[0] if mine == ANY else impossible
+        row[0] = above[0] if character == ANY else impossible
         for j, letter in enumerate(template):
-            best = above[j] + 1 if mine == letter != ANY and above[j] >= 0 else impossible
+            best = above[j] + 1 if character == letter != ANY and above[j] >= 0 else impossible
             if letter == ANY:
                 best = max(best, row[j], above[j + 1], above[j])
-            if mine == ANY:
+            if character == ANY:
                 best = max(best, above[j + 1], row[j], above[j])
             row[j + 1] = best
     letters = len(quoted) - quoted.count(ANY)
@@ -77,15 +78,16 @@ def agreement(quoted: str, template: str) -> float:
 
 
 def best_agreement(quoted: str) -> float:
-    """How well the nearest message of the program agrees, with a second text where it fills one in."""
+    """Agreement with the nearest message of the program, also with another string in one of its fields."""
     message = re.sub(r"^\w+Error: ", "", quoted)
-    mine = words(message)
-    near = sorted(sources(), key=lambda each: -len(mine & each[1]) / (4 + len(mine | each[1])))[:12]
-    # A quotation may leave out the end, and what stands before it in a longer message.
+    own_words = words(message)
+    similarity = lambda each: len(own_words & each[1]) / (4 + len(own_words | each[1]))
+    near = sorted(sources(), key=lambda each: -similarity(each))[:12]
+    # A quotation may omit the end or the beginning of a message.
     endings = [message, message.removesuffix(f" {ANY}"), ANY + message]
-    whole = max(agreement(each, text) for each in endings for text, _ in near)
-    if whole > 0.6:
-        return whole
+    best = max(agreement(each, text) for each in endings for text, _ in near)
+    if best > 0.6:
+        return best
     frames = [text for text, _ in sources() if ANY in text and len(text) < 80]
     frame = max(agreement(each, text) for each in endings for text in frames)
     part = max(agreement(message, f"{ANY}{text}{ANY}") for text, _ in near)
@@ -93,7 +95,7 @@ def best_agreement(quoted: str) -> float:
 
 
 @pytest.mark.parametrize("quoted", QUOTED)
-def test_every_quoted_message_is_one_of_the_program(quoted):
+def test_quoted_messages_exist_in_the_program(quoted):
     assert best_agreement(quoted) > 0.6
 
 
@@ -105,7 +107,7 @@ def test_every_quoted_message_is_one_of_the_program(quoted):
         "Nothing of this kind is raised anywhere.",
     ],
 )
-def test_other_messages_are_none_of_the_program(quoted):
+def test_invented_messages_do_not_exist_in_the_program(quoted):
     assert best_agreement(quoted) < 0.6
 
 
@@ -139,7 +141,7 @@ COUNTED = {
     [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/*.md"))],
     ids=lambda page: page.name,
 )
-def test_a_page_that_counts_counts_right(page):
+def test_numbers_on_pages_are_right(page):
     text = page.read_text(encoding="utf-8").lower()
     stated = re.findall(rf"\b(\d+|{'|'.join(NUMBERS)}) (?:small )?({'|'.join(COUNTED)})\b", text)
     number = lambda word: NUMBERS.index(word) if word in NUMBERS else int(word)

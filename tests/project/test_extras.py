@@ -1,4 +1,4 @@
-"""The library needs little, starts quickly, and says what is missing and how to install it."""
+"""Optional dependencies: imports without them, messages, and import time."""
 
 import re
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 
-# What extras bring, by the name of the module.
+# The extra of each optional module.
 EXTRAS = {
     "matplotlib": "plot",
     "PIL": "plot",
@@ -25,13 +25,13 @@ EXTRAS = {
 
 
 def python(code: str, *arguments: str, hide=()) -> subprocess.CompletedProcess[str]:
-    """Another interpreter, in which some packages are as if they were not installed."""
+    """Run code in another interpreter; imports of the modules in `hide` fail."""
     hidden = f"import sys; sys.modules.update(dict.fromkeys({list(hide)!r}))\n"
     command = [sys.executable, "-c", hidden + code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
 
 
-def test_every_optional_package_is_in_the_extra_that_messages_name():
+def test_optional_packages_are_in_their_extras():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     packages = {"PIL": "pillow", "tomli_w": "tomli-w", "skimage": "scikit-image"}
     for module, extra in EXTRAS.items():
@@ -41,7 +41,7 @@ def test_every_optional_package_is_in_the_extra_that_messages_name():
         assert not any(entry.startswith(name) for entry in project["dependencies"]), module
 
 
-def test_the_library_works_with_nothing_but_what_it_asks_for():
+def test_library_works_without_extras():
     code = """
 import jax, optax, vertax as vx
 for package in (vx.adjoints, vx.costs, vx.energies, vx.fitting, vx.initialise, vx.io, vx.mesh, vx.solvers):
@@ -58,9 +58,9 @@ try:
 except ImportError as error:
     print(error)
 """
-    outcome = python(code, hide=EXTRAS)
-    assert outcome.returncode == 0, outcome.stderr
-    lines = outcome.stdout.splitlines()
+    process = python(code, hide=EXTRAS)
+    assert process.returncode == 0, process.stderr
+    lines = process.stdout.splitlines()
     assert len(lines) == 3
     assert all(
         line.startswith('Drawing needs matplotlib: pip install "vertax[plot]"')
@@ -70,17 +70,17 @@ except ImportError as error:
 
 
 @pytest.mark.parametrize("missing", ["typer", "tomli_w", "matplotlib"])
-def test_the_command_says_what_it_misses(missing, tmp_path):
+def test_command_line_names_the_missing_extra(missing, tmp_path):
     (tmp_path / "tiny.toml").write_text('experiment = "infer_shape_factors"\n')
     code = "from vertax.__main__ import main; main()"
-    outcome = python(code, "run", str(tmp_path / "tiny.toml"), hide=[missing])
-    assert outcome.returncode == 1
-    assert f'needs {missing.replace("_", "-")}: pip install "vertax[run]"' in outcome.stderr
-    assert outcome.stderr.startswith("Error: ")
-    assert "Traceback" not in outcome.stderr
+    process = python(code, "run", str(tmp_path / "tiny.toml"), hide=[missing])
+    assert process.returncode == 1
+    assert f'needs {missing.replace("_", "-")}: pip install "vertax[run]"' in process.stderr
+    assert process.stderr.startswith("Error: ")
+    assert "Traceback" not in process.stderr
 
 
-def test_a_run_says_which_extra_its_experiment_misses(tmp_path):
+def test_run_names_the_missing_extra_of_its_experiment(tmp_path):
     (tmp_path / "image.tif").write_bytes(b"II*\0")
     (tmp_path / "image.toml").write_text('experiment = "infer_from_microscopy"\n')
     code = "from vertax.__main__ import main; main()"
@@ -93,20 +93,20 @@ def test_a_run_says_which_extra_its_experiment_misses(tmp_path):
         "--output",
         str(tmp_path / "out"),
     ]
-    outcome = python(code, *arguments, hide=["skimage", "tifffile"])
-    assert outcome.returncode == 1
-    assert 'pip install "vertax[image]"' in outcome.stderr
-    assert "Traceback" not in outcome.stderr
+    process = python(code, *arguments, hide=["skimage", "tifffile"])
+    assert process.returncode == 1
+    assert 'pip install "vertax[image]"' in process.stderr
+    assert "Traceback" not in process.stderr
 
 
 def loaded(code: str) -> set[str]:
-    """The packages that some code imports."""
-    outcome = python(f"import sys\n{code}\nprint(*sys.modules)")
-    assert outcome.returncode == 0, outcome.stderr
-    return set(outcome.stdout.splitlines()[-1].split())
+    """The modules that some code imports."""
+    process = python(f"import sys\n{code}\nprint(*sys.modules)")
+    assert process.returncode == 0, process.stderr
+    return set(process.stdout.splitlines()[-1].split())
 
 
-def test_importing_the_library_imports_no_pictures_and_no_experiment():
+def test_import_does_not_load_plotting_or_experiments():
     everything = "import vertax as vx; vx.fit; vx.equilibrate; vx.io; vx.initialise"
     for code, unwanted in (("import vertax", {"jax", "matplotlib"}), (everything, {"matplotlib"})):
         modules = loaded(code)
@@ -116,7 +116,7 @@ def test_importing_the_library_imports_no_pictures_and_no_experiment():
 
 
 @pytest.mark.parametrize("command", ["--help", "--version", "list", "run --help"])
-def test_what_answers_at_once_imports_nothing_heavy(command):
+def test_help_and_lists_do_not_load_jax(command):
     code = f"""
 import contextlib
 from vertax.__main__ import main
@@ -130,11 +130,11 @@ with contextlib.suppress(SystemExit):
     assert not {"jax", "matplotlib", "numpy", "equinox", "vertax.runs._config"} & modules
 
 
-def test_an_import_that_fails_for_another_reason_says_so():
-    from vertax._base.extras import needing
+def test_error_of_a_failed_import_includes_the_original_message():
+    from vertax._base.extras import requires_extra
 
-    said = r"VTK needs what the extra \[files\] brings.*broken library"
-    with pytest.raises(ImportError, match=said), needing("files", "VTK"):
+    message = r"VTK needs what the extra \[files\] brings.*broken library"
+    with pytest.raises(ImportError, match=message), requires_extra("files", "VTK"):
         raise ImportError("broken library")
-    with pytest.raises(ImportError, match=r"^a fault of ours$"), needing("files", "VTK"):
-        raise ImportError("a fault of ours", name="vertax.io")
+    with pytest.raises(ImportError, match=r"^a bug in vertax$"), requires_extra("files", "VTK"):
+        raise ImportError("a bug in vertax", name="vertax.io")

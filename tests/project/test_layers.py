@@ -1,4 +1,4 @@
-"""Imports point downward, and experiments use what users can use."""
+"""Packages import only from lower layers, and experiments use only the public API."""
 
 import ast
 import importlib.util
@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2] / "vertax"
 
-# From the bottom to the top: a package imports from itself and from what stands before it.
+# From bottom to top: a package imports from itself and from packages before it.
 LAYERS = [
     "_base",
     "mesh",
@@ -33,7 +33,7 @@ LAYERS = [
     "runs",
     "experiments",
 ]
-# An experiment sees what a user sees: these packages by their public names.
+# Packages that experiments may import, by their public names.
 FIGURES = "vertax.experiments.tissue_moduli.figures"
 PUBLIC = {"vertax", *(f"vertax.{name}" for name in LAYERS if name != "_base")}
 
@@ -89,14 +89,14 @@ def test_imports_are_resolved_to_absolute_names(statement, expected):
     assert imports(path, statement) == expected
 
 
-def test_every_package_has_its_layer():
+def test_every_package_has_a_layer():
     folders = {path.parent.name for path in ROOT.glob("*/__init__.py")}
     assert folders == set(LAYERS)
     assert {path.name for path in ROOT.glob("*.py")} == {"__init__.py", "__main__.py"}
 
 
 @pytest.mark.parametrize("package", LAYERS)
-def test_imports_point_downward(package):
+def test_packages_import_from_lower_layers_only(package):
     allowed = LAYERS[: LAYERS.index(package) + 1]
     upward = [
         f"{path.relative_to(ROOT)} imports {name}"
@@ -107,7 +107,7 @@ def test_imports_point_downward(package):
     assert not upward
 
 
-def test_no_circles_within_a_package():
+def test_there_are_no_circular_imports():
     files = {path: set(imports(path)) for path in ROOT.rglob("*.py") if path.name != "__init__.py"}
     below = {module_name(path): names for path, names in files.items()}
     while below:
@@ -117,7 +117,7 @@ def test_no_circles_within_a_package():
             del below[name]
 
 
-def test_experiments_are_clients():
+def test_experiments_import_public_names_only():
     private = [
         f"{path.relative_to(ROOT)} imports {name}"
         for path in modules("experiments")

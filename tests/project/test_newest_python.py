@@ -1,4 +1,4 @@
-"""The search for the Python of `make test-newest`, and the choice of tests that it runs."""
+"""The Python version and the tests of `make test-newest`."""
 
 import newest_python
 import pytest
@@ -13,7 +13,7 @@ def program(path, script):
 
 @pytest.fixture
 def folders(tmp_path, monkeypatch):
-    """Two folders, which are all of PATH."""
+    """Two folders, the only ones in PATH."""
     pair = tmp_path / "first", tmp_path / "second"
     monkeypatch.setenv("PATH", ":".join(map(str, pair)))
     monkeypatch.setattr(newest_python, "VERSIONS", ("99.2", "99.1", "3.11"))
@@ -32,22 +32,22 @@ def test_a_program_that_fails_is_skipped(folders):
     assert newest_python.newest_python() == "/path/of/python99.1"
 
 
-def test_the_versions_of_pyenv_are_found(folders, tmp_path):
+def test_versions_of_pyenv_are_used(folders, tmp_path):
     first, second = folders
     program(first / "python99.1", FAILS)
     program(tmp_path / "versions" / "python", WORKS)
-    known = f'[ "$PYENV_VERSION" = 99.1.5 ] && echo {tmp_path}/versions/python || exit 1'
-    listed = '[ "$2" = python99.1 ] && echo 99.1.4 && echo 99.1.5 || exit 1'
-    program(second / "pyenv", f'if [ "$1" = whence ]; then {listed}; else {known}; fi')
+    which = f'[ "$PYENV_VERSION" = 99.1.5 ] && echo {tmp_path}/versions/python || exit 1'
+    whence = '[ "$2" = python99.1 ] && echo 99.1.4 && echo 99.1.5 || exit 1'
+    program(second / "pyenv", f'if [ "$1" = whence ]; then {whence}; else {which}; fi')
     assert newest_python.newest_python() == "/path/of/python99.1"
 
 
-def test_a_version_that_is_no_newer_is_not_returned(folders):
+def test_only_newer_versions_are_returned(folders):
     program(folders[0] / "python3.11", "echo 3.11; echo /path/of/python3.11")
     assert newest_python.newest_python() is None
 
 
-def test_several_folders_of_tests_can_be_chosen():
+def test_folders_of_tests_can_be_selected_and_excluded():
     chosen = [path for group in run.groups(["io", "solvers/test_minres.py"]) for path in group]
     names = {path.relative_to(run.FOLDER).as_posix() for path in chosen}
     assert "io/test_tissue_files.py" in names

@@ -1,8 +1,10 @@
+"""The public names of vertax."""
+
 import importlib.metadata
 
 import vertax as vx
 
-# The names that users may rely on. Taking one away is a breaking change; adding one is a decision.
+# Public names. Removing one is a breaking change.
 NAMES = """
 AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy
 AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiation Checkpoint
@@ -14,7 +16,7 @@ initialise io load_tissue mechanics mesh plot_history plot_recovery plot_tissue 
 runs save_tissue solvers transitions uncertainty
 """
 
-FAMILIES = {
+PACKAGES = {
     "activities": "AbstractActivity FluctuatingTensions Push SelfPropulsion Sum ThermalNoise",
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
@@ -59,7 +61,7 @@ FAMILIES = {
 
 
 def public(module):
-    # The hook that checks types in tests leaves its own name behind.
+    # The import hook of jaxtyping, which checks types in tests, adds this name.
     return sorted(n for n in vars(module) if not n.startswith("_") and n != "jaxtyping")
 
 
@@ -68,16 +70,16 @@ def test_top_level_names():
     assert all(hasattr(vx, name) for name in NAMES.split())
 
 
-def test_the_version_is_that_of_the_package():
+def test_version_agrees_with_the_package_metadata():
     assert vx.__version__ == importlib.metadata.version("vertax")
 
 
-def test_names_of_the_families():
-    for family, names in FAMILIES.items():
-        assert public(getattr(vx, family)) == names.split(), family
+def test_names_of_packages():
+    for package, names in PACKAGES.items():
+        assert public(getattr(vx, package)) == names.split(), package
 
 
-def test_importing_changes_no_setting_of_jax():
+def test_import_does_not_change_settings_of_jax():
     import subprocess
     import sys
 

@@ -1,4 +1,4 @@
-"""Every public name has its place in the reference."""
+"""Every public name is in the reference."""
 
 import importlib
 import re
@@ -24,29 +24,29 @@ PACKAGES = sorted(name for name in dir(vx) if hasattr(getattr(vx, name), "__path
 
 def public(package: str) -> set[str]:
     module = importlib.import_module(f"vertax.{package}")
-    # The hook that checks types in tests leaves its own name behind.
+    # The import hook of jaxtyping, which checks types in tests, adds this name.
     names = {name for name in dir(module) if not name.startswith("_")} - {"jaxtyping"}
     return {name for name in names if not hasattr(getattr(module, name), "__path__")}
 
 
-def named(path: str) -> object:
-    """What a name of the reference stands for."""
+def resolve(path: str) -> object:
+    """The object with a name in the reference."""
     return reduce(getattr, path.split("."), vx)
 
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_every_public_name_is_documented(package):
-    # Some stand in two packages, or at the top as well: once is enough.
-    documented = {id(named(name)) for name in DOCUMENTED}
+    # A name in two packages, or also at the top level, is documented once.
+    documented = {id(resolve(name)) for name in DOCUMENTED}
     module = importlib.import_module(f"vertax.{package}")
     assert not [n for n in public(package) if id(getattr(module, n)) not in documented]
 
 
-def test_no_name_is_documented_twice():
+def test_names_are_documented_once():
     assert len(DOCUMENTED) == len(set(DOCUMENTED))
 
 
-def test_every_page_of_reference_is_in_the_table_of_contents():
+def test_reference_pages_are_in_the_table_of_contents():
     contents = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     assert {f"reference/{page.name}" for page in PAGES} == set(
         re.findall(r"reference/\w+\.md", contents)
@@ -54,7 +54,7 @@ def test_every_page_of_reference_is_in_the_table_of_contents():
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
-def test_paths_that_a_page_names_are_there(page):
+def test_paths_on_pages_exist(page):
     folders = "vertax|tests|configs|docs|notebooks|benchmarks"
     paths = re.findall(rf"`((?:{folders})/[\w./]*)`", page.read_text(encoding="utf-8"))
     assert not [path for path in paths if not (ROOT / path).exists()]

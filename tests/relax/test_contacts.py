@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brute_force_overlaps import faces_that_overlap
 from free_helpers import cluster
 from helpers import fine_difference
 from hypothesis import example, given, settings, strategies as st
-from tilings import faces_that_overlap
 
 import vertax as vx
 from vertax.relax._contacts import no_contacts

@@ -8,9 +8,9 @@ import optimistix as optx
 import pytest
 from free_helpers import cluster
 from helpers import (
-    LOOSE,
+    FIXED_TOPOLOGY,
+    NO_CONTACT,
     SOLVERS,
-    STILL,
     counted_compilations,
     dense_hessian,
     each_solver,
@@ -136,9 +136,9 @@ def test_vmap_and_single_runs_agree():
     batch = [random_tissue(12, s) for s in range(3)]
     energy = AreaElasticity(20.0, 1.0) + LineTension(jnp.full(36, 0.5))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *batch)
-    together = eqx.filter_vmap(lambda t: LOOSE(t, energy))(stacked)
+    together = eqx.filter_vmap(lambda t: NO_CONTACT(t, energy))(stacked)
     for k, tissue in enumerate(batch):
-        alone = LOOSE(tissue, energy)
+        alone = NO_CONTACT(tissue, energy)
         np.testing.assert_array_equal(alone.num_t1, together.num_t1[k])
         np.testing.assert_allclose(alone.tissue.vertices, together.tissue.vertices[k], atol=1e-9)
 
@@ -250,7 +250,7 @@ def test_no_convergence_is_an_error_by_default_and_a_result_otherwise():
         vx.equilibrate(tissue, energy, max_steps=2)
     # (Without contacts two steps from the random tissue make cells overlap, which has another message.)
     few, lattice = (
-        dataclasses.replace(STILL, max_steps=2, tolerance=1e-30),
+        dataclasses.replace(FIXED_TOPOLOGY, max_steps=2, tolerance=1e-30),
         vx.initialise.hexagonal(3, 4),
     )
     with pytest.raises(Exception, match="reached no equilibrium"):
@@ -272,7 +272,7 @@ def test_a_nan_parameter_is_reported():
     with pytest.raises(RuntimeError, match=message):
         vx.equilibrate(random_tissue(12, 0), energy)
     tissue = random_tissue(12, 0)
-    relax = eqx.filter_jit(lambda p: STILL(tissue, ShapeFactorEnergy(p)).energy)
+    relax = eqx.filter_jit(lambda p: FIXED_TOPOLOGY(tissue, ShapeFactorEnergy(p)).energy)
     with pytest.raises(RuntimeError, match=message):
         relax(jnp.full(12, jnp.nan)).block_until_ready()
 
@@ -318,7 +318,7 @@ class _Blind(vx.AbstractEnergy):
 def test_a_relaxation_ends_where_an_energy_ignores_a_coordinate_that_is_nan():
     tissue = random_tissue(3, 1)
     tissue = tissue.with_vertices(tissue.vertices.at[0].set(jnp.nan))
-    equilibrium = dataclasses.replace(STILL, max_steps=20)(tissue, _Blind(), throw=False)
+    equilibrium = dataclasses.replace(FIXED_TOPOLOGY, max_steps=20)(tissue, _Blind(), throw=False)
     assert equilibrium.num_steps <= 20
     assert equilibrium.result == vx.RESULTS.nonfinite
 
@@ -349,7 +349,7 @@ def test_no_retracing_between_calls():
             return ShapeFactorEnergy(self.p0)(tissue)
 
     for k in range(4):
-        STILL(random_tissue(10, k), Counting(jnp.array(3.6 + 0.01 * k)))
+        FIXED_TOPOLOGY(random_tissue(10, k), Counting(jnp.array(3.6 + 0.01 * k)))
         if k == 0:
             first = len(traces)
     # Evaluating the final energy outside of the compiled part would count here too.

@@ -8,7 +8,7 @@ import time
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import STILL, random_tissue
+from helpers import FIXED_TOPOLOGY, random_tissue
 
 import vertax as vx
 from vertax.runs import Fitting, RunFolder, _folder, fit_side_by_side, side_by_side
@@ -63,7 +63,9 @@ def test_after_an_interrupt_nothing_else_begins(tmp_path, monkeypatch):
 def problem(p0):
     tissue = random_tissue(6)
     energy = vx.energies.ShapeFactorEnergy(jnp.full(6, p0))
-    return vx.InverseProblem(tissue, energy, vx.costs.VertexDistance(tissue), response=STILL)
+    return vx.InverseProblem(
+        tissue, energy, vx.costs.VertexDistance(tissue), response=FIXED_TOPOLOGY
+    )
 
 
 def outcome(problem, interrupted):

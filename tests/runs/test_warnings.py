@@ -5,7 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ADAM, LEAST_SQUARES, STILL, random_tissue
+from helpers import ADAM, FIXED_TOPOLOGY, LEAST_SQUARES, random_tissue
 from typer.testing import CliRunner
 
 import vertax as vx
@@ -23,7 +23,9 @@ relaxation = { contacts = false, transitions = false }  # which compiles less
 def problem(p0=3.6):
     tissue = random_tissue(6)
     energy = vx.energies.ShapeFactorEnergy(jnp.full(6, p0))
-    return vx.InverseProblem(tissue, energy, vx.costs.VertexDistance(tissue), response=STILL)
+    return vx.InverseProblem(
+        tissue, energy, vx.costs.VertexDistance(tissue), response=FIXED_TOPOLOGY
+    )
 
 
 def test_a_run_with_a_fit_that_is_not_at_its_end_says_so(tmp_path):

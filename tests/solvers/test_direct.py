@@ -7,7 +7,7 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
-from helpers import STILL, random_tissue, shape_factors
+from helpers import FIXED_TOPOLOGY, random_tissue, shape_factors
 
 import vertax as vx
 from vertax.energies import ShapeFactorEnergy
@@ -56,7 +56,7 @@ def test_sensitivities_are_those_of_minres():
 
     def perimeters(p0, solver):
         adjoint = vx.ImplicitDifferentiation(linear_solver=solver)
-        return STILL(tissue, ShapeFactorEnergy(p0), adjoint=adjoint).tissue.perimeters
+        return FIXED_TOPOLOGY(tissue, ShapeFactorEnergy(p0), adjoint=adjoint).tissue.perimeters
 
     jacobian = eqx.filter_jit(lambda solver: jax.jacfwd(lambda p: perimeters(p, solver))(p0))
     expected = jacobian(vx.MINRES())
@@ -68,14 +68,14 @@ def test_sensitivities_are_those_of_minres():
 
 @pytest.mark.thorough
 def test_gauss_newton_without_a_jacobian():
-    start = STILL(random_tissue(N, 2), ShapeFactorEnergy(3.6)).tissue
+    start = FIXED_TOPOLOGY(random_tissue(N, 2), ShapeFactorEnergy(3.6)).tissue
     truth = ShapeFactorEnergy(shape_factors(N, 3.6, 0.05))
-    target = STILL(start, truth).tissue
+    target = FIXED_TOPOLOGY(start, truth).tissue
     problem = vx.InverseProblem(
         start,
         ShapeFactorEnergy(jnp.full(N, 3.6)),
         vx.costs.VertexDistance(target),
-        response=STILL,
+        response=FIXED_TOPOLOGY,
         adjoint=vx.ImplicitDifferentiation(),
     )
     products = lx.Normal(lx.CG(rtol=1e-3, atol=1e-12))

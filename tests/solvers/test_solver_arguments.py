@@ -7,7 +7,7 @@ import pytest
 
 from vertax import solvers
 
-pytestmark = pytest.mark.usefixtures("as_a_user")
+pytestmark = pytest.mark.usefixtures("without_type_checks")
 
 
 @pytest.mark.parametrize(

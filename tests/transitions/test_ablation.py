@@ -1,3 +1,5 @@
+"""Ablation of edges and cells."""
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ def foam(n_edges):
 
 
 @pytest.mark.thorough
-def test_the_first_recoil_is_the_tension_of_the_edge():
+def test_initial_force_after_a_cut_is_the_tension_of_the_edge():
     tissue = random_tissue(9, 2, lloyd_steps=2)
     energy, tension = foam(tissue.n_edges)
     rest = vx.equilibrate(tissue, energy).tissue
@@ -32,7 +34,7 @@ def test_the_first_recoil_is_the_tension_of_the_edge():
     np.testing.assert_allclose(others, 0, atol=1e-8)
 
 
-def test_cells_become_one_hole_without_energy():
+def test_ablated_cells_become_one_hole_without_energy():
     tissue = random_tissue(12, 4, lloyd_steps=3).with_capacity(12)
     energy, _ = foam(tissue.n_edges)
     neighbour = int(tissue.topology.cell[tissue.topology.twin[0]])
@@ -43,27 +45,27 @@ def test_cells_become_one_hole_without_energy():
     assert wounded.areas.sum() == pytest.approx(12)
     (hole,) = np.flatnonzero(cells & wounded.alive)
     assert left.cell_terms(wounded)[hole] == 0
-    # A division is undone by ablation, but for the corners that it left.
+    # Ablation of both daughters is the inverse of a division, except for collinear corners.
     parent = random_tissue(9, 2).with_capacity(10)
     change = divide(parent, 3)
     pair = jnp.isin(jnp.arange(10), jnp.array([3, 9]))
-    whole, _ = ablate(change.tissue, energy=foam(30)[0], cells=pair)
-    whole.topology.validate()
-    areas = np.asarray(whole.areas)
+    merged, _ = ablate(change.tissue, energy=foam(30)[0], cells=pair)
+    merged.topology.validate()
+    areas = np.asarray(merged.areas)
     assert areas[3] + areas[9] == pytest.approx(float(parent.areas[3]), abs=1e-13)
     np.testing.assert_allclose(
         np.delete(areas, [3, 9]), np.delete(parent.areas, [3, 9]), atol=1e-13
     )
 
 
-def test_holes_that_cannot_become_one_are_refused(as_a_user):
+def test_holes_that_cannot_merge_are_rejected(without_type_checks):
     energy = vx.energies.AreaElasticity(1.0, 1.0)
     cluster = vx.initialise.free_voronoi(8, key=0, lloyd_steps=5).with_capacity(8)
     touching = np.asarray(cluster.topology.edge_cells)
     (inner,) = np.setdiff1d(np.arange(8), touching[(touching == 8).any(axis=1)])
     ring = np.isin(np.arange(9), touching[(touching == inner).any(axis=1)])[:8]
     ring[inner] = False
-    for cells in (ring, np.ones(8, bool)):  # around a living cell; and all of a free tissue
+    for cells in (ring, np.ones(8, bool)):  # around a living cell, and a whole free tissue
         with pytest.raises(RuntimeError, match="but two of them cannot"):
             ablate(cluster, energy, cells=cells)
         with pytest.raises(Exception, match="but two of them cannot"):
@@ -72,7 +74,7 @@ def test_holes_that_cannot_become_one_are_refused(as_a_user):
             )
 
 
-def test_a_pin_goes_with_its_vertex():
+def test_removed_vertices_are_not_pinned():
     tissue = random_tissue(9, 2)
     pinned = eqx.tree_at(
         lambda t: t.pinned,
@@ -85,7 +87,7 @@ def test_a_pin_goes_with_its_vertex():
     np.testing.assert_array_equal(wounded.pinned, wounded.topology.alive_vertices)
 
 
-def test_bad_arguments_are_named(as_a_user):
+def test_invalid_arguments_are_rejected(without_type_checks):
     tissue = random_tissue(6, 1)
     energy, _ = foam(tissue.n_edges)
     with pytest.raises(ValueError, match="with_capacity"):

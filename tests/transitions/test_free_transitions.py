@@ -1,4 +1,4 @@
-"""T1 transitions at the outline of a free tissue."""
+"""T1 transitions of free tissues."""
 
 import equinox as eqx
 import jax
@@ -8,12 +8,12 @@ import pytest
 from free_helpers import angles_of, cluster, doublet, outline_length, with_angles
 
 import vertax as vx
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import LineTension, ShapeFactorEnergy
 
 
 class OutlineLength(vx.AbstractEnergy):
-    """Likes edges on the outline (or dislikes them)."""
+    """The number of edges on the outline times a sign."""
 
     sign: float | jax.Array
 
@@ -21,8 +21,8 @@ class OutlineLength(vx.AbstractEnergy):
         return self.sign * jnp.sum(tissue.topology.on_outline.astype(float))
 
 
-class Anything(vx.AbstractEnergy):
-    """Finds every flipped configuration better, by a hash of the topology that no flip leaves."""
+class RandomEnergy(vx.AbstractEnergy):
+    """A pseudo-random function of the topology, which changes with every flip."""
 
     weights: jax.Array
 
@@ -31,7 +31,7 @@ class Anything(vx.AbstractEnergy):
 
 
 class Opaque(vx.AbstractEnergy):
-    """Hides that an energy is local."""
+    """Wraps a local energy as one that is not local."""
 
     inner: vx.AbstractEnergy
 
@@ -45,7 +45,7 @@ def compiled_sweep(tissue, energy, rule):
 
 
 def sweep(tissue, energy, rule):
-    # As arrays, other numbers compile nothing anew.
+    # Numbers as arrays, so that other numbers do not recompile.
     return compiled_sweep(tissue, *traced((energy, rule)))
 
 
@@ -70,7 +70,7 @@ def inner_edges_at_the_outline(tissue):
     return np.flatnonzero(((start == n) ^ (end == n)) & ~np.asarray(tissue.topology.on_outline))
 
 
-def test_an_inner_edge_becomes_an_arc_and_comes_back():
+def test_an_inner_edge_can_become_an_arc_and_return():
     tissue = cluster(12, 1, lloyd_steps=3)
     rule = vx.T1(threshold=0.02)
     edge = inner_edges_at_the_outline(tissue)[0]
@@ -94,7 +94,7 @@ def test_an_inner_edge_becomes_an_arc_and_comes_back():
     assert same(again) == same(tissue) != same(flipped)
 
 
-def test_the_length_of_an_arc_counts_not_that_of_its_chord():
+def test_threshold_applies_to_the_length_of_the_arc():
     tissue = cluster(12, 1, lloyd_steps=3)
     arc = int(np.flatnonzero(tissue.is_arc)[0])
     tissue = shortened(tissue, arc)
@@ -105,8 +105,8 @@ def test_the_length_of_an_arc_counts_not_that_of_its_chord():
     assert sweep(bulging, OutlineLength(1.0), rule)[1].sum() == 0
 
 
-def test_flips_that_tear_are_refused():
-    # The interface of a doublet has the exterior at both ends; so has a bridge between two halves.
+def test_flips_that_disconnect_the_tissue_are_rejected():
+    # Edges with the exterior at both ends: the interface of a doublet, a bridge between two parts.
     for tissue in (doublet(), cluster(8, 1), cluster(8, 3)):
         start, end = ends(tissue)
         bridges = (start == tissue.n_cells) & (end == tissue.n_cells)
@@ -120,25 +120,25 @@ def test_flips_that_tear_are_refused():
 
 @pytest.mark.parametrize("inner_arcs", [False, True])
 @pytest.mark.parametrize("seed", range(3))
-def test_no_sequence_of_flips_breaks_the_mesh(seed, inner_arcs):
+def test_random_flips_preserve_all_invariants(seed, inner_arcs):
     tissue = cluster(8, seed, inner_arcs=inner_arcs)
-    n_flips, shortest = 0, outline_length(tissue)
+    n_flips, least_length = 0, outline_length(tissue)
     for k in range(25):
         key = jax.random.key(100 * seed + k)
-        energy = Anything(jax.random.normal(key, (97,)))
+        energy = RandomEnergy(jax.random.normal(key, (97,)))
         tissue, counts = sweep(tissue, energy, vx.T1(threshold=100.0))
         tissue.topology.validate()
         n_flips += int(counts.sum())
-        shortest = min(shortest, outline_length(tissue))
-        # Flips leave edges of length 100 behind.
+        least_length = min(least_length, outline_length(tissue))
+        # Flipped edges have length 100.
         place = jax.random.normal(key, tissue.vertices.shape)
         tissue = with_angles(tissue.with_vertices(place), 0.5 * jnp.ones(tissue.n_edges))
     assert n_flips > 8
-    assert shortest >= 2
+    assert least_length >= 2
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_local_and_total_judgement_agree(seed):
+def test_local_and_total_energies_give_the_same_flips(seed):
     tissue = cluster(12, seed, random_angles=True)
     tension = 0.3 * jax.random.normal(jax.random.key(seed), (tissue.n_edges,))
     energy = ShapeFactorEnergy(3.7) + LineTension(tension)
@@ -151,11 +151,11 @@ def test_local_and_total_judgement_agree(seed):
     np.testing.assert_allclose(a.vertices, b.vertices, atol=1e-14)
 
 
-def test_straight_clusters_keep_three_sides():
+def test_cells_of_straight_clusters_keep_three_sides():
     tissue = cluster(8, 1)
     tissue = vx.Tissue(tissue.vertices, tissue.topology, vx.Free())
     for k in range(10):
-        energy = Anything(jax.random.normal(jax.random.key(k), (97,)))
+        energy = RandomEnergy(jax.random.normal(jax.random.key(k), (97,)))
         before = tissue.neighbour_counts.min()
         tissue, _ = sweep(tissue, energy, vx.T1(threshold=100.0))
         tissue.topology.validate()

@@ -1,4 +1,4 @@
-"""Random sequences of operations on small tissues, checked by NumPy alone."""
+"""Random sequences of operations on small tissues, checked in NumPy."""
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import vertax as vx
 from vertax.io import load_tissue, save_tissue
 from vertax.transitions import ablate, divide, remove
 
-# One capacity, so that all tissues of a kind share what is compiled.
+# One capacity, so that tissues of the same kind share compiled functions.
 CAPACITY = 12
 ENERGY = (
     vx.energies.AreaElasticity(1.0, 1.0)
@@ -24,11 +24,11 @@ FRICTION = vx.dissipations.SubstrateFriction(1.0)
 
 
 def straight(n, seed):
-    """A free tissue of straight edges, in which a cell of two sides would have no area."""
+    """A free tissue with straight edges and at least three sides per cell."""
     tissue = cluster(max(n, 5), seed, lloyd_steps=4)
     tissue = vx.Tissue(tissue.vertices, tissue.topology, vx.Free())
-    sound = (tissue.topology.neighbour_counts > 2).all() and not tissue.overlaps.any
-    return tissue if sound else straight(n, seed + 1000)
+    valid = (tissue.topology.neighbour_counts > 2).all() and not tissue.overlaps.any
+    return tissue if valid else straight(n, seed + 1000)
 
 
 KINDS = {
@@ -41,7 +41,7 @@ KINDS = {
 
 @eqx.filter_jit
 def swept(tissue, rule):
-    """Transitions, without those that make cells overlap."""
+    """The tissue after transitions, without those that cause overlaps."""
     search = vx.Relaxation(transitions=rule, tolerance=1e-30).search(tissue, ENERGY)
     state, true = search.begin(tissue, ENERGY), jnp.array(True)
     start = search.feasibility.start(tissue, state.contacts, state.counts)
@@ -50,14 +50,14 @@ def swept(tissue, rule):
 
 @eqx.filter_jit
 def smoothed(tissue):
-    """Vertices some way to the middle of their neighbours, if no cells overlap then."""
+    """Move vertices towards the mean of their neighbours, unless cells overlap then."""
     m = tissue.topology
     vector = jnp.where(m.forward[:, None], 1, -1) * tissue.edge_vectors[m.edge]
     pull = jnp.mean(vector.reshape(-1, 3, 2), axis=1)
     vertices = tissue.vertices + 0.3 * jnp.where(m.alive_vertices[:, None], pull, 0)
     moved = tissue.with_vertices(vertices.astype(tissue.vertices.dtype))
     if m.exterior:
-        # A free tissue would shrink to a point. (Vertices of spare slots go to its middle.)
+        # Rescale a free tissue, which would shrink to a point. (Vertices of spare slots are at its centre.)
         vertices = moved.gathered(moved.vertices)
         middle = jnp.mean(vertices, axis=0)
         scale = jnp.sqrt(jnp.sum(moved.alive) / jnp.sum(moved.areas)).astype(vertices.dtype)
@@ -134,20 +134,19 @@ class Player:
         return dense.with_capacity(CAPACITY)
 
     def relax(self):
-        found = vx.equilibrate(
+        equilibrium = vx.equilibrate(
             self.tissue, ENERGY, transitions=vx.T1() + vx.transitions.T2(), throw=False
         )
-        assert found.valid
-        return found.tissue
+        assert equilibrium.valid
+        return equilibrium.tissue
 
     def evolve(self):
         times = jnp.asarray([0.0, 0.05], self.dtype)
-        found = vx.evolve(self.tissue, ENERGY, FRICTION, times, throw=False)
-        return found.tissue
+        return vx.evolve(self.tissue, ENERGY, FRICTION, times, throw=False).tissue
 
-    def play(self, steps, shares):
-        names = list(shares)
-        weights = np.array([shares[name] for name in names], float)
+    def play(self, steps, frequencies):
+        names = list(frequencies)
+        weights = np.array([frequencies[name] for name in names], float)
         for step in range(steps):
             name = str(self.rng.choice(names, p=weights / weights.sum()))
             new = getattr(self, name)()
@@ -170,7 +169,7 @@ ALL = QUICK | {"relax": 0.4, "evolve": 0.3}
 
 
 @pytest.mark.parametrize("kind", ["periodic", "arcs"])
-def test_random_operations_keep_tissues_sound(kind, tmp_path):
+def test_random_operations_give_valid_tissues(kind, tmp_path):
     player = Player(kind, 0, tmp_path)
     player.play(150, QUICK)
     assert min(player.counts[name] for name in ("divide", "remove", "t1")) >= 3, player.counts
@@ -179,7 +178,7 @@ def test_random_operations_keep_tissues_sound(kind, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize("kind", list(KINDS))
-def test_many_random_operations_keep_tissues_sound(kind, dtype, tmp_path):
+def test_many_random_operations_give_valid_tissues(kind, dtype, tmp_path):
     player = Player(kind, 1, tmp_path, dtype)
     player.play(250, ALL)
     assert min(player.counts[name] for name in ("divide", "remove", "t1")) >= 3, player.counts

@@ -25,7 +25,7 @@ def test_a_shrinking_cell_is_extruded():
     assert not relaxed.tissue.alive[3]
     assert relaxed.tissue.alive.sum() == 8
     assert relaxed.tissue.areas.sum() == pytest.approx(float(tissue.areas.sum()))
-    # What is left is at rest by itself.
+    # The tissue without spare slots is in equilibrium.
     alone = relaxed.tissue.without_spare()
     energy = vx.energies.AreaElasticity(1.0, 1.2) + vx.energies.LineTension(0.1)
     force = jax.grad(lambda y: energy(alone.with_configuration(y)))(alone.vertices)
@@ -34,7 +34,7 @@ def test_a_shrinking_cell_is_extruded():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("inner_arcs", [False, True])
-def test_cells_are_extruded_at_the_outline_too(inner_arcs):
+def test_cells_on_the_outline_are_extruded(inner_arcs):
     cluster = vx.initialise.free_voronoi(9, key=2, lloyd_steps=3, inner_arcs=inner_arcs)
     tissue = cluster.with_capacity(9)
     relaxed = vx.equilibrate(tissue, shrinking(9, [0, 1]), transitions=BOTH)
@@ -44,13 +44,13 @@ def test_cells_are_extruded_at_the_outline_too(inner_arcs):
 
 
 @pytest.mark.slow
-def test_a_cell_loses_sides_before_it_goes():
+def test_a_cell_loses_sides_by_t1_before_it_vanishes():
     tissue = random_tissue(9, 1, lloyd_steps=2).with_capacity(9)
     cell = int(jnp.argmax(tissue.neighbour_counts))
     assert tissue.neighbour_counts[cell] >= 6
     energy = shrinking(9, [cell])
 
-    def course(rule, throw):
+    def evolve(rule, throw):
         return vx.evolve(
             tissue,
             energy,
@@ -60,19 +60,19 @@ def test_a_cell_loses_sides_before_it_goes():
             throw=throw,
         )
 
-    # With six sides it cannot become a vertex.
-    assert course(vx.T2(), throw=False).tissue.alive[cell]
-    moved = course(BOTH, throw=True)
+    # A cell with six sides cannot collapse to a vertex.
+    assert evolve(vx.T2(), throw=False).tissue.alive[cell]
+    moved = evolve(BOTH, throw=True)
     assert not moved.tissue.alive[cell]
     assert moved.tissue.alive.sum() == 8
     sides = [int(frame.neighbour_counts[cell]) for frame in moved.trajectory]
-    gone = sides.index(0)
-    assert (np.diff(sides[: gone + 1]) <= 0).all(), sides
+    end = sides.index(0)
+    assert (np.diff(sides[: end + 1]) <= 0).all(), sides
     assert moved.transitions.sum() >= sides[0] - 3 + 1  # T1s, and the T2
 
 
 @pytest.mark.slow
-def test_gradients_where_slots_are_spare():
+def test_gradients_do_not_depend_on_spare_slots():
     tissue = random_tissue(9, 1, lloyd_steps=2)
     energy = lambda a, n: (
         vx.energies.AreaElasticity(1.0, a[:n]) + vx.energies.PerimeterElasticity(0.1, 3.6)
@@ -88,7 +88,7 @@ def test_gradients_where_slots_are_spare():
     np.testing.assert_allclose(roomy, plain, atol=1e-8)
 
 
-def test_t2_needs_a_place_for_spare_slots():
+def test_t2_without_spare_slots_is_rejected():
     with pytest.raises(ValueError, match="with_capacity"):
         vx.equilibrate(random_tissue(6), shrinking(6, [0]), transitions=vx.T2())
     with pytest.raises(ValueError, match="threshold"):

@@ -1,3 +1,5 @@
+"""T1 transitions of periodic tissues."""
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,12 +9,12 @@ from helpers import edge_cell_sets, random_tissue, shape_factors, tissues
 from hypothesis import given, settings, strategies as st
 
 import vertax as vx
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import LineTension, ShapeFactorEnergy
 
 
 class Opaque(vx.AbstractEnergy):
-    """Hides that an energy is local."""
+    """Wraps a local energy as one that is not local."""
 
     inner: vx.AbstractEnergy
 
@@ -26,14 +28,14 @@ def compiled_sweep(tissue, energy, rule, counts):
 
 
 def sweep(tissue, energy, rule, counts=None):
-    # As arrays, other numbers compile nothing anew.
+    # Numbers as arrays, so that other numbers do not recompile.
     return compiled_sweep(tissue, *traced((energy, rule)), counts)
 
 
-def test_the_configuration_of_lower_energy_wins():
-    # Four hexagons around a short edge. Tension on that edge alone cannot tell the two configurations
-    # apart (they have one length), so the cells decide: large target perimeters for the two cells at
-    # its sides pull it open, for the two at its ends flip it.
+def test_edges_flip_only_if_the_energy_decreases():
+    # Four hexagons around a short edge. Both configurations have the same edge length, so the energies of the
+    # cells decide: with large target perimeters of the two cells at its sides the edge does not flip, with
+    # large ones of the two cells at its ends it does.
     tissue = vx.initialise.hexagonal(4, 4)
     edge = 5
     v, w = np.asarray(tissue.topology.edge_vertices)[edge]
@@ -46,7 +48,7 @@ def test_the_configuration_of_lower_energy_wins():
 
     kept, counts = sweep(tissue, ShapeFactorEnergy(loose), rule)
     assert counts.sum() == 0
-    # Refused flips leave the vertices where they are.
+    # Rejected flips do not move vertices.
     np.testing.assert_array_equal(kept.vertices, tissue.vertices)
     assert edge_cell_sets(kept) == edge_cell_sets(tissue)
 
@@ -55,7 +57,7 @@ def test_the_configuration_of_lower_energy_wins():
     assert counts.sum() == 1
     assert flipped.edge_lengths[edge] == pytest.approx(0.01, rel=0.02)
     assert not set(edge_cell_sets(flipped)[edge]) & set(sides.tolist())
-    # The flipped edge stands across the old one.
+    # The flipped edge is perpendicular to the old one.
     assert jnp.dot(flipped.edge_vectors[edge], tissue.edge_vectors[edge]) == pytest.approx(
         0, abs=1e-9
     )
@@ -65,7 +67,7 @@ def test_the_configuration_of_lower_energy_wins():
 
 @settings(max_examples=10, deadline=None)
 @given(tissues(min_cells=5), st.floats(3.4, 4.2), st.floats(0.05, 0.5))
-def test_a_sweep_keeps_the_mesh_valid_and_lowers_the_energy(recipe, p0, threshold):
+def test_a_sweep_preserves_all_invariants(recipe, p0, threshold):
     tissue = recipe()
     energy = ShapeFactorEnergy(p0)
     new, counts = sweep(tissue, energy, vx.T1(threshold=threshold))
@@ -74,12 +76,12 @@ def test_a_sweep_keeps_the_mesh_valid_and_lowers_the_energy(recipe, p0, threshol
     changed = np.asarray(counts) > 0
     before, after = edge_cell_sets(tissue), edge_cell_sets(new)
     for e in range(tissue.n_edges):
-        # Edges keep their number and their two cells, unless they are the ones that flipped.
+        # Edges that do not flip keep their number and their two cells.
         assert (before[e] == after[e]) or changed[e]
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_local_and_total_judgement_agree(seed):
+def test_local_and_total_energies_give_the_same_flips(seed):
     tissue = random_tissue(40, seed)
     energy = ShapeFactorEnergy(shape_factors(40, 3.8, 0.2, seed)) + LineTension(
         0.3 * jax.random.normal(jax.random.key(seed), (120,))
@@ -93,13 +95,13 @@ def test_local_and_total_judgement_agree(seed):
     np.testing.assert_allclose(a.vertices, b.vertices, atol=1e-14)
 
 
-def test_several_independent_flips_in_one_sweep():
+def test_a_sweep_flips_several_edges():
     tissue = random_tissue(200, 0)
     _, counts = sweep(tissue, ShapeFactorEnergy(3.8), vx.T1(threshold=0.1))
     assert counts.sum() >= 5
 
 
-def test_two_sided_cells_never_come_out():
+def test_cells_keep_at_least_three_sides():
     # Large threshold and a fluid tissue: as many flips as possible.
     tissue = random_tissue(40, 3)
     energy = ShapeFactorEnergy(jax.random.uniform(jax.random.key(1), (40,), minval=2.5, maxval=5.0))
@@ -110,14 +112,14 @@ def test_two_sided_cells_never_come_out():
         flips += int(counts.sum())
         assert tissue.neighbour_counts.min() >= 3
         tissue.topology.validate()
-        nudge = 0.03 * jax.random.normal(jax.random.key(flips), tissue.vertices.shape)
-        tissue = tissue.with_configuration(tissue.vertices + nudge)
+        shift = 0.03 * jax.random.normal(jax.random.key(flips), tissue.vertices.shape)
+        tissue = tissue.with_configuration(tissue.vertices + shift)
     assert flips > 5
 
 
 @pytest.mark.thorough
 def test_edge_parameters_stay_with_their_edge():
-    # Mark one edge by a huge tension: wherever it goes, its number goes with it.
+    # One edge has a large tension, also after flips, so it becomes short.
     tissue = random_tissue(30, 7)
     tension = jnp.full(90, 0.1).at[17].set(2.0)
     energy = ShapeFactorEnergy(3.7) + LineTension(tension)
@@ -126,7 +128,7 @@ def test_edge_parameters_stay_with_their_edge():
     assert relaxed.tissue.edge_lengths[17] < 0.01
 
 
-def test_an_edge_turned_inside_out_is_a_candidate():
+def test_an_inverted_edge_is_a_candidate():
     tissue = vx.initialise.hexagonal(4, 4)
     v, w = np.asarray(tissue.topology.edge_vertices)[8]
     over = 0.6 * tissue.edge_vectors[8]
@@ -146,10 +148,10 @@ def test_the_number_of_flips_of_an_edge_is_bounded():
 
 @pytest.mark.parametrize("boundary", ["periodic", pytest.param("free", marks=pytest.mark.thorough)])
 def test_edges_of_high_tension_end_in_four_fold_vertices(boundary):
-    # An edge under three times the tension of its neighbours shrinks to nothing in either configuration
-    # (two pull at each end, with at most twice their tension). It must come to rest there, not flip for
-    # ever; and the solver must find its way with many such vertices, each a thousand times stiffer
-    # against opening than against being moved.
+    # An edge with three times the tension of its neighbours shrinks to length 0 in both configurations (the
+    # two neighbours at each end pull with at most twice their tension). It must reach equilibrium instead of
+    # flipping back and forth. The solver must converge although opening such a vertex is a thousand times
+    # stiffer than moving it.
     make = vx.initialise.free_voronoi if boundary == "free" else vx.initialise.periodic_voronoi
     tissue = make(16, key=jax.random.key(1))
     tense = jax.random.bernoulli(jax.random.key(2), 0.3, (tissue.n_edges,))
@@ -160,8 +162,8 @@ def test_edges_of_high_tension_end_in_four_fold_vertices(boundary):
 
 
 @pytest.mark.thorough
-def test_an_edge_that_flipped_flips_again_only_if_it_grows():
-    # Cells pull the two at the ends of the edge together; only its own tension says whether it grows.
+def test_an_edge_flips_back_only_if_it_grows():
+    # The cells at the ends of the edge are pulled together; whether it grows depends on its tension.
     tissue = vx.initialise.hexagonal(4, 4)
     edge = 8
     v, w = np.asarray(tissue.topology.edge_vertices)[edge]
@@ -189,6 +191,6 @@ def test_sweeps_vmap_over_tissues():
 
 
 @pytest.mark.parametrize("options", [{"threshold": 0.0}, {"threshold": -1e-3}, {"max_flips": 0}])
-def test_bad_settings_are_refused(options):
+def test_invalid_settings_are_rejected(options):
     with pytest.raises(ValueError, match=f"`{next(iter(options))}` must be"):
         vx.T1(**options)

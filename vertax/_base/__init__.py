@@ -1,1 +1,1 @@
-"""What every other package may use: compiled properties, files that are whole or absent, one shim."""
+"""Utilities without physics: argument checks, tracing, pytrees, files, compilation."""

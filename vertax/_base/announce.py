@@ -1,4 +1,4 @@
-"""A message for users who wait for a compilation."""
+"""Messages on the terminal while a function compiles."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from tqdm import tqdm
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 DELAY = 1.0
-"""Seconds of a compilation after which a message is printed."""
+"""Seconds of compilation after which a message is printed."""
 
 
 class _Thread(threading.local):
     label: str | None = None
-    """What is compiled, if that is announced."""
+    """Name of the compiled function in the message; None for no message."""
     timer: threading.Timer | None = None
-    """The timer of the outermost compiled function that is being called."""
+    """Timer of the outermost compiled function that is being called."""
 
 
 _thread = _Thread()
@@ -30,9 +30,9 @@ _label_of_process: list[str] = []
 
 
 def announced_jit(function: Function, *, inline: bool = False) -> Function:
-    """`equinox.filter_jit`, for functions whose compilation `announce_compilations` reports."""
+    """`equinox.filter_jit` with the messages of `announce_compilations`."""
 
-    # JAX calls it only to trace it: a function that is compiled already does not start the timer.
+    # JAX calls this only to trace it: a compiled function does not start the timer.
     @functools.wraps(function)
     def traced(*args: Any, **kwargs: Any) -> Any:
         timer = _thread.timer
@@ -47,7 +47,7 @@ def announced_jit(function: Function, *, inline: bool = False) -> Function:
         label = _thread.label or next(iter(_label_of_process), None)
         if label is None or _thread.timer is not None:
             return compiled(*args, **kwargs)
-        _thread.timer = threading.Timer(DELAY, _say, (label,))
+        _thread.timer = threading.Timer(DELAY, _print_message, (label,))
         _thread.timer.daemon = True
         try:
             return compiled(*args, **kwargs)
@@ -59,25 +59,25 @@ def announced_jit(function: Function, *, inline: bool = False) -> Function:
 
 
 @contextlib.contextmanager
-def announce_compilations(what: str) -> Iterator[None]:
-    """Print, once a compilation takes a second, that `what` is compiled.
+def announce_compilations(label: str) -> Iterator[None]:
+    """Print "Compiling `label`" when a compilation takes longer than `DELAY`.
 
-    It prints on a terminal and in a notebook; elsewhere only if `announce_in_this_process` was called.
+    The message appears on a terminal and in a notebook; elsewhere only after `announce_in_this_process`.
     """
     before = _thread.label
     # The outermost context names the job that the user started.
     if before is None and (sys.stderr.isatty() or "ipykernel" in sys.modules or _label_of_process):
-        _thread.label = what
+        _thread.label = label
     try:
         yield
     finally:
         _thread.label = before
 
 
-def announce_in_this_process(what: str) -> None:
-    """Announce compilations in all threads, also outside of a terminal; by default that of `what`."""
-    _label_of_process[:] = [what]
+def announce_in_this_process(label: str) -> None:
+    """Announce compilations in all threads, also without a terminal; `label` is the default name."""
+    _label_of_process[:] = [label]
 
 
-def _say(what: str) -> None:
-    tqdm.write(f"Compiling {what} (once for each size and kind of tissue) …", file=sys.stderr)
+def _print_message(label: str) -> None:
+    tqdm.write(f"Compiling {label} (once for each size and kind of tissue) …", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""NumPy archives with a header that says what they hold, in which version."""
+"""NumPy archives (`.npz`) with a header: the kind of file and the version of its format."""
 
 from __future__ import annotations
 
@@ -30,43 +30,43 @@ def write_archive(
 
 
 def read_archive(path: str | os.PathLike[str], what: str, version: int) -> dict[str, np.ndarray]:
-    """All arrays of an archive, read in full so that damage shows here.
+    """Read all arrays of an archive at once, so that a damaged file is an error here.
 
     **Arguments:**
 
     - `path`: the file.
     - `what`: the kind of file, see `write_archive`.
-    - `version`: the newest version that is understood.
+    - `version`: the newest version that can be read.
 
     **Returns:** the arrays by name, header included.
 
     **Raises:**
 
-    - `FileNotFoundError` if there is no such file.
-    - `ValueError`, with the file's name, if it is another kind of file, is truncated or damaged, or of
-        a newer version.
+    - `FileNotFoundError` if the file does not exist.
+    - `ValueError`, with the file's name, for another kind of file, a truncated or damaged file, or a
+        newer version.
     """
     name = os.fspath(path)
     arrays = _read(name, what)
     if "format" not in arrays or str(arrays["format"]) != f"vertax-{what}":
         raise ValueError(f"{name} is not a vertax {what} file: it has no header saying so.")
-    found = arrays.get("version", np.asarray(""))
-    if found.shape != () or found.dtype.kind != "i" or found < 1:
-        raise ValueError(f"{name} has a broken header: its version is {found}.")
-    if found > version:
+    stored = arrays.get("version", np.asarray(""))
+    if stored.shape != () or stored.dtype.kind != "i" or stored < 1:
+        raise ValueError(f"{name} has a broken header: its version is {stored}.")
+    if stored > version:
         raise ValueError(
-            f"{name} has version {found} of the {what} format, but this vertax reads up to "
+            f"{name} has version {stored} of the {what} format, but this vertax reads up to "
             f"version {version}. Update vertax."
         )
     return arrays
 
 
 def as_jax(array: Shaped[np.ndarray, "..."], name: str) -> Shaped[Array, "..."]:
-    """An array of the file `name` on the device, bit for bit.
+    """Convert an array of the file `name` to JAX without rounding.
 
     **Raises:**
 
-    - `ValueError` for 64-bit numbers while JAX is limited to 32 bits.
+    - `ValueError` for 64-bit numbers if JAX is limited to 32 bits.
     """
     converted = jnp.asarray(array)
     if converted.dtype != array.dtype:
@@ -85,6 +85,6 @@ def _read(name: str, what: str) -> dict[str, np.ndarray]:
         try:
             with np.load(file, allow_pickle=False) as archive:
                 return {key: np.asarray(archive[key]) for key in archive.files}
-        # The archive reader fails in a dozen ways, depending on which byte is wrong.
+        # NumPy raises errors of many types for a damaged archive.
         except Exception as error:
             raise ValueError(f"{name} is truncated or damaged: {error}") from error

@@ -1,4 +1,4 @@
-"""Files that are either there in full or not at all."""
+"""Atomic writing of files: a file is complete or absent."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def atomic_write(
     encoding: str | None = None,
     newline: str | None = None,
 ) -> Iterator[IO[Any]]:
-    """Write a file that appears under its name only once it is complete.
+    """Write a file that appears under its name only when it is complete.
 
     The text or bytes go to a temporary file in the same folder, which replaces `path` when the
-    block ends. If the block raises (or the process is interrupted) the old file, if any, is left as
-    it was and nothing else stays behind.
+    block ends. If the block raises (or the process is interrupted), an old file stays unchanged and
+    the temporary file is removed.
 
     ```python
     with vertax.io.atomic_write("metrics.json") as file:
@@ -33,10 +33,9 @@ def atomic_write(
 
     **Arguments:**
 
-    - `path`: the file to write. A symbolic link keeps pointing where it did: its target is
-        replaced.
+    - `path`: the file to write. Of a symbolic link the target is replaced.
     - `mode`: `"w"` for text, `"wb"` for bytes.
-    - `encoding`: of text; UTF-8 unless told.
+    - `encoding`: of text; by default UTF-8.
     - `newline`: as for `open`; pass `""` for the `csv` module.
 
     **Returns:** a context manager that gives the open file.
@@ -55,8 +54,8 @@ def atomic_write(
         raise FileNotFoundError(f"Cannot write {os.fspath(path)!r}: there is no folder {folder}.")
     if destination.is_dir():
         raise IsADirectoryError(f"Cannot write {os.fspath(path)!r}: it is a folder.")
-    # Exclusive creation ("x") by `open` and not `tempfile`: a file made by the latter is private to
-    # its owner, and would stay so under its final name.
+    # `open` with mode "x" instead of `tempfile`, which would leave the final file readable only by its
+    # owner.
     temporary = folder / f".vertax-{secrets.token_hex(8)}.tmp"
     if mode == "w":
         encoding = encoding or "utf-8"
@@ -64,7 +63,7 @@ def atomic_write(
         with open(temporary, mode.replace("w", "x"), encoding=encoding, newline=newline) as file:
             yield file
             file.flush()
-            # Without it a crash of the machine can leave the new name on an empty file.
+            # Without fsync, a crash of the machine can leave an empty file under the final name.
             os.fsync(file.fileno())
         if destination.exists():
             shutil.copymode(destination, temporary)
@@ -77,29 +76,28 @@ def atomic_write(
 
 @contextlib.contextmanager
 def atomic_draft(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A file that another program writes, and that appears under its name only once it is complete.
+    """Like `atomic_write`, for a file that another program writes.
 
     **Arguments:**
 
     - `path`: the file to write.
 
-    **Returns:** a context manager that gives the path of a draft with the same ending.
+    **Returns:** a context manager that gives the path of a temporary file with the same suffix.
 
     **Raises:** as `atomic_write`.
     """
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / f"draft{Path(path).suffix}"
-        with atomic_write(path, "wb") as file:  # what is wrong with `path` shows before the work
+        with atomic_write(path, "wb") as file:  # an invalid `path` raises here, before the work
             yield draft
             with draft.open("rb") as content:
                 shutil.copyfileobj(content, file)
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the new name itself durable, where the system can."""
-    with contextlib.suppress(
-        OSError
-    ):  # Windows cannot open folders, some file systems not sync them
+    """Write the folder entry to disk, if the system supports it."""
+    # Windows cannot open folders; some file systems cannot sync them.
+    with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""Which axes of an array are those of cells, edges or vertices, as fields declare it."""
+"""Axes of cells, edges and vertices in arrays, as declared by the annotations of fields."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 
 Tree = TypeVar("Tree", bound=Any)
 
@@ -26,26 +26,26 @@ AXES = ("cells", "edges", "vertices")
 """The names of axes, as in `Float[Array, "cells"]`."""
 
 METADATA = "axis"
-"""The key of the metadata of a field: the name of its first axis, or None for none of them."""
+"""Metadata key of a field: the name of its first axis (one of `AXES`), or None."""
 
 _SHAPE = re.compile(r"\[[^\[\]]*,\s*[\"']([^\"']*)[\"']\s*\]")
 
 
 @dataclasses.dataclass(frozen=True)
 class Declaration:
-    """What a field declares of the arrays that it holds."""
+    """The axes that a field declares for its arrays."""
 
     owner: type
     field: str
     shapes: tuple[tuple[str, ...], ...] | None
-    """The names of axes, for each kind of array that it may hold; None if it declares nothing."""
+    """The names of axes of each array type in the annotation; None without a declaration."""
 
     def axes(self, ndim: int) -> dict[int, str]:
-        """The axes of an array of so many dimensions that are those of cells, edges or vertices.
+        """The axes of cells, edges and vertices in an array of `ndim` dimensions.
 
         **Raises:**
 
-        - `TypeError` if its annotation allows several answers.
+        - `TypeError` if the annotation is ambiguous.
         """
         candidates = [_axes_of(shape, ndim) for shape in self.shapes or ()]
         candidates = [axes for axes in candidates if axes is not None]
@@ -60,18 +60,18 @@ class Declaration:
 
 
 def declarations(tree: Any, opaque: tuple[type, ...] = ()) -> list[Declaration | None]:
-    """For each leaf of a pytree, in order, what the innermost field that holds it declares.
+    """For each leaf of a pytree, the declaration of the innermost field that contains it.
 
     **Arguments:**
 
     - `tree`: the pytree.
-    - `opaque`: classes whose instances count as leaves.
+    - `opaque`: classes with instances that count as leaves.
 
-    **Returns:** the declarations; None for a leaf that no field of a module holds.
+    **Returns:** the declarations; None for a leaf outside of modules.
     """
     is_leaf = lambda x: isinstance(x, opaque)
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=is_leaf)
-    return [_declared(tree, path) for path, _ in leaves]
+    return [_declaration_at(tree, path) for path, _ in leaves]
 
 
 def gather(
@@ -83,22 +83,22 @@ def gather(
     opaque: tuple[type, ...] = (),
     strict: tuple[type, ...] = (eqx.Module,),
 ) -> Tree:
-    """A pytree of which arrays with one entry for each cell, edge or vertex have the entries of `parents`.
+    """Index the arrays of a pytree along their axes of cells, edges and vertices by `parents`.
 
     **Arguments:**
 
     - `tree`: the pytree.
-    - `parents`: for each of the names in `AXES` the index of the entry that each new entry repeats.
-    - `sizes`: the number of entries before, by the same names.
-    - `axis`: the name of the first axis of arrays of which no field declares anything.
-    - `opaque`: classes whose instances stay as they are.
-    - `strict`: classes whose fields must declare an array whose first axis is as long as one of `sizes`.
+    - `parents`: for each name in `AXES`, the old index of each new entry.
+    - `sizes`: for each name in `AXES`, the old number of entries.
+    - `axis`: the name of the first axis of arrays without a declaration.
+    - `opaque`: classes with instances that stay unchanged.
+    - `strict`: classes in which an array must be declared if the length of its first axis is one of `sizes`.
 
     **Raises:**
 
-    - `TypeError` without `axis`, for an array outside of modules, and for an array in a field of a class in
-        `strict` that declares nothing and has one of the sizes.
-    - `ValueError` for an array of another length than was declared.
+    - `TypeError` if `axis` is None, for an array outside of modules, and for an undeclared array of one of
+        `sizes` in a class of `strict`.
+    - `ValueError` for an array of another length than declared.
     """
     is_leaf = lambda x: isinstance(x, opaque)
     leaves, structure = jax.tree.flatten(tree, is_leaf=is_leaf)
@@ -162,10 +162,10 @@ def _check_undeclared(
 
 def _taken(x: Array | np.ndarray, parent: Any, axis: int) -> Array | np.ndarray:
     if is_concrete(x) and is_concrete(parent) and not _is_key(x):
-        # By NumPy: JAX would compile for each size.
+        # NumPy, because JAX would compile this for each size.
         taken = np.take(np.asarray(x), np.asarray(parent), axis)
         return taken if isinstance(x, np.ndarray) else jnp.asarray(taken)
-    # (Indexed, and not by `jnp.take`: keys of random numbers may be indexed.)
+    # (`jnp.take` does not support random keys.)
     return jnp.asarray(x)[(slice(None),) * axis + (parent,)]
 
 
@@ -173,7 +173,7 @@ def _is_key(x: Array | np.ndarray) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
-def _declared(tree: Any, path: tuple[Any, ...]) -> Declaration | None:
+def _declaration_at(tree: Any, path: tuple[Any, ...]) -> Declaration | None:
     declaration: Declaration | None = None
     node: Any = tree
     for key in path:
@@ -185,14 +185,14 @@ def _declared(tree: Any, path: tuple[Any, ...]) -> Declaration | None:
             node = node[key.idx]  # pyright: ignore[reportIndexIssue]
         elif isinstance(key, jax.tree_util.DictKey):
             node = node[key.key]  # pyright: ignore[reportIndexIssue]
-        else:  # a node that says nothing of its children
+        else:  # a pytree node without named children
             break
     return declaration
 
 
 @functools.cache
 def declaration_of(cls: type, name: str) -> Declaration:
-    """What a field of a class declares."""
+    """The declaration of a field of a class."""
     (field,) = (f for f in dataclasses.fields(cls) if f.name == name)
     if METADATA in field.metadata:
         axis = field.metadata[METADATA]
@@ -207,7 +207,7 @@ def declaration_of(cls: type, name: str) -> Declaration:
 
 
 def _annotation(cls: type, field: dataclasses.Field[Any]) -> Any:
-    """The annotation of a field, evaluated if its names are those of the module."""
+    """The annotation of a field, evaluated in its module if possible."""
     if not isinstance(field.type, str):
         return field.type
     for base in cls.__mro__:
@@ -215,13 +215,13 @@ def _annotation(cls: type, field: dataclasses.Field[Any]) -> Any:
             names = vars(sys.modules[base.__module__]) if base.__module__ in sys.modules else {}
             try:
                 return eval(field.type, dict(names))
-            except Exception:  # names of a function, or for type checkers only: read as text
+            except Exception:  # local names or TYPE_CHECKING imports: parse the text instead
                 return field.type
     return field.type
 
 
 def _shapes(annotation: Any) -> Iterator[tuple[str, ...]]:
-    """The shapes of all arrays that an annotation names."""
+    """The shapes of all array types in an annotation."""
     if isinstance(annotation, str):
         yield from (tuple(shape.split()) for shape in _SHAPE.findall(annotation))
     elif isinstance(shape := getattr(annotation, "dim_str", None), str):
@@ -234,13 +234,13 @@ def _shapes(annotation: Any) -> Iterator[tuple[str, ...]]:
 
 
 def _axes_of(shape: tuple[str, ...], ndim: int) -> dict[int, str] | None:
-    """The axes of cells, edges and vertices of an array; None if it has another number of dimensions."""
+    """The axes of cells, edges and vertices of an array; None if `ndim` does not match."""
     names = [name.rpartition("=")[2] for name in shape]
     many = [i for i, name in enumerate(names) if name == "..." or "*" in name]
     more = ndim - len(names)
     if more < (-1 if many else 0) or (more > 0 and not many):
         return None
-    if many:  # stands for any number of axes, of which the name is that of the first
+    if many:  # a variadic axis (`*cells` or `...`); its name is that of the first axis
         (at, *_), spread = many, names[many[0]]
         names[at : at + 1] = [spread.replace("*", "")] * min(1, more + 1) + [""] * more
     plain = [name.lstrip("#?*") for name in names]

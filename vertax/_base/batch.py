@@ -1,4 +1,4 @@
-"""Many of a kind as one pytree with a leading axis, and one of them again."""
+"""Batches: stack pytrees along a leading axis, and take one member."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Tree = TypeVar("Tree", bound=Any)
 
 
 def stack(trees: Sequence[Tree]) -> Tree:
-    """A batch of pytrees of one structure: each array gets a leading axis.
+    """Stack pytrees of the same structure: each array gets a leading axis.
 
     ```python
     problems = [make(key) for key in jax.random.split(jax.random.key(0), 8)]
@@ -24,15 +24,15 @@ def stack(trees: Sequence[Tree]) -> Tree:
 
     **Arguments:**
 
-    - `trees`: tissues of one size, energies, inverse problems, … What is no array in them (functions,
-        Python numbers) must be the same in all.
+    - `trees`: tissues of one size, energies, inverse problems, … Leaves that are not
+        arrays (functions, Python numbers) must be equal in all.
 
     **Returns:** the batch.
 
     **Raises:**
 
-    - `ValueError` for no trees, and for those that differ in structure, in the shape of an array or in
-        what is no array.
+    - `ValueError` without trees, and for trees that differ in structure, in the shape of an array or in
+        a leaf that is not an array.
     """
     trees = list(trees)
     if not trees:
@@ -48,21 +48,21 @@ def stack(trees: Sequence[Tree]) -> Tree:
 
 
 def member(tree: Tree, index: int) -> Tree:
-    """One of a batch.
+    """Take one member of a batch.
 
     **Arguments:**
 
     - `tree`: the batch: each of its arrays has a leading axis.
-    - `index`: which, from 0.
+    - `index`: the index of the member, from 0.
 
     **Returns:** its member.
 
     **Raises:**
 
-    - `IndexError` if there are not so many.
+    - `IndexError` for an index out of range.
     """
     sizes = {x.shape[0] if x.ndim else 0 for x in jax.tree.leaves(tree) if _is_array(x)}
-    # JAX takes the last one for an index beyond the end.
+    # JAX clamps an index out of range.
     if sizes and not -min(sizes) <= index < min(sizes):
         raise IndexError(
             f"Argument `index` must lie in 0 … {min(sizes) - 1}, the members of the batch, but is {index}."
@@ -86,7 +86,7 @@ def _stacked(first: Any, *others: Any) -> Any:
     for other in others:
         if other is not first and other != first:
             raise ValueError(
-                "Argument `trees` must not differ in what is no array, but one holds "
+                "Argument `trees` must have equal leaves except for arrays, but one holds "
                 f"{first!r} where another holds {other!r}. Make numbers that differ arrays: jnp.array(…)."
             )
     return first

@@ -1,4 +1,4 @@
-"""What takes long, in the middle of its way, in a file."""
+"""Checkpoints of long runs: write the progress to a file, and continue from it."""
 
 from __future__ import annotations
 
@@ -19,34 +19,33 @@ from jaxtyping import PyTree, Shaped
 from vertax._base.archive import as_jax, read_archive, write_archive
 
 _VERSION = 1
-# Writing takes no more than this share of the time of a fit, however slow the disk.
-_SHARE = 0.02
+# Largest fraction of the run time that is spent on writing.
+_WRITING_FRACTION = 0.02
 
 Row = Mapping[str, Any]
 
 
 class Checkpoint(eqx.Module):
-    """Where, and how often, [`fit`][vertax.fit] or [`evolve`][vertax.evolve] writes how far it has come.
+    """File and interval of the checkpoints of [`fit`][vertax.fit] and [`evolve`][vertax.evolve].
 
     ```python
     fit = vx.fit(problem, optax.adam(1e-2), epochs=5000, checkpoint="fit.npz")
     ```
 
-    If the file is there, the same call goes on from it, and ends at the same numbers, bit for bit on one
-    machine, as if it had never stopped; a fit that has come to its end is not repeated. Delete the file to
-    start anew. A greater number of `epochs` continues a fit that is done, and further `times` a movement.
+    If the file exists, the same call continues from it and returns the same result as an uninterrupted run
+    (on the same machine, bit for bit); a finished fit is not repeated. Delete the file to start again. A
+    larger number of `epochs` continues a finished fit, and more `times` a finished evolution.
 
-    The file is a NumPy `.npz` archive without pickles: of a fit the state of the optimiser, the parameters,
-    the tissue, what is known of its Hessian, the best point so far and the history; of a movement all
-    frames, and the state that the next one begins with. It is written at the end, at an interrupt from the
-    keyboard, and between epochs or frames, atomically: a process that is killed while it writes leaves the
-    last one.
+    The file is a NumPy `.npz` archive without pickles. For a fit it holds the state of the optimiser, the
+    parameters, the tissue, the recycled Hessian, the best point so far and the history; for an evolution all
+    frames and the current state. It is written atomically at the end, after a keyboard interrupt, and between
+    epochs or frames: a process that is killed while it writes leaves the previous checkpoint.
 
     **Arguments:**
 
-    - `path`: the file, by custom with the ending `.npz`.
-    - `every`: least number of seconds from one to the next; 0 is after each epoch or frame, unless writing
-        takes more than 2 % of the time.
+    - `path`: the file, usually with the suffix `.npz`.
+    - `every`: minimum time between two checkpoints in seconds; 0 writes after each epoch or frame, unless
+        writing takes more than 2 % of the time.
 
     **Raises:**
 
@@ -62,22 +61,22 @@ class Checkpoint(eqx.Module):
 
 
 class Progress(NamedTuple):
-    """How far it has come: a new one after each epoch or frame, so that an interrupt finds a whole one."""
+    """State and history of a run; replaced as a whole, so that an interrupt never saves a partial one."""
 
     state: PyTree
     rows: tuple[Row, ...] = ()
     notes: tuple[Row, ...] = ()
 
 
-class Keeper:
-    """Reads and writes the checkpoints of one fit, or of one movement in time.
+class CheckpointFile:
+    """Reads and writes the checkpoints of one fit or evolution.
 
     **Arguments:**
 
-    - `checkpoint`: where and how often, a path or a `Checkpoint`; None for not at all.
-    - `identity`: what makes this one another than others, by what it is called in messages; only called if
-        there is something to read or to write.
-    - `what`: what messages call it.
+    - `checkpoint`: a path or a `Checkpoint`; None for no checkpoints.
+    - `identity`: returns texts that identify the run, by their name in messages; called only if there is a
+        `checkpoint`.
+    - `what`: name of the run in messages.
     """
 
     def __init__(
@@ -90,43 +89,43 @@ class Keeper:
             checkpoint = Checkpoint(checkpoint)
         self._what = what
         if checkpoint is not None and not checkpoint.path.absolute().parent.is_dir():
-            # Said now, and not when hours of work are to be written.
+            # Raise now, not after hours of work.
             raise FileNotFoundError(
                 f"Argument `checkpoint` is {os.fspath(checkpoint.path)!r}, but there is no folder "
                 f"{checkpoint.path.parent}. Make it first."
             )
         self._checkpoint = checkpoint
         self._identity = identity() if checkpoint is not None else {}
-        self._due = 0.0 if checkpoint is None else time.perf_counter() + checkpoint.every
+        self._next_time = 0.0 if checkpoint is None else time.perf_counter() + checkpoint.every
 
     def load(self, start: PyTree) -> Progress:
-        """The progress in the file, or that of a fit which starts now."""
+        """Return the progress in the file, or initial progress with the state `start`."""
         if self._checkpoint is None or not self._checkpoint.path.exists():
             return Progress(start)
         return _load(self._checkpoint.path, self._identity, start, self._what)
 
-    def note(self, progress: Progress) -> None:
-        """Write it, if it is time to."""
-        if self._checkpoint is None or time.perf_counter() < self._due:
+    def save_if_due(self, progress: Progress) -> None:
+        """Write a checkpoint if `every` seconds have passed since the last one."""
+        if self._checkpoint is None or time.perf_counter() < self._next_time:
             return
         began = time.perf_counter()
         self.save(progress)
         ended = time.perf_counter()
-        self._due = ended + max(self._checkpoint.every, (ended - began) / _SHARE)
+        self._next_time = ended + max(self._checkpoint.every, (ended - began) / _WRITING_FRACTION)
 
     def save(self, progress: Progress) -> None:
-        """Write it now."""
+        """Write a checkpoint."""
         if self._checkpoint is not None:
             _save(self._checkpoint.path, self._identity, progress)
 
 
 def without_addresses(text: str) -> str:
-    """A text in which no address of an object in memory is left, so that two processes write the same."""
+    """Remove memory addresses from a text, which differ between processes."""
     return re.sub(r" at 0x[0-9a-f]+", "", text)
 
 
 def digest(tree: PyTree) -> str:
-    """A number that tells the arrays of one pytree from those of another."""
+    """SHA-256 hash of the arrays of a pytree."""
     numbers = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
         if eqx.is_array_like(leaf):
@@ -157,8 +156,13 @@ def _load(path: Path, identity: Mapping[str, str], start: PyTree, what: str) -> 
     rows, notes = (_rows(arrays, prefix) for prefix in ("row_", "note_"))
     fresh = _arrays(start)
     stored = [arrays.get(f"state_{i}", np.zeros(0, bool)) for i in range(len(fresh))]
-    if n.shape or n != len(rows) or len(notes) not in (0, n) or not all(map(_alike, stored, fresh)):
-        raise ValueError(f"{name} is broken: its state does not go with the {what}. {remedy}")
+    if (
+        n.shape
+        or n != len(rows)
+        or len(notes) not in (0, n)
+        or not all(map(_same_layout, stored, fresh))
+    ):
+        raise ValueError(f"{name} is broken: its state does not match the {what}. {remedy}")
     restored = [_restored(x, like, name) for x, like in zip(stored, fresh, strict=True)]
     dynamic, static = eqx.partition(start, eqx.is_array)
     state = eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), restored), static)
@@ -166,13 +170,13 @@ def _load(path: Path, identity: Mapping[str, str], start: PyTree, what: str) -> 
 
 
 def _check_identity(
-    name: str, text: str, wanted: Mapping[str, str], what: str, remedy: str
+    name: str, text: str, expected: Mapping[str, str], what: str, remedy: str
 ) -> None:
     try:
         stored = json.loads(text)
     except json.JSONDecodeError:
         stored = {}
-    for part, value in wanted.items():
+    for part, value in expected.items():
         if stored.get(part) != value:
             raise ValueError(
                 f"{name} is the checkpoint of a {what} with another {part}"
@@ -182,7 +186,7 @@ def _check_identity(
 
 
 def _difference(stored: Mapping[str, str], part: str, value: str) -> str:
-    """What stands in one description and not in the other."""
+    """The first difference of two descriptions, as text; empty if it is long."""
     then, now = (
         [piece.strip(" ,") for piece in re.split(r", |\n", text)]
         for text in (stored.get(part, ""), value)
@@ -191,15 +195,15 @@ def _difference(stored: Mapping[str, str], part: str, value: str) -> str:
         [piece for piece in then if piece not in now][:1],
         [piece for piece in now if piece not in then][:1],
     )
-    # What a description leaves out has its default.
-    texts = [next(iter(only), "the default") for only in pieces]
+    # A setting that is missing in a description has its default.
+    texts = [next(iter(piece), "the default") for piece in pieces]
     return (
         "" if max(map(len, texts)) > 60 or not any(pieces) else f": {texts[0]} and not {texts[1]}"
     )
 
 
 def columns_of(rows: Sequence[Row]) -> dict[str, np.ndarray]:
-    """Rows with the same names as columns, the first axis being that of the rows."""
+    """Rows as columns: arrays with the rows along the first axis."""
     return {name: np.asarray([row[name] for row in rows]) for name in rows[0]} if rows else {}
 
 
@@ -220,13 +224,13 @@ def _is_key(x: Any) -> bool:
 
 
 def _plain(x: Any) -> Shaped[np.ndarray, "..."]:
-    """An array as NumPy can write it: random keys are made of numbers."""
+    """A NumPy array of numbers, also for random keys."""
     return np.asarray(jax.random.key_data(x) if _is_key(x) else x)
 
 
-def _alike(stored: np.ndarray, fresh: Any) -> bool:
+def _same_layout(stored: np.ndarray, fresh: Any) -> bool:
     like = _plain(fresh)
-    # A file holds numbers that NumPy does not know, such as bfloat16, as raw bytes.
+    # NumPy stores dtypes of ml_dtypes, such as bfloat16, as raw bytes.
     return (stored.shape, stored.itemsize) == (like.shape, like.itemsize)
 
 

@@ -1,4 +1,4 @@
-"""What arguments must be: numbers, whole numbers and keys, refused with the name of the argument."""
+"""Checks of arguments: numbers, integers, random keys, times."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, Shaped
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 
 _SEED_BITS = 64
 
@@ -21,107 +21,108 @@ def check_number(
     value: Any,
     *,
     above: float | int | None = None,
-    least: float | int | None = None,
+    at_least: float | int | None = None,
     many: bool = False,
 ) -> None:
-    """Refuse what is no real number, or not in range. The value of a traced number is not looked at.
+    """Raise an error unless a value is a real number in a range. The range of a tracer is not checked.
 
     **Arguments:**
 
-    - `name`: of the argument, or what the message is to say of it.
-    - `value`: a number, or an array of no dimension.
-    - `above`, `least`: what it must exceed, or at least be.
-    - `many`: whether it may be an array, all entries of which are checked.
+    - `name`: name of the argument, for the message.
+    - `value`: a number, or an array of shape `()`.
+    - `above`, `at_least`: exclusive and inclusive lower bound.
+    - `many`: whether `value` may be an array of any shape; then each entry is checked.
 
     **Raises:**
 
-    - `TypeError` for what is no real number.
+    - `TypeError` unless `value` is a real number.
     - `ValueError` for a number out of range, NaN, or infinity.
     """
-    wanted = "finite"
+    condition = "finite"
     if above is not None:
-        wanted = "positive" if above == 0 else f"above {above:g}"
-    elif least is not None:
-        wanted = f"at least {least:g}"
+        condition = "positive" if above == 0 else f"above {above:g}"
+    elif at_least is not None:
+        condition = f"at least {at_least:g}"
     dtype = _dtype(value)
-    # Booleans are numbers to Python, but no length or strength.
+    # Booleans are integers in Python, but not valid numbers here.
     if dtype is None or not (dtype.kind in "iu" or _floating(dtype)):
         what = "hold real numbers" if many else "be one real number"
-        raise TypeError(f"Argument `{name}` must {what}, but is {named(value)}.")
+        raise TypeError(f"Argument `{name}` must {what}, but is {describe(value)}.")
     if np.shape(value) != () and not many:
-        raise ValueError(f"Argument `{name}` must be one number, but is {named(value)}.")
+        raise ValueError(f"Argument `{name}` must be one number, but is {describe(value)}.")
     if not is_concrete(value):
         return
-    numbers_given = np.asarray(value).astype(float)
-    inside = ~np.isnan(numbers_given)
+    array = np.asarray(value).astype(float)
+    in_range = ~np.isnan(array)
     if above is not None:
-        inside &= numbers_given > above
-    if least is not None:
-        inside &= numbers_given >= least
-    if not inside.all():
-        raise ValueError(f"Argument `{name}` must be {wanted}, but is {_shown(value)}.")
-    if np.isinf(numbers_given).any():
-        finite = "" if wanted == "finite" else " and finite"
-        raise ValueError(f"Argument `{name}` must be {wanted}{finite}, but is {_shown(value)}.")
+        in_range &= array > above
+    if at_least is not None:
+        in_range &= array >= at_least
+    if not in_range.all():
+        raise ValueError(f"Argument `{name}` must be {condition}, but is {_value_or_range(value)}.")
+    if np.isinf(array).any():
+        finite = "" if condition == "finite" else " and finite"
+        raise ValueError(
+            f"Argument `{name}` must be {condition}{finite}, but is {_value_or_range(value)}."
+        )
 
 
-def check_whole(name: str, value: Any, *, least: int | None = None) -> None:
-    """Refuse what is no whole number, or too small.
+def check_integer(name: str, value: Any, *, at_least: int | None = None) -> None:
+    """Raise an error unless a value is an integer in a range.
 
     **Arguments:**
 
-    - `name`: of the argument.
+    - `name`: name of the argument, for the message.
     - `value`: an integer of Python or NumPy.
-    - `least`: what it must at least be.
+    - `at_least`: inclusive lower bound.
 
     **Raises:**
 
-    - `TypeError` for what is no whole number.
-    - `ValueError` for one that is too small.
+    - `TypeError` unless `value` is an integer.
+    - `ValueError` for an integer that is too small.
     """
-    wanted = "a whole number" if least is None else f"at least {least}"
+    condition = "a whole number" if at_least is None else f"at least {at_least}"
     if not isinstance(value, numbers.Integral) or isinstance(value, bool | np.bool_):
         raise TypeError(
-            f"Argument `{name}` must be {wanted} (a Python integer), but is {named(value)}."
+            f"Argument `{name}` must be {condition} (a Python integer), but is {describe(value)}."
         )
-    if least is not None and value < least:
-        raise ValueError(f"Argument `{name}` must be {wanted}, but is {value}.")
+    if at_least is not None and value < at_least:
+        raise ValueError(f"Argument `{name}` must be {condition}, but is {value}.")
 
 
-def check_concrete(what: str, *arguments: Any) -> None:
-    """Refuse traced arrays, with the remedy.
+def check_concrete(function: str, *arguments: Any) -> None:
+    """Raise an error if an argument contains a tracer.
 
     **Arguments:**
 
-    - `what`: who refuses them, such as `periodic_voronoi`.
-    - `arguments`: what must not be traced.
+    - `function`: name of the function that needs concrete arrays, such as `periodic_voronoi`.
+    - `arguments`: pytrees that must not contain tracers.
 
     **Raises:**
 
-    - `TypeError` if one of them is.
+    - `TypeError` if one of them does.
     """
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves(arguments)):
         raise TypeError(
-            f"{what} needs arrays whose numbers it can look at, so it does not work inside jax.jit, "
+            f"{function} needs arrays with concrete values, so it does not work inside jax.jit, "
             "jax.vmap or jax.grad. Call it outside, once for each tissue; tissues of one size make a batch "
-            "by "
-            "jax.tree.map(lambda *x: jax.numpy.stack(x), *tissues)."
+            "by jax.tree.map(lambda *x: jax.numpy.stack(x), *tissues)."
         )
 
 
 def as_key(key: PRNGKeyArray | int) -> PRNGKeyArray:
-    """A key of random numbers, or that of a seed.
+    """Convert a seed to a random key; check a random key.
 
     **Arguments:**
 
-    - `key`: a key from `jax.random.key` (or `jax.random.PRNGKey`), or a whole number as its seed.
+    - `key`: a key from `jax.random.key` (or `jax.random.PRNGKey`), or an integer as its seed.
 
     **Returns:** the key.
 
     **Raises:**
 
     - `TypeError` for anything else.
-    - `ValueError` for several keys, or a seed of more than 64 bits.
+    - `ValueError` for an array of keys, or a seed of more than 64 bits.
     """
     if isinstance(key, numbers.Integral) and not isinstance(key, bool | np.bool_):
         seed = int(key)
@@ -133,7 +134,7 @@ def as_key(key: PRNGKeyArray | int) -> PRNGKeyArray:
     if not isinstance(key, jax.Array | np.ndarray):
         raise TypeError(
             "Argument `key` must be a key from jax.random.key(seed) or a seed, but is "
-            f"{named(key)}."
+            f"{describe(key)}."
         )
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     if typed and key.shape == ():
@@ -151,32 +152,32 @@ def as_key(key: PRNGKeyArray | int) -> PRNGKeyArray:
 
 
 def as_real(name: str, value: ArrayLike | Sequence[Any]) -> Array:
-    """An array of finite real numbers on the device; whole numbers become floating-point numbers.
+    """Convert to a JAX array of finite real numbers; integers become floating-point numbers.
 
     **Arguments:**
 
-    - `name`: of the argument.
-    - `value`: the array, which may be traced, or what becomes one.
+    - `name`: name of the argument, for the message.
+    - `value`: an array, which may be traced, or a sequence of numbers.
 
     **Returns:** the array.
 
     **Raises:**
 
-    - `TypeError` for what is no array of real numbers.
-    - `ValueError` for numbers that are not finite.
+    - `TypeError` unless `value` contains real numbers.
+    - `ValueError` for NaN and infinity.
     """
     _check_real(name, value)
     array = jnp.asarray(value)
     return array if _floating(array.dtype) else array.astype(jnp.result_type(float))
 
 
-def as_doubles(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray, "..."]:
-    """Finite real numbers as float64 of NumPy, whatever the precision of the device is.
+def as_float64(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray, "..."]:
+    """Convert to a NumPy array of finite float64 numbers, also if JAX is limited to 32 bits.
 
     **Arguments:**
 
-    - `name`: of the argument.
-    - `value`: the array, or what becomes one.
+    - `name`: name of the argument, for the message.
+    - `value`: an array or a sequence of numbers.
 
     **Returns:** the array.
 
@@ -189,30 +190,30 @@ def as_doubles(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray
 def _check_real(name: str, value: Any) -> None:
     dtype = _dtype(value)
     if dtype is None or dtype.kind == "c":
-        was = named(value) if dtype is None else f"an array of type {dtype}"
+        was = describe(value) if dtype is None else f"an array of type {dtype}"
         raise TypeError(f"Argument `{name}` must hold real numbers, but is {was}.")
     if is_concrete(value) and not np.isfinite(np.asarray(value)).all():
         raise ValueError(f"Argument `{name}` must be finite, but holds NaN or infinity.")
 
 
 def _dtype(value: Any) -> np.dtype | None:
-    """The type of the numbers, if there are any."""
+    """The dtype of a value; None unless it contains numbers."""
     try:
         dtype = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
-    except (TypeError, ValueError):  # rows of different lengths, say
+    except (TypeError, ValueError):  # for example rows of different lengths
         return None
-    # Keys of random numbers have a type of their own.
+    # Random keys have a dtype that is not a number.
     numeric = isinstance(dtype, np.dtype) and (dtype.kind in "biufc" or _floating(dtype))
     return dtype if numeric else None
 
 
 def _floating(dtype: np.dtype) -> bool:
-    """Whether a type is one of floating-point numbers, bfloat16 and the like included."""
+    """Whether a dtype is floating point, including bfloat16 and other types of ml_dtypes."""
     return bool(jnp.issubdtype(dtype, jnp.floating))
 
 
-def named(value: Any) -> str:
-    """What a message says of a value that is of the wrong type: itself if it is short."""
+def describe(value: Any) -> str:
+    """Describe a value of the wrong type in an error message."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if hasattr(value, "shape") and np.shape(value) != ():
@@ -222,18 +223,18 @@ def named(value: Any) -> str:
     return f"an object of type {type(value).__name__}"
 
 
-def _shown(value: Any) -> str:
-    """A number, or the range of some."""
+def _value_or_range(value: Any) -> str:
+    """A number, or the range of an array, as text."""
     array = np.asarray(value)
     return str(value) if array.shape == () else f"from {array.min()} to {array.max()}"
 
 
-def increasing(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
-    """The argument `times` as an array.
+def as_times(times: ArrayLike | Sequence[Any]) -> Float[Array, " times"]:
+    """Convert the argument `times` to an array.
 
     **Raises:**
 
-    - `ValueError` if there are fewer than two, or they do not increase.
+    - `ValueError` for fewer than two times, or times that do not increase.
     """
     array = as_real("times", times)
     if array.ndim != 1 or array.size < 2:

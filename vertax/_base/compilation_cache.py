@@ -1,4 +1,4 @@
-"""Compiled functions that outlive the process: JAX's persistent compilation cache, in the user's folder."""
+"""JAX's persistent compilation cache, in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax
 
 VARIABLE = "VERTAX_CACHE"
 _OFF = ("off", "0", "no", "false")
-_LARGEST = 2 * 1024**3  # bytes; what was not used for longest goes first
+_MAX_SIZE = 2 * 1024**3  # bytes; the least recently used functions are removed first
 
 
 def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
@@ -24,24 +24,24 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     vx.enable_compilation_cache()
     ```
 
-    The command `vertax`, the notebooks and the widget of napari call it; the library does not, because the
-    cache is a setting of JAX for the whole process. Call it before the first computation. A function is found
-    again if it, the shapes of its arguments and the versions of JAX and of the device are the same; numbers
-    may differ. At 2 GB the functions that were not used for longest are removed.
+    The command `vertax`, the notebooks and the napari widget call it; the library does not, because the
+    cache is a setting of JAX for the whole process. Call it before the first computation. A cached function
+    is used if its code, the shapes and dtypes of its arguments, the version of JAX and the device are equal.
+    Above 2 GB the least recently used functions are removed.
 
     **Arguments:**
 
-    - `folder`: where to keep them. If left out, the folder that the environment variable `VERTAX_CACHE`
-        names (`off` for none), and else `vertax` in the user's cache folder (`XDG_CACHE_HOME`, by default
-        `~/.cache`; `~/Library/Caches` on macOS, `%LOCALAPPDATA%` on Windows). Others must not be able to
-        write there: the programs in it are executed.
+    - `folder`: folder of the cache. By default the value of the environment variable `VERTAX_CACHE` (`off`
+        disables the cache), or `vertax` in the user's cache folder (`XDG_CACHE_HOME`, by default
+        `~/.cache`; `~/Library/Caches` on macOS, `%LOCALAPPDATA%` on Windows). Other
+        users must not have write access: the programs in it are executed.
 
-    **Returns:** the folder, or `None` if nothing is kept: it is switched off, or the user's cache folder
-    cannot be written to. A folder that was set for JAX before (`JAX_COMPILATION_CACHE_DIR`) is left as it is.
+    **Returns:** the folder, or `None` without a cache: it is disabled, or the user's cache folder is not
+    writable. A folder that was set in JAX before (`JAX_COMPILATION_CACHE_DIR`) stays.
 
     **Raises:**
 
-    - `ValueError` if the folder that was asked for cannot be used.
+    - `ValueError` if the given folder cannot be used.
     """
     asked = os.environ.get(VARIABLE, "") if folder is None else os.fspath(folder)
     if folder is None and asked.lower() in _OFF:
@@ -54,23 +54,23 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
         if not os.access(path, os.W_OK | os.X_OK):
             raise PermissionError(None, "no permission to write")
     except OSError as error:
-        if not asked:  # a home that is read-only is no reason to stop
+        if not asked:  # a read-only home directory is not an error
             return None
         raise ValueError(
             f"Cannot keep compiled functions in {path}: {error.strerror}. Name another folder, or set "
             f"{VARIABLE}=off."
         ) from None
     path = path.absolute()
-    _forget_halves(path)
+    _remove_incomplete_files(path)
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # JAX keeps what took a second; hundreds of small functions take as long together.
+    # By default JAX caches only functions that compile for 1 s; hundreds of small functions take as long.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    jax.config.update("jax_compilation_cache_max_size", _LARGEST)
+    jax.config.update("jax_compilation_cache_max_size", _MAX_SIZE)
     return path
 
 
 def _user_folder() -> Path:
-    """The folder for what programs can make again."""
+    """The cache folder of the user."""
     if (chosen := os.environ.get("XDG_CACHE_HOME", "")) and Path(chosen).is_absolute():
         return Path(chosen)
     home = Path(os.path.expanduser("~"))
@@ -81,9 +81,9 @@ def _user_folder() -> Path:
     return home / ".cache"
 
 
-def _forget_halves(folder: Path) -> None:
-    """Remove functions whose writing was cut short: JAX would warn of them at each start."""
-    # It writes the time of the last use after the function itself, if it keeps to a size.
+def _remove_incomplete_files(folder: Path) -> None:
+    """Remove functions that were not written completely: JAX would print a warning at each start."""
+    # With a maximum size, JAX writes the file `-atime` after the file `-cache`.
     if not (folder / ".lockfile").exists():
         return
     with contextlib.suppress(OSError):

@@ -1,27 +1,27 @@
-"""What is installed on request only: the extras of the package."""
+"""Optional dependencies: the extras of the package."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
 
-# Modules that are called otherwise than their packages.
+# Modules with another name than their package on PyPI.
 _PACKAGES = {"skimage": "scikit-image", "PIL": "pillow", "tomli_w": "tomli-w"}
 
 
 @contextlib.contextmanager
-def needing(extra: str, who: str) -> Iterator[None]:
-    """Around imports of what an extra brings: if it is missing, say how to install it.
+def requires_extra(extra: str, feature: str) -> Iterator[None]:
+    """Wrap imports of an extra; if one fails, the error states the command that installs the extra.
 
     ```python
-    with needing("files", "Writing VTK files"):
+    with requires_extra("files", "Writing VTK files"):
         import meshio
     ```
 
     **Arguments:**
 
     - `extra`: its name in `pyproject.toml`.
-    - `who`: what needs it, the beginning of the message.
+    - `feature`: what needs the extra; the beginning of the message.
 
     **Returns:** a context manager.
 
@@ -33,10 +33,10 @@ def needing(extra: str, who: str) -> Iterator[None]:
         yield
     except ImportError as error:
         module = (error.name or "").partition(".")[0]
-        # A fault of ours, or something that is missing further down and was said there.
+        # A bug in vertax, or an error that already states a command.
         if module == "vertax" or "pip install" in str(error):
             raise
         package = _PACKAGES.get(module, module) or f"what the extra [{extra}] brings"
         raise ImportError(
-            f'{who} needs {package}: pip install "vertax[{extra}]" ({error}).', name=error.name
+            f'{feature} needs {package}: pip install "vertax[{extra}]" ({error}).', name=error.name
         ) from error

@@ -1,4 +1,4 @@
-"""A warning before a process has more compiled functions than Linux lets it keep."""
+"""A warning before compiled functions use up the memory maps of the process (Linux)."""
 
 from __future__ import annotations
 
@@ -8,31 +8,30 @@ from pathlib import Path
 
 import jax.numpy as jnp
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 
 MAPS = Path("/proc/self/maps")
 LIMIT = Path("/proc/sys/vm/max_map_count")
 FRACTION = 0.7
-"""Fraction of the limit at which to warn: the next function may need some thousands."""
+"""Fraction of the limit at which to warn; one compilation may need thousands of memory maps."""
 INTERVAL = 1.0
-"""Seconds between two counts, each of which takes milliseconds."""
+"""Least time between two counts in seconds; a count takes milliseconds."""
 
 _last_count = 0.0
 _has_warned = False
 
 
 def memory_maps() -> int:
-    """Number of memory maps of this process; 0 where the system does not list them."""
+    """Number of memory maps of this process; 0 on systems other than Linux."""
     return MAPS.read_bytes().count(b"\n") if MAPS.exists() else 0
 
 
 def warn_of_memory_maps() -> None:
-    """Warn, once in a process, if compiled functions hold nearly all memory maps that the system allows.
+    """Warn once per process if compiled functions use most of the memory maps that the system allows.
 
-    Each function that XLA compiles for a CPU holds some memory maps of the process, and a gradient of one
-    size of tissue is more than a thousand of them. Linux allows 65530; beyond, LLVM cannot allocate memory
-    and the process ends by a segmentation fault. Call this before a compilation; inside a trace it does
-    nothing.
+    Each function that XLA compiles for a CPU uses several memory maps; the gradient for one tissue size uses
+    more than a thousand. Linux allows 65530; above, LLVM cannot allocate memory and the process ends with a
+    segmentation fault. Call this before a compilation; inside a trace it does nothing.
     """
     global _last_count, _has_warned
     now = time.monotonic()

@@ -1,7 +1,7 @@
-"""What adjoints know of Optimistix beyond its documented interface; known to work with 0.1.
+"""The undocumented part of the interface of adjoints in Optimistix; tested with version 0.1.
 
-An adjoint of Optimistix is handed a minimisation as a function and a tuple whose entries have no names.
-This is the only place that knows their order.
+`optimistix.AbstractAdjoint.apply` receives a minimisation as a function and a tuple of its inputs. The order
+of these inputs is used only in this module.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import equinox as eqx
 import equinox.internal as eqxi
 from jaxtyping import Array, Int, PyTree
 
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 
 
 class Minimisation(eqx.Module):
-    """A minimisation as an adjoint of Optimistix sees it."""
+    """The arguments of `optimistix.AbstractAdjoint.apply` by name."""
 
     run_with: Callable[[tuple], tuple[PyTree[Array], PyTree]]
     fn: Any
@@ -29,36 +29,36 @@ class Minimisation(eqx.Module):
     args: PyTree
     options: dict[str, Any]
     others: tuple[Any, ...]
-    """What an adjoint need not know: most steps, the shapes of outputs, tags."""
+    """Maximum number of steps, shapes of the outputs, tags."""
 
     @classmethod
     def of(cls, primal_fn: Callable, inputs: tuple) -> Minimisation:
-        """The minimisation that `optimistix.AbstractAdjoint.apply` is called with."""
+        """From the arguments of `optimistix.AbstractAdjoint.apply`."""
         fn, solver, y0, args, options, *others = inputs
         return cls(primal_fn, fn, solver, y0, args, options, tuple(others))
 
     @property
     def inputs(self) -> tuple:
-        """The tuple that it was made from."""
+        """The tuple of inputs, in the order of Optimistix."""
         return (self.fn, self.solver, self.y0, self.args, self.options, *self.others)
 
     def run(
         self, kind: Literal["lax", "checkpointed"] = "lax", *, checkpoints: int | None = None
     ) -> tuple[PyTree[Array], PyTree]:
-        """The minimum, and what Optimistix has to say of the way there."""
+        """Run the minimisation; return the minimum and the residuals of Optimistix."""
         loop = partial(eqxi.while_loop, kind=kind, checkpoints=checkpoints)
         return self.run_with((*self.inputs, loop))
 
     def run_as_constant(self) -> tuple[PyTree[Array], PyTree]:
-        """The same, not differentiable; on a CPU members of a `jax.vmap` run one after another."""
-        return one_at_a_time(Minimisation.run)(self)
+        """Like `run`, but not differentiable; on a CPU `jax.vmap` runs the members sequentially."""
+        return sequential_vmap_on_cpu(Minimisation.run)(self)
 
-    def but(self, **changes: Any) -> Minimisation:
-        """The same with some of its parts replaced."""
+    def replaced(self, **changes: Any) -> Minimisation:
+        """A copy with some fields replaced."""
         return dataclasses.replace(self, **changes)
 
 
-def steps_of(residual: PyTree) -> Int[Array, ""]:
-    """How many steps a minimisation took."""
+def num_steps_of(residual: PyTree) -> Int[Array, ""]:
+    """Number of steps, from the residuals of `Minimisation.run`."""
     num_steps, *_ = residual
     return num_steps

@@ -1,7 +1,7 @@
 """Reductions that XLA compiles to one kernel on a CPU.
 
-XLA recognises `max` and `any` of many numbers and splits them into a tree of three kernels. A reduction by a
-function that it does not recognise is one kernel, and as fast.
+XLA splits `max` and `any` of a large array into three kernels. A reduction by a function that XLA does not
+recognise is one kernel, and as fast.
 """
 
 from __future__ import annotations
@@ -13,29 +13,29 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 def any_of(x: Bool[Array, "*shape"]) -> Bool[Array, ""]:
-    """Whether any is true."""
+    """Whether any entry is true."""
     return jax.lax.reduce(x.reshape(-1), np.bool_(False), lambda a, b: jnp.where(b, b, a), (0,))
 
 
 def max_of(x: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """The largest of some numbers that are not negative; NaN is ignored."""
+    """The maximum of numbers ≥ 0; NaN is ignored."""
     return jax.lax.reduce(
         x.reshape(-1), np.zeros((), x.dtype), lambda a, b: jnp.where(b > a, b, a), (0,)
     )
 
 
-def number_of(x: Bool[Array, "*shape"]) -> Float[Array, ""]:
-    """How many are true."""
+def count_true(x: Bool[Array, "*shape"]) -> Float[Array, ""]:
+    """The number of entries that are true."""
     ones = jnp.ones(x.size, jnp.float32)
     return jnp.dot(x.reshape(-1).astype(jnp.float32), ones)
 
 
-def indices_of(
+def indices_of_true(
     mask: Bool[Array, " n"], size: int
 ) -> tuple[Int[Array, " size"], Bool[Array, " size"]]:
-    """The first indices at which a mask is true, in their order, and which of them are any.
+    """The first `size` indices at which a mask is true, in ascending order, and which of these are valid.
 
-    (`jax.numpy.nonzero` computes a prefix sum, twenty kernels.)
+    (`jax.numpy.nonzero` computes a prefix sum: twenty kernels.)
     """
     values, indices = jax.lax.top_k(mask.astype(jnp.float32), min(size, mask.size))
     pad = max(0, size - mask.size)

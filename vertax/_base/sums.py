@@ -1,4 +1,4 @@
-"""Sums of few arrays."""
+"""Sums of a small number of arrays."""
 
 import functools
 import operator
@@ -8,5 +8,5 @@ from jaxtyping import Array, Inexact
 
 
 def total(terms: Iterable[Inexact[Array, "*shape"]]) -> Inexact[Array, "*shape"]:
-    """The sum of at least one array, written out: XLA takes several times as long along a short axis."""
+    """The sum of one or more arrays, unrolled: faster in XLA than a reduction along a short axis."""
     return functools.reduce(operator.add, terms)

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from vertax._base.fields import check_fields
+from vertax._base.field_checks import check_fields
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue

@@ -34,7 +34,7 @@ class ThermalNoise(AbstractActivity):
     temperature: Float[Array, ""]
 
     def __init__(self, temperature: ArrayLike):
-        check_number("temperature", temperature, least=0)
+        check_number("temperature", temperature, at_least=0)
         self.temperature = as_real("temperature", temperature)
 
     def drive(

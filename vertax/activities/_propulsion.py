@@ -41,9 +41,9 @@ class SelfPropulsion(AbstractActivity):
     def __init__(
         self, force: ArrayLike, rotational_diffusion: ArrayLike = 1.0, alignment: ArrayLike = 0.0
     ):
-        check_number("force", force, least=0, many=True)
-        check_number("rotational_diffusion", rotational_diffusion, least=0)
-        check_number("alignment", alignment, least=0)
+        check_number("force", force, at_least=0, many=True)
+        check_number("rotational_diffusion", rotational_diffusion, at_least=0)
+        check_number("alignment", alignment, at_least=0)
         self.force = as_real("force", force)
         self.rotational_diffusion = as_real("rotational_diffusion", rotational_diffusion)
         self.alignment = as_real("alignment", alignment)

@@ -33,7 +33,7 @@ class FluctuatingTensions(AbstractActivity):
     persistence: Float[Array, ""]
 
     def __init__(self, deviation: ArrayLike, persistence: ArrayLike):
-        check_number("deviation", deviation, least=0)
+        check_number("deviation", deviation, at_least=0)
         check_number("persistence", persistence, above=0)
         self.deviation = as_real("deviation", deviation)
         self.persistence = as_real("persistence", persistence)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 
 
 def _floating(x: ArrayLike) -> Array:

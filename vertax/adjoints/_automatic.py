@@ -88,7 +88,7 @@ class AutomaticDifferentiation(AbstractAdjoint):
             )
         root, residual = frozen(frozen(minimisation).run())
         vjp_arg = (minimisation.fn, minimisation.args, self.outcome)
-        others = frozen(minimisation.but(fn=None, args=None))
+        others = frozen(minimisation.replaced(fn=None, args=None))
         return _unroll(vjp_arg, root, others, self.without_outcome()), residual
 
     def _rehearse(self, fn: Callable, args: PyTree, options: dict[str, Any]) -> GradientOutcome:
@@ -178,7 +178,7 @@ def _(
     fn, args, _ = vjp_arg
     options = others.options
     outcome = adjoint._rehearse(fn, args, options)
-    unrolled = others.but(
+    unrolled = others.replaced(
         solver=options["relaxation"],
         y0=options["start"],
         options=options | {"num_steps": outcome.num_steps},
@@ -187,7 +187,7 @@ def _(
 
     def minimum(moving: PyTree) -> PyTree[Array]:
         fn, args = eqx.combine(moving, fixed)
-        steps = unrolled.but(fn=fn, args=args)
+        steps = unrolled.replaced(fn=fn, args=args)
         return steps.run("checkpointed", checkpoints=adjoint.checkpoints)[0]
 
     root, pull = jax.vjp(minimum, moving)

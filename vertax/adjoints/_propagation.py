@@ -13,7 +13,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from vertax._base.optimistix import Minimisation, steps_of
+from vertax._base.optimistix import Minimisation, num_steps_of
 from vertax.adjoints._adjoint import (
     DEGENERATE,
     UNTRUSTED,
@@ -110,7 +110,7 @@ class EquilibriumPropagation(AbstractAdjoint):
         minimisation = Minimisation.of(primal_fn, inputs)
         root, residual = frozen(frozen(minimisation).run())
         vjp_arg = (minimisation.fn, minimisation.args, self.outcome)
-        others = frozen(minimisation.but(fn=None, args=None))
+        others = frozen(minimisation.replaced(fn=None, args=None))
         return _propagate(vjp_arg, root, others, self.without_outcome()), residual
 
     def strength(
@@ -174,7 +174,7 @@ def _(
     fn, args, slot = vjp_arg
     options = others.options
     # The solver of an equilibrium that is known takes no step; the relaxation that found it does.
-    nudge = others.but(solver=options.get("relaxation", others.solver), y0=root, args=args)
+    nudge = others.replaced(solver=options.get("relaxation", others.solver), y0=root, args=args)
     coarsest = options.get("tolerance", jnp.inf)
     moving, fixed = differentiable((fn, args))
 
@@ -188,12 +188,12 @@ def _(
     def phase(force: PyTree[Array], strength: Float[Array, ""]) -> Phase:
         nudged = _Nudged(fn, force)
         tolerance = jnp.minimum(coarsest, adjoint.tolerance(strength))
-        y, residual = nudge.but(
+        y, residual = nudge.replaced(
             fn=nudged, options=options | {"tolerance": tolerance}
         ).run_as_constant()
         along = Resistance.along(jax.grad(lambda y: fn(y, args)[0]), root, y)
         left = optx.max_norm(jax.tree.map(jnp.add, along.force, force))
-        return Phase(slope(y), left, steps_of(residual), along.nonlinearity)
+        return Phase(slope(y), left, num_steps_of(residual), along.nonlinearity)
 
     cotangent = materialise(cotangent, root)
     at_rest = None if adjoint.centred else slope(root)

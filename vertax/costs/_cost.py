@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.batch import member
 from vertax._base.checks import check_number
-from vertax._base.fields import check_fields
+from vertax._base.field_checks import check_fields
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vertax._base.batch import stack
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax.costs._cost import AbstractCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -47,7 +47,7 @@ class Frames(AbstractCost):
             if not isinstance(cost, AbstractCost) or cost.of_frames:
                 raise TypeError(
                     "Argument `costs` of Frames must hold costs of single tissues, one for each time after "
-                    f"the first, but number {number} is {named(cost)}."
+                    f"the first, but number {number} is {describe(cost)}."
                 )
         try:
             self.costs = stack(costs)

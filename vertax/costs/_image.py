@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from vertax._base.checks import as_doubles, as_real, check_number, check_whole
-from vertax._base.modules import is_concrete
+from vertax._base.checks import as_float64, as_real, check_integer, check_number
+from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue
@@ -58,11 +58,11 @@ def render(
     if len(np.shape(shape)) != 1 or len(shape) != 2:
         raise ValueError(f"Argument `shape` must be (rows, columns), but is {shape}.")
     for side in shape:
-        check_whole("shape", side)
+        check_integer("shape", side)
     if min(shape) < _SPLINE_POINTS:
         raise ValueError(f"Argument `shape` must be at least 6 × 6 pixels, but is {shape}.")
     check_number("psf_width", psf_width, above=0)
-    check_whole("points_per_edge", points_per_edge, least=1)
+    check_integer("points_per_edge", points_per_edge, at_least=1)
     if pixel_size is not None:
         check_number("pixel_size", pixel_size, above=0)
     if tissue.vertices.ndim != 2:
@@ -186,7 +186,7 @@ class MeshImage(AbstractLeastSquaresCost):
     ):
         # Inside jax.vmap the numbers of an image are not there to be looked at.
         known = is_concrete(image) and is_concrete(weight)
-        xp, convert = (np, as_doubles) if known else (jnp, as_real)
+        xp, convert = (np, as_float64) if known else (jnp, as_real)
         pixels = convert("image", image)
         if pixels.ndim != 2 or min(pixels.shape) < _SPLINE_POINTS:
             raise ValueError(
@@ -204,7 +204,7 @@ class MeshImage(AbstractLeastSquaresCost):
                 "Argument `weight` must be at least 0 everywhere and positive somewhere."
             )
         check_number("psf_width", psf_width, above=0)
-        check_whole("points_per_edge", points_per_edge, least=1)
+        check_integer("points_per_edge", points_per_edge, at_least=1)
         weights = weights / weights.sum()
         if fit_intensity:
             mean = (weights * pixels).sum()

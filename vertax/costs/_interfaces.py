@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from vertax._base.checks import as_real
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue

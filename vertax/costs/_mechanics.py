@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vertax import mechanics
-from vertax._base.checks import as_real, check_number, check_whole, named
-from vertax._base.modules import is_concrete
+from vertax._base.checks import as_real, check_integer, check_number, describe
+from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import as_matrix
@@ -69,7 +69,7 @@ class CellStress(AbstractLeastSquaresCost):
     def __check_init__(self):
         if self.cells is not None and not jnp.issubdtype(self.cells.dtype, jnp.integer):
             raise TypeError(
-                f"Argument `cells` must hold whole numbers, but is {named(self.cells)}."
+                f"Argument `cells` must hold whole numbers, but is {describe(self.cells)}."
             )
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
@@ -177,7 +177,7 @@ class SpectralGap(AbstractLeastSquaresCost):
     below: int = eqx.field(static=True, default=2)
 
     def __check_init__(self):
-        check_whole("below", self.below, least=1)
+        check_integer("below", self.below, at_least=1)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The difference."""

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.checks import check_whole, named
+from vertax._base.checks import check_integer, describe
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -91,7 +91,7 @@ class EdgeDistance(AbstractLeastSquaresCost):
 
     def __check_init__(self):
         check_target("EdgeDistance", self.target)
-        check_whole("points_per_edge", self.points_per_edge, least=2)
+        check_integer("points_per_edge", self.points_per_edge, at_least=2)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """Displacements of points on edges, times the root of the share of length they stand for."""
@@ -183,7 +183,7 @@ def _meeting_cells(tissue: Tissue) -> Int[Array, "vertices 3"]:
 def check_target(who: str, target: Tissue) -> None:
     """Refuse a target that is no tissue with a `TypeError`."""
     if not isinstance(target, Tissue):
-        raise TypeError(f"The target of {who} must be a Tissue, but is {named(target)}.")
+        raise TypeError(f"The target of {who} must be a Tissue, but is {describe(target)}.")
 
 
 def check_equal(

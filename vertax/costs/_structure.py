@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
 from vertax._base.checks import check_number
-from vertax._base.extremes import greater
+from vertax._base.minimum_maximum import maximum
 from vertax.costs._cost import AbstractCost
 from vertax.costs._positions import check_equal, check_target
 from vertax.costs._transport import entropic_transport
@@ -178,4 +178,4 @@ def _squared_distances(
 ) -> Float[Array, "cells cells"]:
     """Squared distance of each row of one matrix from each row of another."""
     squares = jnp.sum(rows**2, axis=1)[:, None] + jnp.sum(columns**2, axis=1)[None, :]
-    return greater(squares - 2 * rows @ columns.T, 0)
+    return maximum(squares - 2 * rows @ columns.T, 0)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vertax._base.fields import check_fields
+from vertax._base.field_checks import check_fields
 from vertax.mesh import Tissue
 
 

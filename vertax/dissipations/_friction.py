@@ -57,7 +57,7 @@ def coefficient_of(name: str, value: ArrayLike) -> Float[Array, "*shape"]:
 
     - `ValueError` for what is negative or not finite.
     """
-    check_number(name, value, least=0, many=True)
+    check_number(name, value, at_least=0, many=True)
     return as_real(name, value)
 
 

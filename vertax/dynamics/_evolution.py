@@ -15,9 +15,9 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
 from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import Checkpoint
-from vertax._base.checks import as_key, check_whole, increasing, named
+from vertax._base.checks import as_key, as_times, check_integer, describe
 from vertax._base.memory_maps import warn_of_memory_maps
-from vertax._base.modules import is_concrete, traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
@@ -100,12 +100,12 @@ class Evolution(AbstractResponse):
         if not isinstance(dissipation, AbstractDissipation):
             raise TypeError(
                 "Argument `dissipation` must be one of vertax.dissipations, e.g. SubstrateFriction(1.0), "
-                f"but is {named(dissipation)}."
+                f"but is {describe(dissipation)}."
             )
         if not isinstance(activity, AbstractActivity | None):
             raise TypeError(
                 "Argument `activity` must be one of vertax.activities, e.g. ThermalNoise(0.01), but is "
-                f"{named(activity)}."
+                f"{describe(activity)}."
             )
         if activity is not None and key is None and drive is None:
             raise ValueError(
@@ -117,15 +117,15 @@ class Evolution(AbstractResponse):
         self.relaxation = Relaxation() if relaxation is None else relaxation
         if not isinstance(self.relaxation, Relaxation):
             raise TypeError(
-                f"Argument `relaxation` must be a vertax.Relaxation, but is {named(relaxation)}."
+                f"Argument `relaxation` must be a vertax.Relaxation, but is {describe(relaxation)}."
             )
         for name, function in (("boundary", boundary), ("pins", pins)):
             if function is not None and not callable(function):
                 raise TypeError(
-                    f"Argument `{name}` must be a function of time, but is {named(function)}. For one that "
-                    "stays, leave it out."
+                    f"Argument `{name}` must be a function of time, but is {describe(function)}. For one "
+                    "that stays, leave it out."
                 )
-        check_whole("substeps", substeps, least=1)
+        check_integer("substeps", substeps, at_least=1)
         if order not in (1, 2):
             raise ValueError(f"Argument `order` must be 1 or 2, but is {order!r}.")
         if order == 2 and not isinstance(dissipation, AbstractViscosity):
@@ -136,7 +136,7 @@ class Evolution(AbstractResponse):
         if not isinstance(control, StepControl | None):
             raise TypeError(
                 "Argument `control` must be a vertax.dynamics.StepControl, e.g. StepControl(1e-3), but is "
-                f"{named(control)}."
+                f"{describe(control)}."
             )
         if control is not None and (substeps != 1 or activity is not None):
             wrong = "`substeps`" if activity is None else "`activity`"
@@ -149,7 +149,7 @@ class Evolution(AbstractResponse):
                 )
             )
         self.dissipation, self.control = dissipation, control
-        self.times = increasing(times)
+        self.times = as_times(times)
         self.substeps, self.order = substeps, order
         self.boundary, self.pins = boundary, pins
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.mesh import Tissue
 from vertax.mesh._trajectory import Trajectory
 from vertax.relax._response import _NOT_FINITE, Equilibrium

@@ -13,8 +13,15 @@ import numpy as np
 from tqdm import tqdm
 
 from vertax._base.announce import announced_jit
-from vertax._base.checkpoints import Checkpoint, Keeper, Progress, Row, digest, without_addresses
-from vertax._base.modules import is_concrete
+from vertax._base.checkpoints import (
+    Checkpoint,
+    CheckpointFile,
+    Progress,
+    Row,
+    digest,
+    without_addresses,
+)
+from vertax._base.tracing import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._time_integration import Frames, State, begin, evolved, first_frame, march
@@ -48,9 +55,9 @@ def evolve_by_frames(
             "jax.grad: leave them out there."
         )
     times = np.asarray(evolution.times)
-    keeper = Keeper(checkpoint, lambda: _identity(tissue, energy, evolution), "movement")
+    file = CheckpointFile(checkpoint, lambda: _identity(tissue, energy, evolution), "movement")
     start, first = _begin(tissue, energy, evolution)
-    done = keeper.load(start)
+    done = file.load(start)
     if not done.rows:
         done = Progress(start, (_row(times[0], first),))
     _check_times(np.array([row["time"] for row in done.rows]), times)
@@ -74,13 +81,13 @@ def evolve_by_frames(
             bar.set_description(refresh=False)
             bar.set_postfix(time=f"{ends[1]:g}", t1=int(state.num_t1))
             bar.update()
-            keeper.note(done)
+            file.save_if_due(done)
     except KeyboardInterrupt:
-        keeper.save(done)
+        file.save(done)
         raise
     finally:
         bar.close()
-    keeper.save(done)
+    file.save(done)
     return _joined(times, done.state, done.rows, first)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax.activities import AbstractActivity
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
@@ -51,7 +51,7 @@ class Material(AbstractEnergy):
             if value is not None and not isinstance(value, kind):
                 raise TypeError(
                     f"Argument `{name}` of Material must be an {kind.__name__} or None, but is "
-                    f"{named(value)}."
+                    f"{describe(value)}."
                 )
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:

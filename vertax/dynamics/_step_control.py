@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from vertax._base.checks import check_number, check_whole
+from vertax._base.checks import check_integer, check_number
 from vertax.adjoints._adjoint import frozen
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
@@ -54,7 +54,7 @@ class StepControl(eqx.Module):
         check_number("tolerance", self.tolerance, above=0)
         if self.first is not None:
             check_number("first", self.first, above=0)
-        check_whole("most", self.most, least=1)
+        check_integer("most", self.most, at_least=1)
 
     def begin(self, times: Float[Array, " times"]) -> Float[Array, ""]:
         """The length of the first step."""

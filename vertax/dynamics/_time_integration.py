@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import named
-from vertax._base.modules import choose
+from vertax._base.checks import describe
+from vertax._base.tracing import tree_where
 from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractViscosity
@@ -150,7 +150,7 @@ def march(
             whole_step, *ends = marks
             after = step(whole(now), *ends)
             arrays = eqx.filter(after, eqx.is_array)
-            return choose(whole_step, now, arrays), arrays
+            return tree_where(whole_step, now, arrays), arrays
 
         # The whole step and its halves by the code of one: compiling is what takes long.
         marks = (
@@ -168,7 +168,7 @@ def march(
         following = control.next_step(end - start, error, state.error, sound, evolution.order)
         # One that a frame cut short says little of how long the next may be.
         following = jnp.where(accepted & last, jnp.maximum(following, dt), following)
-        after = choose(accepted, fine, state)
+        after = tree_where(accepted, fine, state)
         timing = (frozen(following), frozen(jnp.where(accepted, error, state.error)))
         after = eqx.tree_at(lambda s: (s.dt, s.error), after, timing)
         return after, jnp.where(accepted, end, start), jnp.where(accepted, end - start, 0)
@@ -256,7 +256,7 @@ def _energy_at(energy: Any, time: Any) -> AbstractEnergy:
     if not isinstance(found, AbstractEnergy):
         raise TypeError(
             "Argument `energy` must be an energy, or a function of time that returns one, but returned "
-            f"{named(found)}."
+            f"{describe(found)}."
         )
     return found
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax.energies._energy import AbstractLocalEnergy
 from vertax.mesh import Tissue
 
@@ -20,7 +20,7 @@ def _as_mask(name: str, value: ArrayLike | None) -> Bool[Array, "..."] | None:
         return None
     array = value if isinstance(value, jax.Array) else np.asarray(value)
     if array.dtype.kind not in "biuf":
-        raise TypeError(f"Argument `{name}` must be a mask of booleans, but is {named(value)}.")
+        raise TypeError(f"Argument `{name}` must be a mask of booleans, but is {describe(value)}.")
     return jnp.asarray(array) != 0
 
 

@@ -10,8 +10,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._base.checks import as_real, named
-from vertax._base.fields import check_fields
+from vertax._base.checks import as_real, describe
+from vertax._base.field_checks import check_fields
 from vertax.mesh import Tissue
 
 
@@ -125,7 +125,7 @@ def check_energy(energy: Any, name: str = "energy") -> None:
         return
     raise TypeError(
         f"Argument `{name}` must be an energy, e.g. vertax.energies.ShapeFactorEnergy(3.8), but is "
-        f"{named(energy)}.{instance_hint(energy)}"
+        f"{describe(energy)}.{instance_hint(energy)}"
     )
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.checks import as_real, check_number
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_edge
 from vertax.mesh import Tissue
 

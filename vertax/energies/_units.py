@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from vertax._base.probe import probe
+from vertax._base.probe_vector import probe_vector
 from vertax.mesh import Tissue
-from vertax.mesh._measured import Measured
+from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._tissue import mean_area
 
 
@@ -52,9 +52,9 @@ def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[A
     """The size of a typical second derivative of an energy, or of any number that a tissue has."""
     # The Rayleigh quotient of a vector without pattern is the mean eigenvalue, near enough.
     y, unravel = ravel_pytree(tissue.configuration)
-    there = lambda x: Measured(tissue.with_configuration(unravel(x)))
+    there = lambda x: MeasuredTissue(tissue.with_configuration(unravel(x)))
     slope = jax.grad(lambda x: energy(there(x)))
-    direction = probe(y)
+    direction = probe_vector(y)
     if tissue.topology.spare:  # what cannot move must not make the rest look soft
         weights = tissue.by_row(tissue.topology.alive_vertices.astype(y.dtype))
         weigh = lambda x, w: (x.T * w).T

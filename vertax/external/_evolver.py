@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from vertax._base.checks import check_number, check_whole
+from vertax._base.checks import check_integer, check_number
 from vertax.energies import AbstractEnergy
 from vertax.external._evolver_datafile import datafile, leveller
 from vertax.external._evolver_model import Terms, slope_of
@@ -82,9 +82,9 @@ class SurfaceEvolver(AbstractSimulator):
             check_number(name, getattr(self, name), above=0)
         if self.t1 is not None:
             check_number("t1", self.t1, above=0)
-        check_whole("pieces", self.pieces, least=2)
-        check_whole("steps", self.steps, least=0)
-        check_whole("newton_steps", self.newton_steps, least=0)
+        check_integer("pieces", self.pieces, at_least=2)
+        check_integer("steps", self.steps, at_least=0)
+        check_integer("newton_steps", self.newton_steps, at_least=0)
 
     def relax(
         self,

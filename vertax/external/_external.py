@@ -13,8 +13,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from vertax._base.checks import check_number, check_whole, named
-from vertax._base.modules import is_concrete, traced
+from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
@@ -86,7 +86,7 @@ class External(AbstractResponse):
         if not isinstance(self.simulator, AbstractSimulator):
             raise TypeError(
                 "Argument `simulator` must be a subclass of vertax.external.AbstractSimulator, made by "
-                f"calling it, but is {named(self.simulator)}."
+                f"calling it, but is {describe(self.simulator)}."
             )
         if self.slope not in ("energy", "program", "differences"):
             raise ValueError(
@@ -103,7 +103,7 @@ class External(AbstractResponse):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0, many=True)
         if self.workers is not None:
-            check_whole("workers", self.workers, least=1)
+            check_integer("workers", self.workers, at_least=1)
         if self.timeout is not None and not self.processes:
             raise ValueError(
                 "Argument `timeout` needs processes=True: a simulator that hangs in a thread cannot be ended."

@@ -7,7 +7,7 @@ from typing import Any
 import optax
 import optimistix as optx
 
-from vertax._base.checks import check_whole, named
+from vertax._base.checks import check_integer, describe
 from vertax.fitting._inverse import InverseProblem
 
 
@@ -23,19 +23,19 @@ def check_arguments(
     """
     if not isinstance(problem, InverseProblem):
         raise TypeError(
-            f"Argument `problem` must be a vertax.InverseProblem, but is {named(problem)}."
+            f"Argument `problem` must be a vertax.InverseProblem, but is {describe(problem)}."
         )
     _check_optimiser(optimiser)
-    check_whole("epochs", epochs, least=1)
+    check_integer("epochs", epochs, at_least=1)
     if guidance is not None and not callable(guidance):
         raise TypeError(
             "Argument `guidance` must be a function of the epoch, such as "
-            f"optax.linear_schedule(1.0, 0.0, 100), but is {named(guidance)}. A constant strength is set "
+            f"optax.linear_schedule(1.0, 0.0, 100), but is {describe(guidance)}. A constant strength is set "
             "in the problem: InverseProblem(..., guidance=...)."
         )
     if callback is not None and not callable(callback):
         raise TypeError(
-            f"Argument `callback` must be a function of epoch and record, but is {named(callback)}."
+            f"Argument `callback` must be a function of epoch and record, but is {describe(callback)}."
         )
 
 
@@ -58,5 +58,5 @@ def _check_optimiser(optimiser: Any) -> None:
         remedy = f"Call it: {getattr(optimiser, '__name__', 'optimiser')}(…)."
     raise TypeError(
         "Argument `optimiser` must be an optimiser of parameters, but is "
-        f"{named(optimiser)}. {remedy}"
+        f"{describe(optimiser)}. {remedy}"
     )

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
-from vertax._base.modules import choose, traced
+from vertax._base.tracing import traced, tree_where
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
@@ -221,7 +221,7 @@ def _update(
             parameters, optimiser_state, following, best, going, None, state.looked, stale
         )
         # A relaxation that broke down must not be where the next one starts.
-        return choose(going, moved, eqx.tree_at(lambda s: s.going, state, going)), record
+        return tree_where(going, moved, eqx.tree_at(lambda s: s.going, state, going)), record
 
     return (eqx.filter_vmap(one) if batched else one)(*arguments)
 

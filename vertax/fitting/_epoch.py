@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from vertax._base.modules import choose
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
+from vertax._base.tracing import tree_where
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
@@ -31,7 +31,7 @@ class Best(eqx.Module):
 def over_members(function: Callable[..., Any], problem: InverseProblem) -> Callable[..., Any]:
     """A function, which takes derivatives inside, of each member of a batch of problems."""
     batched = problem.response.prefers_batching
-    return eqx.filter_vmap(function if batched else one_at_a_time(function))
+    return eqx.filter_vmap(function if batched else sequential_vmap_on_cpu(function))
 
 
 class AbstractMethod(eqx.Module):
@@ -98,7 +98,7 @@ def better(
     lower = (guidance < best.guidance) | (
         (guidance == best.guidance) & (facts.cost < best.facts.cost)
     )
-    return choose(ok & lower, new, best)
+    return tree_where(ok & lower, new, best)
 
 
 def guidance_of(problem: InverseProblem) -> Float[Array, "*batch"]:

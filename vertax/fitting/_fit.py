@@ -20,14 +20,14 @@ from tqdm import tqdm
 from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import (
     Checkpoint,
-    Keeper,
+    CheckpointFile,
     Progress,
     Row,
     columns_of,
     digest,
     without_addresses,
 )
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._arguments import check_arguments
 from vertax.fitting._descent import Descent
@@ -134,8 +134,10 @@ def fit(
         method = LeastSquares(optimiser, problem, parameters, constants, true, batched)
     else:
         method = Descent(optimiser, problem, parameters, constants, true, batched, guidance)
-    keeper = Keeper(checkpoint, lambda: _identity_of(given, true, method.description(), batched))
-    done, stopped, interrupted = _run(method, keeper, epochs, progress, callback)
+    file = CheckpointFile(
+        checkpoint, lambda: _identity_of(given, true, method.description(), batched)
+    )
+    done, stopped, interrupted = _run(method, file, epochs, progress, callback)
     complaint = given.response.last_error_message()
     if stopped is not None and complaint is not None:
         stopped = f"{stopped}. {complaint.rstrip('.')}"
@@ -211,7 +213,7 @@ def _check_batch(tree: PyTree) -> None:
 
 def _run(
     method: AbstractMethod,
-    keeper: Keeper,
+    file: CheckpointFile,
     epochs: int,
     progress: bool,
     callback: Callback | None,
@@ -219,7 +221,7 @@ def _run(
     """How far the fit came, why it could not go on, and whether it was interrupted."""
     done = Progress(None)
     try:
-        done = keeper.load(method.start())
+        done = file.load(method.start())
         _check_progress(done, method, epochs)
         # Closed at the end, whatever ends it: a bar that is not keeps an old number of epochs.
         bar = tqdm(
@@ -250,15 +252,15 @@ def _run(
                     t1=int(np.sum(row["num_t1"])),
                 )
                 bar.update()
-                keeper.note(done)
+                file.save_if_due(done)
     except KeyboardInterrupt:
         if not done.rows or not np.isfinite(done.state.best.facts.cost).any():
             raise
-        keeper.save(done)
+        file.save(done)
         return done, None, True
     except eqx.EquinoxRuntimeError as error:
         return done, f"epoch {len(done.rows)} broke down ({_first_line(error)})", False
-    keeper.save(done)
+    file.save(done)
     return done, None, False
 
 

@@ -13,9 +13,9 @@ import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax._base.memory_maps import warn_of_memory_maps
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.adjoints import (
     AbstractAdjoint,
     EquilibriumPropagation,
@@ -105,7 +105,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
                         "vertax.AbstractCost."
                     )
                 raise TypeError(
-                    f"Argument `{name}` must be {example}, but is {named(value)}.{remedy}"
+                    f"Argument `{name}` must be {example}, but is {describe(value)}.{remedy}"
                 )
         check_energy(self.energy)
         self.response.check_compatible(

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
-from vertax._base.modules import choose
+from vertax._base.tracing import tree_where
 from vertax.adjoints import ImplicitDifferentiation
 from vertax.fitting._epoch import (
     AbstractMethod,
@@ -226,7 +226,7 @@ def _epoch(
         going = ~done & (n_still < _PATIENCE)
         moved = State(y, leaves, tissue, placed, facts, state.scale, best, n_still, going)
         # In a batch a member that was done earlier stands still.
-        state = choose(state.going, moved, state)
+        state = tree_where(state.going, moved, state)
         return state, _record(state)
 
     arguments = (problem, constants, true, state)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import check_number
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._history import Fit
 from vertax.fitting._inverse import InverseProblem

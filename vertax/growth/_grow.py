@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.announce import announce_compilations, announced_jit
-from vertax._base.checks import as_key, check_whole, increasing, named
-from vertax._base.modules import is_concrete, traced
+from vertax._base.checks import as_key, as_times, check_integer, describe
+from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
 from vertax.dynamics._incremental_potential import Incremental
@@ -173,30 +173,30 @@ def grow(
         ("relaxation", relaxation, Relaxation | None),
     ):
         if not isinstance(value, kind):
-            raise TypeError(f"Argument `{name}` is of a wrong kind: {named(value)}.")
+            raise TypeError(f"Argument `{name}` is of a wrong kind: {describe(value)}.")
     wrong = isinstance(energy, AbstractEnergy) or not callable(energy)
     if wrong or (isinstance(energy, type) and issubclass(energy, AbstractEnergy)):
         name = energy.__name__ if isinstance(energy, type) else "energy"
         raise TypeError(
             "Argument `energy` must be a function of what cells know of themselves that returns an energy, "
-            f"but is {named(energy)}. Pass such a function, e.g. lambda cells: {name}"
+            f"but is {describe(energy)}. Pass such a function, e.g. lambda cells: {name}"
             f"{'(...)' if isinstance(energy, type) else ''}."
         )
     if not tissue.topology.spare:
         raise ValueError(
             "Argument `tissue` must have room for cells to come: pass tissue.with_capacity(...)."
         )
-    check_whole("substeps", substeps, least=1)
+    check_integer("substeps", substeps, at_least=1)
     divisions = 4 + tissue.n_cells // 20 if divisions is None else divisions
-    check_whole("divisions", divisions, least=1)
+    check_integer("divisions", divisions, at_least=1)
     records = 8 * tissue.n_cells if records is None else records
-    check_whole("records", records, least=1)
+    check_integer("records", records, at_least=1)
     if is_concrete(tissue.topology.cell):
         labels = np.unique(np.asarray(tissue.topology.cell))
-        check_whole("records", records, least=int(np.sum(labels < tissue.n_cells)))
+        check_integer("records", records, at_least=int(np.sum(labels < tissue.n_cells)))
     adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
     relaxation = Relaxation(transitions=T1() + T2()) if relaxation is None else relaxation
-    times = increasing(times)
+    times = as_times(times)
     parts = traced((tissue, energy, cycle, dissipation), tissue.vertices.dtype)
     settings = (relaxation.traced(), adjoint, times, as_key(key), (substeps, divisions, records))
     with announce_compilations(f"the growth of a tissue with room for {tissue.n_cells} cells"):

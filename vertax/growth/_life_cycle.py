@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.checks import as_real, check_number
-from vertax._base.fields import check_fields
+from vertax._base.field_checks import check_fields
 from vertax.mesh import Tissue
 
 
@@ -118,10 +118,10 @@ class GrowAndDivide(AbstractLifeCycle):
         shrinking_time: ArrayLike = 1.0,
         orientation: Literal["long", "random"] = "long",
     ):
-        check_number("growth_rate", growth_rate, least=0)
+        check_number("growth_rate", growth_rate, at_least=0)
         check_number("division_area", division_area, above=0)
-        check_number("variation", variation, least=0)
-        check_number("death_rate", death_rate, least=0)
+        check_number("variation", variation, at_least=0)
+        check_number("death_rate", death_rate, at_least=0)
         check_number("shrinking_time", shrinking_time, above=0)
         if orientation not in ("long", "random"):
             raise ValueError(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Int, Shaped
 
 from vertax._base.announce import announce_compilations
-from vertax._base.checks import check_number, check_whole, named
+from vertax._base.checks import check_integer, check_number, describe
 from vertax.inference._balance import equations
 from vertax.inference._curves import Points, read_courses
 from vertax.inference._inferred import InferredTensions
@@ -96,7 +96,7 @@ def infer_tensions(
     for name, value in (("noise", noise), ("prior", prior)):
         if value is not None:
             check_number(name, value, above=0)
-    check_whole("resamples", resamples, least=0)
+    check_integer("resamples", resamples, at_least=0)
     source = segmentation_or_mask
     if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in _EVOLVER:
         source = read_surface_evolver(source)
@@ -114,7 +114,7 @@ def infer_tensions(
     else:
         raise TypeError(
             "Argument `segmentation_or_mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
-            f"is {named(segmentation_or_mask)}."
+            f"is {describe(segmentation_or_mask)}."
         )
     tissue = course.tissue
     geometry = seen(tissue)

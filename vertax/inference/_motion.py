@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from vertax._base.checks import check_whole
+from vertax._base.checks import check_integer
 from vertax.mesh import Free, Tissue
 
 Chain = Float[np.ndarray, "_ 2"]
@@ -77,7 +77,7 @@ class EdgeMotion:
         *,
         substeps: int = 50,
     ):
-        check_whole("substeps", substeps, least=1)
+        check_integer("substeps", substeps, at_least=1)
         if not len(tissues) == len(chains) == len(times) >= 2:
             raise ValueError(
                 "Arguments `tissues`, `chains` and `times` must hold two frames or more, and as many of "

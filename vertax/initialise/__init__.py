@@ -1,4 +1,4 @@
-"""Ways to make a first tissue."""
+"""Initial tissues: Voronoi, hexagonal, and from label images and micrographs."""
 
 from vertax.initialise._free import free_voronoi as free_voronoi
 from vertax.initialise._labels import (

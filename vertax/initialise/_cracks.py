@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vertax.initialise._order import spatial_order
+from vertax.initialise._spatial_order import spatial_order
 
 # A *crack* is the side between two pixels of different cells; cracks join at the corners of pixels.
 # The whole extraction is exact integer arithmetic on these corners, on the torus. Each corner has

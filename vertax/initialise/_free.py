@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from vertax._base.checks import as_key, check_concrete, check_whole
-from vertax.initialise._order import spatial_order
-from vertax.initialise._tidy import without_overlaps
+from vertax._base.checks import as_key, check_concrete, check_integer
+from vertax.initialise._overlap_repair import repair_overlaps
+from vertax.initialise._spatial_order import spatial_order
 from vertax.initialise._voronoi import tessellate
 from vertax.mesh import Free, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
@@ -26,15 +26,15 @@ def free_voronoi(
 ) -> Tissue:
     r"""A round cluster of Voronoi cells with arcs on its outline (paper, Methods, "Mesh initialization").
 
-    The cells of those random seeds that are nearest to the origin, among enough of them, one for each
-    unit of area. These hang together and enclose no hole. What of a cell's outline lies between two
-    junctions becomes one arc, which keeps the area of the cell (up to nearly a whole circle).
+    Of random seeds with density 1 the cells of the `n_cells` seeds nearest to the origin; they form a
+    connected cluster without holes. The outline of a cell between two junctions becomes one arc with the
+    angle that preserves the area of the cell (limited to 0.9 π).
 
     **Arguments:**
 
-    - `n_cells`: number of cells, at least two. (Three edges meet at every vertex, and a single free cell
-        has none.)
-    - `key`: a key from `jax.random.key`, or a whole number as its seed.
+    - `n_cells`: number of cells, at least two. (Three edges meet at each vertex; a single free cell has no
+        such vertex.)
+    - `key`: a key from `jax.random.key`, or an integer as its seed.
     - `lloyd_steps`: number of Lloyd iterations, which make the cells more regular.
     - `random_angles`: draw the angles of the arcs uniformly from 0 to $\pi/2$, as in the paper.
     - `inner_arcs`, `softening`: passed on to [`Tissue`][vertax.Tissue].
@@ -44,8 +44,8 @@ def free_voronoi(
     **Raises:**
 
     - `ValueError` for fewer than two cells, or a negative number of Lloyd iterations.
-    - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`: how a tissue is
-        connected depends on numbers, which are not known there.
+    - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`, because the topology
+        depends on concrete values.
     """
     check_concrete("free_voronoi", key)
     if n_cells == 1 and n_cells is not True:
@@ -54,19 +54,20 @@ def free_voronoi(
             "tissue, and a single free cell has none. Begin with two cells, or with one in a periodic box: "
             "vx.initialise.periodic_voronoi(1, key=0)."
         )
-    check_whole("n_cells", n_cells, least=2)
-    check_whole("lloyd_steps", lloyd_steps, least=0)
+    check_integer("n_cells", n_cells, at_least=2)
+    check_integer("lloyd_steps", lloyd_steps, at_least=0)
     dtype = jnp.result_type(float)
-    # A periodic box of seeds, so that no cell is unbounded, with a margin of three cells.
+    # Seeds in a periodic box with a margin of three cells, so that all cells are bounded.
     n_seeds = int(np.ceil((2 * np.sqrt(n_cells / np.pi) + 6) ** 2))
     box = np.sqrt(n_seeds) * np.eye(2)
     seed_key, angle_key = jax.random.split(as_key(key))
     fractions = np.asarray(jax.random.uniform(seed_key, (n_seeds, 2), dtype), float)
     seeds = (fractions[spatial_order(fractions)] - 0.5) @ box
     seeds, vertices, topology = tessellate(seeds, box, lloyd_steps)
-    # Seeds in a disk have cells whose union is a disk. On the way from a seed p straight to the centre
-    # the nearest seed is always at least as central as p, as the circle about the way point through p
-    # lies within that about the centre; and outwards from a seed that is left out, never more central.
+    # The union of the Voronoi cells of the seeds in a disk is a topological disk: at each point x between a
+    # seed p and the centre, the nearest seed is at least as close to the centre as p, because the circle
+    # about x through p is inside the circle about the centre through p. On the ray outward from a seed
+    # outside of the disk, the nearest seed is at least as far from the centre as that seed.
     chosen = np.zeros(n_seeds, bool)
     chosen[np.argsort(np.sum(seeds**2, axis=1))[:n_cells]] = True
     corners = np.repeat(vertices, 3, axis=0) + np.asarray(topology.frame) @ box
@@ -74,13 +75,15 @@ def free_voronoi(
     if random_angles:
         angles = jax.random.uniform(angle_key, angles.shape, dtype, maxval=np.pi / 2)
 
-    def made(vertices: Float[Array, "vertices 2"], angles: Float[Array, " edges"] | None) -> Tissue:
-        # The default softening follows from the areas, and these from the angles.
+    def build(
+        vertices: Float[Array, "vertices 2"], angles: Float[Array, " edges"] | None
+    ) -> Tissue:
+        # The default softening depends on the areas, which depend on the angles.
         return Tissue(vertices, topology, Free(), softening, angles=angles, inner_arcs=inner_arcs)
 
-    tissue = made(jnp.asarray(vertices, dtype), jnp.asarray(angles, dtype))
-    tidy = without_overlaps(tissue)
-    return tissue if tidy is tissue else made(tidy.vertices, tidy.angles)
+    tissue = build(jnp.asarray(vertices, dtype), jnp.asarray(angles, dtype))
+    repaired = repair_overlaps(tissue)
+    return tissue if repaired is tissue else build(repaired.vertices, repaired.angles)
 
 
 def _cut_out(
@@ -91,33 +94,33 @@ def _cut_out(
     """The cluster of the chosen cells: vertices, topology and the angles of its arcs."""
     cell, twin = np.asarray(topology.cell), np.asarray(topology.twin)
     inside = chosen[cell]
-    # Junctions are where two or three chosen cells meet; all of their three edges stay. Where one
-    # chosen cell meets two others its outline goes on.
+    # A vertex of two or three chosen cells is a junction and keeps its three edges. A vertex of one chosen
+    # cell is inside an arc of the outline.
     junction = np.sum(inside.reshape(-1, 3), axis=1) >= 2
-    here = np.flatnonzero(np.repeat(junction, 3))
-    # From each junction along its edge, around the chosen cell on the left, to the next junction. On the
-    # way sum up what the outline encloses with the origin.
-    here = here[inside[here]]
+    start = np.flatnonzero(np.repeat(junction, 3))
+    # Walk from each junction around the chosen cell on the left to the next junction, and sum the area
+    # between the outline and the origin.
+    start = start[inside[start]]
     following = np.asarray(topology.next)
-    last, swept = here.copy(), np.zeros(len(here))
-    walking = np.ones(len(here), bool)
+    last, swept = start.copy(), np.zeros(len(start))
+    walking = np.ones(len(start), bool)
     while walking.any():
         step = 0.5 * _cross(corners[last], corners[following[last]])
         swept[walking] += step[walking]
         walking &= ~junction[twin[last] // 3]
         last = np.where(walking, following[last], last)
-    chord = corners[following[last]] - corners[here]
-    bulge = swept - 0.5 * _cross(corners[here], chord)
+    chord = corners[following[last]] - corners[start]
+    bulge = swept - 0.5 * _cross(corners[start], chord)
 
     number = np.cumsum(junction) - 1
     rename = lambda h: 3 * number[h // 3] + h % 3
     n_half = 3 * int(junction.sum())
     new_twin, new_cell = np.empty(n_half, int), np.full(n_half, chosen.sum())
     vertices = np.empty((n_half // 3, 2))
-    first, other = rename(here), rename(twin[last])
+    first, other = rename(start), rename(twin[last])
     new_twin[first], new_twin[other] = other, first
-    new_cell[first] = (np.cumsum(chosen) - 1)[cell[here]]
-    vertices[first // 3] = corners[here]
+    new_cell[first] = (np.cumsum(chosen) - 1)[cell[start]]
+    vertices[first // 3] = corners[start]
     cluster = Topology(new_twin, new_cell, np.zeros((n_half, 2), int), exterior=True)
     angles = np.zeros(cluster.n_edges)
     outline = new_cell[other] == chosen.sum()

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from vertax._base.checks import check_concrete, check_number
 from vertax.initialise._cracks import Mesh, crack_graph
 from vertax.initialise._mask_arguments import check_options, checked_mask
+from vertax.initialise._overlap_repair import repair_overlaps
 from vertax.initialise._repairs import (
     fill_gaps,
     join_pieces,
@@ -21,7 +22,6 @@ from vertax.initialise._repairs import (
     untangle,
     with_exterior,
 )
-from vertax.initialise._tidy import without_overlaps
 from vertax.mesh import Free, Periodic, Tissue, Topology
 from vertax.mesh._arcs import angle_of_area
 from vertax.mesh._geometry import geometry_of
@@ -137,7 +137,7 @@ def from_labels(
     """
     check_concrete("from_labels", mask, pixel_size)
     check_options(boundary, pixel_size)
-    check_number("gap_width", gap_width, least=0)
+    check_number("gap_width", gap_width, at_least=0)
     values, image, background = checked_mask(mask, background)
     if boundary == "free":
         if gap_width > max(image.shape):
@@ -185,7 +185,7 @@ def from_labels(
         top_bottom, left_right = _touching(image, n)
         whole = (mesh.cells < n) & ~(top_bottom | left_right)[label]
     return Segmentation(
-        tissue=without_overlaps(tissue),
+        tissue=repair_overlaps(tissue),
         labels=values[label],
         whole=whole,
         absorbed=np.setdiff1d(values, values[label]),
@@ -239,7 +239,7 @@ def _free_from_labels(
     home = image[margin : margin + rows, margin : margin + columns]
     top_bottom, left_right = _touching(home, exterior + 1)
     return Segmentation(
-        tissue=without_overlaps(
+        tissue=repair_overlaps(
             _with_arcs(straight, mesh, curved, pixel_size, inner_arcs=inner_arcs)
         ),
         labels=values[label],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Array, Int, Integer, Shaped
 
-from vertax._base.checks import check_number, check_whole
+from vertax._base.checks import check_integer, check_number
 
 _BOUNDARIES = ("mirrored", "periodic", "free")
 
@@ -103,7 +103,7 @@ def check_zero(
 def _background(mask: Integer[np.ndarray, "rows columns"], given: int | None) -> int | None:
     """The positive label of what is no cell."""
     if given is not None:
-        check_whole("background", given)
+        check_integer("background", given)
         if not np.any(mask == given):
             raise ValueError(
                 f"Argument `background` must be a label of the mask, but no pixel has {given}."

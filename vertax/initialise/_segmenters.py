@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from vertax._base.checks import check_number
-from vertax._base.extras import needing
+from vertax._base.extras import requires_extra
 
 _SMALLEST_SIDE = 16
 
@@ -80,7 +80,7 @@ class Watershed(AbstractSegmenter):
     def __call__(
         self, image: Shaped[np.ndarray | Array, " *shape"]
     ) -> Int[np.ndarray, "rows columns"]:
-        with needing("image", "Watershed"):
+        with requires_extra("image", "Watershed"):
             from skimage import measure, morphology, segmentation
         pixels = check_image(image)
         for name in ("cell_size", "smoothing"):
@@ -148,7 +148,7 @@ class Cellpose(AbstractSegmenter):
     def __call__(
         self, image: Shaped[np.ndarray | Array, " *shape"]
     ) -> Int[np.ndarray, "rows columns"]:
-        with needing("cellpose", "Cellpose"):
+        with requires_extra("cellpose", "Cellpose"):
             models = importlib.import_module("cellpose.models")
         _check_version("cellpose", 4)
         pixels = check_image(image)
@@ -227,7 +227,7 @@ def estimate_cell_size(image: Float[np.ndarray, "rows columns"]) -> float:
 def _check_size(name: str, value: float | None, *, zero: bool) -> None:
     if value is None:
         return
-    check_number(name, value, least=0) if zero else check_number(name, value, above=0)
+    check_number(name, value, at_least=0) if zero else check_number(name, value, above=0)
 
 
 def _check_version(package: str, least: int) -> None:

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import ArrayLike, PRNGKeyArray
 from scipy.spatial import Delaunay, KDTree
 
-from vertax._base.checks import as_doubles, as_key, check_concrete, check_number, check_whole
-from vertax.initialise._order import spatial_order
+from vertax._base.checks import as_float64, as_key, check_concrete, check_integer, check_number
+from vertax.initialise._spatial_order import spatial_order
 from vertax.mesh import Periodic, Tissue, Topology
 
-# Beyond, what is left of the digits of a position tells little of where in the box it is.
-_FARTHEST = 1e8
+# Largest distance of seeds from the origin, in boxes; above, rounding changes their position in the box.
+_MAX_DISTANCE = 1e8
 
 
 def periodic_voronoi(
@@ -27,15 +27,15 @@ def periodic_voronoi(
 ) -> Tissue:
     r"""Periodic Voronoi tessellation of random or given seeds (paper, Methods, "Mesh initialization").
 
-    Cells carry the numbers of their seeds. Random seeds are numbered along a space-filling curve.
+    Cells have the numbers of their seeds. Random seeds are numbered along a space-filling curve.
 
     **Arguments:**
 
     - `n_cells`: number of random seeds, uniform in the box; needs `key`. Or
     - `seeds`, shape `(cells, 2)`: the seeds themselves; they may lie outside the box.
-    - `key`: a key from `jax.random.key`, or a whole number as its seed, for random seeds.
+    - `key`: a key from `jax.random.key`, or an integer as its seed, for random seeds.
     - `lattice`, shape `(2, 2)`: the two lattice vectors of the box as rows; by default a square of side
-        $\sqrt N$, so that the mean cell area is 1. Sheared boxes are fine.
+        $\sqrt N$, so that the mean cell area is 1. Boxes may be sheared.
     - `lloyd_steps`: number of Lloyd iterations (each seed moves to the mean of its cell's corners),
         which make the tissue more regular.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
@@ -46,19 +46,19 @@ def periodic_voronoi(
 
     - `ValueError` if both or neither of `n_cells` and `seeds` are given, if seeds are not finite, of
         the wrong shape, fewer than one, or coincide (also across the periodic boundary).
-    - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`: how a tissue is
-        connected depends on numbers, which are not known there.
+    - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`, because the topology
+        depends on concrete values.
     """
     check_concrete("periodic_voronoi", seeds, key, lattice)
     if (n_cells is None) == (seeds is None):
         raise ValueError("Give either `n_cells` (with `key`) or `seeds`, and not both.")
     if n_cells is not None:
-        check_whole("n_cells", n_cells, least=1)
-    check_whole("lloyd_steps", lloyd_steps, least=0)
+        check_integer("n_cells", n_cells, at_least=1)
+    check_integer("lloyd_steps", lloyd_steps, at_least=0)
     dtype = jnp.result_type(float)
     points = np.zeros((0, 2))
     if seeds is not None:
-        points = as_doubles("seeds", seeds)
+        points = as_float64("seeds", seeds)
         if points.ndim != 2 or points.shape[1] != 2:
             raise ValueError(
                 f"Argument `seeds` must have shape (cells, 2), but has {points.shape}."
@@ -68,7 +68,7 @@ def periodic_voronoi(
         raise ValueError(f"A tissue needs at least one cell, but got {n_cells} seeds.")
     box = np.sqrt(n_cells) * np.eye(2)
     if lattice is not None:
-        box = as_doubles("lattice", lattice)
+        box = as_float64("lattice", lattice)
     boundary = Periodic(jnp.asarray(box, dtype))
     if seeds is None:
         if key is None:
@@ -89,7 +89,7 @@ def hexagonal(nx: int, ny: int, *, area: float = 1.0, softening: float | None = 
 
     **Arguments:**
 
-    - `nx`, `ny`: cells in a row, and rows.
+    - `nx`, `ny`: number of cells in a row, and number of rows.
     - `area`: area of each hexagon.
     - `softening`: passed on to [`Tissue`][vertax.Tissue].
 
@@ -100,8 +100,8 @@ def hexagonal(nx: int, ny: int, *, area: float = 1.0, softening: float | None = 
     - `ValueError` for fewer than one cell or row, or an area that is not positive.
     """
     check_concrete("hexagonal", area)
-    check_whole("nx", nx, least=1)
-    check_whole("ny", ny, least=1)
+    check_integer("nx", nx, at_least=1)
+    check_integer("ny", ny, at_least=1)
     check_number("area", area, above=0)
     spacing = np.sqrt(2 * area / np.sqrt(3))
     column, row = np.meshgrid(np.arange(nx), np.arange(ny))
@@ -127,9 +127,9 @@ def tessellate(
 
 def _voronoi(seeds: np.ndarray, lattice: np.ndarray) -> tuple[np.ndarray, Topology]:
     """Vertices and topology of the periodic Voronoi tessellation of `seeds`."""
-    # Seeds on a circle (a square lattice, say) have several Delaunay triangulations, and a periodic one
-    # need not come out. A tiny displacement of the seeds (the same for all images) and of the lattice picks
-    # one; the vertices are still the circumcentres of the seeds as given.
+    # Cocircular seeds (as in a square lattice) have several Delaunay triangulations, and SciPy may return one
+    # that is not periodic. A small displacement of the seeds (the same for all images) and of the lattice
+    # selects one; the vertices are the circumcentres of the given seeds.
     for attempt, jitter in enumerate((0.0, 1e-9, 1e-7)):
         rng = np.random.default_rng(attempt)
         scale = jitter * np.sqrt(np.linalg.det(lattice) / len(seeds))
@@ -149,16 +149,16 @@ def _periodic_delaunay(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """One triangle of each class of the periodic Delaunay triangulation, counter-clockwise.
 
-    Returns seed numbers `(triangles, 3)` and lattice images `(triangles, 3, 2)`, or None if what came
-    out is not periodic.
+    Returns seed numbers `(triangles, 3)` and lattice images `(triangles, 3, 2)`, or None if the
+    triangulation is not periodic.
     """
     n = len(seeds)
-    # A reduced basis (Lagrange-Gauss) keeps the images that matter few, also in sheared boxes.
+    # With a reduced basis (Lagrange-Gauss) a small number of images suffices, also in sheared boxes.
     basis, change = _reduce(lattice)
     fractions = seeds @ np.linalg.inv(basis)
-    if np.abs(fractions).max() > _FARTHEST:
+    if np.abs(fractions).max() > _MAX_DISTANCE:
         raise ValueError(
-            f"Argument `seeds` must lie within {_FARTHEST:.0e} boxes of the origin, but the farthest is "
+            f"Argument `seeds` must lie within {_MAX_DISTANCE:.0e} boxes of the origin, but the farthest is "
             f"{np.abs(fractions).max():.0e} boxes away."
         )
     home = np.floor(fractions).astype(int)
@@ -172,8 +172,8 @@ def _periodic_delaunay(
             f"Argument `seeds` must be distinct, but seeds {first} and {second} coincide "
             "(up to periodicity)."
         )
-    # No empty circle is larger than the covering radius of one seed's own images, which is below 0.71
-    # of the longer reduced vector: a margin of 1.5 boxes always suffices, fewer if the seeds are many.
+    # The radius of an empty circle is at most the covering radius of the images of one seed, which is below
+    # 0.71 of the longer reduced vector: a margin of 1.5 boxes always suffices, a smaller one for many seeds.
     for margin in (min(1.5, 8 * spacing), 1.5):
         reach = int(np.ceil(margin))
         grid = np.arange(-reach, reach + 1)
@@ -214,20 +214,20 @@ def _periodic_delaunay(
     if len(classes) != 2 * n:
         return None
     ids, image = classes[:, :3], classes[:, 3:].reshape(-1, 3, 2)
-    # Back to the images of the seeds as given, in the lattice as given.
+    # Convert to images of the given seeds in the given lattice.
     return ids, (image - home[ids]) @ change
 
 
 def _dual(
     seeds: np.ndarray, lattice: np.ndarray, ids: np.ndarray, image: np.ndarray
 ) -> tuple[np.ndarray, Topology]:
-    """The trivalent mesh whose vertices are the circumcentres of the triangles."""
+    """The trivalent mesh with the circumcentres of the triangles as vertices."""
     vertices = _circumcentres(seeds[ids] + image @ lattice)
     box = np.floor(vertices @ np.linalg.inv(lattice) + 1e-12).astype(int)
     vertices = vertices - box @ lattice
     order = spatial_order(vertices @ np.linalg.inv(lattice))
     vertices, ids, image = vertices[order], ids[order], (image - box[:, None])[order]
-    # Half-edge k of a triangle crosses the side opposite its corner k, so the three leave in
+    # Half-edge k of a triangle crosses the side opposite to its corner k, so the three half-edges are in
     # counter-clockwise order, with corner k + 2 on the left and corner k + 1 on the right.
     left, right = np.roll(ids, 1, axis=1).ravel(), np.roll(ids, -1, axis=1).ravel()
     left_image = np.roll(image, 1, axis=1).reshape(-1, 2)

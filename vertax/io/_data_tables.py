@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 from vertax._base.atomic import atomic_write
-from vertax._base.checks import check_concrete, named
+from vertax._base.checks import check_concrete, describe
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
 
@@ -92,7 +92,7 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
     """
     if not isinstance(table, Mapping):
         raise TypeError(
-            f"Argument `table` must hold columns by name, as a dictionary does, but is {named(table)}."
+            f"Argument `table` must hold columns by name, as a dictionary does, but is {describe(table)}."
         )
     columns = {name: _as_column(name, column) for name, column in table.items()}
     for name, column in columns.items():
@@ -163,7 +163,7 @@ def edge_columns(
 def check_single(tissue: Tissue) -> None:
     """Refuse a batch, what is no tissue, and one that is traced."""
     if not isinstance(tissue, Tissue):
-        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {named(tissue)}.")
+        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {describe(tissue)}.")
     if tissue.vertices.ndim != 2:
         raise ValueError(
             "Argument `tissue` must be a single tissue, but its vertices have shape "
@@ -179,7 +179,7 @@ def _joined(
     joined = {name: np.asarray(column) for name, column in table.items()}
     if not isinstance(columns, Mapping):
         raise TypeError(
-            f"Columns of the {what}s must be given by name, as in a dictionary, but are {named(columns)}."
+            f"Columns of the {what}s must be given by name, as in a dictionary, but are {describe(columns)}."
         )
     for name, column in columns.items():
         if name in joined:
@@ -222,7 +222,7 @@ def _text(name: str, value: Any) -> str:
     known = str | bool | np.bool_ | numbers.Real | np.datetime64 | datetime.date | datetime.time
     if not isinstance(value, known) and not isinstance(value, os.PathLike):
         raise TypeError(
-            f"Column `{name}` must hold numbers, booleans or text, but holds {named(value)}. Write the parts "
-            "of what is more (the real and the imaginary one, say) as columns of their own."
+            f"Column `{name}` must hold numbers, booleans or text, but holds {describe(value)}. Write the "
+            "parts of what is more (the real and the imaginary one, say) as columns of their own."
         )
     return str(value)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vertax._base.atomic import atomic_write
-from vertax._base.checks import check_whole, named
+from vertax._base.checks import check_integer, describe
 from vertax.io._data_tables import Column, cell_columns, check_single, edge_columns
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
@@ -85,7 +85,7 @@ def write_geojson(
 def checked_drawing(tissue: Tissue, points_per_arc: int) -> Drawing:
     """The geometry that files need, arguments checked."""
     check_single(tissue)
-    check_whole("points_per_arc", points_per_arc, least=1)
+    check_integer("points_per_arc", points_per_arc, at_least=1)
     return Drawing(tissue, points_per_arc)
 
 
@@ -113,6 +113,6 @@ def _strict(name: str, value: Any) -> Any:
     if not (value is None or isinstance(value, str | bool | int | float)):
         raise TypeError(
             f"Column `{name}` must hold numbers, booleans or text, which is what JSON has, but holds "
-            f"{named(value)}."
+            f"{describe(value)}."
         )
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 
-from vertax._base.checks import check_whole
-from vertax._base.extras import needing
+from vertax._base.checks import check_integer
+from vertax._base.extras import requires_extra
 
 _TIFF = (".tif", ".tiff")
 
@@ -46,7 +46,7 @@ def read_image(
         )
     for name, index in (("channel", channel), ("plane", plane)):
         if index is not None:
-            check_whole(name, index)
+            check_integer(name, index)
     pixels, axes = _read(file)
     if pixels.dtype.kind not in "biuf":
         raise ValueError(
@@ -83,7 +83,7 @@ def _read(file: Path) -> tuple[np.ndarray, str]:
 
 
 def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
-    with needing("image", "Reading TIFF files"):
+    with requires_extra("image", "Reading TIFF files"):
         import tifffile
     with tifffile.TiffFile(file) as tiff:
         series = tiff.series[0]
@@ -95,7 +95,7 @@ def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
 
 
 def _read_picture(file: Path) -> tuple[np.ndarray, str]:
-    with needing("image", "Reading pictures"):
+    with requires_extra("image", "Reading pictures"):
         from PIL import Image
 
     with Image.open(file) as picture:

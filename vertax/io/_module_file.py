@@ -30,7 +30,7 @@ from vertax import (
     solvers,
 )
 from vertax._base.archive import as_jax, read_archive, write_archive
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax.energies import AbstractEnergy
 from vertax.fitting import InverseProblem
 from vertax.mesh import Free, Periodic, Tissue, Topology
@@ -176,12 +176,14 @@ def _load(
     name = os.fspath(path)
     user_classes: dict[str, type[eqx.Module]] = {}
     if isinstance(classes, type) or not isinstance(classes, Iterable):
-        raise TypeError(f"Argument `classes` must be a list of classes, but is {named(classes)}.")
+        raise TypeError(
+            f"Argument `classes` must be a list of classes, but is {describe(classes)}."
+        )
     for cls in classes:
         if not (isinstance(cls, type) and issubclass(cls, eqx.Module)):
             raise TypeError(
                 "Argument `classes` must hold classes, subclasses of equinox.Module, but holds "
-                f"{named(cls)}."
+                f"{describe(cls)}."
             )
         if user_classes.setdefault(cls.__name__, cls) is not cls:
             raise ValueError(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vertax._base.checks import check_number, named
+from vertax._base.checks import check_number, describe
 from vertax.io._bounded_tables import BoundedTables, checked, with_exterior, without_exterior
 from vertax.io._data_tables import check_single
 from vertax.mesh import Free, Periodic, Tissue, Topology
@@ -100,7 +100,7 @@ def from_tables(tables: Tables | BoundedTables, *, softening: float | None = Non
     if not isinstance(tables, Tables):
         raise TypeError(
             "Argument `tables` must be vertax.io.Tables or BoundedTables, but is "
-            f"{named(tables)}. Write Tables(vert_table, he_table, face_table, width, height)."
+            f"{describe(tables)}. Write Tables(vert_table, he_table, face_table, width, height)."
         )
     tables = _checked(tables)
     vert_table, he_table, face_table, width, height = tables

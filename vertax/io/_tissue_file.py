@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertax._base.archive import as_jax, read_archive, write_archive
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue, Topology
 
 _VERSION = 1
@@ -79,7 +79,7 @@ def load_tissue(path: str | os.PathLike[str]) -> Tissue:
 def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
     """All that a tissue consists of by name, see `save_tissue`; the way back is `tissue_from`."""
     if not isinstance(tissue, Tissue):
-        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {named(tissue)}.")
+        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {describe(tissue)}.")
     topology = tissue.topology
     kind, record = _record_of(tissue.boundary)
     arrays: dict[str, Any] = {

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vertax._base.atomic import atomic_draft
-from vertax._base.extras import needing
+from vertax._base.extras import requires_extra
 from vertax.io._data_tables import Column, cell_columns, edge_columns
 from vertax.io._geojson import checked_drawing, edge_path
 from vertax.io._triangles import is_convex, triangulate
@@ -57,7 +57,7 @@ def write_vtk(
     - `ValueError` for another ending, values that are no numbers, a batch of tissues, less than one
         point an arc, and as [`cell_table`][vertax.io.cell_table].
     """
-    with needing("files", "Writing VTK files"):
+    with requires_extra("files", "Writing VTK files"):
         import meshio
     if Path(path).suffix not in _SUFFIXES:
         raise ValueError(

@@ -9,8 +9,8 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._base.checks import as_real, named
-from vertax._base.modules import is_concrete
+from vertax._base.checks import as_real, describe
+from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
 from vertax.energies._energy import check_energy
 from vertax.mesh import Periodic, Tissue
@@ -38,7 +38,7 @@ def check_system(tissue: Any, energy: Any, *, box: str | None = None) -> None:
 def check_tissue(tissue: Any, *, box: str | None = None) -> None:
     """Refuse what is no tissue; see `check_system`."""
     if not isinstance(tissue, Tissue):
-        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {named(tissue)}.")
+        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {describe(tissue)}.")
     if np.ndim(tissue.vertices) != 2:
         raise ValueError(
             "Argument `tissue` must be one tissue, but its vertices have shape "
@@ -60,7 +60,7 @@ def check_dissipation(dissipation: Any) -> None:
     if not isinstance(dissipation, AbstractDissipation):
         raise TypeError(
             "Argument `dissipation` must be a dissipation, e.g. vertax.dissipations.SubstrateFriction(1.0), "
-            f"but is {named(dissipation)}."
+            f"but is {describe(dissipation)}."
         )
 
 
@@ -74,7 +74,7 @@ def check_linear_solver(solver: Any) -> None:
     if not isinstance(solver, lx.AbstractLinearSolver):
         raise TypeError(
             "Argument `linear_solver` must be a linear solver, e.g. vertax.MINRES(), but is "
-            f"{named(solver)}."
+            f"{describe(solver)}."
         )
 
 
@@ -87,7 +87,9 @@ def check_relaxation(relaxation: Any) -> None:
     """
     if not isinstance(relaxation, Relaxation):
         raise TypeError(
-            "Argument `relaxation` must be a vertax.Relaxation, but is " + named(relaxation) + "."
+            "Argument `relaxation` must be a vertax.Relaxation, but is "
+            + describe(relaxation)
+            + "."
         )
 
 

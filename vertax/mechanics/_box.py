@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._base.checks import as_real, check_number, check_whole
-from vertax._base.modules import traced
+from vertax._base.checks import as_real, check_integer, check_number
+from vertax._base.tracing import traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
@@ -89,7 +89,7 @@ class BoxRelaxation(AbstractResponse):
         check_relaxation(self.relaxation)
         if self.tolerance is not None:
             check_number("tolerance", self.tolerance, above=0)
-        check_whole("max_steps", self.max_steps, least=1)
+        check_integer("max_steps", self.max_steps, at_least=1)
 
     def __call__(
         self,

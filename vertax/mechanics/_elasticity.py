@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import as_angle, check_linear_solver, check_system
 from vertax.mechanics._landscape import (

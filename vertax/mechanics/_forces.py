@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import check_system
 from vertax.mesh import Tissue
-from vertax.mesh._tissue import Known
+from vertax.mesh._tissue import Measurements
 
 
 class _Slackened(Tissue):
@@ -27,11 +27,11 @@ class _Slackened(Tissue):
             setattr(self, name, getattr(tissue, name))
         self.more_area, self.more_length = area, length
 
-    def measured(self) -> Known:
+    def measured(self) -> Measurements:
         """Areas and edge lengths, and more; perimeters follow."""
         known = super().measured()
         around = self.cell_sums((self.more_length, self.more_length))
-        return Known(
+        return Measurements(
             known.lengths + self.more_length,
             known.areas + self.more_area,
             known.perimeters + around,

@@ -12,7 +12,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
 from vertax.mechanics._arguments import as_matrix, check_tissue
 from vertax.mesh import Periodic, Tissue

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, PyTree
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from vertax._base.checks import as_doubles, check_concrete, check_number, check_whole
-from vertax._base.modules import is_concrete, traced
+from vertax._base.checks import as_float64, check_concrete, check_integer, check_number
+from vertax._base.tracing import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mechanics._arguments import check_system
 from vertax.mechanics._hessian import (
@@ -85,7 +85,7 @@ def modes(
         or inside `jax.jit`.
     """
     check_system(tissue, energy)
-    check_whole("k", k, least=1)
+    check_integer("k", k, at_least=1)
     if method not in (None, "dense", "sparse"):
         raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
     size = ravel_pytree(tissue.configuration)[0].size
@@ -169,8 +169,8 @@ def density_of_states(
 
     - `ValueError` for what is no list of finite eigenvalues, or no bins.
     """
-    check_whole("bins", bins, least=1)
-    found = as_doubles("values", values)
+    check_integer("bins", bins, at_least=1)
+    found = as_float64("values", values)
     if found.ndim != 1 or found.size == 0:
         raise ValueError(
             f"Argument `values` must be one list of eigenvalues, but its shape is {found.shape}."

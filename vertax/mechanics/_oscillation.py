@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 from scipy.sparse import diags_array
 
 from vertax._base.checks import as_real, check_number
-from vertax._base.modules import is_concrete, traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mechanics._arguments import check_dissipation, check_system
@@ -83,7 +83,7 @@ def complex_modulus(
     """
     check_system(tissue, energy, box="a complex modulus")
     check_dissipation(dissipation)
-    check_number("frequencies", frequencies, least=0, many=True)
+    check_number("frequencies", frequencies, at_least=0, many=True)
     omegas = jnp.atleast_1d(as_real("frequencies", frequencies)).astype(tissue.vertices.dtype)
     if omegas.ndim != 1 or omegas.size == 0:
         raise ValueError(

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._base.checks import as_real, named
-from vertax._base.modules import is_concrete, traced
+from vertax._base.checks import as_real, describe
+from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import as_matrix, check_relaxation, check_system
@@ -117,7 +117,7 @@ def ramp(
     if not callable(deformation):
         raise TypeError(
             "Argument `deformation` must be a function from a strain to a deformation gradient, e.g. "
-            f"vertax.mechanics.pure_shear, but is {named(deformation)}."
+            f"vertax.mechanics.pure_shear, but is {describe(deformation)}."
         )
     as_matrix("deformation", jnp.zeros(jax.eval_shape(deformation, values[0]).shape))
     relaxation = Relaxation() if relaxation is None else relaxation

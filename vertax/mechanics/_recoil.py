@@ -9,8 +9,8 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vertax._base.checks import check_whole
-from vertax._base.modules import is_concrete, traced
+from vertax._base.checks import check_integer
+from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import check_dissipation, check_linear_solver, check_system
@@ -117,7 +117,7 @@ def recoil(
     check_dissipation(dissipation)
     if is_concrete(edge):
         number = np.asarray(edge)[()] if isinstance(edge, jax.Array) else edge
-        check_whole("edge", number, least=0)
+        check_integer("edge", number, at_least=0)
         if number >= tissue.n_edges:
             raise ValueError(
                 f"Argument `edge` must be one of the {tissue.n_edges} edges, from 0 on, but is {number}."

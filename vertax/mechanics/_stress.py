@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vertax._base.checks import as_real
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import check_system
 from vertax.mechanics._forces import pressures_and_tensions

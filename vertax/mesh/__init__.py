@@ -1,4 +1,4 @@
-"""The mesh: who is next to whom, and where."""
+"""The mesh: connectivity, positions, boundary and geometry of a tissue."""
 
 from vertax.mesh._boundary import (
     AbstractBoundary as AbstractBoundary,

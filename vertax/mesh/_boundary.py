@@ -1,4 +1,4 @@
-"""The space a tissue lives in."""
+"""The boundary of a tissue: a periodic box or the plane."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from vertax._base.checks import named
-from vertax._base.modules import is_concrete
+from vertax._base.checks import describe
+from vertax._base.tracing import is_concrete
 
 
 class AbstractBoundary(eqx.Module):
-    """The space a tissue lives in: how lattice images are placed and which motions cost nothing."""
+    """The boundary of a tissue: translations of lattice images, and zero modes."""
 
     @abc.abstractmethod
     def translation(self, image: Num[Array, "*shape 2"]) -> Num[Array, "*shape 2"]:
-        """Displacement of an integer lattice image from the home box."""
+        """Displacement of a lattice image (two integers) from the home box."""
 
     @abc.abstractmethod
     def shortest(self, displacement: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
-        """The shortest of all displacements that lead to an image of the same point."""
+        """The minimum-image displacement: the shortest one to any image of the same point."""
 
     @abc.abstractmethod
     def carry(
         self, vertices: Float[Array, "vertices 2"], other: AbstractBoundary
     ) -> Float[Array, "vertices 2"]:
-        """Where vertices go when this space is deformed uniformly into another one of its kind.
+        """The vertices after a uniform deformation of this boundary into `other`.
 
         **Raises:**
 
-        - `TypeError` if the other one is of another kind.
+        - `TypeError` if `other` is of another class.
         """
 
     @abc.abstractmethod
@@ -43,11 +43,11 @@ class AbstractBoundary(eqx.Module):
         reference: Float[Array, "vertices 2"],
         pinned: Bool[Array, " vertices"] | None = None,
     ) -> Float[Array, " modes"]:
-        """How far a configuration moved along the motions that change no shape.
+        """Components of the displacement from `reference` along the zero modes.
 
         One number for each zero mode, in units of length times the square root of the number of
-        vertices: the norm of the part of the displacement that lies along that mode. Motions that
-        `pinned` vertices rule out are no zero modes, and count as 0.
+        vertices: the norm of the projection of the displacement on that mode. It is 0 for motions that
+        `pinned` vertices prevent.
         """
 
     @abc.abstractmethod
@@ -57,19 +57,19 @@ class AbstractBoundary(eqx.Module):
         reference: Float[Array, "vertices 2"],
         pinned: Bool[Array, " vertices"] | None = None,
     ) -> Float[Array, "vertices 2"]:
-        """The vertices, moved as a whole such that nothing is left of their drift."""
+        """The vertices after the rigid motion that makes their drift 0."""
 
     @abc.abstractmethod
     def motions(
         self, vertices: Float[Array, "vertices 2"], distance: Float[Array, ""]
     ) -> Float[Array, "modes vertices 2"]:
-        """The vertices, moved as a whole by about a distance, for each of the modes of `drift`."""
+        """The vertices after a rigid motion of about `distance` along each zero mode."""
 
 
 class Periodic(AbstractBoundary):
-    """A periodic box spanned by two lattice vectors; differentiable, sheared boxes included.
+    """A periodic box with two lattice vectors, also sheared; differentiable in the lattice.
 
-    Its two zero modes are the translations.
+    There are two zero modes, the translations.
 
     **Arguments:**
 
@@ -109,13 +109,13 @@ class Periodic(AbstractBoundary):
         return image[..., :1] * self.lattice[0] + image[..., 1:] * self.lattice[1]
 
     def shortest(self, displacement: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
-        """The shortest of all displacements that lead to an image of the same point.
+        """The minimum-image displacement: the shortest one to any image of the same point.
 
-        Exact for boxes that lean by at most half their width (for others as long as the shortest
-        displacement is shorter than half the distance between opposite sides).
+        Exact if the second lattice vector leans by at most half the width of the box; otherwise exact for
+        displacements shorter than half the distance between opposite sides of the box.
         """
-        # Rounding the fractions finds the image within the parallelogram around 0; in a leaning box one
-        # of its neighbours may still be closer.
+        # Rounding the fractional coordinates gives the image in the parallelogram around 0; in a sheared box
+        # one of the eight images next to it may be closer.
         inverse = inverse_of(self.lattice)
         nearest = jax.lax.stop_gradient(jnp.round(displacement @ inverse))
         steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
@@ -128,8 +128,8 @@ class Periodic(AbstractBoundary):
         self, vertices: Float[Array, "vertices 2"], other: AbstractBoundary
     ) -> Float[Array, "vertices 2"]:
         if not isinstance(other, Periodic):
-            raise _of_another_kind(self, other)
-        # As a displacement, so that a box that stays as it is leaves the vertices alone to the last bit.
+            raise _boundary_type_error(self, other)
+        # As a displacement, so that the vertices are unchanged to the last bit if the box is.
         (p, q), (r, s) = inverse_of(self.lattice)
         x, y = vertices[:, :1], vertices[:, 1:]
         first, second = p * x + r * y, q * x + s * y
@@ -160,10 +160,10 @@ class Periodic(AbstractBoundary):
 
 
 class Free(AbstractBoundary):
-    """The plane: a cluster of cells with an exterior around it.
+    """The plane: a cluster of cells surrounded by an exterior.
 
-    Its three zero modes are the translations and the rotation. Give the tissue `angles`, and edges with
-    the exterior on one side are circular arcs.
+    There are three zero modes: two translations and the rotation. If the tissue has `angles`, edges on the
+    outline are circular arcs.
     """
 
     def translation(self, image: Num[Array, "*shape 2"]) -> Num[Array, "*shape 2"]:
@@ -176,7 +176,7 @@ class Free(AbstractBoundary):
         self, vertices: Float[Array, "vertices 2"], other: AbstractBoundary
     ) -> Float[Array, "vertices 2"]:
         if not isinstance(other, Free):
-            raise _of_another_kind(self, other)
+            raise _boundary_type_error(self, other)
         return vertices
 
     def drift(
@@ -201,7 +201,7 @@ class Free(AbstractBoundary):
         (centre, rotates), (pivot, _) = _pivot(reference, pinned), _pivot(vertices, pinned)
         arm, moved = reference - centre, vertices - pivot
         turn = jnp.arctan2(jnp.sum(_cross(moved, arm)), jnp.sum(moved * arm))
-        return jnp.where(rotates, centre + _turned(moved, turn), vertices)
+        return jnp.where(rotates, centre + _rotated(moved, turn), vertices)
 
     def motions(
         self, vertices: Float[Array, "vertices 2"], distance: Float[Array, ""]
@@ -210,32 +210,33 @@ class Free(AbstractBoundary):
         centre = jnp.mean(vertices, axis=0)
         arm = vertices - centre
         turn = distance / jnp.sqrt(jnp.mean(jnp.sum(arm**2, axis=-1)))
-        return jnp.concatenate([shifted, (centre + _turned(arm, turn))[None]])
+        return jnp.concatenate([shifted, (centre + _rotated(arm, turn))[None]])
 
 
-def _of_another_kind(one: AbstractBoundary, other: AbstractBoundary) -> TypeError:
+def _boundary_type_error(one: AbstractBoundary, other: AbstractBoundary) -> TypeError:
+    name = describe(other) if not isinstance(other, AbstractBoundary) else type(other).__name__
     return TypeError(
-        f"A tissue in a {type(one).__name__} boundary needs another such boundary to go to, not "
-        f"{named(other) if not isinstance(other, AbstractBoundary) else type(other).__name__}."
+        f"Argument `boundary` must be of the class {type(one).__name__}, like that of the tissue, but is "
+        f"{name}."
     )
 
 
 def _pivot(
     vertices: Float[Array, "vertices 2"], pinned: Bool[Array, " vertices"] | None
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """What a free tissue can turn about, if it can: its centroid, or the one vertex that is pinned."""
+    """The centre of rotation (the centroid, or the only pinned vertex), and whether rotations are free."""
     if pinned is None:
         return jnp.mean(vertices, axis=0), jnp.array(True)
     n_pinned = jnp.sum(pinned)
-    counts = jnp.where(n_pinned > 0, pinned, True)[:, None]
-    centre = jnp.sum(jnp.where(counts, vertices, 0), axis=0) / jnp.sum(counts)
+    included = jnp.where(n_pinned > 0, pinned, True)[:, None]
+    centre = jnp.sum(jnp.where(included, vertices, 0), axis=0) / jnp.sum(included)
     return centre, n_pinned <= 1
 
 
-def _turned(p: Float[Array, "n 2"], angle: Float[Array, ""]) -> Float[Array, "n 2"]:
-    """Vectors turned counter-clockwise."""
-    aside = jnp.stack([-p[:, 1], p[:, 0]], axis=-1)
-    return jnp.cos(angle) * p + jnp.sin(angle) * aside
+def _rotated(p: Float[Array, "n 2"], angle: Float[Array, ""]) -> Float[Array, "n 2"]:
+    """Vectors rotated counter-clockwise."""
+    perpendicular = jnp.stack([-p[:, 1], p[:, 0]], axis=-1)
+    return jnp.cos(angle) * p + jnp.sin(angle) * perpendicular
 
 
 def _cross(p: Float[Array, "n 2"], q: Float[Array, "n 2"]) -> Float[Array, " n"]:
@@ -250,6 +251,6 @@ def _translation_drift(
 
 
 def inverse_of(lattice: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
-    """The inverse of two lattice vectors, written out: that of larger matrices takes long to compile."""
+    """The inverse of a 2 × 2 matrix by its formula, which compiles faster than `jnp.linalg.inv`."""
     (a, b), (c, d) = lattice
     return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)

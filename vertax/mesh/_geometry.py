@@ -14,11 +14,11 @@ from vertax.mesh._tissue import Tissue
 
 
 class Geometry(NamedTuple):
-    """What programs in NumPy need to know of a tissue."""
+    """Topology and geometry of a tissue, for code in NumPy."""
 
     edge_vertices: Int[np.ndarray, "edges 2"]
     edge_cells: Int[np.ndarray, "edges 2"]
-    """On the left and on the right; the exterior is the number of cells."""
+    """Cell on the left and on the right; `n_cells` for the exterior."""
     forward: Bool[np.ndarray, " halfedges"]
     edge_vectors: Float[np.ndarray, "edges 2"]
     edge_lengths: Float[np.ndarray, " edges"]
@@ -27,7 +27,7 @@ class Geometry(NamedTuple):
 
 
 def geometry_of(tissue: Tissue) -> Geometry:
-    """The geometry of a tissue, by one compiled function for each size class (see `pad`)."""
+    """The geometry of a tissue; compiled once for each size class (see `pad`)."""
     padded = pad(tissue)
     parts = [np.asarray(x) for x in _measure(padded)]
     m = tissue.topology

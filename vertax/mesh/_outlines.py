@@ -1,4 +1,4 @@
-"""Cells as polygons, for drawing."""
+"""Outlines of cells as polygons, for drawing."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ _POINTS_PER_ARC = 24
 
 
 class Drawing(eqx.Module):
-    """The geometry that pictures need, each cell placed with its centroid in the home box.
+    """The geometry for drawing a tissue; the centroid of each cell is in the home box.
 
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
-    - `points_per_arc`: number of straight pieces that an arc is drawn in.
-    - `near`: if given, periodic cells are placed as near as can be to these points, and not in the home
-        box: in an animation, to where they were.
+    - `points_per_arc`: number of straight pieces of an arc.
+    - `near`: if given, each periodic cell is drawn in the image nearest to this point instead of in the home
+        box. In an animation these are the centroids of the last frame.
     """
 
     lines: Float[np.ndarray, "halfedges points 2"]
-    """Each half-edge from its source to its target, where the cell on its left is drawn."""
+    """Each half-edge from its source to its target, in the image in which the cell on its left is drawn."""
     image: Int[np.ndarray, "halfedges 2"]
-    """Lattice image of that source."""
+    """Lattice image of the source of each half-edge in `lines`."""
     cell: Int[np.ndarray, " halfedges"]
     following: Int[np.ndarray, " halfedges"]
     twin: Int[np.ndarray, " halfedges"]
@@ -37,16 +37,16 @@ class Drawing(eqx.Module):
     n_cells: int
     n_edges: int
     alive: Bool[np.ndarray, " cells"]
-    """Which cells there are; the others have no corners."""
+    """Which cells exist; spare slots have no corners."""
     alive_edges: Bool[np.ndarray, " edges"]
     centroids: Float[np.ndarray, "cells 2"]
-    """Of the cells, where they are drawn."""
+    """Centroids of the drawn cells; NaN for spare slots."""
     cell_size: float
-    """Root of the mean area."""
+    """Square root of the mean area."""
     box: Float[np.ndarray, "5 2"] | None
-    """Outline of the periodic box, closed; None without one."""
+    """Closed outline of the periodic box; None for a free tissue."""
     lattice: Float[np.ndarray, "2 2"] | None
-    """Its sides."""
+    """Lattice vectors of the periodic box; None for a free tissue."""
 
     def __init__(
         self,
@@ -63,14 +63,14 @@ class Drawing(eqx.Module):
         if isinstance(tissue.boundary, Periodic):
             self.lattice = lattice = np.asarray(tissue.boundary.lattice, float)
             fractions = centroids.astype(float) @ np.linalg.inv(lattice)
-            # The margin keeps a centroid on the side of the box (a regular lattice, say) from
-            # jumping to the other side by rounding. A cell of area 0 has no centroid and stays put.
+            # The margin prevents that rounding moves a centroid on the boundary of the box (as in a regular
+            # lattice) to the opposite side. A cell of area 0 has no centroid and is not shifted.
             fractions = np.nan_to_num(fractions, posinf=0, neginf=0)
             image[: tissue.n_cells] = -np.floor(fractions + 1e-6).astype(int)
             if near is not None:
-                # A cell that was not there before is in the home box.
-                known = np.flatnonzero(np.isfinite(near).all(axis=1))
-                image[known] = np.rint(near[known] @ np.linalg.inv(lattice) - fractions[known])
+                # New cells have no point in `near` and are in the home box.
+                old = np.flatnonzero(np.isfinite(near).all(axis=1))
+                image[old] = np.rint(near[old] @ np.linalg.inv(lattice) - fractions[old])
             shift = image @ lattice
             first, second = lattice
             self.box = np.stack([0 * first, first, first + second, second, 0 * first])
@@ -92,52 +92,51 @@ class Drawing(eqx.Module):
         """Corners of all cells and their numbers of corners, see `cell_polygons`."""
         n_points = self.lines.shape[1] - 1
         sides = np.bincount(self.cell, minlength=self.n_cells)[: self.n_cells]
-        # The first half-edge of each cell; of spare slots any one.
+        # The first half-edge of each cell; 0 for spare slots.
         cells, first = np.unique(self.cell, return_index=True)
         half_edge = np.zeros(self.n_cells, int)
         half_edge[cells[cells < self.n_cells]] = first[cells < self.n_cells]
         polygons = np.repeat(self.lines[half_edge, :1], n_points * sides.max(), axis=1)
         # All cells at once, one side at a time.
         for k in range(sides.max()):
-            more = k < sides
+            has_side = k < sides
             side = slice(k * n_points, (k + 1) * n_points)
-            polygons[more, side] = self.lines[half_edge[more], :-1]
+            polygons[has_side, side] = self.lines[half_edge[has_side], :-1]
             half_edge = self.following[half_edge]
         return polygons, n_points * sides
 
     def sides(
         self, mask: Bool[np.ndarray, " cells"]
     ) -> tuple[Float[np.ndarray, "lines points 2"], Int[np.ndarray, " lines"]]:
-        """Lines that show each side of each marked cell once, and the edge of each.
+        """Lines that draw each side of the marked cells once, and the edge of each line.
 
-        An edge between two cells drawn side by side is one line; one across the periodic boundary
-        shows at both cells, in two places.
+        An edge between two cells that are drawn next to each other is one line; an edge across the
+        periodic boundary is two lines, one at each cell.
         """
-        mask = np.append(mask & self.alive, [False, False])  # the exterior, and nowhere
-        first, other = self.half_edge, self.twin[self.half_edge]
-        # Both cells of an edge draw it in the same place if they see its first vertex in the same
-        # image.
-        apart = np.any(self.image[first] != self.image[self.following[other]], axis=1)
-        left, right = mask[self.cell[first]], mask[self.cell[other]]
-        shown = np.concatenate([first[left], other[right & (apart | ~left)]])
-        return self.lines[shown], self.edge[shown]
+        mask = np.append(mask & self.alive, [False, False])  # the exterior and spare slots
+        first, second = self.half_edge, self.twin[self.half_edge]
+        # Both cells of an edge draw it in the same place if its first vertex has the same image in both.
+        apart = np.any(self.image[first] != self.image[self.following[second]], axis=1)
+        left, right = mask[self.cell[first]], mask[self.cell[second]]
+        drawn = np.concatenate([first[left], second[right & (apart | ~left)]])
+        return self.lines[drawn], self.edge[drawn]
 
 
 def cell_polygons(
     tissue: Tissue, points_per_arc: int = _POINTS_PER_ARC
 ) -> tuple[Float[np.ndarray, "cells sides 2"], Int[np.ndarray, " cells"]]:
-    """Corners of all cells, counter-clockwise, each cell whole.
+    """Corners of all cells, counter-clockwise.
 
-    In a periodic tissue each cell is placed so that its centroid lies in the home box; its corners
-    may stick out. If there are arcs, each side is a line of so many pieces.
+    In a periodic tissue the centroid of each cell is in the home box; its corners may be outside. In a
+    tissue with arcs, each side is a line of `points_per_arc` pieces.
 
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
-    - `points_per_arc`: number of straight pieces that stand for an arc.
+    - `points_per_arc`: number of straight pieces of an arc.
 
-    **Returns:** the corners, in units of length, where rows of cells with fewer sides than others
-    are filled up with their first corner; and the number of corners of each cell, 0 of spare slots.
+    **Returns:** the corners, in units of length, where the rows of cells with fewer corners are padded with
+    their first corner; and the number of corners of each cell, 0 for spare slots.
 
     **Raises:**
 

@@ -1,4 +1,4 @@
-"""Whether a tissue tiles the plane: where its cells overlap, or nearly do."""
+"""Overlaps of cells: sides of a face that cross, and sides that are close to each other."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from vertax.mesh._topology import Topology, take
 Carry = TypeVar("Carry")
 
 
-# If every face is a simple polygon (of arcs) that runs counter-clockwise, and the exterior clockwise, then
-# the tissue tiles the plane: by their turning numbers the angles of all faces add up to one full turn for
-# each vertex, and no vertex has less, so its three faces surround it once. Nothing has to be compared across
-# faces.
+# If every face is a simple polygon (of arcs) with counter-clockwise orientation, and the exterior one with
+# clockwise orientation, then the tissue tiles the plane: by the turning numbers of the faces, the angles of
+# all faces sum to 2π per vertex. No vertex has less than 2π, so its three faces surround it exactly once.
+# Therefore sides of different faces need not be compared.
 class Overlaps(eqx.Module):
-    """Where the faces of a tissue overlap; under `jax.vmap` one entry for each of the batch.
+    """Overlaps of the faces of a tissue; under `jax.vmap` with a leading batch axis.
 
     A tissue tiles the plane if each of its cells, and the exterior of a free one, is a simple polygon (of
-    straight edges or of arcs), and no cell is inside out.
+    straight edges or of arcs), and no cell is inside out (of area ≤ 0).
     """
 
     crossed: Int[Array, "*batch halfedges"]
-    """For each half-edge another one, a side of the same face, that it crosses; itself if there is none."""
+    """For each half-edge another one of the same face that it crosses; itself if there is none."""
     cells: Bool[Array, "*batch cells"]
     """Which cells cross themselves or are inside out."""
     exterior: Bool[Array, "*batch"]
@@ -47,7 +47,7 @@ class Overlaps(eqx.Module):
         return self.crossed != jnp.arange(self.crossed.shape[-1])
 
     def describe(self) -> str:
-        """Where the tissue (of a batch: the first one that does) overlaps, in words; empty if nowhere."""
+        """List the overlaps as text, of a batch those of the first tissue with overlaps; empty without."""
         bad = np.flatnonzero(np.atleast_1d(self.any))
         if not bad.size:
             return ""
@@ -66,7 +66,7 @@ class Overlaps(eqx.Module):
 
 
 def find_overlaps(topology: Topology, sides: Sides, areas: Float[Array, " cells"]) -> Overlaps:
-    """Compare each side with all others of its face."""
+    """Compare each side with all other sides of its face."""
     crossed = crossed_sides(sides, topology.next, _last(topology), few_long=topology.exterior)
     return _overlaps(topology, areas, crossed)
 
@@ -78,21 +78,23 @@ def crossed_sides(
     *,
     few_long: bool = False,
 ) -> Int[Array, " halfedges"]:
-    """For each side another one of its face that it crosses, or itself.
+    """For each side another side of its face that it crosses, or the side itself.
 
     **Arguments:**
 
-    - `following`: the next side of the face.
-    - `last`: two less than the number of its sides.
-    - `few_long`: as for `around`.
+    - `following`: for each side, the next side of its face.
+    - `last`: for each side, the number of sides of its face minus two.
+    - `few_long`: as for `loop_over_side_pairs`.
     """
 
     def compare(pair: Pairs, crossed: Array) -> Array:
         return jnp.where(_crosses(pair), pair.other, crossed)
 
-    here = jnp.arange(len(sides), dtype=following.dtype)
+    half_edges = jnp.arange(len(sides), dtype=following.dtype)
     rows = lambda half_edges: take(sides, half_edges)
-    return around(rows, following, here, last, compare, here, few_long=few_long)
+    return loop_over_side_pairs(
+        rows, following, half_edges, last, compare, half_edges, few_long=few_long
+    )
 
 
 def overlaps_and_nearest(
@@ -101,39 +103,39 @@ def overlaps_and_nearest(
     areas: Float[Array, " cells"],
     measure: Callable[[Sides, Sides, Array, Array], Float[Array, " halfedges"]],
 ) -> tuple[Bool[Array, " vertices"], Int[Array, "2 halfedges"], Float[Array, "2 halfedges"]]:
-    """The vertices of overlaps; and of each corner the two nearest sides of its face that it does not end.
+    """The vertices of overlaps; and for each corner the two nearest sides of its face that do not end at it.
 
     Vertices of overlaps are the corners of cells that cross themselves or are inside out, and the ends of the
     sides of the outline that cross.
 
     **Arguments:**
 
-    - `measure`: how near the starts of sides are to other sides; given also whether each of those is the
-        next side, and whether it is the last but one.
+    - `measure`: returns the distance from the start of each side to another side. Its third argument states
+        whether the other side is the next one of the face, its fourth whether it is the last but one.
 
-    **Returns:** the vertices; the two sides, as half-edges; and how near they are.
+    **Returns:** which vertices belong to overlaps; the two sides, as half-edges; and their distances.
     """
-    here = _numbers(m)
+    half_edges = _numbers(m)
     before_last = take(m.previous, m.previous)
 
-    def both(pair: Pairs, carry: tuple) -> tuple:
+    def compare(pair: Pairs, carry: tuple) -> tuple:
         crossed, first, second, low, high = carry
-        after = jnp.broadcast_to(pair.k == 1, pair.here.shape)
-        before = pair.other == take(before_last, pair.here)
-        paired = pair.other != pair.here
-        gap = jnp.where(paired, measure(pair.mine, pair.theirs, after, before), jnp.inf)
-        crossed |= sides_cross(pair.mine, pair.theirs, pair.k == 1) & paired
+        after = jnp.broadcast_to(pair.k == 1, pair.half_edge.shape)
+        before = pair.other == take(before_last, pair.half_edge)
+        paired = pair.other != pair.half_edge
+        gap = jnp.where(paired, measure(pair.side, pair.other_side, after, before), jnp.inf)
+        crossed |= sides_cross(pair.side, pair.other_side, pair.k == 1) & paired
         nearest, nearer = gap < low, gap < high
         second = jnp.where(nearest, first, jnp.where(nearer, pair.other, second))
         high = jnp.where(nearest, low, jnp.where(nearer, gap, high))
         first, low = jnp.where(nearest, pair.other, first), jnp.where(nearest, gap, low)
         return crossed, first, second, low, high
 
-    none, no = jnp.full(here.size, jnp.inf, sides.dtype), jnp.zeros(here.size, bool)
-    start = (no, here, here, none, none)
+    infinite = jnp.full(half_edges.size, jnp.inf, sides.dtype)
+    start = (jnp.zeros(half_edges.size, bool), half_edges, half_edges, infinite, infinite)
     rows = lambda half_edges: take(sides, half_edges)
-    crossed, first, second, low, high = around(
-        rows, m.next, here, _last(m), both, start, few_long=m.exterior
+    crossed, first, second, low, high = loop_over_side_pairs(
+        rows, m.next, half_edges, _last(m), compare, start, few_long=m.exterior
     )
     inside_out = ~(areas > 0) & m.alive if m.spare else ~(areas > 0)
     faces = jnp.concatenate([inside_out, jnp.zeros(m.n_faces - m.n_cells, bool)])
@@ -147,7 +149,8 @@ def overlaps_and_nearest(
 
 
 def _crosses(pair: Pairs) -> Bool[Array, " pairs"]:
-    return sides_cross(pair.mine, pair.theirs, pair.k == 1) & (pair.other != pair.here)
+    crosses = sides_cross(pair.side, pair.other_side, pair.k == 1)
+    return crosses & (pair.other != pair.half_edge)
 
 
 def _overlaps(
@@ -170,79 +173,80 @@ def _last(topology: Topology) -> Int[Array, " halfedges"]:
 
 def _number_of_sides(topology: Topology) -> Int[Array, " faces"]:
     n_sides = jax.ops.segment_sum(jnp.ones_like(topology.cell), topology.cell, topology.n_faces)
-    return n_sides.at[topology.nowhere].set(0) if topology.spare else n_sides
+    return n_sides.at[topology.spare_label].set(0) if topology.spare else n_sides
 
 
 class Pairs(NamedTuple):
-    """Some half-edges, and for each the one that comes k sides later in its face, or itself."""
+    """Half-edges, each with the one that is k sides later in its face, or with itself."""
 
     k: Int[Array, ""]
-    here: Int[Array, " pairs"]
+    half_edge: Int[Array, " pairs"]
     other: Int[Array, " pairs"]
-    mine: Sides
-    theirs: Sides
+    side: Sides
+    other_side: Sides
 
 
-def around(
+def loop_over_side_pairs(
     sides_of: Callable[[Int[Array, " some"]], Sides],
     following: Int[Array, " halfedges"],
-    here: Int[Array, " some"],
+    half_edges: Int[Array, " some"],
     last: Int[Array, " some"],
     body: Callable[[Pairs, Carry], Carry],
     start: Carry,
     *,
     few_long: bool = False,
 ) -> Carry:
-    """Walk around faces, all at once: `body` sees each half-edge with the one k sides further.
+    """Loop over k = 1, 2, …: `body` gets each half-edge with the half-edge k sides later in its face.
 
-    k goes from 1 to `last`, which may differ from face to face; half-edges that are through are paired with
-    themselves. With two less than the number of sides each corner meets all sides that it does not end.
+    k ends at `last`, which may differ between faces; after that a half-edge is paired with itself. If `last`
+    is the number of sides minus two, each corner is paired with all sides that do not end at it.
 
     **Arguments:**
 
-    - `sides_of`: the sides that half-edges are.
-    - `following`: of each half-edge the next one of its face.
-    - `here`: from where to walk, half-edges.
-    - `last`: how far to go from each.
-    - `body`: takes pairs, and the rows of what is carried that belong to them; returns these rows anew.
-    - `start`: arrays with a row for each of `here`.
-    - `few_long`: whether some faces have far more sides than most, as the exterior has. Then those that
-        still have some way to go are walked with by themselves.
+    - `sides_of`: returns the sides of half-edges.
+    - `following`: for each half-edge, the next one of its face.
+    - `half_edges`: the half-edges to start from.
+    - `last`: the largest k of each.
+    - `body`: takes pairs and the rows of the carry that belong to them; returns the updated rows.
+    - `start`: the initial carry: arrays with a row for each of `half_edges`.
+    - `few_long`: whether a small number of faces, such as the exterior, has many more sides than the others.
+        Then half-edges are sorted by `last`, so that only the first pieces need many steps.
 
-    **Returns:** what is carried, at the end.
+    **Returns:** the final carry.
     """
-    n = here.size
+    n = half_edges.size
 
-    def walk(here: Int[Array, " some"], last: Int[Array, " some"], start: Carry) -> Carry:
-        mine = sides_of(here)
+    def walk(half_edges: Int[Array, " some"], last: Int[Array, " some"], start: Carry) -> Carry:
+        sides = sides_of(half_edges)
 
-        def one(k: Int[Array, ""], carry: tuple) -> tuple:
+        def step(k: Int[Array, ""], carry: tuple) -> tuple:
             other, inner = carry
             other = take(following, other)
-            partner = jnp.where(k <= last, other, here)
-            return other, body(Pairs(k, here, partner, mine, sides_of(partner)), inner)
+            partner = jnp.where(k <= last, other, half_edges)
+            pairs = Pairs(k, half_edges, partner, sides, sides_of(partner))
+            return other, body(pairs, inner)
 
-        return jax.lax.fori_loop(1, jnp.max(last) + 1, one, (here, start))[1]
+        return jax.lax.fori_loop(1, jnp.max(last) + 1, step, (half_edges, start))[1]
 
     size = min(n, max(64, int(4 * n**0.5)) if few_long else _PIECE)
     if size == n:
-        return walk(here, last, start)
-    # Those with the longest way come first, so that the others are soon through. (The last piece is filled
-    # up with what has no way to go.)
+        return walk(half_edges, last, start)
+    # Half-edges with the largest `last` come first, so that the other pieces end early. (The last piece is
+    # padded with `last` = 0.)
     order = jnp.argsort(-last) if few_long else None
     sort = lambda x: x if order is None else take(x, order)
-    filled = lambda x: jnp.append(sort(x), jnp.zeros(-n % size, x.dtype))
-    here, last, start = jax.tree.map(filled, (here, last, start))
+    pad = lambda x: jnp.append(sort(x), jnp.zeros(-n % size, x.dtype))
+    half_edges, last, start = jax.tree.map(pad, (half_edges, last, start))
 
     def piece(i: Int[Array, ""], carry: Carry) -> Carry:
         cut = lambda x: jax.lax.dynamic_slice_in_dim(x, i * size, size)
         put = lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, i * size, 0)
-        return jax.tree.map(put, carry, walk(cut(here), cut(last), jax.tree.map(cut, carry)))
+        return jax.tree.map(put, carry, walk(cut(half_edges), cut(last), jax.tree.map(cut, carry)))
 
-    end = jax.lax.fori_loop(0, here.size // size, piece, start)
+    end = jax.lax.fori_loop(0, half_edges.size // size, piece, start)
     end = jax.tree.map(lambda x: x[:n], end)
     return end if order is None else jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x), end)
 
 
-# What is walked with at once: so much stays at hand.
+# Number of half-edges in a piece, such that their rows stay in the cache of the CPU.
 _PIECE = 16384

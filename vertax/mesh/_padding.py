@@ -1,4 +1,4 @@
-"""Tissues of nearly the same size, brought to one size."""
+"""Padding of tissues to size classes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vertax.mesh._tissue import Tissue
 
 
 def pad(tissue: Tissue, *parts: Any) -> Any:
-    r"""A tissue with spare slots up to the next size class, so that similar sizes share compiled functions.
+    r"""Add spare slots up to the next size class, so that tissues of similar size share compiled functions.
 
     ```python
     for mask in masks:
@@ -22,25 +22,25 @@ def pad(tissue: Tissue, *parts: Any) -> Any:
         relaxed = vx.equilibrate(tissue, energy).tissue.without_spare()
     ```
 
-    JAX compiles a function anew for each size of its arguments. The size classes are
+    JAX compiles a function again for each size of its arguments. The size classes are
     $c_{k+1} = \lfloor \tfrac54 (c_k + 1) \rfloor$ with $c_0 = 4$ (4, 6, 8, 11, 15, 20, …, 85, 107, 135, …),
-    so a tissue gets at most a quarter more cells than it has; below 4 cells it keeps its size. Spare slots
-    have no area and feel no force, see [`with_capacity`][vertax.Tissue.with_capacity]. Cells, edges and
-    vertices keep their numbers, and come before the spare ones.
+    so padding adds at most 25 % to the number of cells; below 4 cells a tissue keeps its size. Spare slots
+    have area 0 and force 0, see [`with_capacity`][vertax.Tissue.with_capacity]. Cells, edges and
+    vertices keep their numbers; spare ones follow.
 
     **Arguments:**
 
-    - `tissue`: the tissue; its numbers must be known (not inside `jax.jit`).
-    - `parts`: energies and other modules that belong to it. Their arrays with one entry for each cell, edge
-        or vertex become longer by copies of the first entry. Fields declare which these are by their
-        annotation, such as `Float[Array, "cells"]`, see [your own energy](../extending.md).
+    - `tissue`: the tissue, with concrete arrays (not inside `jax.jit`).
+    - `parts`: energies and other modules of the tissue. Their arrays with one entry for each cell, edge or
+        vertex are extended by copies of the first entry. Fields declare these axes by their annotation,
+        such as `Float[Array, "cells"]`, see [your own energy](../extending.md).
 
-    **Returns:** the padded tissue; with parts, the tuple of the tissue and the padded parts.
+    **Returns:** the padded tissue; with `parts`, a tuple of the padded tissue and the padded parts.
 
     **Raises:**
 
-    - `TypeError` inside `jax.jit`, and for an array of a part that has as many entries as there are cells,
-        edges or vertices, and does not declare for which of them.
+    - `TypeError` inside `jax.jit`, and for an undeclared array of a part with as many entries as there are
+        cells, edges or vertices.
     - `ValueError` for an array of another length than its field declares.
     """
     check_concrete("pad", tissue.topology)

@@ -1,4 +1,4 @@
-"""Sides of a face by pairs: whether they cross, and how far one is from the other."""
+"""Pairs of sides of a face: whether they cross, and their distance."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vertax._base.extremes import greater, lesser
+from vertax._base.minimum_maximum import maximum, minimum
 
-# A side is a row of a table: where it begins, its chord and, if there are arcs, its angle α, positive if it
-# bulges to the right, which is out of the face. With the unit vector e along the chord c and n to its left,
-# points x of its circle, as seen from its start, obey
+# A side is a row of an array: its start, its chord and, in tissues with arcs, its angle α, positive if it
+# bulges to the right (out of the face). With the unit vector e along the chord of length c and the unit
+# vector n to its left, the points x of its circle, relative to its start, satisfy
 #
-#     F(x) = κ/2 |x|² - g·x = 0,    κ = 2 sin(α) / c,    g = sin(α) e + cos(α) n,
+#     F(x) = κ/2 |x|² - g·x = 0,    κ = 2 sin(α) / c,    g = sin(α) e + cos(α) n.
 #
-# which is the line of the chord for α = 0, without any large radius. The signed distance from the circle is
+# For α = 0 this is the line of the chord; no radius becomes large. The signed distance from the circle is
 # 2 F / (1 + √(1 + 2 κ F)).
 Sides = Float[Array, "sides parts"]
 
 
 def cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
-    """Cross product."""
+    """Cross product of vectors in the plane."""
     return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
 
 
@@ -32,11 +32,11 @@ def dot(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
 
 
 def sides_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array, " sides"]:
-    """Whether two sides have a point in common, other than where both end.
+    """Whether two sides have a common point other than a common end.
 
     **Arguments:**
 
-    - `joined`: whether the other one begins where the first one ends.
+    - `joined`: whether `other` begins at the end of `one`.
     """
     straight = _segments_cross(one, other) & ~joined
     if one.shape[-1] == 4:
@@ -49,14 +49,14 @@ def _segments_cross(one: Sides, other: Sides) -> Bool[Array, " sides"]:
     p, u, q, v = one[:, :2], one[:, 2:4], other[:, :2], other[:, 2:4]
     w = q - p
     apart = (cross(u, w) * cross(u, w + v) >= 0) | (cross(v, w) * cross(v, w - u) >= 0)
-    # Rounding may let sides in one line, like those of a row of bricks, look crossed.
+    # By rounding, collinear sides (as in a row of bricks) may seem to cross: compare their bounding boxes.
     low, high = jnp.minimum(p, p + u), jnp.maximum(p, p + u)
     below, above = jnp.minimum(q, q + v), jnp.maximum(q, q + v)
     return ~apart & jnp.all((low <= above) & (below <= high), axis=-1)
 
 
 def _arcs_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array, " sides"]:
-    """The same for circles: they meet on the line where κ' F = κ F'."""
+    """`sides_cross` for arcs: two circles intersect on the line κ' F = κ F'."""
     circles = jnp.column_stack(circle_of(one)), jnp.column_stack(circle_of(other))
     first = (jnp.abs(circles[0][:, 0]) >= jnp.abs(circles[1][:, 0]))[:, None]
     a, b = jnp.where(first, one, other), jnp.where(first, other, one)
@@ -74,22 +74,22 @@ def _arcs_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array
     squared = half**2 - 2 * k1 * rest
     root = half + jnp.where(half < 0, -1, 1) * jnp.sqrt(jnp.maximum(squared, 0))
     nonzero = lambda x: jnp.where(x == 0, jnp.finfo(w.dtype).tiny, x)
-    # Where sides are joined they have one point in common.
+    # Joined sides have a common end, which does not count.
     joint = other[:, :2] - a[:, :2]
     nearby = 4 * jnp.finfo(w.dtype).eps ** 0.5 * jnp.sqrt(dot(a[:, 2:4], a[:, 2:4]))
     crosses = jnp.zeros(squared.shape, bool)
-    for share in (root / nonzero(k1), 2 * rest / nonzero(root)):
-        x = foot + share[:, None] * along
+    for position in (root / nonzero(k1), 2 * rest / nonzero(root)):
+        x = foot + position[:, None] * along
         away = ~joined | (jnp.sqrt(dot(x - joint, x - joint)) > nearby)
         crosses |= away & _on_arc(a, x) & _on_arc(b, x - w)
     return crosses & (squared > 0)
 
 
 def _on_arc(side: Sides, x: Float[Array, "sides 2"]) -> Bool[Array, " sides"]:
-    """Whether a point of the circle, as seen from the start, is one of the arc."""
+    """Whether a point of the circle, relative to the start of the side, is on the arc."""
     chord, angle = side[:, 2:4], side[:, 4]
     squared, along, aside = dot(chord, chord), dot(chord, x), cross(chord, x)
-    # An arc is what its circle has on one side of the chord. A flat one hardly leaves the chord.
+    # The arc is the part of its circle on one side of the chord. A flat arc is close to the chord.
     flat = (along > 0) & (along < squared) & (jnp.abs(aside) < squared)
     return jnp.where(jnp.abs(angle) < 0.5, flat, aside * angle < 0)
 
@@ -102,7 +102,7 @@ class Circle(NamedTuple):
 
 
 def circle_of(side: Sides) -> Circle:
-    """The circles of sides that may be arcs."""
+    """The circles of sides that may be arcs; κ = 0 for straight sides."""
     chord, angle = side[:, 2:4], side[:, 4:]
     squared = jnp.sum(chord**2, axis=-1, keepdims=True)
     unit = chord / jnp.sqrt(jnp.where(squared > 0, squared, 1))
@@ -117,26 +117,26 @@ def squared_distance_to_segment(
     point: Float[Array, "sides 2"], side: Sides
 ) -> Float[Array, " sides"]:
     """Squared distance of a point from each straight side."""
-    way, _ = _way_to_segment(point, side)
-    return dot(way, way)
+    offset, _ = _offset_from_segment(point, side)
+    return dot(offset, offset)
 
 
-# Where on the side the nearest point is does not matter in first order.
+# By the envelope theorem the derivative is that at a fixed nearest point of the side.
 @squared_distance_to_segment.defjvp
 def _(primals: tuple, tangents: tuple) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
-    (way, share), (change, moved) = _way_to_segment(*primals), tangents
-    change = change - moved[:, :2] - share[:, None] * moved[:, 2:4]
-    return dot(way, way), 2 * dot(way, change)
+    (offset, fraction), (change, moved) = _offset_from_segment(*primals), tangents
+    change = change - moved[:, :2] - fraction[:, None] * moved[:, 2:4]
+    return dot(offset, offset), 2 * dot(offset, change)
 
 
-def _way_to_segment(
+def _offset_from_segment(
     point: Float[Array, "sides 2"], side: Sides
 ) -> tuple[Float[Array, "sides 2"], Float[Array, " sides"]]:
-    """The way from the nearest point of each side, and at which share of it that is."""
+    """Vector from the nearest point of each side, and the position of that point (0 to 1) on the side."""
     first, chord = point - side[:, :2], side[:, 2:4]
     squared = dot(chord, chord)
-    share = lesser(greater(dot(first, chord) / jnp.where(squared > 0, squared, 1), 0), 1)
-    return first - share[:, None] * chord, share
+    fraction = minimum(maximum(dot(first, chord) / jnp.where(squared > 0, squared, 1), 0), 1)
+    return first - fraction[:, None] * chord, fraction
 
 
 def squared_distance_to_arc(
@@ -147,71 +147,71 @@ def squared_distance_to_arc(
     first, chord = point - side[:, :2], side[:, 2:4]
     last = first - chord
     value = 0.5 * curvature * dot(first, first) - dot(g, first)
-    # At the centre of its circle a point is as far from all of the arc.
-    centred = 1 + 2 * curvature * value
-    distance = 2 * value / (1 + jnp.sqrt(jnp.where(centred > 0, centred, 1)))
+    # 0 at the centre of the circle, where the distance to all points of the arc is the same.
+    squared = 1 + 2 * curvature * value
+    distance = 2 * value / (1 + jnp.sqrt(jnp.where(squared > 0, squared, 1)))
     past_start = -cross(g, first) >= 0
     before_end = curvature * cross(first, chord) + cross(g, last) >= 0
     wide = jnp.abs(side[:, 4]) > 0.5 * jnp.pi
-    faces = jnp.where(wide, past_start | before_end, past_start & before_end) & (centred > 0)
-    ends = lesser(dot(first, first), dot(last, last))
+    faces = jnp.where(wide, past_start | before_end, past_start & before_end) & (squared > 0)
+    ends = minimum(dot(first, first), dot(last, last))
     return jnp.where(faces, distance**2, ends)
 
 
 def bulge_gap(
     one: Sides, other: Sides, circles: tuple[Circle, Circle], reach: Float[Array, ""]
 ) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
-    """Distance from an arc that bulges into the face to another side, and how much that counts.
+    """Distance from an arc that bulges into the face to another side, and a weight from 0 to 1.
 
-    The gap is where its circle is nearest to that of the other one, which may be a line. Where this comes
-    within `reach` of the end of a side, or the arc is flat, its corners are as near, and the weight goes
-    smoothly from 1 to 0. (The gap is infinite where it is 0.)
+    The gap is the least distance between the circle of the arc and that of the other side (or its line). If
+    the nearest point is within `reach` of the end of a side, or the arc is flat, then its corners are as
+    near, and the weight decreases smoothly to 0. (For weight 0 the gap is infinite.)
     """
     bulge = -one[:, 4]
     bulging = bulge > _FLAT
     radius = -1 / jnp.where(bulging, circles[0].curvature, -1)
     to_centre = -radius[:, None] * circles[0].normal
     curvature, g = circles[1]
-    way = one[:, :2] + to_centre - other[:, :2]
-    value = 0.5 * curvature * dot(way, way) - dot(g, way)
+    centre = one[:, :2] + to_centre - other[:, :2]
+    value = 0.5 * curvature * dot(centre, centre) - dot(g, centre)
     squared = 1 + 2 * curvature * value
     root = jnp.sqrt(jnp.where(squared > 0, squared, 1))
-    # How far the centre is from the other circle, on its inner side, and the direction there.
+    # Distance of the centre from the other circle, positive on its inner side, and the direction to it.
     distance = -2 * value / (1 + root)
-    unit = (curvature[:, None] * way - g) / root[:, None]
+    unit = (curvature[:, None] * centre - g) / root[:, None]
     x = to_centre + radius[:, None] * unit
-    y = way + distance[:, None] * unit
+    y = centre + distance[:, None] * unit
     gap = distance - radius
     x, y, gap = jax.lax.optimization_barrier((x, y, gap))
     facing = bulging & (squared > 0) & (gap > 0) & _on_arc(one, x) & _on_arc(other, y)
     inner = _inner(one, x, facing, reach) * _inner(other, y, facing, reach)
-    weight = _rise(bulge / _FLAT - 1) * inner
+    weight = _smooth_step(bulge / _FLAT - 1) * inner
     return jnp.where(facing, gap, jnp.inf), jnp.where(facing, weight, 0)
 
 
-_FLAT = 0.01
+_FLAT = 0.01  # radians
 
 
 def _inner(
     side: Sides, x: Float[Array, "sides 2"], where: Bool[Array, " sides"], reach: Float[Array, ""]
 ) -> Float[Array, " sides"]:
-    """1 for a point on the inner part of an arc, and less near its ends."""
+    """Weight of a point on an arc: 1 in its inner part, decreasing to 0 at its ends."""
     x, chord = jnp.where(where[:, None], x, 1), jnp.where(where[:, None], side[:, 2:4], 3)
     last, squared = x - chord, dot(chord, chord)
-    near = lesser(0.1 * jnp.sqrt(squared), reach)
-    return _rise(jnp.sqrt(dot(x, x) * dot(last, last) / squared) / near)
+    near = minimum(0.1 * jnp.sqrt(squared), reach)
+    return _smooth_step(jnp.sqrt(dot(x, x) * dot(last, last) / squared) / near)
 
 
-def _rise(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """From 0 at 0 to 1 at 1, twice differentiable."""
-    x = lesser(greater(x, 0), 1)
+def _smooth_step(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """6x⁵ - 15x⁴ + 10x³ between 0 and 1; constant outside; twice differentiable."""
+    x = minimum(maximum(x, 0), 1)
     return (10 + (6 * x - 15) * x) * x**3
 
 
 def wedge(
     one: Sides, circles: tuple[Circle, Circle]
 ) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
-    """Sine and cosine of the angle of the face between a side and the one that begins where it ends."""
+    """Sine and cosine of the interior angle of the face between a side and the next one."""
     (curvature, g), (_, leaving) = circles
     arriving = g - curvature[:, None] * one[:, 2:4]  # normals to the two tangents there
     return -cross(leaving, arriving), -dot(leaving, arriving)

@@ -11,17 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from vertax._base.modules import compiled_property, is_concrete
+from vertax._base.tracing import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free, Periodic
 from vertax.mesh._capacity import size_class, with_slots, without_slots
-from vertax.mesh._ends import at_ends
+from vertax.mesh._edge_ends import gather_at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
 
 
-class Known(NamedTuple):
-    """What most energies ask of a tissue."""
+class Measurements(NamedTuple):
+    """The properties of a tissue that most energies depend on."""
 
     lengths: Float[Array, " edges"]
     areas: Float[Array, " cells"]
@@ -29,43 +29,42 @@ class Known(NamedTuple):
 
 
 class Tissue(eqx.Module):
-    r"""A planar tissue: vertices, their connectivity and the space they live in.
+    r"""A planar tissue: vertices, topology and boundary.
 
-    Geometry is differentiable in `vertices`, in the angles of `arcs` and in the boundary (the lattice of
+    The geometry is differentiable in `vertices`, in the angles of `arcs` and in the boundary (the lattice of
     a periodic box).
 
     Edges are straight, or circular arcs (paper, Methods, "Bounded mode"): an arc with the angle
     $\alpha$ between its chord $c$ and its tangents has the radius $R = c / (2 \sin\alpha)$ and the length
     $c\,\alpha / \sin\alpha$, and adds the area $c^2 (\alpha - \sin\alpha\cos\alpha) / (4 \sin^2\alpha)$
-    to the cell on the left of its edge, which it bulges out of if $\alpha > 0$. On the outline of a
+    to the cell on the left of its edge (for $\alpha > 0$ it bulges out of that cell). On the outline of a
     free tissue the cell is always on the left.
 
     **Arguments:**
 
     - `vertices`, shape `(vertices, 2)`: positions, in units of length; they may lie outside the periodic box.
     - `topology`: the [`Topology`][vertax.Topology].
-    - `boundary`: the space, [`Periodic`][vertax.Periodic] or [`Free`][vertax.Free].
-    - `softening`: the length $\varepsilon$ below which an edge is rounded off,
-        $\ell = \sqrt{|d|^2 + \varepsilon^2}$; it makes a four-fold vertex (an edge of length 0) a smooth
-        point of every energy. 0 switches it off; by default $10^{-3}$ of the root mean cell area,
-        which changes the length of a typical edge by parts in a million. (Of an arc, it is the chord.)
-    - `angles`, shape `(edges,)`: the angle $\alpha$ of each edge, in radians. Every edge owns one,
-        since a T1 transition may put it on the outline, but only those of arcs count. Beyond 0.98 π
-        (nearly a circle) they are bounded smoothly, see `edge_angles`. Left out: all edges are
-        straight.
-    - `inner_arcs`: whether edges between two cells are arcs too, as in a foam; otherwise the edges on
-        the outline are.
-    - `pinned`, shape `(vertices,)`: which vertices do not move when the tissue relaxes. T1 transitions
-        leave edges alone that end at one.
-    - `angle_length`: the length that makes an angle a degree of freedom like a position, so that
-        solvers may measure steps and forces without knowing which is which; by default half the root
-        mean cell area, about what moves the middle of an arc as far as a vertex.
+    - `boundary`: [`Periodic`][vertax.Periodic] or [`Free`][vertax.Free].
+    - `softening`: the length $\varepsilon$ in the softened edge length
+        $\ell = \sqrt{|d|^2 + \varepsilon^2}$, with which every energy is smooth at a four-fold vertex (an
+        edge of length 0). 0 for no softening; by default $10^{-3}$ of the square root of the mean cell area,
+        which changes a typical edge length by a relative $10^{-6}$. (Of an arc the chord is softened.)
+    - `angles`, shape `(edges,)`: the angle $\alpha$ of each edge, in radians. Each edge has one, since
+        a T1 transition may move it to the outline; angles of straight edges are ignored. Above 0.98 π
+        (nearly a circle) they are limited smoothly, see `edge_angles`. By default all edges are straight.
+    - `inner_arcs`: whether edges between two cells are arcs too, as in a foam; by default only edges on the
+        outline are.
+    - `pinned`, shape `(vertices,)`: which vertices do not move when the tissue relaxes. Edges with a pinned
+        end do not flip in T1 transitions.
+    - `angle_length`: factor that converts an angle to a length, so that all degrees of freedom have the same
+        unit; by default half the square root of the mean cell area, for which the midpoint of an arc moves
+        about as far as a vertex.
 
     **Raises:**
 
     - `ValueError` for positions, angles or pins of the wrong shape or that are not finite, a negative
-        softening, an `angle_length` that is not positive, a boundary that does not go with the topology
-        (free if and only if there is an exterior), or angles where no edge can be an arc.
+        softening, an `angle_length` that is not positive, a boundary that does not match the topology
+        (free if and only if there is an exterior), or angles in a tissue without arcs.
     """
 
     vertices: Float[Array, "vertices 2"]
@@ -73,7 +72,7 @@ class Tissue(eqx.Module):
     boundary: AbstractBoundary
     softening: Float[Array, ""]
     arcs: Arcs | None
-    """The angles of edges and what belongs to them; None if all edges are straight."""
+    """The angles of the edges; None if all edges are straight."""
     pinned: Bool[Array, " vertices"] | None
 
     def __init__(
@@ -106,8 +105,8 @@ class Tissue(eqx.Module):
         self.boundary = boundary
         if angles is not None and not (topology.exterior or inner_arcs):
             raise ValueError(
-                "Argument `angles` is for arcs, but a periodic tissue has none: pass `inner_arcs=True`, "
-                "or no angles."
+                "Argument `angles` must be None in a tissue without arcs, but a periodic tissue has none. "
+                "Pass `inner_arcs=True`, or no angles."
             )
         self.arcs = None
         if angles is not None:
@@ -121,9 +120,9 @@ class Tissue(eqx.Module):
             )
         self.softening = jnp.zeros((), vertices.dtype)
         if softening is None or (angles is not None and angle_length is None):
-            # Padded, so that similar sizes share the compiled function.
-            known = all(map(is_concrete, jax.tree.leaves(self)))
-            padded = self.with_capacity(size_class(self.n_cells)) if known else self
+            # Padded, so that tissues of similar size share the compiled function.
+            concrete = all(map(is_concrete, jax.tree.leaves(self)))
+            padded = self.with_capacity(size_class(self.n_cells)) if concrete else self
             size = jnp.sqrt(jax.lax.stop_gradient(_mean_area(padded)))
             softening = 1e-3 * size if softening is None else softening
             angle_length = 0.5 * size if angle_length is None else angle_length
@@ -139,12 +138,12 @@ class Tissue(eqx.Module):
 
     @property
     def angles(self) -> Float[Array, " edges"] | None:
-        """The angle of each edge, of which only those of arcs count; None if all edges are straight."""
+        """The angle of each edge, ignored for straight edges; None if all edges are straight."""
         return None if self.arcs is None else self.arcs.angles
 
     @property
     def angle_length(self) -> Float[Array, ""] | None:
-        """The length that makes an angle a degree of freedom; None if all edges are straight."""
+        """Factor that converts an angle to a length; None if all edges are straight."""
         return None if self.arcs is None else self.arcs.length
 
     @property
@@ -169,7 +168,7 @@ class Tissue(eqx.Module):
 
     @property
     def alive(self) -> Bool[Array, " cells"]:
-        """Which cells there are; the others are spare slots, see `with_capacity`."""
+        """Which cells exist; the others are spare slots, see `with_capacity`."""
         return self.topology.alive
 
     @compiled_property
@@ -179,19 +178,19 @@ class Tissue(eqx.Module):
 
     @compiled_property
     def edge_segments(self) -> tuple[Float[Array, "edges 2"], Float[Array, "edges 2"]]:
-        """First vertex of each edge, and the edge as a vector from there across periodic boundaries."""
+        """First vertex of each edge, and the vector to its second vertex across periodic boundaries."""
         x, y, dx, dy = self._segments()
         return jnp.stack([x, y], axis=-1), jnp.stack([dx, dy], axis=-1)
 
     @compiled_property
     def edge_vectors(self) -> Float[Array, "edges 2"]:
-        """Each edge as a vector, from its first to its second vertex across periodic boundaries."""
+        """Vector from the first to the second vertex of each edge, across periodic boundaries."""
         return self.edge_segments[1]
 
     def edge_points(self, fractions: Float[Array, " points"]) -> Float[Array, "edges points 2"]:
-        """Points on each edge at some fractions (0 to 1) of its length.
+        """Points on each edge at given fractions (0 to 1) of its length.
 
-        Edges across a periodic boundary go on beyond the box.
+        Points of edges across a periodic boundary may be outside of the box.
         """
         first, vector = self.edge_segments
         if self.arcs is None:
@@ -200,7 +199,7 @@ class Tissue(eqx.Module):
 
     @property
     def is_arc(self) -> Bool[Array, " edges"]:
-        """Which edges are arcs; the angles of the others do not count."""
+        """Which edges are arcs; the angles of the others are ignored."""
         if self.arcs is None:
             return jnp.zeros(self.n_edges, bool)
         if not self.arcs.inner:
@@ -212,8 +211,8 @@ class Tissue(eqx.Module):
     def edge_angles(self) -> Float[Array, " edges"]:
         """Angle between the chord and the tangents of each edge, positive if it bulges to its right.
 
-        That is out of the cell on its left; 0 for straight edges. Always between -π and π, where an
-        edge is an arc: a minimiser may overstep that in `angles`, but not here.
+        A positive angle bulges out of the cell on the left; straight edges have the angle 0. Limited to the
+        range between -π and π of arcs, which a minimiser may leave in `angles`.
         """
         if self.arcs is None:
             return jnp.zeros(self.n_edges, self.vertices.dtype)
@@ -231,7 +230,7 @@ class Tissue(eqx.Module):
 
     @compiled_property
     def edge_tangents(self) -> tuple[Float[Array, "edges 2"], Float[Array, "edges 2"]]:
-        """Unit vectors along each edge at its first and at its second vertex."""
+        """Unit tangents of each edge at its first and at its second vertex."""
         chord, angle = self.edge_vectors, self.edge_angles
         squared = jnp.sum(chord**2, axis=-1, keepdims=True)
         unit = chord / jnp.sqrt(jnp.where(squared > 0, squared, 1))
@@ -246,7 +245,7 @@ class Tissue(eqx.Module):
 
     @compiled_property
     def areas(self) -> Float[Array, " cells"]:
-        """Signed area of each cell, positive for an upright (counter-clockwise) cell."""
+        """Signed area of each cell, positive for counter-clockwise cells; negative if inside out."""
         return self.measured().areas
 
     @compiled_property
@@ -264,19 +263,19 @@ class Tissue(eqx.Module):
     def corners(self) -> Float[Array, "halfedges 2"]:
         """Source of each half-edge, in the frame of the cell on its left.
 
-        The corners of one cell, in the order of `topology.next`, are its polygon drawn whole.
+        The corners of one cell, in the order of `topology.next`, are its polygon.
         """
         return jnp.repeat(self.vertices, 3, axis=0) + self.boundary.translation(self.topology.frame)
 
     def corners_of(self, half_edges: Int[Array, "*some"]) -> Float[Array, "*some 2"]:
-        """The rows of `corners` of some half-edges; no others are looked at."""
+        """The rows of `corners` of some half-edges, without computing the others."""
         image = self.boundary.translation(take(self.topology.frame, half_edges))
         return take(self.vertices, source(half_edges)) + image
 
     @compiled_property
     def centroids(self) -> Float[Array, "cells 2"]:
-        """Centre of area of each cell, in the frame of the cell; 0 of spare slots."""
-        # Relative to the mean corner: the polygon formula loses digits far from the origin.
+        """Centroid of each cell, in the frame of the cell; 0 for spare slots."""
+        # Relative to the mean corner, because the polygon formula loses digits far from the origin.
         m, corners = self.topology, self.corners
         face_sums = lambda values: jax.ops.segment_sum(values, m.cell, m.n_faces)
         count = face_sums(jnp.ones_like(corners[:, :1]))
@@ -302,14 +301,14 @@ class Tissue(eqx.Module):
 
     @compiled_property
     def sides(self) -> Float[Array, "halfedges parts"]:
-        """Where each half-edge begins, in the frame of the cell on its left, and its vector.
+        """Start of each half-edge, in the frame of the cell on its left, and its vector.
 
-        If there are arcs, followed by its angle: positive where it bulges to its right, out of that cell.
+        With arcs followed by its angle, positive if it bulges to its right, out of that cell.
         """
         return self.sides_of(jnp.arange(self.topology.n_half_edges))
 
     def sides_of(self, half_edges: Int[Array, " some"]) -> Float[Array, "some parts"]:
-        """The rows of `sides` of some half-edges; no others are looked at."""
+        """The rows of `sides` of some half-edges, without computing the others."""
         m = self.topology
         start = self.corners_of(half_edges)
         parts = [start, self.corners_of(take(m.next, half_edges)) - start]
@@ -320,21 +319,21 @@ class Tissue(eqx.Module):
 
     @compiled_property
     def overlaps(self) -> Overlaps:
-        """Where cells overlap: whether the tissue tiles the plane, as every tissue should."""
+        """Overlaps of cells; a tissue without overlaps tiles the plane."""
         return find_overlaps(self.topology, self.sides, self.areas)
 
     @property
     def configuration(self) -> PyTree[Float[Array, "..."]]:
-        """The degrees of freedom that an equilibrium relaxes: `vertices`.
+        """The degrees of freedom of a relaxation: `vertices`.
 
         With arcs a pair, `(vertices, angles * angle_length)`.
         """
         return self.vertices if self.arcs is None else (self.vertices, self.arcs.scaled)
 
     def with_configuration(self, configuration: PyTree[Float[Array, "..."]]) -> Tissue:
-        """The same tissue with its degrees of freedom replaced.
+        """The tissue with other degrees of freedom.
 
-        What cannot move (pinned and spare vertices, and angles of straight edges) stays as it is.
+        Pinned and spare vertices and angles of straight edges do not change.
         """
         vertices, scaled = self._split(configuration)
         held = self.held
@@ -347,60 +346,60 @@ class Tissue(eqx.Module):
         return moved.with_angles(angles)
 
     def by_row(self, values: Float[Array, " vertices"]) -> PyTree[Float[Array, "..."]]:
-        """A number a vertex for each row of the `configuration`: of an arc, the lesser of its ends."""
+        """Values of vertices as values of the rows of `configuration`; of an arc the minimum of its ends."""
         if self.arcs is None:
             return values
         return values, jnp.min(take(values, self.topology.edge_vertices), axis=-1)
 
     def with_vertices(self, vertices: Float[Array, "vertices 2"]) -> Tissue:
-        """The same tissue with its vertices, also pinned ones, elsewhere."""
+        """The tissue with other vertices, including pinned ones."""
         return eqx.tree_at(lambda t: t.vertices, self, vertices)
 
     def with_angles(self, angles: Float[Array, " edges"]) -> Tissue:
-        """The same tissue, which has arcs, with other angles."""
+        """The tissue, which must have arcs, with other angles."""
         return eqx.tree_at(lambda t: t.arcs.angles, self, angles)
 
     def with_capacity(self, n_cells: int) -> Tissue:
-        """The same tissue with room for more cells to come; works under `jax.jit`.
+        """The tissue with spare slots for new cells; works under `jax.jit`.
 
-        Arrays of cells, edges and vertices become longer by spare slots, in which `alive` is False: their
-        areas, perimeters and edge lengths are 0, and they feel no force. Divisions take them and cells that
-        vanish leave some behind. Cells keep their numbers. A periodic tissue has then `2 * n_cells` vertices
-        and `3 * n_cells` edges, a free one those of one cell less; parameters that are one a cell, or one an
-        edge, need as many entries.
+        Arrays of cells, edges and vertices are extended by spare slots, with `alive` False, areas,
+        perimeters and edge lengths 0, and force 0. A division uses one spare slot, and a cell that vanishes
+        becomes one. Cells keep their numbers. A periodic tissue then has `2 * n_cells` vertices and
+        `3 * n_cells` edges, a free tissue `2 * n_cells - 2` and `3 * n_cells - 3`; parameters of cells and
+        edges need as many entries.
 
         **Arguments:**
 
-        - `n_cells`: number of cells that there is to be room for, living ones included.
+        - `n_cells`: the capacity: number of cells, living and spare.
 
-        **Returns:** the tissue, whose `n_cells` that is.
+        **Returns:** the tissue with this `n_cells`.
 
         **Raises:**
 
-        - `ValueError` if there is room for more already.
+        - `ValueError` if the tissue has a larger capacity.
         """
         topology = with_slots(self.topology, n_cells)
 
-        def longer(x: Array, size: int, filling: Array | np.ndarray | float = 0) -> Array:
+        def extend(x: Array, size: int, filling: Array | np.ndarray | float = 0) -> Array:
             xp = np if is_concrete(x) else jnp
-            more = xp.broadcast_to(filling, (size - len(x), *x.shape[1:])).astype(x.dtype)
-            return jnp.asarray(xp.concatenate([xp.asarray(x), more]))
+            rows = xp.broadcast_to(filling, (size - len(x), *x.shape[1:])).astype(x.dtype)
+            return jnp.asarray(xp.concatenate([xp.asarray(x), rows]))
 
-        of_vertices = lambda x: longer(x, topology.n_vertices)
-        of_edges = lambda x: longer(x, topology.n_edges)
+        of_vertices = lambda x: extend(x, topology.n_vertices)
+        of_edges = lambda x: extend(x, topology.n_edges)
         xp = np if is_concrete(self.vertices) else jnp
         middle = xp.mean(xp.asarray(self.vertices), axis=0)
-        vertices = longer(self.vertices, topology.n_vertices, middle)
+        vertices = extend(self.vertices, topology.n_vertices, middle)
         return self._with(topology, vertices, of_vertices, of_edges)
 
     def without_spare(self) -> Tissue:
-        """The same tissue without spare slots: cells, edges and vertices are numbered anew, in their order.
+        """The tissue without spare slots; cells, edges and vertices are renumbered in the same order.
 
-        **Returns:** the tissue, as large as what lives of it.
+        **Returns:** the tissue of living cells.
 
         **Raises:**
 
-        - `TypeError` under `jax.jit`: its size depends on what lives.
+        - `TypeError` under `jax.jit`, because the size of the result depends on values.
         """
         if not self.topology.spare:
             return self
@@ -409,14 +408,14 @@ class Tissue(eqx.Module):
         return self._with(topology, of_vertices(self.vertices), of_vertices, of_edges)
 
     def drift(self, configuration: PyTree[Float[Array, "..."]]) -> Float[Array, " modes"]:
-        """How far a configuration strayed from that of this tissue in ways that have no energy.
+        """Displacement of a configuration from that of this tissue along directions without energy.
 
-        These are the motions of the whole, see [`AbstractBoundary`][vertax.AbstractBoundary], and the
-        degrees of freedom that `with_configuration` ignores. All are lengths.
+        These are the rigid motions, see [`AbstractBoundary`][vertax.AbstractBoundary], and the degrees of
+        freedom that `with_configuration` ignores. All components are lengths.
         """
         vertices, scaled = self._split(configuration)
-        here, there = self.gathered(self.vertices), self.gathered(vertices)
-        drift = [self.boundary.drift(there, here, self.pinned)]
+        reference, moved = self.gathered(self.vertices), self.gathered(vertices)
+        drift = [self.boundary.drift(moved, reference, self.pinned)]
         held = self.held
         if held is not None:
             drift.append(jnp.where(held[:, None], vertices - self.vertices, 0).ravel())
@@ -425,34 +424,34 @@ class Tissue(eqx.Module):
         return jnp.concatenate(drift)
 
     def settled(self, start: Tissue) -> Tissue:
-        """The same shape, moved as a whole to where it has no drift from the vertices of `start`."""
-        here, there = self.gathered(self.vertices), self.gathered(start.vertices)
-        return self.with_vertices(self.boundary.settle(here, there, self.pinned))
+        """The tissue after the rigid motion that makes its drift from `start` 0."""
+        moved, reference = self.gathered(self.vertices), self.gathered(start.vertices)
+        return self.with_vertices(self.boundary.settle(moved, reference, self.pinned))
 
     def held_as(self, start: Tissue) -> Tissue:
-        """This tissue in the boundary of `start` and with its vertices.
+        """The tissue with the boundary and the vertices of `start`.
 
-        What it lends to a configuration (pinned vertices, what `drift` counts from) is then that of
-        `start`; differentiable are the boundary and the pinned vertices.
+        Pinned vertices and the reference of `drift` are then those of `start`. The result is differentiable
+        in the boundary and the pinned vertices only.
         """
         vertices = jax.lax.stop_gradient(start.vertices)
         if start.pinned is not None:
             vertices = jnp.where(start.pinned[:, None], start.vertices, vertices)
-        lent = (start.boundary, vertices)
-        return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, lent)
+        new = (start.boundary, vertices)
+        return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, new)
 
     def carried(self, boundary: AbstractBoundary) -> Tissue:
-        """The same tissue, deformed uniformly with its space into another one, pinned vertices too."""
+        """The tissue after a uniform deformation into another boundary, including pinned vertices."""
         vertices = self.boundary.carry(self.vertices, boundary)
         return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, (boundary, vertices))
 
     def with_topology(self, topology: Topology) -> Tissue:
-        """The same vertices, connected in another way."""
+        """The tissue with another topology and the same vertices."""
         return eqx.tree_at(lambda t: t.topology, self, topology)
 
     @property
     def held(self) -> Bool[Array, " vertices"] | None:
-        """Which vertices do not move: pinned ones and those of spare slots; None if all do."""
+        """Which vertices do not move: pinned vertices and those of spare slots; None if all move."""
         if not self.topology.spare:
             return self.pinned
         spare = ~self.topology.alive_vertices
@@ -465,14 +464,14 @@ class Tissue(eqx.Module):
         of_vertices: Callable[[Array], Array],
         of_edges: Callable[[Array], Array],
     ) -> Tissue:
-        """A tissue of another size; and what becomes of arrays with one entry a vertex, or one an edge."""
+        """The tissue with another size; `of_vertices` and `of_edges` convert its arrays."""
         tissue = eqx.tree_at(lambda t: (t.topology, t.vertices), self, (topology, vertices))
         if self.pinned is not None:
             tissue = eqx.tree_at(lambda t: t.pinned, tissue, of_vertices(self.pinned))
         return tissue if self.arcs is None else tissue.with_angles(of_edges(self.arcs.angles))
 
     def gathered(self, vertices: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
-        """Vertices with those of spare slots in the middle of the others, where they count for nothing."""
+        """The vertices, with those of spare slots at the mean of the others, so that they add no drift."""
         if not self.topology.spare:
             return vertices
         alive = self.topology.alive_vertices[:, None]
@@ -485,28 +484,27 @@ class Tissue(eqx.Module):
         return (configuration, None) if self.arcs is None else configuration
 
     def _segments(self) -> tuple[Float[Array, " edges"], ...]:
-        """The first vertex of each edge, x and y, and the edge as a vector from there."""
-        # Apart, from here to areas and lengths: pairs would be taken apart and put together again in every
-        # product with a Hessian.
+        """x and y of the first vertex of each edge, and x and y of its vector."""
+        # Separate arrays for x and y: pairs would be split and stacked again in each Hessian-vector product.
         m = self.topology
         following = edge_neighbourhood(m)[-1]
         offset = self.boundary.translation(take(m.frame, following) - take(m.frame, m.half_edge))
-        x, y, to_x, to_y = at_ends(m, self.vertices)
+        x, y, to_x, to_y = gather_at_ends(m, self.vertices)
         return x, y, to_x + offset[:, 0] - x, to_y + offset[:, 1] - y
 
     def _chords(self, segments: tuple[Float[Array, " edges"], ...]) -> Float[Array, " edges"]:
-        """How far the ends of each edge are from each other (softened)."""
+        """Length of the chord of each edge (softened)."""
         _, _, dx, dy = segments
         squared = dx * dx + dy * dy + self.softening**2
-        # An edge of length exactly 0 without softening has no direction: the root of 1, less 1, keeps the
-        # derivative finite there (0, the middle of all its one-sided slopes).
+        # At length 0 without softening the square root is not differentiable: √1 - 1 instead has value 0 and
+        # derivative 0, the mean of the one-sided derivatives.
         at_zero = (squared == 0).astype(squared.dtype)
         return jnp.sqrt(squared + at_zero) - at_zero
 
     def _area_shares(
         self, segments: tuple[Float[Array, " edges"], ...]
     ) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
-        """What each edge contributes to the areas of its left and right cell (shoelace formula)."""
+        """Contributions of each edge to the areas of its left and right cell (shoelace formula)."""
         m = self.topology
         x, y, dx, dy = segments
 
@@ -523,8 +521,8 @@ class Tissue(eqx.Module):
         bulge = (dx**2 + dy**2) * area_factor(self.edge_angles)
         return left + bulge, right - bulge
 
-    def measured(self) -> Known:
-        """`edge_lengths`, `areas` and `perimeters`, from one look at the vertices."""
+    def measured(self) -> Measurements:
+        """`edge_lengths`, `areas` and `perimeters`, from one gather of the vertices."""
         segments = self._segments()
         lengths = self._chords(segments)
         if self.topology.spare:
@@ -532,14 +530,14 @@ class Tissue(eqx.Module):
         if self.arcs is not None:
             lengths = lengths * length_factor(self.edge_angles)
         areas = self.cell_sums(self._area_shares(segments))
-        return Known(lengths, areas, self.cell_sums((lengths, lengths)))
+        return Measurements(lengths, areas, self.cell_sums((lengths, lengths)))
 
     def cell_sums(
         self, shares: tuple[Float[Array, " edges"], Float[Array, " edges"]]
     ) -> Float[Array, " cells"]:
-        """Sums over the edges of each cell of what they contribute to it on their left and right."""
+        """Sums over the edges of each cell; `shares` are the contributions to the left and the right cell."""
         m = self.topology
-        # The exterior, number n_cells, is out of range and dropped.
+        # The label n_cells of the exterior is out of range and dropped.
         mode = "drop" if m.exterior or m.spare else "promise_in_bounds"
         ids = jnp.concatenate([m.edge_cells[:, 0], m.edge_cells[:, 1]])
         return jax.ops.segment_sum(jnp.concatenate(shares), ids, self.n_cells, mode=mode)
@@ -564,10 +562,10 @@ def _mean_area(tissue: Tissue) -> Float[Array, ""]:
 
 
 def mean_area(tissue: Tissue) -> Float[Array, ""]:
-    """The mean area of the cells that there are."""
+    """The mean area of the living cells."""
     if isinstance(tissue.boundary, Periodic):
-        number = jnp.sum(tissue.alive) if tissue.topology.spare else tissue.n_cells
-        return jnp.abs(tissue.boundary.area) / number
+        n_alive = jnp.sum(tissue.alive) if tissue.topology.spare else tissue.n_cells
+        return jnp.abs(tissue.boundary.area) / n_alive
     areas = jnp.abs(tissue.areas)
     return jnp.sum(areas) / jnp.sum(tissue.alive) if tissue.topology.spare else jnp.mean(areas)
 

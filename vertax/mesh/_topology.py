@@ -1,4 +1,4 @@
-"""Who is next to whom: the trivalent half-edge mesh."""
+"""The connectivity of a tissue: a trivalent half-edge mesh."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from jaxtyping import Array, ArrayLike, Bool, Int, Shaped
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vertax._base.modules import compiled_property, is_concrete
-from vertax.mesh._half_edges import check_arrays
+from vertax._base.tracing import compiled_property, is_concrete
+from vertax.mesh._topology_checks import check_half_edge_arrays
 
 
 # Every vertex joins exactly three edges, so half-edge h = 3 v + k is the k-th edge leaving vertex v in
-# counter-clockwise order, and needs no table of sources. With `twin` that is the whole connectivity:
+# counter-clockwise order, and no table of sources is needed. The involution `twin` is the connectivity:
 #
 #     source(h) = h // 3,   target(h) = twin[h] // 3,   next(h) = one slot clockwise of twin[h].
 #
@@ -30,12 +30,12 @@ from vertax.mesh._half_edges import check_arrays
 # Offsets of edges follow from the frames (offset(h) = frame[next(h)] - frame[h]), so they sum to zero
 # around every cell by construction, also for a cell that spans half the box and more.
 #
-# In a free tissue the outside is one more face, so that vertices on the outline are trivalent too. Its
-# half-edges carry the label n_cells, which sums over cells drop: a segment number out of range.
+# In a free tissue the exterior is one more face, so that vertices on the outline are trivalent too. Its
+# half-edges have the label n_cells, which `segment_sum` over cells drops because it is out of range.
 #
-# A tissue may have room for more cells than live in it. A cell spends two vertices and three edges, so a
-# spare slot is two vertices joined by three edges, closed in itself, whose half-edges carry the label of
-# nowhere, n_cells + 1. Arrays keep their sizes while cells come and go.
+# A tissue may have a capacity for more cells than it has. A cell adds two vertices and three edges, so a
+# spare slot is a separate component of two vertices joined by three edges, with the label n_cells + 1 on its
+# half-edges. So arrays keep their sizes when cells are created or removed.
 class Topology(eqx.Module):
     """The connectivity of a tissue: a trivalent half-edge rotation system.
 
@@ -47,20 +47,19 @@ class Topology(eqx.Module):
 
     - `twin`, shape `(halfedges,)`: the half-edge in the opposite direction, an involution without fixed
         points.
-    - `cell`, shape `(halfedges,)`: the cell on the left of each half-edge, `0 … n_cells - 1`; and
-        `n_cells` where that is the exterior.
+    - `cell`, shape `(halfedges,)`: the cell on the left of each half-edge, `0 … n_cells - 1`;
+        `n_cells` for the exterior.
     - `frame`, shape `(halfedges, 2)`: integer lattice image of each half-edge's source, in the frame of
-        the cell on its left. Zero where there is no periodicity.
-    - `edge`, shape `(halfedges,)`: an edge number for each half-edge, shared with its twin. Numbered in
-        the order of the half-edges when left out.
-    - `exterior`: whether there is the outside of a free tissue.
-    - `spare`: whether there may be spare slots for cells to come: pairs of vertices joined by three edges,
-        whose half-edges have the label `n_cells + 1`. `n_cells` is then the number of cells that there is
-        room for.
+        the cell on its left. Zero in a free tissue.
+    - `edge`, shape `(halfedges,)`: an edge number for each half-edge, shared with its twin. By default
+        numbered in the order of the half-edges.
+    - `exterior`: whether the mesh has an exterior, as free tissues do.
+    - `spare`: whether the mesh may have spare slots for new cells: pairs of vertices joined by three edges,
+        with the label `n_cells + 1` on their half-edges. `n_cells` is then the capacity.
 
     **Raises:**
 
-    - `ValueError` naming the broken invariant (see [`Topology.validate`][vertax.Topology.validate]),
+    - `ValueError` with the violated invariant (see [`Topology.validate`][vertax.Topology.validate]),
         for concrete arrays; inside `jax.jit` and `jax.vmap` only shapes and types are checked.
     """
 
@@ -69,9 +68,9 @@ class Topology(eqx.Module):
     frame: Int[Array, "halfedges 2"]
     edge: Int[Array, " halfedges"]
     half_edge: Int[Array, " edges"]
-    """One half-edge of each edge; it gives the edge its direction. The exterior is never on its left."""
+    """One half-edge of each edge, which gives the edge its direction; the exterior is never on its left."""
     n_cells: int = eqx.field(static=True)
-    """Number of cells, without the exterior; with spare slots, that there is room for."""
+    """Number of cells without the exterior; with spare slots, the capacity."""
     exterior: bool = eqx.field(static=True)
     """Whether there is an exterior."""
     spare: bool = eqx.field(static=True)
@@ -87,32 +86,32 @@ class Topology(eqx.Module):
         exterior: bool = False,
         spare: bool = False,
     ):
-        known = all(is_concrete(x) for x in (twin, cell, frame, edge))
-        xp = np if known else jnp
+        concrete = all(is_concrete(x) for x in (twin, cell, frame, edge))
+        xp = np if concrete else jnp
         twin, cell, frame = (xp.asarray(x) for x in (twin, cell, frame))
-        check_arrays(twin, cell, frame, known=known)
+        check_half_edge_arrays(twin, cell, frame, concrete=concrete)
         h = xp.arange(twin.size)
         if edge is None:
             edge = (xp.cumsum(h < twin) - 1)[xp.minimum(h, twin)]
         edge = xp.asarray(edge)
         n_edges = twin.size // 2
-        outside = edge.min() < 0 or edge.max() >= n_edges if known and edge.size else False
+        outside = edge.min() < 0 or edge.max() >= n_edges if concrete and edge.size else False
         if edge.shape != twin.shape or edge.dtype.kind not in "iu" or outside:
             raise ValueError(
                 "Argument `edge` must give each half-edge a number in 0 … n_edges - 1."
             )
         # The first half-edge of each edge gives it its direction.
         half_edge = xp.zeros(n_edges, int)
-        if known:
+        if concrete:
             half_edge[edge[::-1]] = h[::-1]
         else:
             half_edge = jnp.full(n_edges, twin.size).at[edge].min(h)
-        # A trivalent mesh of a torus has half as many faces as vertices, one of a sphere two more.
+        # By Euler's formula a trivalent mesh has V/2 faces on a torus and V/2 + 2 on a sphere.
         n_cells = twin.size // 6 + exterior
-        if known and not spare:
+        if concrete and not spare:
             n_cells = int(cell.max()) + (not exterior)
         half_edge = xp.where(cell[half_edge] == n_cells, twin[half_edge], half_edge)
-        # (Converted by NumPy if known: JAX would compile for each size.)
+        # (Concrete arrays are converted by NumPy, because JAX would compile for each size.)
         to_int32 = lambda x: jnp.asarray(xp.asarray(x, np.int32))
         self.twin = to_int32(twin)
         self.cell = to_int32(cell)
@@ -122,7 +121,7 @@ class Topology(eqx.Module):
         self.n_cells = n_cells
         self.exterior = exterior
         self.spare = spare
-        if known:
+        if concrete:
             self.validate()
 
     @property
@@ -142,28 +141,28 @@ class Topology(eqx.Module):
 
     @property
     def n_faces(self) -> int:
-        """How many labels half-edges may have: cells, the exterior and nowhere."""
+        """Number of labels of half-edges: cells, the exterior and the label of spare slots."""
         return self.n_cells + (2 if self.spare else self.exterior)
 
     @property
-    def nowhere(self) -> int:
+    def spare_label(self) -> int:
         """The label of the half-edges of spare slots."""
         return self.n_cells + 1
 
     @compiled_property
     def alive(self) -> Bool[Array, " cells"]:
-        """Which cells there are; the others are spare slots."""
+        """Which cells exist; the others are spare slots."""
         return self.neighbour_counts > 0
 
     @property
     def alive_vertices(self) -> Bool[Array, " vertices"]:
-        """Which vertices belong to no spare slot."""
-        return self.cell.reshape(-1, 3)[:, 0] != self.nowhere
+        """Which vertices are not in a spare slot."""
+        return self.cell.reshape(-1, 3)[:, 0] != self.spare_label
 
     @property
     def alive_edges(self) -> Bool[Array, " edges"]:
-        """Which edges belong to no spare slot."""
-        return take(self.cell, self.half_edge) != self.nowhere
+        """Which edges are not in a spare slot."""
+        return take(self.cell, self.half_edge) != self.spare_label
 
     @compiled_property
     def source(self) -> Int[Array, " halfedges"]:
@@ -172,7 +171,7 @@ class Topology(eqx.Module):
 
     @compiled_property
     def target(self) -> Int[Array, " halfedges"]:
-        """Vertex that each half-edge reaches."""
+        """Vertex to which each half-edge leads."""
         return source(self.twin)
 
     @compiled_property
@@ -183,8 +182,8 @@ class Topology(eqx.Module):
     @compiled_property
     def previous(self) -> Int[Array, " halfedges"]:
         """Preceding half-edge around the cell on the left."""
-        here = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
-        return take(self.twin, counter_clockwise(here))
+        half_edges = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
+        return take(self.twin, counter_clockwise(half_edges))
 
     @compiled_property
     def offset(self) -> Int[Array, "halfedges 2"]:
@@ -193,20 +192,20 @@ class Topology(eqx.Module):
 
     @compiled_property
     def edge_vertices(self) -> Int[Array, "edges 2"]:
-        """The two ends of each edge, from → to."""
+        """The first and the second vertex of each edge."""
         return source(jnp.stack([self.half_edge, take(self.twin, self.half_edge)], axis=-1))
 
     @compiled_property
     def edge_cells(self) -> Int[Array, "edges 2"]:
-        """The cells on the left and on the right of each edge (`n_cells`: the exterior)."""
+        """The cells on the left and on the right of each edge (`n_cells` for the exterior)."""
         h = self.half_edge
         return jnp.stack([take(self.cell, h), take(self.cell, take(self.twin, h))], axis=-1)
 
     @compiled_property
     def forward(self) -> Bool[Array, " halfedges"]:
-        """Which half-edges run along the direction of their edge."""
-        here = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
-        return take(self.half_edge, self.edge) == here
+        """Which half-edges have the direction of their edge."""
+        half_edges = jnp.arange(self.n_half_edges, dtype=self.twin.dtype)
+        return take(self.half_edge, self.edge) == half_edges
 
     @compiled_property
     def on_outline(self) -> Bool[Array, " edges"]:
@@ -224,9 +223,9 @@ class Topology(eqx.Module):
 
         **Raises:**
 
-        - `ValueError` naming what is broken: the involution, labels of cells or edges that do not
-            follow the mesh, a cell in several pieces or with too few sides, lattice frames
-            that contradict each other, a tissue in several pieces or of the wrong genus.
+        - `ValueError` with the violated invariant: `twin` is an involution, labels of cells and edges are
+            consistent, each cell is one face with enough sides, lattice frames are consistent, the tissue
+            is connected and has the right genus.
         """
         twin, cell, frame, edge, half_edge = (
             np.asarray(x) for x in (self.twin, self.cell, self.frame, self.edge, self.half_edge)
@@ -234,17 +233,19 @@ class Topology(eqx.Module):
         n_half, n_faces = twin.size, self.n_faces
         h = np.arange(n_half)
 
-        def require(ok: np.ndarray | bool, what: str):
-            if not np.all(ok):
-                bad = np.flatnonzero(~np.atleast_1d(ok))[:3].tolist()
-                raise ValueError(f"The topology is broken: {what} (first offenders: {bad}).")
+        def require(condition: np.ndarray | bool, invariant: str):
+            if not np.all(condition):
+                violations = np.flatnonzero(~np.atleast_1d(condition))[:3].tolist()
+                raise ValueError(
+                    f"The topology is broken: {invariant} (first violations: {violations})."
+                )
 
         require(cell.shape == (n_half,), "`cell` must have one entry a half-edge")
         require(frame.shape == (n_half, 2), "`frame` must have two entries a half-edge")
         require(edge.shape == (n_half,), "`edge` must have one entry a half-edge")
         require(half_edge.shape == (n_half // 2,), "`half_edge` must have one entry an edge")
         require(0 < n_faces <= n_half, "there must be cells, and no more than half-edges")
-        nowhere = cell == self.nowhere if self.spare else np.zeros(n_half, bool)
+        is_spare = cell == self.spare_label if self.spare else np.zeros(n_half, bool)
         for name, index, bound, at in (
             ("twin", twin, n_half, "half-edges"),
             ("edge", edge, n_half // 2, "half-edges"),
@@ -267,8 +268,8 @@ class Topology(eqx.Module):
             "`half_edge` must point into its edge, at edges",
         )
         inside = (cell >= 0) & (cell < self.n_cells + self.exterior)
-        require(inside | nowhere, "`cell` must lie in 0 … n_cells - 1, at half-edges")
-        sides = np.bincount(cell[~nowhere], minlength=n_faces)[: self.n_cells + self.exterior]
+        require(inside | is_spare, "`cell` must lie in 0 … n_cells - 1, at half-edges")
+        sides = np.bincount(cell[~is_spare], minlength=n_faces)[: self.n_cells + self.exterior]
         may_be_spare = (np.arange(sides.size) < self.n_cells) & self.spare
         require((sides > 0) | may_be_spare, "every cell must have half-edges, at cells")
 
@@ -276,7 +277,7 @@ class Topology(eqx.Module):
         require(cell[following] == cell, "`cell` must be the same all around a face, at half-edges")
         closed = following[following] == h
         require(
-            ~nowhere | closed,
+            ~is_spare | closed,
             "a spare slot must be two vertices joined by three edges, at half-edges",
         )
         n_orbits, face = connected_components(
@@ -286,7 +287,7 @@ class Topology(eqx.Module):
         labels = cell[np.unique(face, return_index=True)[1]]
         faces_of_cell = np.bincount(labels, minlength=sides.size)[: sides.size]
         require((faces_of_cell == 1) | (sides == 0), "every cell must be one face, at cells")
-        # A side on the outline may be an arc, so two sides are enough there.
+        # A side on the outline may be an arc, so a cell there may have two sides.
         outside = np.bincount(cell, cell[twin] == self.n_cells, n_faces)[: sides.size] > 0
         outside[self.n_cells :] = True
         require(
@@ -304,9 +305,9 @@ class Topology(eqx.Module):
             coo_array((np.ones(n_half, bool), (h // 3, twin // 3)), shape=(n_vertices, n_vertices)),
             directed=False,
         )
-        n_spare = int(np.count_nonzero(nowhere)) // 6
+        n_spare = int(np.count_nonzero(is_spare)) // 6
         require(n_pieces - n_spare == 1, "the tissue must be in one piece")
-        euler = n_vertices - n_half // 2 + n_orbits - 2 * n_spare  # each of which is a sphere
+        euler = n_vertices - n_half // 2 + n_orbits - 2 * n_spare  # each spare slot is a sphere
         if self.exterior:
             require(
                 euler == 2,
@@ -314,7 +315,7 @@ class Topology(eqx.Module):
             )
             require(np.all(frame == 0, axis=1), "`frame` must be 0 in a free tissue, at half-edges")
             require(
-                (cell[twin] != cell) | nowhere, "an edge must lie between two faces, at half-edges"
+                (cell[twin] != cell) | is_spare, "an edge must lie between two faces, at half-edges"
             )
             require(
                 cell[half_edge] != self.n_cells,
@@ -330,9 +331,8 @@ class Topology(eqx.Module):
 def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
     """Flip the marked edges (the topological part of a T1 transition).
 
-    The flipped half-edges turn clockwise by a quarter turn: the cells that were at an edge's ends
-    become its two sides. No two marked edges may share a cell (the exterior does not count); geometry is
-    left alone.
+    A flipped half-edge turns clockwise by 90°: the cells at the ends of the edge become the cells on its
+    sides. Two marked edges must not share a cell (except the exterior). Vertices do not move.
     """
     # At h = v -> w, with t its twin, the four other half-edges counter-clockwise are a, b (at v) and
     # c, d (at w). In the picture h points east; V, L, W, R are the cells around it.
@@ -345,30 +345,32 @@ def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
     #                                             /   \
     #                                            c  R  d
     #
-    # What hung on a moves to b, b to c, c to d and d to a, taking twin, cell and edge along. `roll` is
-    # that permutation of half-edges and `unroll` its inverse, so a mesh relabelled by it is
-    # twin' = roll ∘ twin ∘ unroll, which stays an involution even if two of the four are twins.
+    # The data of a (twin, cell, edge) move to b, b to c, c to d and d to a. `roll` is that permutation of
+    # half-edges and `unroll` its inverse. The relabelled mesh is twin' = roll ∘ twin ∘ unroll, which is an
+    # involution even if two of the four are twins.
     #
-    # Every half-edge looks for itself whether it flips, or which of its two neighbours around the vertex
-    # does: after a flipped one comes an a or a c, before it a b or a d.
+    # Each half-edge computes whether it flips, or which of its two neighbours around the vertex does: the
+    # half-edge after a flipped one is an a or a c, the one before it a b or a d.
     twin, frame, h = topology.twin, topology.frame, topology.half_edge
-    here = jnp.arange(topology.n_half_edges, dtype=h.dtype)
-    left, right = counter_clockwise(here), clockwise(here)
+    half_edges = jnp.arange(topology.n_half_edges, dtype=h.dtype)
+    left, right = counter_clockwise(half_edges), clockwise(half_edges)
     flips = take(flip, topology.edge)
     follows, leads = take(flips, right), take(flips, left)
     beside = lambda neighbour, turn: turn(take(twin, neighbour))
-    roll = jnp.where(leads, beside(left, counter_clockwise), here)
+    roll = jnp.where(leads, beside(left, counter_clockwise), half_edges)
     roll = jnp.where(follows, left, roll)
-    unroll = jnp.where(follows, beside(right, clockwise), here)
+    unroll = jnp.where(follows, beside(right, clockwise), half_edges)
     unroll = jnp.where(leads, right, unroll)
     ahead = counter_clockwise(twin)
     cell = take(topology.cell, jnp.where(flips, ahead, unroll))
-    # Corners: v stays a corner of L and V and becomes one of W; w stays one of R and W and becomes one
-    # of V. A new corner is one step of the flipped edge away from the other end's.
+    # Corners: v remains a corner of L and V and becomes one of W; w remains one of R and W and becomes one
+    # of V. The frame of a new corner is that of the other end minus the offset of the flipped edge.
     step = (take(frame, clockwise(twin)) - frame) * flips[:, None]
-    frame = take(frame, jnp.where(flips, ahead, jnp.where(follows | leads, right, here))) - step
+    frame = (
+        take(frame, jnp.where(flips, ahead, jnp.where(follows | leads, right, half_edges))) - step
+    )
     twin, half_edge = take(roll, take(twin, unroll)), take(roll, h)
-    if topology.exterior:  # which stays on the right of edges
+    if topology.exterior:  # it must be on the right of edges
         outside = take(cell, half_edge) == topology.n_cells
         half_edge = jnp.where(outside, take(twin, half_edge), half_edge)
     return eqx.tree_at(
@@ -387,17 +389,18 @@ def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
 def edge_neighbourhood(
     topology: Topology, edges: Int[Array, " edges"] | None = None
 ) -> tuple[Int[Array, " edges"], ...]:
-    """The twin `t` of each edge's half-edge and the four half-edges `a, b, c, d` around it.
+    """The twin `t` of the half-edge of each edge, and the four half-edges `a, b, c, d` next to the edge.
 
-    Counter-clockwise: `a`, `b` leave the source of the edge, `c`, `d` its target. Of all edges, or of some.
+    In counter-clockwise order `a`, `b` leave the source of the edge and `c`, `d` its target. `edges` selects
+    edges; by default all.
     """
     h = topology.half_edge if edges is None else take(topology.half_edge, edges)
     t = take(topology.twin, h)
     return t, counter_clockwise(h), clockwise(h), counter_clockwise(t), clockwise(t)
 
 
-# Written for speed of compilation as much as of execution: `//`, `%` and `[]` of jax.numpy each expand
-# into a dozen operations that guard against signs and bounds, and every property uses these.
+# These functions use `jax.lax` to compile fast: `//`, `%` and `[]` of jax.numpy each expand into a dozen
+# operations for negative numbers and bounds.
 
 
 def source(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
@@ -418,5 +421,5 @@ def counter_clockwise(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
 
 
 def take(array: Shaped[Array, "n *shape"], index: Int[Array, "..."]) -> Shaped[Array, "..."]:
-    """`array[index]` for indices known to be valid."""
+    """`array[index]` for valid, non-negative indices (not checked)."""
     return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -1,4 +1,4 @@
-"""Trajectories: a tissue on its way through a relaxation or a fit."""
+"""Trajectories: the tissues of a relaxation, a fit or an evolution."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vertax.mesh import Tissue
 
 @runtime_checkable
 class _Record(Protocol):
-    """What a trajectory takes down of an epoch of a fit."""
+    """The part of the record of an epoch that a trajectory stores."""
 
     tissue: Tissue
     cost: Array
@@ -25,9 +25,9 @@ class _Record(Protocol):
 
 
 class Trajectory(Sequence[Tissue]):
-    """A sequence of tissues of one size, its frames, each with some numbers.
+    """A sequence of tissues of the same size (frames), each with named numbers.
 
-    T1 transitions change the topology, so every frame has its own. As the callback of a fit it records
+    T1 transitions change the topology, so each frame has its own. As the callback of a fit it records
     the equilibrium of each epoch:
 
     ```python
@@ -38,12 +38,12 @@ class Trajectory(Sequence[Tissue]):
         ...
     ```
 
-    [`record_relaxation`][vertax.relax.record_relaxation] records a relaxation. Frames are kept in the
-    memory of the host, not of the device.
+    [`record_relaxation`][vertax.relax.record_relaxation] records a relaxation. Frames are
+    stored in host memory, not in device memory.
 
     **Arguments:**
 
-    - `every`: as a callback, record every so many epochs, beginning with the first.
+    - `every`: number of epochs between two frames, if used as a callback; the first epoch is recorded.
 
     **Raises:**
 
@@ -65,12 +65,12 @@ class Trajectory(Sequence[Tissue]):
         **Arguments:**
 
         - `tissue`: a single tissue of the same sizes, kind and precision as the frames before.
-        - `values`: numbers by name that go with it (a time, a cost), of the same names in each frame.
+        - `values`: numbers of the frame by name (such as a time or a cost); each frame has the same names.
 
         **Raises:**
 
-        - `ValueError` for a tissue that does not go with those before, for other names, or for a value
-            that is not one number.
+        - `ValueError` for a tissue of another size, kind or precision, for other names, or for a value that
+            is not one number.
         """
         if tissue.vertices.ndim != 2:
             raise ValueError(
@@ -92,7 +92,7 @@ class Trajectory(Sequence[Tissue]):
                     f"has: {', '.join(numbers)}."
                 )
             if eqx.tree_equal(frame.topology, last.topology):
-                frame = frame.with_topology(last.topology)  # the same arrays, held once
+                frame = frame.with_topology(last.topology)  # share the arrays
         self._frames.append(frame)
         for name, value in numbers.items():
             self._values.setdefault(name, []).append(value)
@@ -102,9 +102,9 @@ class Trajectory(Sequence[Tissue]):
 
         **Arguments:**
 
-        - `epoch`: its number, which is recorded too.
-        - `record`: what the fit knows of it, of which cost, largest force and number of T1 transitions
-            are recorded.
+        - `epoch`: its number, recorded as a value.
+        - `record`: the record of the fit; its cost, largest force and number of T1 transitions are
+            recorded as values.
         """
         if epoch % self.every == 0:
             self.append(

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vertax._base.probe import probe
+from vertax._base.probe_vector import probe_vector
 from vertax._base.sums import total
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._ends import Ends
-from vertax.mesh._measured import Measured
-from vertax.mesh._tissue import Known
+from vertax.mesh._edge_ends import EdgeEnds
+from vertax.mesh._measured_tissue import MeasuredTissue
+from vertax.mesh._tissue import Measurements
 from vertax.mesh._topology import Topology, take
 
 # The least stiffness of a block, in units of the mean. (Between 0.1 and 3 times this number the number of
@@ -81,7 +81,7 @@ class EdgeBlocks(eqx.Module):
     Hessian is: they change the number of iterations, not the solution.
     """
 
-    ends: Ends
+    ends: EdgeEnds
     first: Symmetric
     """The block of the first end of each edge."""
     second: Symmetric
@@ -116,7 +116,7 @@ class EdgeBlocks(eqx.Module):
         # (Rounding must not make a block indefinite, however stiff the edge.)
         rounding = 20 * jnp.finfo(mean.dtype).eps * (diagonal.xx + diagonal.yy)
         diagonal = diagonal.stiffened(rounding)
-        ends = Ends.of(m)
+        ends = EdgeEnds.of(m)
         first, second = (Symmetric(*(take(x, end) for x in diagonal)) for end in ends.vertices)
         moves = None if tissue.held is None else ~tissue.held
         return cls(ends, first, second, between, moves, softest)
@@ -156,7 +156,7 @@ class EdgeBlocks(eqx.Module):
 class EdgeInverse(eqx.Module):
     """The inverse of `EdgeBlocks` for one damping."""
 
-    ends: Ends
+    ends: EdgeEnds
     first: Symmetric
     second: Symmetric
     between: Square
@@ -164,9 +164,9 @@ class EdgeInverse(eqx.Module):
 
     def __call__(self, force: Float[Array, "vertices 2"]) -> Float[Array, "vertices 2"]:
         """The displacement of vertices by forces on them."""
-        x, y, to_x, to_y = self.ends.look(force)
+        x, y, to_x, to_y = self.ends.gather(force)
         a, b, c = self.first, self.second, self.between
-        moved = self.ends.back(
+        moved = self.ends.scatter_add(
             a.xx * x + a.xy * y + c.xx * to_x + c.xy * to_y,
             a.xy * x + a.yy * y + c.yx * to_x + c.yy * to_y,
             c.xx * x + c.yx * y + b.xx * to_x + b.xy * to_y,
@@ -187,9 +187,9 @@ class _Response(NamedTuple):
     perimeter: Float[Array, " cells"]
 
     @classmethod
-    def of(cls, energy: AbstractEnergy, tissue: Tissue, geometry: Known) -> _Response:
+    def of(cls, energy: AbstractEnergy, tissue: Tissue, geometry: Measurements) -> _Response:
         slope, change = jax.linearize(
-            jax.grad(lambda geometry: energy(Measured(tissue, geometry))), geometry
+            jax.grad(lambda geometry: energy(MeasuredTissue(tissue, geometry))), geometry
         )
         zero = jax.tree.map(jnp.zeros_like, geometry)
         # All areas at once, and so on: the terms of an energy are those of single cells and edges.
@@ -268,11 +268,13 @@ def _of_cells(values: Float[Array, " cells"], cells: Array) -> Array:
     return values.at[cells].get(mode="fill", fill_value=0)
 
 
-def _directly(tissue: Tissue, energy: AbstractEnergy, geometry: Known) -> Float[Array, ""]:
+def _directly(tissue: Tissue, energy: AbstractEnergy, geometry: Measurements) -> Float[Array, ""]:
     """The mean second derivative by vertices at fixed lengths, areas and perimeters."""
     # (Zero for most energies; JAX then compiles nothing.)
-    slope = jax.grad(lambda vertices: energy(Measured(tissue.with_vertices(vertices), geometry)))
-    direction = probe(tissue.vertices)
+    slope = jax.grad(
+        lambda vertices: energy(MeasuredTissue(tissue.with_vertices(vertices), geometry))
+    )
+    direction = probe_vector(tissue.vertices)
     _, response = jax.jvp(slope, (tissue.vertices,), (direction,))
     mean = jnp.sum(direction * response) / jnp.sum(direction**2)
     return jnp.where(jnp.isfinite(mean), jnp.maximum(mean, 0), 0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax.precondition._sum import Preconditioner, TissueInverse
 from vertax.solvers._minres import MINRES
 from vertax.solvers._rows import point_of, table_of
@@ -54,7 +54,7 @@ class PreconditionedMINRES(lx.AbstractLinearSolver[_State]):
     def compute(
         self, state: _State, vector: PyTree[Array], options: dict[str, Any]
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        return one_at_a_time(_solve)(self, state, vector, options)
+        return sequential_vmap_on_cpu(_solve)(self, state, vector, options)
 
     def transpose(self, state: _State, options: dict[str, Any]) -> tuple[_State, dict[str, Any]]:
         return state, options

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.reductions import any_of, indices_of, number_of
+from vertax._base.reductions import any_of, count_true, indices_of_true
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
 from vertax.mesh._sides import Sides, dot
@@ -146,8 +146,8 @@ class Contacts(eqx.Module):
         overlapping, nearest, gaps = overlaps_and_nearest(m, tissue.sides, tissue.areas, measure)
         near = (gaps < _MARGIN**2).reshape(-1)
         # (A slice of its results would make XLA sort instead.)
-        which, valid = indices_of(near, size)
-        overflow = number_of(near) > size
+        which, valid = indices_of_true(near, size)
+        overflow = count_true(near) > size
         which = which.astype(m.twin.dtype)
         corner = jax.lax.rem(which, jnp.asarray(m.n_half_edges, which.dtype))
         sides = jnp.where(valid, jnp.stack([corner, take(nearest.reshape(-1), which)]), 0)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.reductions import indices_of
+from vertax._base.reductions import indices_of_true
 from vertax._base.sums import total
 from vertax.mesh import Tissue
 from vertax.mesh._topology import Topology, edge_neighbourhood, take
@@ -145,7 +145,7 @@ class InversionBarrier(AbstractBarrier):
         counts = self.counts + turned
         held = self.held & (squared < (_LONG * self.reach) ** 2)
         held |= turned & (counts >= _OFTEN)
-        edges, valid = indices_of(held, len(self.edges))
+        edges, valid = indices_of_true(held, len(self.edges))
         edges = jnp.where(valid, edges, n)
         return InversionBarrier(edges.astype(self.edges.dtype), counts, self.reach, self.force)
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import choose
-from vertax._base.probe import probe
+from vertax._base.probe_vector import probe_vector
 from vertax._base.reductions import any_of
+from vertax._base.tracing import tree_where
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.precondition._recycled_hessian import RecycledHessian
@@ -186,7 +186,7 @@ class Search(eqx.Module):
             contacts = contacts.with_stiffness(iteration.stiffness(minimiser))
         return SearchState(
             tissue=tissue,
-            origin=choose(flipped, tissue.configuration, state.origin),
+            origin=tree_where(flipped, tissue.configuration, state.origin),
             iteration=minimiser,
             contacts=contacts,
             preconditioner=preconditioner,
@@ -237,7 +237,7 @@ class Search(eqx.Module):
 
 def probe_of(tissue: Tissue) -> Float[Array, "rows columns"]:
     """A vector without pattern; zero in spare slots, which must not make the rest look soft."""
-    direction = probe(table_of(tissue.configuration))
+    direction = probe_vector(table_of(tissue.configuration))
     if tissue.topology.spare:
         alive = tissue.by_row(tissue.topology.alive_vertices.astype(direction.dtype))
         direction *= table_of(alive)

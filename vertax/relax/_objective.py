@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._measured import Measured
+from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.precondition._edge_blocks import EdgeBlocks
 from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.precondition._recycled_hessian import RecycledHessian
@@ -25,7 +25,7 @@ def objective(
     """The energy of a configuration and of its contacts, as Optimistix wants it."""
     tissue, energy, contacts = args
     trial = tissue.with_configuration(configuration)
-    value = energy(Measured(trial))
+    value = energy(MeasuredTissue(trial))
     return value if contacts is None else value + contacts(trial), None
 
 

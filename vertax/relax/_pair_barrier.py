@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vertax._base.extremes import lesser
+from vertax._base.minimum_maximum import minimum
 from vertax._base.reciprocal import reciprocal
 from vertax._base.sums import total
 from vertax.mesh._sides import (
@@ -147,7 +147,7 @@ class PairBarrier(AbstractBarrier):
 
         first = one[:, :2] - other[:, :2]
         last = first - other[:, 2:4]
-        inverse = inverse_square(lesser(dot(first, first), dot(last, last)), after | before)
+        inverse = inverse_square(minimum(dot(first, first), dot(last, last)), after | before)
         squared = reciprocal(inverse)
         if one.shape[-1] == 4:
             return [(squared_distance_to_segment(one[:, :2], other) * inverse, squared)]
@@ -157,7 +157,7 @@ class PairBarrier(AbstractBarrier):
         acute = after & (cosine > 0) & (sine > 0)
         arms = dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])
         # (The corner's other side is next to the one before. This one is not, and may come near anywhere.)
-        inverse = inverse_square(lesser(*arms), after)
+        inverse = inverse_square(minimum(*arms), after)
         angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
         gap, weight = bulge_gap(one, other, circles, self.distance)
         far = jnp.isinf(gap)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.modules import traced
+from vertax._base.tracing import traced
 from vertax.adjoints import ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import units_of

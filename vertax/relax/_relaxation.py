@@ -13,10 +13,10 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import check_number, named
+from vertax._base.checks import check_number, describe
 from vertax._base.memory_maps import warn_of_memory_maps
-from vertax._base.modules import differs_between_devices, is_concrete, traced
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
+from vertax._base.tracing import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
@@ -96,11 +96,11 @@ class Relaxation(AbstractResponse):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0, many=True)
         if self.contact_range is not None:
-            check_number("contact_range", self.contact_range, least=0, many=True)
+            check_number("contact_range", self.contact_range, at_least=0, many=True)
         if not isinstance(self.preconditioner, RecycledHessian | None):
             raise TypeError(
                 "Argument `preconditioner` must be a result of `preconditioner_at`, or None, but "
-                f"is {named(self.preconditioner)}."
+                f"is {describe(self.preconditioner)}."
             )
 
     def __call__(
@@ -190,7 +190,7 @@ class Relaxation(AbstractResponse):
 
         With `recompute` the backward pass recomputes intermediate results: for one of many steps in a row.
         """
-        end = one_at_a_time(search)(*frozen((tissue, energy, self)))
+        end = sequential_vmap_on_cpu(search)(*frozen((tissue, energy, self)))
         finish = eqx.filter_checkpoint(attached) if recompute else attached
         return finish(end, tissue, energy, self, adjoint)
 
@@ -336,7 +336,7 @@ def attached(
     return conclude(end, tissue, energy, adjoint, *parts)
 
 
-_search = announced_jit(one_at_a_time(search))
+_search = announced_jit(sequential_vmap_on_cpu(search))
 _compiled_attachment = announced_jit(attached)
 
 

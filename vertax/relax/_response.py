@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
-from vertax._base.extras import needing
+from vertax._base.extras import requires_extra
 from vertax.runs._errors import ConfigError
 
-with needing("run", "The configuration of experiments"):
+with requires_extra("run", "The configuration of experiments"):
     import annotated_types
     import pydantic
     from pydantic.fields import FieldInfo

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vertax._base.extras import needing
+from vertax._base.extras import requires_extra
 from vertax.io import atomic_write
 from vertax.runs._errors import RunFolderError
 
-with needing("run", "The folder of a run"):
+with requires_extra("run", "The folder of a run"):
     import matplotlib
     from matplotlib.figure import Figure
 

@@ -17,7 +17,7 @@ from jaxtyping import ArrayLike, Shaped
 from tqdm import tqdm
 
 from vertax._base.archive import read_archive, write_archive
-from vertax._base.extras import needing
+from vertax._base.extras import requires_extra
 from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
 from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
@@ -29,7 +29,7 @@ from vertax.runs._summary import plain, safe, sentence
 from vertax.runs._tables import histories, history_columns
 from vertax.runs._versions import installed_version
 
-with needing("run", "The folder of a run"):
+with requires_extra("run", "The folder of a run"):
     import tomli_w
     from matplotlib.figure import Figure
 

@@ -16,7 +16,7 @@ from typing import Any
 from tqdm import tqdm
 
 from vertax._base.compilation_cache import enable_compilation_cache
-from vertax._base.extras import needing
+from vertax._base.extras import requires_extra
 from vertax.fitting import FitError
 from vertax.io import write_csv
 from vertax.runs._claim import CONFIG, METRICS, changes
@@ -29,7 +29,7 @@ from vertax.runs._pool import THREADS, n_threads
 from vertax.runs._registry import find_experiment
 from vertax.runs._summary import plain, safe
 
-with needing("run", "A sweep"):
+with requires_extra("run", "A sweep"):
     import tomli_w
 
 TABLE = "sweep"
@@ -236,7 +236,7 @@ def _done(
 
 @contextlib.contextmanager
 def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
-    with needing("distributed", "A sweep"):
+    with requires_extra("distributed", "A sweep"):
         import distributed
 
     if scheduler is None:

@@ -137,7 +137,7 @@ def run(
 
     from vertax import FitError, enable_compilation_cache
     from vertax._base.announce import announce_in_this_process
-    from vertax._base.extras import needing
+    from vertax._base.extras import requires_extra
     from vertax.runs import (
         ConfigError,
         RunFolder,
@@ -148,7 +148,7 @@ def run(
 
     folder: RunFolder | None = None
     formats = tuple(figures or ("png",))
-    with needing("run", "A run"):
+    with requires_extra("run", "A run"):
         import matplotlib
     # Figures go to files only, also where there is a screen.
     matplotlib.use("Agg")

@@ -11,8 +11,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PyTree
 
-from vertax._base.checks import check_number, check_whole, named
-from vertax._base.modules import is_concrete
+from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.tracing import is_concrete
 from vertax.solvers._solver import AbstractSolver, value_and_gradient, with_value_and_gradient
 
 
@@ -86,7 +86,7 @@ class Optax(AbstractSolver):
         if not isinstance(self.optimiser, optax.GradientTransformation):
             raise TypeError(
                 "Argument `optimiser` must be an Optax optimiser, such as optax.adam(1e-2), but is "
-                f"{named(self.optimiser)}."
+                f"{describe(self.optimiser)}."
             )
 
     @property
@@ -157,7 +157,7 @@ def LBFGS(history: int = 10) -> Optax:
 
     - `ValueError` for less than one.
     """
-    check_whole("history", history, least=1)
+    check_integer("history", history, at_least=1)
     return Optax(optax.lbfgs(memory_size=history))
 
 

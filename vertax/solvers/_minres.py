@@ -11,9 +11,9 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import choose
-from vertax._base.probe import probe
-from vertax._base.vmapping import one_at_a_time
+from vertax._base.probe_vector import probe_vector
+from vertax._base.sequential_vmap import sequential_vmap_on_cpu
+from vertax._base.tracing import tree_where
 from vertax.solvers._lanczos import (
     BREAKDOWN,
     CONVERGED,
@@ -185,7 +185,7 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         options: dict[str, Any],
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         """Solves the system for one vector; see the class."""
-        return one_at_a_time(_solve)(self, state, vector, options)
+        return sequential_vmap_on_cpu(_solve)(self, state, vector, options)
 
     def transpose(
         self, state: lx.AbstractLinearOperator, options: dict[str, Any]
@@ -240,7 +240,7 @@ def _solve(
     # |A| must be known before Lanczos can tell it: if b is a null vector, A b is rounding
     # error, and this shows only in comparison with |A|. With no pattern in g, the mean square
     # of |A g|/|g| is that of the eigenvalues.
-    g = probe(b)
+    g = probe_vector(b)
     norm_g = norm(g, precondition(g))
 
     # Solve 0 is the system itself; solve -1 solves nothing, and has A P g looked at instead. If the
@@ -315,7 +315,7 @@ def _solve(
             more=more | probing,
             rhs=jnp.where(probing, r_0, jnp.where(first, seen.a_r, change)),
             target=jnp.where(first, finest, target),
-            last=choose(probing, solve.last, seen),
+            last=tree_where(probing, solve.last, seen),
             step=end.step,
             status=seen.status,
             operator_norm=operator_norm,

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.modules import choose
+from vertax._base.tracing import tree_where
 from vertax.solvers._conjugate_gradients import (
     AbstractInverse,
     DiagonalInverse,
@@ -172,7 +172,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         g, product, (value, aux) = jax.linearize(force_and_value, trial, has_aux=True)
         model = Model(value, g, product, lambda table: point_of(table, y))
         state = self._judged(model, options, state)
-        return point_of(choose(state.progress.accepted, trial, start), y), state, model, aux
+        return point_of(tree_where(state.progress.accepted, trial, start), y), state, model, aux
 
     def _judged(self, model: Model, options: Any, s: NewtonState) -> NewtonState:
         """Accept or reject the trial point, or correct the step."""
@@ -293,7 +293,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
                 jnp.where(steps, _STEP, jnp.where(measures, _EVALUATE, s.phase)),
                 jnp.where(measures, stiffness, s.stiffness),
                 trial,
-                choose(steps, proposal, s.proposal),
+                tree_where(steps, proposal, s.proposal),
                 jnp.where(steps, predicted, s.predicted),
                 jnp.where(steps, trial, s.base),
                 s.num_products + proposal.num_products,

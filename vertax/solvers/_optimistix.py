@@ -10,7 +10,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from vertax._base.checks import named
+from vertax._base.checks import describe
 from vertax.solvers._first_order import has_line_search
 from vertax.solvers._solver import AbstractSolver, value_and_gradient
 
@@ -31,7 +31,7 @@ def check_solver(solver: Any) -> None:
         remedy = "Wrap the Optax optimiser: vertax.solvers.Optax(optimiser)."
     elif isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractRootFinder):
         remedy = f"{type(solver).__name__} solves another kind of problem. {remedy}"
-    raise TypeError(f"Argument `solver` must be a minimiser, but is {named(solver)}. {remedy}")
+    raise TypeError(f"Argument `solver` must be a minimiser, but is {describe(solver)}. {remedy}")
 
 
 class Wrapped(AbstractSolver):

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
-from vertax._base.modules import choose
+from vertax._base.tracing import tree_where
 from vertax.solvers._rows import Rows
 
 State = TypeVar("State")
@@ -184,7 +184,7 @@ class Stepwise(AbstractIteration[_StepwiseState]):
         def restart() -> tuple[Any, Any]:
             fresh = self.solver.init(fn, y, args, options, value, aux, frozenset())
             old = self.solver.reevaluated(fresh, state.inner)
-            return y, eqx.filter(choose(state.restart == _FRESH, fresh, old), eqx.is_array)
+            return y, eqx.filter(tree_where(state.restart == _FRESH, fresh, old), eqx.is_array)
 
         def step() -> tuple[Any, Any]:
             inner = eqx.combine(arrays, static)

@@ -1,4 +1,4 @@
-"""Transitions: how a mesh changes its topology."""
+"""Changes of topology: T1 and T2 transitions, division, removal and ablation of cells."""
 
 from vertax.transitions._ablation import ablate as ablate
 from vertax.transitions._change import Change as Change

@@ -1,4 +1,4 @@
-"""What becomes of a tissue when a cell comes or goes."""
+"""The result of a division or removal, and the inheritance of parameters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from vertax._base.axes import AXES, gather
-from vertax._base.modules import is_concrete
+from vertax._base.tracing import is_concrete
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 
@@ -18,40 +18,40 @@ Tree = TypeVar("Tree")
 
 
 class Change(eqx.Module):
-    """A tissue in which a cell came or went, and the index of the parent of each cell, edge and vertex."""
+    """The tissue after a division or removal, and the parent index of each cell, edge and vertex."""
 
     tissue: Tissue
     cells: Int[Array, "*batch cells"]
-    """For each cell the one whose parameters it has: itself, or its mother."""
+    """Index of the old cell with the parameters of each cell: itself, or its mother."""
     edges: Int[Array, "*batch edges"]
-    """For each edge the one whose parameters it has: itself, or the one that it was a part of. A new
-    interface has those of the edge at which it begins."""
+    """Index of the old edge with the parameters of each edge: itself, or the edge that was split. A new
+    interface has the parameters of the edge at its start."""
     vertices: Int[Array, "*batch vertices"]
-    """For each vertex the one whose parameters it has: itself, or where the edge that was cut begins."""
+    """Index of the old vertex with the parameters of each vertex: itself, or the start of the split edge."""
     done: Bool[Array, "*batch"]
-    """Whether it happened. If not the tissue is as it was."""
+    """Whether the change was made; otherwise the tissue is unchanged."""
 
     def inherited(self, tree: Tree, *, axis: str | None = None) -> Tree:
-        """An energy, or any other pytree, in which new cells, edges and vertices have entries of old ones.
+        """An energy, or another pytree, with the entries of parents for new cells, edges and vertices.
 
-        Which arrays have one entry for each cell, edge or vertex is what the fields that hold them declare:
-        by the names of the axes of their annotation, such as `Float[Array, "cells"]` or
-        `Float[Array, "knots edges"]`; or by metadata, `eqx.field(metadata={"axis": "cells"})`, with None for
-        no such axis. All other arrays stay as they are, whatever their size, and so do tissues.
+        Fields declare their axes of cells, edges and vertices by their annotation, such as
+        `Float[Array, "cells"]` or `Float[Array, "knots edges"]`, or by metadata,
+        `eqx.field(metadata={"axis": "cells"})`, with None for no such axis. All other arrays stay unchanged,
+        whatever their size, and so do tissues.
 
         **Arguments:**
 
         - `tree`: the pytree.
-        - `axis`: what arrays have one entry (or row) for that no field declares: `"cells"`, `"edges"` or
-            `"vertices"`. Needed for arrays outside of modules.
+        - `axis`: the first axis of arrays without a declaration: `"cells"`, `"edges"` or `"vertices"`. Needed
+            for arrays outside of modules.
 
-        **Returns:** the same with the entries of new cells, edges and vertices.
+        **Returns:** the pytree with the entries of new cells, edges and vertices.
 
         **Raises:**
 
-        - `TypeError` without `axis`, for an array that is not in a field of a module, and for an array in a
-            field of an energy that declares nothing and is as long as there are cells, edges or vertices.
-        - `ValueError` for an array of another length than was declared, or another `axis`.
+        - `TypeError` without `axis`, for an array outside of modules, and for an undeclared array in an
+            energy with as many entries as there are cells, edges or vertices.
+        - `ValueError` for an array of another length than declared, or another `axis`.
         """
         if axis is not None and axis not in AXES:
             raise ValueError(f"Argument `axis` must be one of {AXES} or None, but is {axis!r}.")
@@ -61,7 +61,7 @@ class Change(eqx.Module):
 
 
 def unchanged(tissue: Tissue) -> Change:
-    """A tissue to which nothing has happened."""
+    """The `Change` of an unchanged tissue."""
     numbers = lambda n: jnp.arange(n, dtype=tissue.topology.twin.dtype)
     return Change(
         tissue,
@@ -72,8 +72,8 @@ def unchanged(tissue: Tissue) -> Change:
     )
 
 
-def raised_if(change: Change, wrong: Bool[Array, ""], reason: str) -> Change:
-    """The change, or an error."""
+def raise_if(change: Change, wrong: Bool[Array, ""], reason: str) -> Change:
+    """Raise an error if `wrong`, also inside `jax.jit`; return the change."""
     if not is_concrete(wrong):
         return eqx.error_if(change, wrong, reason)
     if np.any(np.asarray(wrong)):

@@ -1,4 +1,4 @@
-"""Division: one cell becomes two."""
+"""Division of a cell."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._base.checks import as_real, check_whole
-from vertax._base.modules import choose, is_concrete
+from vertax._base.checks import as_real, check_integer
+from vertax._base.tracing import is_concrete, tree_where
 from vertax.mesh import Tissue, Topology
-from vertax.mesh._surgery import Slot, spare_slot, split_cell
+from vertax.mesh._euler_operators import Slot, spare_slot, split_cell
 from vertax.mesh._topology import take
-from vertax.transitions._change import Change, raised_if, unchanged
+from vertax.transitions._change import Change, raise_if, unchanged
 from vertax.transitions._cut import Cut, find_cut, points_at
 from vertax.transitions._t1 import has_new_overlaps
 
@@ -29,33 +29,33 @@ def divide(
 ) -> Change:
     r"""Divide a cell by a straight edge through its centroid.
 
-    The daughters lie beside each other along an axis, and the new edge is across it: along the long axis of
-    the cell by Hertwig's rule, or along one that you give. Together they cover what the mother did. One keeps
-    her number, the other one takes a spare slot, see [`with_capacity`][vertax.Tissue.with_capacity]:
+    The new edge is perpendicular to an axis, along which the daughters are next to each other: the long axis
+    of the cell (Hertwig's rule), or a given axis. The daughters cover the area of the mother. One keeps the
+    number of the mother, the other one uses a spare slot, see [`with_capacity`][vertax.Tissue.with_capacity]:
 
     ```python
     change = vx.transitions.divide(tissue.with_capacity(50), 3)
     tissue, energy = change.tissue, change.inherited(energy)
     ```
 
-    Works under `jax.jit` and `jax.vmap`. Where sides are arcs their parts are arcs of the same circle. The
-    new edge keeps 5 % of the length of a side away from its corners.
+    Works under `jax.jit` and `jax.vmap`. The parts of an arc are arcs of the same circle. The ends of the new
+    edge are at least 5 % of the length of a side away from its corners.
 
     **Arguments:**
 
     - `tissue`: the tissue, with spare slots.
     - `cell`: number of the cell.
-    - `axis`, shape `(2,)`: direction of one daughter from the other; by default the long axis of the second
-        moments of the area.
-    - `throw`: raise an error if the cell cannot divide. If False, look at `done`.
+    - `axis`, shape `(2,)`: direction from one daughter to the other; by default the long axis, from the
+        second moments of the area.
+    - `throw`: raise an error if the cell cannot divide. If False, check `done`.
 
     **Returns:** a [`Change`][vertax.transitions.Change], with the tissue.
 
     **Raises:**
 
-    - `ValueError` for an axis that is none, or a cell that is not there.
-    - `RuntimeError` (of Equinox inside `jax.jit`) if there is no spare slot left, or if it cannot be cut
-        in two along this axis without overlaps.
+    - `ValueError` for an invalid axis, or a cell that does not exist.
+    - `RuntimeError` (an error of Equinox inside `jax.jit`) without a spare slot, or if no cut
+        perpendicular to the axis gives two cells without overlaps.
     """
     if axis is not None:
         axis = as_real("axis", axis)
@@ -72,8 +72,8 @@ def divide(
         f"The cell cannot divide: the tissue has a capacity of {tissue.n_cells} cells, and all are alive. "
         "Make room with tissue.with_capacity(...) before."
     )
-    change = raised_if(change, full, reason)
-    return raised_if(
+    change = raise_if(change, full, reason)
+    return raise_if(
         change,
         ~change.done,
         "The cell cannot be cut in two there. Try another axis, or throw=False.",
@@ -81,14 +81,14 @@ def divide(
 
 
 def check_cell(tissue: Tissue, cell: int | Int[Array, ""]) -> None:
-    """Refuse what is no cell, or one that is not there, if that can be seen."""
-    array = isinstance(cell, jax.Array | np.ndarray) and cell.ndim == 0
-    if not (array and jnp.issubdtype(jnp.result_type(cell), jnp.integer)):
-        check_whole("cell", cell)
+    """Raise an error unless `cell` is the number of a living cell; only its type is checked for tracers."""
+    is_array = isinstance(cell, jax.Array | np.ndarray) and cell.ndim == 0
+    if not (is_array and jnp.issubdtype(jnp.result_type(cell), jnp.integer)):
+        check_integer("cell", cell)
     if not is_concrete(cell) or not is_concrete(tissue.topology.cell):
         return
-    there = 0 <= int(cell) < tissue.n_cells and int(cell) in np.asarray(tissue.topology.cell)
-    if not there:
+    alive = 0 <= int(cell) < tissue.n_cells and int(cell) in np.asarray(tissue.topology.cell)
+    if not alive:
         raise ValueError(f"Argument `cell` must be the number of a living cell, but is {cell}.")
 
 
@@ -102,15 +102,15 @@ def _divide(
 def divided(
     tissue: Tissue, cell: Int[Array, ""], axis: Float[Array, "2"] | None, do: Bool[Array, ""]
 ) -> Change:
-    """Divide a cell, if it is to, there is room and it can be cut."""
+    """Divide a cell if `do`, if there is a spare slot and if it can be cut."""
     m, sides = tissue.topology, tissue.sides
     cut = find_cut(tissue, m.cell == cell, axis)
     slot = spare_slot(m)
-    done = do & slot.there & cut.possible
+    done = do & slot.available & cut.possible
 
     out, into = cut.out, cut.into
     both = jnp.stack([out, into])
-    points = points_at(take(sides, both), cut.shares)
+    points = points_at(take(sides, both), cut.fractions)
     parts = _Parts.of(m, cut, slot)
     changed = split_cell(m, out, parts.second, slot, done)
     frames = jnp.stack([take(m.frame, out), take(changed.frame, parts.second)])
@@ -121,56 +121,56 @@ def divided(
     drop = lambda e: jnp.where(done, e, tissue.n_edges)
     if tissue.angles is not None:
         angles = tissue.angles
-        for kept, more, share in zip(parts.edges, slot.edges, parts.shares, strict=False):
-            angle = take(angles, kept)
-            angles = angles.at[drop(more)].set((1 - share) * angle, mode="drop")
-            angles = angles.at[drop(kept)].set(share * angle, mode="drop")
+        for old, new_edge, fraction in zip(parts.edges, slot.edges, parts.fractions, strict=False):
+            angle = take(angles, old)
+            angles = angles.at[drop(new_edge)].set((1 - fraction) * angle, mode="drop")
+            angles = angles.at[drop(old)].set(fraction * angle, mode="drop")
         new = new.with_angles(angles.at[drop(slot.edges[2])].set(0, mode="drop"))
-    # (Through a concave cell, or near a corner, the new edge may cross other sides.)
-    good = done & ~has_new_overlaps(new, tissue)
+    # (In a concave cell, or near a corner, the new edge may cross other sides.)
+    valid = done & ~has_new_overlaps(new, tissue)
 
-    none = unchanged(tissue)
-    put = lambda old, where, parent: old.at[jnp.where(good, where, old.size)].set(
+    same = unchanged(tissue)
+    put = lambda old, where, parent: old.at[jnp.where(valid, where, old.size)].set(
         parent.astype(old.dtype), mode="drop"
     )
     edge, other = take(m.edge, out), take(m.edge, into)
     return Change(
-        choose(good, new, tissue),
-        put(none.cells, slot.cell, cell),
-        put(none.edges, jnp.stack(slot.edges), jnp.stack([edge, other, edge])),
-        put(none.vertices, jnp.stack(slot.vertices), take(m.source, both)),
-        good,
+        tree_where(valid, new, tissue),
+        put(same.cells, slot.cell, cell),
+        put(same.edges, jnp.stack(slot.edges), jnp.stack([edge, other, edge])),
+        put(same.vertices, jnp.stack(slot.vertices), take(m.source, both)),
+        valid,
     )
 
 
 class _Parts(NamedTuple):
-    """What becomes of the edges that are cut, the first before the second."""
+    """The parts of the edges after the first and the second cut."""
 
     second: Int[Array, ""]
-    """The half-edge that is cut second; one of the first cut, if both are on one edge."""
+    """The half-edge of the second cut; a part of the first edge if both cuts are on the same edge."""
     edges: tuple[Int[Array, ""], Int[Array, ""]]
-    """The edges that are cut, which keep the part before the cut."""
-    shares: tuple[Float[Array, ""], Float[Array, ""]]
-    """How long that part is, in units of what is cut."""
+    """The edges that are cut; each keeps the part before the cut."""
+    fractions: tuple[Float[Array, ""], Float[Array, ""]]
+    """Length of that part, as a fraction of the length before the cut."""
 
     @classmethod
     def of(cls, m: Topology, cut: Cut, slot: Slot) -> _Parts:
-        first, share = cut.shares
+        first, second = cut.fractions
         out, into = cut.out, cut.into
         edge, other, ahead = take(m.edge, out), take(m.edge, into), 3 * slot.vertices[0]
-        # A cell that is its own neighbour may be cut twice at one edge, from either side: the second cut is
-        # on the part before the first one, or after it.
+        # If a cell is its own neighbour, both cuts may be on the same edge, on opposite sides: the second cut
+        # is on the part before the first cut, or after it.
         opposite = take(m.twin, out) == into
-        late = opposite & (first + share > 1)
-        before = jnp.where(late, (share - 1 + first) / first, share / (1 - first))
-        # An arc may be cut twice from the same side.
+        late = opposite & (first + second > 1)
+        before = jnp.where(late, (second - 1 + first) / first, second / (1 - first))
+        # An arc may be cut twice on the same side.
         same = out == into
-        after = same & (share > first)
-        along = jnp.where(after, (share - first) / (1 - first), share / first)
-        second = jnp.where(late, ahead + 2, jnp.where(after, ahead, into))
+        after = same & (second > first)
+        along = jnp.where(after, (second - first) / (1 - first), second / first)
+        half_edge = jnp.where(late, ahead + 2, jnp.where(after, ahead, into))
         on_new = (opposite & ~late) | after
         return cls(
-            second,
+            half_edge,
             (edge, jnp.where(on_new, slot.edges[0], other)),
-            (first, jnp.where(same, along, jnp.where(opposite, before, share))),
+            (first, jnp.where(same, along, jnp.where(opposite, before, second))),
         )

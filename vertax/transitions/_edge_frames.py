@@ -1,4 +1,4 @@
-"""Edges that may flip: their surroundings, and what becomes of those."""
+"""The neighbourhoods of edges, and the tissue after some edges flip."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vertax.mesh._topology import edge_neighbourhood, flip_edges, source, take
 
 
 class EdgeFrames(eqx.Module):
-    """The surroundings of edges: their cells, their lengths and the directions a T1 places them in.
+    """The neighbourhoods of edges: cells, lengths, and directions before and after a T1 transition.
 
     **Arguments:**
 
@@ -28,7 +28,7 @@ class EdgeFrames(eqx.Module):
     vector: Float[Array, "rows 2"]
     neighbours: tuple[Sides, Sides, Sides, Sides]
     angle: Float[Array, " rows"]
-    stretch: Float[Array, " rows"]  # length over distance of the ends
+    stretch: Float[Array, " rows"]  # length / distance of the ends
     length: Float[Array, " rows"]
     along: Float[Array, "rows 2"]
     across: Float[Array, "rows 2"]
@@ -43,14 +43,14 @@ class EdgeFrames(eqx.Module):
         self.start, self.end = source(h), source(t)
         self.cells = take(m.cell, jnp.stack([h, t, a, c], axis=-1))
         self.edges = take(m.edge, jnp.stack([h, a, b, c, d], axis=-1))
-        # (All at once: a tissue is looked at in one place.)
+        # (One gather for all.)
         n = h.size
         sides = tissue.sides_of(jnp.concatenate([h, t, a, b, c, d]))
-        here, there, p, q, r, s = (sides[k * n : (k + 1) * n] for k in range(6))
+        forward_side, twin_side, p, q, r, s = (sides[k * n : (k + 1) * n] for k in range(6))
         self.neighbours = (p, q, r, s)
-        self.vector = forward = here[:, 2:4]
+        self.vector = forward = forward_side[:, 2:4]
         chord = jnp.sqrt(dot(forward, forward))
-        self.angle, self.stretch = _angles(here), _stretches(here)
+        self.angle, self.stretch = _angles(forward_side), _stretches(forward_side)
         self.length = chord * self.stretch
         axis = edge_axis(forward, *(side[:, 2:4] for side in self.neighbours))
         upright = dot(axis, forward) >= 0
@@ -58,9 +58,10 @@ class EdgeFrames(eqx.Module):
         direction = jnp.where(upright[:, None], direction, -direction)
         norm = jnp.sqrt(dot(direction, direction))[:, None]
         self.along = direction / jnp.where(norm > 0, norm, 1)
-        # A flipped half-edge has turned clockwise, see `flip_edges`.
+        # A flipped half-edge turns clockwise, see `flip_edges`.
         self.across = jnp.stack([self.along[:, 1], -self.along[:, 0]], axis=-1)
-        self.inside_out = _disordered(here, p, q) & _disordered(there, r, s) & ~upright
+        disordered = _disordered(forward_side, p, q) & _disordered(twin_side, r, s)
+        self.inside_out = disordered & ~upright
         left, right, at_start, at_end = (self.cells[:, k] for k in range(4))
         spare = jnp.min(_spare_sides(tissue, self.edges[:, 0], self.cells[:, :2]), axis=-1)
         losses = jnp.where(left == right, 2, 1)
@@ -77,13 +78,13 @@ class EdgeFrames(eqx.Module):
         direction: Float[Array, "rows 2"],
         length: Float[Array, " rows"],
     ) -> Tissue:
-        """Lay the marked edges in a direction, about their midpoint, with a given length."""
+        """Move the ends of the marked edges to a direction and length; the midpoints stay."""
         half = self._half(which, direction, length)
         vertices = tissue.vertices.at[self.start].add(-half).at[self.end].add(half)
         return tissue.with_vertices(vertices)
 
     def flip(self, tissue: Tissue, which: Bool[Array, " rows"]) -> Tissue:
-        """Give the marked edges their new neighbours; arcs among them become straight."""
+        """Flip the marked edges in the topology; arcs become straight."""
         number = self.edges[:, 0]
         marked = jnp.zeros(tissue.n_edges, bool).at[number].max(which)
         if tissue.angles is not None:
@@ -97,7 +98,7 @@ class EdgeFrames(eqx.Module):
         turns: Bool[Array, " rows"],
         length: Float[Array, " rows"],
     ) -> Tissue:
-        """The tissue with some edges flipped, and others laid upright, with a given length."""
+        """The tissue with some edges flipped and others turned to `along`, with a given length."""
         direction = jnp.where(flips[:, None], self.across, self.along)
         chord = jnp.where(flips, length, length / self.stretch)
         return self.flip(self.place(tissue, flips | turns, direction, chord), flips)
@@ -118,14 +119,14 @@ def edge_axis(
     c: Float[Array, "rows 2"],
     d: Float[Array, "rows 2"],
 ) -> Float[Array, "rows 2"]:
-    """Which way edges ought to point, of no special length, as the far ends of their neighbours show.
+    """Direction of edges from the far ends of their neighbours (not normalised).
 
-    A short edge's own vector may have shrunk to nothing or turned around; it has no influence here.
+    It does not depend on the vector of the edge itself, which may be 0 or inverted for a short edge.
 
     **Arguments:**
 
-    - `vector`: of the edges.
-    - `a`, `b`, `c`, `d`: of their neighbours as they leave, see `edge_neighbourhood`.
+    - `vector`: vectors of the edges.
+    - `a`, `b`, `c`, `d`: vectors of their neighbours, away from the edge, see `edge_neighbourhood`.
     """
     return c + d - a - b + 2 * vector
 
@@ -140,15 +141,15 @@ def _stretches(sides: Sides) -> Float[Array, " sides"]:
 
 def _disordered(first: Sides, second: Sides, third: Sides) -> Bool[Array, " sides"]:
     """Whether three sides that leave one vertex are not in counter-clockwise order."""
-    # They are if at least two of their consecutive cross products are positive. An edge that passed
-    # through length 0 spoils that order at both ends.
+    # They are in order if at least two of their consecutive cross products are positive. If an edge passes
+    # through length 0, the order is inverted at both ends.
     p, q, r = (_leaving(side) for side in (first, second, third))
     backwards = [(cross(u, v) < 0).astype(jnp.int32) for u, v in ((p, q), (q, r), (r, p))]
     return sum(backwards, start=jnp.array(0)) >= 2
 
 
 def _leaving(sides: Sides) -> Float[Array, "sides 2"]:
-    """In which direction sides leave."""
+    """Tangents of sides at their start."""
     chord = sides[:, 2:4]
     if sides.shape[-1] == 4:
         return chord
@@ -159,13 +160,13 @@ def _leaving(sides: Sides) -> Float[Array, "sides 2"]:
 def _spare_sides(
     tissue: Tissue, edges: Int[Array, " rows"], cells: Int[Array, "rows 2"]
 ) -> Int[Array, "rows 2"]:
-    """How many sides more than it needs the cell left, and right, of each edge has without its arc."""
+    """Number of sides that the cells left and right of each edge can lose, if the edge leaves them."""
     m = tissue.topology
     face_sums = lambda values: jax.ops.segment_sum(values, m.cell, m.n_faces)
     sides = take(face_sums(jnp.ones_like(m.cell)), cells)
     if not m.exterior or tissue.angles is None:
         return sides - 3
-    # Two sides bound a cell if one is an arc on the outline, other than the edge that leaves; two arcs
-    # bound the exterior.
+    # A cell may have two sides if one of them is an arc on the outline, other than the edge that leaves it;
+    # the exterior may have two arcs.
     arcs = take(face_sums(take(m.on_outline, m.edge).astype(m.cell.dtype)), cells)
     return sides - jnp.where(arcs > take(m.on_outline, edges)[:, None], 2, 3)

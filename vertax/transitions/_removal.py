@@ -1,4 +1,4 @@
-"""Removal: a cell goes, and its neighbours close the gap."""
+"""Removal of a cell."""
 
 from __future__ import annotations
 
@@ -7,52 +7,52 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vertax._base.modules import choose
+from vertax._base.tracing import tree_where
 from vertax.mesh import Tissue
-from vertax.transitions._change import Change, raised_if, unchanged
+from vertax.transitions._change import Change, raise_if, unchanged
 from vertax.transitions._division import check_cell
 from vertax.transitions._edge_frames import EdgeFrames
 from vertax.transitions._t1 import has_new_overlaps, overlapping_faces
 from vertax.transitions._t2 import can_vanish, vanished
 
-# A flipped edge is at first so long, compared with what it was; and shorter where there is no room.
-_SHARES = (0.5, 0.1, 0.02)
+# Lengths of a flipped edge, relative to its length before; the next one is tried if cells overlap.
+_LENGTH_FRACTIONS = (0.5, 0.1, 0.02)
 
 
 def remove(tissue: Tissue, cell: int | Int[Array, ""], *, throw: bool = True) -> Change:
-    """Remove a cell at once, as extrusion and death do; its neighbours share what it leaves.
+    """Remove a cell at once (extrusion or cell death); its neighbours share its area.
 
-    Its shortest edges flip until it has three sides, and then it becomes a vertex. Its slot is spare then.
-    Where a cell is to shrink in time before it goes, let its target area fall and relax with
+    Its shortest edges flip until it has three sides; then it collapses to a vertex and its slot becomes
+    spare. For a cell that shrinks in time before it vanishes, decrease its target area and relax with
     `transitions=T1() + T2()` instead. Works under `jax.jit` and `jax.vmap`.
 
     **Arguments:**
 
-    - `tissue`: the tissue, which must have place for spare slots, see
+    - `tissue`: the tissue, which must support spare slots, see
         [`with_capacity`][vertax.Tissue.with_capacity].
     - `cell`: number of the cell.
-    - `throw`: raise an error if the cell cannot go. If False, look at `done`.
+    - `throw`: raise an error if the cell cannot be removed. If False, check `done`.
 
     **Returns:** a [`Change`][vertax.transitions.Change], with the tissue.
 
     **Raises:**
 
-    - `ValueError` for a cell that is not there, or a tissue that has no place for spare slots.
-    - `RuntimeError` (of Equinox inside `jax.jit`) if the cell cannot go: a neighbour would be left with too
-        few sides, cells would overlap, or it is pinned.
+    - `ValueError` for a cell that does not exist, or a tissue without spare slots.
+    - `RuntimeError` (an error of Equinox inside `jax.jit`) if the cell cannot be removed: a neighbour would
+        have too few sides, cells would overlap, or a corner is pinned.
     """
     if not tissue.topology.spare:
         raise ValueError(
-            "A cell that goes leaves a spare slot behind, for which the tissue must be ready: pass "
+            "Argument `tissue` must support spare slots, to remove a cell, but does not. Pass "
             "tissue.with_capacity(tissue.n_cells)."
         )
     check_cell(tissue, cell)
     change = _remove(tissue, jnp.asarray(cell))
     reason = (
-        "The cell cannot be removed: a neighbour would be left with too few sides, cells would overlap, or a "
-        "corner is pinned. With throw=False `done` tells."
+        "The cell cannot be removed: a neighbour would have too few sides, cells would overlap, or a corner "
+        "is pinned. With throw=False check `done`."
     )
-    return raised_if(change, ~change.done, reason) if throw else change
+    return raise_if(change, ~change.done, reason) if throw else change
 
 
 @eqx.filter_jit
@@ -61,62 +61,61 @@ def _remove(tissue: Tissue, cell: Int[Array, ""]) -> Change:
 
 
 def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change:
-    """A cell is gone, if it is to go and can."""
+    """Remove a cell if `do` and if possible."""
     edges = jnp.arange(tissue.n_edges)
 
     def sides(tissue: Tissue) -> Array:
         return jnp.sum(tissue.topology.cell == cell)
 
-    # A flip takes the edge from the two cells beside it and gives it to the two at its ends. In a small
-    # periodic box these may be the same cell. Only flips that take sides from the cell are candidates, so
-    # that the loop ends: each flip lowers the number of sides, and between two flips each edge is refused
-    # at most once.
-    def candidates(frames: EdgeFrames, refused: Array) -> Array:
-        its_own = frames.cells == cell
-        lost = jnp.sum(its_own[:, :2], axis=-1) - jnp.sum(its_own[:, 2:], axis=-1)
-        return (lost > 0) & frames.can_flip & ~refused
+    # In a flip the two cells at the sides of the edge lose a side, and the two at its ends gain one. In a
+    # small periodic box these may be the same cell. Only flips by which the cell loses sides are candidates,
+    # so that the loop ends: each flip reduces its number of sides, and between two flips each edge is
+    # rejected at most once.
+    def candidates(frames: EdgeFrames, rejected: Array) -> Array:
+        is_cell = frames.cells == cell
+        lost = jnp.sum(is_cell[:, :2], axis=-1) - jnp.sum(is_cell[:, 2:], axis=-1)
+        return (lost > 0) & frames.can_flip & ~rejected
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
-        *_, more = carry
-        return more
+        *_, is_unfinished = carry
+        return is_unfinished
 
     def flip(carry: tuple) -> tuple:
-        tissue, refused, _ = carry
+        tissue, rejected, _ = carry
         frames = EdgeFrames(tissue)
-        may = candidates(frames, refused)
-        edge = jnp.argmin(jnp.where(may, frames.length, jnp.inf))
-        which = may & (edges == edge)
-        tissue, good = flipped(tissue, frames, which)
-        # What found no room before may find some now.
-        refused = jnp.where(good, False, refused | which)
-        return tissue, refused, (sides(tissue) > 3) & (good | jnp.any(may & ~which))
+        can_flip = candidates(frames, rejected)
+        edge = jnp.argmin(jnp.where(can_flip, frames.length, jnp.inf))
+        which = can_flip & (edges == edge)
+        tissue, valid = flipped(tissue, frames, which)
+        # After a flip, edges that were rejected are tried again.
+        rejected = jnp.where(valid, False, rejected | which)
+        return tissue, rejected, (sides(tissue) > 3) & (valid | jnp.any(can_flip & ~which))
 
-    none = unchanged(tissue)
-    nothing = jnp.zeros(tissue.n_edges, bool)
-    start = (tissue, nothing, do & (sides(tissue) > 3))
+    same = unchanged(tissue)
+    start = (tissue, jnp.zeros(tissue.n_edges, bool), do & (sides(tissue) > 3))
     reduced, *_ = jax.lax.while_loop(unfinished, flip, start)
-    go = do & can_vanish(reduced)[cell]
-    gone = vanished(reduced, cell, go)
-    done = go & ~has_new_overlaps(gone, tissue)
-    return Change(choose(done, gone, tissue), none.cells, none.edges, none.vertices, done)
+    possible = do & can_vanish(reduced)[cell]
+    new = vanished(reduced, cell, possible)
+    done = possible & ~has_new_overlaps(new, tissue)
+    return Change(tree_where(done, new, tissue), same.cells, same.edges, same.vertices, done)
 
 
 def flipped(
     tissue: Tissue, frames: EdgeFrames, which: Bool[Array, " edges"]
 ) -> tuple[Tissue, Bool[Array, ""]]:
-    """The tissue with an edge flipped where there is room for it, and whether it is."""
+    """Flip an edge if that causes no overlaps; also return whether it flipped."""
     before = overlapping_faces(tissue.overlaps)
-    shares = jnp.asarray(_SHARES, frames.length.dtype)
+    fractions = jnp.asarray(_LENGTH_FRACTIONS, frames.length.dtype)
 
-    def with_share(k: Int[Array, ""]) -> Tissue:
-        placed = frames.place(tissue, which, frames.across, shares[k] * frames.length)
+    def attempt(k: Int[Array, ""]) -> Tissue:
+        placed = frames.place(tissue, which, frames.across, fractions[k] * frames.length)
         return frames.flip(placed, which)
 
-    def crowded(carry: tuple) -> tuple:
+    def next_attempt(carry: tuple) -> tuple:
         k, _ = carry
-        return k + 1, jnp.any(overlapping_faces(with_share(k).overlaps) & ~before)
+        return k + 1, jnp.any(overlapping_faces(attempt(k).overlaps) & ~before)
 
-    again = lambda carry: carry[1] & (carry[0] < len(_SHARES))
-    tries, bad = jax.lax.while_loop(again, crowded, (jnp.array(0), jnp.array(True)))
-    good = ~bad & jnp.any(which)
-    return choose(good, with_share(tries - 1), tissue), good
+    unfinished = lambda carry: carry[1] & (carry[0] < len(_LENGTH_FRACTIONS))
+    attempts, bad = jax.lax.while_loop(unfinished, next_attempt, (jnp.array(0), jnp.array(True)))
+    valid = ~bad & jnp.any(which)
+    return tree_where(valid, attempt(attempts - 1), tissue), valid

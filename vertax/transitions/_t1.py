@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.modules import is_concrete
 from vertax._base.reductions import any_of
 from vertax._base.sums import total
+from vertax._base.tracing import is_concrete
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
-from vertax.mesh._measured import Measured
+from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._overlaps import Overlaps
 from vertax.mesh._tissue import mean_area
 from vertax.mesh._topology import take
@@ -127,9 +127,9 @@ class T1(AbstractTransitions):
                 length = jnp.where(last & ~flips, frames.length, length)
                 trial_tissue = frames.changed(tissue, flips, turns, length)
                 if isinstance(energy, AbstractLocalEnergy):
-                    cost = _local_costs(energy, Measured(trial_tissue), frames)
+                    cost = _local_costs(energy, MeasuredTissue(trial_tissue), frames)
                 else:
-                    cost = jnp.where(tried, energy(Measured(trial_tissue)), costs[k])
+                    cost = jnp.where(tried, energy(MeasuredTissue(trial_tissue)), costs[k])
                 costs = jax.lax.select(last, costs, costs.at[k].set(cost))
                 return trial_tissue, flips, costs
 

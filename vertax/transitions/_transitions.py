@@ -1,4 +1,4 @@
-"""What every rule for transitions has in common."""
+"""The interface of rules for transitions, and sequences of rules."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from vertax.mesh import Tissue
 
 
 class AbstractTransitions(eqx.Module):
-    """A rule by which a tissue changes its topology while it relaxes.
+    """A rule for changes of topology during a relaxation.
 
-    Rules add: `T1() + T2()` is one sweep of each, in this order.
+    Rules can be added: `T1() + T2()` makes one sweep of each, in this order.
     """
 
     @abc.abstractmethod
     def init(self, tissue: Tissue) -> Int[Array, "*rules edges"]:
-        """How often each edge took part in a transition: never yet."""
+        """Zero counts of transitions for each edge."""
 
     @abc.abstractmethod
     def sweep(
@@ -35,28 +35,28 @@ class AbstractTransitions(eqx.Module):
         **Arguments:**
 
         - `tissue`: the tissue.
-        - `energy`: its energy, which decides.
-        - `counts`: how often each edge took part in a transition.
-        - `length_fraction`: new edges have this fraction of their usual length; an edge of fraction 0 does
-            not flip. A relaxation shortens new edges that make cells overlap.
+        - `energy`: its energy, by which candidates are accepted or rejected.
+        - `counts`: number of transitions of each edge.
+        - `length_fraction`: length of a new edge, as a fraction of its default length; an edge with
+            fraction 0 does not flip. A relaxation reduces it for new edges that cause overlaps.
 
         **Returns:** the new tissue and the updated counts.
         """
 
     def __add__(self, other: AbstractTransitions) -> AbstractTransitions:
-        """Both rules, one after the other."""
+        """A sweep of this rule, then one of the other."""
         if not isinstance(other, AbstractTransitions):
             return NotImplemented
         return InTurn((*_rules(self), *_rules(other)))
 
 
 class InTurn(AbstractTransitions):
-    """Some rules, one sweep of each after the other; made by `+`."""
+    """A sequence of rules, made by `+`: a sweep makes one sweep of each rule."""
 
     rules: tuple[AbstractTransitions, ...]
 
     def init(self, tissue: Tissue) -> Int[Array, "rules edges"]:
-        """How often each edge took part in a transition by each rule: never yet."""
+        """Zero counts of transitions for each rule and edge."""
         return jnp.stack([rule.init(tissue) for rule in self.rules])
 
     def sweep(
@@ -66,11 +66,11 @@ class InTurn(AbstractTransitions):
         counts: Int[Array, "rules edges"],
         length_fraction: Float[Array, " edges"] | float = 1.0,
     ) -> tuple[Tissue, Int[Array, "rules edges"]]:
-        """A sweep of each; returns the new tissue and the updated counts."""
+        """Make one sweep of each rule; return the new tissue and the updated counts."""
         updated = []
-        for rule, own in zip(self.rules, counts, strict=True):
-            tissue, own = rule.sweep(tissue, energy, own, length_fraction)
-            updated.append(own)
+        for rule, old in zip(self.rules, counts, strict=True):
+            tissue, new = rule.sweep(tissue, energy, old, length_fraction)
+            updated.append(new)
         return tissue, jnp.stack(updated)
 
 

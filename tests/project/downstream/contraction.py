@@ -1,7 +1,7 @@
-"""What a project that builds on vertax looks like: an energy and a cost of its own, fitted and saved.
+"""Example of a project that uses vertax: a user-defined energy and cost, a fit, and files.
 
-`make types` checks it in strict mode, as such a project would; what JAX, Optax and Optimistix leave
-unknown is excused line by line. `test_downstream.py` runs it.
+`make types` checks it in strict mode; lines with unknown types of JAX, Optax and Optimistix are excluded.
+`test_downstream.py` runs it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import vertax as vx
 
 
 class Contractility(vx.AbstractLocalEnergy):
-    """Cells that contract their perimeter, each with its own strength."""
+    """Contractility of the perimeter, with one strength per cell."""
 
     strength: Float[Array, " cells"]
     rest: float = 0.0
@@ -32,16 +32,16 @@ class Contractility(vx.AbstractLocalEnergy):
 
 
 class Evenness(vx.AbstractCost):
-    """How much the areas of cells differ."""
+    """Variance of the cell areas."""
 
     weight: float = 1.0
 
     def __call__(self, tissue: vx.Tissue, energy: vx.AbstractEnergy) -> Float[Array, ""]:
-        """Variance of the areas."""
+        """Value of the cost."""
         return self.weight * jnp.var(tissue.areas)
 
 
-# Nothing flips and nothing touches in these tissues: so less is compiled.
+# Without T1 transitions and contacts, which compiles faster.
 RESPONSE = vx.Relaxation(transitions=None, tolerance=1e-6, contact_range=None)
 
 
@@ -52,7 +52,7 @@ def relax(tissue: vx.Tissue, strength: Float[Array, " cells"]) -> vx.Equilibrium
 
 
 def problem(tissue: vx.Tissue) -> vx.InverseProblem[vx.AbstractEnergy]:
-    """Contractilities that make all cells alike."""
+    """Infer the contractilities for which all cells have the same area."""
     number = jnp.arange(tissue.n_cells)  # pyright: ignore[reportUnknownMemberType]
     strength = 0.1 * (1 + number)
     energy = vx.energies.AreaElasticity(1.0, 1.0) + Contractility(strength)
@@ -73,22 +73,22 @@ def gradient(tissue: vx.Tissue, strength: Float[Array, " cells"]) -> Float[Array
 def fit(
     problem: vx.InverseProblem[vx.AbstractEnergy], folder: Path, epochs: int
 ) -> vx.Fit[vx.AbstractEnergy]:
-    """Solve the problem, and leave everything in a folder."""
+    """Solve the problem, and save all results in a folder."""
     trajectory = vx.mesh.Trajectory()
     optimiser = optax.adam(1e-2)
-    outcome = vx.fit(problem, optimiser, epochs, progress=False, callback=trajectory)
-    vx.save_tissue(folder / "tissue.npz", outcome.tissue)
-    vx.io.save_energy(folder / "energy.npz", outcome.energy)
+    result = vx.fit(problem, optimiser, epochs, progress=False, callback=trajectory)
+    vx.save_tissue(folder / "tissue.npz", result.tissue)
+    vx.io.save_energy(folder / "energy.npz", result.energy)
     vx.io.save_problem(folder / "problem.npz", problem)
     vx.io.save_trajectory(folder / "fit.npz", trajectory)
-    vx.io.write_csv(folder / "cells.csv", vx.io.cell_table(outcome.tissue))
-    numbers = np.arange(outcome.tissue.n_cells)
-    vx.io.write_geojson(folder / "cells.geojson", outcome.tissue, cells={"number": numbers})
-    return outcome
+    vx.io.write_csv(folder / "cells.csv", vx.io.cell_table(result.tissue))
+    numbers = np.arange(result.tissue.n_cells)
+    vx.io.write_geojson(folder / "cells.geojson", result.tissue, cells={"number": numbers})
+    return result
 
 
-def again(folder: Path) -> tuple[float, vx.InverseProblem[vx.AbstractEnergy]]:
-    """What is in the folder: the cost of the fit, and the problem with the fitted energy."""
+def load(folder: Path) -> tuple[float, vx.InverseProblem[vx.AbstractEnergy]]:
+    """Load the cost of the fit, and the problem with the fitted energy."""
     classes: list[type[eqx.Module]] = [Contractility, Evenness]
     tissue = vx.load_tissue(folder / "tissue.npz")
     energy = vx.io.load_energy(folder / "energy.npz", classes=classes)

@@ -35,7 +35,7 @@ from vertax.runs import ExperimentConfig, RunFolder, TissueSection
 
 from . import figures
 
-STILL = Relaxation(transitions=None, contact_range=None, tolerance=1e-12)
+FIXED_TOPOLOGY = Relaxation(transitions=None, contact_range=None, tolerance=1e-12)
 
 
 class Config(ExperimentConfig):
@@ -93,7 +93,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     first, energy = _random(config, config.tissue, key)
     wild = _random(config, config.quenched, jax.random.fold_in(key, 2))
     rest = Relaxation(contact_range=None)(first, energy).tissue
-    solid = STILL(rest, energy, throw=False).tissue
+    solid = FIXED_TOPOLOGY(rest, energy, throw=False).tissue
     decay = folder.part("decay", lambda: _decay(config, solid, energy))
     quenches = [
         folder.part(f"quench {n}", lambda n=n: _quench(config, *wild, n))
@@ -163,7 +163,12 @@ def _decay(config: Config, solid: Tissue, energy: ShapeFactorEnergy) -> dict[str
     for order in (1, 2):
         for i, n in enumerate(counts):
             movie = _by_frames(
-                config, start, energy, np.linspace(0, lasts, n + 1), order=order, relaxation=STILL
+                config,
+                start,
+                energy,
+                np.linspace(0, lasts, n + 1),
+                order=order,
+                relaxation=FIXED_TOPOLOGY,
             )
             left = np.sum(np.asarray(movie.tissue.vertices - solid.vertices) * mode) / size
             errors[order - 1, i] = abs(left / np.exp(-1) - 1)
@@ -240,7 +245,7 @@ def _gradients(config: Config, solid: Tissue, energy: ShapeFactorEnergy) -> dict
             ShapeFactorEnergy(targets + by * along),
             friction,
             [0.0, 0.1, 0.4],
-            relaxation=STILL,
+            relaxation=FIXED_TOPOLOGY,
             adjoint=adjoint,
             throw=False,
         )
@@ -263,7 +268,7 @@ def _controlled(config: Config, solid: Tissue, energy: ShapeFactorEnergy) -> dic
     bend = 0.02 * jax.random.normal(key, solid.vertices.shape)
     start = solid.with_vertices(solid.vertices + bend)
     times = np.linspace(0, 1, 3)
-    # (In very short steps no force gets below that of STILL, for rounding.)
+    # (In very short steps no force gets below that of FIXED_TOPOLOGY, for rounding.)
     plain = Relaxation(transitions=None, contact_range=None)
     fine = np.linspace(0, 1, 1001)
     exact = _by_frames(config, start, energy, fine, order=2, relaxation=plain).tissue.vertices

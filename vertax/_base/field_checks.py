@@ -1,4 +1,4 @@
-"""What fields of modules may hold: refused by the name of the field when a module is made."""
+"""Checks of the fields of a module when it is created."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vertax._base.checks import named
+from vertax._base.checks import describe
 
 
 def check_fields(module: eqx.Module) -> None:
-    """Raise an error if a field of a module, or of a module in it, holds what cannot be compiled.
+    """Raise an error if a field of a module, or of a nested module, cannot be passed to a compiled function.
 
-    A static field is a part of the program, which JAX finds by hash and equality: an array has neither.
+    JAX looks up a compiled function by the hash and equality of static fields; arrays have no hash.
 
     **Raises:**
 
-    - `TypeError`, with the name of the field, for a static field whose value has no hash, such as an array,
-        and for an array of NumPy that holds no numbers.
+    - `TypeError`, with the name of the field, for a static value without a hash, such as an array, and for
+        a NumPy array that does not contain numbers.
     """
     for field in dataclasses.fields(module):
         if not hasattr(module, field.name):
@@ -35,7 +35,7 @@ def check_fields(module: eqx.Module) -> None:
                 check_fields(leaf)
             elif isinstance(leaf, np.ndarray) and not _numeric(leaf.dtype):
                 raise TypeError(
-                    f"Field {what} must hold numbers, but holds {named(leaf)}. Give text as a tuple: "
+                    f"Field {what} must hold numbers, but holds {describe(leaf)}. Give text as a tuple: "
                     "tuple(array.tolist())."
                 )
 
@@ -45,8 +45,8 @@ def _check_static(what: str, value: Any) -> None:
         hash(value)
     except TypeError as error:
         raise TypeError(
-            f"Field {what} must have a hash, because it is static, but holds {named(value)} ({error}). For "
-            "an array leave out static=True (a NumPy array is not fitted); give a list as a tuple."
+            f"Field {what} must have a hash, because it is static, but holds {describe(value)} ({error}). "
+            "For an array leave out static=True (a NumPy array is not fitted); give a list as a tuple."
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""What edges see of their ends: as plain indexing sees it, with every derivative and in batches."""
+"""Gathering vertices at the ends of edges agrees with indexing, in all derivatives and batches."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vertax as vx
-from vertax.mesh._ends import at_ends
+from vertax.mesh._edge_ends import gather_at_ends
 
 TISSUES = {
     "periodic": vx.initialise.periodic_voronoi(12, key=0),
@@ -16,8 +16,8 @@ TISSUES = {
 of_each_tissue = pytest.mark.parametrize("tissue", TISSUES.values(), ids=TISSUES)
 
 
-def looked_up(topology: vx.mesh.Topology, values: jax.Array) -> jax.Array:
-    return jnp.stack(at_ends(topology, values))
+def gathered(topology: vx.mesh.Topology, values: jax.Array) -> jax.Array:
+    return jnp.stack(gather_at_ends(topology, values))
 
 
 def indexed(tissue: vx.Tissue, values: jax.Array) -> jax.Array:
@@ -29,30 +29,33 @@ def random(seed: int, *shape: int) -> jax.Array:
 
 
 @of_each_tissue
-def test_it_is_indexing(tissue):
+def test_gather_agrees_with_indexing(tissue):
     values = random(0, tissue.n_vertices, 2)
-    np.testing.assert_array_equal(looked_up(tissue.topology, values), indexed(tissue, values))
+    np.testing.assert_array_equal(gathered(tissue.topology, values), indexed(tissue, values))
 
 
 @of_each_tissue
-def test_its_transpose_is_that_of_indexing_and_is_no_scatter(tissue):
+def test_transpose_agrees_with_indexing_and_has_no_scatter(tissue):
     values, parts = random(0, tissue.n_vertices, 2), random(1, 4, tissue.n_edges)
-    look = lambda x: looked_up(tissue.topology, x)
-    (back,) = jax.linear_transpose(look, values)(parts)
+    gather = lambda x: gathered(tissue.topology, x)
+    (back,) = jax.linear_transpose(gather, values)(parts)
     (expected,) = jax.linear_transpose(lambda x: indexed(tissue, x), values)(parts)
     np.testing.assert_allclose(back, expected, atol=1e-14)
-    transposed = jax.jit(lambda p: jax.linear_transpose(look, values)(p))
+    transposed = jax.jit(lambda p: jax.linear_transpose(gather, values)(p))
     assert "scatter" not in transposed.lower(parts).as_text()
-    # The transpose of the transpose is where it began.
-    again = jax.linear_transpose(lambda p: jax.linear_transpose(look, values)(p)[0], parts)(values)
-    np.testing.assert_array_equal(again[0], look(values))
+    # The transpose of the transpose is the function itself.
+    again = jax.linear_transpose(lambda p: jax.linear_transpose(gather, values)(p)[0], parts)(
+        values
+    )
+    np.testing.assert_array_equal(again[0], gather(values))
 
 
 @of_each_tissue
-def test_derivatives_of_every_kind_are_those_of_indexing(tissue):
+def test_derivatives_agree_with_indexing(tissue):
     x, v = random(2, tissue.n_vertices, 2), random(3, tissue.n_vertices, 2)
-    bent = lambda look: lambda x: jnp.sum(jnp.sin(look(x)) * jnp.cos(look(x)[::-1]))
-    ours, plain = bent(lambda x: looked_up(tissue.topology, x)), bent(lambda x: indexed(tissue, x))
+    nonlinear = lambda gather: lambda x: jnp.sum(jnp.sin(gather(x)) * jnp.cos(gather(x)[::-1]))
+    ours = nonlinear(lambda x: gathered(tissue.topology, x))
+    plain = nonlinear(lambda x: indexed(tissue, x))
     for derivative in (
         jax.grad,
         jax.jacfwd,
@@ -63,28 +66,26 @@ def test_derivatives_of_every_kind_are_those_of_indexing(tissue):
         np.testing.assert_allclose(derivative(ours)(x), derivative(plain)(x), atol=1e-12)
 
 
-def test_batches_of_values_and_of_tissues():
+def test_vmap_over_values_and_topologies():
     tissues = [vx.initialise.periodic_voronoi(12, key=k) for k in range(3)]
     topologies = vx.fitting.stack([t.topology for t in tissues])
     values = random(4, 3, tissues[0].n_vertices, 2)
-    forces = jax.grad(lambda x, m: jnp.sum(looked_up(m, x) ** 3))
+    forces = jax.grad(lambda x, m: jnp.sum(gathered(m, x) ** 3))
     together = jax.vmap(forces)(values, topologies)
     for k, tissue in enumerate(tissues):
         np.testing.assert_allclose(together[k], forces(values[k], tissue.topology), rtol=1e-12)
     shared = jax.vmap(forces, in_axes=(0, None))(values, tissues[0].topology)
     np.testing.assert_allclose(shared[1], forces(values[1], tissues[0].topology), rtol=1e-12)
-    # The derivative of a batch, too.
-    total = lambda x: jnp.sum(
-        jax.vmap(lambda x: jnp.sum(looked_up(tissues[0].topology, x) ** 3))(x)
-    )
+    # Also the derivative of a batch.
+    total = lambda x: jnp.sum(jax.vmap(lambda x: jnp.sum(gathered(tissues[0].topology, x) ** 3))(x))
     np.testing.assert_allclose(jax.grad(total)(values), shared, rtol=1e-12)
 
 
-def test_what_uses_one_part_alone_has_derivatives_as_well():
+def test_derivatives_of_a_function_of_one_component():
     tissue = TISSUES["periodic"]
     x, v = random(6, tissue.n_vertices, 2), random(7, tissue.n_vertices, 2)
-    first = lambda look: lambda x: jnp.sum(look(x)[0] ** 3)
-    ours = first(lambda x: at_ends(tissue.topology, x))
+    first = lambda gather: lambda x: jnp.sum(gather(x)[0] ** 3)
+    ours = first(lambda x: gather_at_ends(tissue.topology, x))
     plain = first(lambda x: indexed(tissue, x))
     for derivative in (
         jax.grad,
@@ -94,8 +95,8 @@ def test_what_uses_one_part_alone_has_derivatives_as_well():
         np.testing.assert_allclose(derivative(ours)(x), derivative(plain)(x), atol=1e-12)
 
 
-def test_single_precision_stays():
+def test_gradient_of_float32_is_float32():
     tissue = TISSUES["periodic"]
     values = random(5, tissue.n_vertices, 2).astype(jnp.float32)
-    gradient = jax.grad(lambda x: jnp.sum(looked_up(tissue.topology, x) ** 2))(values)
+    gradient = jax.grad(lambda x: jnp.sum(gathered(tissue.topology, x) ** 2))(values)
     assert gradient.dtype == jnp.float32

@@ -1,4 +1,4 @@
-"""What makes modules pleasant to use: properties that compile as one, numbers that compile once."""
+"""Tracing and compilation: compiled properties, tests for tracers, numbers that do not recompile."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from vertax._base.announce import announced_jit
 Tree = TypeVar("Tree", bound=Any)
 
 if TYPE_CHECKING:
-    compiled_property = property  # so that type checkers see the type of each property
+    compiled_property = property  # for the types of properties
 else:
 
     class compiled_property(property):
         """A property of an Equinox module that is compiled as one function.
 
-        Outside `jax.jit` a property of thirty array operations would otherwise compile thirty functions
-        when it is first used; inside, it is inlined.
+        Outside `jax.jit`, a property of thirty array operations would otherwise compile thirty functions at
+        its first use. Inside `jax.jit` the property is inlined.
         """
 
         def __init__(self, method: Callable[[Any], Any]):
@@ -31,35 +31,34 @@ else:
 
 
 def is_concrete(value: Any) -> bool:
-    """Whether the numbers of an array can be looked at (outside of `jax.jit` and `jax.grad`)."""
+    """Whether a value is not a tracer of `jax.jit`, `jax.vmap` or `jax.grad`."""
     return not isinstance(value, jax.core.Tracer)
 
 
 def differs_between_devices(array: jax.typing.ArrayLike) -> bool:
-    """Whether `jax.shard_map` keeps track of an array as one that differs from device to device."""
+    """Whether an array varies over a mesh axis of `jax.shard_map`."""
     kind = jax.typeof(array)
-    newer = getattr(getattr(kind, "mat", None), "varying", None)  # as of JAX 0.10
+    newer = getattr(getattr(kind, "mat", None), "varying", None)  # since JAX 0.10
     return bool(newer or getattr(kind, "vma", None))
 
 
-def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """`jnp.where` of two pytrees that may hold more than arrays, with the types of the old one."""
+def tree_where(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
+    """`jnp.where` for pytrees, with the dtypes of `old`; leaves that are not arrays are those of `new`."""
     pick = lambda x, y: jnp.where(condition, x, y).astype(y.dtype) if eqx.is_array(x) else x
     return jax.tree.map(pick, new, old)
 
 
 def traced(tree: Tree, dtype: Any = None, *, integers: bool = False) -> Tree:
-    """The same pytree with arrays for its Python floats (and integers), and without weakly typed arrays.
+    """Replace Python floats (and integers) by arrays, and weakly typed arrays by strongly typed ones.
 
-    `equinox.filter_jit` compiles a function again for another Python number and for another type of an
-    array. Weak types differ between a number, `jnp.full(n, 3.7)` and the result of a computation.
+    `equinox.filter_jit` compiles a function again for another Python number and for another weak type of an
+    array. `jnp.full(n, 3.7)` is weakly typed; the result of a computation usually is not.
 
     **Arguments:**
 
     - `tree`: the pytree.
-    - `dtype`: the floating-point type of floats and of weakly typed arrays, usually that of the tissue. If
-        left out, floats become weakly typed arrays, which take the precision of what they are combined with,
-        and weakly typed arrays stay.
+    - `dtype`: dtype of floats and weakly typed arrays, usually that of the tissue. By default floats become
+        weakly typed arrays and weakly typed arrays stay.
     - `integers`: convert Python integers too.
     """
 

@@ -1,4 +1,4 @@
-"""A tissue that knows its lengths and areas has those of any other."""
+"""The cached geometry of a `MeasuredTissue` agrees with that of its tissue."""
 
 import equinox as eqx
 import jax
@@ -8,7 +8,7 @@ import pytest
 from free_helpers import cluster
 
 import vertax as vx
-from vertax.mesh._measured import Measured
+from vertax.mesh._measured_tissue import MeasuredTissue
 
 TISSUES = {
     "periodic": lambda: vx.initialise.periodic_voronoi(12, key=0),
@@ -20,29 +20,29 @@ PROPERTIES = ("edge_lengths", "areas", "perimeters", "shape_factors")
 
 
 @pytest.mark.parametrize("kind", TISSUES)
-def test_properties_and_two_derivatives_are_those_of_the_tissue(kind):
+def test_properties_and_derivatives_agree_with_the_tissue(kind):
     tissue = TISSUES[kind]()
     start = tissue.configuration
-    way = jax.tree.map(lambda x: jax.random.normal(jax.random.key(1), x.shape), start)
+    direction = jax.tree.map(lambda x: jax.random.normal(jax.random.key(1), x.shape), start)
 
     def energy(t):
         return sum(jnp.sum(jnp.sin((k + 2) * getattr(t, p))) for k, p in enumerate(PROPERTIES))
 
-    def looked_at(wrap):
+    def values(wrap):
         at = lambda x: energy(wrap(tissue.with_configuration(x)))
-        return jax.jit(lambda x: (at(x), *jax.jvp(jax.grad(at), (x,), (way,))))(start)
+        return jax.jit(lambda x: (at(x), *jax.jvp(jax.grad(at), (x,), (direction,))))(start)
 
-    known, plain = looked_at(Measured), looked_at(lambda t: t)
-    for one, other in zip(jax.tree.leaves(known), jax.tree.leaves(plain), strict=True):
+    cached, plain = values(MeasuredTissue), values(lambda t: t)
+    for one, other in zip(jax.tree.leaves(cached), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10 * np.abs(other).max())
 
 
-def test_what_is_known_counts_for_the_very_same_arrays_only():
+def test_cache_is_valid_for_the_same_arrays_only():
     tissue = TISSUES["periodic"]()
     moved = 1.1 * tissue.vertices
     wide = vx.Periodic(1.1 * tissue.boundary.lattice)
     both = lambda t: (t.vertices, t.boundary)
-    grown, measured = eqx.tree_at(both, tissue, (moved, wide)), Measured(tissue)
+    grown, measured = eqx.tree_at(both, tissue, (moved, wide)), MeasuredTissue(tissue)
     elsewhere = {
         "method": eqx.tree_at(lambda t: t.boundary, measured.with_vertices(moved), wide),
         "tree_at": eqx.tree_at(both, measured, (moved, wide)),

@@ -1,4 +1,4 @@
-"""What tables of half-edges must be before anything is made of them."""
+"""Checks of the arrays of a topology."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 
-def check_arrays(
+def check_half_edge_arrays(
     twin: Shaped[Array | np.ndarray, "..."],
     cell: Shaped[Array | np.ndarray, "..."],
     frame: Shaped[Array | np.ndarray, "..."],
     *,
-    known: bool,
+    concrete: bool,
 ) -> None:
-    """Refuse what is no table of half-edges.
+    """Check shapes, dtypes and values of the arrays of half-edges.
 
     **Arguments:**
 
-    - `twin`, `cell`, `frame`: as of [`Topology`][vertax.Topology].
-    - `known`: whether their numbers can be looked at; otherwise only shapes and types are checked.
+    - `twin`, `cell`, `frame`: as for [`Topology`][vertax.Topology].
+    - `concrete`: whether the arrays are concrete; for tracers only shapes and dtypes are checked.
 
     **Raises:**
 
-    - `ValueError` naming the argument.
+    - `ValueError` with the name of the argument.
     """
     if twin.ndim != 1 or twin.size == 0 or twin.size % 6 != 0:
         raise ValueError(
@@ -45,7 +45,7 @@ def check_arrays(
                 f"Argument `{name}` must have {what} for each half-edge, shape {shape}, but its shape is "
                 f"{array.shape}."
             )
-    if not known:
+    if not concrete:
         return
     h = np.arange(n_half)
     if twin.min() < 0 or twin.max() >= n_half or np.any(twin[twin] != h):
@@ -63,6 +63,6 @@ def check_arrays(
     limits = np.iinfo(np.int32)
     if frame.min() < limits.min or frame.max() > limits.max:
         raise ValueError(
-            "Argument `frame` must hold lattice images that 32 bits can number, but goes from "
+            "Argument `frame` must hold lattice images in the range of 32-bit integers, but goes from "
             f"{frame.min()} to {frame.max()}."
         )

@@ -1,6 +1,7 @@
-"""Cells come and go: what changes of the connectivity when one divides, vanishes or fuses.
+"""Euler operators of the mesh: split a cell, collapse a triangle, merge two cells.
 
-All of this is for one place at a time, whose half-edge may be traced; `do` says whether anything happens.
+Each operator changes one place of the mesh; its half-edge may be traced. If the boolean `do` is False the
+topology is unchanged.
 """
 
 from __future__ import annotations
@@ -15,33 +16,33 @@ from jaxtyping import Array, Bool, Int
 from vertax.mesh._topology import Topology, clockwise, counter_clockwise, source, take
 
 Index = Int[Array, ""]
-Yes = Bool[Array, ""]
+Condition = Bool[Array, ""]
 
 
 class Slot(NamedTuple):
-    """Room for one cell more."""
+    """A spare slot: the numbers for one new cell."""
 
     cell: Index
     vertices: tuple[Index, Index]
     edges: tuple[Index, Index, Index]
-    there: Yes
-    """Whether there is any; if not the numbers mean nothing."""
+    available: Condition
+    """Whether there is a spare slot; otherwise the numbers are undefined."""
 
 
 def spare_slot(topology: Topology) -> Slot:
-    """The first spare slot of each kind."""
+    """The first spare slot."""
     m, dtype = topology, topology.twin.dtype
-    none = jnp.zeros((), dtype)
+    zero = jnp.zeros((), dtype)
     if not m.spare:
-        return Slot(none, (none, none), (none, none, none), jnp.array(False))
+        return Slot(zero, (zero, zero), (zero, zero, zero), jnp.array(False))
     cell, vertex = (jnp.argmin(alive).astype(dtype) for alive in (m.alive, m.alive_vertices))
     first, second, third = (take(m.edge, 3 * vertex + k) for k in range(3))
     other = source(take(m.twin, 3 * vertex))
     return Slot(cell, (vertex, other), (first, second, third), ~jnp.all(m.alive))
 
 
-def _put(array: Array, do: Yes, *pairs: tuple[Index, Array]) -> Array:
-    """Write values at indices, if at all."""
+def _put(array: Array, do: Condition, *pairs: tuple[Index, Array]) -> Array:
+    """Write values at indices if `do`."""
     index = jnp.stack([i for i, _ in pairs])
     values = jnp.stack([jnp.asarray(value, array.dtype) for _, value in pairs])
     return array.at[jnp.where(do, index, array.shape[0])].set(values, mode="drop")
@@ -54,15 +55,15 @@ def _with(topology: Topology, **arrays: Array) -> Topology:
     )
 
 
-def insert_vertex(m: Topology, h: Index, vertex: Index, edge: Index, do: Yes) -> Topology:
-    """Put a vertex of a spare slot on an edge, and a new edge between it and the end of half-edge `h`.
+def insert_vertex(m: Topology, h: Index, vertex: Index, edge: Index, do: Condition) -> Topology:
+    """Split the edge of half-edge `h` by a vertex of a spare slot.
 
-    Of its half-edges the first goes on to the end of `h`, the third goes back; the second points into the
-    cell on the left of `h` and is for the caller to connect.
+    A new edge joins the vertex and the end of `h`. The first half-edge of the vertex leads to the end of `h`,
+    the third to its start; the second points into the cell on the left of `h` and is not connected yet.
     """
     ahead, inward, back = (3 * vertex + k for k in range(3))
     t, old = take(m.twin, h), take(m.edge, h)
-    # At a corner the cell and the image are those of the corner where `h` begins.
+    # The corner of the right cell at the start of `h` has this cell and image.
     behind = clockwise(h)
     forward = take(m.half_edge, old) == h
     return _with(
@@ -92,61 +93,61 @@ def insert_vertex(m: Topology, h: Index, vertex: Index, edge: Index, do: Yes) ->
     )
 
 
-def split_cell(m: Topology, first: Index, second: Index, slot: Slot, do: Yes) -> Topology:
-    """Divide a cell by an edge between two of its sides, as half-edges with the cell on their left.
+def split_cell(m: Topology, first: Index, second: Index, slot: Slot, do: Condition) -> Topology:
+    """Split a cell by an edge between two of its sides, given as half-edges with the cell on their left.
 
-    The new vertices of the slot lie on the first and on the second side. What comes after the first and
-    before the second becomes the new cell.
+    The new vertices of the slot are on the first and the second side. The part of the cell after the first
+    and before the second side becomes the new cell.
     """
     (a, b), (edge_a, edge_b, between) = slot.vertices, slot.edges
     m = insert_vertex(m, first, a, edge_a, do)
     m = insert_vertex(m, second, b, edge_b, do)
-    there, back = 3 * a + 1, 3 * b + 1
+    h, t = 3 * a + 1, 3 * b + 1  # the half-edges of the new edge
     m = _with(
         m,
-        twin=_put(m.twin, do, (there, back), (back, there)),
-        edge=_put(m.edge, do, (there, between), (back, between)),
-        half_edge=_put(m.half_edge, do, (between, there)),
+        twin=_put(m.twin, do, (h, t), (t, h)),
+        edge=_put(m.edge, do, (h, between), (t, between)),
+        half_edge=_put(m.half_edge, do, (between, h)),
     )
     return _with(m, cell=_relabelled(m, 3 * a, slot.cell, do)[0])
 
 
-def _relabelled(m: Topology, start: Index, label: Index, do: Yes) -> tuple[Array, Array]:
-    """The cells of half-edges with one face called otherwise; and which half-edges those are."""
+def _relabelled(m: Topology, start: Index, label: Index, do: Condition) -> tuple[Array, Array]:
+    """The array `cell` with a new label for the face of `start`; and the mask of its half-edges."""
 
-    # The next half-edge around a face is a permutation, so the walk returns to its start. (It also ends if
-    # it meets a half-edge again, which a broken topology may have.)
-    def one(carry: tuple) -> tuple:
+    # `next` is a permutation, so the walk around the face returns to its start. (In a broken topology it ends
+    # at the first half-edge that was visited before.)
+    def step(carry: tuple) -> tuple:
         marked, h, _ = carry
         h = clockwise(take(m.twin, h))
         return marked.at[h].set(True), h, (h != start) & ~take(marked, h)
 
     marked = jnp.zeros(m.n_half_edges, bool)
-    marked, *_ = jax.lax.while_loop(lambda carry: carry[2], one, (marked, start, do))
+    marked, *_ = jax.lax.while_loop(lambda carry: carry[2], step, (marked, start, do))
     return jnp.where(marked, label, m.cell), marked
 
 
-def _freed(m: Topology, vertices: tuple[Index, Index], edges: tuple, do: Yes) -> Topology:
-    """Make two vertices and three edges that nothing holds on to any more a spare slot."""
-    one, other = (3 * v for v in vertices)
-    here, there = [one + k for k in range(3)], [other, other + 2, other + 1]
-    pairs = [*zip(here, there, strict=True), *zip(there, here, strict=True)]
+def _freed(m: Topology, vertices: tuple[Index, Index], edges: tuple, do: Condition) -> Topology:
+    """Turn two vertices and three edges that are no longer connected into a spare slot."""
+    first, second = (3 * v for v in vertices)
+    outward, twins = [first + k for k in range(3)], [second, second + 2, second + 1]
+    pairs = [*zip(outward, twins, strict=True), *zip(twins, outward, strict=True)]
     zero = jnp.zeros(2, m.frame.dtype)
-    slots = [*here, *there]
+    half_edges = [*outward, *twins]
     return _with(
         m,
         twin=_put(m.twin, do, *pairs),
-        cell=_put(m.cell, do, *((h, jnp.asarray(m.nowhere)) for h in slots)),
-        frame=_put(m.frame, do, *((h, zero) for h in slots)),
-        edge=_put(m.edge, do, *zip(slots, [*edges, *edges], strict=True)),
-        half_edge=_put(m.half_edge, do, *zip(edges, here, strict=True)),
+        cell=_put(m.cell, do, *((h, jnp.asarray(m.spare_label)) for h in half_edges)),
+        frame=_put(m.frame, do, *((h, zero) for h in half_edges)),
+        edge=_put(m.edge, do, *zip(half_edges, [*edges, *edges], strict=True)),
+        half_edge=_put(m.half_edge, do, *zip(edges, outward, strict=True)),
     )
 
 
-def collapse_triangle(m: Topology, h: Index, do: Yes) -> Topology:
-    """Make a cell of three sides a vertex, that at which the half-edge `h` with it on its left begins.
+def collapse_triangle(m: Topology, h: Index, do: Condition) -> Topology:
+    """Collapse a cell with three sides to a vertex: the source of `h`, which has the cell on its left.
 
-    Its neighbours lose a side each; none may have less than four.
+    Each neighbour loses one side and must have at least four.
     """
     sides = [h]
     for _ in range(2):
@@ -156,19 +157,19 @@ def collapse_triangle(m: Topology, h: Index, do: Yes) -> Topology:
     kept = [outward[0]]
     for _ in range(2):
         kept.append(counter_clockwise(kept[-1]))
-    # Seen from the cell, the corners of a neighbour are one lattice vector away from its own.
-    home = take(m.frame, h)
+    # The frame of a neighbour differs from that of the cell by one lattice vector.
+    frame = take(m.frame, h)
     frames = [
-        home + take(m.frame, out) - take(m.frame, side)
+        frame + take(m.frame, out) - take(m.frame, side)
         for out, side in zip(outward, sides, strict=True)
     ]
     edges = [take(m.edge, out) for out in outward]
-    begins = [
+    half_edge = [
         jnp.where(take(m.half_edge, edge) == out, new, end)
         for edge, out, new, end in zip(edges, outward, kept, ends, strict=True)
     ]
     cells = [take(m.cell, out) for out in outward]
-    gone = tuple(take(m.edge, side) for side in sides)
+    removed = tuple(take(m.edge, side) for side in sides)
     vertices = source(sides[1]), source(sides[2])
     m = _with(
         m,
@@ -176,26 +177,26 @@ def collapse_triangle(m: Topology, h: Index, do: Yes) -> Topology:
         cell=_put(m.cell, do, *zip(kept, cells, strict=True)),
         frame=_put(m.frame, do, *zip(kept, frames, strict=True)),
         edge=_put(m.edge, do, *zip(kept, edges, strict=True)),
-        half_edge=_put(m.half_edge, do, *zip(edges, begins, strict=True)),
+        half_edge=_put(m.half_edge, do, *zip(edges, half_edge, strict=True)),
     )
-    return _freed(m, vertices, gone, do)
+    return _freed(m, vertices, removed, do)
 
 
-def merge_cells(m: Topology, h: Index, do: Yes) -> Topology:
-    """Take an edge away: the cell on the left of the half-edge `h` becomes a part of that on its right.
+def merge_cells(m: Topology, h: Index, do: Condition) -> Topology:
+    """Remove an edge: the cell on the left of the half-edge `h` becomes part of the cell on its right.
 
-    The other two edges at either end become one. This is what undoes a division.
+    The other two edges at each end become one. This is the inverse of `split_cell`.
     """
     t = take(m.twin, h)
-    # The absorbed corners are numbered in the frame of the other cell from now on.
+    # Convert the corners of the absorbed cell to the frame of the other cell.
     shift = take(m.frame, clockwise(h)) - take(m.frame, h)
     cell, marked = _relabelled(m, h, take(m.cell, t), do)
     m = _with(m, cell=cell, frame=jnp.where(marked[:, None], m.frame + shift, m.frame))
-    gone = [take(m.edge, h)]
+    removed = [take(m.edge, h)]
     for half_edge, outer in ((h, clockwise), (t, counter_clockwise)):
         kept, lost = outer(half_edge), outer(outer(half_edge))
         end, start, edge = take(m.twin, kept), take(m.twin, lost), take(m.edge, kept)
-        gone.append(take(m.edge, lost))
+        removed.append(take(m.edge, lost))
         forward = take(m.half_edge, edge) == kept
         m = _with(
             m,
@@ -203,4 +204,4 @@ def merge_cells(m: Topology, h: Index, do: Yes) -> Topology:
             edge=_put(m.edge, do, (start, edge)),
             half_edge=_put(m.half_edge, do, (edge, jnp.where(forward, start, end))),
         )
-    return _freed(m, (source(h), source(t)), tuple(gone), do)
+    return _freed(m, (source(h), source(t)), tuple(removed), do)

@@ -1,4 +1,4 @@
-"""Linear functions that bring their own transpose."""
+"""Linear functions with a custom transpose."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from jaxtyping import Array
 Several = tuple[Array, ...]
 
 
-def linear_pair(
-    name: str, there: Callable[..., Several], back: Callable[..., Several]
+def linear_with_transpose(
+    name: str, function: Callable[..., Several], transposed: Callable[..., Several]
 ) -> Callable[..., Several]:
-    """The first of two functions that are each other's transpose, as JAX is to know it.
+    """A linear function with a given transpose; the transpose of the transpose is the function again.
 
-    The transpose of a look at an array, `x[indices]`, is a scatter to JAX, which takes twice as long on a CPU
-    and adds up in any order on a GPU. Where it can be a look as well, here is how to say so. (And what comes
-    apart need not be put together for it.)
+    JAX transposes a gather, `x[indices]`, to a scatter-add, which takes twice as long on a CPU and adds in
+    undefined order on a GPU. Use this if the transpose can be written as a gather too. (Several arrays as
+    input and output avoid a concatenation in the transpose.)
 
     **Arguments:**
 
-    - `name`: what it is called in a program.
-    - `there`: a function of several arrays, in which it is linear, and of other arguments, in which it is not
-        differentiated; it returns several arrays.
-    - `back`: its transpose: of the cotangents, and of the same others.
+    - `name`: name of the primitive in a jaxpr.
+    - `function`: takes a tuple of arrays, in which it is linear, and other arguments, which are constants of
+        the differentiation; returns a tuple of arrays.
+    - `transposed`: its transpose; takes the cotangents and the same other arguments.
     """
-    one, other = Primitive(name), Primitive(f"{name}_transposed")
-    _define(one, there, other)
-    _define(other, back, one)
-    return lambda parts, *others: tuple(one.bind(*parts, *others, number=len(parts)))
+    forward, backward = Primitive(name), Primitive(f"{name}_transposed")
+    _define(forward, function, backward)
+    _define(backward, transposed, forward)
+    return lambda parts, *others: tuple(forward.bind(*parts, *others, number=len(parts)))
 
 
 def _define(primitive: Primitive, function: Callable[..., Several], transposed: Primitive) -> None:
@@ -43,12 +43,12 @@ def _define(primitive: Primitive, function: Callable[..., Several], transposed: 
     def flat(*operands: Any, number: int) -> list[Array]:
         return list(function(operands[:number], *operands[number:]))
 
-    def outcome(*operands: Any, number: int) -> list[jax.core.ShapedArray]:
+    def abstract_eval(*operands: Any, number: int) -> list[jax.core.ShapedArray]:
         out = jax.eval_shape(functools.partial(flat, number=number), *operands)
         return [jax.core.ShapedArray(x.shape, x.dtype) for x in out]
 
     def jvp(primals: Any, tangents: Any, number: int) -> tuple[Any, Any]:
-        # (JAX does not ask where all tangents are zero.)
+        # (JAX does not call this if all tangents are symbolic zeros.)
         parts = map(ad.instantiate_zeros, tangents[:number])
         changes = primitive.bind(*parts, *primals[number:], number=number)
         return primitive.bind(*primals, number=number), changes
@@ -60,17 +60,19 @@ def _define(primitive: Primitive, function: Callable[..., Several], transposed: 
         else:
             cotangents = [ad.instantiate_zeros(part) for part in cotangents]
             back = transposed.bind(*cotangents, *others, number=len(cotangents))
-        # (A part that is known is one that was filled up with zeros.)
-        unknown = [ad.is_undefined_primal(part) for part in parts]
-        wanted = [x if is_unknown else None for x, is_unknown in zip(back, unknown, strict=True)]
-        return [*wanted, *(None for _ in others)]
+        # (A defined primal is an instantiated zero; it has no cotangent.)
+        undefined = [ad.is_undefined_primal(part) for part in parts]
+        gradients = [
+            x if is_undefined else None for x, is_undefined in zip(back, undefined, strict=True)
+        ]
+        return [*gradients, *(None for _ in others)]
 
     def batched(operands: Any, axes: Any, number: int) -> tuple[list[Array], list[int]]:
         out = jax.vmap(functools.partial(flat, number=number), in_axes=axes)(*operands)
         return out, [0] * len(out)
 
     primitive.def_impl(jax.jit(flat, static_argnames="number"))
-    primitive.def_abstract_eval(outcome)
+    primitive.def_abstract_eval(abstract_eval)
     ad.primitive_jvps[primitive] = jvp
     ad.primitive_transposes[primitive] = transpose
     batching.primitive_batchers[primitive] = batched

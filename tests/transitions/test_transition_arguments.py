@@ -1,4 +1,4 @@
-"""What cannot be is named, with the remedy."""
+"""Invalid arguments of transitions and growth are rejected by name."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,32 +25,32 @@ def roomy(plain):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (5, "room for"),
-        (-1, "room for"),
+        (5, "capacity of the tissue"),
+        (-1, "capacity of the tissue"),
         (7.0, "whole number"),
         ("7", "whole number"),
         (True, "whole number"),
     ],
 )
-def test_capacities(plain, as_a_user, wrong, message):
+def test_invalid_capacities_are_rejected(plain, without_type_checks, wrong, message):
     with pytest.raises((TypeError, ValueError), match=f"`n_cells`.*{message}"):
         plain.with_capacity(wrong)
 
 
 @pytest.mark.parametrize("change", [divide, remove])
 @pytest.mark.parametrize("cell", [6, 7, -1, 1.5, None, jnp.arange(2)])
-def test_cells_that_are_none(roomy, as_a_user, change, cell):
+def test_invalid_cell_numbers_are_rejected(roomy, without_type_checks, change, cell):
     with pytest.raises((TypeError, ValueError), match="`cell`"):
         change(roomy, cell)
 
 
 @pytest.mark.parametrize("axis", [[0.0, 0.0], [1.0], [np.nan, 1.0], [np.inf, 0.0], "long"])
-def test_axes_that_are_none(roomy, as_a_user, axis):
+def test_invalid_axes_are_rejected(roomy, without_type_checks, axis):
     with pytest.raises((TypeError, ValueError), match="`axis`"):
         divide(roomy, 0, axis)
 
 
-def test_divisions_and_transitions_without_room(plain, as_a_user):
+def test_transitions_without_spare_slots_are_rejected(plain, without_type_checks):
     with pytest.raises(RuntimeError, match=r"capacity of 6 cells.*with_capacity"):
         divide(plain, 0)
     with pytest.raises(ValueError, match="with_capacity"):
@@ -77,13 +77,15 @@ def test_divisions_and_transitions_without_room(plain, as_a_user):
         {},
     ],
 )
-def test_ablations_of_what_is_none(roomy, as_a_user, wrong):
+def test_invalid_masks_of_ablation_are_rejected(roomy, without_type_checks, wrong):
     name = next(iter(wrong), "edges")
     with pytest.raises((TypeError, ValueError), match=f"`{name}`"):
         ablate(roomy, ENERGY, **wrong)
 
 
-def test_ablations_that_do_not_go_together(plain, as_a_user):
+def test_ablation_of_a_nonlocal_energy_or_without_spare_slots_is_rejected(
+    plain, without_type_checks
+):
     with pytest.raises(TypeError, match="`energy`"):
         ablate(plain, lambda tissue: 0.0, edges=jnp.zeros(18, bool))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="with_capacity"):
@@ -102,7 +104,7 @@ def test_ablations_that_do_not_go_together(plain, as_a_user):
         ("orientation", "short"),
     ],
 )
-def test_rates_that_are_none(as_a_user, name, wrong):
+def test_invalid_rates_are_rejected(without_type_checks, name, wrong):
     with pytest.raises(ValueError, match=f"`{name}`"):
         GrowAndDivide(**{"growth_rate": 0.1, "division_area": 1.5, name: wrong})
 
@@ -123,7 +125,7 @@ def test_rates_that_are_none(as_a_user, name, wrong):
         ("key", "seed"),
     ],
 )
-def test_growth_that_cannot_be(plain, roomy, as_a_user, name, wrong):
+def test_invalid_arguments_of_growth_are_rejected(plain, roomy, without_type_checks, name, wrong):
     arguments = {
         "tissue": roomy,
         "energy": lambda cells: ENERGY,

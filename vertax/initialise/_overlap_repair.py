@@ -1,4 +1,4 @@
-"""First tissues that tile the plane."""
+"""Repair of overlaps in initial tissues."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from vertax.mesh import Periodic, Tissue
 from vertax.mesh._geometry import geometry_of
 from vertax.mesh._overlaps import crossed_sides
 
-_ROUNDS = 60
+_MAX_ITERATIONS = 60
 
 
-def without_overlaps(tissue: Tissue) -> Tissue:
-    """The same tissue, mended where its cells overlap, and only there.
+def repair_overlaps(tissue: Tissue) -> Tissue:
+    """Remove overlaps of cells; only cells that overlap change.
 
-    Arcs are made flatter; and where straight edges cross, corners move towards their neighbours.
+    Angles of arcs decrease; then corners move towards their neighbours. A tissue without overlaps is returned
+    as the same object.
 
     **Raises:**
 
-    - `ValueError` if that does not help.
+    - `ValueError` if overlaps remain.
     """
     m = tissue.topology
     cell, twin = np.asarray(m.cell), np.asarray(m.twin)
     following = np.where(twin % 3 == 0, twin + 2, twin - 1)
-    for attempt in range(_ROUNDS):
-        crossed = _crossed(tissue, following, cell)
+    for attempt in range(_MAX_ITERATIONS):
+        crossed = _crossing_sides(tissue, following, cell)
         bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
         if not crossed.any():
             return tissue
@@ -37,7 +38,7 @@ def without_overlaps(tissue: Tissue) -> Tissue:
         touched[np.asarray(m.edge)[crossed]] = True
         if tissue.arcs is not None:
             tissue = tissue.with_angles(jnp.where(touched, 0.7, 1) * tissue.arcs.angles)
-        if tissue.arcs is None or attempt >= _ROUNDS // 4:
+        if tissue.arcs is None or attempt >= _MAX_ITERATIONS // 4:
             moving = np.zeros(m.n_vertices, bool)
             moving[ends[touched]] = True
             step = np.zeros((m.n_vertices, 2))
@@ -48,16 +49,16 @@ def without_overlaps(tissue: Tissue) -> Tissue:
                 tissue.vertices + 0.5 * jnp.asarray(np.where(moving[:, None], step, 0))
             )
     raise ValueError(
-        f"Cells of the first tissue overlap: {tissue.overlaps.describe()}. Smooth the outlines that it "
-        "is made from, or leave these cells out."
+        f"Cells of the initial tissue overlap: {tissue.overlaps.describe()}. Smooth the outlines from "
+        "which it is made, or leave these cells out."
     )
 
 
-def _crossed(
+def _crossing_sides(
     tissue: Tissue, following: Int[np.ndarray, " halfedges"], cell: Int[np.ndarray, " halfedges"]
 ) -> Bool[np.ndarray, " halfedges"]:
     """Which half-edges cross another side of their face."""
-    # Tissues come in all sizes. Filled up to a power of two, they share what is compiled.
+    # Pad to a power of two, so that different sizes share the compiled function.
     n = following.size
     more = max(64, 1 << (n - 1).bit_length()) - n
     start = np.repeat(np.asarray(tissue.vertices), 3, axis=0)

@@ -1,4 +1,4 @@
-"""Whether a tissue tiles the plane, by brute force: a check that shares nothing with the library's."""
+"""Overlaps of a tissue by brute force, independently of the library."""
 
 import numpy as np
 
@@ -6,7 +6,10 @@ import vertax as vx
 
 
 def faces_that_overlap(tissue: vx.Tissue, points: int = 48) -> list[int]:
-    """The faces (the exterior last) whose outline, drawn by pieces, crosses itself or is inside out."""
+    """The faces (the exterior last) with an outline that crosses itself or is inside out.
+
+    Arcs are replaced by polygons with `points` corners.
+    """
     m = tissue.topology
     following, cell = np.asarray(m.next), np.asarray(m.cell)
     vertices, lattice = np.asarray(tissue.vertices), np.zeros((2, 2))
@@ -19,7 +22,7 @@ def faces_that_overlap(tissue: vx.Tissue, points: int = 48) -> list[int]:
         first = h = int(np.flatnonzero(cell == face)[0])
         outline = []
         while True:
-            outline.append(piece(start[h], start[following[h]], angles[h], points))
+            outline.append(side_points(start[h], start[following[h]], angles[h], points))
             h = int(following[h])
             if h == first:
                 break
@@ -31,8 +34,8 @@ def faces_that_overlap(tissue: vx.Tissue, points: int = 48) -> list[int]:
     return bad
 
 
-def piece(p: np.ndarray, q: np.ndarray, angle: float, points: int) -> np.ndarray:
-    """Points from p on, without q, on an arc that bulges to the right of the way."""
+def side_points(p: np.ndarray, q: np.ndarray, angle: float, points: int) -> np.ndarray:
+    """Points on an arc from p (included) to q (excluded) that bulges to the right of its chord."""
     if abs(angle) < 1e-9:
         return p[None]
     chord = q - p

@@ -1,4 +1,4 @@
-"""Cells come and go."""
+"""Division and removal of cells."""
 
 import equinox as eqx
 import jax
@@ -39,7 +39,7 @@ def newborn(before, after):
 @each_kind
 @settings(max_examples=6, deadline=None)
 @given(mother=st.integers(0, 5), angle=st.one_of(st.none(), st.floats(0, 6.2)))
-def test_daughters_cover_what_the_mother_did(kind, mother, angle):
+def test_daughters_have_the_area_of_the_mother(kind, mother, angle):
     tissue = KINDS[kind]().with_capacity(8)
     axis = None if angle is None else jnp.array([np.cos(angle), np.sin(angle)])
     change = divide(tissue, mother, axis)
@@ -52,7 +52,7 @@ def test_daughters_cover_what_the_mother_did(kind, mother, angle):
     assert areas[mother] + areas[daughter] == pytest.approx(float(tissue.areas[mother]), abs=1e-13)
     others = np.setdiff1d(np.arange(8), [mother, daughter])
     np.testing.assert_allclose(areas[others], tissue.areas[others], atol=1e-13)
-    # Lengths too, but for the new edge; arcs are cut into arcs of the same circle.
+    # Lengths are preserved except for the new edge; arcs are split into arcs of the same circle.
     ends = np.sort(np.asarray(new.topology.edge_cells), axis=1)
     inner = (ends == sorted([mother, daughter])).all(axis=1) & ~np.asarray(
         tissue.topology.alive_edges
@@ -64,10 +64,12 @@ def test_daughters_cover_what_the_mother_did(kind, mother, angle):
         apart = new.centroids[daughter] - new.centroids[mother]
         edge = new.edge_vectors[inner][0]
         assert abs(apart @ axis) > 0
-        assert abs(edge @ axis) < 0.3 * np.linalg.norm(edge)  # clear of the corners
+        assert abs(edge @ axis) < 0.3 * np.linalg.norm(
+            edge
+        )  # not exact because of the margin at corners
 
 
-def test_the_long_axis_is_cut_across():
+def test_default_cut_is_perpendicular_to_the_long_axis():
     box = jnp.array([[6.0, 0.0], [0.0, 1.5]])
     tissue = random_tissue(4, 1, lattice=box, lloyd_steps=30).with_capacity(5)
     for mother in range(4):
@@ -76,7 +78,7 @@ def test_the_long_axis_is_cut_across():
         assert (halves > 0.3 * tissue.areas[mother]).all()
 
 
-def test_a_single_periodic_cell_grows_to_many():
+def test_repeated_divisions_of_a_periodic_cell():
     tissue = random_tissue(1).with_capacity(12)
 
     @jax.jit
@@ -97,8 +99,8 @@ def test_a_single_periodic_cell_grows_to_many():
 
 
 @pytest.mark.parametrize("inner_arcs", [False, True])
-def test_a_doublet_divides_along_every_axis(inner_arcs):
-    # The corners of its cells lie on one line, and a cut may cross one arc twice.
+def test_a_doublet_can_divide_along_any_axis(inner_arcs):
+    # The corners of its cells are collinear, and a cut may intersect one arc twice.
     tissue = doublet(inner_arcs=inner_arcs).with_angles(jnp.array([1.4, 0.3, 1.6])).with_capacity(3)
     n_sides = set()
     for mother in range(2):
@@ -116,15 +118,15 @@ def test_a_doublet_divides_along_every_axis(inner_arcs):
     assert n_sides == {(3, 3, 3), (2, 2, 4)}
 
 
-def test_a_cut_that_makes_cells_overlap_is_refused():
-    # A chevron: the line through its centroid across x leaves it and enters it again.
+def test_cuts_that_cause_overlaps_are_rejected():
+    # In a concave cell the line through the centroid may leave the cell and enter it again.
     tissue = random_tissue(6, 3)
     cell = int(tissue.topology.cell[0])
-    mine = np.flatnonzero(np.asarray(tissue.topology.cell) == cell)
+    half_edges = np.flatnonzero(np.asarray(tissue.topology.cell) == cell)
     rng = np.random.default_rng(0)
     for _ in range(20):
         shift = np.zeros((12, 2))
-        shift[mine // 3] = 0.35 * rng.normal(size=(mine.size, 2))
+        shift[half_edges // 3] = 0.35 * rng.normal(size=(half_edges.size, 2))
         bent = tissue.with_vertices(tissue.vertices + shift)
         if bent.overlaps.any:
             continue
@@ -135,7 +137,7 @@ def test_a_cut_that_makes_cells_overlap_is_refused():
             assert change.done == (change.tissue.alive.sum() == 7)
 
 
-def test_parameters_are_inherited():
+def test_daughters_inherit_parameters():
     tissue = random_tissue(6, 3).with_capacity(8)
     change = divide(tissue, 2)
     energy = vx.energies.AreaElasticity(1.0, jnp.arange(8.0)) + vx.energies.LineTension(
@@ -148,7 +150,7 @@ def test_parameters_are_inherited():
     daughter = newborn(tissue, change.tissue)
     assert areas[daughter] == 2
     assert areas[2] == 2
-    # Parts of an edge keep its tension: on either side of the new corner lie the same cells but one.
+    # Both parts of an edge keep its tension; their cells differ by one daughter only.
     cells = np.sort(np.asarray(change.tissue.topology.edge_cells), axis=1)
     old = np.sort(np.asarray(tissue.topology.edge_cells), axis=1)
     born = np.flatnonzero(
@@ -162,7 +164,7 @@ def test_parameters_are_inherited():
 
 
 class Network(vx.AbstractEnergy):
-    """An energy whose weights have as many rows as there are cells, or edges."""
+    """An energy with weights that have as many rows as there are cells or edges."""
 
     layer: eqx.nn.Linear
     rows: Float[Array, "hidden"]
@@ -195,7 +197,7 @@ def network(**fields):
     )
 
 
-def test_only_what_is_declared_is_inherited():
+def test_only_declared_axes_are_inherited():
     tissue = random_tissue(6, 3).with_capacity(8)
     change = divide(tissue, 2)
     old = network()
@@ -211,15 +213,17 @@ def test_only_what_is_declared_is_inherited():
     assert isinstance(new.given, np.ndarray)
     np.testing.assert_array_equal(new.parts["a"], old.parts["a"][edges])
     assert new.parts["b"] == 3
-    # A corner of the new edge was on an edge that began at the vertex whose entries it has.
+    # A new vertex has the entries of the vertex at the start of the split edge.
     born = np.flatnonzero(change.tissue.topology.alive_vertices & ~tissue.topology.alive_vertices)
     assert (vertices[born] < 12).all()
     np.testing.assert_array_equal(np.delete(vertices, born), np.delete(np.arange(16), born))
-    # Keys of random numbers, one a cell; and arrays outside of modules.
+    # One random key per cell; and arrays outside of modules.
     keys = {"keys": jax.random.split(jax.random.key(0), 8), "age": jnp.arange(8.0)}
-    heirs = change.inherited(keys, axis="cells")
-    assert (jax.random.key_data(heirs["keys"]) == jax.random.key_data(keys["keys"][cells])).all()
-    np.testing.assert_array_equal(heirs["age"], cells)
+    inherited = change.inherited(keys, axis="cells")
+    assert (
+        jax.random.key_data(inherited["keys"]) == jax.random.key_data(keys["keys"][cells])
+    ).all()
+    np.testing.assert_array_equal(inherited["age"], cells)
 
 
 class Undeclared(vx.AbstractEnergy):
@@ -229,7 +233,7 @@ class Undeclared(vx.AbstractEnergy):
         return jnp.sum(self.strength * tissue.perimeters)
 
 
-def test_what_is_not_declared_is_refused_by_name(as_a_user):
+def test_undeclared_axes_are_rejected_by_name(without_type_checks):
     change = divide(random_tissue(6, 3).with_capacity(8), 2)
     with pytest.raises(TypeError, match="`strength` of Undeclared must declare"):
         change.inherited(Undeclared(jnp.ones(8)))
@@ -242,7 +246,7 @@ def test_what_is_not_declared_is_refused_by_name(as_a_user):
         change.inherited(Undeclared(jnp.ones(5)), axis="faces")
 
 
-def test_a_full_pool_names_its_capacity(as_a_user):
+def test_division_without_a_spare_slot_is_rejected(without_type_checks):
     tissue = random_tissue(6, 3).with_capacity(7)
     full = divide(tissue, 0).tissue
     with pytest.raises(RuntimeError, match="capacity of 7 cells"):
@@ -261,7 +265,7 @@ def test_a_full_pool_names_its_capacity(as_a_user):
 
 
 @each_kind
-def test_a_cell_goes_and_its_neighbours_close_the_gap(kind):
+def test_neighbours_fill_the_area_of_a_removed_cell(kind):
     tissue = KINDS[kind]().with_capacity(6)
     for cell in range(2):
         change = remove(tissue, cell)
@@ -275,8 +279,8 @@ def test_a_cell_goes_and_its_neighbours_close_the_gap(kind):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 2), (3, 1), (1, 3), (2, 2)])
-def test_removal_from_a_small_box_ends(shape, as_a_user):
-    # A cell that meets itself gains a side at one end of an edge for one that it loses.
+def test_removal_from_a_small_box_terminates(shape, without_type_checks):
+    # A cell that is its own neighbour may gain a side in the flip by which it loses one.
     tissue = vx.initialise.hexagonal(*shape)
     tissue = tissue.with_capacity(tissue.n_cells)
     change = remove(tissue, 0, throw=False)
@@ -292,7 +296,7 @@ def test_removal_from_a_small_box_ends(shape, as_a_user):
 
 
 @pytest.mark.slow
-def test_events_in_a_batch():
+def test_divide_and_remove_vmap_over_tissues():
     tissues = [random_tissue(6, seed, lloyd_steps=2).with_capacity(7) for seed in (1, 2)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *tissues)
     cells = jnp.array([1, 4])
@@ -300,13 +304,13 @@ def test_events_in_a_batch():
     gone = eqx.filter_vmap(lambda t, c: remove(t, c, throw=False))(batch, cells)
     for k, tissue in enumerate(tissues):
         for many, one in ((changes, divide(tissue, cells[k])), (gone, remove(tissue, cells[k]))):
-            mine = jax.tree.map(lambda x, k=k: x[k], many.tissue)
-            assert eqx.tree_equal(mine.topology, one.tissue.topology)
-            np.testing.assert_allclose(mine.vertices, one.tissue.vertices, atol=1e-13)
+            member = jax.tree.map(lambda x, k=k: x[k], many.tissue)
+            assert eqx.tree_equal(member.topology, one.tissue.topology)
+            np.testing.assert_allclose(member.vertices, one.tissue.vertices, atol=1e-13)
 
 
 def smoothed(tissue):
-    """Vertices half-way to the middle of their neighbours, if no cells overlap then."""
+    """Move vertices half-way to the mean of their neighbours, unless cells overlap then."""
     m = tissue.topology
     vector = tissue.edge_vectors[m.edge]
     vector = jnp.where(m.forward[:, None], vector, -vector)
@@ -317,11 +321,11 @@ def smoothed(tissue):
     return jax.tree.map(lambda a, b: jnp.where(moved.overlaps.any, a, b), tissue, moved)
 
 
-def sound(tissue, box):
-    """Every invariant of a mesh that a compiled program can look at."""
+def is_valid(tissue, box):
+    """Invariants of a tissue that can be checked inside `jax.jit`."""
     m = tissue.topology
     h = jnp.arange(m.n_half_edges)
-    nowhere = m.cell == m.nowhere
+    spare = m.cell == m.spare_label
     conditions = [
         m.twin[m.twin] == h,
         m.twin != h,
@@ -329,11 +333,11 @@ def sound(tissue, box):
         m.edge[m.half_edge] == jnp.arange(m.n_edges),
         m.cell[m.next] == m.cell,
         m.offset[m.twin] == -m.offset,
-        (m.next[m.next] == h) | ~nowhere,
+        (m.next[m.next] == h) | ~spare,
         m.neighbour_counts != 1,
-        jnp.sum(m.alive_vertices) == 2 * jnp.sum(m.alive),  # that of Euler
+        jnp.sum(m.alive_vertices) == 2 * jnp.sum(m.alive),  # Euler's formula
         jnp.sum(m.alive_edges) == 3 * jnp.sum(m.alive),
-        # Simple polygons that run counter-clockwise, and cover the box once.
+        # Cells are simple counter-clockwise polygons that cover the box once.
         ~tissue.overlaps.any,
         jnp.abs(jnp.sum(tissue.areas) - box) < 1e-9 * box,
     ]
@@ -342,9 +346,11 @@ def sound(tissue, box):
 
 @eqx.filter_jit
 def random_events(tissue, key, n_events):
-    """Many T1 transitions, divisions and removals at random, and how many there were of each."""
+    """Apply random T1 transitions, divisions and removals; return the number of each."""
     box = jnp.linalg.det(tissue.boundary.lattice)
-    keep = lambda yes, new, old: jax.tree.map(lambda a, b: jnp.where(yes, a, b), new, old)
+    select = lambda condition, new, old: jax.tree.map(
+        lambda a, b: jnp.where(condition, a, b), new, old
+    )
 
     def event(i, carry):
         tissue, counts, ok = carry
@@ -361,9 +367,9 @@ def random_events(tissue, key, n_events):
 
         def birth():
             change = divide(tissue, cell, axis, throw=False)
-            # One through a concave cell may cross it: the geometry is nobody's here.
-            good = change.done & ~change.tissue.overlaps.any
-            return keep(good, change.tissue, tissue), good
+            # A cut through a concave cell may cause overlaps.
+            valid = change.done & ~change.tissue.overlaps.any
+            return select(valid, change.tissue, tissue), valid
 
         def death():
             change = removed(tissue, cell, n_alive > 4)
@@ -372,9 +378,9 @@ def random_events(tissue, key, n_events):
         kind = jax.random.randint(keys[3], (), 0, 3)
         tissue, done = jax.lax.switch(kind, [t1, birth, death])
         tissue = jax.lax.fori_loop(0, 3, lambda _, t: smoothed(t), tissue)
-        return tissue, counts.at[kind].add(done), ok & sound(tissue, box)
+        return tissue, counts.at[kind].add(done), ok & is_valid(tissue, box)
 
-    start = (tissue, jnp.zeros(3, int), sound(tissue, box))
+    start = (tissue, jnp.zeros(3, int), is_valid(tissue, box))
     return jax.lax.fori_loop(0, n_events, event, start)
 
 
@@ -386,13 +392,13 @@ def run_events(n_events):
     return tissue, np.asarray(counts)
 
 
-def test_random_events_keep_every_invariant():
+def test_random_events_preserve_all_invariants():
     _, counts = run_events(300)
     assert (counts > 20).all()
 
 
 @pytest.mark.slow
-def test_very_many_random_events_keep_every_invariant():
+def test_200000_random_events_preserve_all_invariants():
     tissue, counts = run_events(200_000)
     assert counts.sum() > 100_000
     assert (counts > 10_000).all()

@@ -1,4 +1,4 @@
-"""Functions that `jax.vmap` runs one after another on a CPU."""
+"""Sequential `jax.vmap` on a CPU."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from jaxtyping import Array
 Result = TypeVar("Result")
 
 
-def one_at_a_time(function: Callable[..., Result]) -> Callable[..., Result]:
-    """A function whose `jax.vmap` is a loop over the batch on a CPU, and a batched program elsewhere.
+def sequential_vmap_on_cpu(function: Callable[..., Result]) -> Callable[..., Result]:
+    """Make `jax.vmap` of a function a loop over the batch on a CPU, and a batched program elsewhere.
 
-    Members of a batch need different numbers of iterations. Batched, a `while` loop runs until the slowest
-    member is done, and a `cond` computes both branches; on a CPU that takes longer than one member after
-    another. The function is not differentiable while it is batched: its inputs must be constants of the
-    differentiation.
+    A batched `while_loop` runs until its slowest member ends, and a batched `cond` computes both branches. On
+    a CPU a loop over the members is faster. Under `jax.vmap` the function is not differentiable: its inputs
+    must be constants of the differentiation.
 
     **Arguments:**
 
-    - `function`: of pytrees, which returns a pytree. It must take all arrays as arguments.
+    - `function`: takes pytrees and returns a pytree. It must not close over arrays.
 
-    **Returns:** a function of the same arguments and results.
+    **Returns:** a function with the same arguments and results.
     """
 
     def call(*args: Any) -> Result:
@@ -40,7 +39,7 @@ def one_at_a_time(function: Callable[..., Result]) -> Callable[..., Result]:
             results.append((out_structure, rest))
             return flat
 
-        # Traced once: the rule below evaluates the same program again.
+        # Traced once; the batching rule below evaluates the same jaxpr.
         flat = _mapped(jaxpr_as_fun(jax.make_jaxpr(of_leaves)(*leaves)))(*leaves)
         out_structure, rest = results[-1]
         return eqx.combine(jax.tree.unflatten(out_structure, flat), rest)
@@ -49,7 +48,7 @@ def one_at_a_time(function: Callable[..., Result]) -> Callable[..., Result]:
 
 
 def _mapped(program: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
-    """A function of arrays with the rule for `jax.vmap`."""
+    """Add the batching rule to a function of arrays."""
     mapped = jax.custom_batching.custom_vmap(lambda *leaves: tuple(program(*leaves)))
 
     @mapped.def_vmap
@@ -59,7 +58,7 @@ def _mapped(program: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
 
             def one(members: list[Array]) -> Any:
                 rest = iter(members)
-                # `mapped`, so that a second `vmap` is a loop as well.
+                # `mapped`, so that a nested `vmap` is a loop too.
                 pairs = zip(leaves, batched, strict=True)
                 return mapped(*(next(rest) if is_batched else x for x, is_batched in pairs))
 
