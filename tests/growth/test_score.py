@@ -30,7 +30,7 @@ def test_the_mean_is_that_of_the_values_and_its_gradient_that_of_the_expectation
 
 
 def test_what_does_not_go_together_is_named(as_a_user):
-    with pytest.raises(ValueError, match="one entry a run"):
+    with pytest.raises(ValueError, match="one entry per run"):
         score_function(jnp.ones(3), jnp.ones(2))
     with pytest.raises(ValueError, match="`baseline`"):
         score_function(jnp.ones(1), jnp.ones(1))

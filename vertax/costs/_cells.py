@@ -41,7 +41,7 @@ class CellAreas(AbstractLeastSquaresCost):
 
     **Arguments:**
 
-    - `target`: areas to reach; scalar or one a cell.
+    - `target`: areas to reach; scalar or one per cell.
 
     **Raises:**
 
@@ -57,7 +57,7 @@ class CellAreas(AbstractLeastSquaresCost):
         """Differences of areas over the root of the number of cells."""
         if self.target.shape not in ((), (tissue.n_cells,)):
             raise ValueError(
-                "The target of CellAreas must be a scalar or have one entry a cell, shape "
+                "The target of CellAreas must be a scalar or have one entry per cell, shape "
                 f"({tissue.n_cells},), but its shape is {self.target.shape}."
             )
         differences = tissue.areas - self.target

@@ -58,7 +58,7 @@ class HomotypicLength(AbstractCost):
         """Length of the interfaces within types, or its share."""
         if self.cell_types.shape != (tissue.n_cells,):
             raise ValueError(
-                f"The types of HomotypicLength must have one entry a cell, shape ({tissue.n_cells},), "
+                f"The types of HomotypicLength must have one entry per cell, shape ({tissue.n_cells},), "
                 f"but their shape is {self.cell_types.shape}."
             )
         cells = tissue.topology.edge_cells

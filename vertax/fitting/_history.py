@@ -73,7 +73,7 @@ class Fit(eqx.Module, Generic[Energy]):
     best_epoch: Int[np.ndarray, "*batch"]
     """The epoch that they come from; -1 for a member of a batch that never reached equilibrium."""
     history: History
-    """One entry an epoch."""
+    """One entry per epoch."""
     notes: dict[str, Shaped[np.ndarray, "epochs ..."]] = eqx.field(default_factory=dict)
     """What the callback returned, by name; the first axis is that of the epochs."""
     interrupted: bool = False
@@ -96,7 +96,7 @@ class Record(Facts):
         return {"mean": record.parameters.target_shape_factor.mean()}
 
     fit = vx.fit(problem, optimiser, 200, callback=watch)
-    fit.notes["mean"]  # one number an epoch
+    fit.notes["mean"]  # one number per epoch
     ```
     """
 

@@ -54,7 +54,7 @@ def score_function(
     value, likely = as_real("value", value), as_real("log_likelihood", log_likelihood)
     if value.ndim != 1 or value.shape != likely.shape:
         raise ValueError(
-            "Arguments `value` and `log_likelihood` must have one entry a run, but have the shapes "
+            "Arguments `value` and `log_likelihood` must have one entry per run, but have the shapes "
             f"{value.shape} and {likely.shape}."
         )
     n = value.shape[0]
