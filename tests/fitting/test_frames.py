@@ -98,13 +98,13 @@ class TestBadInput:
 
     def test_costs_of_frames(self, as_a_user):
         cost = VertexDistance(random_tissue(CELLS))
-        with pytest.raises(TypeError, match="number 1 is"):
+        with pytest.raises(TypeError, match="entry 1 is"):
             Frames([cost, 1.0])  # pyright: ignore[reportArgumentType]
         for costs in ([], [cost, VertexDistance(random_tissue(CELLS + 1))]):
-            with pytest.raises(ValueError, match="at least one cost, and all of one kind"):
+            with pytest.raises(ValueError, match="at least one cost, and all of one class"):
                 Frames(costs)
         movie, truth, _ = seen()
-        with pytest.raises(ValueError, match="1 costs, so it must see 2 frames"):
+        with pytest.raises(ValueError, match="1 costs must have 2 frames"):
             Frames([VertexDistance(movie.tissue)])(movie.frames, truth)
 
     def test_materials(self, as_a_user):
