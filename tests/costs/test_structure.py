@@ -53,7 +53,10 @@ def flipped(tissue, length: float | jax.Array = 1e-9):
         half_vector = direction * length / 2
         offset = tissue.vertices[end] - (tissue.vertices[start] + vector)
         return (
-            tissue.vertices.at[start].set(middle - half_vector).at[end].set(middle + away + offset)
+            tissue.vertices.at[start]
+            .set(middle - half_vector)
+            .at[end]
+            .set(middle + half_vector + offset)
         )
 
     before = tissue.with_vertices(placed(unit))
