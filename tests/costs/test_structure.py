@@ -349,8 +349,8 @@ def test_invalid_guidance_is_rejected():
     tissue = random_tissue(6)
     guess = vx.energies.ShapeFactorEnergy(jnp.full(6, 3.7))
     problem = vx.InverseProblem(tissue, guess, CentroidDistance(tissue), response=STILL)
-    with pytest.raises(ValueError, match=r"`guidance` must give one number that is not negative"):
+    with pytest.raises(ValueError, match=r"`guidance` must return one number that is not negative"):
         vx.fit(problem, optax.adam(1e-2), 2, guidance=lambda epoch: -1.0, progress=False)
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    with pytest.raises(ValueError, match="`guidance` goes with an Optax optimiser"):
+    with pytest.raises(ValueError, match="`guidance` must be None for a least-squares solver"):
         vx.fit(problem, solver, 2, guidance=lambda epoch: 1.0, progress=False)
