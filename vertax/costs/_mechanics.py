@@ -89,7 +89,7 @@ class CellStress(AbstractLeastSquaresCost):
         if self.target.shape not in ((2, 2), selected.shape):
             raise ValueError(
                 "The target of CellStress must have the shape (2, 2) or one entry for each selected cell, "
-                f"{chosen.shape}, but its shape is {self.target.shape}."
+                f"{selected.shape}, but its shape is {self.target.shape}."
             )
         return _components(selected - self.target) / jnp.sqrt(1.0 * selected.shape[0])
 

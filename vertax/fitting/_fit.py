@@ -137,7 +137,7 @@ def fit(
     done, stopped, interrupted = _run(method, keeper, epochs, progress, callback)
     response_error = given.response.complaint()
     if stopped is not None and response_error is not None:
-        stopped = f"{stopped}. {complaint.rstrip('.')}"
+        stopped = f"{stopped}. {response_error.rstrip('.')}"
     if not done.rows:
         raise FitError(f"The fit stopped: {stopped}.", None)
     best = done.state.best
@@ -309,7 +309,7 @@ def _failure(record: Record, epoch: int) -> str:
             f"the gradient of epoch {epoch} cannot be trusted (residual {residual:.1e}; to continue anyway "
             "pass an adjoint with throw=False)"
         )
-    return f"cost ({cost}) or gradient ({slope}) is not finite in epoch {epoch}"
+    return f"cost ({cost}) or gradient ({gradient_norm}) is not finite in epoch {epoch}"
 
 
 def _first_line(error: Exception) -> str:

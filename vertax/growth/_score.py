@@ -56,7 +56,7 @@ def score_function(
     if value.ndim != 1 or value.shape != log_p.shape:
         raise ValueError(
             "Arguments `value` and `log_likelihood` must have one entry per run, but have the shapes "
-            f"{value.shape} and {likely.shape}."
+            f"{value.shape} and {log_p.shape}."
         )
     n = value.shape[0]
     if baseline is None:
