@@ -17,7 +17,7 @@ import optax
 from _arguments import count
 
 import vertax as vx
-from vertax.fitting._descent import _FIRST_LOOK as FIRST_LOOK
+from vertax.fitting._descent import _FIRST_HESSIAN_EPOCH as FIRST_LOOK
 
 jax.config.update("jax_enable_x64", True)
 # One object, so that fits share what is compiled.

@@ -1,4 +1,4 @@
-"""What drives a tissue in time."""
+"""Thermal noise, self-propulsion and fluctuating tensions."""
 
 import functools
 
@@ -48,8 +48,9 @@ def evolve(
 
 class TestThermalNoise:
     @pytest.mark.thorough
-    def test_its_forces_belong_to_the_dissipation(self):
-        # Their covariance is 2 T / dt times the matrix of the dissipation, of which this is a diagonal form.
+    def test_force_covariance_matches_the_dissipation(self):
+        # The covariance of the forces is 2 T / dt times the matrix of the dissipation; both are compared as
+        # quadratic forms along random directions.
         tissue, _ = solid()
         dissipation = SubstrateFriction(0.7) + PerimeterViscosity(0.3)
         dt, temperature = 0.1, 0.02
@@ -65,22 +66,22 @@ class TestThermalNoise:
             )[0]
             return jax.vmap(lambda key: draw(key).force.ravel())(keys)
 
-        works = np.asarray(forces(jax.random.split(KEY, 4000))) @ directions.T
-        wanted = 2 * temperature / dt * np.einsum("ki,ij,kj->k", directions, matrix, directions)
-        np.testing.assert_allclose((works**2).mean(axis=0), wanted, rtol=0.08)
-        np.testing.assert_allclose(works.mean(axis=0) / np.sqrt(wanted), 0, atol=0.06)
+        work = np.asarray(forces(jax.random.split(KEY, 4000))) @ directions.T
+        expected = 2 * temperature / dt * np.einsum("ki,ij,kj->k", directions, matrix, directions)
+        np.testing.assert_allclose((work**2).mean(axis=0), expected, rtol=0.08)
+        np.testing.assert_allclose(work.mean(axis=0) / np.sqrt(expected), 0, atol=0.06)
 
-    def test_equipartition(self):
-        # Of implicit Euler steps each mode has λ <q²> = T / (1 + λ dt / 2 ζ).
+    def test_modes_satisfy_equipartition(self):
+        # With implicit Euler steps λ <q²> = T / (1 + λ dt / 2 ζ) for each mode.
         tissue, energy = solid()
         temperature, dt, friction = 1e-6, 0.4, 2.0
         values, modes = np.linalg.eigh(dense_hessian(tissue, energy))
         values, modes = values[2:], modes[:, 2:]
         movie = evolve(ThermalNoise(temperature), dt * jnp.arange(1500))
-        moved = np.asarray(movie.frames.vertices - tissue.vertices)[200:]
-        amplitudes = moved.reshape(len(moved), -1) @ modes
+        displacement = np.asarray(movie.frames.vertices - tissue.vertices)[200:]
+        amplitudes = displacement.reshape(len(displacement), -1) @ modes
         energies = values * (amplitudes**2).mean(axis=0) * (1 + values * dt / (2 * friction))
-        # Stiff modes forget at once; so the mean over modes, by how often each has forgotten.
+        # Stiff modes decorrelate faster: weight each mode by its rate of independent samples.
         weights = 1 - np.exp(-values * dt / friction)
         assert np.average(energies, weights=weights) == pytest.approx(temperature, rel=0.03)
         slow, fast = values < np.median(values), values > np.median(values)
@@ -88,19 +89,27 @@ class TestThermalNoise:
         assert energies[slow].mean() == pytest.approx(temperature, rel=0.15)
 
     @pytest.mark.thorough
-    def test_the_same_key_gives_the_same_course_and_it_can_go_on(self):
+    def test_noise_is_reproducible_and_can_be_continued(self):
         times = 0.1 * jnp.arange(9)
-        whole = evolve(ThermalNoise(1e-4), times)
-        again = evolve(ThermalNoise(1e-4), times)
-        np.testing.assert_array_equal(whole.frames.vertices, again.frames.vertices)
+        full = evolve(ThermalNoise(1e-4), times)
+        repeated = evolve(ThermalNoise(1e-4), times)
+        np.testing.assert_array_equal(full.frames.vertices, repeated.frames.vertices)
         other = evolve(ThermalNoise(1e-4), times, key=1)
-        assert jnp.abs(other.tissue.vertices - whole.tissue.vertices).max() > 1e-3
-        half = evolve(ThermalNoise(1e-4), times[:5])
-        rest = evolve(ThermalNoise(1e-4), times[4:], key=None, drive=half.drive, tissue=half.tissue)
-        np.testing.assert_allclose(rest.frames.vertices, whole.frames.vertices[4:], atol=1e-13)
+        assert jnp.abs(other.tissue.vertices - full.tissue.vertices).max() > 1e-3
+        first_half = evolve(ThermalNoise(1e-4), times[:5])
+        second_half = evolve(
+            ThermalNoise(1e-4),
+            times[4:],
+            key=None,
+            drive=first_half.drive,
+            tissue=first_half.tissue,
+        )
+        np.testing.assert_allclose(
+            second_half.frames.vertices, full.frames.vertices[4:], atol=1e-13
+        )
 
     @pytest.mark.thorough
-    def test_its_strength_has_a_gradient(self):
+    def test_temperature_gradient_matches_finite_differences(self):
         weights = np.random.default_rng(0).normal(size=(24, 2))
 
         @eqx.filter_jit
@@ -113,15 +122,15 @@ class TestThermalNoise:
         difference = central_difference(cost, jnp.array(1e-3), jnp.array(1.0), 1e-6)
         np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
-    def test_bad_arguments(self, without_type_checks):
-        class Own(vx.AbstractDissipation):
+    def test_invalid_arguments_are_rejected(self, without_type_checks):
+        class NotASumOfSquares(vx.AbstractDissipation):
             def __call__(self, tissue, before, dt):
                 return jnp.sum((tissue.vertices - before.vertices) ** 2) / dt
 
         with pytest.raises(ValueError, match="`temperature` must be at least 0"):
             ThermalNoise(-1.0)
         with pytest.raises(ValueError, match="AbstractViscosity"):
-            evolve(ThermalNoise(1.0), [0.0, 1.0], Own())
+            evolve(ThermalNoise(1.0), [0.0, 1.0], NotASumOfSquares())
         with pytest.raises(ValueError, match="`key` is missing"):
             evolve(ThermalNoise(1.0), [0.0, 1.0], key=None)
         with pytest.raises(TypeError, match="`activity`"):
@@ -130,7 +139,7 @@ class TestThermalNoise:
 
 class TestSelfPropulsion:
     @pytest.mark.parametrize("make", [lambda: solid()[0], lambda: cluster(9, 2)])
-    def test_forces_add_up_to_those_of_the_cells(self, make):
+    def test_vertex_forces_sum_to_cell_forces(self, make):
         tissue = make()
         activity = SelfPropulsion(jnp.linspace(0.1, 1.0, tissue.n_cells), 0.0)
         angles, _ = state = activity.init(tissue, KEY)
@@ -143,9 +152,8 @@ class TestSelfPropulsion:
         total = jnp.sum(activity.force[:, None] * direction, axis=0)
         np.testing.assert_allclose(push.force.sum(axis=0), total, atol=1e-12)
 
-    def test_a_cell_walks_at_random_and_persistently(self):
-        # The centre of a cluster moves at v = F / (n ζ) with the sum F of the forces of its cells; that of
-        # each decays as exp(-D_r t), so <F(t) F(0)> does.
+    def test_direction_autocorrelation_decays_exponentially(self):
+        # <cos(θ(t) - θ(0))> = exp(-D_r t).
         diffusion, dt, n = 0.8, 0.05, 40
         activity = SelfPropulsion(1.0, diffusion)
         tissue = solid()[0]
@@ -165,10 +173,12 @@ class TestSelfPropulsion:
             return jnp.concatenate([state[0][None], angles])
 
         angles = np.asarray(jax.vmap(walk)(jax.random.split(KEY, 200)))
-        alike = np.cos(angles - angles[:, :1]).mean(axis=(0, 2))
-        np.testing.assert_allclose(alike, np.exp(-diffusion * dt * np.arange(n + 1)), atol=0.04)
+        correlation = np.cos(angles - angles[:, :1]).mean(axis=(0, 2))
+        np.testing.assert_allclose(
+            correlation, np.exp(-diffusion * dt * np.arange(n + 1)), atol=0.04
+        )
 
-    def test_the_centre_moves_with_the_sum_of_forces(self):
+    def test_centroid_velocity_is_total_force_over_friction(self):
         tissue = cluster(9, 2)
         energy = ShapeFactorEnergy(jnp.full(9, 3.4))
         activity = SelfPropulsion(0.3, 0.5)
@@ -183,28 +193,28 @@ class TestSelfPropulsion:
         )
         angles, _ = movie.drive[0]
         force = 0.3 * np.stack([np.cos(angles), np.sin(angles)], axis=-1).sum(axis=0)
-        moved = movie.tissue.vertices.mean(axis=0) - tissue.vertices.mean(axis=0)
-        np.testing.assert_allclose(moved, 0.1 * force / (2.0 * tissue.n_vertices), atol=1e-9)
+        displacement = movie.tissue.vertices.mean(axis=0) - tissue.vertices.mean(axis=0)
+        np.testing.assert_allclose(displacement, 0.1 * force / (2.0 * tissue.n_vertices), atol=1e-9)
 
-    def test_directions_align_with_movement(self):
+    def test_directions_align_with_velocity(self):
         tissue = solid()[0]
         activity = SelfPropulsion(0.1, 0.0, alignment=5.0)
         angles, _ = activity.init(tissue, KEY)
-        came_from = tissue.vertices - jnp.array([0.0, 0.01])
+        previous = tissue.vertices - jnp.array([0.0, 0.01])
         for _ in range(40):
             _, (angles, _) = activity.drive(
-                (angles, came_from), tissue, FRICTION, jnp.array(0.0), jnp.array(0.05), KEY
+                (angles, previous), tissue, FRICTION, jnp.array(0.0), jnp.array(0.05), KEY
             )
         np.testing.assert_allclose(jnp.sin(angles), 1, atol=0.05)
 
-    def test_bad_arguments(self):
+    def test_invalid_arguments_are_rejected(self):
         with pytest.raises(ValueError, match="`force`"):
             SelfPropulsion(-1.0)
-        with pytest.raises(ValueError, match="one entry a cell"):
+        with pytest.raises(ValueError, match="one entry per cell"):
             evolve(SelfPropulsion(jnp.ones(5)), [0.0, 1.0])
 
 
-def test_fluctuating_tensions_forget():
+def test_tension_autocorrelation_decays_exponentially():
     tissue = solid()[0]
     activity = FluctuatingTensions(0.2, persistence=0.5)
 
@@ -225,8 +235,8 @@ def test_fluctuating_tensions_forget():
         FluctuatingTensions(0.1, 0.0)
 
 
-def test_fluctuating_tensions_of_short_steps_in_float32():
-    # 1 - exp(-dt / τ)² rounds to 0 here.
+def test_tensions_have_the_right_variance_for_short_steps_in_float32():
+    # 1 - exp(-dt / τ)² rounds to 0 for this step.
     short = jnp.asarray(2e-8, jnp.float32)
     activity = FluctuatingTensions(jnp.float32(1.0), jnp.float32(1.0))
     start = jnp.zeros(500, jnp.float32)
@@ -235,7 +245,7 @@ def test_fluctuating_tensions_of_short_steps_in_float32():
     assert np.std(after) == pytest.approx(np.sqrt(2 * 2e-8), rel=0.1)
 
 
-def test_activities_add_and_can_be_ones_own():
+def test_custom_activity_can_be_added():
     class Wind(vx.AbstractActivity):
         force: float
 
@@ -244,7 +254,7 @@ def test_activities_add_and_can_be_ones_own():
 
     tissue = solid()[0]
     movie = evolve(Wind(0.4) + FluctuatingTensions(0.0, 1.0), [0.0, 0.5, 1.0])
-    # The whole drifts at the force over the friction.
+    # All vertices drift with the velocity force / friction.
     np.testing.assert_allclose(movie.tissue.vertices - tissue.vertices, 0.2, atol=1e-8)
     assert movie.drive[0][1].shape == (36,)
     with pytest.raises(TypeError):

@@ -1,5 +1,5 @@
 # pyright: reportArgumentType=false, reportOperatorIssue=false
-"""What costs refuse, and how."""
+"""Arguments that costs reject."""
 
 from typing import Any
 
@@ -123,27 +123,27 @@ def batch(tissue):
         (lambda: costs.mirror(np.ones(3)), ValueError, "`image` must have shape"),
     ],
 )
-def test_what_costs_are_made_of(make, error, message):
+def test_invalid_arguments_of_costs_are_rejected(make, error, message):
     with pytest.raises(error, match=message):
         make()
 
 
 @pytest.mark.parametrize("make", [costs.VertexDistance, costs.EdgeDistance, costs.CentroidDistance])
-def test_targets_in_another_space_and_batches_are_refused(make, tissue, free, batch):
+def test_batches_and_targets_of_another_boundary_are_rejected(make, tissue, free, batch):
     energy = vx.energies.ShapeFactorEnergy(3.7)
-    with pytest.raises(ValueError, match="compares a single tissue with a single target"):
+    with pytest.raises(ValueError, match="must compare a single tissue with a single target"):
         make(batch)(tissue, energy)
-    with pytest.raises(ValueError, match="compares a single tissue with a single target"):
+    with pytest.raises(ValueError, match="must compare a single tissue with a single target"):
         make(tissue)(batch, energy)
     if make is costs.CentroidDistance:
         with pytest.raises(ValueError, match="boundary of the tissue, Periodic, but has Free"):
             make(free)(tissue, energy)
-    # What the message says.
-    both = eqx.filter_jit(eqx.filter_vmap(lambda target: make(target)(tissue, energy)))(batch)
-    np.testing.assert_allclose(both, 0, atol=1e-20)
+    # The remedy of the message works.
+    values = eqx.filter_jit(eqx.filter_vmap(lambda target: make(target)(tissue, energy)))(batch)
+    np.testing.assert_allclose(values, 0, atol=1e-20)
 
 
-def test_settings_of_the_structural_cost(tissue):
+def test_invalid_settings_of_the_structural_cost_are_rejected(tissue):
     for name in ("interface_length", "epsilon", "softening"):
         for value, error in (
             (0.0, ValueError),
@@ -161,7 +161,7 @@ def test_settings_of_the_structural_cost(tissue):
 
 
 @pytest.mark.parametrize("cost", [costs.MeanShapeFactor, costs.AspectRatio])
-def test_one_number_is_wanted(cost, tissue, free):
+def test_array_as_scalar_target_is_rejected(cost, tissue, free):
     with pytest.raises(ValueError, match="`target` must be one number"):
         cost(jnp.full(2, 3.0))(free, vx.energies.ShapeFactorEnergy(3.7))
 
@@ -178,12 +178,12 @@ def test_one_number_is_wanted(cost, tissue, free):
         ({"pixel_size": -1.0}, ValueError, "`pixel_size` must be positive"),
     ],
 )
-def test_what_cannot_be_rendered(tissue, arguments, error, message):
+def test_invalid_arguments_of_render_are_rejected(tissue, arguments, error, message):
     with pytest.raises(error, match=message):
         costs.render(tissue, **{"shape": (9, 9), "psf_width": 0.2} | arguments)
 
 
-def test_a_batch_is_rendered_by_vmap(tissue, batch):
+def test_batch_is_rendered_under_vmap(tissue, batch):
     with pytest.raises(ValueError, match=r"must be a single tissue.*filter_vmap"):
         costs.render(batch, (9, 9), 0.3)
     render = eqx.filter_jit(lambda one: costs.render(one, (9, 9), 0.3))
@@ -191,17 +191,17 @@ def test_a_batch_is_rendered_by_vmap(tissue, batch):
     np.testing.assert_allclose(np.asarray(images)[1], render(tissue), rtol=1e-9)
 
 
-def test_image_costs_may_be_made_under_vmap(tissue):
+def test_image_costs_can_be_constructed_under_vmap(tissue):
     images = np.random.default_rng(0).random((2, 9, 9))
     energy = vx.energies.ShapeFactorEnergy(3.7)
     make = lambda image: costs.MeshImage(image, 0.3)
     cost = eqx.filter_jit(lambda image: make(image)(tissue, energy))
-    many = eqx.filter_vmap(cost)(jnp.asarray(images))
+    batched = eqx.filter_vmap(cost)(jnp.asarray(images))
     one_by_one = [cost(image) for image in images]
-    np.testing.assert_allclose(many, one_by_one, rtol=1e-9)
+    np.testing.assert_allclose(batched, one_by_one, rtol=1e-9)
 
 
-def test_costs_and_energies_add_up_by_sum(tissue):
+def test_builtin_sum_adds_costs_and_energies(tissue):
     energy = vx.energies.ShapeFactorEnergy(3.7)
     terms = [costs.MeanShapeFactor(3.8), costs.CellAreas(2.0)]
     total: Any = sum(terms)

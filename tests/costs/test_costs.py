@@ -19,7 +19,7 @@ class TotalPerimeter(vx.AbstractCost):
 
 
 def exact_image(tissue, shape, width):
-    """Each blurred segment in closed form, with its periodic images."""
+    """Sum of the blurred segments and their periodic images, in closed form."""
     lattice = np.asarray(tissue.boundary.lattice)
     rows, columns = shape
     fx, fy = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
@@ -56,20 +56,20 @@ def test_rendered_image_is_the_blurred_mesh(lattice, shape, pixels, accuracy):
     assert np.abs(image - exact).max() < accuracy * exact.max()
 
 
-def test_image_holds_the_total_length_of_the_edges():
+def test_integral_of_image_is_total_edge_length():
     tissue = random_tissue(9, 2)
     image = render(tissue, (64, 64), 0.15)
     assert image.mean() * 9 == pytest.approx(float(tissue.edge_lengths.sum()), rel=1e-9)
 
 
-def test_image_moves_with_the_tissue_around_the_box():
+def test_image_is_equivariant_under_periodic_translation():
     tissue = random_tissue(9, 2)
     moved = tissue.with_configuration(tissue.vertices + jnp.array([3.0 * 5 / 60, -3.0 * 70 / 60]))
     shifted = np.roll(render(tissue, (60, 60), 0.15), (-70, 5), axis=(0, 1))
     np.testing.assert_allclose(render(moved, (60, 60), 0.15), shifted, atol=1e-9)
 
 
-def test_cost_of_the_own_image_is_zero_whatever_its_brightness():
+def test_cost_of_true_image_is_zero_for_any_brightness_and_contrast():
     tissue = random_tissue(9, 2)
     image = np.asarray(render(tissue, (64, 64), 0.12))
     for scale, background in ((1.0, 0.0), (250.0, 31.0), (1e-3, -5.0)):
@@ -81,7 +81,7 @@ def test_cost_of_the_own_image_is_zero_whatever_its_brightness():
     assert value_of(MeshImage(-image, 0.12), tissue, energy) == pytest.approx(0.5)
 
 
-def test_image_cost_is_least_at_the_true_tissue():
+def test_image_cost_is_minimal_at_the_true_tissue():
     tissue, _ = relaxed(12, 1)
     cost = MeshImage(render(tissue, (64, 64), 0.1), 0.1)
     noise = random_like(tissue.vertices)
@@ -92,7 +92,7 @@ def test_image_cost_is_least_at_the_true_tissue():
     assert values[0] < values[1] < values[2]
 
 
-def test_pixels_of_no_weight_do_not_count():
+def test_pixels_of_weight_zero_are_ignored():
     tissue = random_tissue(9, 2)
     image = np.array(render(tissue, (64, 64), 0.12))
     weight = np.ones_like(image)
@@ -103,7 +103,7 @@ def test_pixels_of_no_weight_do_not_count():
 
 
 @pytest.mark.parametrize("fit_intensity", [True, False])
-def test_derivatives_of_the_image_cost(fit_intensity):
+def test_image_cost_derivatives_match_finite_differences(fit_intensity):
     target, _ = relaxed(12, 1)
     image = 3 * render(target, (48, 48), 0.15) + 2 + 0.3 * random_like(jnp.zeros((48, 48)))
     tissue = target.with_configuration(target.vertices + 0.02 * random_like(target.vertices, 1))
@@ -122,7 +122,7 @@ def test_derivatives_of_the_image_cost(fit_intensity):
     assert slope == pytest.approx(float(difference), rel=1e-6)
 
 
-def test_vertex_distance_goes_the_short_way_around():
+def test_vertex_distance_uses_the_minimum_image():
     tissue = random_tissue(9, 2)
     cost = VertexDistance(tissue)
     far = tissue.with_configuration(tissue.vertices + jnp.array([3.0 + 0.1, -6.0]))
@@ -130,7 +130,7 @@ def test_vertex_distance_goes_the_short_way_around():
     assert cost(tissue, energy) == 0
 
 
-def test_vertex_distance_follows_its_formula_and_gradient():
+def test_vertex_distance_and_gradient_match_their_formulas():
     tissue, _ = relaxed(12, 1)
     noise = 0.05 * random_like(tissue.vertices)
     moved = tissue.with_configuration(tissue.vertices + noise)
@@ -144,7 +144,7 @@ def test_vertex_distance_follows_its_formula_and_gradient():
     np.testing.assert_allclose(gradient, noise / 24, rtol=1e-9)
 
 
-def test_weighted_sums():
+def test_weighted_sum_is_the_sum_of_weighted_costs():
     tissue = random_tissue(9, 2)
     other = tissue.with_configuration(tissue.vertices + 0.1)
     a, b = VertexDistance(other), TotalPerimeter()
@@ -158,16 +158,16 @@ def test_weighted_sums():
         a + 1.0  # pyright: ignore
 
 
-def test_a_negative_weight_has_no_residuals():
+def test_residuals_reject_a_negative_weight():
     tissue = random_tissue(5)
     moved = tissue.with_vertices(tissue.vertices + 0.1)
     cost = VertexDistance(tissue) + -0.1 * VertexDistance(moved)
     assert cost(moved, energy) == pytest.approx(0.01)  # 0.02 / 2 - 0
-    with pytest.raises(RuntimeError, match="negative weight is no sum of squares"):
+    with pytest.raises(RuntimeError, match=r"must be a sum of squares .* has a negative weight"):
         cost.residuals(moved, energy)
 
 
-def test_a_cost_of_the_parameters():
+def test_cost_can_depend_on_parameters():
     class Regularised(vx.AbstractCost):
         weight: Float[Array, ""]
 
@@ -197,12 +197,12 @@ def test_mirrored_images_are_periodic():
         ((np.eye(64), -1.0), "`psf_width`"),
     ],
 )
-def test_bad_images_are_refused(arguments, message):
+def test_invalid_images_are_rejected(arguments, message):
     with pytest.raises(ValueError, match=message):
         MeshImage(*arguments)
 
 
-def test_bad_options_are_refused():
+def test_invalid_options_of_image_costs_are_rejected():
     with pytest.raises(ValueError, match="`weight` must have the shape"):
         MeshImage(np.eye(64), 0.1, weight=np.ones((3, 3)))
     with pytest.raises(ValueError, match="`weight` must be at least 0"):

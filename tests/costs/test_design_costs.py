@@ -1,4 +1,4 @@
-"""Costs of shape, elongation and patterns, and the bounded tension that designs are made with."""
+"""Costs of shapes, aspect ratio and cell types; bounded tensions."""
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ def e2(tissue, seed=0):
 
 
 def lens(angle, chord=1.0):
-    """Two cells within a pair of mirrored arcs."""
+    """Two cells enclosed by two symmetric arcs."""
     tissue = doublet()
     tissue = tissue.with_vertices(tissue.vertices * chord)
     return with_angles(tissue, angles_of(tissue).at[jnp.array([0, 2])].set(angle))
@@ -35,7 +35,7 @@ def lens(angle, chord=1.0):
 # --- values
 
 
-def test_values_of_cell_costs():
+def test_cell_costs_match_their_formulas():
     tissue = random_tissue(9, 2)
     mean = float(jnp.mean(tissue.perimeters / jnp.sqrt(tissue.areas)))
     cost = MeanShapeFactor(4.1)
@@ -49,14 +49,14 @@ def test_values_of_cell_costs():
         CellAreas(jnp.ones(4))(tissue, energy)
 
 
-def test_a_circle_has_no_long_axis():
+def test_aspect_ratio_of_a_circle_is_one_with_finite_gradient():
     circle = lens(np.pi / 2)
     assert ratio_of(circle) == pytest.approx(1, abs=1e-12)
     gradient = jax.jit(jax.grad(lambda x: aspect_ratio(circle.with_vertices(x))))(circle.vertices)
     assert np.isfinite(gradient).all()
 
 
-def test_aspect_ratio_of_a_box_is_that_of_its_sides():
+def test_box_aspect_ratio_is_ratio_of_lattice_vectors():
     stretched = vx.mechanics.deformed(random_tissue(9, 2), jnp.diag(jnp.array([0.5, 2.0])))
     assert aspect_ratio(stretched, "box") == pytest.approx(0.25)
     assert AspectRatio(0.5, "box")(stretched, energy) == pytest.approx(0.25**2)
@@ -66,8 +66,8 @@ def test_aspect_ratio_of_a_box_is_that_of_its_sides():
         aspect_ratio(stretched)
 
 
-def test_aspect_ratio_of_a_lens_is_that_of_its_area():
-    # Points on a fine grid, for angles on both sides of where the series of arcs ends.
+def test_aspect_ratio_of_a_lens_matches_moments_on_a_grid():
+    # Compare with sums over a fine grid, for angles on both sides of the limit of the series of arcs.
     for angle in (0.3, 1.0, 2.2):
         radius, depth = 1 / np.sin(angle), 1 / np.tan(angle)
         x, y = np.meshgrid(np.linspace(-3, 3, 801), np.linspace(-3, 3, 801))
@@ -80,11 +80,11 @@ def test_aspect_ratio_of_a_lens_is_that_of_its_area():
 
 
 def test_stretching_multiplies_the_aspect_ratio():
-    # Straight edges: an affine map of a polygon is an affine map of its moments.
+    # Straight edges, because an affine map of an arc is not an arc.
     tissue = cluster(8, 3, lloyd_steps=2)
     tissue = with_angles(tissue, jnp.zeros(tissue.n_edges))
-    round_ = jnp.linalg.cholesky(_covariance(tissue))
-    vertices = tissue.vertices @ jnp.linalg.inv(round_).T
+    root = jnp.linalg.cholesky(_covariance(tissue))
+    vertices = tissue.vertices @ jnp.linalg.inv(root).T
     for stretch in (1.3, 3.0, 1e6):
         elongated = tissue.with_vertices(vertices * jnp.array([stretch, 1.0]))
         assert ratio_of(elongated) == pytest.approx(stretch, rel=1e-9)
@@ -98,7 +98,7 @@ def _covariance(tissue):
 
 
 @pytest.mark.parametrize("measure", ["moments", "farthest"])
-def test_aspect_ratio_is_a_matter_of_shape(measure):
+def test_aspect_ratio_is_invariant_under_rotation_translation_and_scaling(measure):
     tissue = cluster(8, 3)
     ratio = ratio_of(tissue, measure)
     assert ratio > 1
@@ -109,7 +109,7 @@ def test_aspect_ratio_is_a_matter_of_shape(measure):
     assert AspectRatio(2.0, measure)(tissue, energy) == pytest.approx((float(ratio) - 2) ** 2)
 
 
-def test_farthest_vertices_and_the_width_across():
+def test_farthest_aspect_ratio_matches_its_definition():
     tissue = cluster(8, 3)
     points = np.asarray(tissue.vertices)
     i, j = np.unravel_index(
@@ -121,8 +121,8 @@ def test_farthest_vertices_and_the_width_across():
     assert ratio_of(tissue, "farthest") == pytest.approx(expected)
 
 
-def test_only_a_free_tissue_has_an_aspect_ratio():
-    with pytest.raises(ValueError, match="only a free tissue has"):
+def test_aspect_ratio_of_periodic_tissue_is_rejected():
+    with pytest.raises(ValueError, match="only for a free tissue"):
         AspectRatio(2.0)(random_tissue(5), energy)
 
 
@@ -140,10 +140,10 @@ def test_homotypic_length_counts_each_interface_once(make, n_types):
             homotypic += length * (types[a] == types[b])
     cost = HomotypicLength(jnp.asarray(types))
     assert value_of(cost, tissue, energy) == pytest.approx(homotypic)
-    share = HomotypicLength(jnp.asarray(types), relative=True)
-    assert value_of(share, tissue, energy) == pytest.approx(homotypic / total)
-    everything = HomotypicLength(jnp.zeros(8, int), relative=True)
-    assert value_of(everything, tissue, energy) == pytest.approx(1)
+    relative = HomotypicLength(jnp.asarray(types), relative=True)
+    assert value_of(relative, tissue, energy) == pytest.approx(homotypic / total)
+    one_type = HomotypicLength(jnp.zeros(8, int), relative=True)
+    assert value_of(one_type, tissue, energy) == pytest.approx(1)
     with pytest.raises(ValueError, match=r"\(8,\)"):
         HomotypicLength(jnp.zeros(7, int))(tissue, energy)
 
@@ -162,7 +162,7 @@ COSTS = {
 
 
 @pytest.mark.parametrize("name", COSTS)
-def test_slopes_of_the_costs(name):
+def test_cost_gradients_match_finite_differences(name):
     cost, tissue = COSTS[name], cluster(8, 1, lloyd_steps=2)
     f = jax.jit(jax.value_and_grad(lambda y: cost(tissue.with_configuration(y), energy)))
     y = tissue.configuration
@@ -175,8 +175,8 @@ def test_slopes_of_the_costs(name):
     assert slope == pytest.approx(float(difference), rel=1e-5)
 
 
-@pytest.mark.slow  # their slopes are checked above, and other costs through the equilibrium
-def test_a_gradient_through_the_equilibrium_periodic():
+@pytest.mark.slow  # the partial derivatives are checked above, hypergradients in tests/adjoints
+def test_hypergradient_matches_finite_differences_periodic():
     tissue, start = relaxed(12, 1)
     weights = (0.5, 0.3, 0.2)
     costs = (
@@ -189,7 +189,7 @@ def test_a_gradient_through_the_equilibrium_periodic():
 
 
 @pytest.mark.thorough
-def test_a_gradient_through_the_equilibrium_free():
+def test_hypergradient_matches_finite_differences_free():
     tissue = cluster(6, 1, lloyd_steps=2)
     start = e2(tissue)
     cost = AspectRatio(2.0) + 0.1 * HomotypicLength(two_types(6), relative=True)
@@ -221,29 +221,29 @@ def _check_hypergradient(tissue, start, cost):
 # --- bounded tension
 
 
-def test_a_bounded_tension_is_a_line_tension_within_bounds():
+def test_bounded_tension_stays_within_bounds():
     tissue = random_tissue(6)
     tension = jnp.linspace(0.11, 0.19, tissue.n_edges)
     bounded = BoundedTension(tension, 0.1, 0.2)
     np.testing.assert_allclose(bounded.tension, tension, rtol=1e-12)
     assert bounded(tissue) == pytest.approx(float(LineTension(tension)(tissue)))
-    # Wherever an optimiser drives it, and with no overflow.
-    for far in (-1e4, 1e4):
-        driven = eqx.tree_at(lambda e: e.logits, bounded, jnp.full(tissue.n_edges, far))
-        assert ((driven.tension >= 0.1) & (driven.tension <= 0.2)).all()
-        slope = eqx.filter_grad(lambda e: e(tissue))(driven)
+    # The bounds hold for extreme logits, without overflow.
+    for logit in (-1e4, 1e4):
+        extreme = eqx.tree_at(lambda e: e.logits, bounded, jnp.full(tissue.n_edges, logit))
+        assert ((extreme.tension >= 0.1) & (extreme.tension <= 0.2)).all()
+        slope = eqx.filter_grad(lambda e: e(tissue))(extreme)
         assert np.isfinite(slope.logits).all()
 
 
-def test_bounds_are_no_parameters():
+def test_bounds_are_not_parameters():
     bounded = BoundedTension(jnp.full(3, 0.15), 0.1, 0.2)
     assert len(jax.tree.leaves(eqx.filter(bounded, eqx.is_inexact_array))) == 1
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [((0.1, 0.2, 0.1), "`low` must be below"), ((0.3, 0.1, 0.2), "`tension` must lie between")],
+    [((0.1, 0.2, 0.1), "`low` must be below"), ((0.3, 0.1, 0.2), "`tension` must be between")],
 )
-def test_bad_bounds_are_refused(arguments, message):
+def test_invalid_bounds_are_rejected(arguments, message):
     with pytest.raises(ValueError, match=message):
         BoundedTension(*arguments)

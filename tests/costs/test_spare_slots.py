@@ -1,4 +1,4 @@
-"""Costs do not see spare slots."""
+"""Costs do not depend on spare slots."""
 
 import equinox as eqx
 import jax
@@ -24,11 +24,11 @@ from vertax.costs import (
 )
 
 ENERGY = vx.energies.ShapeFactorEnergy(3.7)
-N = 6
-ROOM = 9
-TYPES = np.arange(ROOM) % 2
+CELLS = 6
+CAPACITY = 9
+TYPES = np.arange(CAPACITY) % 2
 
-# What makes a cost of a target and its number of slots.
+# Functions of a target and its number of cell slots that return a cost.
 COSTS = {
     "vertices": lambda target, n: VertexDistance(target),
     "vertices by cells": lambda target, n: VertexDistance(target, match="cells"),
@@ -36,7 +36,7 @@ COSTS = {
     "centroids": lambda target, n: CentroidDistance(target),
     "structure": lambda target, n: IndexAwareStructural(target),
     "shape factor": lambda target, n: MeanShapeFactor(3.9),
-    "areas": lambda target, n: CellAreas(jnp.linspace(0.5, 1.5, ROOM)[:n]),
+    "areas": lambda target, n: CellAreas(jnp.linspace(0.5, 1.5, CAPACITY)[:n]),
     "interfaces": lambda target, n: HomotypicLength(TYPES[:n]),
     "relative interfaces": lambda target, n: HomotypicLength(TYPES[:n], relative=True),
     "image": lambda target, n: MeshImage(np.eye(8), 1.5),
@@ -55,42 +55,44 @@ each_cost = pytest.mark.parametrize(
 def pair(name):
     """A tissue and a target."""
     if name in ("moments", "farthest"):
-        return (vx.initialise.free_voronoi(N, key=k, lloyd_steps=2) for k in (1, 2))
-    return (random_tissue(N, 3, lloyd_steps=k) for k in (2, 3))
+        return (vx.initialise.free_voronoi(CELLS, key=k, lloyd_steps=2) for k in (1, 2))
+    return (random_tissue(CELLS, 3, lloyd_steps=k) for k in (2, 3))
 
 
 def value_and_slope(cost, tissue):
     @eqx.filter_jit
     def run(cost, tissue):
-        of = lambda vertices: cost(tissue.with_vertices(vertices), ENERGY)
-        return jax.value_and_grad(of)(tissue.vertices)
+        value = lambda vertices: cost(tissue.with_vertices(vertices), ENERGY)
+        return jax.value_and_grad(value)(tissue.vertices)
 
     return run(cost, tissue)
 
 
 @each_cost
-def test_costs_do_not_see_spare_slots(name):
+def test_costs_do_not_depend_on_spare_slots(name):
     tissue, target = pair(name)
-    value, slope = value_and_slope(COSTS[name](target, N), tissue)
-    roomy = target.with_capacity(ROOM)
-    other, other_slope = value_and_slope(COSTS[name](roomy, ROOM), tissue.with_capacity(ROOM))
+    value, slope = value_and_slope(COSTS[name](target, CELLS), tissue)
+    target_with_spare_slots = target.with_capacity(CAPACITY)
+    other, other_slope = value_and_slope(
+        COSTS[name](target_with_spare_slots, CAPACITY), tissue.with_capacity(CAPACITY)
+    )
     assert value > 1e-6
     assert other == pytest.approx(float(value), rel=1e-9)
     np.testing.assert_allclose(other_slope[: len(slope)], slope, atol=1e-9)
     np.testing.assert_allclose(other_slope[len(slope) :], 0, atol=1e-15)
 
 
-def test_structures_of_tissues_with_different_cells():
-    target = random_tissue(N, 3, lloyd_steps=2).with_capacity(ROOM)
+def test_structural_cost_compares_tissues_with_different_cell_numbers():
+    target = random_tissue(CELLS, 3, lloyd_steps=2).with_capacity(CAPACITY)
     cost = IndexAwareStructural(target)
     divided = vx.transitions.divide(target, 1).tissue
-    same, more = (float(eqx.filter_jit(cost)(t, ENERGY)) for t in (target, divided))
+    same, different = (float(eqx.filter_jit(cost)(t, ENERGY)) for t in (target, divided))
     assert same == pytest.approx(0, abs=1e-3)
-    assert more > 0.1
-    # Seen from the other side it is the same.
-    back = float(
+    assert different > 0.1
+    # Exchanging tissue and target changes little.
+    reverse = float(
         eqx.filter_jit(IndexAwareStructural(divided, cost.interface_length))(target, ENERGY)
     )
-    assert back == pytest.approx(more, rel=0.1)
+    assert reverse == pytest.approx(different, rel=0.1)
     assert mismatched_neighbours(target, target) == 0
     assert mismatched_neighbours(divided, target) > 2

@@ -15,7 +15,7 @@ from vertax.energies import (
     ShapeFactorEnergy,
 )
 
-tissue = random_tissue(12, 1, lloyd_steps=5)  # no edge so short that its length bends over a step
+tissue = random_tissue(12, 1, lloyd_steps=5)  # without short edges, for accurate finite differences
 per_cell = lambda seed: 1 + 0.3 * jax.random.uniform(jax.random.key(seed), (12,))
 per_edge = 1 + jax.random.uniform(jax.random.key(9), (36,))
 
@@ -40,7 +40,7 @@ ENERGIES = [
 name_of = lambda e: type(e).__name__
 
 
-def test_values():
+def test_energies_match_their_formulas():
     a, p, length = tissue.areas, tissue.perimeters, tissue.edge_lengths
     p0, a0 = 3 * per_cell(0), per_cell(1)
     np.testing.assert_allclose(ShapeFactorEnergy(p0)(tissue), np.sum((a - 1) ** 2 + (p - p0) ** 2))
@@ -97,7 +97,7 @@ def test_local_energies_are_the_sum_of_their_terms():
     assert energy(tissue) == pytest.approx(float(cells.sum() + edges.sum()))
 
 
-def test_a_sum_with_a_general_energy_is_general():
+def test_sum_with_a_nonlocal_energy_is_not_local():
     energy = Contractility(per_cell(6)) + ShapeFactorEnergy(3.6)
     assert not isinstance(energy, vx.AbstractLocalEnergy)
     assert energy(tissue) == pytest.approx(
@@ -107,7 +107,7 @@ def test_a_sum_with_a_general_energy_is_general():
         energy + 3.0  # pyright: ignore
 
 
-def test_python_numbers_are_constants_and_arrays_are_parameters():
+def test_numbers_are_constants_and_arrays_are_parameters():
     energy = ShapeFactorEnergy(jnp.full(12, 3.7)) + AreaElasticity(20, 1.0)
     assert len(jax.tree.leaves(eqx.filter(energy, eqx.is_inexact_array))) == 1
 
@@ -122,6 +122,6 @@ def test_python_numbers_are_constants_and_arrays_are_parameters():
         LineTension(jnp.ones(12)),
     ],
 )
-def test_parameters_of_the_wrong_shape_are_named(energy):
+def test_parameters_of_wrong_shape_are_rejected(energy):
     with pytest.raises(ValueError, match=r"Parameter `.*` must be a scalar or have one entry"):
         energy(tissue)

@@ -1,5 +1,5 @@
 # pyright: reportArgumentType=false
-"""What energies refuse, and how."""
+"""Arguments and fields that energies reject."""
 
 from typing import Any
 
@@ -57,18 +57,20 @@ from vertax.energies import (
         ),
     ],
 )
-def test_what_is_no_parameter_is_named(make, error, message, without_type_checks):
+def test_invalid_parameters_are_rejected(make, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         make()
 
 
-def test_whole_numbers_in_an_array_are_parameters_too():
+def test_integer_arrays_become_parameters():
     energy = ShapeFactorEnergy(np.full(6, 4))
     assert eqx.is_inexact_array(energy.target_shape_factor)
-    assert isinstance(ShapeFactorEnergy(4).target_shape_factor, float)  # and one number a constant
+    assert isinstance(
+        ShapeFactorEnergy(4).target_shape_factor, float
+    )  # a Python number is a constant
 
 
-def test_a_batch_of_tissues_wants_vmap():
+def test_batch_of_tissues_requires_vmap():
     tissue = random_tissue(6)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
     energy = ShapeFactorEnergy(3.7) + LineTension(0.1)
@@ -89,7 +91,7 @@ class Odd(AbstractEnergy):
         return jnp.sum(tissue.perimeters**2)
 
 
-# (Equinox warns of static arrays, and accepts them.)
+# Equinox accepts static arrays with a warning.
 @pytest.mark.filterwarnings("ignore:A JAX array is being set as static")
 @pytest.mark.parametrize(
     ("make", "message"),
@@ -101,12 +103,12 @@ class Odd(AbstractEnergy):
         (lambda: Odd(np.array(["a", "b"])), "`strength` of Odd must hold numbers"),
     ],
 )
-def test_fields_that_cannot_be_compiled_are_refused_by_name(make, message):
+def test_fields_that_cannot_be_compiled_are_rejected(make, message):
     with pytest.raises(TypeError, match=message):
         make()
 
 
-def test_unusual_fields_work_more_than_once():
+def test_energies_with_unusual_fields_can_be_evaluated_twice():
     tissue = random_tissue(3, 1)
     value = eqx.filter_jit(lambda energy: energy(tissue))
     for odd in (

@@ -1,6 +1,5 @@
 """A class of energies in place of an instance is rejected by every public function, with the remedy."""
 
-# Wrong types are the point here.
 # pyright: reportArgumentType=false
 
 import jax.numpy as jnp

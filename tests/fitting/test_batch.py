@@ -20,8 +20,8 @@ def problem(seed, **options):
     )
 
 
-def test_a_member_of_a_batch_is_what_was_put_there():
-    # Problems hold functions (`trainable`) and settings beside arrays.
+def test_member_inverts_stack():
+    # Problems hold arrays, functions (`trainable`) and settings.
     problems = [problem(seed) for seed in range(3)]
     batch = stack(problems)
     assert batch.tissue.vertices.shape == (3, 12, 2)
@@ -30,30 +30,30 @@ def test_a_member_of_a_batch_is_what_was_put_there():
     assert member(batch, 1).trainable is problems[1].trainable
 
 
-def test_numpy_arrays_are_stacked_too():
+def test_numpy_arrays_are_stacked():
     batch = stack([{"x": np.arange(2), "n": 1}, {"x": np.arange(2) + 5, "n": 1}])
     np.testing.assert_array_equal(batch["x"], [[0, 1], [5, 6]])
     assert member(batch, 1)["n"] == 1
 
 
-def test_what_cannot_be_a_batch_is_refused():
+def test_stack_rejects_different_trees():
     with pytest.raises(ValueError, match="at least one"):
         stack([])
     with pytest.raises(ValueError, match="one structure"):
         stack([random_tissue(6), vx.initialise.free_voronoi(6, key=jax.random.key(0))])
     with pytest.raises(ValueError, match="equal shapes"):
         stack([jnp.zeros(2), jnp.zeros(3)])
-    # JAX would have kept the first one for all.
+    # Without the check jax.tree.map would keep the first value for all.
     with pytest.raises(ValueError, match=r"one holds 1\.0 where another holds 2\.0"):
         stack([{"a": 1.0}, {"a": 2.0}])
 
 
-def test_a_member_that_is_not_there_is_refused():
+def test_member_rejects_an_index_out_of_range():
     with pytest.raises(IndexError, match="0 … 1"):
         member(stack([jnp.zeros(2), jnp.ones(2)]), 2)
 
 
-def test_guidance_of_a_batch_is_that_of_each_fit():
+def test_batched_fit_with_guidance_matches_single_fits():
     fit = lambda problem, **options: vx.fit(
         problem,
         optax.sgd(1e-3),
@@ -63,11 +63,11 @@ def test_guidance_of_a_batch_is_that_of_each_fit():
         **options,
     )
     problems = [problem(seed) for seed in range(2)]
-    together = fit(stack(problems), batched=True)
-    np.testing.assert_allclose(together.history.guidance, [1.0, 0.5])
-    for index, alone in enumerate(map(fit, problems)):
+    batched = fit(stack(problems), batched=True)
+    np.testing.assert_allclose(batched.history.guidance, [1.0, 0.5])
+    for index, single in enumerate(map(fit, problems)):
         np.testing.assert_allclose(
-            member(together, index).energy.target_shape_factor,
-            alone.energy.target_shape_factor,
+            member(batched, index).energy.target_shape_factor,
+            single.energy.target_shape_factor,
             rtol=1e-9,
         )

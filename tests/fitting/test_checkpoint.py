@@ -1,4 +1,4 @@
-"""Fits that stop in the middle and go on."""
+"""Interrupted fits that are resumed from checkpoints."""
 
 import dataclasses
 from typing import Any
@@ -53,19 +53,19 @@ def run(case, epochs=EPOCHS, **changes):
 
 
 def bits(outcome):
-    """All numbers of a fit but the time that it took."""
+    """The bytes of all numbers of a fit, except the seconds."""
     timeless = dataclasses.replace(outcome.history, seconds=np.zeros_like(outcome.history.seconds))
     leaves = jax.tree.leaves(dataclasses.replace(outcome, history=timeless))
     return [(np.shape(x), np.asarray(x).tobytes()) for x in leaves]
 
 
 def interrupt_at(epoch):
-    def watch(number, record):
+    def callback(number, record):
         if number == epoch:
             raise KeyboardInterrupt
         return {"cost": record.cost}
 
-    return watch
+    return callback
 
 
 @pytest.fixture
@@ -80,42 +80,42 @@ MARKS |= dict.fromkeys(("least squares", "position"), pytest.mark.thorough)
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=MARKS.get(c, ())) for c in CASES])
-def test_an_interrupted_fit_goes_on_to_the_same_numbers(case, path):
-    whole = run(case, callback=interrupt_at(None))
+def test_resumed_fit_matches_uninterrupted_fit(case, path):
+    uninterrupted = run(case, callback=interrupt_at(None))
     stopped = run(case, callback=interrupt_at(3), checkpoint=path)
     assert stopped.interrupted
     assert len(stopped.history.cost) == 3
-    seen = []
-    watch = lambda epoch, record: seen.append(epoch) or {"cost": record.cost}
-    again = run(case, callback=watch, checkpoint=path)
-    assert not again.interrupted
-    assert seen == list(range(3, len(whole.history.cost)))
-    assert bits(again) == bits(whole)
-    np.testing.assert_array_equal(again.notes["cost"], whole.history.cost)
+    epochs_run = []
+    callback = lambda epoch, record: epochs_run.append(epoch) or {"cost": record.cost}
+    resumed = run(case, callback=callback, checkpoint=path)
+    assert not resumed.interrupted
+    assert epochs_run == list(range(3, len(uninterrupted.history.cost)))
+    assert bits(resumed) == bits(uninterrupted)
+    np.testing.assert_array_equal(resumed.notes["cost"], uninterrupted.history.cost)
 
 
 @pytest.mark.thorough
-def test_a_fit_that_knows_its_hessian_goes_on_to_the_same_numbers(path, monkeypatch):
-    monkeypatch.setattr(_descent, "_FIRST_LOOK", 2)
-    monkeypatch.setattr(_descent, "_NEXT_LOOK", 2)
-    whole = run("adam", callback=interrupt_at(None))
+def test_resumed_fit_with_recycled_hessian_matches_uninterrupted_fit(path, monkeypatch):
+    monkeypatch.setattr(_descent, "_FIRST_HESSIAN_EPOCH", 2)
+    monkeypatch.setattr(_descent, "_HESSIAN_INTERVAL", 2)
+    uninterrupted = run("adam", callback=interrupt_at(None))
     run("adam", callback=interrupt_at(4), checkpoint=path)
-    assert bits(run("adam", callback=interrupt_at(None), checkpoint=path)) == bits(whole)
+    assert bits(run("adam", callback=interrupt_at(None), checkpoint=path)) == bits(uninterrupted)
 
 
-def test_a_fit_that_is_done_is_not_repeated_but_may_be_continued(path):
-    done = run("adam", checkpoint=path)
-    refuse = lambda *_: pytest.fail("an epoch was repeated")
-    again = run("adam", checkpoint=path, callback=refuse)
-    assert bits(again) == bits(done)
-    np.testing.assert_array_equal(again.history.seconds, done.history.seconds)
+def test_finished_fit_is_not_repeated_and_can_be_extended(path):
+    finished = run("adam", checkpoint=path)
+    fail = lambda *_: pytest.fail("an epoch was repeated")
+    resumed = run("adam", checkpoint=path, callback=fail)
+    assert bits(resumed) == bits(finished)
+    np.testing.assert_array_equal(resumed.history.seconds, finished.history.seconds)
     longer = run("adam", EPOCHS + 3, checkpoint=path)
     assert bits(longer) == bits(run("adam", EPOCHS + 3))
     with pytest.raises(ValueError, match=f"holds {EPOCHS + 3} epochs, but argument `epochs` is 2"):
         run("adam", 2, checkpoint=path)
 
 
-def test_a_killed_fit_goes_on_from_its_last_checkpoint(path):
+def test_killed_fit_resumes_from_its_last_checkpoint(path):
     def kill(epoch, record):
         if epoch == 4:
             raise ZeroDivisionError
@@ -128,7 +128,7 @@ def test_a_killed_fit_goes_on_from_its_last_checkpoint(path):
     assert [file.name for file in path.parent.iterdir()] == ["fit.npz"]
 
 
-def test_a_short_fit_is_written_once(path, monkeypatch):
+def test_short_fit_is_saved_once(path, monkeypatch):
     written = []
     monkeypatch.setattr("vertax._base.checkpoints._save", lambda *_: written.append(1))
     run("adam", checkpoint=path)
@@ -147,7 +147,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("message", OTHERS)
-def test_the_checkpoint_of_another_fit_is_refused(message, path):
+def test_checkpoint_of_another_fit_is_rejected(message, path):
     run("adam", 2, checkpoint=path)
     before = path.read_bytes()
     arguments = {"problem": PROBLEM, "optimiser": ADAM, "truth": TRUTH} | OTHERS[message]
@@ -157,7 +157,7 @@ def test_the_checkpoint_of_another_fit_is_refused(message, path):
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
-def test_a_truncated_checkpoint_is_refused(kept, path):
+def test_truncated_checkpoint_is_rejected(kept, path):
     run("adam", 2, checkpoint=path)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
@@ -165,12 +165,12 @@ def test_a_truncated_checkpoint_is_refused(kept, path):
         run("adam", 3, checkpoint=path)
 
 
-def test_a_checkpoint_needs_a_folder(path):
+def test_checkpoint_in_a_missing_folder_is_rejected(path):
     with pytest.raises(FileNotFoundError, match=r"no folder .*none\. Make it first"):
         run("adam", 3, checkpoint=path.parent / "none" / "fit.npz", callback=pytest.fail)
 
 
-def test_foreign_files_are_refused(path):
+def test_files_of_another_format_are_rejected(path):
     vx.save_tissue(path, PROBLEM.tissue)
     with pytest.raises(ValueError, match=r"is not a vertax checkpoint file.*Delete the file"):
         run("adam", 3, checkpoint=path)
@@ -186,14 +186,14 @@ def test_foreign_files_are_refused(path):
         ({"identity": "{"}, "is the checkpoint of a fit with another problem"),
     ],
 )
-def test_contradictions_are_refused(changes, message, path):
+def test_inconsistent_checkpoints_are_rejected(changes, message, path):
     run("adam", 2, checkpoint=path)
     rewritten(path, **changes)
     with pytest.raises(ValueError, match=rf"fit\.npz.*{message}"):
         run("adam", 3, checkpoint=path)
 
 
-def test_notes_keep_their_names():
+def test_notes_with_changing_names_are_rejected():
     with pytest.raises(
         ValueError, match=r"same names in each epoch \(a\), but returned b in epoch 1"
     ):
@@ -202,6 +202,6 @@ def test_notes_keep_their_names():
         run("adam", 3, callback=lambda epoch, _: {"a": 1.0} if epoch else None)
 
 
-def test_checkpoints_are_written_at_times_that_make_sense(path):
+def test_negative_checkpoint_interval_is_rejected(path):
     with pytest.raises(ValueError, match="`every` must not be negative"):
         vx.Checkpoint(path, every=-1)

@@ -1,4 +1,4 @@
-"""Fits of tissues on their way: costs of several frames, and materials."""
+"""Fits of evolutions: costs of several frames, and materials."""
 
 import functools
 
@@ -28,8 +28,8 @@ TIMES = (0.0, 0.2, 0.5)
 
 
 @functools.cache
-def seen():
-    """A movie, what it was made of, and a first guess."""
+def movie_problem():
+    """An evolution, its true material, and an inverse problem with an initial guess."""
     tissue, energy = relaxed(CELLS, 1, 3.5)
     p0 = energy.target_shape_factor
     truth = Material(ShapeFactorEnergy(p0 + 0.1 * random_like(p0, 3)), SubstrateFriction(2.0))
@@ -41,59 +41,59 @@ def seen():
 
 
 @pytest.mark.slow  # the Jacobian through all steps compiles for most of a minute
-def test_energy_and_friction_are_found_from_a_movie():
-    _, truth, problem = seen()
+def test_energy_and_friction_are_recovered_from_a_movie():
+    _, truth, problem = movie_problem()
     fit = vx.fit(problem, LEAST_SQUARES, 30, truth=truth, progress=False)
     assert fit.history.relative_error[-1] < 1e-6
     assert isinstance(fit.energy.dissipation, SubstrateFriction)
     np.testing.assert_allclose(fit.energy.dissipation.coefficient, 2.0, rtol=1e-6)
-    # It begins at the first frame again in each epoch, and so does what is known of the errors.
-    known = vx.uncertainty(problem, fit)
-    assert known.noise < 1e-8
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(known.deviation))
+    # The uncertainty also starts from the first frame.
+    errors = vx.uncertainty(problem, fit)
+    assert errors.noise < 1e-8
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(errors.deviation))
 
 
 @pytest.mark.thorough
-def test_the_cost_is_the_sum_of_those_of_the_frames_and_mixes_with_others():
-    movie, truth, problem = seen()
+def test_cost_is_the_sum_over_frames_and_can_be_added_to_others():
+    movie, truth, problem = movie_problem()
     centroid = vx.costs.CentroidDistance(movie.tissue)
     mixed = problem.cost + 0.5 * centroid
     other = movie.tissue.with_vertices(movie.tissue.vertices + random_like(movie.tissue.vertices))
     frames = vx.fitting.stack([problem.tissue, other, other])
-    singly = [VertexDistance(frame)(other, truth) for frame in movie.trajectory[1:]]
-    expected = sum(singly) + 0.5 * centroid(other, truth)
+    each = [VertexDistance(frame)(other, truth) for frame in movie.trajectory[1:]]
+    expected = sum(each) + 0.5 * centroid(other, truth)
     np.testing.assert_allclose(mixed(frames, truth), expected)
     np.testing.assert_allclose(0.5 * jnp.sum(mixed.residuals(frames, truth) ** 2), expected)
 
 
-def test_its_gradient_matches_finite_differences():
-    _, _, problem = seen()
+def test_gradient_matches_finite_differences():
+    _, _, problem = movie_problem()
     gradient = eqx.filter_jit(lambda p: p.value_and_gradient(throw=False).gradient)(problem)
     parameters = eqx.filter(problem.energy, eqx.is_inexact_array)
     direction = jax.tree.map(random_like, parameters)
     slope = sum(
         jnp.sum(g * d) for g, d in zip(*map(jax.tree.leaves, (gradient, direction)), strict=True)
     )
-    whole = lambda parameters: eqx.combine(parameters, problem.energy)
-    evaluate = eqx.filter_jit(lambda parameters: problem(whole(parameters), throw=False)[0])
+    energy_with = lambda parameters: eqx.combine(parameters, problem.energy)
+    evaluate = eqx.filter_jit(lambda parameters: problem(energy_with(parameters), throw=False)[0])
     np.testing.assert_allclose(
         slope, central_difference(evaluate, parameters, direction), rtol=1e-6
     )
 
 
 @pytest.mark.thorough
-def test_an_optax_fit_begins_each_epoch_at_the_first_frame():
-    _, _, problem = seen()
+def test_each_epoch_starts_at_the_first_frame():
+    _, _, problem = movie_problem()
     fit = vx.fit(problem, optax.adam(1e-2), 4, progress=False)
-    last = problem(fit.energy)[0]
-    np.testing.assert_allclose(fit.cost, last, rtol=1e-6)
+    expected = problem(fit.energy)[0]
+    np.testing.assert_allclose(fit.cost, expected, rtol=1e-6)
 
 
-class TestBadInput:
-    def test_what_goes_with_rest_alone(self):
-        _, _, problem = seen()
+class TestInvalidInput:
+    def test_settings_for_equilibria_are_rejected(self):
+        _, _, problem = movie_problem()
         arguments = (problem.tissue, problem.energy, problem.cost)
-        with pytest.raises(ValueError, match="`cost` is one of several frames"):
+        with pytest.raises(ValueError, match="`cost` must be a cost of a single tissue"):
             vx.InverseProblem(*arguments)
         for what, wrong in (
             ("`fit_position`", {"fit_position": True}),
@@ -103,18 +103,18 @@ class TestBadInput:
             with pytest.raises(ValueError, match=f"{what}.* goes with a tissue at rest"):
                 vx.InverseProblem(*arguments, response=problem.response, **wrong)  # pyright: ignore[reportArgumentType]
 
-    def test_costs_of_frames(self, without_type_checks):
+    def test_invalid_costs_of_frames_are_rejected(self, without_type_checks):
         cost = VertexDistance(random_tissue(CELLS))
-        with pytest.raises(TypeError, match="number 1 is"):
+        with pytest.raises(TypeError, match="entry 1 is"):
             Frames([cost, 1.0])  # pyright: ignore[reportArgumentType]
         for costs in ([], [cost, VertexDistance(random_tissue(CELLS + 1))]):
-            with pytest.raises(ValueError, match="at least one cost, and all of one kind"):
+            with pytest.raises(ValueError, match="at least one cost, and all of one class"):
                 Frames(costs)
-        movie, truth, _ = seen()
-        with pytest.raises(ValueError, match="1 costs, so it must see 2 frames"):
+        movie, truth, _ = movie_problem()
+        with pytest.raises(ValueError, match="1 costs must have 2 frames"):
             Frames([VertexDistance(movie.tissue)])(movie.frames, truth)
 
-    def test_materials(self, without_type_checks):
+    def test_invalid_materials_are_rejected(self, without_type_checks):
         with pytest.raises(TypeError, match="`dissipation` of Material must be an AbstractDiss"):
             Material(ShapeFactorEnergy(3.5), 1.0)  # pyright: ignore[reportArgumentType]
         with pytest.raises(TypeError, match="function of time"):

@@ -1,4 +1,4 @@
-"""The Laplace approximation: how well data determine parameters."""
+"""Uncertainty of fitted parameters (Laplace approximation)."""
 
 import dataclasses
 from typing import Any
@@ -21,51 +21,51 @@ def hidden():
     return relaxed(8, 3)
 
 
-AT_REST = optax.adam(1e-12)
+NEGLIGIBLE_STEPS = optax.adam(1e-12)
 
 
 def fitted(tissue, energy, cost):
-    """A problem, and a fit that leaves the energy as it is."""
+    """A problem, and a fit that does not change the energy."""
     problem = vx.InverseProblem(tissue, energy, cost, response=FIXED_TOPOLOGY)
-    return problem, vx.fit(problem, AT_REST, 1, progress=False)
+    return problem, vx.fit(problem, NEGLIGIBLE_STEPS, 1, progress=False)
 
 
 @pytest.mark.slow  # sixty fits
-def test_it_is_the_scatter_of_repeated_fits(hidden):
+def test_deviation_matches_the_scatter_of_repeated_fits(hidden):
     tissue, truth = hidden
     noise = 1e-4
 
-    def once(key):
+    def noisy_cost(key):
         target = tissue.with_vertices(
             tissue.vertices + noise * jax.random.normal(key, tissue.vertices.shape)
         )
-        # Noise has no mean here: no parameter moves the centroid.
+        # Remove the mean of the noise, because no parameter moves the centroid.
         target = target.settled(tissue)
         return VertexDistance(target)
 
     keys = jax.random.split(jax.random.key(0), 60)
     problems = eqx.filter_vmap(
-        lambda key: vx.InverseProblem(tissue, truth, once(key), response=FIXED_TOPOLOGY),
+        lambda key: vx.InverseProblem(tissue, truth, noisy_cost(key), response=FIXED_TOPOLOGY),
         out_axes=eqx.if_array(0),
     )(keys)
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
     fits = vx.fit(problems, solver, 12, batched=True, progress=False)
     scatter = np.std(np.asarray(p0_of(fits.energy)), axis=0)
-    one = lambda tree: jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, tree)
-    said = vx.uncertainty(one(problems), one(fits))
-    np.testing.assert_allclose(p0_of(said.deviation), scatter, rtol=0.6)
-    mean_ratio = float(np.mean(p0_of(said.deviation) / scatter))
+    first_member = lambda tree: jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, tree)
+    estimate = vx.uncertainty(first_member(problems), first_member(fits))
+    np.testing.assert_allclose(p0_of(estimate.deviation), scatter, rtol=0.6)
+    mean_ratio = float(np.mean(p0_of(estimate.deviation) / scatter))
     assert 0.75 < mean_ratio < 1.3
-    np.testing.assert_allclose(np.diag(said.covariance) ** 0.5, p0_of(said.deviation))
+    np.testing.assert_allclose(np.diag(estimate.covariance) ** 0.5, p0_of(estimate.deviation))
 
 
-def test_it_follows_its_formula(hidden):
+def test_covariance_matches_its_formula(hidden):
     tissue, truth = hidden
     target = tissue.with_vertices(
         tissue.vertices + 1e-3 * jax.random.normal(jax.random.key(1), tissue.vertices.shape)
     )
     problem, fit = fitted(tissue, truth, VertexDistance(target))
-    said = vx.uncertainty(problem, fit)
+    estimate = vx.uncertainty(problem, fit)
 
     @jax.jit
     def residuals(p0):
@@ -74,51 +74,53 @@ def test_it_follows_its_formula(hidden):
     p0 = p0_of(fit.energy)
     step = 1e-5 * np.eye(8)
     jacobian = np.stack([(residuals(p0 + e) - residuals(p0 - e)) / 2e-5 for e in step], axis=1)
-    left = np.asarray(residuals(p0))
-    expected = np.linalg.inv(jacobian.T @ jacobian) * (left @ left) / (len(left) - 8)
-    np.testing.assert_allclose(said.covariance, expected, rtol=1e-3, atol=1e-4 * expected.max())
-    # A narrow prior leaves little to learn.
+    residual = np.asarray(residuals(p0))
+    expected = np.linalg.inv(jacobian.T @ jacobian) * (residual @ residual) / (len(residual) - 8)
+    np.testing.assert_allclose(estimate.covariance, expected, rtol=1e-3, atol=1e-4 * expected.max())
+    # A narrow prior dominates the data.
     narrow = vx.uncertainty(problem, fit, prior=1e-7)
     np.testing.assert_allclose(p0_of(narrow.deviation), 1e-7, rtol=1e-2)
-    # Fewer independent residuals say less.
+    # Fewer independent residuals give larger deviations.
     fewer = vx.uncertainty(problem, fit, n_independent=16)
-    assert (p0_of(fewer.deviation) > p0_of(said.deviation)).all()
+    assert (p0_of(fewer.deviation) > p0_of(estimate.deviation)).all()
 
 
 class OneNumber(vx.costs.AbstractLeastSquaresCost):
     """Twenty measurements of the perimeter of one cell."""
 
-    wanted: jax.Array
+    measured_perimeters: jax.Array
 
     def residuals(self, tissue, energy):
-        return tissue.perimeters[0] - self.wanted
+        return tissue.perimeters[0] - self.measured_perimeters
 
 
 @pytest.mark.parametrize("noise", [pytest.param(1e-1, marks=pytest.mark.thorough), 1e-7])
 @pytest.mark.thorough
-def test_it_names_what_the_data_do_not_determine(hidden, noise):
+def test_undetermined_directions_have_the_deviation_of_the_prior(hidden, noise):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + noise * jax.random.normal(jax.random.key(0), (20,))
     problem, fit = fitted(tissue, truth, OneNumber(measured))
-    alone = vx.uncertainty(problem, fit)
-    assert int(jnp.sum(jnp.isinf(alone.deviations))) == 7
-    assert np.isinf(p0_of(alone.deviation)).any()
-    # Where the data say nothing the prior is all there is, however precise they are elsewhere.
+    without_prior = vx.uncertainty(problem, fit)
+    assert int(jnp.sum(jnp.isinf(without_prior.deviations))) == 7
+    assert np.isinf(p0_of(without_prior.deviation)).any()
+    # Along undetermined directions the deviation is that of the prior, for any precision of the data.
     prior = 0.3
-    both = vx.uncertainty(problem, fit, prior=prior)
-    # The data see one direction, of which they have twenty measurements (Sherman-Morrison).
+    with_prior = vx.uncertainty(problem, fit, prior=prior)
+    # The data determine one direction, by twenty measurements (Sherman-Morrison formula).
     slope = _slope(problem, fit)
-    less = np.outer(slope, slope) / (slope @ slope + (float(alone.noise) / prior) ** 2 / 20)
-    by_hand = prior**2 * (np.eye(8) - less)
-    np.testing.assert_allclose(np.sort(both.deviations)[1:], prior, rtol=1e-9)
-    np.testing.assert_allclose(both.covariance, by_hand, rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(p0_of(both.deviation), np.sqrt(np.diag(by_hand)), rtol=1e-4)
-    best = 1 / np.sqrt(1 / float(alone.deviations[-1]) ** 2 + 1 / prior**2)
-    assert float(both.deviations[-1]) == pytest.approx(best, rel=1e-6)
+    reduction = np.outer(slope, slope) / (
+        slope @ slope + (float(without_prior.noise) / prior) ** 2 / 20
+    )
+    expected = prior**2 * (np.eye(8) - reduction)
+    np.testing.assert_allclose(np.sort(with_prior.deviations)[1:], prior, rtol=1e-9)
+    np.testing.assert_allclose(with_prior.covariance, expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(p0_of(with_prior.deviation), np.sqrt(np.diag(expected)), rtol=1e-4)
+    best = 1 / np.sqrt(1 / float(without_prior.deviations[-1]) ** 2 + 1 / prior**2)
+    assert float(with_prior.deviations[-1]) == pytest.approx(best, rel=1e-6)
 
 
 def _slope(problem, fit):
-    """How the residuals, all alike, depend on the target shape factors, by finite differences."""
+    """Gradient of a residual with respect to the target shape factors, by finite differences."""
 
     @jax.jit
     def residual(p0):
@@ -130,34 +132,36 @@ def _slope(problem, fit):
 
 
 @pytest.mark.thorough
-def test_a_position_that_the_cost_does_not_see_makes_no_difference(hidden):
+def test_position_without_influence_on_the_cost_does_not_change_deviations(hidden):
     tissue, truth = hidden
     measured = tissue.perimeters[0] + 0.1 * jax.random.normal(jax.random.key(0), (20,))
     problem, fit = fitted(tissue, truth, OneNumber(measured))
     moving = dataclasses.replace(problem, fit_position=True)
-    still, moved = (vx.uncertainty(p, fit, prior=0.3) for p in (problem, moving))
-    # Two parameters more leave a little more to the noise.
-    ratio = float(moved.noise / still.noise)
-    np.testing.assert_allclose(p0_of(moved.deviation), p0_of(still.deviation), rtol=ratio - 1)
+    without_position, with_position = (vx.uncertainty(p, fit, prior=0.3) for p in (problem, moving))
+    # With two more parameters the estimate of the noise is a little larger.
+    ratio = float(with_position.noise / without_position.noise)
+    np.testing.assert_allclose(
+        p0_of(with_position.deviation), p0_of(without_position.deviation), rtol=ratio - 1
+    )
     assert 1 < ratio < 1.2
 
 
 @pytest.mark.thorough
-def test_data_without_noise_leave_nothing_open(hidden):
+def test_exact_data_give_zero_deviation(hidden):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, OneNumber(jnp.full(20, 3.6, float)))
     exact = eqx.tree_at(
-        lambda p: p.cost.wanted,
+        lambda p: p.cost.measured_perimeters,
         problem,
         jnp.full(20, problem(fit.energy, fit.tissue)[1].tissue.perimeters[0]),
     )
-    sure = vx.uncertainty(exact, fit, prior=0.3)
-    assert float(sure.deviations[-1]) < 1e-9
-    np.testing.assert_allclose(sure.deviations[:-1], 0.3)
+    estimate = vx.uncertainty(exact, fit, prior=0.3)
+    assert float(estimate.deviations[-1]) < 1e-9
+    np.testing.assert_allclose(estimate.deviations[:-1], 0.3)
 
 
 @pytest.mark.slow
-def test_a_fitted_position_adds_to_the_uncertainty(hidden):
+def test_fitted_position_increases_the_uncertainty(hidden):
     tissue, truth = hidden
     width = 0.12
     image = np.asarray(render(tissue, (48, 48), width))
@@ -169,18 +173,18 @@ def test_a_fitted_position_adds_to_the_uncertainty(hidden):
         2,
         progress=False,
     )
-    known, unknown = (
+    fixed, fitted_position = (
         vx.uncertainty(
             vx.InverseProblem(tissue, truth, cost, response=FIXED_TOPOLOGY, fit_position=moves),
             fit,
         )
         for moves in (False, True)
     )
-    assert (p0_of(unknown.deviation) > p0_of(known.deviation)).all()
-    assert float(jnp.max(p0_of(unknown.deviation) / p0_of(known.deviation))) < 3
+    assert (p0_of(fitted_position.deviation) > p0_of(fixed.deviation)).all()
+    assert float(jnp.max(p0_of(fitted_position.deviation) / p0_of(fixed.deviation))) < 3
 
 
-def test_bad_arguments_are_refused(hidden, without_type_checks):
+def test_invalid_arguments_are_rejected(hidden, without_type_checks):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, VertexDistance(tissue))
     every: Any = "all"

@@ -1,4 +1,4 @@
-"""A foam that coarsens: its bubbles exchange gas through their walls."""
+"""Coarsening of a foam by gas diffusion through the walls between bubbles."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,16 +13,16 @@ TENSION, STIFFNESS, DIFFUSION = 0.1, 20.0, 3.0
 
 
 def flux(tissue, gas):
-    """What flows into each bubble: through each wall, in proportion to its length and to the difference."""
+    """Inflow of gas into each bubble: diffusion coefficient × length × pressure difference of each wall."""
     pressure = jnp.append(STIFFNESS * (gas - tissue.areas), 0.0)
     left, right = tissue.topology.edge_cells.T
-    through = DIFFUSION * tissue.edge_lengths * (pressure[right] - pressure[left])
+    flow = DIFFUSION * tissue.edge_lengths * (pressure[right] - pressure[left])
     inflow = jnp.zeros(tissue.n_cells)
-    return inflow.at[left].add(through, mode="drop").at[right].add(-through, mode="drop")
+    return inflow.at[left].add(flow, mode="drop").at[right].add(-flow, mode="drop")
 
 
 class GasExchange(AbstractLifeCycle):
-    """Bubbles know how much gas they have, as the area that it would take without any pressure."""
+    """The state of each bubble is its amount of gas, given as the area at pressure 0."""
 
     gas: Float[Array, " cells"]
 
@@ -38,7 +38,7 @@ class GasExchange(AbstractLifeCycle):
 
 
 @pytest.mark.slow
-def test_the_law_of_von_neumann_holds_while_bubbles_vanish():
+def test_foam_obeys_the_law_of_von_neumann_through_t2_transitions():
     """dA/dt = π/3 γ D (n - 6): J. von Neumann (1952), in Metal Interfaces; W. Mullins (1956)."""
     n = 12
     first = random_tissue(n, 5, lloyd_steps=1).with_capacity(n)
@@ -72,13 +72,13 @@ def test_the_law_of_von_neumann_holds_while_bubbles_vanish():
     assert (np.diff(n_alive) <= 0).all()
     frames = list(grown.trajectory)
     law = np.pi / 3 * TENSION * DIFFUSION
-    seen = {}
+    rates_by_sides = {}
     for frame, gas in zip(frames, grown.cells_then, strict=True):
         alive, sides = np.asarray(frame.alive), np.asarray(frame.neighbour_counts)
         inflow = np.asarray(flux(frame, gas))[alive]
         np.testing.assert_allclose(inflow, law * (sides[alive] - 6), atol=1e-3 * law)
         assert frame.areas.sum() == pytest.approx(n)
-    # And so do the areas, between two frames in which all is as it was.
+    # The areas obey the law as well, between two frames of the same topology.
     for k in range(len(frames) - 1):
         before, after = frames[k], frames[k + 1]
         if n_alive[k] != n_alive[k + 1] or vx.plotting.flipped_edges(before, after).any():
@@ -86,9 +86,14 @@ def test_the_law_of_von_neumann_holds_while_bubbles_vanish():
         alive = np.asarray(before.alive)
         rate = np.asarray(after.areas - before.areas)[alive] / 0.1
         for sides, speed in zip(np.asarray(before.neighbour_counts)[alive], rate, strict=True):
-            seen.setdefault(int(sides), []).append(speed / law)
-    assert len(seen) >= 4
-    assert min(seen) <= 4
-    for sides, speeds in seen.items():
+            rates_by_sides.setdefault(int(sides), []).append(speed / law)
+    assert len(rates_by_sides) >= 4
+    assert min(rates_by_sides) <= 4
+    for sides, speeds in rates_by_sides.items():
         assert np.mean(speeds) == pytest.approx(sides - 6, abs=0.05)
-    print({sides: (len(x), float(np.mean(x)), float(np.std(x))) for sides, x in seen.items()})
+    print(
+        {
+            sides: (len(x), float(np.mean(x)), float(np.std(x)))
+            for sides, x in rates_by_sides.items()
+        }
+    )

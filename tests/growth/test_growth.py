@@ -1,4 +1,4 @@
-"""Tissues that grow."""
+"""Growth of tissues: divisions, deaths, lineage and gradients."""
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ def founders(capacity=9):
     return vx.initialise.free_voronoi(4, key=0, lloyd_steps=2).with_capacity(capacity)
 
 
-# With contacts and transitions several times as much is compiled.
+# Contacts and transitions make compilation several times longer.
 RELAXATIONS = [
     pytest.param(FIXED_TOPOLOGY, id="still"),
     pytest.param(None, id="default", marks=pytest.mark.slow),
@@ -38,7 +38,7 @@ def grown(request):
     return grow(founders(), energy_of, cycle, times, key=1, relaxation=request.param)
 
 
-def test_cells_divide_and_the_tissue_stays_sound(grown):
+def test_cells_divide_and_the_tissue_stays_valid(grown):
     n_alive = np.asarray(grown.n_alive)
     assert n_alive[0] == 4
     assert n_alive[-1] > 5
@@ -48,12 +48,12 @@ def test_cells_divide_and_the_tissue_stays_sound(grown):
         assert not frame.overlaps.any
     assert grown.sound.all()
     np.testing.assert_array_equal(grown.number[-1] >= 0, grown.tissue.alive)
-    # A daughter begins with half of what her mother had.
+    # A daughter inherits half the target area of the mother.
     young = np.asarray(grown.tissue.alive & (grown.cells.age == 0))
     assert (np.asarray(grown.cells.target_area)[young] < 1.2).all()
 
 
-def test_growth_from_two_free_cells_counts_what_could_not_happen():
+def test_failed_divisions_and_deaths_are_counted():
     tissue, times = vx.initialise.free_voronoi(2, key=0).with_capacity(5), jnp.linspace(0, 10, 9)
     run = lambda cycle: grow(
         tissue, energy_of, cycle, times, key=1, relaxation=FIXED_TOPOLOGY, throw=False
@@ -64,14 +64,14 @@ def test_growth_from_two_free_cells_counts_what_could_not_happen():
     for frame in grown.trajectory:
         frame.topology.validate()
         assert not frame.overlaps.any
-    # From the first division for which there was no slot on, they are counted.
+    # Failed divisions are counted once all slots are used.
     assert grown.full
     failed = np.asarray(grown.failed_divisions)
     assert failed[-1] > 0
     assert (failed[np.asarray(grown.n_alive) < 5] == 0).all()
     assert (np.diff(failed) >= 0).all()
     assert (grown.failed_deaths == 0).all()
-    # Nothing can vanish without T2 transitions.
+    # Cells cannot be removed without T2 transitions.
     dying = run(GrowAndDivide(0.0, 1.5, death_rate=10.0, shrinking_time=0.3))
     assert dying.n_alive[-1] == 2
     assert dying.failed_deaths[0] == 0
@@ -79,7 +79,7 @@ def test_growth_from_two_free_cells_counts_what_could_not_happen():
     assert (dying.failed_divisions == 0).all()
 
 
-def test_growth_from_one_periodic_cell():
+def test_growth_can_start_from_one_periodic_cell():
     tissue, times = random_tissue(1).with_capacity(5), jnp.linspace(0, 8, 9)
     cycle = GrowAndDivide(0.2, 1.5)
     grown = grow(tissue, energy_of, cycle, times, key=1, relaxation=FIXED_TOPOLOGY)
@@ -88,7 +88,7 @@ def test_growth_from_one_periodic_cell():
     assert grown.tissue.areas.sum() == pytest.approx(1)
 
 
-def test_the_lineage_is_a_forest(grown):
+def test_lineage_is_a_binary_forest(grown):
     lineage = grown.lineage
     count = int(lineage.count)
     mother, fate = np.asarray(lineage.mother)[:count], np.asarray(lineage.fate)[:count]
@@ -104,7 +104,7 @@ def test_the_lineage_is_a_forest(grown):
     assert sorted(alive[alive >= 0]) == np.flatnonzero(fate == 0).tolist()
 
 
-def test_a_full_pool_and_bad_arguments_are_named(grown, without_type_checks):
+def test_exhausted_capacity_and_invalid_arguments_are_rejected(grown, without_type_checks):
     cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 5, 6)
     with pytest.raises(RuntimeError, match="capacity of 9 cells"):
         eqx.tree_at(lambda g: g.full, grown, jnp.array(True)).checked()
@@ -117,7 +117,7 @@ def test_a_full_pool_and_bad_arguments_are_named(grown, without_type_checks):
 
 
 @pytest.mark.slow
-def test_the_dying_are_extruded():
+def test_dying_cells_are_extruded():
     tissue = random_tissue(12, 3, lloyd_steps=5).with_capacity(12)
     cycle = GrowAndDivide(0.0, 2.0, death_rate=0.15, shrinking_time=0.3)
     energy = lambda cells: energy_of(cells) + vx.energies.LineTension(0.03)
@@ -130,9 +130,9 @@ def test_the_dying_are_extruded():
 
 
 @pytest.mark.slow
-def test_gradient_by_the_rate_of_growth_between_events():
+def test_growth_rate_gradient_matches_finite_differences():
     tissue = founders(8)
-    still = vx.Relaxation(transitions=None, contact_range=None, tolerance=1e-11)
+    relaxation = vx.Relaxation(transitions=None, contact_range=None, tolerance=1e-11)
 
     @eqx.filter_jit
     def size(rate):
@@ -145,7 +145,7 @@ def test_gradient_by_the_rate_of_growth_between_events():
             times,
             key=1,
             dissipation=FRICTION,
-            relaxation=still,
+            relaxation=relaxation,
             divisions=1,
             throw=False,
         )

@@ -1,4 +1,4 @@
-"""Activities: what drives a tissue, and is not the gradient of an energy."""
+"""Activities: forces and noise that are not the gradient of an energy."""
 
 from vertax.activities._activity import AbstractActivity as AbstractActivity, Sum as Sum
 from vertax.activities._noise import ThermalNoise as ThermalNoise

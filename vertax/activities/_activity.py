@@ -1,4 +1,4 @@
-"""What every activity is, and how activities add up."""
+"""The abstract activity and sums of activities."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from vertax.mesh import Tissue
 
 
 class AbstractActivity(eqx.Module):
-    """What drives a tissue in time and is not the gradient of its energy.
+    """Active forces on a tissue in time, which are not the gradient of its energy.
 
-    In each step it acts as an energy would: [`Push`][vertax.activities.Push] is forces on vertices,
-    [`LineTension`][vertax.energies.LineTension] tensions. It may have a state, such as the directions in
-    which cells want to go, and draw random numbers. Subclass it, put the parameters into fields and write
-    `drive`, and `init` if there is a state:
+    In each time step an activity returns an energy that is added to that of the tissue, such as
+    [`Push`][vertax.activities.Push] for forces on vertices or [`LineTension`][vertax.energies.LineTension]
+    for tensions. It may have a state, such as the direction of propulsion of each cell, and draw random
+    numbers. Subclass it, put the parameters into fields and write `drive`, and `init` if there is a state:
 
     ```python
     class Wind(vx.AbstractActivity):
@@ -36,7 +36,7 @@ class AbstractActivity(eqx.Module):
     """
 
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
-        """The state that it begins with; by default none."""
+        """The initial state; by default None."""
         return None
 
     def __check_init__(self):
@@ -52,31 +52,31 @@ class AbstractActivity(eqx.Module):
         dt: Float[Array, ""],
         key: PRNGKeyArray,
     ) -> tuple[AbstractEnergy, PyTree[Array]]:
-        """What acts in one step, and the next state.
+        """The energy that acts during one step, and the next state.
 
         **Arguments:**
 
-        - `state`: the one that `init` or the last step returned.
-        - `tissue`: where the step begins.
-        - `dissipation`: what resists.
-        - `time`, `dt`: when the step begins, and its length.
-        - `key`: for random numbers.
+        - `state`: the state returned by `init` or by the previous step.
+        - `tissue`: the tissue at the start of the step.
+        - `dissipation`: the dissipation of the tissue.
+        - `time`, `dt`: the start time of the step and its length.
+        - `key`: the key for random numbers.
         """
 
     def __add__(self, other: AbstractActivity) -> AbstractActivity:
-        """Both at once."""
+        """The sum of two activities."""
         if not isinstance(other, AbstractActivity):
             return NotImplemented
         return Sum((*_terms(self), *_terms(other)))
 
 
 class Sum(AbstractActivity):
-    """Several activities at once; made by `+`."""
+    """A sum of activities; made by `+`."""
 
     terms: tuple[AbstractActivity, ...]
 
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
-        """The states of all."""
+        """The initial states of all terms."""
         keys = jax.random.split(key, len(self.terms))
         return tuple(term.init(tissue, k) for term, k in zip(self.terms, keys, strict=True))
 
@@ -89,12 +89,12 @@ class Sum(AbstractActivity):
         dt: Float[Array, ""],
         key: PRNGKeyArray,
     ) -> tuple[AbstractEnergy, PyTree[Array]]:
-        """What all do in one step."""
+        """The sum of the energies of all terms, and their next states."""
         keys = jax.random.split(key, len(self.terms))
         parts = zip(self.terms, state, keys, strict=True)
-        drawn = [term.drive(s, tissue, dissipation, time, dt, key) for term, s, key in parts]
-        first, *rest = (acts for acts, _ in drawn)
-        return functools.reduce(operator.add, rest, first), tuple(state for _, state in drawn)
+        results = [term.drive(s, tissue, dissipation, time, dt, key) for term, s, key in parts]
+        first, *rest = (energy for energy, _ in results)
+        return functools.reduce(operator.add, rest, first), tuple(state for _, state in results)
 
 
 def _terms(activity: AbstractActivity) -> tuple[AbstractActivity, ...]:

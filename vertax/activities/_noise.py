@@ -15,20 +15,24 @@ from vertax.mesh import Tissue
 
 
 class ThermalNoise(AbstractActivity):
-    r"""Noise that belongs to the dissipation at a temperature, by fluctuation and dissipation.
+    r"""Thermal noise by the fluctuation-dissipation theorem.
 
-    With a dissipation $\tfrac1{2 \Delta t} \sum_i s_i^2$ each square has a noise of its own, independent
-    normal numbers $\xi_i$: the force is $\sqrt{2 T / \Delta t}\, \sum_i \xi_i\, \partial s_i / \partial x$,
-    for friction $\sqrt{2 \zeta T / \Delta t}\, \xi$. In equilibrium each mode of a solid tissue has the mean
-    energy $T / 2$ (and in steps of length $\Delta t$ less by a factor $1 + \lambda \Delta t / 2 \zeta$).
+    For a dissipation $\tfrac1{2 \Delta t} \sum_i s_i^2$ the force is
+
+    $$f = \sqrt{2 T / \Delta t}\, \sum_i \xi_i\, \partial s_i / \partial x$$
+
+    with independent standard normal $\xi_i$; for friction $f = \sqrt{2 \zeta T / \Delta t}\, \xi$. In
+    equilibrium each mode of a solid tissue has the mean energy $T / 2$; implicit Euler steps of length
+    $\Delta t$ reduce it by the factor $1 + \lambda \Delta t / 2 \zeta$ for a mode of stiffness $\lambda$.
 
     **Arguments:**
 
-    - `temperature`: $T$ in units of energy, $k_B$ included.
+    - `temperature`: $T$ in units of energy ($k_B T$).
 
     **Raises:**
 
-    - `ValueError` for a negative temperature, and in a step for a dissipation that is no sum of squares.
+    - `ValueError` for a negative temperature, and in a step for a dissipation that is not an
+        [`AbstractViscosity`][vertax.dissipations.AbstractViscosity].
     """
 
     temperature: Float[Array, ""]
@@ -49,16 +53,16 @@ class ThermalNoise(AbstractActivity):
         """A random force."""
         if not isinstance(dissipation, AbstractViscosity):
             raise ValueError(
-                "ThermalNoise needs to know what is squared in the dissipation, and "
-                f"{type(dissipation).__name__} does not say: make it a subclass of "
-                "vertax.dissipations.AbstractViscosity."
+                "The dissipation must be half a sum of squares (a subclass of "
+                "vertax.dissipations.AbstractViscosity) for ThermalNoise, but is "
+                f"{type(dissipation).__name__}. Derive it from AbstractViscosity."
             )
-        moved = lambda vertices: dissipation.strains(tissue.with_vertices(vertices), tissue)
-        strains, pull = jax.vjp(moved, tissue.vertices)
-        (force,) = pull(jax.random.normal(key, strains.shape, strains.dtype))
-        return Push(root(2 * self.temperature / dt) * force), state
+        strains_at = lambda vertices: dissipation.strains(tissue.with_vertices(vertices), tissue)
+        strains, vjp = jax.vjp(strains_at, tissue.vertices)
+        (force,) = vjp(jax.random.normal(key, strains.shape, strains.dtype))
+        return Push(safe_sqrt(2 * self.temperature / dt) * force), state
 
 
-def root(x: Float[Array, ""]) -> Float[Array, ""]:
-    """The square root, with the slope 0 at 0."""
+def safe_sqrt(x: Float[Array, ""]) -> Float[Array, ""]:
+    """The square root, with the derivative 0 at 0."""
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)

@@ -1,4 +1,4 @@
-"""Cells that propel themselves."""
+"""Self-propelled cells."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
 
 from vertax._base.checks import as_real, check_number
 from vertax.activities._activity import AbstractActivity
-from vertax.activities._noise import root
+from vertax.activities._noise import safe_sqrt
 from vertax.activities._push import Push
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
@@ -17,21 +17,25 @@ from vertax.mesh import Tissue
 
 
 class SelfPropulsion(AbstractActivity):
-    r"""Cells that push in a direction of their own, which diffuses: $\dot\theta = \sqrt{2 D_r}\, \eta(t)$.
+    r"""Self-propulsion with rotational diffusion and velocity alignment.
 
-    The force of a cell is shared out evenly among its vertices. The directions can align with the
-    velocities of the cells, $\dot\theta = J \sin(\phi - \theta) + \dots$ with $\phi$ the direction in which a
-    cell moved in the last step. (Bi et al. 2016, doi:10.1103/PhysRevX.6.021011, of Voronoi tissues.)
+    Each cell has a force of constant magnitude along the direction $\theta$ with
+
+    $$\dot\theta = J \sin(\phi - \theta) + \sqrt{2 D_r}\, \eta(t),$$
+
+    where $\phi$ is the direction of motion of the cell in the previous step and $\eta$ is white noise. The
+    force is divided equally among the vertices of the cell. (Bi et al. 2016,
+    doi:10.1103/PhysRevX.6.021011, for Voronoi tissues.)
 
     **Arguments:**
 
-    - `force`: of each cell; a scalar or one a cell.
-    - `rotational_diffusion`: $D_r$, one over time.
-    - `alignment`: $J$, one over time.
+    - `force`: the magnitude of the force; a scalar or one per cell.
+    - `rotational_diffusion`: $D_r$, inverse time.
+    - `alignment`: $J$, inverse time.
 
     **Raises:**
 
-    - `ValueError` for negative numbers, or a force of another shape.
+    - `ValueError` for negative numbers, and in a step for a force of the wrong shape.
     """
 
     force: Float[Array, "*cells"]
@@ -49,7 +53,7 @@ class SelfPropulsion(AbstractActivity):
         self.alignment = as_real("alignment", alignment)
 
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
-        """Random directions, and where the vertices are."""
+        """Uniformly distributed directions, and the positions of the vertices."""
         angles = jax.random.uniform(key, (tissue.n_cells,), tissue.vertices.dtype, 0, 2 * jnp.pi)
         return angles, tissue.vertices
 
@@ -62,21 +66,23 @@ class SelfPropulsion(AbstractActivity):
         dt: Float[Array, ""],
         key: PRNGKeyArray,
     ) -> tuple[AbstractEnergy, PyTree[Array]]:
-        """Forces on vertices."""
-        angles, last = state
+        """Forces on vertices; the next directions and positions."""
+        angles, previous = state
         m = tissue.topology
-        # Cells of half-edges; the exterior, of number n_cells, is dropped.
-        moved = (tissue.vertices - last)[m.source]
-        velocity = jax.ops.segment_sum(moved, m.cell, tissue.n_cells)
-        still = jnp.all(velocity == 0, axis=-1)
-        ahead = jnp.arctan2(velocity[:, 1], jnp.where(still, 1, velocity[:, 0]))
-        turn = jnp.where(still, 0, self.alignment * jnp.sin(ahead - angles)) * dt
+        # Sum over the half-edges of each cell; `segment_sum` drops the exterior, which has index n_cells.
+        displacement = (tissue.vertices - previous)[m.source]
+        velocity = jax.ops.segment_sum(displacement, m.cell, tissue.n_cells)
+        at_rest = jnp.all(velocity == 0, axis=-1)
+        heading = jnp.arctan2(velocity[:, 1], jnp.where(at_rest, 1, velocity[:, 0]))
+        alignment = jnp.where(at_rest, 0, self.alignment * jnp.sin(heading - angles)) * dt
         noise = jax.random.normal(key, angles.shape, angles.dtype)
-        angles = angles + turn + root(2 * self.rotational_diffusion * dt) * noise
+        angles = angles + alignment + safe_sqrt(2 * self.rotational_diffusion * dt) * noise
         direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-        shares = jnp.broadcast_to(
+        force_per_vertex = jnp.broadcast_to(
             per_cell(self.force, tissue, "force"), angles.shape
         ) / jnp.maximum(m.neighbour_counts, 1)
-        at_corners = (shares[:, None] * direction).at[m.cell].get(mode="fill", fill_value=0)
+        at_corners = (
+            (force_per_vertex[:, None] * direction).at[m.cell].get(mode="fill", fill_value=0)
+        )
         force = jnp.sum(at_corners.reshape(-1, 3, 2), axis=1)
         return Push(force), (angles, tissue.vertices)

@@ -1,4 +1,4 @@
-"""Forces on vertices."""
+"""Constant forces on vertices."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from vertax.mesh import Tissue
 
 
 class Push(AbstractEnergy):
-    r"""Constant forces on vertices, less the work that they do: $-\sum_v f_v \cdot x_v$.
+    r"""Potential of constant forces on vertices, $-\sum_v f_v \cdot x_v$.
 
     **Arguments:**
 
-    - `force`: on each vertex, shape `(vertices, 2)`.
+    - `force`, shape `(vertices, 2)`: $f_v$, the force on each vertex.
     """
 
     force: Float[Array, "vertices 2"]
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
-        """Less the work of the forces."""
+        """Potential energy of the forces."""
         return -jnp.sum(self.force * tissue.vertices)

@@ -1,4 +1,4 @@
-"""Tensions that fluctuate."""
+"""Fluctuating line tensions."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from vertax.mesh import Tissue
 
 
 class FluctuatingTensions(AbstractActivity):
-    r"""Active tensions of edges around 0, each an Ornstein–Uhlenbeck process.
+    r"""Active line tensions of mean 0, an independent Ornstein–Uhlenbeck process for each edge.
 
-    Tensions have a standard deviation $\sigma$ and forget themselves in a time $\tau$; steps of any length
-    draw from the exact distribution. (As in Krajnc 2020, Soft Matter 16, 3209, and Yamamoto et al. 2022.)
+    $$\langle \gamma_e(t)\, \gamma_e(t') \rangle = \sigma^2 e^{-|t - t'| / \tau}$$
+
+    Steps of any length draw from the exact transition distribution. (As in Krajnc 2020, Soft Matter 16, 3209,
+    and Yamamoto et al. 2022.)
 
     **Arguments:**
 
-    - `deviation`: $\sigma$, energy per length.
-    - `persistence`: $\tau$, a time.
+    - `deviation`: standard deviation $\sigma$, energy per length.
+    - `persistence`: correlation time $\tau$.
 
     **Raises:**
 
@@ -39,7 +41,7 @@ class FluctuatingTensions(AbstractActivity):
         self.persistence = as_real("persistence", persistence)
 
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
-        """Tensions in units of their deviation."""
+        """Stationary tensions, in units of their standard deviation."""
         return jax.random.normal(key, (tissue.n_edges,), tissue.vertices.dtype)
 
     def drive(
@@ -51,10 +53,10 @@ class FluctuatingTensions(AbstractActivity):
         dt: Float[Array, ""],
         key: PRNGKeyArray,
     ) -> tuple[AbstractEnergy, PyTree[Array]]:
-        """Tensions of edges."""
-        left = jnp.exp(-dt / self.persistence)
-        drawn = jax.random.normal(key, state.shape, state.dtype)
-        # 1 - exp(-2 dt / τ), which would lose all digits for dt / τ near the unit of rounding.
-        forgotten = -jnp.expm1(-2 * dt / self.persistence)
-        state = left * state + jnp.sqrt(forgotten) * drawn
+        """Line tensions, and the next state."""
+        decay = jnp.exp(-dt / self.persistence)
+        noise = jax.random.normal(key, state.shape, state.dtype)
+        # 1 - exp(-2 dt / τ); `expm1` avoids the cancellation for dt much smaller than τ.
+        variance = -jnp.expm1(-2 * dt / self.persistence)
+        state = decay * state + jnp.sqrt(variance) * noise
         return LineTension(self.deviation * state), state

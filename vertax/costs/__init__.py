@@ -1,4 +1,4 @@
-"""Costs: what we want of an equilibrium."""
+"""Costs: objectives of inference and design, evaluated at an equilibrium."""
 
 from vertax.costs._aspect import AspectRatio as AspectRatio, aspect_ratio as aspect_ratio
 from vertax.costs._cells import CellAreas as CellAreas, MeanShapeFactor as MeanShapeFactor

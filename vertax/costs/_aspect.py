@@ -1,4 +1,4 @@
-"""The elongation of a whole cluster of cells, or of a box."""
+"""Aspect ratio of a free tissue or of a periodic box."""
 
 from __future__ import annotations
 
@@ -18,32 +18,36 @@ from vertax.mesh._arcs import arc_points, length_factor
 
 Measure = Literal["moments", "farthest", "box"]
 
-# Moments are integrals along the outline (Green's theorem). On an arc of angle α the integrand has the
-# harmonics up to 4 α of a parameter from -1 to 1: this many Gauss-Legendre points leave only rounding
-# errors up to a whole circle, α = π; and a chord, a polynomial, they integrate exactly.
+# Moments are integrals along the outline (Green's theorem). On an arc of half-angle α the integrand contains
+# cos(4 α s) with s in [-1, 1]: 24 Gauss-Legendre points are exact to rounding up to a full circle, α = π. On
+# a straight edge the integrand is a polynomial, which they integrate exactly.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
 def aspect_ratio(tissue: Tissue, measure: Measure = "moments") -> Float[Array, ""]:
-    r"""Ratio of the long to the short axis of a free tissue, $r = L/\ell \ge 1$; or of the sides of a box.
+    r"""Ratio of the long to the short axis of a free tissue, $r = L/\ell \ge 1$, or of the sides of a box.
+
+    | `measure` | ratio |
+    |---|---|
+    | `"moments"` | $\sqrt{\lambda_1/\lambda_2}$, eigenvalues of the second-moment matrix of the area |
+    | `"farthest"` | largest distance of two vertices over the width of the tissue across it (the paper's) |
+    | `"box"` | length of the first lattice vector over that of the second |
+
+    `"moments"` includes arcs and depends smoothly on the whole outline, except at $r = 1$, where the
+    derivative is undefined and 0 is returned. The derivative of `"farthest"` depends on four vertices and is
+    discontinuous where the extreme vertices change. `"box"` is meant for periodic tissues with a box that
+    relaxes too ([`BoxRelaxation`][vertax.mechanics.BoxRelaxation]).
 
     **Arguments:**
 
-    - `tissue`: a free tissue; or a periodic one, of which the box is measured.
-    - `measure`: `"moments"` is $\sqrt{\lambda_1/\lambda_2}$ with the eigenvalues of the matrix of second
-        moments of the area within the outline (its arcs included), the axis ratio of the ellipse of
-        the same moments. Every part of the outline counts and it is smooth, but at $r = 1$, where it
-        has a kink (no axis is the long one) and a derivative of 0 here. `"farthest"` is the paper's:
-        $L$ is the distance of the two vertices farthest apart, and $\ell$ the width of all vertices
-        across the line through them. Its derivative sees four vertices and jumps when others become
-        the outermost. `"box"` is how many times longer the first lattice vector of a periodic tissue is than
-        the second, for a box that comes to rest ([`BoxRelaxation`][vertax.mechanics.BoxRelaxation]).
+    - `tissue`: a free tissue; a periodic one for `"box"`.
+    - `measure`: `"moments"`, `"farthest"` or `"box"`, see above.
 
     **Returns:** the ratio.
 
     **Raises:**
 
-    - `ValueError` for a periodic tissue, a free one if it is to be `"box"`, or another measure.
+    - `ValueError` for an unknown measure, or one that does not apply to the boundary of the tissue.
     """
     _check_measure(measure)
     boundary = tissue.boundary
@@ -57,26 +61,26 @@ def aspect_ratio(tissue: Tissue, measure: Measure = "moments") -> Float[Array, "
         )
     if not isinstance(boundary, Free):
         raise ValueError(
-            "The aspect ratio is that of an outline, which only a free tissue has, but the boundary is "
-            f'{type(boundary).__name__}: pass measure="box" for that of its box.'
+            f'Argument `measure` can be "{measure}" only for a free tissue, but the boundary is '
+            f'{type(boundary).__name__}. For the aspect ratio of a periodic box pass measure="box".'
         )
     return _from_moments(tissue) if measure == "moments" else _from_farthest(tissue)
 
 
 class AspectRatio(AbstractLeastSquaresCost):
-    r"""Squared distance of the aspect ratio of a tissue from a target (paper, "Convergent extension").
+    r"""Squared difference of the aspect ratio of a tissue and a target (paper, "Convergent extension").
 
     $$C = \left(\frac{L}{\ell} - r_\mathrm{target}\right)^2$$
 
     **Arguments:**
 
-    - `target`: the ratio to reach, at least 1; of a box also below.
-    - `measure`: how the ratio is measured, see [`aspect_ratio`][vertax.costs.aspect_ratio].
+    - `target`: the target ratio, at least 1 (for `"box"`, above 0).
+    - `measure`: the definition of the ratio, see [`aspect_ratio`][vertax.costs.aspect_ratio].
 
     **Raises:**
 
-    - `ValueError` for a target below 1 (of a box, not above 0), a tissue that does not go with the
-        measure, or another measure.
+    - `ValueError` for a target out of range, an unknown measure, or a measure that does not apply to the
+        boundary of the tissue.
     """
 
     target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
@@ -88,7 +92,7 @@ class AspectRatio(AbstractLeastSquaresCost):
         check_number("target", self.target, **limit, many=True)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """The distance, times the root of 2: the paper's cost is the square, not half of it."""
+        r"""$\sqrt2\,(r - r_\mathrm{target})$, because the cost is half the sum of squares."""
         check_number("target", self.target)
         return jnp.sqrt(2.0) * (aspect_ratio(tissue, self.measure) - self.target)[None]
 
@@ -103,11 +107,11 @@ def _check_measure(measure: str) -> None:
 def _from_moments(tissue: Tissue) -> Float[Array, ""]:
     xx, xy, yy = _second_moments(tissue)
     mean, half = (xx + yy) / 2, (xx - yy) / 2
-    # The eigenvalues are mean ± spread. The `where` is doubled: the slope of a root at 0 is infinite.
+    # The eigenvalues are mean ± spread. The inner `where` keeps the derivative of the root finite at 0.
     squared = half**2 + xy**2
     distinct = squared > 0
     spread = jnp.where(distinct, jnp.sqrt(jnp.where(distinct, squared, 1)), 0)
-    # Their product is the determinant: mean - spread cancels for a long tissue.
+    # √(λ₁/λ₂) = λ₁/√(λ₁ λ₂) with the determinant λ₁ λ₂, because λ₂ = mean - spread suffers from cancellation.
     return (mean + spread) / jnp.sqrt(xx * yy - xy**2)
 
 
@@ -115,17 +119,17 @@ def _second_moments(tissue: Tissue) -> tuple[Array, Array, Array]:
     r"""$\int x^2, \int xy, \int y^2$ over the area within the outline, about its centroid."""
     first, chord = tissue.edge_segments
     angle = tissue.edge_angles
-    # Far from the origin the integrals would lose digits.
+    # Shift the origin to the tissue, to avoid cancellation.
     first = first - jnp.mean(tissue.vertices, axis=0)
     nodes, weights = (jnp.asarray(x, chord.dtype) for x in (_NODES, _WEIGHTS / 2))
     points = arc_points(first, chord, angle, (1 + nodes) / 2)
-    # On its way from the start to the end the tangent turns by 2 α, and is along the chord half-way.
-    turn = angle[:, None] * nodes
-    cos, sin = jnp.cos(turn)[..., None], jnp.sin(turn)[..., None]
-    left = jnp.stack([-chord[:, 1], chord[:, 0]], axis=-1)
-    velocity = length_factor(angle)[:, None, None] * (cos * chord[:, None] + sin * left[:, None])
-    # For a function f that is homogeneous of degree n, ∫ f dA = 1/(n + 2) ∮ f p × dp; on the outline the
-    # tissue is on the left of each edge. Edges inside do not count.
+    # Along an arc the tangent turns by 2 α; at the middle it is parallel to the chord.
+    tangent_angle = angle[:, None] * nodes
+    cos, sin = jnp.cos(tangent_angle)[..., None], jnp.sin(tangent_angle)[..., None]
+    normal = jnp.stack([-chord[:, 1], chord[:, 0]], axis=-1)
+    velocity = length_factor(angle)[:, None, None] * (cos * chord[:, None] + sin * normal[:, None])
+    # For f homogeneous of degree n, ∫ f dA = 1/(n + 2) ∮ f p × dp, counter-clockwise along the outline: the
+    # tissue is on the left of each outline edge. Inner edges do not contribute.
     swept = points[..., 0] * velocity[..., 1] - points[..., 1] * velocity[..., 0]
     swept = jnp.where(tissue.topology.on_outline[:, None], weights * swept, 0)
     area = jnp.sum(swept) / 2

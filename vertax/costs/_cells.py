@@ -1,4 +1,4 @@
-"""What is wanted of the shapes and sizes of cells."""
+"""Costs of cell shapes and cell areas."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from vertax.mesh import Tissue
 
 
 class MeanShapeFactor(AbstractLeastSquaresCost):
-    r"""Squared distance of the mean observed shape factor from a target (paper, "Inverse mechanical design").
+    r"""Squared difference of the mean shape factor and a target (paper, "Inverse mechanical design").
 
     $$C = \left(\frac1N \sum_{c=1}^N \frac{P_c}{\sqrt{A_c}} - P_\mathrm{target}\right)^2$$
 
-    with the shape factors that the cells have in equilibrium. (The paper's formula has the target shape
-    factors $p^0_c$ of the energy instead, which no equilibrium is needed for. In a fluid tissue, where
-    every cell attains its target, the two are the same.)
+    with the shape factors of the cells at equilibrium. The formula in the paper has the target shape factors
+    $p^0_c$ of the energy instead, which do not depend on the equilibrium. In a fluid tissue every cell
+    attains its target, and the two agree.
 
     **Arguments:**
 
-    - `target`: the mean shape factor to reach, dimensionless.
+    - `target`: the target of the mean shape factor, dimensionless.
     """
 
     target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """The distance, times the root of 2: the paper's cost is the square, not half of it."""
+        r"""$\sqrt2$ times the difference, because the cost is half the sum of squares."""
         check_number("target", self.target)
         return jnp.sqrt(2.0) * (_mean(tissue, tissue.shape_factors) - self.target)[None]
 
 
 class CellAreas(AbstractLeastSquaresCost):
-    r"""Mean squared distance of the areas of cells from those wanted, $\frac1{2N}\sum_c (A_c - A^t_c)^2$.
+    r"""Half the mean squared difference of cell areas and targets, $\frac1{2N}\sum_c (A_c - A^t_c)^2$.
 
     **Arguments:**
 
-    - `target`: areas to reach; scalar or one a cell.
+    - `target`: target areas $A^t$; scalar or one per cell.
 
     **Raises:**
 
-    - `ValueError` if the number of areas is not that of the cells, or one is not positive.
+    - `ValueError` for an area that is not positive, or for a wrong number of areas.
     """
 
     target: Float[Array, "*cells"] = eqx.field(converter=partial(as_real, "target"))
@@ -54,10 +54,10 @@ class CellAreas(AbstractLeastSquaresCost):
         check_number("target", self.target, above=0, many=True)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """Differences of areas over the root of the number of cells."""
+        r"""$(A_c - A^t_c) / \sqrt N$."""
         if self.target.shape not in ((), (tissue.n_cells,)):
             raise ValueError(
-                "The target of CellAreas must be a scalar or have one entry a cell, shape "
+                "The target of CellAreas must be a scalar or have one entry per cell, shape "
                 f"({tissue.n_cells},), but its shape is {self.target.shape}."
             )
         differences = tissue.areas - self.target
@@ -68,5 +68,5 @@ class CellAreas(AbstractLeastSquaresCost):
 
 
 def _mean(tissue: Tissue, values: Float[Array, " cells"]) -> Float[Array, ""]:
-    """The mean over the cells that there are; spare slots have 0."""
+    """The mean over living cells of values that are 0 in spare slots."""
     return jnp.sum(values) / jnp.sum(tissue.alive) if tissue.topology.spare else jnp.mean(values)

@@ -1,4 +1,4 @@
-"""What every cost is, and how costs are weighted and added."""
+"""Abstract costs and weighted sums of costs."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vertax.mesh import Tissue
 
 
 class AbstractCost(eqx.Module):
-    """What we want of an equilibrium, as a number to minimise.
+    """A number to minimise, as a function of an equilibrium and its energy.
 
-    Subclass it and write `__call__`; data and settings are fields. Weighted sums are written as such:
+    Subclass it and write `__call__`; data and settings are fields. Costs can be weighted and added:
     `0.99 * cost_a + 0.01 * cost_b`.
     """
 
@@ -27,27 +27,28 @@ class AbstractCost(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
-        """Cost of a relaxed tissue and the energy that it minimises."""
+        """Cost of a relaxed tissue and its energy."""
 
     @property
     def of_frames(self) -> bool:
-        """Whether it is to see all frames of a movement, a tissue with a leading axis of times.
+        """Whether `__call__` takes all frames of an evolution, as a tissue with a leading axis of times.
 
-        By default False: it sees one tissue, the last. See [`Frames`][vertax.costs.Frames].
+        By default False: it takes the last frame. See [`Frames`][vertax.costs.Frames].
         """
         return False
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """The numbers of which the cost is half the sum of squares.
+        """The residuals: the cost is half the sum of their squares.
 
         **Raises:**
 
-        - `TypeError` if the cost is no sum of squares (see
+        - `TypeError` if the cost is not a sum of squares (see
             [`AbstractLeastSquaresCost`][vertax.costs.AbstractLeastSquaresCost]).
         """
         raise TypeError(
-            f"{type(self).__name__} is no sum of squares, which a least-squares solver needs: subclass "
-            "vertax.costs.AbstractLeastSquaresCost, or fit with an Optax optimiser."
+            "The cost must be a sum of squares for a least-squares solver, but "
+            f"{type(self).__name__} is not. Subclass vertax.costs.AbstractLeastSquaresCost, or fit with an "
+            "Optax optimiser."
         )
 
     def __add__(self, other: AbstractCost) -> AbstractCost:
@@ -66,24 +67,24 @@ class AbstractCost(eqx.Module):
         return WeightedSum(jnp.asarray(weight) * weights, costs)
 
     __rmul__ = __mul__
-    # A NumPy array on the left would make an array of costs.
+    # Without this, a NumPy array times a cost would be an array of costs.
     __array_ufunc__ = None
 
     def __radd__(self, other: int) -> AbstractCost:
-        """What `sum` of some costs begins with: 0 and the first one."""
+        """The cost itself for 0, with which the built-in `sum` starts."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
 class AbstractLeastSquaresCost(AbstractCost):
     """A cost that is half a sum of squares.
 
-    Subclass it and write `residuals` instead of `__call__`; such a cost also serves second-order
-    solvers like `optimistix.LevenbergMarquardt` in [`fit`][vertax.fit].
+    Subclass it and write `residuals` instead of `__call__`. [`fit`][vertax.fit] can also minimise such a cost
+    with a least-squares solver, e.g. `optimistix.LevenbergMarquardt`.
     """
 
     @abc.abstractmethod
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """The numbers of which the cost is half the sum of squares."""
+        """The residuals: the cost is half the sum of their squares."""
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Half the sum of the squared residuals."""
@@ -98,33 +99,34 @@ class WeightedSum(AbstractCost):
 
     @property
     def of_frames(self) -> bool:
-        """Whether one of the terms sees all frames; others see the last one then."""
+        """Whether one of the terms takes all frames; the other terms then take the last one."""
         return any(cost.of_frames for cost in self.costs)
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Weighted sum of the costs."""
-        values = [cost(self._seen(cost, tissue), energy) for cost in self.costs]
+        values = [cost(self._argument_of(cost, tissue), energy) for cost in self.costs]
         return jnp.sum(self.weights * jnp.stack(values))
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """The residuals of all terms, times the roots of the weights.
+        """The residuals of all terms, times the square roots of the weights.
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox, also inside `jax.jit`) for a negative weight, of which there is no root.
-        - `TypeError` if a term is no sum of squares.
+        - `RuntimeError` (of Equinox, also inside `jax.jit`) for a negative weight.
+        - `TypeError` if a term is not a sum of squares.
         """
         weights = eqx.error_if(
             self.weights,
             self.weights < 0,
-            "A weighted sum of costs with a negative weight is no sum of squares, which a least-squares "
-            "solver needs: make the weight positive, or fit with an Optax optimiser.",
+            "A weighted sum of costs must be a sum of squares for a least-squares solver, but has a negative "
+            "weight. Make the weight positive, or fit with an Optax optimiser.",
         )
         roots = jnp.sqrt(weights)
-        parts = [cost.residuals(self._seen(cost, tissue), energy) for cost in self.costs]
+        parts = [cost.residuals(self._argument_of(cost, tissue), energy) for cost in self.costs]
         return jnp.concatenate([root * part for root, part in zip(roots, parts, strict=True)])
 
-    def _seen(self, cost: AbstractCost, tissue: Tissue) -> Tissue:
+    def _argument_of(self, cost: AbstractCost, tissue: Tissue) -> Tissue:
+        """The frame or frames of which a term is evaluated."""
         return member(tissue, -1) if self.of_frames and not cost.of_frames else tissue
 
 

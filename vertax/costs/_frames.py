@@ -1,4 +1,4 @@
-"""Costs of a tissue on its way."""
+"""Costs of the frames of an evolution."""
 
 from __future__ import annotations
 
@@ -17,29 +17,30 @@ from vertax.mesh import Tissue
 
 
 class Frames(AbstractCost):
-    r"""What is wanted of each frame of a movement: the sum $\sum_k C_k(x(t_k))$.
+    r"""Sum of the costs of single frames of an evolution, $C = \sum_k C_k(x(t_k))$.
 
     ```python
-    cost = vx.costs.Frames([vx.costs.VertexDistance(tissue) for tissue in seen])
-    problem = vx.InverseProblem(seen_first, energy, cost, response=vx.Evolution(friction, times))
+    cost = vx.costs.Frames([vx.costs.VertexDistance(tissue) for tissue in observed[1:]])
+    problem = vx.InverseProblem(observed[0], energy, cost, response=vx.Evolution(friction, times))
     ```
 
-    It is a sum of squares if they are, so that least-squares solvers and
-    [`uncertainty`][vertax.uncertainty] apply. A cost of your own that sees all frames at once has a property
-    `of_frames` that is True; it is called with a tissue that has a leading axis of times.
+    If the $C_k$ are sums of squares, so is $C$, and least-squares solvers and
+    [`uncertainty`][vertax.uncertainty] apply. A custom cost that depends on several frames at once overrides
+    the property `of_frames` to return True; it is called with a tissue that has a leading axis of times.
 
     **Arguments:**
 
-    - `costs`: one for each of the times after the first, all of one kind; of the first the tissue is given.
+    - `costs`: one cost for each time after the first, all of one class and size. The first frame is the given
+        tissue and has no cost.
 
     **Raises:**
 
-    - `TypeError` for what is no cost.
-    - `ValueError` for no costs, or costs that are not of one kind and size.
+    - `TypeError` unless all are costs of single tissues.
+    - `ValueError` for no costs, or for costs of different classes or sizes.
     """
 
     costs: AbstractCost
-    """All as one, with a leading axis."""
+    """The costs, stacked along a leading axis."""
 
     def __init__(self, costs: Sequence[AbstractCost]):
         costs = list(costs)
@@ -47,19 +48,19 @@ class Frames(AbstractCost):
             if not isinstance(cost, AbstractCost) or cost.of_frames:
                 raise TypeError(
                     "Argument `costs` of Frames must hold costs of single tissues, one for each time after "
-                    f"the first, but number {number} is {describe(cost)}."
+                    f"the first, but entry {number} is {describe(cost)}."
                 )
         try:
             self.costs = stack(costs)
         except ValueError as error:
             raise ValueError(
-                "Argument `costs` of Frames must hold at least one cost, and all of one kind and size. "
-                "Add up costs of several kinds: Frames(some) + Frames(others)."
+                "Argument `costs` of Frames must hold at least one cost, and all of one class and size. "
+                "Add costs of several classes: Frames(some) + Frames(others)."
             ) from error
 
     @property
     def of_frames(self) -> bool:
-        """It sees all frames."""
+        """True: the cost takes all frames."""
         return True
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
@@ -71,17 +72,20 @@ class Frames(AbstractCost):
 
         **Raises:**
 
-        - `TypeError` if the costs are no sums of squares.
+        - `TypeError` if the costs are not sums of squares.
         """
         return self._each(tissue, energy, "residuals").ravel()
 
-    def _each(self, tissue: Tissue, energy: AbstractEnergy, what: str) -> Float[Array, "frames *n"]:
+    def _each(
+        self, tissue: Tissue, energy: AbstractEnergy, method: str
+    ) -> Float[Array, "frames *n"]:
+        """A method of each cost at its frame."""
         n_costs = jax.tree.leaves(eqx.filter(self.costs, eqx.is_array))[0].shape[0]
         if tissue.vertices.ndim != 3 or len(tissue.vertices) != n_costs + 1:
             raise ValueError(
-                f"Frames holds {n_costs} costs, so it must see {n_costs + 1} frames, that of the start "
-                f"included, but vertices have the shape {tissue.vertices.shape}."
+                f"Argument `tissue` of Frames with {n_costs} costs must have {n_costs + 1} frames, the "
+                f"initial one included, but its vertices have shape {tissue.vertices.shape}."
             )
         later = jax.tree.map(lambda x: x[1:], tissue)
-        of_one = lambda cost, frame: getattr(cost, what)(frame, energy)
-        return eqx.filter_vmap(of_one)(self.costs, later)
+        evaluate = lambda cost, frame: getattr(cost, method)(frame, energy)
+        return eqx.filter_vmap(evaluate)(self.costs, later)

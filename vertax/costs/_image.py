@@ -16,12 +16,13 @@ from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue
 from vertax.mesh._boundary import inverse_of
 
 
-# The paper convolves the mesh, a measure carried by its edges, with a Gaussian point spread function in
-# Fourier space. Summing the transforms of all segments at all frequencies costs edges × pixels. Here the
-# same Fourier coefficients come from a non-uniform fast transform: each edge is a set of Gauss-Legendre
-# points that carry its length; every point is spread on the pixels by a quintic B-spline (six pixels wide
-# and four times differentiable, so that gradients are smooth); an FFT follows; and the transform of the
-# spline is divided out where the Gaussian is multiplied in. Cost: edges × points × 36 + pixels log pixels.
+# Non-uniform FFT of the edges, a line density on the plane, times a Gaussian transfer function:
+# 1. represent each edge by Gauss-Legendre points, weighted by length;
+# 2. spread each point on the pixels by a quintic B-spline (6 × 6 pixels, four times differentiable);
+# 3. take the FFT; divide by the transform of the spline and multiply by that of the Gaussian;
+# 4. take the inverse FFT.
+# Cost: edges × points × 36 + pixels log(pixels). The direct sum of the transforms of all segments, as in the
+# paper, costs edges × pixels.
 def render(
     tissue: Tissue,
     shape: tuple[int, int],
@@ -32,28 +33,29 @@ def render(
 ) -> Float[Array, "rows columns"]:
     r"""Fluorescence image of the edges of a tissue (paper, Methods, "Mesh-Image cost").
 
-    The edges, arcs as arcs, each carrying its length, blurred by a Gaussian of standard deviation
+    The line density of the edges (straight or arcs), convolved with a Gaussian of standard deviation
     `psf_width`. The image of a periodic tissue covers one period: pixel `[r, c]` is centred at the
     fraction $(c + \tfrac12)/columns$ of the first lattice vector and $(r + \tfrac12)/rows$ of the second,
-    so rows follow $y$. That of a free tissue has a corner at the origin: pixel `[r, c]` is centred at
+    so rows follow $y$. The image of a free tissue has a corner at the origin: pixel `[r, c]` is centred at
     $x = c + \tfrac12$, $y = r + \tfrac12$ times `pixel_size`.
 
     **Arguments:**
 
     - `tissue`: a tissue with a [`Periodic`][vertax.Periodic] or a [`Free`][vertax.Free] boundary.
     - `shape`: rows and columns, at least 6 each.
-    - `psf_width`: standard deviation of the point spread function, in units of length. Accurate to a
-        few parts in a thousand from one pixel on, to parts in a million from two.
-    - `points_per_edge`: quadrature points on each edge; 0.7 times this number of point spread widths is
-        the longest edge that is rendered to parts in a hundred thousand.
-    - `pixel_size`: length of a pixel side, for a free tissue (and only then).
+    - `psf_width`: standard deviation of the point spread function, in units of length. The relative error is
+        a few 1e-3 for one pixel, and about 1e-6 for two pixels or more.
+    - `points_per_edge`: quadrature points $n$ on each edge. The relative error is about 1e-5 for edges up to
+        $0.7\,n$ times `psf_width`.
+    - `pixel_size`: length of a pixel side; required for a free tissue, not allowed for a periodic one.
 
     **Returns:** line density (length of edge per area) at the pixel centres.
 
     **Raises:**
 
-    - `TypeError` for a boundary of another kind; `ValueError` for too small an image, a width, number of
-        points or pixel size that is not positive, a batch, and if `pixel_size` is missing or too much.
+    - `TypeError` for a boundary that is neither periodic nor free.
+    - `ValueError` for an image below 6 × 6 pixels, a width, number of points or pixel size that is not
+        positive, a batch, and a missing or superfluous `pixel_size`.
     """
     if len(np.shape(shape)) != 1 or len(shape) != 2:
         raise ValueError(f"Argument `shape` must be (rows, columns), but is {shape}.")
@@ -68,7 +70,7 @@ def render(
     if tissue.vertices.ndim != 2:
         raise ValueError(
             f"Argument `tissue` must be a single tissue, but its vertices have shape "
-            f"{tissue.vertices.shape}. Take a batch through equinox.filter_vmap."
+            f"{tissue.vertices.shape}. Map over a batch with equinox.filter_vmap."
         )
     lattice, (rows, columns) = _canvas(tissue.boundary, shape, pixel_size)
     dtype = tissue.vertices.dtype
@@ -81,7 +83,7 @@ def render(
     inverse = inverse_of(lattice).T
     fractions = points.reshape(-1, 2) @ inverse.T
     if isinstance(tissue.boundary, Free):
-        # What is further from the image than half its size would come back in from the other side.
+        # Drop points further from the image than half its size: the FFT would wrap them into it.
         mass = jnp.where(jnp.all(jnp.abs(fractions - 0.25) < 0.5, axis=-1), mass, 0)
     column, wx = _spread(fractions[:, 0] * columns - 0.5, columns)
     row, wy = _spread(fractions[:, 1] * rows - 0.5, rows)
@@ -102,7 +104,7 @@ def render(
 def _canvas(
     boundary: AbstractBoundary, shape: tuple[int, int], pixel_size: float | Array | None
 ) -> tuple[Float[Array, "2 2"], tuple[int, int]]:
-    """A periodic lattice and its number of pixels, whose first ones are the image."""
+    """The periodic lattice and pixel numbers of the FFT; the image is its first rows and columns."""
     if isinstance(boundary, Periodic) and pixel_size is None:
         return boundary.lattice, shape
     if isinstance(boundary, Free) and pixel_size is not None:
@@ -111,8 +113,8 @@ def _canvas(
         return jnp.diag(jnp.array([columns, rows]) * pixel_size), (rows, columns)
     if isinstance(boundary, Periodic | Free):
         raise ValueError(
-            "Argument `pixel_size` is needed for a free tissue, and follows from the box for a periodic "
-            f"one, but is {pixel_size} with a boundary of class {type(boundary).__name__}."
+            "Argument `pixel_size` must be given for a free tissue, and None for a periodic one, but is "
+            f"{pixel_size} for a boundary of class {type(boundary).__name__}."
         )
     raise TypeError(
         "Argument `tissue` must have a Periodic or Free boundary, but it is "
@@ -127,15 +129,15 @@ def _spread(
     position: Float[Array, " points"], size: int
 ) -> tuple[Int[Array, "points 6"], Float[Array, "points 6"]]:
     """Pixels (wrapped around) and quintic B-spline weights of points, in units of pixels."""
-    cell = jax.lax.stop_gradient(jnp.floor(position))
-    u = position - cell
-    # Cox-de Boor: w[k] at degree d is the spline of support d + 1 whose knot is k pixels to the left.
+    pixel_below = jax.lax.stop_gradient(jnp.floor(position))
+    u = position - pixel_below
+    # Cox-de Boor recursion: w[k] at degree d is the weight of the k-th of d + 1 neighbouring pixels.
     w = [jnp.ones_like(u)]
     for d in range(1, _SPLINE_POINTS):
         zero = jnp.zeros_like(u)
         lower, upper = [zero, *w], [*w, zero]
         w = [((u + d - k) * lower[k] + (k + 1 - u) * upper[k]) / d for k in range(d + 1)]
-    first = cell.astype(jnp.int32) - (_SPLINE_POINTS // 2 - 1)
+    first = pixel_below.astype(jnp.int32) - (_SPLINE_POINTS // 2 - 1)
     pixels = first[:, None] + jnp.arange(_SPLINE_POINTS, dtype=jnp.int32)
     return jnp.mod(pixels, size), jnp.stack(w, axis=-1)
 
@@ -145,25 +147,24 @@ class MeshImage(AbstractLeastSquaresCost):
 
     $$C = \frac{1}{2M} \sum_{k=1}^{M} \bigl(a\,I(X)(r_k) + b - I_{\mathrm{exp}}(r_k)\bigr)^2$$
 
-    over the $M$ pixels, with $I(X)$ the edges blurred by a Gaussian (see
-    [`render`][vertax.costs.render]). The measured image is first brought to mean 0 and variance 1. The
-    intensity scale $a \ge 0$ and background $b$ take their best values in closed form, so brightness
-    and contrast of the measured image do not matter: then $C = \tfrac12(1 - \rho^2)$, with $\rho$ the
-    correlation of the two images (and $\tfrac12$ if that is negative).
+    over the $M$ pixels, with the rendered image $I(X)$ (see [`render`][vertax.costs.render]). The measured
+    image is standardised to mean 0 and variance 1. The intensity scale $a \ge 0$ and background $b$ minimise
+    $C$ in closed form, so the cost is independent of brightness and contrast:
+    $C = \tfrac12(1 - \max(\rho, 0)^2)$ with the correlation $\rho$ of the two images.
 
     **Arguments:**
 
-    - `image`: the measured image, rows along y: of one period of the tissue (see
-        [`mirror`][vertax.costs.mirror] for one that is not periodic), or of a free tissue.
+    - `image`: the measured image, rows along y, of one period of the tissue or of a free tissue. See
+        [`mirror`][vertax.costs.mirror] for images that are not periodic.
     - `psf_width`: standard deviation of the point spread function, in units of length.
-    - `weight`: how much each pixel counts, at least 0; all the same by default.
+    - `weight`: weight of each pixel, at least 0; by default equal.
     - `points_per_edge`: quadrature points on each edge, see [`render`][vertax.costs.render].
-    - `fit_intensity`: False compares with the image as it is ($a = 1$, $b = 0$, no standardisation).
-    - `pixel_size`: length of a pixel side, for a free tissue (and only then).
+    - `fit_intensity`: False sets $a = 1$, $b = 0$, and does not standardise the image.
+    - `pixel_size`: length of a pixel side; required for a free tissue, not allowed for a periodic one.
 
     **Raises:**
 
-    - `ValueError` for an image that is not two-dimensional, not finite or constant, a weight of another
+    - `ValueError` for an image that is not two-dimensional, not finite or constant, a weight of the wrong
         shape, or a width that is not positive.
     """
 
@@ -184,9 +185,9 @@ class MeshImage(AbstractLeastSquaresCost):
         fit_intensity: bool = True,
         pixel_size: float | Float[Array, ""] | None = None,
     ):
-        # Inside jax.vmap the numbers of an image are not there to be looked at.
-        known = is_concrete(image) and is_concrete(weight)
-        xp, convert = (np, as_float64) if known else (jnp, as_real)
+        # Inside jax.vmap the image is traced: it cannot be checked, and NumPy cannot standardise it.
+        concrete = is_concrete(image) and is_concrete(weight)
+        xp, convert = (np, as_float64) if concrete else (jnp, as_real)
         pixels = convert("image", image)
         if pixels.ndim != 2 or min(pixels.shape) < _SPLINE_POINTS:
             raise ValueError(
@@ -199,7 +200,7 @@ class MeshImage(AbstractLeastSquaresCost):
                 f"Argument `weight` must have the shape of the image, {pixels.shape}, but has "
                 f"{weights.shape}."
             )
-        if known and (not (weights >= 0).all() or not weights.sum() > 0):
+        if concrete and (not (weights >= 0).all() or not weights.sum() > 0):
             raise ValueError(
                 "Argument `weight` must be at least 0 everywhere and positive somewhere."
             )
@@ -209,8 +210,8 @@ class MeshImage(AbstractLeastSquaresCost):
         if fit_intensity:
             mean = (weights * pixels).sum()
             deviation = xp.sqrt((weights * (pixels - mean) ** 2).sum())
-            if known and not deviation > 1e-12 * np.abs(pixels).max():
-                raise ValueError("Argument `image` must show something, but is constant.")
+            if concrete and not deviation > 1e-12 * np.abs(pixels).max():
+                raise ValueError("Argument `image` must not be constant, but is constant.")
             pixels = (pixels - mean) / deviation
         self.image = jnp.asarray(pixels)
         self.psf_width = jnp.asarray(psf_width, self.image.dtype)
@@ -222,7 +223,7 @@ class MeshImage(AbstractLeastSquaresCost):
         self.pixel_size = None if pixel_size is None else jnp.asarray(pixel_size, self.image.dtype)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """Difference of the two images at each pixel, times the root of its share of the weights."""
+        """Difference of the images at each pixel, times the square root of its normalised weight."""
         shape = (self.image.shape[0], self.image.shape[1])
         model = render(
             tissue,
@@ -240,9 +241,9 @@ class MeshImage(AbstractLeastSquaresCost):
 
 
 def mirror(image: np.ndarray) -> np.ndarray:
-    """An image and its mirror images, a periodic image of twice the height and width.
+    """Extend an image by its mirror images to a periodic image of twice the height and width.
 
-    The way of the paper to make a micrograph periodic; goes with
+    The paper makes micrographs periodic in this way. Use it with
     `vertax.initialise.from_labels(…, boundary="mirrored")`.
 
     **Arguments:**

@@ -1,4 +1,4 @@
-"""Which kinds of cells touch."""
+"""Length of interfaces between cells of the same type."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from vertax.mesh._topology import take
 
 
 def _as_types(value: ArrayLike | Sequence[int]) -> Int[Array, "..."]:
-    """Whole numbers as integers."""
+    """Convert whole numbers to an integer array."""
     types = as_real("cell_types", value)
     if is_concrete(types) and not bool(jnp.all(types == jnp.round(types))):
         raise ValueError(
-            "Argument `cell_types` must hold whole numbers, one for each type, but holds fractions. "
-            "numpy.unique(types, return_inverse=True)[1] numbers what is anything else."
+            "Argument `cell_types` must hold whole numbers, but holds fractions. Convert other labels by "
+            "numpy.unique(types, return_inverse=True)[1]."
         )
     return types.astype(int)
 
 
 class HomotypicLength(AbstractCost):
-    r"""Length of the interfaces between cells of one type (paper, "Inverse patterning design").
+    r"""Length of homotypic interfaces, between cells of the same type (paper, "Inverse patterning design").
 
     $$C = \sum_t \ell_{tt} \qquad\text{or}\qquad C = \sum_t \ell_{tt} \, / \, \ell_\mathrm{tot}$$
 
-    over the types $t$, of which there may be any number; $\ell_\mathrm{tot}$ is the length of all
-    interfaces between two cells. Edges on the outline of a free tissue are no interfaces. One minus the
-    relative cost is the heterotypic share, the paper's $\ell_{12} / \ell_\mathrm{tot}$.
+    over all types $t$, where $\ell_\mathrm{tot}$ is the length of all interfaces between two cells. Edges on
+    the outline of a free tissue are not interfaces. With two types, one minus the relative cost is the
+    paper's heterotypic fraction $\ell_{12} / \ell_\mathrm{tot}$.
 
-    At a vertex three cells meet, and of three cells at least two are of one type if there are only two
-    types: no junction of three is without a homotypic interface. The cost can vanish all the same,
-    where these interfaces shrink to points, at which four cells meet as in a checkerboard.
+    With two types every vertex has a homotypic interface, because two of the three cells at a vertex have
+    the same type. The cost can still vanish: homotypic interfaces can shrink to length 0, to fourfold
+    vertices as in a checkerboard.
 
     **Arguments:**
 
-    - `cell_types`: a whole number for each cell.
+    - `cell_types`: the type of each cell, a whole number.
     - `relative`: divide by the length of all interfaces.
 
     **Raises:**
 
-    - `ValueError` if the number of types is not that of the cells, or for types that are no whole numbers.
-    - `TypeError` for types that are no numbers.
+    - `ValueError` for fractions, and for a number of types other than the number of cells.
+    - `TypeError` for types that are not numbers.
     """
 
     cell_types: Int[Array, " cells"] = eqx.field(converter=_as_types)
     relative: bool = eqx.field(static=True, default=False)
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
-        """Length of the interfaces within types, or its share."""
+        """Length of homotypic interfaces, or its fraction."""
         if self.cell_types.shape != (tissue.n_cells,):
             raise ValueError(
-                f"The types of HomotypicLength must have one entry a cell, shape ({tissue.n_cells},), "
+                f"The types of HomotypicLength must have one entry per cell, shape ({tissue.n_cells},), "
                 f"but their shape is {self.cell_types.shape}."
             )
         cells = tissue.topology.edge_cells
@@ -66,5 +66,9 @@ class HomotypicLength(AbstractCost):
         types = take(self.cell_types, jnp.minimum(cells, tissue.n_cells - 1))
         homotypic = inner & (types[:, 0] == types[:, 1])
         lengths = tissue.edge_lengths
-        within = jnp.sum(jnp.where(homotypic, lengths, 0))
-        return within / jnp.sum(jnp.where(inner, lengths, 0)) if self.relative else within
+        homotypic_length = jnp.sum(jnp.where(homotypic, lengths, 0))
+        return (
+            homotypic_length / jnp.sum(jnp.where(inner, lengths, 0))
+            if self.relative
+            else homotypic_length
+        )

@@ -1,4 +1,4 @@
-"""What is wanted of stress, moduli and modes."""
+"""Costs of stress, elastic moduli and vibrational modes."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from vertax.mechanics._arguments import as_matrix
 from vertax.mechanics._elasticity import shear_part, young_part
 from vertax.mesh import Tissue
 
-# Components xx, yy and √2 xy: the sum of their squares is that of all four.
+# With the components xx, yy and √2 xy, the sum of squares is that of all four components.
 _SHEAR = np.sqrt(2.0)
 
 
 class Stress(AbstractLeastSquaresCost):
-    r"""Distance of the stress of a tissue from one wanted, $\tfrac12 |\sigma - \sigma^t|^2$.
+    r"""Squared difference of the stress of a tissue and a target, $\tfrac12 |\sigma - \sigma^t|^2$.
 
     **Arguments:**
 
-    - `target`, shape `(2, 2)`: the symmetric stress to reach, energy per area, see
+    - `target`, shape `(2, 2)`: the symmetric target stress $\sigma^t$, energy per area, see
         [`stress`][vertax.mechanics.stress].
 
     **Raises:**
 
-    - `ValueError` for another shape, or a matrix that is not symmetric.
+    - `ValueError` for a wrong shape, or a matrix that is not symmetric.
     """
 
     target: Float[Array, "2 2"] = eqx.field(converter=partial(as_real, "target"))
@@ -46,19 +46,20 @@ class Stress(AbstractLeastSquaresCost):
 
 
 class CellStress(AbstractLeastSquaresCost):
-    r"""Mean distance of the stress of chosen cells from one wanted, $\frac1{2n} \sum_c |\sigma_c -
-    \sigma^t_c|^2$.
+    r"""Mean squared difference of the stresses of $n$ cells and targets.
+
+    $$C = \frac1{2n} \sum_c |\sigma_c - \sigma^t_c|^2$$
 
     **Arguments:**
 
-    - `target`, shape `(2, 2)` or one for each of the chosen cells: symmetric stress, energy per area, see
+    - `target`, shape `(2, 2)` or one for each selected cell: symmetric stress, energy per area, see
         [`cell_stress`][vertax.mechanics.cell_stress].
-    - `cells`: the numbers of the chosen cells; by default all.
+    - `cells`: the indices of the selected cells; by default all.
 
     **Raises:**
 
-    - `TypeError` for cells that are no whole numbers.
-    - `ValueError` if targets and cells do not match, or a cell is none.
+    - `TypeError` for indices that are not integers.
+    - `ValueError` if the numbers of targets and cells differ, or an index is out of range.
     """
 
     target: Float[Array, "*cells 2 2"] = eqx.field(converter=partial(as_real, "target"))
@@ -73,34 +74,34 @@ class CellStress(AbstractLeastSquaresCost):
             )
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """The components of the differences over the root of their number."""
+        r"""The components of the differences, over $\sqrt n$."""
         stresses = mechanics.cell_stress(tissue, energy)
-        chosen = stresses
+        selected = stresses
         if self.cells is not None:
             within = (self.cells >= 0) & (self.cells < tissue.n_cells)
             if is_concrete(within) and not within.all():
                 raise ValueError(
-                    f"Argument `cells` must hold numbers of cells, from 0 to {tissue.n_cells - 1}, but "
+                    f"Argument `cells` must hold indices of cells, from 0 to {tissue.n_cells - 1}, but "
                     f"holds {self.cells[~within][0]}."
                 )
-            # A cell that is none has no stress, and not that of the last.
-            chosen = stresses.at[self.cells].get(mode="fill", fill_value=jnp.nan)
-        if self.target.shape not in ((2, 2), chosen.shape):
+            # An index out of range gives NaN; by default JAX would clip it to the last cell.
+            selected = stresses.at[self.cells].get(mode="fill", fill_value=jnp.nan)
+        if self.target.shape not in ((2, 2), selected.shape):
             raise ValueError(
-                "The target of CellStress must have the shape (2, 2) or one entry for each chosen cell, "
-                f"{chosen.shape}, but its shape is {self.target.shape}."
+                "The target of CellStress must have the shape (2, 2) or one entry for each selected cell, "
+                f"{selected.shape}, but its shape is {self.target.shape}."
             )
-        return _components(chosen - self.target) / jnp.sqrt(1.0 * chosen.shape[0])
+        return _components(selected - self.target) / jnp.sqrt(1.0 * selected.shape[0])
 
 
 class ShearModulus(AbstractLeastSquaresCost):
-    r"""Distance of the shear modulus from one wanted, $\tfrac12 (G - G^t)^2$.
+    r"""Squared difference of the shear modulus and a target, $\tfrac12 (G - G^t)^2$.
 
     **Arguments:**
 
-    - `target`: the relaxed modulus to reach, energy per area.
+    - `target`: the target $G^t$ of the relaxed modulus, energy per area.
     - `angle`: direction of the shear, see [`shear_modulus`][vertax.mechanics.shear_modulus]; by default
-        the mean over all.
+        the mean over all directions.
     """
 
     target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
@@ -113,11 +114,11 @@ class ShearModulus(AbstractLeastSquaresCost):
 
 
 class BulkModulus(AbstractLeastSquaresCost):
-    r"""Distance of the bulk modulus from one wanted, $\tfrac12 (B - B^t)^2$.
+    r"""Squared difference of the bulk modulus and a target, $\tfrac12 (B - B^t)^2$.
 
     **Arguments:**
 
-    - `target`: the relaxed modulus to reach, energy per area, see
+    - `target`: the target $B^t$ of the relaxed modulus, energy per area, see
         [`bulk_modulus`][vertax.mechanics.bulk_modulus].
     """
 
@@ -130,19 +131,19 @@ class BulkModulus(AbstractLeastSquaresCost):
 
 
 class Anisotropy(AbstractLeastSquaresCost):
-    r"""Distance of the anisotropy of the stiffness from one wanted, $\tfrac12 (a - a^t)^2$.
+    r"""Squared difference of the elastic anisotropy and a target, $\tfrac12 (a - a^t)^2$.
 
-    $a = (Y_\parallel - Y_\perp) / (Y_\parallel + Y_\perp)$ with Young's moduli along a direction and
-    across it.
+    $a = (Y_\parallel - Y_\perp) / (Y_\parallel + Y_\perp)$ with Young's moduli parallel and perpendicular to
+    a direction.
 
     **Arguments:**
 
-    - `target`: the anisotropy to reach, between -1 and 1; 0 for a tissue as stiff along as across.
+    - `target`: the target $a^t$, between -1 and 1; 0 for equal moduli.
     - `angle`: the direction, in radians from the x axis.
 
     **Raises:**
 
-    - `ValueError` for a target that cannot be.
+    - `ValueError` for a target outside (-1, 1).
     """
 
     target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
@@ -161,16 +162,15 @@ class Anisotropy(AbstractLeastSquaresCost):
 
 
 class SpectralGap(AbstractLeastSquaresCost):
-    r"""Distance of a gap between the eigenvalues of the Hessian from one wanted.
+    r"""Squared difference of a gap in the spectrum of the Hessian and a target.
 
-    $C = \tfrac12 (\lambda_{k+1} - \lambda_k - g)^2$, with eigenvalues in ascending order from
-    $\lambda_1$ on.
+    $C = \tfrac12 (\lambda_{k+1} - \lambda_k - g)^2$ with eigenvalues $\lambda_1 \le \lambda_2 \le \dots$
 
     **Arguments:**
 
-    - `target`: the gap $g$ to reach, energy per length squared.
-    - `below`: how many modes $k$ are below the gap. In a periodic tissue 2 of them are the translations,
-        and the default is the softest mode other than these.
+    - `target`: the target gap $g$, energy per length squared.
+    - `below`: the number $k$ of modes below the gap. A periodic tissue has 2 translations of eigenvalue 0:
+        with the default 2, the gap is the lowest eigenvalue of the other modes.
     """
 
     target: Float[Array, ""] = eqx.field(converter=partial(as_real, "target"))
@@ -187,7 +187,7 @@ class SpectralGap(AbstractLeastSquaresCost):
 
 
 def _tensor(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "3 3"]:
-    # A cost that is not known is NaN, which a fit notices; an error would end it.
+    # Without an error a failed solve gives NaN, which a fit handles for each member of a batch.
     return mechanics.elastic_tensor(tissue, energy, throw=False)
 
 

@@ -1,4 +1,4 @@
-"""Distances between the vertices, or the cells, of two tissues."""
+"""Distances between the vertices, edges or cells of two tissues."""
 
 from __future__ import annotations
 
@@ -22,23 +22,21 @@ class VertexDistance(AbstractLeastSquaresCost):
 
     $$C = \frac{1}{2N}\sum_{i=1}^{N} \|x_i - x_{\mathrm{target},i}\|^2$$
 
-    over the $N$ vertices, in units of length squared; across a periodic boundary the shorter way
-    counts.
+    over the $N$ vertices, in units of length squared, with the minimum image in a periodic box.
 
-    Compared by number, tissue and target should have one topology: after a T1 between them, numbers
-    stand for different places. Compared by cells, a vertex belongs to the one of the target at which
-    the same three cells meet in the same order; one that has no counterpart, or (in tiny periodic
-    tissues) several, does not count.
+    With `match="number"` vertices are matched by index: tissue and target should have the same topology,
+    because T1 transitions permute the positions of vertices. With `match="cells"` a vertex is matched with
+    the target vertex where the same three cells meet in the same cyclic order. A vertex with no match, or
+    (in small periodic tissues) with several, contributes 0.
 
     **Arguments:**
 
-    - `target`: the target tissue, with as many vertices.
-    - `match`: by `"number"` of the vertices, or by the `"cells"` that meet there.
+    - `target`: the target tissue, with the same number of vertices.
+    - `match`: match vertices by `"number"` (their index) or by the three `"cells"` that meet there.
 
     **Raises:**
 
-    - `ValueError` if the numbers of vertices, or for `"cells"` those of cells, differ, or for an unknown
-        `match`.
+    - `ValueError` if the numbers of vertices (for `"cells"` also of cells) differ, or for an unknown `match`.
     """
 
     target: Tissue
@@ -53,14 +51,16 @@ class VertexDistance(AbstractLeastSquaresCost):
             )
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """Displacements from the target over the root of the number of vertices."""
-        check_equal(type(self).__name__, tissue, self.target, "vertices", place=True)
-        goal = self.target.vertices
+        r"""$(x_i - x_{\mathrm{target},i}) / \sqrt N$."""
+        check_equal(type(self).__name__, tissue, self.target, "vertices", same_boundary=True)
+        target_vertices = self.target.vertices
         if self.match == "cells":
             check_equal(type(self).__name__, tissue, self.target, "cells")
             counterpart, matched = matching_vertices(tissue, self.target)
-            goal = jnp.where(matched[:, None], take(goal, counterpart), tissue.vertices)
-        displacement = tissue.boundary.shortest(tissue.vertices - goal)
+            target_vertices = jnp.where(
+                matched[:, None], take(target_vertices, counterpart), tissue.vertices
+            )
+        displacement = tissue.boundary.shortest(tissue.vertices - target_vertices)
         return _root_of_mean(displacement, tissue.topology.alive_vertices, tissue)
 
 
@@ -70,16 +70,16 @@ class EdgeDistance(AbstractLeastSquaresCost):
     $$C = \frac{1}{2L}\sum_e \ell_{\mathrm{target},e}
       \int_0^1 \|x_e(s) - x_{\mathrm{target},e}(s)\|^2\,\mathrm ds$$
 
-    at the same share $s$ of the length of an edge, with the length $L$ of all edges of the target; in
-    units of length squared; across a periodic boundary the shorter way counts. Where edges are arcs it
-    sees how they bend, which [`VertexDistance`][vertax.costs.VertexDistance] does not; and it weighs what
-    is drawn of a tissue, so that a short edge, whose direction and angle are mostly noise, counts little.
-    Edges are compared by number, so tissue and target should have one topology.
+    at the relative arc length $s$ along each edge, with the total length $L$ of the edges of the target; in
+    units of length squared, with the minimum image in a periodic box. Unlike
+    [`VertexDistance`][vertax.costs.VertexDistance] it depends on the curvature of arcs, and its weights are
+    the edge lengths: short edges, with poorly measured directions and angles, have small weights. Edges are
+    matched by index, so tissue and target should have the same topology.
 
     **Arguments:**
 
-    - `target`: the target tissue, with as many edges.
-    - `points_per_edge`: points of the quadrature (midpoint rule) on each edge.
+    - `target`: the target tissue, with the same number of edges.
+    - `points_per_edge`: points of the midpoint rule on each edge.
 
     **Raises:**
 
@@ -94,12 +94,12 @@ class EdgeDistance(AbstractLeastSquaresCost):
         check_integer("points_per_edge", self.points_per_edge, at_least=2)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """Displacements of points on edges, times the root of the share of length they stand for."""
-        check_equal(type(self).__name__, tissue, self.target, "edges", place=True)
+        """Displacements of points on edges, times the square roots of their quadrature weights."""
+        check_equal(type(self).__name__, tissue, self.target, "edges", same_boundary=True)
         fractions = (jnp.arange(self.points_per_edge) + 0.5) / self.points_per_edge
         fractions = fractions.astype(tissue.vertices.dtype)
-        goal = self.target.edge_points(fractions)
-        displacement = tissue.boundary.shortest(tissue.edge_points(fractions) - goal)
+        target_vertices = self.target.edge_points(fractions)
+        displacement = tissue.boundary.shortest(tissue.edge_points(fractions) - target_vertices)
         lengths = self.target.edge_lengths
         share = lengths / (jnp.sum(lengths) * self.points_per_edge)
         return (jnp.sqrt(share)[:, None, None] * displacement).ravel()
@@ -110,13 +110,12 @@ class CentroidDistance(AbstractLeastSquaresCost):
 
     $$C = \frac{1}{2N}\sum_{c=1}^{N} \|\bar x_c - \bar x_{\mathrm{target},c}\|^2$$
 
-    over the $N$ cells, in units of length squared; across a periodic boundary the shorter way counts.
-    Cells, unlike vertices, are the same on both sides of a T1 transition, so this is the distance to use
-    between tissues of different topology.
+    over the $N$ cells, in units of length squared, with the minimum image in a periodic box. T1 transitions
+    preserve the cells and their indices, so this distance can compare tissues of different topology.
 
     **Arguments:**
 
-    - `target`: the target tissue, with as many cells.
+    - `target`: the target tissue, with the same number of cells.
 
     **Raises:**
 
@@ -129,94 +128,95 @@ class CentroidDistance(AbstractLeastSquaresCost):
         check_target("CentroidDistance", self.target)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
-        """Displacements from the target over the root of the number of cells."""
-        check_equal(type(self).__name__, tissue, self.target, "cells", place=True)
+        r"""$(\bar x_c - \bar x_{\mathrm{target},c}) / \sqrt N$."""
+        check_equal(type(self).__name__, tissue, self.target, "cells", same_boundary=True)
         displacement = tissue.boundary.shortest(tissue.centroids - self.target.centroids)
         return _root_of_mean(displacement, tissue.alive & self.target.alive, tissue)
 
 
 def _root_of_mean(
-    displacement: Float[Array, "n 2"], there: Bool[Array, " n"], tissue: Tissue
+    displacement: Float[Array, "n 2"], living: Bool[Array, " n"], tissue: Tissue
 ) -> Float[Array, " residuals"]:
-    """Residuals of which half the sum of squares is the mean square over what there is."""
+    """Displacements over the square root of the number of living rows; 0 in spare slots."""
     if not tissue.topology.spare:
         return displacement.ravel() / jnp.sqrt(1.0 * len(displacement))
-    return jnp.where(there[:, None], displacement, 0).ravel() / jnp.sqrt(1.0 * jnp.sum(there))
+    return jnp.where(living[:, None], displacement, 0).ravel() / jnp.sqrt(1.0 * jnp.sum(living))
 
 
 def matching_vertices(
     tissue: Tissue, target: Tissue
 ) -> tuple[Int[Array, " vertices"], Bool[Array, " vertices"]]:
-    """Which vertices of two tissues join the same three cells in the same order.
+    """Match vertices of two tissues where the same three cells meet in the same cyclic order.
 
     **Arguments:**
 
-    - `tissue`, `target`: the tissues, with equally many vertices and cells.
+    - `tissue`, `target`: the tissues, with equal numbers of vertices and cells.
 
-    **Returns:** for each vertex of the tissue the one of the target, and whether there is exactly one.
+    **Returns:** for each vertex of the tissue the index of its match in the target, and whether there is
+    exactly one match.
     """
     n = tissue.n_vertices
     keys = jnp.concatenate([_meeting_cells(tissue), _meeting_cells(target)])
     order = jnp.lexsort(keys.T[::-1])
-    # Equal keys are now side by side; a pair of ours and theirs, and no third, is a match.
-    ranked = take(keys, order)
-    same = jnp.all(ranked[1:] == ranked[:-1], axis=-1)
-    no = jnp.zeros(1, bool)
-    pair = same & ~jnp.concatenate([no, same[:-1]]) & ~jnp.concatenate([same[1:], no])
+    # After sorting, equal keys are adjacent. A match is exactly two equal keys, one from each tissue.
+    sorted_keys = take(keys, order)
+    same = jnp.all(sorted_keys[1:] == sorted_keys[:-1], axis=-1)
+    padding = jnp.zeros(1, bool)
+    matches = same & ~jnp.concatenate([padding, same[:-1]]) & ~jnp.concatenate([same[1:], padding])
     first, second = jnp.sort(jnp.stack([order[:-1], order[1:]]), axis=0)
-    pair &= (first < n) & (second >= n)
-    # Rows that are no pair write to a place past the end, which is dropped.
-    place = jnp.where(pair, first, n)
-    counterpart = jnp.zeros(n, order.dtype).at[place].set(second - n, mode="drop")
-    matched = jnp.zeros(n, bool).at[place].set(True, mode="drop")
+    matches &= (first < n) & (second >= n)
+    # Rows that are not a pair write to an index out of range, which is dropped.
+    slot = jnp.where(matches, first, n)
+    counterpart = jnp.zeros(n, order.dtype).at[slot].set(second - n, mode="drop")
+    matched = jnp.zeros(n, bool).at[slot].set(True, mode="drop")
     return counterpart, matched
 
 
 def _meeting_cells(tissue: Tissue) -> Int[Array, "vertices 3"]:
-    """The cells at each vertex in counter-clockwise order, the one of least number first."""
+    """The cells at each vertex in counter-clockwise order, starting with the smallest index."""
     cells = tissue.topology.cell.reshape(-1, 3)
-    turns = jnp.stack([jnp.roll(cells, -k, axis=1) for k in range(3)], axis=1)
+    rotations = jnp.stack([jnp.roll(cells, -k, axis=1) for k in range(3)], axis=1)
     first = jnp.argmin(cells, axis=1)
-    return jnp.take_along_axis(turns, first[:, None, None], axis=1)[:, 0]
+    return jnp.take_along_axis(rotations, first[:, None, None], axis=1)[:, 0]
 
 
-def check_target(who: str, target: Tissue) -> None:
-    """Refuse a target that is no tissue with a `TypeError`."""
+def check_target(caller: str, target: Tissue) -> None:
+    """Raise a `TypeError` unless a target is a tissue."""
     if not isinstance(target, Tissue):
-        raise TypeError(f"The target of {who} must be a Tissue, but is {describe(target)}.")
+        raise TypeError(f"The target of {caller} must be a Tissue, but is {describe(target)}.")
 
 
 def check_equal(
-    who: str, tissue: Tissue, target: Tissue, name: str, *, place: bool = False
+    caller: str, tissue: Tissue, target: Tissue, name: str, *, same_boundary: bool = False
 ) -> None:
-    """Refuse a target with another number of something, or a batch.
+    """Raise an error unless tissue and target have equal numbers of cells, edges or vertices.
 
     **Arguments:**
 
-    - `who`: what compares them.
+    - `caller`: the class or function that compares them, for messages.
     - `tissue`, `target`: the tissues.
-    - `name`: what there must be equally many of, e.g. `"cells"`.
-    - `place`: whether both must also lie in the same kind of space.
+    - `name`: `"cells"`, `"edges"` or `"vertices"`.
+    - `same_boundary`: whether the boundaries must also be of one class.
 
     **Raises:**
 
-    - `TypeError` if the target is no tissue.
-    - `ValueError` if there are not equally many.
+    - `TypeError` if the target is not a tissue.
+    - `ValueError` for different numbers or boundaries, or a batch.
     """
-    check_target(who, target)
+    check_target(caller, target)
     for each in (tissue, target):
         if each.vertices.ndim != 2:
             raise ValueError(
-                f"{who} compares a single tissue with a single target, but vertices have shape "
-                f"{each.vertices.shape}. Take a batch through equinox.filter_vmap, costs included."
+                f"{caller} must compare a single tissue with a single target, but vertices have shape "
+                f"{each.vertices.shape}. Map over a batch with equinox.filter_vmap, costs included."
             )
     ours, theirs = (type(t.boundary).__name__ for t in (tissue, target))
-    if place and ours != theirs:
+    if same_boundary and ours != theirs:
         raise ValueError(
-            f"The target of {who} must have the boundary of the tissue, {ours}, but has {theirs}."
+            f"The target of {caller} must have the boundary of the tissue, {ours}, but has {theirs}."
         )
     ours, theirs = (getattr(t, f"n_{name}") for t in (tissue, target))
     if ours != theirs:
         raise ValueError(
-            f"The target of {who} must have {ours} {name}, as the tissue has, but has {theirs}."
+            f"The target of {caller} must have {ours} {name}, as the tissue has, but has {theirs}."
         )

@@ -1,4 +1,4 @@
-"""Who is next to whom, as a cost: the index-aware structural (IAS) cost."""
+"""The index-aware structural (IAS) cost: the distance of two tissues by cell adjacency."""
 
 from __future__ import annotations
 
@@ -20,40 +20,39 @@ from vertax.mesh._arcs import length_factor
 
 
 class IndexAwareStructural(AbstractCost):
-    r"""How differently the cells of two tissues are connected (paper, "IAS cost").
+    r"""Distance between the cell adjacencies of two tissues by optimal transport (paper, "IAS cost").
 
-    From the adjacency $A$ of the cells of each tissue, its structure $S = 2I - A - \tfrac12 A^2$; from
-    the rows of the two structures the distances $C_{ij} = \|S_i - S^\mathrm{target}_j\|$; and from
-    these the entropic optimal transport between the cells of both, each of weight $1/N$:
+    1. The adjacency of two cells is $A_{ij} = \sum \ell / (\ell + \ell_0)$ over their interfaces of length
+       $\ell$.
+    2. The structure of a tissue is $S = 2I - A - \tfrac12 A^2$.
+    3. The distance of cell $i$ of the tissue and cell $j$ of the target is
+       $C_{ij} = \sqrt{d^2 + s^2} - s$ with $d = \|S_i - S^\mathrm{target}_j\|$.
+    4. The cost is that of the entropic optimal transport between the cells, each of weight $1/N$
+       (Cuturi 2013, "Sinkhorn distances"):
 
     $$L = \min_P \sum_{ij} P_{ij} C_{ij}
       + \varepsilon \Bigl(\sum_{ij} P_{ij} \log P_{ij} + \log N\Bigr)$$
 
-    The constant makes $L = 0$ for equal tissues, as far as $\varepsilon$ is small against the distances
-    between different cells (some units). Rows are compared entry by entry, so cells keep their numbers:
-    hence "index-aware".
+    The constant $\log N$ makes $L \approx 0$ for equal tissues, if $\varepsilon$ is small compared with the
+    distances between different cells (of order 1). Rows of $S$ are compared entry by entry, so $L$ depends
+    on the indices of the cells ("index-aware").
 
-    A matrix of zeros and ones has no derivative. Here $A_{ij} = \sum \ell / (\ell + \ell_0)$ over the
-    interfaces of the two cells: it vanishes with the interface, is continuous through a T1 transition
-    and has a slope at length zero that goes on pushing. The exterior of a free tissue is no cell.
+    $A$ vanishes with the interface, is continuous through a T1 transition, and has a nonzero derivative at
+    $\ell = 0$. The exterior of a free tissue is not a cell.
 
-    The first derivatives are those of the envelope theorem, $\partial L / \partial C = P$, and need no
-    derivative of the solver; second derivatives are right too (implicit differentiation of the
-    transport potentials).
+    First derivatives use the envelope theorem, $\partial L / \partial C = P$; second derivatives use implicit
+    differentiation of the transport potentials.
 
-    Spare slots count for nothing. A cell that only one of the tissues has costs as much as a cell without
-    neighbours would.
-
-    Paper: M. Cuturi (2013), "Sinkhorn distances", for the entropic transport.
+    Spare slots contribute 0. A cell that exists in only one of the tissues is compared with a cell without
+    neighbours.
 
     **Arguments:**
 
-    - `target`: the target tissue, with as many cells.
-    - `interface_length`: $\ell_0$, in units of length; left out, a tenth of the root of the mean cell
+    - `target`: the target tissue, with the same number of cells.
+    - `interface_length`: $\ell_0$, in units of length; by default 0.1 times the square root of the mean cell
         area of the target.
     - `epsilon`: strength $\varepsilon$ of the entropy, in units of the entries of $S$.
-    - `softening`: distances below this count quadratically, so that $L$ is smooth where tissues agree:
-        $\sqrt{d^2 + s^2} - s$ in place of $d$.
+    - `softening`: $s$, in units of the entries of $S$; makes $L$ smooth at $d = 0$.
 
     **Raises:**
 
@@ -73,17 +72,17 @@ class IndexAwareStructural(AbstractCost):
                 check_number(name, value, above=0, many=True)
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
-        """Cost of the optimal transport between the structures."""
+        """Cost of the entropic optimal transport between the structures."""
         distances = self.distances(tissue)
         cost = entropic_transport(distances, jnp.asarray(self.epsilon, distances.dtype))
         if not (tissue.topology.spare or self.target.topology.spare):
             return cost
-        # Spare slots are transported to spare slots for nothing: what they add is weight alone.
+        # Spare slots are transported to spare slots at cost 0 and change only the weights 1/N.
         living = jnp.maximum(jnp.sum(tissue.alive), jnp.sum(self.target.alive))
         return cost * tissue.n_cells / living
 
     def distances(self, tissue: Tissue) -> Float[Array, "cells cells"]:
-        """Distance of each cell's structure (first axis) from that of each cell of the target."""
+        """Distances $C$ between the cells of the tissue (rows) and of the target (columns)."""
         check_equal(type(self).__name__, tissue, self.target, "cells")
         length = self.interface_length
         if length is None:
@@ -91,34 +90,36 @@ class IndexAwareStructural(AbstractCost):
         rows = structure(adjacency(tissue, length))
         columns = structure(adjacency(self.target, length))
         spare = tissue.topology.spare or self.target.topology.spare
-        none, gone = ~tissue.alive, ~self.target.alive
+        spare_rows, spare_columns = ~tissue.alive, ~self.target.alive
         if spare:
             rows, columns = (
-                jnp.where(x[:, None], 0, y) for x, y in ((none, rows), (gone, columns))
+                jnp.where(x[:, None], 0, y)
+                for x, y in ((spare_rows, rows), (spare_columns, columns))
             )
         squared = _squared_distances(rows, columns)
-        # √(d² + s²) - s, without the difference, which cancels for d far below s.
+        # √(d² + s²) - s = d² / (√(d² + s²) + s), which avoids the cancellation for d much smaller than s.
         distances = squared / (jnp.sqrt(squared + self.softening**2) + self.softening)
         if not spare:
             return distances
-        # The first spare slot belongs to the first, and so on, so that there is nothing to choose.
-        same = jnp.cumsum(none)[:, None] == jnp.cumsum(gone)
+        # The k-th spare slot of the tissue has distance 0 only from the k-th spare slot of the target, which
+        # makes the plan between spare slots unique.
+        same = jnp.cumsum(spare_rows)[:, None] == jnp.cumsum(spare_columns)
         far = jax.lax.stop_gradient(jnp.max(distances))
-        return jnp.where(none[:, None] & gone, jnp.where(same, 0, far), distances)
+        return jnp.where(spare_rows[:, None] & spare_columns, jnp.where(same, 0, far), distances)
 
 
 def adjacency(
     tissue: Tissue, interface_length: Float[Array, ""] | float | None = None
 ) -> Float[Array, "cells cells"]:
-    r"""Which cells touch: symmetric, with zeros on the diagonal.
+    r"""Adjacency matrix of the cells: symmetric, with zeros on the diagonal.
 
     **Arguments:**
 
     - `tissue`: the tissue.
-    - `interface_length`: $\ell_0$: each interface of length $\ell$ counts $\ell / (\ell + \ell_0)$;
-        left out, cells that touch count 1, however often they do.
+    - `interface_length`: $\ell_0$: the entries are $\sum \ell / (\ell + \ell_0)$ over the interfaces of two
+        cells; by default they are 1 for cells that touch, and 0 otherwise.
 
-    **Returns:** the matrix; the exterior of a free tissue is left out.
+    **Returns:** the matrix, without the exterior of a free tissue.
 
     **Raises:**
 
@@ -130,11 +131,11 @@ def adjacency(
     left, right = m.edge_cells.T
     weights = jnp.ones(tissue.n_edges, tissue.vertices.dtype)
     if interface_length is not None:
-        # Softened lengths do not vanish with their edge: what is left of them is taken away.
-        rest = tissue.softening
+        # A softened length does not vanish with the edge: subtract its value at length 0.
+        length_at_zero = tissue.softening
         if tissue.angles is not None:
-            rest = rest * length_factor(tissue.edge_angles)
-        lengths = tissue.edge_lengths - rest
+            length_at_zero = length_at_zero * length_factor(tissue.edge_angles)
+        lengths = tissue.edge_lengths - length_at_zero
         weights = lengths / (lengths + interface_length)
     weights = jnp.where(left == right, 0, weights)
     matrix = jnp.zeros((m.n_faces, m.n_faces), weights.dtype)
@@ -144,21 +145,23 @@ def adjacency(
 
 
 def structure(adjacency: Float[Array, "cells cells"]) -> Float[Array, "cells cells"]:
-    r"""The structure $2I - A - \tfrac12 A^2$ of an adjacency: neighbours, and theirs."""
+    r"""The structure $2I - A - \tfrac12 A^2$ of an adjacency: first and second neighbours."""
     return 2 * jnp.eye(len(adjacency)) - adjacency - 0.5 * adjacency @ adjacency
 
 
 def mismatched_neighbours(tissue: Tissue, target: Tissue) -> int:
-    """How many neighbourships differ between two tissues (the paper's discrete IAS error).
+    """Number of neighbour pairs that differ between two tissues (the paper's discrete IAS error).
 
-    Cells are assigned to each other so that the distances of their structures, from who touches whom
-    alone, have the smallest sum (Hungarian method); then the neighbours that only one of two assigned
-    cells has are counted, and divided by two, because two cells take part in each. One T1 between
-    otherwise equal tissues gives 2: a neighbourship lost and one gained.
+    1. Assign the cells of the target to those of the tissue, minimising the sum of the distances between
+       their structures from binary adjacencies (Hungarian algorithm).
+    2. Count the entries in which the rows of the adjacencies of assigned cells differ, and divide by two,
+       because each pair has two cells.
+
+    One T1 transition between otherwise equal tissues gives 2: one pair lost and one gained.
 
     **Arguments:**
 
-    - `tissue`, `target`: the tissues, with equally many cells.
+    - `tissue`, `target`: the tissues, with the same number of cells.
 
     **Returns:** the number; divided by the number of interfaces it is a relative topological error.
 
@@ -176,6 +179,6 @@ def mismatched_neighbours(tissue: Tissue, target: Tissue) -> int:
 def _squared_distances(
     rows: Float[Array, "cells cells"], columns: Float[Array, "cells cells"]
 ) -> Float[Array, "cells cells"]:
-    """Squared distance of each row of one matrix from each row of another."""
+    """Squared distances between the rows of two matrices."""
     squares = jnp.sum(rows**2, axis=1)[:, None] + jnp.sum(columns**2, axis=1)[None, :]
     return maximum(squares - 2 * rows @ columns.T, 0)

@@ -1,4 +1,4 @@
-"""Dissipations: what resists the motion of a tissue."""
+"""Dissipations: friction and viscosity of a tissue."""
 
 from vertax.dissipations._dissipation import (
     AbstractDissipation as AbstractDissipation,

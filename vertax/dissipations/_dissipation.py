@@ -1,4 +1,4 @@
-"""What every dissipation is, and how dissipations add up."""
+"""Abstract dissipations and sums of dissipations."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from vertax.mesh import Tissue
 
 
 class AbstractDissipation(eqx.Module):
-    r"""What a motion from one configuration to the next dissipates.
+    r"""Dissipation of a time step.
 
-    By Onsager's principle velocities minimise the dissipation $R(\dot x; x)$, quadratic in them, plus the
-    rate at which the energy changes. A step of a length of time $\Delta t$ then minimises
+    By Onsager's variational principle the velocities minimise $R(\dot x; x) + \dot E$, with a dissipation
+    function $R$ that is quadratic in $\dot x$. A time step of length $\Delta t$ minimises the incremental
+    potential
 
     $$E(x) + \Delta t\, R\left(\frac{x - x_0}{\Delta t}; x_0\right),$$
 
-    and a dissipation is the second term. Subclass it, put the coefficients into fields and write
+    and a dissipation returns its second term. Subclass it, put the coefficients into fields and write
     `__call__`:
 
     ```python
@@ -31,8 +32,8 @@ class AbstractDissipation(eqx.Module):
             return 0.5 * self.strength * jnp.sum((tissue.areas - before.areas) ** 2) / dt
     ```
 
-    Dissipations add: `SubstrateFriction(1.0) + PerimeterViscosity(0.2)`. One that is half a sum of squares
-    is better a subclass of [`AbstractViscosity`][vertax.dissipations.AbstractViscosity].
+    Dissipations add: `SubstrateFriction(1.0) + PerimeterViscosity(0.2)`. If the dissipation is half a sum of
+    squares, subclass [`AbstractViscosity`][vertax.dissipations.AbstractViscosity] instead.
     """
 
     def __check_init__(self):
@@ -46,9 +47,9 @@ class AbstractDissipation(eqx.Module):
 
         **Arguments:**
 
-        - `tissue`: at the end of the step.
-        - `before`: the same tissue where the step begins; it may lie in another box.
-        - `dt`: the length of the step in time.
+        - `tissue`: the tissue at the end of the step.
+        - `before`: the tissue at the start of the step; its box may differ.
+        - `dt`: the length of the step.
         """
 
     def __add__(self, other: AbstractDissipation) -> AbstractDissipation:
@@ -63,13 +64,12 @@ class AbstractDissipation(eqx.Module):
 class AbstractViscosity(AbstractDissipation):
     r"""A dissipation that is half a sum of squares, $\tfrac1{2 \Delta t} \sum_i s_i^2$.
 
-    Override `strains`. That it is known what is squared lets steps be of second order, and gives thermal
-    noise the right correlations.
+    Override `strains`, which returns the $s_i$. Second-order time steps and thermal noise use them.
     """
 
     @abc.abstractmethod
     def strains(self, tissue: Tissue, before: Tissue) -> Float[Array, " strains"]:
-        """What changed in a step, times the square root of what resists it; 0 if nothing moved."""
+        """The $s_i$: changes during a step times the square roots of their coefficients; 0 without motion."""
 
     def __call__(
         self, tissue: Tissue, before: Tissue, dt: float | Float[Array, ""]
@@ -92,12 +92,12 @@ class Sum(AbstractDissipation):
 
 
 class ViscositySum(AbstractViscosity):
-    """A sum of viscosities; made by `+`, and half a sum of squares itself."""
+    """A sum of viscosities, which is half a sum of squares; made by `+`."""
 
     terms: tuple[AbstractViscosity, ...]
 
     def strains(self, tissue: Tissue, before: Tissue) -> Float[Array, " strains"]:
-        """Those of all terms, one after the other."""
+        """The strains of all terms, concatenated."""
         return jnp.concatenate([term.strains(tissue, before) for term in self.terms])
 
 

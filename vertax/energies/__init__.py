@@ -1,4 +1,4 @@
-"""Energies: how a tissue wants to deform."""
+"""Mechanical energies of a tissue."""
 
 from vertax.energies._ablation import Ablated as Ablated
 from vertax.energies._elasticity import (

@@ -1,4 +1,4 @@
-"""Ablation: what a laser takes away of an energy."""
+"""Laser ablation: an energy without the terms of some cells and edges."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def _as_mask(name: str, value: ArrayLike | None) -> Bool[Array, "..."] | None:
 
 
 class Ablated(AbstractLocalEnergy):
-    r"""An energy of which some cells and edges have lost their part, as after a cut by a laser.
+    r"""An energy without the terms of ablated cells and edges.
 
-    A cut edge has no tension any more; a cell that is gone is a hole, which neither resists a change of its
-    area nor has a perimeter. Their neighbours are as they were.
+    A cut edge has no tension. An ablated cell is a hole: it has no area elasticity and no perimeter
+    elasticity. The terms of all other cells and edges are unchanged.
 
     ```python
     cut = vx.energies.Ablated(energy, edges=jnp.arange(tissue.n_edges) == 7)
@@ -37,13 +37,13 @@ class Ablated(AbstractLocalEnergy):
 
     **Arguments:**
 
-    - `energy`: the energy before, a sum over cells and edges.
-    - `cells`, shape `(cells,)`: which cells are holes; by default none.
-    - `edges`, shape `(edges,)`: which edges are cut; by default none.
+    - `energy`: the energy before ablation, a sum over cells and edges.
+    - `cells`, shape `(cells,)`: True for ablated cells; by default none.
+    - `edges`, shape `(edges,)`: True for cut edges; by default none.
 
     **Raises:**
 
-    - `ValueError` in an energy for masks of the wrong length.
+    - `ValueError` when the energy is evaluated, for a mask of the wrong length.
     """
 
     energy: AbstractLocalEnergy
@@ -55,19 +55,20 @@ class Ablated(AbstractLocalEnergy):
     )
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
-        """Energy of each cell that is no hole."""
+        """Energy of each cell; 0 for ablated cells."""
         terms = self.energy.cell_terms(tissue)
-        return _without(terms, self.cells, "cells", tissue.n_cells)
+        return _masked(terms, self.cells, "cells", tissue.n_cells)
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
-        """Energy of each edge that is not cut."""
+        """Energy of each edge; 0 for cut edges."""
         terms = self.energy.edge_terms(tissue)
-        return _without(terms, self.edges, "edges", tissue.n_edges)
+        return _masked(terms, self.edges, "edges", tissue.n_edges)
 
 
-def _without(
+def _masked(
     terms: Float[Array, "*n"], mask: Bool[Array, "..."] | None, name: str, size: int
 ) -> Float[Array, "*n"]:
+    """The terms, with 0 where the mask is True."""
     if mask is None:
         return terms
     if mask.shape != (size,):

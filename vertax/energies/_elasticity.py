@@ -1,4 +1,4 @@
-"""Elastic cells: areas, perimeters and shape factors with targets."""
+"""Area and perimeter elasticity of cells."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class ShapeFactorEnergy(AbstractLocalEnergy):
     $$E_1 = \sum_c \left(\frac{A_c}{A_0} - 1\right)^2
           + \sum_c \left(\frac{P_c}{\sqrt{A_0}} - p^0_c\right)^2$$
 
-    The paper's first energy; Bi et al. 2015, doi:10.1038/nphys3471, at equal moduli. Tissues of equal
-    cells are rigid for $p_0$ below about 3.81 and fluid-like above.
+    The paper's energy $E_1$; that of Bi et al. 2015, doi:10.1038/nphys3471, with equal moduli. A tissue of
+    equal cells is rigid for $p_0$ below about 3.81 and fluid-like above.
 
     **Arguments:**
 
-    - `target_shape_factor`: $p^0$, dimensionless; scalar or one a cell.
-    - `mean_area`: $A_0$, in units of length squared; scalar or one a cell.
+    - `target_shape_factor`: $p^0$, dimensionless; scalar or one per cell.
+    - `mean_area`: $A_0$, in units of length squared; scalar or one per cell.
 
     **Raises:**
 
@@ -51,12 +51,12 @@ class ShapeFactorEnergy(AbstractLocalEnergy):
 class AreaElasticity(AbstractLocalEnergy):
     r"""$\tfrac12\sum_c K_c\,(A_c - A^0_c)^2$ (Farhadifar et al. 2007, doi:10.1016/j.cub.2007.11.049).
 
-    Together with [`LineTension`][vertax.energies.LineTension] the paper's second energy.
+    The sum with [`LineTension`][vertax.energies.LineTension] is the paper's energy $E_2$.
 
     **Arguments:**
 
-    - `stiffness`: $K$, energy per area squared; scalar or one a cell.
-    - `target_area`: $A^0$; scalar or one a cell.
+    - `stiffness`: $K$, energy per area squared; scalar or one per cell.
+    - `target_area`: $A^0$; scalar or one per cell.
     """
 
     stiffness: float | Float[Array, "*cells"] = eqx.field(
@@ -81,12 +81,12 @@ class AreaElasticity(AbstractLocalEnergy):
 class PerimeterElasticity(AbstractLocalEnergy):
     r"""$\tfrac12\sum_c K_c\,(P_c - P^0_c)^2$ (Farhadifar et al. 2007, doi:10.1016/j.cub.2007.11.049).
 
-    With `target_perimeter = 0` the perimeter contractility $\tfrac12\Gamma P^2$.
+    With `target_perimeter = 0` it is the perimeter contractility $\tfrac12\Gamma P^2$.
 
     **Arguments:**
 
-    - `stiffness`: $K$, energy per length squared; scalar or one a cell.
-    - `target_perimeter`: $P^0$; scalar or one a cell.
+    - `stiffness`: $K$, energy per length squared; scalar or one per cell.
+    - `target_perimeter`: $P^0$; scalar or one per cell.
     """
 
     stiffness: float | Float[Array, "*cells"] = eqx.field(

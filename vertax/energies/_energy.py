@@ -1,4 +1,4 @@
-"""What every energy is, and how energies add up."""
+"""Abstract energies, sums of energies, and the parameters of energies."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class AbstractEnergy(eqx.Module):
     ```
 
     Fields that are arrays are parameters, which a fit adjusts by default; plain Python numbers are
-    constants. Energies add: `AreaElasticity(...) + LineTension(...)`. An energy that is a sum over cells
-    and edges is better a subclass of [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]: T1 transitions
-    are then judged many at a time.
+    constants. Energies add: `AreaElasticity(...) + LineTension(...)`. For an energy that is a sum over cells
+    and edges, subclass [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy] instead: candidate T1
+    transitions are then evaluated in one batch.
 
-    `jax.custom_vjp` must not be used inside: implicit differentiation needs forward mode through the
-    gradient (`jax.custom_jvp` is fine).
+    Do not use `jax.custom_vjp` inside: implicit differentiation needs forward mode through the gradient.
+    `jax.custom_jvp` works.
     """
 
     def __check_init__(self):
@@ -55,15 +55,15 @@ class AbstractEnergy(eqx.Module):
         return LocalSum(local) if len(local) == len(terms) else Sum(terms)
 
     def __radd__(self, other: int) -> AbstractEnergy:
-        """What `sum` of some energies begins with: 0 and the first one."""
+        """The energy itself for 0, with which the built-in `sum` starts."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
 class AbstractLocalEnergy(AbstractEnergy):
-    """An energy that is a sum of one term a cell and one term an edge.
+    r"""An energy $\sum_c E_c + \sum_e E_e$ with one term per cell and one term per edge.
 
-    Override `cell_terms`, `edge_terms` or both. Each term may depend on the geometry of its own cell
-    (or edge) alone; that is what lets T1 transitions be judged by local differences.
+    Override `cell_terms`, `edge_terms` or both. Each term must depend only on the geometry of that cell
+    or edge, so that the energy change of a T1 transition is a sum of local differences.
     """
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
@@ -75,7 +75,7 @@ class AbstractLocalEnergy(AbstractEnergy):
         return jnp.zeros(tissue.n_edges, tissue.vertices.dtype)
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
-        """Energy of a tissue: the sum of all terms, of cells and edges that there are."""
+        """Sum of the terms of all living cells and edges; spare slots add 0."""
         by_cell, by_edge = self.cell_terms(tissue), self.edge_terms(tissue)
         if tissue.topology.spare:
             by_cell = jnp.where(tissue.alive, by_cell, 0)
@@ -94,7 +94,7 @@ class Sum(AbstractEnergy):
 
 
 class LocalSum(AbstractLocalEnergy):
-    """A sum of local energies; made by `+`, and local itself."""
+    """A sum of local energies, which is a local energy; made by `+`."""
 
     terms: tuple[AbstractLocalEnergy, ...]
 
@@ -110,7 +110,7 @@ class LocalSum(AbstractLocalEnergy):
 
 
 def check_energy(energy: Any, name: str = "energy") -> None:
-    """Raise an error unless an argument is an energy, or another function of a tissue.
+    """Raise an error unless an argument is an energy or another function of a tissue.
 
     **Arguments:**
 
@@ -119,7 +119,7 @@ def check_energy(energy: Any, name: str = "energy") -> None:
 
     **Raises:**
 
-    - `TypeError` for an object that cannot be called, or a class of energies in place of an instance.
+    - `TypeError` for an object that is not callable, and for a class in place of an instance.
     """
     if callable(energy) and not isinstance(energy, type):
         return
@@ -130,12 +130,12 @@ def check_energy(energy: Any, name: str = "energy") -> None:
 
 
 def instance_hint(value: Any) -> str:
-    """How to make an instance of a class that was passed in its place; empty for other values."""
+    """Remedy for a class in place of an instance: how to make an instance; empty for other values."""
     if not isinstance(value, type):
         return ""
     try:
         parameters = inspect.signature(value).parameters.values()
-    except (TypeError, ValueError):  # a class of C code without a signature
+    except (TypeError, ValueError):  # a class defined in C has no signature
         return f" Pass an instance, {value.__name__}(...)."
     required = [p.name for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
     return f" Pass an instance, {value.__name__}({', '.join(required)})."
@@ -146,22 +146,22 @@ def _terms(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:
 
 
 Parameter: TypeAlias = float | Float[Array, "*shape"]
-"""A parameter of an energy: an array, which is what a fit adjusts by default, or a constant float."""
+"""A parameter of an energy: an array, which a fit adjusts by default, or a constant float."""
 
 
 def as_parameter(name: str, value: ArrayLike) -> Parameter:
-    """A Python number stays one, a constant; anything else becomes an array of floating-point numbers.
+    """Convert a Python number to a float (a constant), and anything else to a floating-point array.
 
     **Arguments:**
 
-    - `name`: of the parameter.
+    - `name`: name of the parameter, for error messages.
     - `value`: the parameter.
 
     **Returns:** a float or an array.
 
     **Raises:**
 
-    - `TypeError` for what are no real numbers.
+    - `TypeError` unless the value holds real numbers.
     - `ValueError` for NaN and infinity.
     """
     array = as_real(name, value)
@@ -169,24 +169,24 @@ def as_parameter(name: str, value: ArrayLike) -> Parameter:
 
 
 def per_cell(values: Parameter, tissue: Tissue, name: str) -> Parameter:
-    """Check that a parameter is a scalar or has one entry a cell."""
+    """Check that a parameter is a scalar or has one entry per cell."""
     return _check(values, tissue, tissue.n_cells, name, "cell")
 
 
 def per_edge(values: Parameter, tissue: Tissue, name: str) -> Parameter:
-    """Check that a parameter is a scalar or has one entry an edge."""
+    """Check that a parameter is a scalar or has one entry per edge."""
     return _check(values, tissue, tissue.n_edges, name, "edge")
 
 
-def _check(values: Parameter, tissue: Tissue, size: int, name: str, what: str) -> Parameter:
+def _check(values: Parameter, tissue: Tissue, size: int, name: str, item: str) -> Parameter:
     if tissue.vertices.ndim != 2:
         raise ValueError(
-            "An energy is that of a single tissue, but the vertices have shape "
-            f"{tissue.vertices.shape}. Take a batch through equinox.filter_vmap."
+            "Argument `tissue` of an energy must be a single tissue, but its vertices have shape "
+            f"{tissue.vertices.shape}. Map over a batch with equinox.filter_vmap."
         )
     if jnp.shape(values) not in ((), (size,)):
         raise ValueError(
-            f"Parameter `{name}` must be a scalar or have one entry a {what}, shape ({size},), but its "
+            f"Parameter `{name}` must be a scalar or have one entry per {item}, shape ({size},), but its "
             f"shape is {jnp.shape(values)}."
         )
     return values

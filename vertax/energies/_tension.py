@@ -1,4 +1,4 @@
-"""Tension along edges."""
+"""Line tension of edges."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from vertax.mesh import Tissue
 class LineTension(AbstractLocalEnergy):
     r"""$\sum_e \gamma_e\,\ell_e$, each edge counted once (Farhadifar et al. 2007).
 
-    With [`AreaElasticity`][vertax.energies.AreaElasticity] the paper's second energy,
+    The sum with [`AreaElasticity`][vertax.energies.AreaElasticity] is the paper's energy
     $E_2 = \tfrac12 K \sum_c (A_c - A^0_c)^2 + \sum_e \gamma_e \ell_e$.
 
     **Arguments:**
 
-    - `tension`: line tension $\gamma$, energy per length; scalar or one an edge.
+    - `tension`: line tension $\gamma$, energy per length; scalar or one per edge.
     """
 
     tension: float | Float[Array, "*edges"] = eqx.field(converter=partial(as_parameter, "tension"))
@@ -34,23 +34,23 @@ class LineTension(AbstractLocalEnergy):
 
 
 class BoundedTension(AbstractLocalEnergy):
-    r"""Line tension that a fit cannot drive out of bounds: $\sum_e \gamma_e\,\ell_e$ with
+    r"""Line tension between two fixed bounds: $\sum_e \gamma_e\,\ell_e$ with
 
     $$\gamma_e = \gamma_\mathrm{low} + (\gamma_\mathrm{high} - \gamma_\mathrm{low})\,
       \frac{1}{1 + e^{-z_e}}.$$
 
-    A fit adjusts the logits $z$, and whatever they become the tension stays between its bounds. With
-    [`LineTension`][vertax.energies.LineTension] an optimiser may go to negative tensions, under which
-    edges lengthen without end, or to such that cells collapse.
+    A fit adjusts the logits $z$; the tension stays between the bounds for every value of $z$. Without
+    bounds ([`LineTension`][vertax.energies.LineTension]) an optimiser may reach negative tensions, for
+    which the energy has no minimum, or tensions for which cells collapse.
 
     **Arguments:**
 
-    - `tension`: line tension $\gamma$ to begin with, energy per length; scalar array or one an edge.
-    - `low`, `high`: the bounds, which are constants.
+    - `tension`: initial line tension $\gamma$, energy per length; scalar array or one per edge.
+    - `low`, `high`: the bounds $\gamma_\mathrm{low}$ and $\gamma_\mathrm{high}$, constants.
 
     **Raises:**
 
-    - `ValueError` if `low` is not below `high`, or a tension not between them.
+    - `ValueError` if `low` is not below `high`, or if a tension is not between them.
     """
 
     logits: Float[Array, "*edges"]
@@ -65,7 +65,7 @@ class BoundedTension(AbstractLocalEnergy):
         tension = as_real("tension", tension).astype(jnp.result_type(float))
         if is_concrete(tension) and not jnp.all((tension > low) & (tension < high)):
             raise ValueError(
-                f"Argument `tension` must lie between {low} and {high}, but goes from {tension.min()} "
+                f"Argument `tension` must be between {low} and {high}, but ranges from {tension.min()} "
                 f"to {tension.max()}."
             )
         self.logits = jnp.log((tension - low) / (high - tension))

@@ -1,4 +1,4 @@
-"""Typical sizes of a tissue and of its energy, in which solvers and adjoints measure."""
+"""Length, stiffness and force scales, in which solvers and adjoints express their tolerances."""
 
 from __future__ import annotations
 
@@ -17,47 +17,50 @@ from vertax.mesh._tissue import mean_area
 
 
 class Units(eqx.Module):
-    """The units of a tissue: whatever unit of length and energy the user chose, it relaxes alike."""
+    """Scales of a tissue and its energy; they make a relaxation independent of the user's units."""
 
     length: Float[Array, ""]
-    """The size of a cell: the root mean cell area."""
+    """Square root of the mean cell area."""
     stiffness: Float[Array, ""]
-    """A typical second derivative of the energy; 1 for one that has none."""
+    """A typical second derivative of the energy; 1 if that is 0 or not finite."""
 
     @property
     def force(self) -> Float[Array, ""]:
-        """The force that moves a vertex by the size of a cell."""
+        """Stiffness times length."""
         return self.stiffness * self.length
 
 
 def units_of(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Units:
-    """The units of a tissue and of its energy."""
+    """The scales of a tissue and its energy."""
     stiffness = mean_stiffness(tissue, energy)
-    sound = jnp.isfinite(stiffness) & (stiffness > 0)
-    return Units(cell_size(tissue), jnp.where(sound, stiffness, 1))
+    valid = jnp.isfinite(stiffness) & (stiffness > 0)
+    return Units(cell_size(tissue), jnp.where(valid, stiffness, 1))
 
 
 def cell_size(tissue: Tissue) -> Float[Array, ""]:
-    """The root mean cell area. Arcs that are nearly full circles, or beyond, count as shorter ones."""
+    """Square root of the mean cell area. Arc angles are clipped, so that the area stays finite."""
     if tissue.angles is not None:
         tissue = tissue.with_angles(jnp.clip(tissue.angles, -_LARGEST_ANGLE, _LARGEST_ANGLE))
     return jnp.sqrt(mean_area(tissue))
 
 
-# Half of the angle that an arc spans. (The segment of a circle has 8 times the area of the half disc then.)
+# Half of the angle that an arc spans, in radians. At this angle the area of the circular segment is 5.3
+# times that of the half disc over the same chord.
 _LARGEST_ANGLE = 2.5
 
 
 def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:
-    """The size of a typical second derivative of an energy, or of any number that a tissue has."""
-    # The Rayleigh quotient of a vector without pattern is the mean eigenvalue, near enough.
+    """A typical absolute second derivative of an energy, or of another function of a tissue."""
+    # The Rayleigh quotient of an unstructured vector approximates the mean eigenvalue.
     y, unravel = ravel_pytree(tissue.configuration)
-    there = lambda x: MeasuredTissue(tissue.with_configuration(unravel(x)))
-    slope = jax.grad(lambda x: energy(there(x)))
+    at = lambda x: MeasuredTissue(tissue.with_configuration(unravel(x)))
+    gradient = jax.grad(lambda x: energy(at(x)))
     direction = probe_vector(y)
-    if tissue.topology.spare:  # what cannot move must not make the rest look soft
+    if (
+        tissue.topology.spare
+    ):  # vertices of spare slots have no stiffness and must not enter the mean
         weights = tissue.by_row(tissue.topology.alive_vertices.astype(y.dtype))
         weigh = lambda x, w: (x.T * w).T
         direction, _ = ravel_pytree(jax.tree.map(weigh, unravel(direction), weights))
-    _, response = jax.jvp(slope, (y,), (direction,))
+    _, response = jax.jvp(gradient, (y,), (direction,))
     return jnp.abs(jnp.sum(direction * response)) / jnp.sum(direction**2)

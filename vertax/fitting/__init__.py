@@ -1,8 +1,9 @@
-"""Inverse problems: parameters whose equilibrium minimises a cost."""
+"""Inverse problems: find parameters such that the equilibrium minimises a cost."""
 
 from vertax._base.batch import member as member, stack as stack
 from vertax._base.checkpoints import Checkpoint as Checkpoint
 from vertax.fitting._batch import stack_fits as stack_fits
+from vertax.fitting._convergence import doubts as doubts, limits as limits
 from vertax.fitting._fit import fit as fit
 from vertax.fitting._history import (
     Fit as Fit,
@@ -15,4 +16,3 @@ from vertax.fitting._inverse import (
     InverseProblem as InverseProblem,
 )
 from vertax.fitting._uncertainty import Uncertainty as Uncertainty, uncertainty as uncertainty
-from vertax.fitting._verdict import doubts as doubts, limits as limits

@@ -1,4 +1,4 @@
-"""What the arguments of a fit must be."""
+"""Checks of the arguments of a fit."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vertax.fitting._inverse import InverseProblem
 def check_arguments(
     problem: Any, optimiser: Any, epochs: Any, guidance: Any, callback: Any
 ) -> None:
-    """Refuse what [`fit`][vertax.fit] cannot work with, with what to write instead.
+    """Raise an error with a remedy for invalid arguments of [`fit`][vertax.fit].
 
     **Raises:**
 
-    - `TypeError` for an argument of another kind.
+    - `TypeError` for an argument of a wrong type.
     - `ValueError` for less than one epoch.
     """
     if not isinstance(problem, InverseProblem):
@@ -40,8 +40,7 @@ def check_arguments(
 
 
 def _check_optimiser(optimiser: Any) -> None:
-    known = optax.GradientTransformation | optx.AbstractLeastSquaresSolver
-    if isinstance(optimiser, known):
+    if isinstance(optimiser, optax.GradientTransformation | optx.AbstractLeastSquaresSolver):
         return
     remedy = (
         "Pass an Optax optimiser, such as optax.adam(1e-2), or a least-squares solver, such as "

@@ -1,4 +1,4 @@
-"""Fits of a batch, joined."""
+"""Stack single fits to the fit of a batch."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from vertax.fitting._history import Fit, History
 
 
 def stack_fits(fits: Sequence[Fit[Any]], *, at_once: int = 1) -> Fit[Any]:
-    """Fits of problems of one shape, which were done one by one, as the fit of a batch.
+    """Stack single fits of problems of one shape to the fit of a batch.
 
     **Arguments:**
 
-    - `fits`: the fits; those that took more epochs are cut to the number of the shortest.
-    - `at_once`: how many of them ran side by side: the seconds of an epoch are those of all fits, over this.
+    - `fits`: the fits; longer histories are truncated to the number of epochs of the shortest.
+    - `at_once`: number of fits that ran in parallel: the seconds of an epoch are the sum over all fits,
+        divided by this number.
 
     **Returns:** the [`Fit`][vertax.Fit] of the batch, notes included.
 
     **Raises:**
 
-    - `ValueError` as [`stack`][vertax.fitting.stack], and for fits whose notes have different names.
+    - `ValueError` as [`stack`][vertax.fitting.stack], and for notes of different names.
     """
     energies, tissues = stack([fit.energy for fit in fits]), stack([fit.tissue for fit in fits])
     names = set(fits[0].notes)
     if any(set(fit.notes) != names for fit in fits):
-        raise ValueError("Argument `fits` must hold fits whose notes have the same names.")
+        raise ValueError("Argument `fits` must hold fits with notes of the same names.")
     epochs = min(len(fit.history.cost) for fit in fits)
     columns = {
         field.name: np.stack([getattr(fit.history, field.name)[:epochs] for fit in fits], axis=1)

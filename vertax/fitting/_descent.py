@@ -31,26 +31,27 @@ from vertax.fitting._inverse import Evaluation, InverseProblem
 from vertax.mesh import Tissue
 from vertax.precondition._recycled_hessian import RecycledHessian
 
-# When the Hessian is worked out: that takes as long as a few epochs, and to compile it as long as hundreds.
-_FIRST_LOOK = 100
-_NEXT_LOOK = 20
+# Epoch of the first Hessian, and the minimum number of epochs between two of them. A Hessian takes as long as
+# a few epochs, and its compilation as long as hundreds.
+_FIRST_HESSIAN_EPOCH = 100
+_HESSIAN_INTERVAL = 20
 
 
 class State(eqx.Module):
-    """Where an epoch begins."""
+    """State at the start of an epoch."""
 
     parameters: PyTree[Array]
     optimiser: PyTree
     tissue: Tissue
     best: Best
-    going: Bool[Array, "*batch"]
-    """False once an epoch was not sound."""
+    active: Bool[Array, "*batch"]
+    """False after an epoch with an invalid cost or gradient."""
     hessian: RecycledHessian | None
-    """That of an equilibrium some epochs ago;"""
-    looked: Int[Array, "*batch"]
-    """how many epochs had passed then,"""
+    """Hessian at the equilibrium of an earlier epoch."""
+    hessian_epoch: Int[Array, "*batch"]
+    """Epoch of that Hessian; 0 if there is none."""
     stale: Bool[Array, "*batch"]
-    """and whether the tissue is elsewhere now."""
+    """Whether the Hessian no longer applies to the current tissue."""
 
 
 class Descent(AbstractMethod):
@@ -64,46 +65,50 @@ class Descent(AbstractMethod):
     batched: bool
     guidance: Callable[[Int[Array, ""]], ArrayLike] | None
     recent: list[Any] = eqx.field(default_factory=list)
-    """The problem and the Hessian of the last epoch, and what compiled functions need of both."""
+    """Cache: the problem, the Hessian and the compiled problem of the last epoch."""
 
     def _evaluation(self, problem: InverseProblem, state: State) -> Evaluation:
         if self.batched:
             return _evaluate_batch(problem, self.constants, state)
-        # Made anew only if something has changed: it takes as long as an epoch of a small tissue.
+        # Rebuild only if something changed: that takes as long as an epoch of a small tissue.
         if not self.recent or self.recent[0] is not problem or self.recent[1] is not state.hessian:
             response = problem.response.with_preconditioner(state.hessian)
-            known = eqx.tree_at(lambda p: p.response, problem, response)
-            self.recent[:] = [problem, state.hessian, known.bare(state.tissue)]
+            preconditioned = eqx.tree_at(lambda p: p.response, problem, response)
+            self.recent[:] = [
+                problem,
+                state.hessian,
+                preconditioned.without_parameters(state.tissue),
+            ]
         shift = no_shift(problem)
         return self.recent[2].evaluate(state.tissue, state.parameters, self.constants, shift)
 
     def start(self) -> State:
-        return _start(self._lenient(), self.optimiser, self.parameters, self.batched)
+        return _start(self._without_throw(), self.optimiser, self.parameters, self.batched)
 
     def advance(self, state: State, epoch: int) -> tuple[State, Record]:
         strength = None
         if self.guidance is not None:
             strength = jnp.asarray(self.strength(epoch), self.problem.tissue.vertices.dtype)
-        problem, hessian = self._lenient(strength), state.hessian
-        wait = _NEXT_LOOK if np.any(state.looked) else _FIRST_LOOK
-        due = hessian is not None and epoch >= np.max(state.looked) + wait
-        if due and np.any(state.stale & state.going):
+        problem, hessian = self._without_throw(strength), state.hessian
+        interval = _HESSIAN_INTERVAL if np.any(state.hessian_epoch) else _FIRST_HESSIAN_EPOCH
+        due = hessian is not None and epoch >= np.max(state.hessian_epoch) + interval
+        if due and np.any(state.stale & state.active):
             hessian = _hessian_at(problem, self.constants, state, self.batched)
-            looked = jnp.full_like(state.looked, epoch)
-            state = dataclasses.replace(state, looked=looked, hessian=hessian)
+            hessian_epoch = jnp.full_like(state.hessian_epoch, epoch)
+            state = dataclasses.replace(state, hessian_epoch=hessian_epoch, hessian=hessian)
         evaluation = self._evaluation(problem, state)
-        following = problem.onward(evaluation.equilibrium.tissue)
-        without = dataclasses.replace(state, hessian=None)
-        guidance = jnp.broadcast_to(guidance_of(problem), state.going.shape)
-        arguments = (without, evaluation, following, hessian, self.true, guidance)
-        number = jnp.asarray(epoch, state.looked.dtype)
+        next_tissue = problem.next_start(evaluation.equilibrium.tissue)
+        state_without_hessian = dataclasses.replace(state, hessian=None)
+        guidance = jnp.broadcast_to(guidance_of(problem), state.active.shape)
+        arguments = (state_without_hessian, evaluation, next_tissue, hessian, self.true, guidance)
+        epoch_index = jnp.asarray(epoch, state.hessian_epoch.dtype)
         settings = (self.problem.adjoint.throw, self.batched)
-        state, record = _update(self.optimiser, arguments, number, *settings)
+        state, record = _update(self.optimiser, arguments, epoch_index, *settings)
         return dataclasses.replace(state, hessian=hessian), record
 
     def description(self) -> str:
-        # An Optax optimiser is made of functions, which have no names for their constants. What they
-        # compute has.
+        # An Optax optimiser consists of closures, which do not print their constants. The jaxpr of an update
+        # contains them.
         fitted = cast(optax.Params, (self.parameters, no_shift(self.problem)))
         value = jax.ShapeDtypeStruct((), self.problem.tissue.vertices.dtype)
         update = optax.with_extra_args_support(self.optimiser).update
@@ -120,12 +125,12 @@ class Descent(AbstractMethod):
         value = np.asarray(self.guidance(jnp.array(epoch)))
         if value.shape or not value >= 0:
             raise ValueError(
-                f"Argument `guidance` must give one number that is not negative, but gave {value}."
+                f"Argument `guidance` must return one number that is not negative, but returned {value}."
             )
         return float(value)
 
-    def _lenient(self, strength: Float[Array, ""] | None = None) -> InverseProblem:
-        # A step that cannot be trusted is refused here, one member of a batch at a time.
+    def _without_throw(self, strength: Float[Array, ""] | None = None) -> InverseProblem:
+        """The problem with an adjoint that does not raise; invalid gradients are handled for each member."""
         if strength is None and self.recent:
             return self.recent[0]
         problem = eqx.tree_at(lambda p: p.adjoint.throw, self.problem, False)
@@ -133,7 +138,7 @@ class Descent(AbstractMethod):
             return problem
         if self.batched:
             strength = jnp.full(len(problem.tissue.vertices), strength)
-        # (In a batch each array has one more axis than its annotation, which `replace` would check.)
+        # `dataclasses.replace` would check annotations, but in a batch each array has one more axis.
         return eqx.tree_at(lambda p: p.guidance, problem, strength, is_leaf=lambda x: x is None)
 
 
@@ -147,16 +152,21 @@ def _start(
     def start(problem: InverseProblem, parameters: PyTree[Array]) -> State:
         fitted = cast(optax.Params, (parameters, no_shift(problem)))
         best = unbeaten(problem, parameters)
-        unknown = problem.response.preconditioner_at(problem.tissue, None)
-        state, yes = traced(optimiser.init(fitted), problem.tissue.vertices.dtype), jnp.array(True)
-        none = jnp.zeros((), jnp.result_type(int))
-        return State(parameters, state, problem.tissue, best, yes, unknown, none, stale=yes)
+        no_hessian = problem.response.preconditioner_at(problem.tissue, None)
+        state, true_array = (
+            traced(optimiser.init(fitted), problem.tissue.vertices.dtype),
+            jnp.array(True),
+        )
+        zero = jnp.zeros((), jnp.result_type(int))
+        return State(
+            parameters, state, problem.tissue, best, true_array, no_hessian, zero, stale=true_array
+        )
 
     return (eqx.filter_vmap(start) if batched else start)(problem, parameters)
 
 
 def _evaluation(problem: InverseProblem, constants: PyTree, state: State) -> Evaluation:
-    """Cost and gradient of an epoch, by the compiled functions that `value_and_gradient` shares."""
+    """Cost and gradient of an epoch, by the compiled functions of `value_and_gradient`."""
     response = problem.response.with_preconditioner(state.hessian)
     problem = eqx.tree_at(lambda p: p.response, problem, response)
     energy = eqx.combine(state.parameters, constants)
@@ -165,7 +175,7 @@ def _evaluation(problem: InverseProblem, constants: PyTree, state: State) -> Eva
 
 @announced_jit
 def _evaluate_batch(problem: InverseProblem, constants: PyTree, state: State) -> Evaluation:
-    """The same for each of a batch, in one compiled function."""
+    """`_evaluation` for each member of a batch, in one compiled function."""
     return over_members(_evaluation, problem)(problem, constants, state)
 
 
@@ -177,12 +187,12 @@ def _update(
     throw: bool,
     batched: bool,
 ) -> tuple[State, Record]:
-    """One update of the parameters, for each of the batch."""
+    """One update of the parameters, for each member of a batch."""
 
     def one(
         state: State,
         evaluation: Evaluation,
-        following: Tissue,
+        next_tissue: Tissue,
         hessian: RecycledHessian | None,
         true: PyTree[Array] | None,
         guidance: Float[Array, ""],
@@ -193,7 +203,7 @@ def _update(
         gradient = (evaluation.gradient, evaluation.shift_gradient)
         equilibrium = evaluation.equilibrium
         record = _record(state.parameters, evaluation, gradient, true, throw)
-        going = state.going & record.sound
+        active = state.active & record.sound
         fitted = (state.parameters, shift)
         updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
             cast(optax.Updates, gradient),
@@ -204,7 +214,7 @@ def _update(
         )
         parameters, shift = eqx.apply_updates(fitted, updates)
         if shift is not None:
-            following = following.with_vertices(following.vertices + shift)
+            next_tissue = next_tissue.with_vertices(next_tissue.vertices + shift)
         best = better(
             state.best,
             state.parameters,
@@ -212,16 +222,16 @@ def _update(
             Facts(**record.facts()),
             guidance,
             epoch,
-            going & equilibrium.converged,
+            active & equilibrium.converged,
         )
         stale = state.stale
         if hessian is not None:
-            stale = ~hessian.near(following.configuration).ready
-        moved = State(
-            parameters, optimiser_state, following, best, going, None, state.looked, stale
+            stale = ~hessian.near(next_tissue.configuration).ready
+        updated = State(
+            parameters, optimiser_state, next_tissue, best, active, None, state.hessian_epoch, stale
         )
-        # A relaxation that broke down must not be where the next one starts.
-        return tree_where(going, moved, eqx.tree_at(lambda s: s.going, state, going)), record
+        # After a failed epoch keep the previous state, so that no relaxation starts from an invalid tissue.
+        return tree_where(active, updated, eqx.tree_at(lambda s: s.active, state, active)), record
 
     return (eqx.filter_vmap(one) if batched else one)(*arguments)
 
@@ -230,11 +240,11 @@ def _update(
 def _hessian_at(
     problem: InverseProblem, constants: PyTree, state: State, batched: bool
 ) -> RecycledHessian | None:
-    """The Hessian where an epoch begins, for each of the batch."""
+    """The Hessian at the start of an epoch, for each member of a batch."""
 
     def one(problem: InverseProblem, constants: PyTree, state: State) -> RecycledHessian | None:
         energy = eqx.combine(state.parameters, constants)
-        pulled = problem.pulled(state.tissue, energy, no_shift(problem))
+        pulled = problem.guided_energy(state.tissue, energy, no_shift(problem))
         return problem.response.preconditioner_at(state.tissue, pulled)
 
     return (eqx.filter_vmap(one) if batched else one)(problem, constants, state)

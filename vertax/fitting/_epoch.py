@@ -1,4 +1,4 @@
-"""What the epochs of all fits have in common: the best point so far, and where the next one starts."""
+"""Shared parts of all fit methods: the abstract method, the best parameters so far, and the errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vertax.mesh import Tissue
 
 
 class Best(eqx.Module):
-    """The parameters of lowest cost so far, and what belongs to them."""
+    """The parameters of lowest cost so far, with their equilibrium, record, guidance and epoch."""
 
     parameters: PyTree[Array]
     tissue: Tissue
@@ -29,55 +29,56 @@ class Best(eqx.Module):
 
 
 def over_members(function: Callable[..., Any], problem: InverseProblem) -> Callable[..., Any]:
-    """A function, which takes derivatives inside, of each member of a batch of problems."""
+    """Map a function that takes derivatives over the members of a batch of problems."""
     batched = problem.response.prefers_batching
     return eqx.filter_vmap(function if batched else sequential_vmap_on_cpu(function))
 
 
 class AbstractMethod(eqx.Module):
-    """A way to fit, one epoch after another."""
+    """A fit method, which advances by one epoch at a time."""
 
     @abc.abstractmethod
     def start(self) -> Any:
-        """The state before the first epoch: a pytree with `best`, and `going`, False once it is done."""
+        """The initial state: a pytree with the fields `best` and `active` (False when the fit has ended)."""
 
     @abc.abstractmethod
     def advance(self, state: Any, epoch: int) -> tuple[Any, Record]:
-        """The state after an epoch, and what happened in it."""
+        """The state after an epoch, and the record of the epoch."""
 
     @abc.abstractmethod
     def description(self) -> str:
-        """The optimiser in words, such that another one has others."""
+        """A text that identifies the optimiser and its settings, for checkpoints."""
 
     @abc.abstractmethod
     def strength(self, epoch: int) -> float:
-        """Strength of the guidance in an epoch; NaN without any."""
+        """Strength of the guidance in an epoch; NaN without guidance."""
 
 
 def no_shift(problem: InverseProblem) -> Float[Array, "2"] | None:
-    """Where a fitted position starts in each epoch; None if it is not fitted."""
-    # It is counted from the last equilibrium: an update displaces the tissue, and is forgotten.
+    """The displacement at the start of each epoch, 0; None if the position is not fitted."""
+    # The displacement is relative to the last equilibrium: an update moves the tissue and resets it to 0.
     return jnp.zeros(2, problem.tissue.vertices.dtype) if problem.fit_position else None
 
 
 def nothing_known(problem: InverseProblem) -> Facts:
-    """The facts of an epoch that has not happened."""
+    """Placeholder facts before the first epoch, with infinite cost."""
     dtype = problem.tissue.vertices.dtype
-    unknown, none = jnp.full((), jnp.nan, dtype), jnp.zeros((), int)
+    nan, zero = jnp.full((), jnp.nan, dtype), jnp.zeros((), int)
     return Facts(
         cost=jnp.full((), jnp.inf, dtype),
         max_force=jnp.full((), jnp.inf, dtype),
         converged=jnp.array(False),
-        num_steps=none,
-        num_t1=none,
-        gradient_norm=unknown,
-        gradient_residual=unknown,
-        gradient_steps=unknown,
-        relative_error=unknown,
+        num_steps=zero,
+        num_t1=zero,
+        gradient_norm=nan,
+        gradient_residual=nan,
+        gradient_steps=nan,
+        relative_error=nan,
     )
 
 
 def unbeaten(problem: InverseProblem, parameters: PyTree[Array]) -> Best:
+    """Placeholder before the first epoch, with infinite cost and epoch -1."""
     facts = nothing_known(problem)
     return Best(
         parameters, problem.tissue, facts, facts.cost, jnp.full((), -1, jnp.result_type(int))
@@ -93,8 +94,9 @@ def better(
     epoch: Array,
     ok: Array,
 ) -> Best:
+    """The better of the previous best and a new candidate, which counts only if `ok`."""
     new = Best(parameters, tissue, facts, guidance, epoch)
-    # Guidance makes any cost small: only costs at the same one can be compared.
+    # Guidance lowers the cost for any parameters: prefer weaker guidance, compare costs at equal guidance.
     lower = (guidance < best.guidance) | (
         (guidance == best.guidance) & (facts.cost < best.facts.cost)
     )
@@ -102,12 +104,14 @@ def better(
 
 
 def guidance_of(problem: InverseProblem) -> Float[Array, "*batch"]:
+    """Strength of the guidance of a problem; 0 without guidance."""
     return jnp.asarray(
         0 if problem.guidance is None else problem.guidance, problem.tissue.vertices.dtype
     )
 
 
 def relative_error(parameters: PyTree[Array], true: PyTree[Array] | None) -> Float[Array, ""]:
+    """Mean of |inferred - true| / |true|; NaN if the true parameters are not given."""
     if true is None:
         return jnp.full_like(jax.tree.leaves(parameters)[0].ravel()[0], jnp.nan)
     errors = jax.tree.map(lambda p, q: jnp.ravel(jnp.abs(p - q) / jnp.abs(q)), parameters, true)

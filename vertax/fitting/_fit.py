@@ -1,4 +1,4 @@
-"""Solving an inverse problem: the loop over epochs, and what it records."""
+"""Fit of an inverse problem: the loop over epochs, with history and checkpoints."""
 
 from __future__ import annotations
 
@@ -54,20 +54,22 @@ def fit(
 ) -> Fit[Energy]:
     r"""Solve an inverse problem.
 
-    Each epoch relaxes the tissue from the last equilibrium, takes the gradient of the cost through it
-    and lets the optimiser, whose state lives through all epochs, update the parameters.
+    Each epoch:
 
-    With a least-squares solver, such as `optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)`, each
-    epoch takes the Jacobian of all residuals, and the fit ends when the solver does. Where the data
-    determine the parameters it needs a dozen epochs. The cost must be an
-    [`AbstractLeastSquaresCost`][vertax.costs.AbstractLeastSquaresCost] or a weighted sum of such.
+    1. relax the tissue, with the previous equilibrium as a warm start;
+    2. compute the cost and its gradient through the equilibrium (the hypergradient);
+    3. update the parameters by one step of the optimiser.
 
-    If the tissue has to change its topology on the way, its own gradient need not lead there: it sees
-    one valley of a rugged landscape (paper, "Topological cost functions unlock robust parameter
-    inference"). `guidance` then lets the cost itself pull the tissue, which relaxes $E + \kappa C$, and
-    fits the parameters so that there is less and less to pull. With strong guidance the tissue is
-    where the cost wants it, and the fit balances forces there; as $\kappa \to 0$ it becomes the inverse
-    problem itself. At parameters that explain the target exactly it makes no difference.
+    With a least-squares solver, e.g. `optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)`, each epoch
+    computes the Jacobian of all residuals, and the fit ends when the solver converges, typically after a
+    dozen epochs if the data determine the parameters. The cost must be an
+    [`AbstractLeastSquaresCost`][vertax.costs.AbstractLeastSquaresCost] or a weighted sum of such costs.
+
+    If the fit must change the topology of the tissue, the gradient at fixed topology may not lead there
+    (paper, "Topological cost functions unlock robust parameter inference"). With `guidance` $\kappa$ the
+    tissue relaxes $E + \kappa C$ instead of $E$: the cost attracts the tissue to the target, through T1
+    transitions too, while the fit reduces the remaining cost. For $\kappa \to 0$ this is the inverse problem
+    itself. Parameters that explain the target exactly are optimal for every $\kappa$.
 
     **Arguments:**
 
@@ -75,36 +77,33 @@ def fit(
     - `optimiser`: an Optax optimiser, e.g. `optax.adam(1e-2)`, or `optax.nadam(1e-3)` as in the paper;
         or a least-squares solver of Optimistix.
     - `epochs`: number of updates.
-    - `truth`: the energy with the true parameters where they are known, to record the error.
-    - `guidance`: strength $\kappa$ of the guidance by epoch, such as an Optax schedule, in place of that
-        of the problem; it should end at 0. Vertices feel a mean cost one by one: about 10 times the
-        number of cells is strong. Of an Optax optimiser only.
-    - `batched`: `problem` (and `truth`) are a batch of independent problems, as made by
-        `equinox.filter_vmap` or by stacking: every array has a leading axis. They are solved as one
-        `vmap`, and everything in the result has that axis too. A member that breaks down stays where it
-        was, and the others go on.
+    - `truth`: the energy with the true parameters if available, to record the error.
+    - `guidance`: strength $\kappa$ as a function of the epoch, e.g. an Optax schedule, which replaces that of
+        the problem; it should end at 0. For a cost that is a mean over vertices, 10 times the number of cells
+        is strong. For Optax optimisers only.
+    - `batched`: whether `problem` (and `truth`) are a batch of independent problems, made by
+        `equinox.filter_vmap` or [`stack`][vertax.fitting.stack]: every array has a leading axis, also in the
+        result. A member that fails keeps its last valid state; the other members continue.
     - `progress`: show a progress bar (only on a terminal).
-    - `callback`: called with the number and the [`Record`][vertax.Record] of each epoch. If it returns
-        arrays or numbers by name, the same names each time, they are in `notes` of the fit.
-    - `checkpoint`: a file, or a [`Checkpoint`][vertax.Checkpoint], to write down how far the fit has come,
-        and to go on from if it is there. The callback sees only the epochs that are still to do; its notes
-        are those of all.
+    - `callback`: called with the index and the [`Record`][vertax.Record] of each epoch. If it returns a
+        dictionary of arrays or numbers, with the same names each time, they are in `notes` of the fit.
+    - `checkpoint`: a file or a [`Checkpoint`][vertax.Checkpoint], to save the state of the fit, and to resume
+        from if it exists. The callback is called only for the remaining epochs; `notes` include all epochs.
 
     **Returns:** a [`Fit`][vertax.Fit] with the parameters of lowest cost among the epochs that reached
-    equilibrium, and among those of the weakest guidance if there is any. An interrupt from the keyboard
-    (Ctrl-C) ends the fit early, as soon as the epoch that runs is done, and keeps what came before;
-    `interrupted` tells so.
+    equilibrium (with guidance, among those of the weakest guidance). A keyboard interrupt (Ctrl-C) ends the
+    fit after the current epoch and returns the result so far, with `interrupted=True`.
 
     **Raises:**
 
-    - `ValueError` if there is nothing to fit, for less than one epoch, for a batch whose arrays
-        differ in their leading axis, for `guidance` of a least-squares solver, for a `callback` whose
-        notes change their names, and for a checkpoint that is broken or that of another fit.
-    - `FileNotFoundError` if there is no folder for the checkpoint.
-    - `TypeError` for a least-squares solver with a cost that is no sum of squares, and for arguments of
-        another kind, such as an optimiser that is none.
-    - [`FitError`][vertax.FitError] if cost or gradient are not finite or cannot be trusted, or if no
-        epoch reached equilibrium; it carries the fit so far.
+    - `ValueError` if there is nothing to fit, for less than one epoch, for a batch with different leading
+        axes, for `guidance` with a least-squares solver, for a `callback` that returns changing names, and
+        for a checkpoint that is broken or belongs to another fit.
+    - `FileNotFoundError` if the folder of the checkpoint does not exist.
+    - `TypeError` for a least-squares solver with a cost that is not a sum of squares, and for arguments of a
+        wrong type.
+    - [`FitError`][vertax.FitError] if cost or gradient are not finite, if the adjoint did not converge, or if
+        no epoch reached equilibrium; it holds the fit so far.
     """
     check_arguments(problem, optimiser, epochs, guidance, callback)
     parameters, fixed = eqx.partition(problem.energy, problem.trainable)
@@ -124,13 +123,13 @@ def fit(
     if isinstance(optimiser, optx.AbstractLeastSquaresSolver):
         if guidance is not None:
             raise ValueError(
-                "Argument `guidance` goes with an Optax optimiser: a least-squares solver judges its steps "
-                "by one cost. Set the guidance of the problem, or leave it out."
+                "Argument `guidance` must be None for a least-squares solver, which needs the same cost in "
+                "all steps. Use an Optax optimiser, or set the guidance of the problem."
             )
-        # It judges each step by the cost itself, so a wrong slope costs a step and no more. And Optimistix
-        # makes a Jacobian of zeros before the first step, of which no adjoint could be sure.
-        lenient = dataclasses.replace(problem.adjoint, throw=False)
-        problem = dataclasses.replace(problem, adjoint=lenient)
+        # The solver accepts a step only if the cost decreases, so an inaccurate Jacobian costs one step. And
+        # before the first step Optimistix computes a Jacobian of zeros, for which the adjoint would raise.
+        adjoint = dataclasses.replace(problem.adjoint, throw=False)
+        problem = dataclasses.replace(problem, adjoint=adjoint)
         method = LeastSquares(optimiser, problem, parameters, constants, true, batched)
     else:
         method = Descent(optimiser, problem, parameters, constants, true, batched, guidance)
@@ -138,9 +137,9 @@ def fit(
         checkpoint, lambda: _identity_of(given, true, method.description(), batched)
     )
     done, stopped, interrupted = _run(method, file, epochs, progress, callback)
-    complaint = given.response.last_error_message()
-    if stopped is not None and complaint is not None:
-        stopped = f"{stopped}. {complaint.rstrip('.')}"
+    response_error = given.response.last_error_message()
+    if stopped is not None and response_error is not None:
+        stopped = f"{stopped}. {response_error.rstrip('.')}"
     if not done.rows:
         raise FitError(f"The fit stopped: {stopped}.", None)
     best = done.state.best
@@ -152,8 +151,8 @@ def fit(
             f"{stopped or 'all epochs were done'}.",
             None,
         )
-    outcome = Fit(
-        eqx.combine(best.parameters, fixed),  # its Python numbers are none that are fitted
+    fit_result = Fit(
+        eqx.combine(best.parameters, fixed),  # `fixed` keeps the Python numbers of the given energy
         best.tissue,
         best.facts.cost,
         best.facts.max_force,
@@ -163,33 +162,35 @@ def fit(
         interrupted,
     )
     if stopped is not None:
-        raise FitError(f"The fit stopped: {stopped}. Try a smaller step of the optimiser.", outcome)
-    return outcome
+        raise FitError(
+            f"The fit stopped: {stopped}. Try a smaller step of the optimiser.", fit_result
+        )
+    return fit_result
 
 
 def _with_numbers_as_data(
     problem: InverseProblem[Energy], parameters: PyTree, batched: bool
 ) -> InverseProblem[Energy]:
-    """The same problem with arrays for its Python numbers, of which another one compiles nothing anew."""
-    # Which leaves are fitted is settled before: a number of the energy is a constant.
+    """The problem with arrays for its Python numbers, so that other numbers need no new compilation."""
+    # Select the fitted leaves first: Python numbers of the energy are constants.
     fitted = jax.tree.map(lambda x: x is not None, parameters, is_leaf=lambda x: x is None)
     dtype = problem.tissue.vertices.dtype
     tissue, energy = traced((problem.tissue, problem.energy), dtype)
     data = dataclasses.replace(
-        problem.as_data(dtype), tissue=tissue, energy=energy, trainable=fitted
+        problem.with_array_numbers(dtype), tissue=tissue, energy=energy, trainable=fitted
     )
     if not batched:
         return data
     n = jax.tree.leaves(parameters)[0].shape[0]
-    spread = lambda new, old: (
+    expand = lambda new, old: (
         new if eqx.is_array(old) or not eqx.is_array(new) else jnp.full(n, new)
     )
     old = dataclasses.replace(problem, trainable=fitted)
-    return jax.tree.map(spread, data, old)
+    return jax.tree.map(expand, data, old)
 
 
 def _identity_of(problem: PyTree, truth: PyTree, optimiser: str, batched: bool) -> dict[str, str]:
-    """What makes a fit another one than others, by what it is called in messages."""
+    """Texts and digests that identify a fit, by their names in messages."""
     layout = eqx.tree_pformat((problem, truth), short_arrays=True, width=100)
     return {
         "problem (sizes, classes or settings)": without_addresses(layout),
@@ -204,10 +205,10 @@ def _check_batch(tree: PyTree) -> None:
     sizes = {x.shape[0] if x.ndim else None for x in arrays}
     if len(sizes) != 1 or None in sizes:
         raise ValueError(
-            "Argument `problem` (and `truth`) must be a batch if `batched` is set: all arrays need one "
-            "leading axis of one size, but there are "
-            f"{sorted('none' if s is None else str(s) for s in sizes)}. Make it with "
-            "equinox.filter_vmap, or of single problems with vertax.fitting.stack."
+            "Argument `problem` (and `truth`) must be a batch if `batched` is set: all arrays need a "
+            "leading axis of the same size, but the sizes are "
+            f"{sorted('none' if s is None else str(s) for s in sizes)}. Stack single problems with "
+            "vertax.fitting.stack, or use equinox.filter_vmap."
         )
 
 
@@ -218,29 +219,29 @@ def _run(
     progress: bool,
     callback: Callback | None,
 ) -> tuple[Progress, str | None, bool]:
-    """How far the fit came, why it could not go on, and whether it was interrupted."""
+    """The progress of the fit, the reason for an early end or None, and whether it was interrupted."""
     done = Progress(None)
     try:
         done = file.load(method.start())
         _check_progress(done, method, epochs)
-        # Closed at the end, whatever ends it: a bar that is not keeps an old number of epochs.
+        # The context manager closes the bar in all cases: an unclosed bar shows an outdated number of epochs.
         bar = tqdm(
             total=epochs,
             initial=len(done.rows),
             unit="epoch",
             disable=None if progress else True,
-            desc="compiling",  # while the first epoch stands at 0
+            desc="compiling",  # until the first epoch is done
         )
         with bar:
-            while len(done.rows) < epochs and np.any(done.state.going):
-                epoch, began = len(done.rows), time.perf_counter()
+            while len(done.rows) < epochs and np.any(done.state.active):
+                epoch, start = len(done.rows), time.perf_counter()
                 state, record = method.advance(done.state, epoch)
-                sound = np.asarray(record.sound)  # waits for the epoch to be done
-                row = _row(record, time.perf_counter() - began, method.strength(epoch))
+                sound = np.asarray(record.sound)  # blocks until the epoch is done
+                row = _row(record, time.perf_counter() - start, method.strength(epoch))
                 if not sound.any():
                     return (
                         Progress(state, (*done.rows, row), done.notes),
-                        _trouble(record, epoch),
+                        _failure(record, epoch),
                         False,
                     )
                 notes = None if callback is None else callback(epoch, record)
@@ -265,7 +266,7 @@ def _run(
 
 
 def _check_progress(done: Progress, method: AbstractMethod, epochs: int) -> None:
-    """Whether a checkpoint goes with what the fit is to do."""
+    """Raise an error if a checkpoint does not match the arguments of the fit."""
     if len(done.rows) > epochs:
         raise ValueError(
             f"The checkpoint holds {len(done.rows)} epochs, but argument `epochs` is {epochs}. Raise it, "
@@ -276,14 +277,14 @@ def _check_progress(done: Progress, method: AbstractMethod, epochs: int) -> None
         if not np.array_equal(then, now, equal_nan=True):
             raise ValueError(
                 f"The checkpoint is that of a fit with another `guidance`: {then} and not {now} in epoch "
-                f"{epoch}. Give the same one again, or delete the file to start this fit anew."
+                f"{epoch}. Pass the same guidance, or delete the file to start this fit anew."
             )
 
 
 def _noted(
     notes: tuple[Row, ...], new: Mapping[str, ArrayLike] | None, epoch: int
 ) -> tuple[Row, ...]:
-    """The notes of all epochs, with those of another one."""
+    """The notes of all epochs so far, with those of a new epoch appended."""
     names = set() if new is None else set(new)
     if epoch > 0 and names != (set(notes[0]) if notes else set()):
         before = ", ".join(notes[0]) if notes else "nothing"
@@ -301,15 +302,16 @@ def _row(record: Record, seconds: float, guidance: float) -> Row:
     return row | {"seconds": seconds, "guidance": guidance}
 
 
-def _trouble(record: Record, epoch: int) -> str:
-    cost, slope = np.asarray(record.cost), np.asarray(record.gradient_norm)
-    if np.isfinite(cost).all() and np.isfinite(slope).all():
+def _failure(record: Record, epoch: int) -> str:
+    """Why the fit cannot continue after an epoch."""
+    cost, gradient_norm = np.asarray(record.cost), np.asarray(record.gradient_norm)
+    if np.isfinite(cost).all() and np.isfinite(gradient_norm).all():
         residual = np.max(record.gradient_residual)
         return (
-            f"the gradient of epoch {epoch} cannot be trusted (residual {residual:.1e}; an adjoint with "
-            "throw=False goes on all the same)"
+            f"the gradient of epoch {epoch} cannot be trusted (residual {residual:.1e}; to continue anyway "
+            "pass an adjoint with throw=False)"
         )
-    return f"cost ({cost}) or gradient ({slope}) is not finite in epoch {epoch}"
+    return f"cost ({cost}) or gradient ({gradient_norm}) is not finite in epoch {epoch}"
 
 
 def _first_line(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""What a fit hands over: its outcome, its history, and what its callback sees."""
+"""Results of a fit: the best parameters, the history, and the record of each epoch."""
 
 from __future__ import annotations
 
@@ -14,14 +14,11 @@ from vertax.mesh import Tissue
 
 
 class Facts(eqx.Module):
-    """What there is to know of an epoch, or of many along a first axis.
-
-    In a batch the last axis is that of its members.
-    """
+    """Scalars of one epoch, or of many along a first axis; in a batch the last axis holds the members."""
 
     cost: Float[Any, "*axes"]
-    """Cost at the parameters that the epoch began with; with a least-squares solver, at those of its last
-    accepted step."""
+    """Cost at the initial parameters of the epoch; with a least-squares solver, at those of its last accepted
+    step."""
     max_force: Float[Any, "*axes"]
     """Largest force of the equilibrium."""
     converged: Bool[Any, "*axes"]
@@ -33,34 +30,33 @@ class Facts(eqx.Module):
     gradient_norm: Float[Any, "*axes"]
     """Norm of the hypergradient; NaN for a least-squares solver."""
     gradient_residual: Float[Any, "*axes"]
-    """How far the adjoint came, see [`GradientOutcome`][vertax.GradientOutcome]; NaN if not known."""
+    """Residual of the adjoint, see [`GradientOutcome`][vertax.GradientOutcome]; NaN if not available."""
     gradient_steps: Float[Any, "*axes"]
-    """Steps of the adjoint; NaN if not known."""
+    """Steps of the adjoint; NaN if not available."""
     relative_error: Float[Any, "*axes"]
-    """Mean of |inferred - true| / |true| over all parameters; NaN if the truth is not known."""
+    """Mean of |inferred - true| / |true| over all parameters; NaN without `truth`."""
 
     def facts(self) -> dict[str, Any]:
-        """These numbers by name."""
+        """These scalars by name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(Facts)}
 
 
 class History(Facts):
-    """What happened in each epoch of a fit; in a batch there is a second axis for its members."""
+    """The scalars of each epoch of a fit; in a batch the second axis holds the members."""
 
     seconds: Float[np.ndarray, " epochs"]
-    """Wall-clock time of each epoch; the first one, and the first of a fit that is continued, includes
-    compilation."""
+    """Wall-clock time of each epoch; the first epoch of a new or resumed fit includes compilation."""
     guidance: Float[np.ndarray, " epochs"]
-    """Strength of the guidance that the fit gave; NaN if it gave none."""
+    """Strength from the argument `guidance` of the fit; NaN without it."""
 
     def columns(self) -> dict[str, np.ndarray]:
-        """All curves by name, without those that nothing is known of."""
+        """All curves by name, without those that are NaN in all epochs."""
         curves = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return {name: curve for name, curve in curves.items() if not np.isnan(curve).all()}
 
 
 class Fit(eqx.Module, Generic[Energy]):
-    """The outcome of a fit: the best parameters, their equilibrium, and the way there."""
+    """The result of a fit: the best parameters, their equilibrium, and the history."""
 
     energy: Energy
     """The energy with the parameters of lowest cost."""
@@ -71,17 +67,17 @@ class Fit(eqx.Module, Generic[Energy]):
     max_force: Float[Array, "*batch"]
     """Largest force at this equilibrium."""
     best_epoch: Int[np.ndarray, "*batch"]
-    """The epoch that they come from; -1 for a member of a batch that never reached equilibrium."""
+    """The epoch of these parameters; -1 for a member of a batch that never reached equilibrium."""
     history: History
-    """One entry an epoch."""
+    """One entry per epoch."""
     notes: dict[str, Shaped[np.ndarray, "epochs ..."]] = eqx.field(default_factory=dict)
-    """What the callback returned, by name; the first axis is that of the epochs."""
+    """Values returned by the callback, by name; the first axis is that of the epochs."""
     interrupted: bool = False
-    """Whether an interrupt from the keyboard ended it before its time."""
+    """Whether a keyboard interrupt ended the fit early."""
 
 
 class FitError(RuntimeError):
-    """A fit that could not go on; `fit` holds what there was until then, if anything."""
+    """A fit that failed; `fit` holds the result up to then, or None."""
 
     def __init__(self, message: str, fit: Fit | None):
         super().__init__(message)
@@ -89,21 +85,21 @@ class FitError(RuntimeError):
 
 
 class Record(Facts):
-    """One epoch of a fit, as its callback sees it; in a batch each array has a leading axis for its members.
+    """One epoch of a fit, an argument of the callback; in a batch the leading axis holds the members.
 
     ```python
     def watch(epoch: int, record: vx.Record) -> dict[str, float]:
         return {"mean": record.parameters.target_shape_factor.mean()}
 
     fit = vx.fit(problem, optimiser, 200, callback=watch)
-    fit.notes["mean"]  # one number an epoch
+    fit.notes["mean"]  # one number per epoch
     ```
     """
 
     parameters: PyTree[Array]
-    """The fitted leaves of the energy, at which the cost was evaluated; the others are None. With a
+    """The fitted leaves of the energy at which the cost was evaluated; the others are None. With a
     least-squares solver, those of its last accepted step."""
     tissue: Tissue
-    """Their equilibrium."""
+    """The equilibrium of these parameters."""
     sound: Bool[Array, "*batch"]
-    """Whether cost and gradient are finite and can be trusted."""
+    """Whether cost and gradient are finite and the adjoint converged."""

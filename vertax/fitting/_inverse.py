@@ -1,4 +1,4 @@
-"""The inverse problem: parameters whose equilibrium minimises a cost."""
+"""The inverse problem: find parameters such that the equilibrium minimises a cost."""
 
 from __future__ import annotations
 
@@ -36,48 +36,47 @@ Energy = TypeVar("Energy", bound=AbstractEnergy)
 
 
 class Evaluation(eqx.Module):
-    """A cost, its gradient, and how both came about."""
+    """A cost, its gradient, the equilibrium, and diagnostics of the adjoint."""
 
     cost: Float[Array, ""]
     equilibrium: Equilibrium
     gradient: PyTree[Array]
     """With respect to the trainable leaves of the energy; the others are None."""
     shift_gradient: Float[Array, 2] | None
-    """With respect to the displacement of the whole; None if there is none."""
+    """With respect to the displacement of the tissue; None without displacement."""
     outcome: GradientOutcome
-    """How the gradient came about."""
+    """Diagnostics of the adjoint."""
 
 
 class InverseProblem(eqx.Module, Generic[Energy]):
-    r"""Find the parameters whose equilibrium minimises a cost (paper, "Bilevel optimization").
+    r"""Find parameters such that the equilibrium minimises a cost (paper, "Bilevel optimization").
 
     $$\min_\theta C(X^*_\theta, \theta) \quad \text{subject to} \quad
       X^*_\theta \in \arg\min_X E(X, \theta)$$
 
     **Arguments:**
 
-    - `tissue`: where the first relaxation starts; of a movement the first frame.
-    - `energy`: the energy, with the first guess of its parameters.
-    - `cost`: what to minimise.
+    - `tissue`: the start of the first relaxation; for an evolution the first frame.
+    - `energy`: the energy, with an initial guess of its parameters.
+    - `cost`: the cost to minimise.
     - `trainable`: which leaves of the energy are fitted: a predicate of a leaf, or a pytree of booleans
         shaped like the energy (as in `equinox.partition`). By default every floating-point array;
         Python floats are constants.
-    - `fit_position`: fit also where the whole tissue lies. No parameter of an energy moves the centroid
-        of a tissue, so a cost that sees positions (an image) needs this unless they are known.
-    - `response`: how the tissue answers to its energy, a [`Relaxation`][vertax.Relaxation], or an
-        [`Evolution`][vertax.Evolution] if it is on its way. Then the cost sees the last frame, or all if it
-        is of [`Frames`][vertax.costs.Frames]; and the energy may be a
-        [`Material`][vertax.dynamics.Material], of which what resists and what drives are fitted as well.
+    - `fit_position`: also fit a displacement of the tissue. The centroid of an equilibrium does not depend on
+        the parameters of the energy, so a cost that depends on absolute positions (e.g. an image) needs this.
+    - `response`: the forward model, a [`Relaxation`][vertax.Relaxation] to equilibrium or an
+        [`Evolution`][vertax.Evolution] in time. With an evolution the cost takes the last frame, or all
+        frames (see [`Frames`][vertax.costs.Frames]); and the energy may be a
+        [`Material`][vertax.dynamics.Material], to fit dissipation and activity too.
     - `adjoint`: how to differentiate, one of `vertax.adjoints`.
-    - `guidance`: strength $\kappa$, energy per cost. If given, the tissue minimises $E + \kappa C$:
-        the cost pulls it, through T1 transitions too, towards what it asks for, while the parameters
-        are not yet such that it goes there by itself. See `guidance` of [`fit`][vertax.fit].
+    - `guidance`: strength $\kappa$, energy per cost. If given, the tissue minimises $E + \kappa C$, see
+        `guidance` of [`fit`][vertax.fit].
 
     **Raises:**
 
-    - `TypeError` for a tissue, an energy, a cost, a response or an adjoint of another type.
-    - `ValueError` for an adjoint, guidance or a fitted position that do not go with the response, or a cost
-        of frames without an evolution.
+    - `TypeError` for a tissue, an energy, a cost, a response or an adjoint of a wrong type.
+    - `ValueError` for an adjoint, guidance or `fit_position` that the response does not support, or a cost of
+        frames without an evolution.
     """
 
     tissue: Tissue
@@ -113,8 +112,8 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         )
         if self.response.supports_warm_start and self.cost.of_frames:
             raise ValueError(
-                "Argument `cost` is one of several frames, and a relaxation has one: pass "
-                "response=vertax.Evolution(dissipation, times)."
+                "Argument `cost` must be a cost of a single tissue for a relaxation, but is one of several "
+                "frames. Pass response=vertax.Evolution(dissipation, times)."
             )
 
     def __call__(
@@ -125,14 +124,14 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         *,
         throw: bool = True,
     ) -> tuple[Float[Array, ""], Equilibrium]:
-        """Cost and equilibrium for some parameters.
+        """Cost and equilibrium for given parameters.
 
         **Arguments:**
 
         - `energy`: the energy, by default the problem's.
-        - `tissue`: where the relaxation starts, by default the problem's tissue.
-        - `shift`: a displacement of the relaxed tissue as a whole, by default none.
-        - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
+        - `tissue`: the start of the relaxation, by default the problem's tissue.
+        - `shift`: a displacement of the relaxed tissue, by default none.
+        - `throw`: raise an error if no equilibrium is reached. If False, check `converged`.
 
         **Returns:** the cost, differentiable in `energy` and `shift`, and the equilibrium.
 
@@ -153,7 +152,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         *,
         throw: bool,
     ) -> tuple[Float[Array, ""], Equilibrium]:
-        """Cost and equilibrium; `primal` is that of the response, or None if it is to be computed."""
+        """Cost and equilibrium; `primal` is the result of `self.primal`, or None to compute it here."""
         if self._nudged_by_cost:
             start = frozen((tissue, energy, shift))
             adjoint = ImplicitDifferentiation()
@@ -173,10 +172,11 @@ class InverseProblem(eqx.Module, Generic[Energy]):
             tissue, energy, shift, adjoint=self.adjoint, primal=primal, throw=throw
         )
         equilibrium = _placed(relaxed, shift)
-        return self.cost(self._seen(equilibrium), energy), equilibrium
+        return self.cost(self._cost_argument(equilibrium), energy), equilibrium
 
     @property
     def _nudged_by_cost(self) -> bool:
+        """Whether equilibrium propagation nudges with the full cost."""
         return isinstance(self.adjoint, EquilibriumPropagation) and self.adjoint.nudge == "cost"
 
     def residuals(
@@ -189,16 +189,16 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         """Residuals of a least-squares cost, the equilibrium, and its tissue displaced by `shift`."""
         equilibrium = self.relax(tissue, energy, shift, adjoint=self.adjoint, primal=primal)
         placed = _placed(equilibrium, shift)
-        return self.cost.residuals(self._seen(placed), energy), equilibrium, placed.tissue
+        return self.cost.residuals(self._cost_argument(placed), energy), equilibrium, placed.tissue
 
-    def _seen(self, equilibrium: Equilibrium) -> Tissue:
-        """What the cost sees."""
+    def _cost_argument(self, equilibrium: Equilibrium) -> Tissue:
+        """The tissue, or the frames, of which the cost is evaluated."""
         if self.cost.of_frames and isinstance(equilibrium, Evolved):
             return equilibrium.frames
         return equilibrium.tissue
 
-    def onward(self, reached: Tissue) -> Tissue:
-        """Where the next epoch starts after one has reached an equilibrium, or the end of a movement."""
+    def next_start(self, reached: Tissue) -> Tissue:
+        """Start of the next epoch: the last equilibrium (warm start), or the first frame of an evolution."""
         return reached if self.response.supports_warm_start else self.tissue
 
     def value_and_gradient(
@@ -209,7 +209,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         *,
         throw: bool = True,
     ) -> Evaluation:
-        """Cost, equilibrium, gradient, and how the gradient came about.
+        """Cost, gradient, equilibrium, and diagnostics of the adjoint.
 
         **Arguments:** as in a call of the problem.
 
@@ -217,8 +217,8 @@ class InverseProblem(eqx.Module, Generic[Energy]):
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge; and
-            for a gradient that cannot be trusted, unless the adjoint is told not to with `throw=False`.
+        - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge; and if
+            the adjoint did not converge, unless the adjoint has `throw=False`.
         """
         warn_of_memory_maps()
         energy = self.energy if energy is None else energy
@@ -227,7 +227,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         dtype = tissue.vertices.dtype
         arguments = traced((tissue, parameters, constants, shift), dtype)
         tissue, parameters, constants, shift = arguments
-        problem = self.bare(tissue)
+        problem = self.without_parameters(tissue)
         evaluation = problem.evaluate(*arguments)
         if self.adjoint.throw and not problem.adjoint.throw:
             outcome, reasons = evaluation.outcome, self.adjoint.reasons
@@ -237,10 +237,15 @@ class InverseProblem(eqx.Module, Generic[Energy]):
             return evaluation
         return eqx.tree_at(lambda e: e.equilibrium, evaluation, evaluation.equilibrium.checked())
 
-    def bare(self, tissue: Tissue) -> InverseProblem[Energy]:
-        """What compiled functions need; problems with one cost and adjoint, strict or not, share them."""
+    def without_parameters(self, tissue: Tissue) -> InverseProblem[Energy]:
+        """The problem without the parts on which compiled functions do not depend.
+
+        These are the tissue, the energy and, for relaxations, `throw` of the adjoint.
+        """
         response = self.response.completed(tissue)
-        problem = dataclasses.replace(self.as_data(tissue.vertices.dtype), response=response)
+        problem = dataclasses.replace(
+            self.with_array_numbers(tissue.vertices.dtype), response=response
+        )
         parts = lambda p: (p.tissue, p.energy, p.trainable)
         problem = eqx.tree_at(parts, problem, (None,) * 3, is_leaf=lambda x: x is None)
         if not isinstance(response, Relaxation):
@@ -254,18 +259,18 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         constants: PyTree,
         shift: Float[Array, 2] | None,
     ) -> Evaluation:
-        """Cost and gradient of a `bare` problem, by compiled functions."""
+        """Cost and gradient of a problem from `without_parameters`, by compiled functions."""
         primal = self.primal(eqx.combine(parameters, constants), tissue, shift)
         return _evaluate(self, primal, tissue, parameters, constants, shift)
 
     def primal(
         self, energy: AbstractEnergy, tissue: Tissue, shift: Float[Array, 2] | None
     ) -> PyTree:
-        """The primal of the response; None if the response has none."""
-        return self.response.primal(tissue, self.pulled(tissue, energy, shift))
+        """The forward computation of the response, to be passed to `evaluate`; None if it has none."""
+        return self.response.primal(tissue, self.guided_energy(tissue, energy, shift))
 
-    def as_data(self, dtype: Any) -> InverseProblem[Energy]:
-        """The same problem with arrays for its numbers other than those of the energy."""
+    def with_array_numbers(self, dtype: Any) -> InverseProblem[Energy]:
+        """The problem with arrays for its Python numbers, except those of the energy."""
         cost, guidance = traced((self.cost, self.guidance), dtype)
         response = self.response.traced()
         return dataclasses.replace(self, cost=cost, guidance=guidance, response=response)
@@ -282,30 +287,30 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         tolerance: Float[Array, ""] | None = None,
         throw: bool = False,
     ) -> Equilibrium:
-        """The equilibrium from `tissue`, not displaced; pulled by the cost where guided or nudged."""
-        pulled = self.pulled(tissue, energy, shift, nudge)
+        """The equilibrium from `tissue`, without displacement, of the guided and nudged energy."""
+        guided = self.guided_energy(tissue, energy, shift, nudge)
         response = self.response if tolerance is None else self.response.finer(tolerance)
         if primal is None:
-            equilibrium = response(tissue, pulled, adjoint=adjoint, throw=throw)
+            equilibrium = response(tissue, guided, adjoint=adjoint, throw=throw)
         else:
-            equilibrium = response.attach(primal, tissue, pulled, adjoint)
-        if pulled is energy:
+            equilibrium = response.attach(primal, tissue, guided, adjoint)
+        if guided is energy:
             return equilibrium
         return eqx.tree_at(lambda e: e.energy, equilibrium, energy(equilibrium.tissue))
 
-    def pulled(
+    def guided_energy(
         self,
         tissue: Tissue,
         energy: AbstractEnergy,
         shift: Float[Array, 2] | None,
         nudge: Float[Array, ""] | None = None,
     ) -> AbstractEnergy:
-        """The energy that a relaxation from `tissue` minimises."""
+        """The energy that a relaxation from `tissue` minimises, with guidance and nudge."""
         if self.guidance is None and nudge is None:
             return energy
         strength = (0 if self.guidance is None else self.guidance) + (0 if nudge is None else nudge)
         strength = jnp.asarray(strength, tissue.vertices.dtype)
-        return _Pulled(energy, self.cost, shift, strength, frozen(tissue))
+        return _GuidedEnergy(energy, self.cost, shift, strength, frozen(tissue))
 
 
 @announced_jit
@@ -317,7 +322,7 @@ def _evaluate(
     constants: PyTree,
     shift: Float[Array, 2] | None,
 ) -> Evaluation:
-    """Cost and gradient where the primal of the response has led."""
+    """Cost and gradient at the equilibrium of the forward computation `primal`."""
 
     def cost(arguments: tuple) -> tuple[Array, Equilibrium]:
         parameters, shift, outcome = arguments
@@ -332,18 +337,18 @@ def _evaluate(
     return Evaluation(value, equilibrium, gradient, shift_gradient, outcome)
 
 
-def _moved(tissue: Tissue, shift: Float[Array, 2] | None) -> Tissue:
+def _displaced(tissue: Tissue, shift: Float[Array, 2] | None) -> Tissue:
     if shift is None:
         return tissue
     return tissue.with_vertices(tissue.vertices + shift)
 
 
 def _placed(equilibrium: Equilibrium, shift: Float[Array, 2] | None) -> Equilibrium:
-    return eqx.tree_at(lambda e: e.tissue, equilibrium, _moved(equilibrium.tissue, shift))
+    return eqx.tree_at(lambda e: e.tissue, equilibrium, _displaced(equilibrium.tissue, shift))
 
 
-class _Pulled(AbstractEnergy):
-    """An energy and a share of the cost."""
+class _GuidedEnergy(AbstractEnergy):
+    r"""$E + \kappa C$."""
 
     energy: AbstractEnergy
     cost: AbstractCost
@@ -352,39 +357,42 @@ class _Pulled(AbstractEnergy):
     start: Tissue
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
-        # A cost that sees positions would push the whole away without end, with one sign or the other:
-        # it is that of the tissue moved back to where it was.
-        placed = _moved(tissue.settled(self.start), self.shift)
+        # Evaluate the cost with the centroid fixed at its start: for a cost that depends on absolute
+        # positions, E + κ C would otherwise translate the tissue, without bound for one sign of κ.
+        placed = _displaced(tissue.settled(self.start), self.shift)
         return self.energy(tissue) + self.strength * self.cost(placed, self.energy)
 
 
 class _Nudging(AbstractNudging):
-    """An inverse problem at rest; its parameters are an energy and a displacement of the whole."""
+    """An inverse problem at an equilibrium; its parameters are an energy and a displacement of the tissue."""
 
     problem: InverseProblem
     settled: Tissue
 
     def cost(self, parameters: PyTree) -> Float[Array, ""]:
         energy, shift = parameters
-        return self.problem.cost(_moved(self.settled, shift), energy)
+        return self.problem.cost(_displaced(self.settled, shift), energy)
 
     def sizes(self, parameters: PyTree) -> tuple[Float[Array, ""], Float[Array, ""]]:
         energy, shift = parameters
-        cost = lambda tissue: self.problem.cost(_moved(tissue, shift), energy)
+        cost = lambda tissue: self.problem.cost(_displaced(tissue, shift), energy)
         at = lambda y: cost(self.settled.with_configuration(y))
-        value, slope = jax.value_and_grad(at)(self.settled.configuration)
+        value, gradient = jax.value_and_grad(at)(self.settled.configuration)
         units = units_of(self.settled, energy)
-        # At the optimum of the cost its slope vanishes, and β has to stay so small that E - (β/2) C keeps
-        # its minimum. A cost that counts neighbours has neither slope nor curvature: only a size.
-        pull = jnp.maximum(optx.max_norm(slope), mean_stiffness(self.settled, cost) * units.length)
-        pull = jnp.maximum(pull, 1e-8 * jnp.abs(value) / units.length)
-        return jnp.where(pull > 0, pull, 1), units.force
+        # The force scale of the cost is the maximum of three estimates. The gradient vanishes at the optimum
+        # of the cost, where the curvature bounds β so that E - (β/2) C keeps its minimum. A discrete cost
+        # has neither gradient nor curvature, only a value.
+        cost_force = jnp.maximum(
+            optx.max_norm(gradient), mean_stiffness(self.settled, cost) * units.length
+        )
+        cost_force = jnp.maximum(cost_force, 1e-8 * jnp.abs(value) / units.length)
+        return jnp.where(cost_force > 0, cost_force, 1), units.force
 
     def relax(
         self, parameters: PyTree, nudge: Float[Array, ""], tolerance: Float[Array, ""]
     ) -> tuple[Tissue, Float[Array, ""], Float[Array, ""]]:
         energy, shift = parameters
-        at_rest = self.problem.relax(
+        nudged = self.problem.relax(
             self.settled,
             energy,
             shift,
@@ -392,10 +400,10 @@ class _Nudging(AbstractNudging):
             nudge=nudge,
             tolerance=tolerance,
         )
-        return at_rest.tissue, at_rest.max_force, at_rest.num_steps.astype(nudge.dtype)
+        return nudged.tissue, nudged.max_force, nudged.num_steps.astype(nudge.dtype)
 
     def energy(
         self, parameters: PyTree, nudge: Float[Array, ""], state: Tissue
     ) -> Float[Array, ""]:
         energy, shift = parameters
-        return self.problem.pulled(self.settled, energy, shift, nudge)(state)
+        return self.problem.guided_energy(self.settled, energy, shift, nudge)(state)

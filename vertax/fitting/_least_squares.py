@@ -30,32 +30,31 @@ from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
 
-# Steps in a row that a solver may refuse before it counts as done.
-_PATIENCE = 8
+# The fit ends after this number of consecutive rejected steps.
+_MAX_REJECTED_STEPS = 8
 _TAGS: frozenset[object] = frozenset()
 
 
 class State(eqx.Module):
-    """Where an epoch begins."""
+    """State at the start of an epoch."""
 
     fitted: PyTree[Array]
-    """Parameters and position of the last accepted step."""
+    """Parameters and displacement of the last accepted step."""
     solver: list[Array]
-    """The arrays of the solver's state. What else it holds are programs, which each compilation makes
-    anew."""
+    """The arrays of the solver state; `_Solver` restores its other leaves, which are compiled functions."""
     tissue: Tissue
-    """Where the next relaxation starts."""
+    """The start of the next relaxation."""
     placed: Tissue
-    """The equilibrium of the accepted step, displaced as it says."""
+    """The equilibrium of the last accepted step, with its displacement."""
     facts: Facts
-    """What there is to know of it."""
+    """The scalars of the last accepted step."""
     scale: Float[Array, "*batch"]
-    """Of the residuals that the solver sees."""
+    """Factor of the residuals in the solver."""
     best: Best
-    n_still: Int[Array, "*batch"]
-    """Steps in a row that were refused."""
-    going: Bool[Array, "*batch"]
-    """False once the solver is done."""
+    n_rejected: Int[Array, "*batch"]
+    """Number of consecutive rejected steps."""
+    active: Bool[Array, "*batch"]
+    """False when the solver has ended."""
 
 
 class LeastSquares(AbstractMethod):
@@ -94,13 +93,13 @@ class LeastSquares(AbstractMethod):
         return float("nan")
 
 
-class _Machine(eqx.Module):
-    """The solver, set up for one problem."""
+class _Solver(eqx.Module):
+    """The solver with the residual function of one problem."""
 
     solver: optx.AbstractLeastSquaresSolver
     evaluate: Callable
     blank: Any
-    """A state of the solver that has not seen anything yet."""
+    """The initial state of the solver."""
     aux: Any
     options: dict[str, Any]
 
@@ -114,7 +113,8 @@ class _Machine(eqx.Module):
         scale: Float[Array, ""],
     ):
         evaluate = _residuals(problem, constants, true, scale)
-        # Forward mode solves the systems of all parameters as one batch; other adjoints have none.
+        # Forward mode solves the linear systems of all parameters as one batch; only implicit differentiation
+        # supports it.
         forward = isinstance(problem.adjoint, ImplicitDifferentiation)
         self.options = {"jac": "fwd" if forward else "bwd"}
         self.solver = solver
@@ -126,12 +126,12 @@ class _Machine(eqx.Module):
         self.evaluate = fn
 
     def restored(self, leaves: list[Array]) -> Any:
-        """The state of the solver that consists of these arrays."""
+        """The solver state with the given arrays."""
         dynamic, static = eqx.partition(self.blank, eqx.is_array)
         return eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), leaves), static)
 
     def step(self, state: State) -> tuple[PyTree, Any, Bool[Array, ""]]:
-        """The last accepted point, the solver's state, and whether it is done."""
+        """The last accepted point, the solver state, and whether the solver has ended."""
         solver_state = self.restored(state.solver)
         arguments = (self.options, solver_state, _TAGS)
         y, solver_state, _ = self.solver.step(self.evaluate, state.fitted, state.tissue, *arguments)
@@ -147,30 +147,30 @@ def _residuals(
     scale: Float[Array, ""],
     primal: PyTree = None,
 ) -> Callable[[PyTree, Tissue], tuple[Array, tuple]]:
-    """The residuals of some parameters, and what there is to know of their equilibrium."""
+    """A function that returns the residuals, and as aux the tissues and scalars of the equilibrium."""
 
     def evaluate(y: PyTree, tissue: Tissue) -> tuple[Array, tuple]:
         parameters, shift = y
         energy = eqx.combine(parameters, constants)
         residuals, relaxed, placed = problem.residuals(energy, tissue, shift, primal)
-        # A relaxation that did not arrive says nothing of these parameters: the solver must not
-        # go there, and comes closer if the cost is worse than any other.
+        # After a failed relaxation the solver must reject the step and try a shorter one: return very large
+        # residuals.
         worst = jnp.asarray(jnp.finfo(residuals.dtype).max ** 0.25, residuals.dtype)
-        ok = relaxed.converged & jnp.all(jnp.isfinite(residuals))
-        residuals = jnp.where(ok, scale * residuals, worst)
-        unknown = jnp.full_like(scale, jnp.nan)
+        valid = relaxed.converged & jnp.all(jnp.isfinite(residuals))
+        residuals = jnp.where(valid, scale * residuals, worst)
+        nan = jnp.full_like(scale, jnp.nan)
         facts = Facts(
             cost=0.5 * jnp.sum((residuals / scale) ** 2),
             max_force=relaxed.max_force,
-            converged=ok,
+            converged=valid,
             num_steps=relaxed.num_steps,
             num_t1=relaxed.num_t1,
-            gradient_norm=unknown,
-            gradient_residual=unknown,
-            gradient_steps=unknown,
+            gradient_norm=nan,
+            gradient_residual=nan,
+            gradient_steps=nan,
             relative_error=relative_error(parameters, true),
         )
-        tissues = (problem.onward(relaxed.tissue), placed)
+        tissues = (problem.next_start(relaxed.tissue), placed)
         return residuals, (eqx.filter(tissues, eqx.is_array), facts)
 
     return evaluate
@@ -185,18 +185,18 @@ def _start(solver: optx.AbstractLeastSquaresSolver, parts: tuple, batched: bool)
         parameters: PyTree,
         primal: PyTree,
     ) -> State:
-        # The damping that a solver begins with suits residuals of order one.
+        # Scale the residuals to norm 1, which suits the initial damping of the solver.
         fitted = (parameters, no_shift(problem))
         one = jnp.ones((), problem.tissue.vertices.dtype)
         first, _ = _residuals(problem, constants, true, one, primal)(fitted, problem.tissue)
         scale = jax.lax.rsqrt(jnp.maximum(jnp.sum(first**2), jnp.finfo(first.dtype).tiny))
-        machine = _Machine(solver, problem, constants, true, fitted, scale)
+        machine = _Solver(solver, problem, constants, true, fitted, scale)
         leaves = _leaves(machine.blank)
         facts = nothing_known(problem)
         best = unbeaten(problem, parameters)
         tissues = (problem.tissue, problem.tissue)
-        still, going = jnp.array(0), jnp.array(True)
-        return State(fitted, leaves, *tissues, facts, scale, best, still, going)
+        n_rejected, active = jnp.array(0), jnp.array(True)
+        return State(fitted, leaves, *tissues, facts, scale, best, n_rejected, active)
 
     return (over_members(start, parts[0]) if batched else start)(*parts)
 
@@ -211,22 +211,22 @@ def _epoch(
     epoch: Int[Array, ""],
     batched: bool,
 ) -> tuple[State, Record]:
-    """One relaxation, Jacobian and step, for each of the batch that is not done."""
+    """One relaxation, Jacobian and step, for each active member of a batch."""
 
     def one(
         problem: InverseProblem, constants: PyTree, true: PyTree[Array] | None, state: State
     ) -> tuple[State, Record]:
-        machine = _Machine(solver, problem, constants, true, state.fitted, state.scale)
+        machine = _Solver(solver, problem, constants, true, state.fitted, state.scale)
         y, solver_state, done = machine.step(state)
-        arrays, facts = solver_state.aux  # those of the last accepted point, which is y
+        arrays, facts = solver_state.aux  # of the last accepted point y
         tissue, placed = (eqx.combine(a, problem.tissue) for a in arrays)
         best = better(state.best, y[0], placed, facts, guidance_of(problem), epoch, facts.converged)
-        n_still = jnp.where(facts.cost == state.facts.cost, state.n_still + 1, 0)
+        n_rejected = jnp.where(facts.cost == state.facts.cost, state.n_rejected + 1, 0)
         leaves = _leaves(solver_state)
-        going = ~done & (n_still < _PATIENCE)
-        moved = State(y, leaves, tissue, placed, facts, state.scale, best, n_still, going)
-        # In a batch a member that was done earlier stands still.
-        state = tree_where(state.going, moved, state)
+        active = ~done & (n_rejected < _MAX_REJECTED_STEPS)
+        updated = State(y, leaves, tissue, placed, facts, state.scale, best, n_rejected, active)
+        # In a batch members that have ended keep their state.
+        state = tree_where(state.active, updated, state)
         return state, _record(state)
 
     arguments = (problem, constants, true, state)
@@ -243,5 +243,5 @@ def _record(state: State) -> Record:
 
 
 def _leaves(state: Any) -> list[Array]:
-    """The arrays of a solver's state; what JAX knows while it compiles is no array of its own."""
+    """The arrays of a solver state, with constants of the compilation converted to arrays."""
     return [jnp.asarray(x) for x in jax.tree.leaves(eqx.filter(state, eqx.is_array))]

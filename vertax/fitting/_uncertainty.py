@@ -1,4 +1,4 @@
-"""How well data determine the parameters: the Gauss-Newton (Laplace) approximation at a fit."""
+"""Uncertainty of fitted parameters: the Gauss-Newton (Laplace) approximation."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from vertax.mesh import Tissue
 
 
 class Uncertainty(eqx.Module):
-    """What the data say, and do not say, of the parameters of a fit."""
+    """Uncertainty of the fitted parameters, from [`uncertainty`][vertax.uncertainty]."""
 
     deviation: AbstractEnergy
-    """Standard deviation of each fitted parameter, in its place in the energy; others are None."""
+    """The energy with the standard deviation of each fitted parameter in its place; other leaves are None."""
     covariance: Float[Array, "parameters parameters"]
-    """Covariance of all fitted parameters, flattened in the order of `jax.tree.leaves`; what neither the
-    data nor a prior determine is left out of it."""
+    """Covariance of all fitted parameters, flattened in the order of `jax.tree.leaves`. Directions of
+    infinite variance are left out."""
     directions: Float[Array, "combinations parameters"]
-    """Combinations of parameters (orthonormal rows), from the worst determined to the best."""
+    """Eigenvectors (orthonormal rows), from the least to the best determined combination of parameters."""
     deviations: Float[Array, " combinations"]
-    """Standard deviation along each combination; where the data say nothing that of the prior, infinite
-    without one."""
+    """Standard deviation along each direction; for a direction that the data do not determine that of the
+    prior, infinite without a prior."""
     noise: Float[Array, ""]
-    """Standard deviation of the noise of a residual, estimated from what the fit left over."""
+    """Standard deviation of the noise of a residual, estimated from the residuals of the fit."""
 
 
 def uncertainty(
@@ -50,26 +50,25 @@ def uncertainty(
 
     $$\mathrm{Cov}(\theta) = \bigl(J^T J / \sigma^2 + I / s^2\bigr)^{-1}$$
 
-    with the standard deviation $s$ of a Gaussian prior, if there is one. A fitted position is fitted
-    along, and its uncertainty included. It holds where residuals are independent and small enough
-    that the equilibrium responds linearly.
+    with the standard deviation $s$ of a Gaussian prior, if given. With `fit_position` the position is
+    marginalised. Valid for independent residuals that are small enough for a linear response of the
+    equilibrium.
 
     **Arguments:**
 
     - `problem`: the inverse problem, with a sum of squares as its cost.
-    - `fit`: its outcome; of a batch, one member.
-    - `prior`: standard deviation of the parameters before the data were seen, in their units; it keeps
-        finite what the data do not determine.
-    - `n_independent`: number of independent residuals, if neighbours are correlated (pixels of an image
-        whose misfit is a structure and not noise); by default all.
+    - `fit`: its fit; for a batch, one member.
+    - `prior`: standard deviation $s$ of the prior, in units of the parameters; it bounds the variance along
+        directions that the data do not determine.
+    - `n_independent`: number of independent residuals, if residuals are correlated (e.g. neighbouring pixels
+        with a systematic misfit); by default all.
 
     **Returns:** an [`Uncertainty`][vertax.Uncertainty].
 
     **Raises:**
 
-    - `TypeError` if the cost is no sum of squares.
-    - `ValueError` for a prior that is not positive, for a batch, or if there are not more independent
-        residuals than parameters.
+    - `TypeError` if the cost is not a sum of squares.
+    - `ValueError` for a prior that is not positive, a batch, or too few independent residuals.
     """
     if prior is not None:
         check_number("prior", prior, above=0)
@@ -77,50 +76,55 @@ def uncertainty(
         check_number("n_independent", n_independent, above=0)
     if problem.tissue.vertices.ndim != 2 or fit.tissue.vertices.ndim != 2:
         raise ValueError(
-            "Arguments `problem` and `fit` must be single ones, but are a batch. Take a member of each: "
-            "jax.tree.map(lambda x: x[0] if equinox.is_array(x) else x, fit)."
+            "Arguments `problem` and `fit` must be single, but are a batch. Take a member of each: "
+            "vertax.fitting.member(fit, 0)."
         )
     dtype = problem.tissue.vertices.dtype
     parameters, constants = traced(eqx.partition(fit.energy, problem.trainable), dtype)
-    problem = problem.as_data(dtype)
+    problem = problem.with_array_numbers(dtype)
     flat, unravel = jfu.ravel_pytree(parameters)
     shift = jnp.zeros(2, flat.dtype) if problem.fit_position else None
-    tissue = traced(problem.onward(fit.tissue), dtype)
+    tissue = traced(problem.next_start(fit.tissue), dtype)
     primal = problem.primal(eqx.combine(parameters, constants), tissue, shift)
     gram, squares, n_residuals = _gram(problem, primal, tissue, flat, unravel, constants, shift)
     n_free = n_residuals if n_independent is None else n_independent
     n_fitted = len(gram)
     if not n_free > n_fitted:
         raise ValueError(
-            f"There must be more independent residuals than parameters, but there are {n_free:g} of "
-            f"them and {n_fitted} parameters. Fit fewer, or raise `n_independent`."
+            f"There must be more independent residuals than parameters, but there are {n_free:g} "
+            f"residuals and {n_fitted} parameters. Fit fewer parameters, or raise `n_independent`."
         )
     variance = squares / (n_residuals * (1 - n_fitted / n_free))
-    # Where the tissue lies is fitted too, and known only so well. (A cost that does not see it leaves
-    # zeros, which the pseudo-inverse passes by.)
-    known, crossed, position = (
+    # Marginalise the position: the Schur complement of its block of JᵀJ. The pseudo-inverse covers costs that
+    # do not depend on the position, for which the block is 0.
+    information, cross, position = (
         gram[: len(flat), : len(flat)],
         gram[: len(flat), len(flat) :],
         gram[len(flat) :, len(flat) :],
     )
     if shift is not None:
-        known = known - crossed @ jnp.linalg.pinv(position, hermitian=True) @ crossed.T
-    values, vectors = jnp.linalg.eigh((known + known.T) / 2)
-    # What the data do not see is asked of the data alone: a prior adds the same to all directions.
-    # Slopes through the equilibrium are known to about 1e-6, their squares to the square of that.
-    unknown = (values <= 1e-10 * values[-1]) | (values <= 0)
-    # So many residuals speak for themselves; the others repeat what they say.
+        information = information - cross @ jnp.linalg.pinv(position, hermitian=True) @ cross.T
+    values, vectors = jnp.linalg.eigh((information + information.T) / 2)
+    # Directions that the data do not determine, judged before the prior is added. The Jacobian through the
+    # equilibrium has a relative error of about 1e-6, so eigenvalues of JᵀJ below 1e-10 of the largest are 0.
+    undetermined = (values <= 1e-10 * values[-1]) | (values <= 0)
+    # With n_free independent of n_residuals residuals, JᵀJ counts each independent one n_residuals / n_free
+    # times.
     spread = variance * n_residuals / n_free
-    rest = 0.0 if prior is None else spread * prior**-2
-    seen = jnp.where(unknown, 0, spread / (jnp.where(unknown, 1, values) + rest))
-    unseen = jnp.where(unknown, jnp.inf if prior is None else prior**2, 0)
-    # The covariance has no place for infinity.
-    inverse = seen + jnp.where(jnp.isfinite(unseen), unseen, 0)
+    prior_precision = 0.0 if prior is None else spread * prior**-2
+    determined_variance = jnp.where(
+        undetermined, 0, spread / (jnp.where(undetermined, 1, values) + prior_precision)
+    )
+    undetermined_variance = jnp.where(undetermined, jnp.inf if prior is None else prior**2, 0)
+    # The covariance leaves out directions of infinite variance.
+    inverse = determined_variance + jnp.where(
+        jnp.isfinite(undetermined_variance), undetermined_variance, 0
+    )
     covariance = (vectors * inverse) @ vectors.T
-    lost = jnp.sum(jnp.where(jnp.isinf(unseen), vectors**2, 0), axis=1) > 1e-9
-    deviation = jnp.where(lost, jnp.inf, jnp.sqrt(jnp.diag(covariance)))
-    along = jnp.sqrt(seen + unseen)
-    return Uncertainty(unravel(deviation), covariance, vectors.T, along, jnp.sqrt(variance))
+    infinite = jnp.sum(jnp.where(jnp.isinf(undetermined_variance), vectors**2, 0), axis=1) > 1e-9
+    deviation = jnp.where(infinite, jnp.inf, jnp.sqrt(jnp.diag(covariance)))
+    deviations = jnp.sqrt(determined_variance + undetermined_variance)
+    return Uncertainty(unravel(deviation), covariance, vectors.T, deviations, jnp.sqrt(variance))
 
 
 @announced_jit

@@ -1,4 +1,4 @@
-"""Growth: tissues in which cells grow, divide and die, with their lineage."""
+"""Growth: cell growth, division and death, with the cell lineage."""
 
 from vertax.growth._grow import Grown as Grown, grow as grow
 from vertax.growth._life_cycle import (

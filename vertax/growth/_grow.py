@@ -1,4 +1,4 @@
-"""Tissues that grow: their cells live by rules, and between events the tissue relaxes or moves."""
+"""Growth of a tissue: a life cycle updates the cells, and the tissue relaxes or moves in between."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vertax.dissipations import AbstractDissipation
 from vertax.dynamics._incremental_potential import Incremental
 from vertax.energies import AbstractEnergy
 from vertax.growth._life_cycle import AbstractLifeCycle
-from vertax.growth._lineage import Lineage, died_at, divided_at, founded
+from vertax.growth._lineage import Lineage, initial_lineage, record_deaths, record_division
 from vertax.mesh import Tissue, Trajectory
 from vertax.relax import RESULTS, Relaxation
 from vertax.transitions import T1, T2
@@ -29,44 +29,44 @@ Energy = Callable[[Any], AbstractEnergy]
 
 
 class Grown(eqx.Module):
-    """What became of a tissue that grew."""
+    """Result of [`grow`][vertax.growth.grow]."""
 
     tissue: Tissue
-    """The tissue at the end."""
+    """The final tissue."""
     cells: PyTree[Array]
-    """What its cells know of themselves then, see [`AbstractLifeCycle`][vertax.growth.AbstractLifeCycle]."""
+    """The final cell states, see [`AbstractLifeCycle`][vertax.growth.AbstractLifeCycle]."""
     times: Float[Array, "*batch times"]
-    """The times of the frames, of which the first is the start."""
+    """The times of the frames; the first is the initial time."""
     frames: Tissue
-    """The tissue at these times: the same tissue with a leading axis."""
+    """The tissue at these times, with a leading axis."""
     cells_then: PyTree[Array]
-    """What cells knew at these times."""
+    """The cell states at these times, with a leading axis."""
     number: Int[Array, "*batch times cells"]
-    """Which cell of the lineage was in each slot; -1 in spare ones."""
+    """Index in the lineage of the cell in each slot; -1 for spare slots."""
     lineage: Lineage
-    """Who came from whom, and when."""
+    """The mother, birth and end of each cell."""
     sound: Bool[Array, "*batch times"]
-    """Whether all steps up to a frame came to an end, in tissues without overlaps."""
+    """Whether all steps up to a frame converged to tissues without overlaps."""
     full: Bool[Array, "*batch"]
-    """Whether a cell could not divide for want of a spare slot."""
+    """Whether a division failed because there was no spare slot."""
     failed_divisions: Int[Array, "*batch times"]
-    """How many divisions up to a frame were due and could not happen: there was no spare slot, or the cell
-    could not be cut in two. A cell that remains due is tried in each step, and counted each time."""
+    """Number of failed divisions up to a frame: there was no spare slot, or the cell could not be cut in two.
+    A failed division is tried again, and counted again, in each following step."""
     failed_deaths: Int[Array, "*batch times"]
-    """How many deaths up to a frame were overdue, see `overdue` of the life cycle, and could not happen, such
-    as that of a cell without which a neighbour had too few sides. Counted in each step that it remains."""
+    """Number of overdue deaths up to a frame (see `overdue` of the life cycle), e.g. because a neighbour
+    would have too few sides without the cell. Counted again in each step."""
     log_likelihood: Float[Array, "*batch"]
-    """The logarithm of how likely the choices of the cycle were, see
+    """Log-likelihood of the discrete random choices of the life cycle, see
     [`score_function`][vertax.growth.score_function]."""
 
     @property
     def n_alive(self) -> Int[Array, "*batch times"]:
-        """How many cells there were."""
+        """Number of living cells in each frame."""
         return jnp.sum(self.number >= 0, axis=-1)
 
     @property
     def trajectory(self) -> Trajectory:
-        """The frames as a trajectory, for [`animate`][vertax.animate] and for files."""
+        """The frames as a trajectory, for [`animate`][vertax.animate] and for writing files."""
         trajectory = Trajectory()
         arrays, static = eqx.partition(self.frames, eqx.is_array)
         for i, time in enumerate(self.times):
@@ -75,34 +75,34 @@ class Grown(eqx.Module):
         return trajectory
 
     def checked(self) -> Grown:
-        """The same, if all went as it should.
+        """The result itself, or an error if it is incomplete.
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox inside `jax.jit`) if a step came to no end or cells overlap, or if there
-            was no room for a cell, or none in the lineage.
+        - `RuntimeError` (of Equinox inside `jax.jit`) if a step did not converge or cells overlap, if there
+            was no spare slot for a cell, or if the lineage was too short.
         """
         capacity, records = self.tissue.n_cells, self.lineage.mother.shape[-1]
         checked = self
-        for wrong, reason in (
+        for failed, reason in (
             (
                 ~self.sound[..., -1],
-                "A step in time came to no end, or cells overlap. Take shorter steps (more `substeps`) or "
-                "slower rates, or pass throw=False and look at `sound`.",
+                "A time step did not converge, or cells overlap. Take shorter steps (more `substeps`) or "
+                "slower rates, or pass throw=False and check `sound`.",
             ),
             (
                 self.full,
                 f"A cell could not divide: the tissue has a capacity of {capacity} cells, and all are alive. "
-                "Make room with tissue.with_capacity(...) before, or pass throw=False.",
+                "Add spare slots with tissue.with_capacity(...), or pass throw=False.",
             ),
             (
                 ~self.lineage.complete,
-                f"There were more cells than the {records} that the lineage has room for. Raise `records`.",
+                f"The lineage has a capacity of {records} cells, but there were more. Raise `records`.",
             ),
         ):
-            if not is_concrete(wrong):
-                checked = eqx.error_if(checked, wrong, reason)
-            elif np.any(np.asarray(wrong)):
+            if not is_concrete(failed):
+                checked = eqx.error_if(checked, failed, reason)
+            elif np.any(np.asarray(failed)):
                 raise RuntimeError(reason)
         return checked
 
@@ -134,57 +134,64 @@ def grow(
     vx.animate(grown.trajectory, "growth.gif")
     ```
 
-    In each step cells age by the rules of the cycle, those whose time has come divide, and then the tissue
-    comes to rest; or, if there is a dissipation, it moves for the length of the step as in
-    [`evolve`][vertax.evolve]. Works under `jax.jit` and `jax.vmap`. A gradient tells how the course changes
-    as long as the same events happen in the same steps; it does not see that rates change which happen, for
-    which there is [`score_function`][vertax.growth.score_function].
+    Each time step:
+
+    1. The life cycle updates the cell states and selects the cells that divide.
+    2. The selected cells divide.
+    3. The tissue relaxes to equilibrium; with a dissipation it moves for the length of the step instead, as
+       in [`evolve`][vertax.evolve]. T1 and T2 transitions happen here.
+
+    Works under `jax.jit` and `jax.vmap`. Gradients hold the discrete events (divisions, deaths and their
+    steps) fixed; [`score_function`][vertax.growth.score_function] adds the dependence of their probabilities
+    on the parameters.
 
     **Arguments:**
 
-    - `tissue`: where it begins, with room for all that will be alive at a time, see
-        [`with_capacity`][vertax.Tissue.with_capacity]: one cell or more in a periodic box, two or more of a
-        free tissue.
-    - `energy`: a function of what cells know of themselves that returns their energy.
-    - `cycle`: the rules, such as [`GrowAndDivide`][vertax.growth.GrowAndDivide].
-    - `times`: when there is to be a frame; they increase, and the first is that of the start.
-    - `key`: for random numbers, a key or a seed.
-    - `substeps`: steps from one frame to the next.
-    - `divisions`: most divisions in a step, by default four and a twentieth of the capacity; what is due
-        beyond that waits for the next one.
-    - `records`: room in the lineage; by default for eight times as many cells as the tissue has slots.
-    - `dissipation`: what resists the motion; by default the tissue is at rest at the end of each step.
-    - `relaxation`: how each step is found, by default with T1 and T2 transitions.
+    - `tissue`: the initial tissue, with spare slots for all cells alive at the same time, see
+        [`with_capacity`][vertax.Tissue.with_capacity]. At least one cell in a periodic box, two in a free
+        tissue.
+    - `energy`: a function of the cell states that returns the energy of the tissue.
+    - `cycle`: the life cycle, e.g. [`GrowAndDivide`][vertax.growth.GrowAndDivide].
+    - `times`: increasing times of the frames; the first is the initial time.
+    - `key`: key or seed for random numbers.
+    - `substeps`: number of time steps between two frames.
+    - `divisions`: maximum number of divisions per step, by default 4 + capacity / 20; further divisions wait
+        for the next step.
+    - `records`: capacity of the lineage, by default eight times the number of cell slots.
+    - `dissipation`: friction and viscosity; by default none, and the tissue relaxes in each step.
+    - `relaxation`: solver and transitions of each step, by default with T1 and T2 transitions.
     - `adjoint`: how to differentiate each step.
-    - `throw`: raise an error if a step found no end, or if there was no room. If False, look at `sound` and
-        `full`.
+    - `throw`: raise an error if a step does not converge or capacity is exhausted. If False, check `sound`
+        and `full`.
 
-    **Returns:** what became of it, [`Grown`][vertax.growth.Grown].
+    **Returns:** a [`Grown`][vertax.growth.Grown].
 
     **Raises:**
 
-    - `TypeError` for a cycle, an energy, a dissipation or a relaxation that is none.
+    - `TypeError` for a cycle, an energy, a dissipation or a relaxation of a wrong type.
     - `ValueError` for times that do not increase, or a tissue without spare slots.
-    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a step found no end, or there is no room.
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a step does not converge or capacity is
+        exhausted.
     """
-    for name, value, kind in (
-        ("cycle", cycle, AbstractLifeCycle),
-        ("dissipation", dissipation, AbstractDissipation | None),
-        ("relaxation", relaxation, Relaxation | None),
+    for name, value, kind, expected in (
+        ("cycle", cycle, AbstractLifeCycle, "an AbstractLifeCycle"),
+        ("dissipation", dissipation, AbstractDissipation | None, "an AbstractDissipation or None"),
+        ("relaxation", relaxation, Relaxation | None, "a Relaxation or None"),
     ):
         if not isinstance(value, kind):
-            raise TypeError(f"Argument `{name}` is of a wrong kind: {describe(value)}.")
-    wrong = isinstance(energy, AbstractEnergy) or not callable(energy)
-    if wrong or (isinstance(energy, type) and issubclass(energy, AbstractEnergy)):
+            raise TypeError(f"Argument `{name}` must be {expected}, but is {describe(value)}.")
+    invalid = isinstance(energy, AbstractEnergy) or not callable(energy)
+    if invalid or (isinstance(energy, type) and issubclass(energy, AbstractEnergy)):
         name = energy.__name__ if isinstance(energy, type) else "energy"
         raise TypeError(
-            "Argument `energy` must be a function of what cells know of themselves that returns an energy, "
+            "Argument `energy` must be a function of the cell states that returns an energy, "
             f"but is {describe(energy)}. Pass such a function, e.g. lambda cells: {name}"
             f"{'(...)' if isinstance(energy, type) else ''}."
         )
     if not tissue.topology.spare:
         raise ValueError(
-            "Argument `tissue` must have room for cells to come: pass tissue.with_capacity(...)."
+            "Argument `tissue` must have spare slots for new cells, but has none. Pass "
+            "tissue.with_capacity(...)."
         )
     check_integer("substeps", substeps, at_least=1)
     divisions = 4 + tissue.n_cells // 20 if divisions is None else divisions
@@ -199,13 +206,13 @@ def grow(
     times = as_times(times)
     parts = traced((tissue, energy, cycle, dissipation), tissue.vertices.dtype)
     settings = (relaxation.traced(), adjoint, times, as_key(key), (substeps, divisions, records))
-    with announce_compilations(f"the growth of a tissue with room for {tissue.n_cells} cells"):
+    with announce_compilations(f"the growth of a tissue with {tissue.n_cells} cell slots"):
         grown = _grow(*parts, *settings)
     return grown.checked() if throw else grown
 
 
 class _State(eqx.Module):
-    """How far it has come."""
+    """State of the loop over time steps."""
 
     tissue: Tissue
     cells: PyTree[Array]
@@ -235,14 +242,16 @@ def _grow(
 
     def divide_one(state: _State, due: Array, time: Array, key: Array) -> tuple[_State, Array]:
         cell = jnp.argmax(due).astype(jnp.int32)
-        turn, draw = jax.random.split(key)
-        axis = cycle.axis(state.cells, state.tissue, cell, turn)
+        axis_key, state_key = jax.random.split(key)
+        axis = cycle.axis(state.cells, state.tissue, cell, axis_key)
         change = divided(state.tissue, cell, axis, jnp.any(due))
         daughter = jnp.argmax(change.tissue.alive & ~state.tissue.alive).astype(jnp.int32)
         pair = jnp.stack([cell, daughter])
-        cells = cycle.born(change.inherited(state.cells, axis="cells"), change.tissue, pair, draw)
+        cells = cycle.born(
+            change.inherited(state.cells, axis="cells"), change.tissue, pair, state_key
+        )
         cells = jax.tree.map(lambda a, b: jnp.where(change.done, a, b), cells, state.cells)
-        lineage, number = divided_at(state.lineage, state.number, pair, time, change.done)
+        lineage, number = record_division(state.lineage, state.number, pair, time, change.done)
         full = state.full | (jnp.any(due) & jnp.all(state.tissue.alive))
         failed = state.failed_divisions + (jnp.any(due) & ~change.done)
         after = _State(
@@ -261,24 +270,24 @@ def _grow(
     def step(state: _State, start: Array, end: Array, key: Array) -> _State:
         aging, *dividing = jax.random.split(key, 1 + divisions)
         cells, due = cycle.advance(state.cells, state.tissue, end - start, aging)
-        likely = cycle.log_likelihood(state.cells, cells, state.tissue, end - start)
+        log_likelihood = cycle.log_likelihood(state.cells, cells, state.tissue, end - start)
         parts = lambda s: (s.cells, s.log_likelihood)
-        state = eqx.tree_at(parts, state, (cells, state.log_likelihood + likely))
+        state = eqx.tree_at(parts, state, (cells, state.log_likelihood + log_likelihood))
         due &= state.tissue.alive
 
         def one(carry: tuple, key: Array) -> tuple:
             state, due = carry
-            happens = lambda: _arrays(divide_one(whole(state), due, end, key))
-            return jax.lax.cond(jnp.any(due), happens, lambda: (state, due)), None
+            perform = lambda: _arrays(divide_one(combine(state), due, end, key))
+            return jax.lax.cond(jnp.any(due), perform, lambda: (state, due)), None
 
         (arrays, _), _ = jax.lax.scan(one, (_arrays(state), due), jnp.stack(dividing))
-        state = whole(arrays)
+        state = combine(arrays)
         before, potential = state.tissue, energy(state.cells)
         if dissipation is not None:
             potential = Incremental(potential, dissipation, before, end - start)
         moved = relaxation.solve(before, potential, adjoint, recompute=True)
-        gone = before.alive & ~moved.tissue.alive
-        lineage, number = died_at(state.lineage, state.number, gone, end)
+        died = before.alive & ~moved.tissue.alive
+        lineage, number = record_deaths(state.lineage, state.number, died, end)
         sound = state.sound & (moved.result == RESULTS.successful) & moved.valid
         overdue = moved.tissue.alive & cycle.overdue(state.cells, moved.tissue)
         return _State(
@@ -295,13 +304,13 @@ def _grow(
 
     def interval(arrays: _State, inputs: tuple) -> tuple[_State, tuple]:
         (start, end), key = inputs
-        marks = start + jnp.linspace(0, 1, substeps + 1, dtype=times.dtype) * (end - start)
+        step_times = start + jnp.linspace(0, 1, substeps + 1, dtype=times.dtype) * (end - start)
 
         def substep(arrays: _State, inputs: tuple) -> tuple[_State, None]:
-            return _arrays(step(whole(arrays), *inputs)), None
+            return _arrays(step(combine(arrays), *inputs)), None
 
         keys = jax.random.split(key, substeps)
-        arrays, _ = jax.lax.scan(substep, arrays, (marks[:-1], marks[1:], keys))
+        arrays, _ = jax.lax.scan(substep, arrays, (step_times[:-1], step_times[1:], keys))
         return arrays, frame_of(arrays)
 
     def frame_of(arrays: _State) -> tuple:
@@ -309,7 +318,7 @@ def _grow(
         return arrays.tissue, arrays.cells, arrays.number, arrays.sound, failed
 
     first, rest = jax.random.split(key)
-    lineage, number = founded(tissue, times[0], records)
+    lineage, number = initial_lineage(tissue, times[0], records)
     begin = _State(
         tissue=tissue,
         cells=cycle.init(tissue, first),
@@ -322,12 +331,12 @@ def _grow(
         log_likelihood=jnp.zeros((), tissue.vertices.dtype),
     )
     arrays, static = eqx.partition(begin, eqx.is_array)
-    whole = lambda arrays: eqx.combine(arrays, static)
+    combine = lambda arrays: eqx.combine(arrays, static)
     keys = jax.random.split(rest, times.shape[0] - 1)
     end, frames = jax.lax.scan(interval, arrays, ((times[:-1], times[1:]), keys))
-    join = lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest])
-    tissues, cells, numbers, sound, failed = jax.tree.map(join, frame_of(arrays), frames)
-    last = whole(end)
+    prepend = lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest])
+    tissues, cells, numbers, sound, failed = jax.tree.map(prepend, frame_of(arrays), frames)
+    last = combine(end)
     return Grown(
         tissue=last.tissue,
         cells=last.cells,

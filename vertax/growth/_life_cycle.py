@@ -1,4 +1,4 @@
-"""Life cycles: when a cell divides, and when it dies."""
+"""Life cycles: rules of cell growth, division and death."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from vertax.mesh import Tissue
 
 
 class AbstractLifeCycle(eqx.Module):
-    """What cells do in time besides moving: how they age, when they divide, and along which axis.
+    """Rules of cell growth, division and death.
 
-    What a cell knows of itself is a pytree of arrays with one entry (or row) a cell; a daughter begins with
-    that of her mother. An array that has not, declares it by the metadata of its field, see
-    [`Change.inherited`][vertax.transitions.Change].
+    The cell states are a pytree of arrays with one entry (or row) per cell. In a division both daughters
+    inherit the state of the mother, before `born` modifies it. An array without an axis of cells must declare
+    this in the metadata of its field, see [`Change.inherited`][vertax.transitions.Change].
     """
 
     def __check_init__(self):
@@ -28,19 +28,19 @@ class AbstractLifeCycle(eqx.Module):
 
     @abc.abstractmethod
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
-        """What the first cells know."""
+        """The initial cell states."""
 
     @abc.abstractmethod
     def advance(
         self, cells: PyTree[Array], tissue: Tissue, dt: Float[Array, ""], key: PRNGKeyArray
     ) -> tuple[PyTree[Array], Bool[Array, " cells"]]:
-        """What they know some time later, and which of them divide now."""
+        """The cell states after a time step, and which cells divide."""
 
     @abc.abstractmethod
     def born(
         self, cells: PyTree[Array], tissue: Tissue, pair: Int[Array, "2"], key: PRNGKeyArray
     ) -> PyTree[Array]:
-        """What two daughters know, who have begun with what their mother knew."""
+        """The cell states after a division; the two slots `pair` hold the inherited state of the mother."""
 
     def log_likelihood(
         self,
@@ -49,56 +49,58 @@ class AbstractLifeCycle(eqx.Module):
         tissue: Tissue,
         dt: Float[Array, ""],
     ) -> Float[Array, ""]:
-        """The logarithm of how likely `advance` made the choices that it made, for `score_function`.
+        """Log-likelihood of the discrete random choices of `advance`, for `score_function`.
 
-        Of choices that are discrete alone: what is drawn from a distribution and goes on as a number, such as
-        a size, is differentiated as such. By default 0, that of a cycle without choices.
+        Continuous random numbers, such as a division area, are not included: they are differentiated
+        directly. By default 0, for a cycle without discrete choices.
         """
         return jnp.zeros((), tissue.vertices.dtype)
 
     def overdue(self, cells: PyTree[Array], tissue: Tissue) -> Bool[Array, " cells"]:
-        """Which cells should have vanished by now; `grow` counts those that have not. By default none."""
+        """Which cells should have been removed before; `grow` counts them. By default none."""
         return jnp.zeros(tissue.n_cells, bool)
 
     def axis(
         self, cells: PyTree[Array], tissue: Tissue, cell: Int[Array, ""], key: PRNGKeyArray
     ) -> Float[Array, "2"] | None:
-        """Along which axis a cell divides; None is its long one."""
+        """Direction from one daughter to the other; None is the long axis of the mother."""
         return None
 
 
 class Cells(eqx.Module):
-    """What a cell of [`GrowAndDivide`][vertax.growth.GrowAndDivide] knows of itself."""
+    """Cell states of [`GrowAndDivide`][vertax.growth.GrowAndDivide]."""
 
     target_area: Float[Array, "*batch cells"]
-    """The area that it would like to have."""
+    """Target area of each cell."""
     division_area: Float[Array, "*batch cells"]
-    """The target area at which it divides."""
+    """Target area at which each cell divides."""
     age: Float[Array, "*batch cells"]
-    """Time since its birth."""
+    """Time since birth."""
     dying: Bool[Array, "*batch cells"]
-    """Whether it shrinks, and will vanish."""
+    """Whether the cell shrinks until it is removed."""
 
 
 class GrowAndDivide(AbstractLifeCycle):
-    r"""Cells whose target areas grow, that divide at a certain size, and die at a certain rate.
+    r"""Growth at a constant rate, division at a random size, and death at a constant rate.
 
-    The target area of a cell grows by $g$ in time. When it comes to the size of division, which is drawn for
-    each cell from a normal distribution, the cell divides, and each daughter has half its target area. A cell
-    that dies shrinks, $\dot A^0 = -A^0 / \tau$, and leaves by T1 and T2 transitions.
+    - Growth: the target area of a living cell obeys $\dot A^0 = g$.
+    - Division: when $A^0$ reaches the division area of the cell, drawn from a normal distribution, the cell
+        divides, and each daughter gets $A^0 / 2$.
+    - Death: at the rate $k$ a cell starts to die; then $\dot A^0 = -A^0 / \tau$, until a T2 transition
+        removes the cell.
 
     **Arguments:**
 
     - `growth_rate`: $g$, area over time.
-    - `division_area`: mean target area at which a cell divides.
-    - `variation`: standard deviation of that over its mean.
-    - `death_rate`: how likely a cell begins to die in unit time.
+    - `division_area`: mean target area at division.
+    - `variation`: coefficient of variation of the division area.
+    - `death_rate`: $k$, inverse time.
     - `shrinking_time`: $\tau$.
-    - `orientation`: a cell divides along its `"long"` axis (Hertwig's rule), or a `"random"` one.
+    - `orientation`: division along the `"long"` axis of the cell (Hertwig's rule) or a `"random"` one.
 
     **Raises:**
 
-    - `ValueError` for negative rates, areas or times that are not positive, or another orientation.
+    - `ValueError` for negative rates, areas or times that are not positive, or an unknown orientation.
     """
 
     growth_rate: Float[Array, ""]
@@ -135,44 +137,44 @@ class GrowAndDivide(AbstractLifeCycle):
         self.orientation = orientation
 
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> Cells:
-        """Cells at random stages between birth and division."""
+        """Cells at uniformly distributed stages between birth and division."""
         shape, dtype = (tissue.n_cells,), tissue.vertices.dtype
-        drawn, stage = jax.random.split(key)
-        division = self._drawn(drawn, shape, dtype)
-        share = 0.5 * (1 + jax.random.uniform(stage, shape, dtype))
-        return Cells(share * division, division, jnp.zeros(shape, dtype), jnp.zeros(shape, bool))
+        area_key, stage_key = jax.random.split(key)
+        division = self._draw_division_areas(area_key, shape, dtype)
+        fraction = 0.5 * (1 + jax.random.uniform(stage_key, shape, dtype))
+        return Cells(fraction * division, division, jnp.zeros(shape, dtype), jnp.zeros(shape, bool))
 
     def advance(
         self, cells: Cells, tissue: Tissue, dt: Float[Array, ""], key: PRNGKeyArray
     ) -> tuple[Cells, Bool[Array, " cells"]]:
-        """Cells that are larger, and older."""
-        strikes = jax.random.uniform(key, cells.age.shape, cells.age.dtype)
-        dying = cells.dying | (strikes < -jnp.expm1(-self.death_rate * dt))
-        fading = cells.target_area * jnp.exp(-dt / self.shrinking_time)
-        target = jnp.where(dying, fading, cells.target_area + self.growth_rate * dt)
+        """The cell states after a time step, and which cells divide."""
+        uniform = jax.random.uniform(key, cells.age.shape, cells.age.dtype)
+        dying = cells.dying | (uniform < -jnp.expm1(-self.death_rate * dt))
+        shrunk = cells.target_area * jnp.exp(-dt / self.shrinking_time)
+        target = jnp.where(dying, shrunk, cells.target_area + self.growth_rate * dt)
         divides = ~dying & (target >= cells.division_area)
         return Cells(target, cells.division_area, cells.age + dt, dying), divides
 
     def log_likelihood(
         self, before: Cells, after: Cells, tissue: Tissue, dt: Float[Array, ""]
     ) -> Float[Array, ""]:
-        """That of those cells to die that did, and of the others not to."""
-        spent = self.death_rate * dt
-        certain = spent == 0  # where the logarithm has no derivative, nobody dies
-        dies = jnp.log(-jnp.expm1(-jnp.where(certain, 1, spent)))
-        each = jnp.where(after.dying & ~certain, dies, -spent)
-        could = tissue.alive & ~before.dying
-        return jnp.sum(jnp.where(could, each, 0)).astype(tissue.vertices.dtype)
+        """Log-likelihood of the cells that started to die, and of those that did not."""
+        hazard = self.death_rate * dt
+        no_deaths = hazard == 0  # no deaths; avoids the derivative of log(0)
+        dies = jnp.log(-jnp.expm1(-jnp.where(no_deaths, 1, hazard)))
+        log_probability = jnp.where(after.dying & ~no_deaths, dies, -hazard)
+        at_risk = tissue.alive & ~before.dying
+        return jnp.sum(jnp.where(at_risk, log_probability, 0)).astype(tissue.vertices.dtype)
 
     def overdue(self, cells: Cells, tissue: Tissue) -> Bool[Array, " cells"]:
-        """Dying cells that aim at less than a thousandth of the area at which they would divide."""
+        """Dying cells with a target area below 1e-3 of their division area."""
         return cells.dying & (cells.target_area < 1e-3 * cells.division_area)
 
     def born(self, cells: Cells, tissue: Tissue, pair: Int[Array, "2"], key: PRNGKeyArray) -> Cells:
-        """Two cells of half the size."""
+        """Halve the target areas, draw division areas and reset the ages of two daughters."""
         return Cells(
             cells.target_area.at[pair].set(0.5 * cells.target_area[pair]),
-            cells.division_area.at[pair].set(self._drawn(key, (2,), cells.age.dtype)),
+            cells.division_area.at[pair].set(self._draw_division_areas(key, (2,), cells.age.dtype)),
             cells.age.at[pair].set(0),
             cells.dying,
         )
@@ -180,15 +182,15 @@ class GrowAndDivide(AbstractLifeCycle):
     def axis(
         self, cells: Cells, tissue: Tissue, cell: Int[Array, ""], key: PRNGKeyArray
     ) -> Float[Array, "2"] | None:
-        """The long axis, or a random one."""
+        """None (the long axis) or a random direction."""
         if self.orientation == "long":
             return None
         angle = jax.random.uniform(key, (), tissue.vertices.dtype, 0, jnp.pi)
         return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
-    def _drawn(
+    def _draw_division_areas(
         self, key: PRNGKeyArray, shape: tuple[int, ...], dtype: jnp.dtype
     ) -> Float[Array, "*shape"]:
-        # (No cell divides at birth, however wide the distribution is.)
+        # A daughter is born with at most 1.9 / 2 of the mean; the lower limit keeps it from dividing at once.
         relative = 1 + self.variation * jax.random.normal(key, shape, dtype)
         return (self.division_area * jnp.clip(relative, 0.6, 1.9)).astype(dtype)

@@ -1,4 +1,4 @@
-"""Who descends from whom."""
+"""The cell lineage: mother, birth and fate of each cell."""
 
 from __future__ import annotations
 
@@ -8,78 +8,78 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vertax.mesh import Tissue
 
-HERE, DIVIDED, DIED = 0, 1, 2
+ALIVE, DIVIDED, DIED = 0, 1, 2
 
 
 class Lineage(eqx.Module):
-    """All cells that there ever were, by a number of their own, in the order of their birth.
+    """One record per cell, in the order of birth; the arrays have a fixed length.
 
-    A cell that divides ends, and two begin. There is room for so many; `complete` says whether it was enough.
+    A division ends the record of the mother and begins two records.
     """
 
     mother: Int[Array, "*batch records"]
-    """The number of the mother; -1 for the first cells, and where there is no such cell yet."""
+    """Index of the mother; -1 for initial cells and unused records."""
     begun: Float[Array, "*batch records"]
-    """When it was born; infinity where there is none."""
+    """Time of birth; infinity for unused records."""
     ended: Float[Array, "*batch records"]
-    """When it divided or died; infinity if it did not."""
+    """Time of division or death; infinity for living cells and unused records."""
     fate: Int[Array, "*batch records"]
-    """0 if it is there still, 1 if it divided, 2 if it died."""
+    """0 for living cells and unused records, 1 if the cell divided, 2 if it died."""
     count: Int[Array, "*batch"]
-    """How many there were."""
+    """Number of cells."""
 
     @property
     def complete(self) -> Bool[Array, "*batch"]:
-        """Whether there was room for all."""
+        """Whether all cells have a record."""
         return self.count <= self.mother.shape[-1]
 
 
-def founded(
+def initial_lineage(
     tissue: Tissue, time: Float[Array, ""], size: int
 ) -> tuple[Lineage, Int[Array, " cells"]]:
-    """The lineage of the first cells, and the number of the one in each slot (-1: none)."""
+    """The lineage of the initial cells, and the record of the cell in each slot (-1 for spare slots)."""
     rank = jnp.cumsum(tissue.alive) - 1
     count = jnp.sum(tissue.alive)
-    there = jnp.arange(size) < count
+    used = jnp.arange(size) < count
     never = jnp.full(size, jnp.inf, time.dtype)
-    begun = jnp.where(there, time, never)
+    begun = jnp.where(used, time, never)
     lineage = Lineage(jnp.full(size, -1), begun, never, jnp.zeros(size, int), count)
     return lineage, jnp.where(tissue.alive, rank, -1)
 
 
-def divided_at(
+def record_division(
     lineage: Lineage,
     number: Int[Array, " cells"],
     pair: Int[Array, "2"],
     time: Float[Array, ""],
     done: Bool[Array, ""],
 ) -> tuple[Lineage, Int[Array, " cells"]]:
-    """The lineage after a division, if there was one: of a slot into two."""
+    """Record the division of the cell in slot `pair[0]` into the slots `pair`, if `done`."""
     size, slots = lineage.mother.shape[0], number.shape[0]
     mother = number[pair[0]]
     born = lineage.count + jnp.arange(2)
-    where = jnp.where(done, born, size)
-    ends = jnp.where(done & (mother >= 0), mother, size)
-    put = lambda array, at, value: array.at[at].set(value, mode="drop")
+    birth_index = jnp.where(done, born, size)
+    mother_index = jnp.where(done & (mother >= 0), mother, size)
+    put = lambda array, index, value: array.at[index].set(value, mode="drop")
     lineage = Lineage(
-        put(lineage.mother, where, mother),
-        put(lineage.begun, where, time),
-        put(lineage.ended, ends, time),
-        put(lineage.fate, ends, DIVIDED),
+        put(lineage.mother, birth_index, mother),
+        put(lineage.begun, birth_index, time),
+        put(lineage.ended, mother_index, time),
+        put(lineage.fate, mother_index, DIVIDED),
         lineage.count + 2 * done,
     )
     return lineage, put(number, jnp.where(done, pair, slots), born)
 
 
-def died_at(
+def record_deaths(
     lineage: Lineage,
     number: Int[Array, " cells"],
-    gone: Bool[Array, " cells"],
+    died: Bool[Array, " cells"],
     time: Float[Array, ""],
 ) -> tuple[Lineage, Int[Array, " cells"]]:
-    """The lineage after some cells went."""
-    at = jnp.where(gone & (number >= 0), number, lineage.mother.shape[0])
-    ended = lineage.ended.at[at].set(time, mode="drop")
-    fate = lineage.fate.at[at].set(DIED, mode="drop")
+    """Record the deaths of the cells in the slots `died`."""
+    index = jnp.where(died & (number >= 0), number, lineage.mother.shape[0])
+    ended = lineage.ended.at[index].set(time, mode="drop")
+    fate = lineage.fate.at[index].set(DIED, mode="drop")
     lineage = eqx.tree_at(lambda x: (x.ended, x.fate), lineage, (ended, fate))
-    return lineage, jnp.where(gone, -1, number)
+    return lineage, jnp.where(died, -1, number)

@@ -1,4 +1,4 @@
-"""Whether a fit came to its end, and what kept it from going further."""
+"""Convergence of a fit: the reason why it stopped, and warnings with remedies."""
 
 from __future__ import annotations
 
@@ -15,32 +15,37 @@ NEVER = "no epoch reached equilibrium"
 
 
 def limits(fit: Fit[Any], reached: Bool[np.ndarray, "*batch"]) -> str | list[str]:
-    """What kept a fit from its goal, in words.
+    """What limited a fit, as a text.
 
     **Arguments:**
 
     - `fit`: the fit, or a batch.
     - `reached`: whether its best parameters are good enough.
 
-    **Returns:** "reached", or the first that holds of: relaxations ended before equilibrium; the cost was
-    still falling; T1 transitions went on to the end; the gradient vanished; the cost stopped falling. A
-    list for a batch.
+    **Returns:** "reached" or the first condition that applies, in the last fifth of the epochs; a list for a
+    batch:
+
+    1. relaxations ended before equilibrium (10 % or more of them);
+    2. the cost was still falling;
+    3. T1 transitions happened;
+    4. the gradient vanished (median norm below 1e-3 of the maximum over all epochs);
+    5. the cost stopped falling.
     """
     reached = np.asarray(reached)
     if not reached.ndim:
         return _limit(bool(reached), *_curves(fit))
-    return [_limit(bool(done), *_curves(fit, k)) for k, done in enumerate(reached)]
+    return [_limit(bool(enough), *_curves(fit, k)) for k, enough in enumerate(reached)]
 
 
 def doubts(fit: Fit[Any]) -> list[str]:
-    """Why a fit may not be at its end.
+    """Warnings about the convergence of a fit, with remedies.
 
     **Arguments:**
 
     - `fit`: the fit, or a batch.
 
-    **Returns:** sentences without a full stop, the remedy included; none if nothing is wrong. Of a batch
-    they say how many members they hold for.
+    **Returns:** sentences without a full stop; an empty list if the fit converged. For a batch each sentence
+    states the number of members that it applies to.
     """
     batch = np.shape(fit.best_epoch)
     members = [_curves(fit, k) for k in range(batch[0])] if batch else [_curves(fit)]
@@ -59,19 +64,18 @@ def doubts(fit: Fit[Any]) -> list[str]:
         FALLING: [still_falling(cost, converged) for cost, converged, *_ in members],
     }
     return [
-        f"{text}{f' in {sum(who)} of {len(who)} members' if batch else ''} ({remedies[text]})"
-        for text, who in holds.items()
-        if any(who)
+        f"{text}{f' in {sum(flags)} of {len(flags)} members' if batch else ''} ({remedies[text]})"
+        for text, flags in holds.items()
+        if any(flags)
     ]
 
 
 def still_falling(
     cost: Float[np.ndarray, " epochs"], converged: Bool[np.ndarray, " epochs"]
 ) -> bool:
-    """Whether the last tenth of the epochs made more than a hundredth of the way down.
+    """Whether more than 1 % of the total decrease of the cost happened in the last tenth of the epochs.
 
-    Optimisers that take small steps go on for ever: a cost that has come down by all but a hundredth is
-    done, and one that never fell has nothing to go on with.
+    Only converged epochs with a finite cost count. False for a cost that never decreased.
     """
     lowest = np.minimum.accumulate(np.where(converged & np.isfinite(cost), cost, np.inf))
     lowest = lowest[np.isfinite(lowest)]
@@ -90,17 +94,19 @@ Curves = tuple[
 
 
 def _curves(fit: Fit[Any], index: int | None = None) -> Curves:
-    """Cost, convergence, T1 transitions and slope of a fit, or of one of a batch."""
+    """Cost, convergence, T1 transitions and gradient norm of a fit, or of a member of a batch."""
     history = fit.history
     every = (history.cost, history.converged, history.num_t1, history.gradient_norm)
     return every if index is None else tuple(curve[:, index] for curve in every)  # pyright: ignore
 
 
 def _last(epochs: int) -> slice:
+    """The last fifth of the epochs."""
     return slice(-max(epochs // 5, 1), None)
 
 
 def _unrelaxed(converged: Bool[np.ndarray, " epochs"]) -> bool:
+    """Whether 10 % or more of the last relaxations did not converge."""
     return bool(converged[_last(len(converged))].mean() < 0.9)
 
 
@@ -109,7 +115,7 @@ def _limit(
     cost: Float[np.ndarray, " epochs"],
     converged: Bool[np.ndarray, " epochs"],
     num_t1: Int[np.ndarray, " epochs"],
-    slope: Float[np.ndarray, " epochs"],
+    gradient_norm: Float[np.ndarray, " epochs"],
 ) -> str:
     last = _last(len(cost))
     if reached:
@@ -119,7 +125,7 @@ def _limit(
     if still_falling(cost, converged):
         return FALLING
     if num_t1[last].any():
-        return "T1 transitions to the end, which the gradient does not foresee"
-    if np.median(slope[last]) < 1e-3 * slope.max():
+        return "T1 transitions to the end, which the gradient does not include"
+    if np.median(gradient_norm[last]) < 1e-3 * gradient_norm.max():
         return "gradient vanished: a minimum, or parameters at their bounds"
     return "stopped falling"

@@ -1,4 +1,4 @@
-"""Whether a fit came to its end."""
+"""Convergence warnings of fits."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,7 @@ from vertax.fitting import doubts, limits, stack_fits
 
 
 def fitted(**curves):
-    """The parts of a fit that tell what limits it."""
+    """A fit with given curves; all other curves are constant."""
     n = 20
     history = {
         "converged": np.full(n, True),
@@ -39,29 +39,29 @@ def fitted(**curves):
         ({}, "stopped falling"),
     ],
 )
-def test_what_limits_a_design_is_named(curves, word):
+def test_limits_names_the_first_limiting_condition(curves, word):
     assert word in limits(fitted(**curves), np.array(False))
     assert limits(fitted(**curves), np.array(True)) == "reached"
 
 
-def test_a_fit_that_is_at_its_end_leaves_no_doubt():
+def test_converged_fit_has_no_warnings():
     assert doubts(fitted(cost=np.exp(-np.arange(20.0)))) == []
-    # Nor does one that began at its end.
+    # A constant cost counts as converged.
     assert doubts(fitted()) == []
 
 
-def test_what_is_not_at_its_end_is_named_with_the_remedy():
+def test_unconverged_fit_has_warnings_with_remedies():
     assert doubts(fitted(cost=np.linspace(2, 1, 20))) == [
         "the cost was still falling at the last epoch (raise the number of epochs)"
     ]
     (doubt,) = doubts(fitted(converged=np.arange(20) < 15))
     assert doubt.startswith("relaxations ended before equilibrium")
-    # What did not converge is no cost to go by.
+    # Costs of epochs that did not converge are ignored.
     assert doubts(fitted(cost=np.linspace(2, 1, 20), converged=np.arange(20) < 1))[1:] == []
 
 
-def test_of_a_batch_the_members_are_counted():
-    falling, done = fitted(cost=np.linspace(2, 1, 20)), fitted()
-    (doubt,) = doubts(stack_fits([falling, done, falling]))
+def test_warnings_of_a_batch_count_the_members():
+    falling, converged = fitted(cost=np.linspace(2, 1, 20)), fitted()
+    (doubt,) = doubts(stack_fits([falling, converged, falling]))
     assert "in 2 of 3 members" in doubt
-    assert limits(stack_fits([falling, done]), np.array([False, True]))[1] == "reached"
+    assert limits(stack_fits([falling, converged]), np.array([False, True]))[1] == "reached"
