@@ -11,8 +11,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
 from vertax.adjoints import EquilibriumPropagation, GradientOutcome
-from vertax.adjoints._adjoint import differentiable, frozen, materialise, settle
-from vertax.adjoints._propagation import NOT_LINEAR, Phase, Resistance, two_phases
+from vertax.adjoints._adjoint import differentiable, finish_gradient, frozen, materialise
+from vertax.adjoints._propagation import NOT_LINEAR, Phase, RestoringForce, gradient_from_phases
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units
 from vertax.external._host import Request
@@ -108,7 +108,7 @@ def _(
             unknown = jnp.full_like(left, jnp.nan)
             return Phase(by_program(answer.slope), left, answer.num_steps, unknown)
         gradient = lambda y: force_of(there.with_configuration(y), frozen(energy))
-        along = Resistance.along(gradient, tissue.configuration, there.configuration)
+        along = RestoringForce.along(gradient, tissue.configuration, there.configuration)
         left = optx.max_norm(jax.tree.map(jnp.add, along.force, pull))
         return Phase(slope(there), left, answer.num_steps, along.nonlinearity)
 
@@ -118,6 +118,8 @@ def _(
         unpulled = slope(tissue) if known else by_program(rest.slope)
     sizes = {"stiffness": rest.units.stiffness, "length_scale": rest.units.length}
     # (The program may run twice at a time.)
-    gradient, outcome = two_phases(adjoint, pull, sizes, phase, unpulled)
-    (d_energy, d_boundary), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASONS)
+    gradient, outcome = gradient_from_phases(adjoint, pull, sizes, phase, unpulled)
+    (d_energy, d_boundary), outcome = finish_gradient(
+        gradient, outcome, adjoint.throw, slot, _REASONS
+    )
     return d_energy, d_boundary, outcome

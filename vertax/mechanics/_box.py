@@ -88,7 +88,7 @@ class BoxRelaxation(AbstractResponse):
     def __check_init__(self):
         if not isinstance(self.free, str) or self.free not in _FREE_STRAINS:
             raise ValueError(
-                f"Argument `free` must be one of {', '.join(_FREEDOMS)}, but is {self.free!r}."
+                f"Argument `free` must be one of {', '.join(_FREE_STRAINS)}, but is {self.free!r}."
             )
         check_relaxation(self.relaxation)
         if self.tolerance is not None:

@@ -43,7 +43,7 @@ def compatibility(
     names = tuple(constraints) if isinstance(constraints, Sequence) else ()
     if isinstance(constraints, str) or not names or not set(names) <= set(_CONSTRAINTS):
         raise ValueError(
-            f"Argument `constraints` must name some of {', '.join(_KINDS)}, but is {constraints!r}."
+            f"Argument `constraints` must name some of {', '.join(_CONSTRAINTS)}, but is {constraints!r}."
         )
     return _compatibility(tissue, names)
 
