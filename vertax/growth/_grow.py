@@ -17,7 +17,7 @@ from vertax._base.checks import as_key, check_whole, increasing, named
 from vertax._base.modules import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
-from vertax.dynamics._incremental_potential import Incremental
+from vertax.dynamics._incremental_potential import IncrementalPotential
 from vertax.energies import AbstractEnergy
 from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, died_at, divided_at, founded
@@ -276,7 +276,7 @@ def _grow(
         state = whole(arrays)
         before, potential = state.tissue, energy(state.cells)
         if dissipation is not None:
-            potential = Incremental(potential, dissipation, before, end - start)
+            potential = IncrementalPotential(potential, dissipation, before, end - start)
         moved = relaxation.solve(before, potential, adjoint, thrifty=True)
         gone = before.alive & ~moved.tissue.alive
         lineage, number = died_at(state.lineage, state.number, gone, end)
