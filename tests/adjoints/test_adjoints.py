@@ -379,7 +379,7 @@ class TestOutcome:
         assert evaluation.outcome.num_steps > 0
         # The outcome does not change the gradient.
         gradient = plain_gradient(*start_and_cost(), adjoint, response)
-        assert distance(found.gradient, gradient) < 1e-8
+        assert distance(evaluation.gradient, gradient) < 1e-8
 
     @pytest.mark.parametrize(
         ("adjoint", "response"),

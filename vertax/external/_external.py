@@ -21,7 +21,7 @@ from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy
 from vertax.energies._units import Units, cell_size, units_of
 from vertax.external._external_gradient import ExternalEquilibrium, attach_gradient, force_of
-from vertax.external._host import Job, Request, Result, stack_results
+from vertax.external._host import Job, Request, Result, run_jobs, stack_results
 from vertax.external._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
 from vertax.mesh import Tissue
 from vertax.relax._equilibrium import follow_start, free_motions
