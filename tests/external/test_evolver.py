@@ -111,7 +111,7 @@ def test_point_forces_do_the_work_of_forces_and_torques(tissue):
     rng = np.random.default_rng(0)
     torques, forces = rng.normal(size=tissue.n_edges), rng.normal(size=tissue.vertices.shape)
     direction = rng.normal(size=strings.points.shape)
-    work = np.sum(strings.pulls(forces, torques) * direction)
+    work = np.sum(strings.point_forces(forces, torques) * direction)
     n = len(forces)
     slope = central_difference(
         lambda p: torques @ strings.angles(np.asarray(p)) + np.sum(forces * p[:n]),

@@ -49,7 +49,7 @@ def datafile(
         quantities[piece].append("spacing")
     _areas(lines, quantities, strings, terms, fixed_cells)
     _perimeters(lines, quantities, strings, terms)
-    pulls, arms = strings.pulls(forces, torques), np.zeros_like(strings.points)
+    pulls, arms = strings.point_forces(forces, torques), np.zeros_like(strings.points)
     springs = _springs(lines, strings, terms, arms)
     pinned = set(strings.fixed.tolist())
     lines.append("vertices")

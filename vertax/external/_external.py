@@ -274,7 +274,7 @@ def _relax_externally(
     throw: bool,
 ) -> Equilibrium:
     start, constant = frozen((tissue, energy))
-    result = frozen(response.ask(Request(start, constant, None, None), throw))
+    result = frozen(response.run_simulator(Request(start, constant, None, None), throw))
     relaxed = eqx.tree_at(
         lambda t: (t.vertices, t.topology), start, (result.vertices, result.topology)
     )

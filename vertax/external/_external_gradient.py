@@ -108,7 +108,7 @@ def _(
             nonlinearity = jnp.full_like(max_force, jnp.nan)
             return Phase(by_program(result.slope), max_force, result.num_steps, nonlinearity)
         gradient = lambda y: force_of(nudged.with_configuration(y), frozen(energy))
-        restoring = RestoringForce.restoring(gradient, tissue.configuration, nudged.configuration)
+        restoring = RestoringForce.along(gradient, tissue.configuration, nudged.configuration)
         max_force = optx.max_norm(jax.tree.map(jnp.add, restoring.force, pull))
         return Phase(slope(nudged), max_force, result.num_steps, restoring.nonlinearity)
 
