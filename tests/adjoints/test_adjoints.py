@@ -475,9 +475,9 @@ class TestDegenerateEquilibrium:
 )
 def test_nonlinearity_of_a_power_law(power, nonlinearity):
     force = lambda y: jnp.where(y == 0, 0, jnp.abs(y) ** power)
-    restoring = RestoringForce.restoring(force, jnp.zeros(1), jnp.full(1, 0.3))
+    restoring = RestoringForce.along(force, jnp.zeros(1), jnp.full(1, 0.3))
     assert restoring.nonlinearity == pytest.approx(nonlinearity, abs=1e-12)
-    assert RestoringForce.restoring(force, jnp.ones(1), jnp.ones(1)).nonlinearity == 0
+    assert RestoringForce.along(force, jnp.ones(1), jnp.ones(1)).nonlinearity == 0
 
 
 class Touching(vx.AbstractCost):
