@@ -1,4 +1,4 @@
-"""Shared by the tests of external programs: a simulator in NumPy and SciPy."""
+"""A simulator in NumPy and SciPy, for the tests of external programs."""
 
 import os
 import time
@@ -11,10 +11,10 @@ from vertax.external import AbstractSimulator, Edges, Relaxed
 
 
 class Foam(AbstractSimulator):
-    """Area elasticity and line tensions, minimised by SciPy.
+    """Area elasticity and line tensions, relaxed by SciPy.
 
-    `noise` displaces the result, like a program that stops too early. A `failure` other than "" is the name
-    of a failure to simulate. A negative first tension is always an error.
+    `noise` displaces the result, as a program does that stops too early. `failure` selects a failure by name;
+    "" for none. A negative first tension always fails.
     """
 
     def __init__(self, noise=0.0, failure=""):
@@ -33,10 +33,9 @@ class Foam(AbstractSimulator):
         value = tension.tension @ lengths + 0.5 * np.sum(area.stiffness * excess**2)
         pressure = np.append(area.stiffness * excess, 0)[edges.cells] * [0.5, -0.5]
         corners = x[edges.ends[:, 0], None] + edges.shifts
-        turned = lambda v: np.stack([v[..., 1], -v[..., 0]], axis=-1)
-        # Derivatives with respect to the first end of each edge, and to its vector.
-        by_corner = np.sum(pressure, axis=1)[:, None] * turned(d)
-        by_vector = -np.sum(pressure[..., None] * turned(corners), axis=1)
+        rotated = lambda v: np.stack([v[..., 1], -v[..., 0]], axis=-1)
+        by_corner = np.sum(pressure, axis=1)[:, None] * rotated(d)
+        by_vector = -np.sum(pressure[..., None] * rotated(corners), axis=1)
         by_vector += (tension.tension / lengths)[:, None] * d
         slope = -forces
         np.add.at(slope, edges.ends[:, 0], by_corner - by_vector)
@@ -44,39 +43,45 @@ class Foam(AbstractSimulator):
         return value - np.sum(forces * x), slope.ravel()
 
     def relax(self, tissue, energy, forces):
-        self.fail(energy, forces)
-        wrong = {
+        self.fail_as_requested(energy, forces)
+        invalid_results = {
             "shape": tissue.vertices[1:],
             "nan": np.full_like(tissue.vertices, np.nan),
             "text": np.full(tissue.vertices.shape, "here"),
-            "no rest": tissue.vertices
+            "not at rest": tissue.vertices
             + 0.01 * np.sin(np.arange(tissue.vertices.size)).reshape(-1, 2),
         }
-        if self.failure in wrong:
-            return wrong[self.failure]
+        if self.failure in invalid_results:
+            return invalid_results[self.failure]
         edges = Edges.of(tissue)
-        pull = np.zeros_like(tissue.vertices) if forces is None else forces
-        args = (edges, energy, pull)
+        nudge = np.zeros_like(tissue.vertices) if forces is None else forces
+        args = (edges, energy, nudge)
         x = tissue.vertices.ravel()
         minimum = so.minimize(self.value_and_slope, x, args=args, jac=True, method="BFGS")
         x = minimum.x
-        # BFGS stops at the rounding error of the energy; Newton's method improves the result.
+        # BFGS stops at the rounding error of the energy; Newton steps improve the result.
         for _ in range(3):
-            steps = 1e-5 * np.eye(x.size)
-            hessian = [(self.slope(x + e, *args) - self.slope(x - e, *args)) / 2e-5 for e in steps]
+            displacements = 1e-5 * np.eye(x.size)
+            hessian = [
+                (self.slope(x + e, *args) - self.slope(x - e, *args)) / 2e-5 for e in displacements
+            ]
             x = x - np.linalg.pinv(np.array(hessian), rcond=1e-8) @ self.slope(x, *args)
         x = x + self.noise * np.random.default_rng(0).standard_normal(x.size)
-        energy_without_forces = self.value_and_slope(x, edges, energy, 0 * pull)[0]
-        return Relaxed(x.reshape(-1, 2), energy=energy_without_forces, num_steps=minimum.nit)
+        energy_without_nudge = self.value_and_slope(x, edges, energy, 0 * nudge)[0]
+        return Relaxed(x.reshape(-1, 2), energy=energy_without_nudge, num_steps=minimum.nit)
 
-    def fail(self, energy, forces):
-        if self.failure == "dies" or (self.failure == "ill" and energy.terms[1].tension[0] < 0.1):
+    def fail_as_requested(self, energy, forces):
+        if self.failure == "dies" or (
+            self.failure == "by tension" and energy.terms[1].tension[0] < 0.1
+        ):
             os._exit(3)
-        if self.failure == "hangs" or (self.failure == "ill" and energy.terms[1].tension[0] < 0.2):
+        if self.failure == "hangs" or (
+            self.failure == "by tension" and energy.terms[1].tension[0] < 0.2
+        ):
             time.sleep(600)
         if self.failure == "times out":
             raise TimeoutError("the reactor does not answer")
-        if self.failure == "raises" or (self.failure == "when pulled" and forces is not None):
+        if self.failure == "raises" or (self.failure == "when nudged" and forces is not None):
             raise OSError("the reactor is too hot")
         if energy.terms[1].tension[0] < 0:
             raise ValueError("a tension is negative")
@@ -87,7 +92,7 @@ class Foam(AbstractSimulator):
         return eqx.tree_at(lambda e: e.terms[1].tension, energy, lengths)
 
     def energy(self, tissue, energy):
-        if self.failure == "endless":
+        if self.failure == "nan energy":
             return np.nan
         forces = np.zeros_like(tissue.vertices)
         return self.value_and_slope(tissue.vertices, Edges.of(tissue), energy, forces)[0]

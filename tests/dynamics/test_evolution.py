@@ -1,4 +1,4 @@
-"""Tissues that move in time."""
+"""Time evolution of tissues."""
 
 import dataclasses
 import functools
@@ -27,21 +27,21 @@ from vertax.dissipations import AreaViscosity, PerimeterViscosity, SubstrateFric
 from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity, ShapeFactorEnergy
 
 FRICTION = SubstrateFriction(1.0)
-CELLS = 12
+N_CELLS = 12
 
 
 @functools.cache
 def solid():
     """A relaxed tissue and its energy."""
-    tissue, energy = relaxed(CELLS, 1, 3.5)
+    tissue, energy = relaxed(N_CELLS, 1, 3.5)
     return FIXED_TOPOLOGY(tissue, energy).tissue, energy
 
 
-class TestDecay:
+class TestDecayOfModes:
     """Small deviations decay mode by mode, at the rates of the eigenvalues of the Hessian over ζ."""
 
     @pytest.mark.parametrize("order", [1, 2])
-    def test_it_has_the_order_of_the_method(self, order):
+    def test_error_has_the_order_of_the_method(self, order):
         tissue, energy = solid()
         values, modes = np.linalg.eigh(dense_hessian(tissue, energy))
         number, size, friction = 20, 1e-5, 2.0
@@ -59,9 +59,9 @@ class TestDecay:
                 order=order,
                 relaxation=relaxation,
             )
-            left = np.sum((np.asarray(movie.tissue.vertices) - tissue.vertices) * mode) / size
-            errors.append(abs(left / np.exp(-values[number] * time / friction) - 1))
-        # As many steps of half the length: an error in each of one order more.
+            amplitude = np.sum((np.asarray(movie.tissue.vertices) - tissue.vertices) * mode) / size
+            errors.append(abs(amplitude / np.exp(-values[number] * time / friction) - 1))
+        # The number of steps is constant, so the error scales as the local error, of order p + 1.
         np.testing.assert_allclose(np.log2(errors[0] / errors[1]), order + 1, atol=0.25)
         np.testing.assert_allclose(np.log2(errors[1] / errors[2]), order + 1, atol=0.15)
         assert errors[0] < (0.1 if order == 1 else 2e-3)
@@ -74,7 +74,7 @@ class TestWithoutActivity:
         [random_tissue, pytest.param(cluster, marks=pytest.mark.slow)],
         ids=["periodic", "free"],
     )
-    def test_the_energy_never_rises_whatever_the_step(self, make):
+    def test_energy_decreases_for_every_time_step(self, make):
         tissue = make(9, 4)
         energy = ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
         num_t1 = 0
@@ -85,12 +85,12 @@ class TestWithoutActivity:
             assert movie.num_t1 == movie.transitions.sum()
             num_t1 += int(movie.num_t1)
         assert num_t1 > 0
-        # After so long it is at rest.
+        # After a time of 250 the tissue is at rest.
         rest = vx.equilibrate(movie.tissue, energy)
         np.testing.assert_allclose(movie.energy, rest.energy, rtol=1e-2)
 
     def check_messages_of_failures(self, movie):
-        """The message of a batch is that of the member which fails in the earliest frame."""
+        """The message of a batch describes the member that fails in the earliest frame."""
         of_frame = jnp.arange(6)
         late = dataclasses.replace(
             movie, sound=of_frame < 4, result=vx.RESULTS.nonlinear_max_steps_reached
@@ -105,7 +105,7 @@ class TestWithoutActivity:
         broken = dataclasses.replace(
             late, max_force=jnp.array(jnp.nan), result=vx.RESULTS.nonfinite
         )
-        with pytest.raises(RuntimeError, match=r"time 0.04 \(frame 4\) a step in time did not"):
+        with pytest.raises(RuntimeError, match=r"time 0.04 \(frame 4\) a time step did not"):
             late.checked()
         message = (
             r"time 10.02 \(frame 2\) of member 2 \(2 of 3 failed\) cells overlap.*force 5.0e-01"
@@ -114,7 +114,7 @@ class TestWithoutActivity:
             vx.fitting.stack([late, movie, early]).checked()
         jitted = eqx.filter_jit(lambda movie: movie.checked().energy)
         for failed, reason in (
-            (late, "A step in time did not converge"),
+            (late, "A time step did not converge"),
             (early, "cells overlap, or the box folds"),
             (broken, "parameters of the energy must be finite"),
         ):
@@ -123,7 +123,7 @@ class TestWithoutActivity:
         with pytest.raises(RuntimeError, match="broke down: its forces are not finite"):
             broken.checked()
 
-    def test_frames_say_what_happened(self):
+    def test_frames_transitions_and_flips_are_consistent(self):
         tissue = random_tissue(9, 4)
         energy = ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
         movie = vx.evolve(tissue, energy, FRICTION, 0.01 * jnp.arange(6))
@@ -134,7 +134,7 @@ class TestWithoutActivity:
         np.testing.assert_array_equal(first.vertices, tissue.vertices)
         np.testing.assert_array_equal(last.vertices, movie.tissue.vertices)
         assert movie.frames.vertices.shape == (6, 18, 2)
-        # An edge that flipped lies between other cells; one that did twice may be back.
+        # A flip changes the cells of an edge; a second flip of the same edge may restore them.
         flipped = np.asarray(movie.flipped.sum(axis=1))
         assert (flipped <= movie.transitions).all()
         assert ((flipped - movie.transitions) % 2 == 0).all()
@@ -150,7 +150,7 @@ class TestWithoutActivity:
 
 
 class TestGradients:
-    """Of what the last frame is with respect to all that it depends on."""
+    """Derivatives of the frames with respect to energy, friction, viscosity and initial vertices."""
 
     @staticmethod
     def problem():
@@ -183,7 +183,7 @@ class TestGradients:
         return parameters, cost
 
     @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
-    def test_they_match_finite_differences(self, order):
+    def test_gradients_match_finite_differences(self, order):
         parameters, cost = self.problem()
         gradient = eqx.filter_jit(jax.grad(lambda p: cost(p, order=order)))(parameters)
         for number, part in enumerate(parameters):
@@ -195,7 +195,7 @@ class TestGradients:
             np.testing.assert_allclose(slope, expected, rtol=1e-6)
 
     @pytest.mark.thorough
-    def test_equilibrium_propagation_agrees_step_by_step(self):
+    def test_equilibrium_propagation_equals_implicit_differentiation(self):
         parameters, cost = self.problem()
         slope = lambda adjoint: eqx.filter_jit(jax.grad(lambda p: cost(p, adjoint)))(parameters)
         by_propagation = slope(vx.EquilibriumPropagation(beta=1e-5))
@@ -205,7 +205,7 @@ class TestGradients:
             )
 
     @pytest.mark.thorough
-    def test_an_inverse_problem_of_a_tissue_that_is_not_at_rest(self):
+    def test_gradient_of_an_inverse_problem_away_from_rest(self):
         tissue, energy = solid()
         target = tissue.with_vertices(tissue.vertices + 0.05 * random_like(tissue.vertices, 2))
         problem = vx.InverseProblem(
@@ -214,19 +214,19 @@ class TestGradients:
             vx.costs.VertexDistance(tissue),
             response=vx.Evolution(FRICTION, [0.0, 0.2], relaxation=FIXED_TOPOLOGY),
         )
-        found = eqx.filter_jit(lambda p: p.value_and_gradient(throw=False))(problem)
+        evaluation = eqx.filter_jit(lambda p: p.value_and_gradient(throw=False))(problem)
         direction = random_like(energy.target_shape_factor)
         evaluate = eqx.filter_jit(lambda p0: problem(ShapeFactorEnergy(p0), throw=False)[0])
         np.testing.assert_allclose(
-            jnp.sum(found.gradient.target_shape_factor * direction),
+            jnp.sum(evaluation.gradient.target_shape_factor * direction),
             central_difference(evaluate, energy.target_shape_factor, direction),
             rtol=1e-6,
         )
 
 
-def test_a_step_strain_of_the_hexagonal_lattice():
-    # Tong et al. 2022 (doi:10.1371/journal.pcbi.1010135): at first 3√3 K_P (1 - p0/c), in the end two thirds
-    # of that.
+def test_stress_after_a_step_strain_of_the_hexagonal_lattice():
+    # Tong et al. 2022 (doi:10.1371/journal.pcbi.1010135): the initial modulus is 3√3 K_P (1 - p0/c), the
+    # final modulus 2/3 of it.
     stiffness, p0, strain = 0.7, 3.4, 1e-4
     tissue = vx.initialise.hexagonal(2, 2)
     tissue = eqx.tree_at(lambda t: t.softening, tissue, 0 * tissue.softening)
@@ -256,11 +256,11 @@ def test_a_step_strain_of_the_hexagonal_lattice():
     np.testing.assert_allclose(stresses[2], 2 * 3**0.5 * unit, rtol=1e-3)
 
 
-def test_pinned_vertices_go_where_they_are_told():
+def test_pinned_vertices_follow_pins():
     tissue = vx.initialise.periodic_voronoi(9, key=4)
-    held = jnp.arange(18) < 2
+    mask = jnp.arange(18) < 2
     tissue = vx.Tissue(
-        tissue.vertices, tissue.topology, tissue.boundary, tissue.softening, pinned=held
+        tissue.vertices, tissue.topology, tissue.boundary, tissue.softening, pinned=mask
     )
     velocity = jnp.array([0.05, 0.0])
     movie = vx.evolve(
@@ -276,21 +276,21 @@ def test_pinned_vertices_go_where_they_are_told():
 
 
 @pytest.mark.thorough
-def test_an_energy_and_a_dissipation_of_ones_own():
+def test_custom_energy_and_dissipation():
     class Ramp(eqx.Module):
         rate: jax.Array
 
         def __call__(self, time):
             return ShapeFactorEnergy(3.5 + self.rate * time)
 
-    class Reluctance(vx.AbstractDissipation):
+    class CustomViscosity(vx.AbstractDissipation):
         strength: float
 
         def __call__(self, tissue, before, dt):
             return 0.5 * self.strength * jnp.sum((tissue.perimeters - before.perimeters) ** 2) / dt
 
     tissue, _ = solid()
-    dissipation = FRICTION + Reluctance(0.3)
+    dissipation = FRICTION + CustomViscosity(0.3)
     relaxation = vx.Relaxation(transitions=None, contact_range=None)
 
     @eqx.filter_jit
@@ -300,35 +300,35 @@ def test_an_energy_and_a_dissipation_of_ones_own():
         ).tissue.perimeters
 
     rate = jnp.array(-0.2)
-    shipped = end(rate, FRICTION + PerimeterViscosity(0.3))
-    np.testing.assert_allclose(end(rate, dissipation), shipped, atol=1e-8)
+    built_in = end(rate, FRICTION + PerimeterViscosity(0.3))
+    np.testing.assert_allclose(end(rate, dissipation), built_in, atol=1e-8)
     gradient = eqx.filter_jit(jax.grad(lambda r: end(r, dissipation).sum()))(rate)
     f = lambda r: end(r, dissipation).sum()
     np.testing.assert_allclose(gradient, central_difference(f, rate, jnp.array(1.0)), rtol=1e-5)
 
 
-def test_other_numbers_compile_nothing_and_batches_agree():
+def test_other_values_need_no_recompilation():
     tissue, _ = solid()
-    go = lambda friction, times: vx.evolve(
+    evolve_with = lambda friction, times: vx.evolve(
         tissue, ShapeFactorEnergy(3.3), SubstrateFriction(friction), times, relaxation=NO_CONTACT
     )
-    first = go(1.0, [0.0, 0.1, 0.2])
+    first = evolve_with(1.0, [0.0, 0.1, 0.2])
     names: list[str] = []
     with counted_compilations(names):
-        other = go(2.0, [0.0, 0.2, 0.4])
+        other = evolve_with(2.0, [0.0, 0.2, 0.4])
     assert not [name for name in names if "evolve" in name]
-    # Twice the friction takes twice as long.
+    # Times are proportional to the friction.
     np.testing.assert_allclose(first.tissue.vertices, other.tissue.vertices, atol=1e-9)
 
 
 @pytest.mark.thorough
-def test_a_cluster_with_arcs_rounds_up_and_stays_where_it_is():
+def test_free_cluster_relaxes_with_constant_centroid():
     tissue = cluster(9, 2)
     energy = AreaElasticity(2.0, 1.0) + LineTension(jnp.full(tissue.n_edges, 0.3))
     movie = vx.evolve(
         tissue, energy, FRICTION + AreaViscosity(0.5), [0.0, 1.0, 30.0], relaxation=NO_CONTACT
     )
-    # Forces that add up to zero move no centre of friction.
+    # The forces sum to zero, so the centroid does not move.
     np.testing.assert_allclose(
         movie.tissue.vertices.mean(axis=0), tissue.vertices.mean(axis=0), atol=1e-9
     )
@@ -336,7 +336,7 @@ def test_a_cluster_with_arcs_rounds_up_and_stays_where_it_is():
     np.testing.assert_allclose(movie.energy, rest.energy, rtol=1e-3)
 
 
-class TestBadInput:
+class TestErrors:
     def test_times(self):
         tissue, energy = solid()
         for times, message in (
@@ -347,42 +347,44 @@ class TestBadInput:
             with pytest.raises(ValueError, match=message):
                 vx.evolve(tissue, energy, FRICTION, times)
 
-    def test_vertices_that_nothing_holds_back_are_named(self):
+    def test_error_lists_vertices_without_dissipation(self):
         tissue, energy = solid()
-        some = SubstrateFriction(jnp.ones(24).at[jnp.array([3, 5])].set(0.0))
+        partial_friction = SubstrateFriction(jnp.ones(24).at[jnp.array([3, 5])].set(0.0))
         with pytest.raises(ValueError, match=r"2 of 24 vertices \(3, 5\)"):
-            vx.evolve(tissue, energy, some, [0.0, 1.0])
+            vx.evolve(tissue, energy, partial_friction, [0.0, 1.0])
 
-    def test_an_energy_that_is_none(self, without_type_checks):
+    def test_energy_function_must_return_an_energy(self, without_type_checks):
         tissue, _ = solid()
         with pytest.raises(TypeError, match="function of time that returns one, but returned"):
             vx.evolve(tissue, lambda time: 3.0 * time, FRICTION, [0.0, 1.0])  # pyright: ignore
 
-    def test_a_box_that_folds(self):
+    def test_folded_box_raises(self):
         tissue, energy = solid()
         shrunk = lambda time: vx.Periodic(
             tissue.boundary.lattice @ jnp.diag(jnp.stack([1.0 - time, jnp.ones_like(time)]))
         )
-        few = vx.Relaxation(transitions=None, contact_range=None, max_steps=20)
+        short_relaxation = vx.Relaxation(transitions=None, contact_range=None, max_steps=20)
         with pytest.raises(RuntimeError, match=r"time 1.5 \(frame 1\) .*the box folds"):
-            vx.evolve(tissue, energy, FRICTION, [0.0, 1.5], boundary=shrunk, relaxation=few)
+            vx.evolve(
+                tissue, energy, FRICTION, [0.0, 1.5], boundary=shrunk, relaxation=short_relaxation
+            )
 
-    def test_a_drive_of_another_activity_or_tissue(self):
+    def test_drive_of_another_activity_or_tissue_raises(self):
         tissue, energy = solid()
         noise, moving = vx.activities.ThermalNoise(0.1), vx.activities.SelfPropulsion(0.1)
         other = vx.initialise.periodic_voronoi(9, key=0)
-        for activity, place in ((noise, tissue), (moving, other)):
-            drive = (activity.init(place, jax.random.key(0)), jax.random.key(1))
+        for activity, initial in ((noise, tissue), (moving, other)):
+            drive = (activity.init(initial, jax.random.key(0)), jax.random.key(1))
             with pytest.raises(ValueError, match="`drive` does not go with this"):
                 vx.evolve(tissue, energy, FRICTION, [0, 1], activity=moving, drive=drive)
 
     def test_settings(self, without_type_checks):
-        class Own(vx.AbstractDissipation):
+        class CustomDissipation(vx.AbstractDissipation):
             def __call__(self, tissue, before, dt):
                 return jnp.sum((tissue.vertices - before.vertices) ** 2) / dt
 
         with pytest.raises(ValueError, match="sum of squares"):
-            vx.Evolution(Own(), [0.0, 1.0], order=2)
+            vx.Evolution(CustomDissipation(), [0.0, 1.0], order=2)
         with pytest.raises(ValueError, match="`order` must be 1 or 2"):
             vx.Evolution(FRICTION, [0.0, 1.0], order=3)
         with pytest.raises(ValueError, match="`substeps` must be at least 1"):
@@ -392,23 +394,29 @@ class TestBadInput:
         with pytest.raises(TypeError, match="`boundary` must be a function of time"):
             vx.Evolution(FRICTION, [0.0, 1.0], boundary=vx.Free())  # pyright: ignore[reportArgumentType]
 
-    def test_what_does_not_go_with_the_tissue(self, without_type_checks):
+    def test_arguments_incompatible_with_the_tissue(self, without_type_checks):
         tissue, energy = solid()
-        still = lambda time: tissue.vertices
+        constant_positions = lambda time: tissue.vertices
         with pytest.raises(ValueError, match=r"`pins` .*the tissue has none"):
-            vx.evolve(tissue, energy, FRICTION, [0.0, 1.0], pins=still)
-        two = jnp.arange(tissue.n_vertices) < 2
-        held = vx.Tissue(tissue.vertices, tissue.topology, tissue.boundary, pinned=two)
+            vx.evolve(tissue, energy, FRICTION, [0.0, 1.0], pins=constant_positions)
+        mask = jnp.arange(tissue.n_vertices) < 2
+        pinned_tissue = vx.Tissue(tissue.vertices, tissue.topology, tissue.boundary, pinned=mask)
         with pytest.raises(ValueError, match="`pins` must return one position for each vertex"):
-            vx.evolve(held, energy, FRICTION, [0.0, 1.0], pins=lambda time: still(time)[:3])
+            vx.evolve(
+                pinned_tissue,
+                energy,
+                FRICTION,
+                [0.0, 1.0],
+                pins=lambda time: constant_positions(time)[:3],
+            )
         with pytest.raises(TypeError, match="`energy` must be an energy"):
             vx.evolve(tissue, 3.0, FRICTION, [0.0, 1.0])  # pyright: ignore[reportArgumentType]
-        flat = lambda time: tissue.boundary.lattice
+        not_a_boundary = lambda time: tissue.boundary.lattice
         with pytest.raises(TypeError, match="must be of the class Periodic"):
-            vx.evolve(tissue, energy, FRICTION, [0.0, 1.0], boundary=flat)  # pyright: ignore[reportArgumentType]
+            vx.evolve(tissue, energy, FRICTION, [0.0, 1.0], boundary=not_a_boundary)  # pyright: ignore[reportArgumentType]
 
-    def test_a_step_that_does_not_converge_is_refused(self):
-        tissue = random_tissue(CELLS, 3)
+    def test_step_that_does_not_converge_raises(self):
+        tissue = random_tissue(N_CELLS, 3)
         with pytest.raises(RuntimeError, match=r"time 0\.5 \(frame 1\)"):
             vx.evolve(
                 tissue,

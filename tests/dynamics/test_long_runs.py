@@ -1,4 +1,4 @@
-"""Movements that are interrupted, and go on."""
+"""Checkpoints of time evolutions: interruption and continuation."""
 
 import itertools
 
@@ -20,8 +20,8 @@ ENERGY = ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
 TIMES = 0.02 * np.arange(7)
 
 
-def driven(times=TIMES, key=3, **settings):
-    """A quench through transitions, with noise and cells that propel themselves."""
+def evolve_driven(times=TIMES, key=3, **settings):
+    """A quench through T1 transitions, with thermal noise and self-propulsion."""
     activity = ThermalNoise(1e-4) + SelfPropulsion(0.05)
     return vx.evolve(
         random_tissue(9, 0),
@@ -46,7 +46,7 @@ def assert_same_bits(one, other):
 
 
 class Interrupt:
-    """A key pressed after so many writings."""
+    """A keyboard interrupt after a given number of frames."""
 
     def __init__(self, monkeypatch, after):
         calls = itertools.count(1)
@@ -61,38 +61,38 @@ class Interrupt:
 
 
 @pytest.mark.thorough
-def test_what_was_interrupted_goes_on_to_the_same_bits(tmp_path, monkeypatch):
-    whole = driven(checkpoint=tmp_path / "whole.npz")
-    assert whole.num_t1 > 0
+def test_interrupted_run_continues_bitwise(tmp_path, monkeypatch):
+    uninterrupted = evolve_driven(checkpoint=tmp_path / "whole.npz")
+    assert uninterrupted.num_t1 > 0
     file = tmp_path / "part.npz"
     for after in (2, 1, 2):
         with monkeypatch.context() as patch:
             Interrupt(patch, after)
             with pytest.raises(KeyboardInterrupt):
-                driven(checkpoint=file)
+                evolve_driven(checkpoint=file)
     names: list[str] = []
     with counted_compilations(names):
-        assert_same_bits(whole, driven(checkpoint=file))
-        # What is done is not repeated, and another one is refused.
-        assert_same_bits(whole, driven(checkpoint=file))
+        assert_same_bits(uninterrupted, evolve_driven(checkpoint=file))
+        # A finished run is not repeated.
+        assert_same_bits(uninterrupted, evolve_driven(checkpoint=file))
     assert not [name for name in names if "advance" in name]
-    # In one piece it is the same to rounding.
-    at_once = driven()
-    assert jax.tree.structure(at_once) == jax.tree.structure(whole)
-    np.testing.assert_array_equal(at_once.transitions, whole.transitions)
-    np.testing.assert_allclose(at_once.frames.vertices, whole.frames.vertices, atol=1e-7)
-    np.testing.assert_array_equal(at_once.steps, whole.steps)
-    # Further times go on; others are refused, and so is another movement.
-    longer = driven(checkpoint=file, times=np.append(TIMES, 0.14))
-    np.testing.assert_array_equal(longer.frames.vertices[:-1], whole.frames.vertices)
+    # A run in one compiled function agrees up to rounding.
+    at_once = evolve_driven()
+    assert jax.tree.structure(at_once) == jax.tree.structure(uninterrupted)
+    np.testing.assert_array_equal(at_once.transitions, uninterrupted.transitions)
+    np.testing.assert_allclose(at_once.frames.vertices, uninterrupted.frames.vertices, atol=1e-7)
+    np.testing.assert_array_equal(at_once.steps, uninterrupted.steps)
+    # Further times continue the run. Other times, and another run, raise an error.
+    longer = evolve_driven(checkpoint=file, times=np.append(TIMES, 0.14))
+    np.testing.assert_array_equal(longer.frames.vertices[:-1], uninterrupted.frames.vertices)
     with pytest.raises(ValueError, match=r"frames at other times \(8, from 0 to 0.14\)"):
-        driven(checkpoint=file)
+        evolve_driven(checkpoint=file)
     with pytest.raises(ValueError, match="checkpoint of a movement with another tissue, energy or"):
-        driven(checkpoint=file, key=4)
+        evolve_driven(checkpoint=file, key=4)
 
 
 @pytest.mark.thorough
-def test_without_noise_and_with_a_control_of_steps(tmp_path):
+def test_checkpoints_with_step_control(tmp_path):
     control = vx.dynamics.StepControl(1e-3, most=20)
     run = lambda **settings: vx.evolve(
         random_tissue(9, 0),
@@ -125,28 +125,33 @@ def test_times_equal_up_to_rounding_continue(tmp_path):
         _check_times(np.asarray([0, 1e-3, 2e-3]), np.asarray([0, 1e-3 + 1e-11, 2e-3]))
 
 
-class TestBadInput:
-    def test_a_step_that_comes_to_no_end_leaves_the_frames_before(self, tmp_path):
+class TestErrors:
+    def test_failed_step_leaves_the_earlier_frames(self, tmp_path):
         file = tmp_path / "run.npz"
-        few = vx.Relaxation(transitions=None, contact_range=None, max_steps=1)
-        go = lambda **settings: vx.evolve(
-            random_tissue(9, 0), ENERGY, FRICTION, [0.0, 0.5, 1.0], relaxation=few, **settings
+        short_relaxation = vx.Relaxation(transitions=None, contact_range=None, max_steps=1)
+        evolve_tissue = lambda **settings: vx.evolve(
+            random_tissue(9, 0),
+            ENERGY,
+            FRICTION,
+            [0.0, 0.5, 1.0],
+            relaxation=short_relaxation,
+            **settings,
         )
-        with pytest.raises(RuntimeError, match=r"On the way to time 0\.5 \(frame 1\)"):
-            go(checkpoint=file)
-        assert not go(checkpoint=file, throw=False).sound[1]
+        with pytest.raises(RuntimeError, match=r"Before time 0\.5 \(frame 1\)"):
+            evolve_tissue(checkpoint=file)
+        assert not evolve_tissue(checkpoint=file, throw=False).sound[1]
 
-    def test_inside_a_compiled_function(self):
+    def test_progress_inside_jit_raises(self):
         tissue = random_tissue(9, 0)
 
-        def go(targets):
+        def evolve_tissue(targets):
             return vx.evolve(
                 tissue, ShapeFactorEnergy(targets), FRICTION, TIMES, progress=True
             ).energy
 
-        with pytest.raises(TypeError, match="movements that run outside"):
-            jax.jit(go)(jnp.full(9, 3.5))
+        with pytest.raises(TypeError, match="do not work inside"):
+            jax.jit(evolve_tissue)(jnp.full(9, 3.5))
 
-    def test_a_folder_that_is_not_there(self, tmp_path):
+    def test_missing_folder_raises(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="there is no folder"):
-            driven(checkpoint=tmp_path / "nowhere" / "run.npz")
+            evolve_driven(checkpoint=tmp_path / "nowhere" / "run.npz")

@@ -1,4 +1,4 @@
-"""Steps whose length follows their error."""
+"""Adaptive time steps."""
 
 import functools
 
@@ -25,15 +25,15 @@ FRICTION = SubstrateFriction(1.0)
 
 
 @functools.cache
-def bent():
-    """A tissue a little away from rest, and its energy."""
+def displaced_tissue():
+    """A tissue displaced from rest, and its energy."""
     tissue, energy = relaxed(9, 1, 3.5)
     tissue = FIXED_TOPOLOGY(tissue, energy).tissue
     return tissue.with_vertices(tissue.vertices + 0.02 * random_like(tissue.vertices, 7)), energy
 
 
-def moved(order=1, **settings):
-    tissue, energy = bent()
+def evolved(order=1, **settings):
+    tissue, energy = displaced_tissue()
     return vx.evolve(
         tissue,
         energy,
@@ -47,33 +47,33 @@ def moved(order=1, **settings):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("order", [1, 2])
-def test_the_error_follows_the_tolerance(order):
-    exact = moved(2, substeps=300).tissue.vertices
+def test_error_scales_with_the_tolerance(order):
+    exact = evolved(2, substeps=300).tissue.vertices
     tolerances = np.array([1e-3, 1e-4, 1e-5])
-    runs = [moved(order, control=StepControl(tolerance, most=200)) for tolerance in tolerances]
+    runs = [evolved(order, control=StepControl(tolerance, most=200)) for tolerance in tolerances]
     errors = np.array([jnp.max(jnp.abs(run.tissue.vertices - exact)) for run in runs])
     counts = np.array([(run.steps > 0).sum() for run in runs])
-    # Errors of one step are asked for, so that at the end goes by the power p / (p + 1).
+    # The tolerance is for the local error; the global error scales with the power p / (p + 1).
     slope = np.polyfit(np.log(tolerances), np.log(errors), 1)[0]
-    # (Stiff modes, which are damped and not followed, leave the second order a little less.)
+    # (The order of stiff modes, which are damped but not resolved, is below 2.)
     np.testing.assert_allclose(slope, order / (order + 1), atol=0.2 if order == 1 else 0.3)
     assert (errors < 10 * tolerances ** (order / (order + 1))).all()
     assert (np.diff(counts) > 0).all()
     for run in runs:
         np.testing.assert_allclose(run.steps.sum(axis=1)[1:], jnp.diff(run.times), rtol=1e-9)
         assert (jnp.diff(run.energies) < 0).all() or order == 2
-        # Later, when all is slow, steps are longer.
+        # Later the motion is slower, and steps are longer.
         steps = np.asarray(run.steps[-1])
         steps = steps[steps > 0]
         assert steps.max() > 3 * run.steps[1, 0]
 
 
 @pytest.mark.thorough
-def test_its_gradient_is_that_of_the_steps_that_were_taken():
-    tissue, energy = bent()
+def test_gradient_at_fixed_step_sizes():
+    tissue, energy = displaced_tissue()
     weights = random_like(tissue.vertices, 8)
-    # What is left of the force is an error of the finite difference.
-    still = vx.Relaxation(transitions=None, contact_range=None, tolerance=1e-12)
+    # The residual force limits the accuracy of the finite difference.
+    precise_relaxation = vx.Relaxation(transitions=None, contact_range=None, tolerance=1e-12)
 
     @eqx.filter_jit
     def cost(friction, control):
@@ -82,13 +82,13 @@ def test_its_gradient_is_that_of_the_steps_that_were_taken():
             energy,
             SubstrateFriction(friction),
             [0.0, 0.4],
-            relaxation=still,
+            relaxation=precise_relaxation,
             control=control,
             throw=False,
         )
         return jnp.sum(weights * movie.tissue.vertices**2), movie.steps[1]
 
-    # So few steps, so coarse, that a small change of friction changes none of their lengths.
+    # With this tolerance a small change of the friction does not change the step sizes.
     control = StepControl(1.0, first=0.05, most=8)
     friction = jnp.linspace(0.8, 1.2, tissue.n_vertices)
     gradient, steps = jax.grad(cost, has_aux=True)(friction, control)
@@ -102,7 +102,7 @@ def test_its_gradient_is_that_of_the_steps_that_were_taken():
 
 
 @pytest.mark.thorough
-def test_through_transitions_refused_steps_leave_nothing_behind():
+def test_rejected_steps_do_not_change_the_state():
     tissue, energy = random_tissue(9, 0), ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
     times = [0.0, 0.1, 0.3]
     control = StepControl(2e-3, first=0.1, most=60)
@@ -115,13 +115,13 @@ def test_through_transitions_refused_steps_leave_nothing_behind():
     np.testing.assert_allclose(run.energy, fixed.energy, rtol=0.02)
 
 
-class TestBadInput:
-    def test_numbers(self):
+class TestErrors:
+    def test_numbers_must_be_positive(self):
         for settings in ({"tolerance": 0.0}, {"first": -1.0}, {"most": 0}):
             with pytest.raises(ValueError, match=next(iter(settings))):
                 StepControl(**settings)  # pyright: ignore[reportArgumentType]
 
-    def test_what_does_not_go_with_it(self, without_type_checks):
+    def test_incompatible_arguments_raise(self, without_type_checks):
         control = StepControl()
         with pytest.raises(ValueError, match="does not go with `substeps`"):
             vx.Evolution(FRICTION, [0.0, 1.0], control=control, substeps=2)
@@ -131,6 +131,6 @@ class TestBadInput:
         with pytest.raises(TypeError, match="`control` must be a"):
             vx.Evolution(FRICTION, [0.0, 1.0], control=0.1)  # pyright: ignore[reportArgumentType]
 
-    def test_too_few_steps(self):
+    def test_too_few_steps_raise(self):
         with pytest.raises(RuntimeError, match="a greater `most`"):
-            moved(control=StepControl(1e-6, most=3))
+            evolved(control=StepControl(1e-6, most=3))

@@ -1,4 +1,4 @@
-"""Responses that another program computes: one of NumPy and SciPy, against vertax itself."""
+"""Equilibria of an external program, a simulator in NumPy and SciPy, compared with vertax."""
 
 import dataclasses
 import re
@@ -15,7 +15,7 @@ from helpers import central_difference
 
 import vertax as vx
 from vertax.external import Edges, SimulatorError
-from vertax.external._host import Job, Request, ask
+from vertax.external._host import Job, Request, run_jobs
 
 ADAM = optax.adam(3e-3)
 FOAM = Foam()
@@ -27,12 +27,12 @@ def foam_energy(tensions):
 
 @pytest.fixture(scope="module")
 def case():
-    """A tissue at rest, its energy, and a cost of other positions."""
+    """A tissue at rest, an energy with other tensions, and the distance to displaced positions."""
     tissue = vx.initialise.periodic_voronoi(6, key=jax.random.key(3), softening=0.0)
     tensions = 0.3 + 0.04 * np.sin(1.7 * np.arange(tissue.n_edges))
     tissue = vx.External(FOAM)(tissue, foam_energy(tensions)).tissue
-    away = 0.03 * np.cos(np.arange(tissue.vertices.size)).reshape(-1, 2)
-    cost = vx.costs.VertexDistance(tissue.with_vertices(tissue.vertices + away))
+    displacement = 0.03 * np.cos(np.arange(tissue.vertices.size)).reshape(-1, 2)
+    cost = vx.costs.VertexDistance(tissue.with_vertices(tissue.vertices + displacement))
     return tissue, foam_energy(1.02 * tensions), cost
 
 
@@ -48,39 +48,43 @@ def problem(case, **settings):
 def implicit(case):
     """The gradient by the implicit function theorem, with a dense pseudo-inverse."""
     tissue, energy, cost = case
-    there = vx.External(FOAM)(tissue, energy).tissue
-    return _implicit(there, energy.terms[1].tension, cost)
+    relaxed = vx.External(FOAM)(tissue, energy).tissue
+    return _implicit(relaxed, energy.terms[1].tension, cost)
 
 
 @eqx.filter_jit
 def _derivatives(tissue, tensions, cost):
-    there = lambda x: tissue.with_vertices(x.reshape(-1, 2))
-    value = lambda x, tensions: foam_energy(tensions)(there(x))
+    displaced = lambda x: tissue.with_vertices(x.reshape(-1, 2))
+    value = lambda x, tensions: foam_energy(tensions)(displaced(x))
     x = tissue.vertices.ravel()
-    pull = jax.grad(lambda x: cost(there(x), foam_energy(tensions)))(x)
-    return pull, jax.hessian(value)(x, tensions), jax.jacobian(jax.grad(value), 1)(x, tensions)
+    cost_gradient = jax.grad(lambda x: cost(displaced(x), foam_energy(tensions)))(x)
+    return (
+        cost_gradient,
+        jax.hessian(value)(x, tensions),
+        jax.jacobian(jax.grad(value), 1)(x, tensions),
+    )
 
 
 def _implicit(*args):
-    pull, hessian, mixed = map(np.asarray, _derivatives(*args))
-    return -mixed.T @ np.linalg.pinv(hessian, rcond=1e-10) @ pull
+    cost_gradient, hessian, mixed = map(np.asarray, _derivatives(*args))
+    return -mixed.T @ np.linalg.pinv(hessian, rcond=1e-10) @ cost_gradient
 
 
 @eqx.filter_jit
-def evaluated(problem):
+def evaluate(problem):
     return problem.value_and_gradient(throw=False)
 
 
 def gradient_of(problem):
-    evaluation = evaluated(problem)
+    evaluation = evaluate(problem)
     return np.asarray(evaluation.gradient.terms[1].tension), evaluation
 
 
-def error(found, expected):
-    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+def error(gradient, expected):
+    return np.linalg.norm(gradient - expected) / np.linalg.norm(expected)
 
 
-def test_edges_know_lengths_and_areas(case):
+def test_lengths_and_areas_of_edges(case):
     for tissue in (case[0], vx.initialise.free_voronoi(5, key=jax.random.key(0))):
         straight = vx.Tissue(tissue.vertices, tissue.topology, tissue.boundary, 0.0)
         edges = Edges.of(straight)
@@ -90,7 +94,7 @@ def test_edges_know_lengths_and_areas(case):
         np.testing.assert_allclose(edges.areas(vertices), straight.areas, rtol=1e-12)
 
 
-def test_gradient_is_that_of_implicit_differentiation(case, implicit):
+def test_gradient_equals_implicit_differentiation(case, implicit):
     gradient, evaluation = gradient_of(problem(case))
     assert error(gradient, implicit) < 1e-6
     cosine = gradient @ implicit / np.linalg.norm(gradient) / np.linalg.norm(implicit)
@@ -116,7 +120,7 @@ def test_gradient_by_derivatives_of_the_program(case, implicit):
     )
 
 
-def test_gradient_is_that_of_differences(case):
+def test_gradient_matches_finite_differences(case):
     inverse = problem(case)
     tensions = case[1].terms[1].tension
     gradient, _ = gradient_of(inverse)
@@ -131,21 +135,21 @@ def numpy_request(case, forces=None):
     return Request(tissue, energy, forces, None)
 
 
-def test_differences_of_the_energy_are_its_derivatives(case):
+def test_slope_by_differences_equals_slope_by_program(case):
     request = numpy_request(case)
     jobs = [Job(FOAM, request, slope, 1e-4) for slope in ("program", "differences")]
-    (known, found), reason = ask(jobs, 2, False, True)
+    (by_program, by_differences), reason = run_jobs(jobs, 2, False, True)
     assert reason is None
-    assert known is not None
-    assert found is not None
-    lengths = known.slope.terms[1].tension
-    np.testing.assert_allclose(found.slope.terms[1].tension, lengths, rtol=1e-8)
-    there = case[0].with_vertices(jnp.asarray(known.vertices))
-    np.testing.assert_allclose(lengths, there.edge_lengths, rtol=1e-12)
+    assert by_program is not None
+    assert by_differences is not None
+    lengths = by_program.slope.terms[1].tension
+    np.testing.assert_allclose(by_differences.slope.terms[1].tension, lengths, rtol=1e-8)
+    relaxed = case[0].with_vertices(jnp.asarray(by_program.vertices))
+    np.testing.assert_allclose(lengths, relaxed.edge_lengths, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("failure", "says"),
+    ("failure", "message"),
     [
         ("raises", "OSError: the reactor is too hot"),
         ("shape", r"`vertices` as an array of shape \(11, 2\)"),
@@ -153,82 +157,82 @@ def test_differences_of_the_energy_are_its_derivatives(case):
         ("text", "must hold real numbers"),
     ],
 )
-def test_what_goes_wrong_is_an_error_with_its_reason(case, failure, says):
-    answers, reason = ask(
+def test_invalid_results_are_simulator_errors(case, failure, message):
+    results, reason = run_jobs(
         [Job(Foam(failure=failure), numpy_request(case), "energy", 1e-4)], 1, False, True
     )
-    assert answers == [None]
+    assert results == [None]
     assert isinstance(reason, SimulatorError)
-    assert re.search(says, str(reason))
+    assert re.search(message, str(reason))
 
 
-def test_an_energy_that_is_not_finite_has_no_differences(case):
-    job = Job(Foam(failure="endless"), numpy_request(case), "differences", 1e-4)
-    answers, reason = ask([job], 1, False, True)
-    assert answers == [None]
+def test_differences_of_a_nan_energy_fail(case):
+    job = Job(Foam(failure="nan energy"), numpy_request(case), "differences", 1e-4)
+    results, reason = run_jobs([job], 1, False, True)
+    assert results == [None]
     assert "The energy by the program is nan" in str(reason)
 
 
-def test_what_is_not_finite_is_not_asked(case):
+def test_requests_with_nan_are_not_run(case):
     request = numpy_request(case, forces=np.full_like(case[0].vertices, np.nan))
-    answers, reason = ask([Job(FOAM, request, "energy", 1e-4)], 1, False, True)
-    assert answers == [None]
+    results, reason = run_jobs([Job(FOAM, request, "energy", 1e-4)], 1, False, True)
+    assert results == [None]
     assert reason is None
 
 
 @pytest.fixture
-def moody(monkeypatch):
-    """Puts the program into a failure, for the length of a test: nothing is compiled for it."""
+def set_failure(monkeypatch):
+    """A function that makes the shared simulator fail during a test, without recompilation."""
     return lambda failure: monkeypatch.setattr(FOAM, "failure", failure)
 
 
-def test_a_program_that_fails_says_so_everywhere(case, moody):
+def test_failure_of_the_program_is_reported(case, set_failure):
     tissue, energy, _ = case
     response = vx.External(FOAM)
-    moody("raises")
+    set_failure("raises")
     failed = response.ledger.failed
     with pytest.raises(SimulatorError, match="Foam failed: OSError: the reactor is too hot"):
         response(tissue, energy)
     assert response.ledger.failed == failed + 1
-    silent = response(tissue, energy, throw=False)
-    assert not silent.converged
-    assert np.isnan(silent.tissue.vertices).all()
+    failed_equilibrium = response(tissue, energy, throw=False)
+    assert not failed_equilibrium.converged
+    assert np.isnan(failed_equilibrium.tissue.vertices).all()
     assert "too hot" in str(response.last_error_message())
     with pytest.raises(Exception, match="the reactor is too hot"):
         eqx.filter_jit(lambda e: response(tissue, e).energy)(energy).block_until_ready()
 
 
-def test_what_is_not_at_rest_is_no_equilibrium(case, moody):
+def test_result_that_is_not_at_rest_raises(case, set_failure):
     tissue, energy, _ = case
-    moody("no rest")
-    with pytest.raises(RuntimeError, match="not at rest by the energy"):
+    set_failure("not at rest")
+    with pytest.raises(RuntimeError, match="not at rest under the energy"):
         vx.External(FOAM)(tissue, energy)
 
 
-def test_a_failure_under_the_nudge_is_no_gradient(case, moody):
-    moody("when pulled")
+def test_failure_of_a_nudged_run_makes_the_gradient_unreliable(case, set_failure):
+    set_failure("when nudged")
     lenient = problem(case, adjoint=vx.EquilibriumPropagation(throw=False))
-    evaluation = evaluated(lenient)
+    evaluation = evaluate(lenient)
     assert evaluation.equilibrium.converged
     assert not evaluation.outcome.trusted
 
 
 @pytest.mark.thorough
-def test_fits_find_tensions_and_go_on_from_a_checkpoint(case, tmp_path, moody):
+def test_fit_continues_from_a_checkpoint(case, tmp_path, set_failure):
     tissue, energy, _ = case
     target = vx.External(FOAM)(tissue, foam_energy(energy.terms[1].tension[::-1])).tissue
     inverse = problem((tissue, energy, vx.costs.VertexDistance(target)))
-    whole = vx.fit(inverse, ADAM, 4, progress=False)
-    assert whole.history.cost[-1] < whole.history.cost[0]
+    uninterrupted = vx.fit(inverse, ADAM, 4, progress=False)
+    assert uninterrupted.history.cost[-1] < uninterrupted.history.cost[0]
     vx.fit(inverse, ADAM, 2, progress=False, checkpoint=tmp_path / "fit.npz")
     continued = vx.fit(inverse, ADAM, 4, progress=False, checkpoint=tmp_path / "fit.npz")
-    np.testing.assert_array_equal(continued.history.cost, whole.history.cost)
-    moody("raises")
+    np.testing.assert_array_equal(continued.history.cost, uninterrupted.history.cost)
+    set_failure("raises")
     with pytest.raises(vx.FitError, match="Foam failed: OSError: the reactor is too hot"):
         vx.fit(inverse, ADAM, 4, progress=False)
 
 
-def test_batches_run_side_by_side_and_fail_one_by_one(case):
+def test_members_of_a_batch_fail_independently(case):
     tissue, energy, _ = case
     tensions = energy.terms[1].tension
     batch = jnp.stack([tensions, tensions.at[0].set(-1.0), 1.1 * tensions])
@@ -243,57 +247,58 @@ def test_batches_run_side_by_side_and_fail_one_by_one(case):
 
 
 @pytest.mark.slow
-def test_processes_do_as_threads_do(case):
+def test_processes_and_threads_agree(case):
     jobs = [Job(FOAM, numpy_request(case), "program", 1e-4)] * 2
-    here, _ = ask(jobs, 2, False, True)
-    there, reason = ask(jobs, 2, True, True)
+    by_threads, _ = run_jobs(jobs, 2, False, True)
+    by_processes, reason = run_jobs(jobs, 2, True, True)
     assert reason is None
-    for a, b in zip(jax.tree.leaves(here), jax.tree.leaves(there), strict=True):
+    for a, b in zip(jax.tree.leaves(by_threads), jax.tree.leaves(by_processes), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.slow
-def test_processes_hang_and_die_one_by_one(case):
+def test_processes_time_out_and_die_independently(case):
     tissue, energy, _ = numpy_request(case)[:3]
-    first = [0.05, 0.15, 0.3, 0.3]
+    first_tensions = [0.05, 0.15, 0.3, 0.3]
     energies = [
         eqx.tree_at(lambda e: e.terms[1].tension, energy, energy.terms[1].tension.copy())
-        for _ in first
+        for _ in first_tensions
     ]
-    for number, value in enumerate(first):
+    for number, value in enumerate(first_tensions):
         energies[number].terms[1].tension[0] = value
     jobs = [
-        Job(Foam(failure="ill"), Request(tissue, e, None, None), "energy", 1e-4) for e in energies
+        Job(Foam(failure="by tension"), Request(tissue, e, None, None), "energy", 1e-4)
+        for e in energies
     ]
     began = time.perf_counter()
-    answers, _ = ask(jobs, 4, True, True, 60.0)
-    assert [answer is None for answer in answers] == [True, True, False, False]
+    results, _ = run_jobs(jobs, 4, True, True, 60.0)
+    assert [answer is None for answer in results] == [True, True, False, False]
     assert time.perf_counter() - began < 300
-    for job, says in zip(jobs, ("ran the program died", "not done after 2 s"), strict=False):
-        assert says in str(ask([job], 1, True, True, 2.0)[1])
-    # What a simulator raises is its own, and its process goes on.
-    moody = Job(Foam(failure="times out"), numpy_request(case), "energy", 1e-4)
-    _, reason = ask([moody], 1, True, True, 60.0)
+    for job, message in zip(jobs, ("ran the program died", "not done after 2 s"), strict=False):
+        assert message in str(run_jobs([job], 1, True, True, 2.0)[1])
+    # A TimeoutError of the simulator is not that of the process, which continues.
+    times_out = Job(Foam(failure="times out"), numpy_request(case), "energy", 1e-4)
+    _, reason = run_jobs([times_out], 1, True, True, 60.0)
     assert "TimeoutError: the reactor does not answer" in str(reason)
-    # The next one has a process again.
-    (again,), _ = ask(jobs[2:3], 1, True, True, 60.0)
-    assert again is not None
+    # The next job gets a new process.
+    (last_result,), _ = run_jobs(jobs[2:3], 1, True, True, 60.0)
+    assert last_result is not None
 
 
 @pytest.mark.slow
-def test_a_fit_in_processes(case):
+def test_fit_in_processes(case):
     tissue, energy, cost = case
     response = vx.External(Foam(), workers=2, processes=True, timeout=120.0)
     adjoint = vx.EquilibriumPropagation()
     inverse = vx.InverseProblem(tissue, energy, cost, response=response, adjoint=adjoint)
-    beside = problem(case)
-    fits = [vx.fit(p, ADAM, 2, progress=False) for p in (inverse, beside)]
+    in_threads = problem(case)
+    fits = [vx.fit(p, ADAM, 2, progress=False) for p in (inverse, in_threads)]
     np.testing.assert_allclose(fits[0].history.cost, fits[1].history.cost, rtol=1e-12)
-    hangs = dataclasses.replace(
+    hanging = dataclasses.replace(
         inverse, response=vx.External(Foam(failure="hangs"), processes=True, timeout=1.0)
     )
     with pytest.raises(vx.FitError, match="not done after 1 s"):
-        vx.fit(hangs, ADAM, 2, progress=False)
+        vx.fit(hanging, ADAM, 2, progress=False)
 
 
 @pytest.mark.slow
@@ -306,27 +311,30 @@ def test_gradient_in_single_precision(case, implicit):
 
 
 @pytest.mark.parametrize(
-    ("adjoint", "says"),
+    ("adjoint", "message"),
     [
-        (vx.ImplicitDifferentiation(), "ImplicitDifferentiation needs derivatives of what relaxes"),
+        (
+            vx.ImplicitDifferentiation(),
+            "ImplicitDifferentiation needs derivatives of the relaxation",
+        ),
         (vx.adjoints.AutomaticDifferentiation(), "AutomaticDifferentiation needs derivatives"),
-        (vx.EquilibriumPropagation(nudge="cost"), "which an external program does not know"),
+        (vx.EquilibriumPropagation(nudge="cost"), "which an external program cannot do"),
     ],
 )
-def test_only_equilibrium_propagation_goes_with_it(case, adjoint, says):
-    with pytest.raises(ValueError, match=says):
+def test_other_adjoints_raise(case, adjoint, message):
+    with pytest.raises(ValueError, match=message):
         problem(case, adjoint=adjoint)
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         vx.External(FOAM)(case[0], case[1], adjoint=adjoint)
 
 
-def test_no_guidance(case):
-    with pytest.raises(ValueError, match="`guidance` lets the tissue relax the cost too"):
+def test_guidance_raises(case):
+    with pytest.raises(ValueError, match="`guidance` adds the cost to the relaxed energy"):
         dataclasses.replace(problem(case), guidance=1.0)
 
 
 @pytest.mark.parametrize(
-    ("settings", "kind", "says"),
+    ("settings", "kind", "message"),
     [
         ({"simulator": 1}, TypeError, "simulator"),
         ({"slope": "guess"}, (ValueError, TypeError), "slope"),
@@ -338,24 +346,29 @@ def test_no_guidance(case):
         ({"timeout": 5.0}, ValueError, "`timeout` needs processes=True"),
     ],
 )
-def test_settings_are_checked(settings, kind, says):
-    with pytest.raises(kind, match=says):
+def test_settings_are_checked(settings, kind, message):
+    with pytest.raises(kind, match=message):
         vx.External(**({"simulator": FOAM} | settings))
 
 
-def test_arcs_are_pulled_by_programs_that_can(case):
+def test_torques_require_support_by_the_simulator(case):
     tissue, energy, _ = numpy_request(case)[:3]
     torques = np.ones(len(energy.terms[1].tension))
     job = Job(FOAM, Request(tissue, energy, 0 * tissue.vertices, torques), "energy", 1e-4)
-    _, reason = ask([job], 1, False, True)
-    assert "this program cannot be told to pull on them" in str(reason)
+    _, reason = run_jobs([job], 1, False, True)
+    assert "this simulator does not support torques on them" in str(reason)
 
 
-def test_what_a_simulator_lacks_is_named(case):
-    class Bare(vx.external.AbstractSimulator):
+def test_missing_methods_are_named(case):
+    class SimulatorWithoutGradient(vx.external.AbstractSimulator):
         def relax(self, tissue, energy, forces):
             return np.asarray(tissue.vertices)
 
-    for slope, says in (("program", "has no `parameter_gradient`"), ("differences", "no `energy`")):
-        _, reason = ask([Job(Bare(), numpy_request(case), slope, 1e-4)], 1, False, True)
-        assert says in str(reason)
+    for slope, message in (
+        ("program", "has no `parameter_gradient`"),
+        ("differences", "no `energy`"),
+    ):
+        _, reason = run_jobs(
+            [Job(SimulatorWithoutGradient(), numpy_request(case), slope, 1e-4)], 1, False, True
+        )
+        assert message in str(reason)

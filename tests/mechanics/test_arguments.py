@@ -1,6 +1,6 @@
-"""What functions of mechanics refuse: the message names the argument and says what it must be."""
+"""Error messages of `vertax.mechanics` name the argument and its requirement."""
 
-# Wrong types are the point here.
+# The tests pass arguments of wrong types.
 # pyright: reportArgumentType=false
 
 import jax
@@ -22,7 +22,7 @@ batch = vx.fitting.stack([tissue, tissue])
 
 ENERGY, TISSUE = "`energy` must be an energy", "`tissue` must be a vertax.Tissue"
 PERIODIC = "`tissue` must be periodic"
-TAKE_BOTH = [
+TISSUE_FUNCTIONS = [
     mechanics.stress,
     mechanics.cell_stress,
     mechanics.pressures,
@@ -42,11 +42,11 @@ TAKE_BOTH = [
 ]
 
 
-@pytest.mark.parametrize("function", TAKE_BOTH)
-def test_each_function_wants_one_tissue_and_an_energy(without_type_checks, function):
-    for nothing in (None, 3.6, vx.energies.ShapeFactorEnergy):
+@pytest.mark.parametrize("function", TISSUE_FUNCTIONS)
+def test_functions_require_one_tissue_and_an_energy(without_type_checks, function):
+    for wrong in (None, 3.6, vx.energies.ShapeFactorEnergy):
         with pytest.raises(TypeError, match=ENERGY):
-            function(tissue, nothing)
+            function(tissue, wrong)
     with pytest.raises(TypeError, match=TISSUE):
         function(energy, tissue)
     with pytest.raises(ValueError, match="`tissue` must be one tissue"):
@@ -56,13 +56,13 @@ def test_each_function_wants_one_tissue_and_an_energy(without_type_checks, funct
 @pytest.mark.parametrize(
     "function",
     [
-        *TAKE_BOTH[4:8],
+        *TISSUE_FUNCTIONS[4:8],
         lambda t, e: mechanics.complex_modulus(t, e, friction, jnp.array([1.0])),
         lambda t, e: mechanics.ramp(t, e, np.array([0.0, 0.1])),
         lambda t, e: BoxRelaxation()(t, e),
     ],
 )
-def test_what_strains_the_box_wants_one(function):
+def test_functions_that_strain_the_box_require_a_periodic_tissue(function):
     with pytest.raises(ValueError, match=PERIODIC):
         function(free, energy)
 
@@ -77,7 +77,7 @@ WRONG = {
     "solver": (lambda: mechanics.elastic_tensor(tissue, energy, linear_solver=3), "linear solver"),
     "no modes": (lambda: mechanics.modes(tissue, energy, 0), "`k` must be at least 1"),
     "modes": (lambda: mechanics.modes(tissue, energy, 37), "`k` must be at most"),
-    "half a mode": (lambda: mechanics.modes(tissue, energy, 2.5), "`k` must be at least 1"),
+    "fraction of a mode": (lambda: mechanics.modes(tissue, energy, 2.5), "`k` must be at least 1"),
     "tolerance": (lambda: mechanics.zero_modes(tissue, energy, tolerance=-1), "be positive"),
     "traced": (
         lambda: jax.jit(lambda p: mechanics.spectrum(tissue, vx.energies.ShapeFactorEnergy(p)))(
@@ -89,14 +89,17 @@ WRONG = {
     "no values": (lambda: mechanics.density_of_states(jnp.ones(0)), "one list of eigenvalues"),
     "nan": (lambda: mechanics.density_of_states(jnp.array([np.nan])), "`values` must be finite"),
     "bins": (lambda: mechanics.density_of_states(jnp.ones(3), 0), "`bins` must be at least 1"),
-    "letters": (lambda: mechanics.self_stresses(tissue, "areas"), "`constraints` must name"),
-    "none": (lambda: mechanics.compatibility(tissue, []), "`constraints` must name"),
+    "string": (lambda: mechanics.self_stresses(tissue, "areas"), "`constraints` must name"),
+    "no constraints": (
+        lambda: mechanics.compatibility(tissue, []),
+        "`constraints` must name",
+    ),
     "principal": (lambda: mechanics.principal(jnp.ones(3)), "`stresses` must have shape"),
-    "past": (
+    "negative frequency": (
         lambda: mechanics.complex_modulus(tissue, energy, friction, -1.0),
         "`frequencies` must be at least 0",
     ),
-    "frequencies": (
+    "frequency matrix": (
         lambda: mechanics.complex_modulus(tissue, energy, friction, np.ones((2, 2))),
         "`frequencies` must be a list",
     ),
@@ -104,7 +107,7 @@ WRONG = {
         lambda: mechanics.complex_modulus(tissue, energy, friction, []),
         "`frequencies` must be a list",
     ),
-    "way": (
+    "method": (
         lambda: mechanics.complex_modulus(tissue, energy, friction, [1.0], method="fast"),
         '`method` must be "dense" or "sparse"',
     ),
@@ -112,16 +115,28 @@ WRONG = {
         lambda: mechanics.complex_modulus(tissue, energy, energy, [1.0]),
         "`dissipation` must be a dissipation",
     ),
-    "before": (lambda: mechanics.recoil(tissue, energy, -1, friction), "`edge` must be at least 0"),
-    "behind": (lambda: mechanics.recoil(tissue, energy, 999, friction), "one of the 27 edges"),
-    "part": (lambda: mechanics.recoil(tissue, energy, 1.5, friction), "`edge` must be at least 0"),
-    "two": (
+    "negative edge": (
+        lambda: mechanics.recoil(tissue, energy, -1, friction),
+        "`edge` must be at least 0",
+    ),
+    "edge too large": (
+        lambda: mechanics.recoil(tissue, energy, 999, friction),
+        "one of the 27 edges",
+    ),
+    "edge not an integer": (
+        lambda: mechanics.recoil(tissue, energy, 1.5, friction),
+        "`edge` must be at least 0",
+    ),
+    "two edges": (
         lambda: mechanics.recoil(tissue, energy, jnp.arange(2), friction),
         "`edge` must be at least 0",
     ),
-    "slick": (lambda: mechanics.recoil(tissue, energy, 1, None), "must be a dissipation"),
-    "no friction": (lambda: mechanics.velocities(tissue, energy, 1.0), "must be a dissipation"),
-    "speed": (
+    "no dissipation": (lambda: mechanics.recoil(tissue, energy, 1, None), "must be a dissipation"),
+    "number as dissipation": (
+        lambda: mechanics.velocities(tissue, energy, 1.0),
+        "must be a dissipation",
+    ),
+    "solver of velocities": (
         lambda: mechanics.velocities(tissue, energy, friction, linear_solver=3),
         "linear solver",
     ),
@@ -129,28 +144,34 @@ WRONG = {
     "skewed": (lambda: BoxRelaxation(stress=skewed), "`stress` must be symmetric"),
     "relaxation": (lambda: BoxRelaxation(relaxation=None), "`relaxation` must be"),
     "free": (lambda: BoxRelaxation(free=["x"]), "`free` must be one of all"),
-    "steps": (lambda: BoxRelaxation(max_steps=0), "`max_steps` must be at least 1"),
-    "strain": (lambda: mechanics.ramp(tissue, energy, 0.1), "`strains` must be a list"),
-    "strains": (lambda: mechanics.ramp(tissue, energy, [0, np.inf]), "`strains` must be finite"),
-    "no way": (
+    "no box steps": (lambda: BoxRelaxation(max_steps=0), "`max_steps` must be at least 1"),
+    "one strain": (lambda: mechanics.ramp(tissue, energy, 0.1), "`strains` must be a list"),
+    "infinite strain": (
+        lambda: mechanics.ramp(tissue, energy, [0, np.inf]),
+        "`strains` must be finite",
+    ),
+    "deformation": (
         lambda: mechanics.ramp(tissue, energy, [0, 0.1], deformation=3),
         "`deformation` must be a function",
     ),
-    "scalar": (
+    "scalar deformation": (
         lambda: mechanics.ramp(tissue, energy, [0, 0.1], deformation=lambda s: s),
         "`deformation` must have shape",
     ),
-    "rest": (lambda: mechanics.ramp(tissue, energy, [0, 0.1], relaxation=3), "`relaxation` must"),
-    "shears": (lambda: mechanics.simple_shear([0.1, 0.2]), "`strain` must be one number"),
-    "pure": (lambda: mechanics.pure_shear(np.nan), "`strain` must be finite"),
-    "row": (lambda: mechanics.deformed(tissue, jnp.ones(2)), "`gradient` must have shape"),
-    "flat": (lambda: mechanics.deformed(tissue, jnp.zeros((2, 2))), "a positive determinant"),
+    "relaxation of a ramp": (
+        lambda: mechanics.ramp(tissue, energy, [0, 0.1], relaxation=3),
+        "`relaxation` must",
+    ),
+    "two shears": (lambda: mechanics.simple_shear([0.1, 0.2]), "`strain` must be one number"),
+    "nan shear": (lambda: mechanics.pure_shear(np.nan), "`strain` must be finite"),
+    "vector": (lambda: mechanics.deformed(tissue, jnp.ones(2)), "`gradient` must have shape"),
+    "singular": (lambda: mechanics.deformed(tissue, jnp.zeros((2, 2))), "a positive determinant"),
     "cost": (lambda: costs.Stress(skewed), "`target` must be symmetric"),
-    "far cell": (
+    "cell out of range": (
         lambda: costs.CellStress(jnp.zeros((2, 2)), jnp.array([3, 99]))(tissue, energy),
         "`cells` must hold numbers of cells, from 0 to 8, but holds 99",
     ),
-    "half cell": (
+    "cell not an integer": (
         lambda: costs.CellStress(jnp.zeros((2, 2)), jnp.array([0.5])),
         "`cells` must hold whole numbers",
     ),
@@ -160,7 +181,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_wrong_values_are_named(without_type_checks, name):
+def test_errors_name_the_argument(without_type_checks, name):
     call, message = WRONG[name]
     with pytest.raises((ValueError, TypeError), match=message.replace("(", r"\(")):
         call()

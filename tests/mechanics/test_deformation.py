@@ -1,4 +1,4 @@
-"""Slow deformation, and boxes that come to rest."""
+"""Quasi-static deformation, and relaxation of the box."""
 
 import equinox as eqx
 import jax
@@ -22,47 +22,47 @@ direction = np.cos(np.arange(N))
 
 def slope_and_difference(loss, h=1e-4):
     at = lambda s: float(loss(p0 + s * h * direction))
-    wanted = (8 * (at(1) - at(-1)) - at(2) + at(-2)) / (12 * h)
-    return float(np.sum(jax.jit(jax.grad(loss))(p0) * direction)), wanted
+    expected = (8 * (at(1) - at(-1)) - at(2) + at(-2)) / (12 * h)
+    return float(np.sum(jax.jit(jax.grad(loss))(p0) * direction)), expected
 
 
-def test_shears():
+def test_deformation_gradients_of_shears():
     np.testing.assert_allclose(mechanics.simple_shear(0.3), [[1, 0.3], [0, 1]])
     np.testing.assert_allclose(np.linalg.det(mechanics.pure_shear(0.3)), 1)
 
 
 @pytest.mark.slow
-def test_the_work_of_the_stress_is_the_change_of_the_energy():
+def test_work_of_the_stress_equals_the_energy_change():
     energy = ShapeFactorEnergy(p0)
-    found = mechanics.ramp(start, energy, jnp.linspace(0, 0.05, 11), relaxation=PRECISE)
-    assert not found.plastic.any()
+    ramp = mechanics.ramp(start, energy, jnp.linspace(0, 0.05, 11), relaxation=PRECISE)
+    assert not ramp.plastic.any()
     area = start.boundary.area
     # Simpson's rule.
-    shear = np.asarray(found.stresses[:, 0, 1])
+    shear = np.asarray(ramp.stresses[:, 0, 1])
     work = 0.005 / 3 * (shear[0] + 4 * shear[1::2].sum() + 2 * shear[2:-1:2].sum() + shear[-1])
-    gained = (found.energies[-1] - found.energies[0]) / area
-    assert work == pytest.approx(float(gained), rel=1e-5)
-    # The slope of the stress is the modulus, but that simple shear turns the tissue as well.
-    rest = jax.tree.map(lambda x: x[0], eqx.filter(found.frames, eqx.is_array))
+    energy_change = (ramp.energies[-1] - ramp.energies[0]) / area
+    assert work == pytest.approx(float(energy_change), rel=1e-5)
+    # The slope of the stress is the modulus, corrected for the rotation in a simple shear.
+    rest = jax.tree.map(lambda x: x[0], eqx.filter(ramp.frames, eqx.is_array))
     rest = eqx.combine(rest, start)
-    s = found.stresses[0]
+    s = ramp.stresses[0]
     slope = (-25 * shear[0] + 48 * shear[1] - 36 * shear[2] + 16 * shear[3] - 3 * shear[4]) / 0.06
     modulus = mechanics.shear_modulus(rest, energy, angle=0.0)
     assert slope == pytest.approx(float(modulus - (s[0, 0] - s[1, 1]) / 2), rel=1e-3)
 
 
 @pytest.mark.slow
-def test_a_large_strain_has_transitions_at_which_energy_is_lost():
+def test_energy_is_dissipated_at_transitions():
     relaxation = vx.Relaxation(contact_range=None)
     energy = ShapeFactorEnergy(jnp.full(N, 3.6))
-    found = mechanics.ramp(start, energy, jnp.linspace(0, 1.0, 41), relaxation=relaxation)
-    assert found.plastic[1:].any()
-    # Less than what elastic deformation would have gained.
-    gain = np.diff(found.energies) / start.boundary.area
-    work = 0.025 * 0.5 * (found.stresses[1:, 0, 1] + found.stresses[:-1, 0, 1])
-    lost = np.asarray(work - gain)
-    plastic = np.asarray(found.plastic[1:])
-    assert lost[plastic].mean() > 10 * np.abs(lost[~plastic]).mean()
+    ramp = mechanics.ramp(start, energy, jnp.linspace(0, 1.0, 41), relaxation=relaxation)
+    assert ramp.plastic[1:].any()
+    # The work of the stress minus the change of the energy, per area.
+    energy_change = np.diff(ramp.energies) / start.boundary.area
+    work = 0.025 * 0.5 * (ramp.stresses[1:, 0, 1] + ramp.stresses[:-1, 0, 1])
+    dissipated = np.asarray(work - energy_change)
+    plastic = np.asarray(ramp.plastic[1:])
+    assert dissipated[plastic].mean() > 10 * np.abs(dissipated[~plastic]).mean()
 
 
 @pytest.mark.slow
@@ -75,24 +75,24 @@ def test_gradient_of_a_ramp_against_differences():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("free", ["all", "area", "shape"])
-def test_a_box_comes_to_the_stress_given(free):
+def test_box_relaxes_to_the_target_stress(free):
     energy = ShapeFactorEnergy(p0)
-    wanted = np.array([[0.1, 0.02], [0.02, 0.05]])
-    found = BoxRelaxation(jnp.asarray(wanted), free, PRECISE)(start, energy)
-    missing = np.asarray(mechanics.stress(found.tissue, energy)) - wanted
-    left = {
-        "all": missing.ravel(),
-        "area": [np.trace(missing)],
-        "shape": [missing[0, 0] - missing[1, 1], missing[0, 1]],
+    expected = np.array([[0.1, 0.02], [0.02, 0.05]])
+    relaxed = BoxRelaxation(jnp.asarray(expected), free, PRECISE)(start, energy)
+    residual = np.asarray(mechanics.stress(relaxed.tissue, energy)) - expected
+    constrained = {
+        "all": residual.ravel(),
+        "area": [np.trace(residual)],
+        "shape": [residual[0, 0] - residual[1, 1], residual[0, 1]],
     }
-    np.testing.assert_allclose(left[free], 0, atol=1e-7)
-    area = float(found.tissue.boundary.area)
+    np.testing.assert_allclose(constrained[free], 0, atol=1e-7)
+    area = float(relaxed.tissue.boundary.area)
     if free == "shape":
         assert area == pytest.approx(9)
-    # It is a minimum of the energy less the work of the stress.
+    # The box minimises the enthalpy, the energy minus the work of the stress.
     if free == "area":
         enthalpy = lambda s: (
-            float(PRECISE(mechanics.deformed(found.tissue, s * jnp.eye(2)), energy).energy)
+            float(PRECISE(mechanics.deformed(relaxed.tissue, s * jnp.eye(2)), energy).energy)
             - 0.075 * area * s**2
         )
         assert enthalpy(1.0) < min(enthalpy(0.99), enthalpy(1.01))
@@ -104,14 +104,14 @@ def test_gradient_of_a_relaxed_box_against_differences(adjoint):
     response = BoxRelaxation(0.1, "all", PRECISE)
 
     def loss(p):
-        found = response(start, ShapeFactorEnergy(p), adjoint=adjoint, throw=False).tissue
-        return jnp.sum(found.boundary.lattice**2) + jnp.sum(found.perimeters**2)
+        relaxed = response(start, ShapeFactorEnergy(p), adjoint=adjoint, throw=False).tissue
+        return jnp.sum(relaxed.boundary.lattice**2) + jnp.sum(relaxed.perimeters**2)
 
-    slope, wanted = slope_and_difference(jax.jit(loss))
-    assert slope == pytest.approx(wanted, rel=1e-6 if "Implicit" in str(adjoint) else 1e-3)
+    slope, expected = slope_and_difference(jax.jit(loss))
+    assert slope == pytest.approx(expected, rel=1e-6 if "Implicit" in str(adjoint) else 1e-3)
 
 
-def test_what_is_refused(without_type_checks):
+def test_invalid_arguments_raise(without_type_checks):
     energy = ShapeFactorEnergy(p0)
     with pytest.raises(ValueError, match="must be periodic"):
         mechanics.ramp(cluster(4, 1), energy, np.array([0.0, 0.1]))

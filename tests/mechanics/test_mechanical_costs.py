@@ -33,28 +33,28 @@ MODULI = [
 ]
 
 
-def test_values():
+def test_stress_costs_are_squared_differences():
     e = elastic(p0)
     stress, cells = mechanics.stress(tissue, e), mechanics.cell_stress(tissue, e)
-    found = [cost(tissue, e) for cost in CHEAP]
+    values = [cost(tissue, e) for cost in CHEAP]
     chosen = np.asarray(cells)[[1, 4, 7]]
-    np.testing.assert_allclose(found[0], 0.5 * np.sum((stress - CHEAP[0].target) ** 2))
-    np.testing.assert_allclose(found[1], 0.5 * np.sum(chosen**2) / 3)
-    with pytest.raises(ValueError, match=r"\(2, 2\) or one entry for each selected cell"):
+    np.testing.assert_allclose(values[0], 0.5 * np.sum((stress - CHEAP[0].target) ** 2))
+    np.testing.assert_allclose(values[1], 0.5 * np.sum(chosen**2) / 3)
+    with pytest.raises(ValueError, match=r"\(2, 2\) or one entry for each chosen cell"):
         costs.CellStress(jnp.zeros((3, 2, 2)))(tissue, e)
 
 
 @pytest.mark.slow
-def test_values_of_moduli():
+def test_residuals_of_moduli():
     e = elastic(p0)
     rest = PRECISE(tissue, e).tissue
     y = [mechanics.youngs_modulus(rest, e, angle=a) for a in (0.0, np.pi / 2)]
-    wanted = [
+    expected = [
         mechanics.shear_modulus(rest, e) - 0.2,
         mechanics.bulk_modulus(rest, e) - 2.0,
         (y[0] - y[1]) / (y[0] + y[1]) - 0.3,
     ]
-    for cost, residual in zip(MODULI, wanted, strict=True):
+    for cost, residual in zip(MODULI, expected, strict=True):
         np.testing.assert_allclose(cost.residuals(rest, e)[0], residual, rtol=1e-9)
     gap = costs.SpectralGap(0.1)(rest, e)
     np.testing.assert_allclose(gap, 0.5 * (mechanics.spectrum(rest, e)[2] - 0.1) ** 2, rtol=1e-6)
@@ -65,12 +65,12 @@ def hypergradient_against_differences(cost, rtol, **options):
         tissue=tissue, energy=elastic(p0), cost=cost, response=PRECISE, **options
     )
     evaluate = eqx.filter_jit(lambda e: problem.value_and_gradient(e, throw=False))
-    found, h = evaluate(elastic(p0)), 1e-4
+    evaluation, h = evaluate(elastic(p0)), 1e-4
     at = lambda s: float(evaluate(elastic(p0 + s * h * direction)).cost)
-    wanted = (8 * (at(1) - at(-1)) - at(2) + at(-2)) / (12 * h)
-    slope = np.sum(found.gradient.terms[1].target_perimeter * direction)
-    np.testing.assert_allclose(slope, wanted, rtol=rtol)
-    assert found.outcome.trusted
+    expected = (8 * (at(1) - at(-1)) - at(2) + at(-2)) / (12 * h)
+    slope = np.sum(evaluation.gradient.terms[1].target_perimeter * direction)
+    np.testing.assert_allclose(slope, expected, rtol=rtol)
+    assert evaluation.outcome.trusted
 
 
 @pytest.mark.slow

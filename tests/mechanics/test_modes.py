@@ -13,23 +13,23 @@ from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 
 N = 12
 ENERGY = ShapeFactorEnergy(shape_factors(N, 3.6, 0.1))
-# The Hessian is that of any configuration.
+# Not relaxed: the tests hold for the Hessian at any configuration.
 tissue = random_tissue(N, 1)
 
 
-def test_values_and_vectors_against_the_dense_matrix():
+def test_dense_modes_are_eigenvectors_of_the_hessian():
     matrix = dense_hessian(tissue, ENERGY)
-    wanted = np.linalg.eigvalsh(matrix)
-    np.testing.assert_allclose(mechanics.spectrum(tissue, ENERGY), wanted, atol=1e-10)
-    found = mechanics.modes(tissue, ENERGY, 5)
-    np.testing.assert_allclose(found.values, wanted[:5], atol=1e-10)
-    vectors = np.asarray(found.displacements).reshape(5, -1)
-    np.testing.assert_allclose(vectors @ matrix, found.values[:, None] * vectors, atol=1e-9)
+    expected = np.linalg.eigvalsh(matrix)
+    np.testing.assert_allclose(mechanics.spectrum(tissue, ENERGY), expected, atol=1e-10)
+    modes = mechanics.modes(tissue, ENERGY, 5)
+    np.testing.assert_allclose(modes.values, expected[:5], atol=1e-10)
+    vectors = np.asarray(modes.displacements).reshape(5, -1)
+    np.testing.assert_allclose(vectors @ matrix, modes.values[:, None] * vectors, atol=1e-9)
     np.testing.assert_allclose(vectors @ vectors.T, np.eye(5), atol=1e-9)
-    assert ((found.participation_ratios > 0) & (found.participation_ratios <= 1 + 1e-12)).all()
+    assert ((modes.participation_ratios > 0) & (modes.participation_ratios <= 1 + 1e-12)).all()
 
 
-def test_the_sparse_matrix_is_the_dense_one():
+def test_sparse_and_dense_hessians_agree():
     from vertax.mechanics._hessian import sparse_hessian
     from vertax.mechanics._landscape import Landscape
 
@@ -40,12 +40,12 @@ def test_the_sparse_matrix_is_the_dense_one():
     assert matrix is not None
     np.testing.assert_allclose(matrix.toarray(), dense_hessian(large, energy), atol=1e-10)
     assert matrix.nnz < 0.5 * matrix.toarray().size
-    # One spring across the tissue is seen, and refused.
+    # A spring across the tissue is not local, so there is no sparse Hessian.
     spring = lambda t: energy(t) + jnp.sum((t.vertices[0] - t.vertices[70]) ** 2)
     assert sparse_hessian(Landscape(large, spring)) is None
 
 
-def test_the_sparse_matrix_of_a_tissue_with_spare_slots():
+def test_sparse_hessian_of_a_tissue_with_spare_slots():
     from vertax.mechanics._hessian import sparse_hessian
     from vertax.mechanics._landscape import Landscape
 
@@ -58,7 +58,7 @@ def test_the_sparse_matrix_of_a_tissue_with_spare_slots():
 
 
 @pytest.mark.slow
-def test_sparse_modes_of_a_relaxed_tissue_are_the_dense_ones():
+def test_sparse_and_dense_modes_of_a_relaxed_tissue_agree():
     energy = ShapeFactorEnergy(shape_factors(64, 3.6, 0.1))
     rest = vx.equilibrate(random_tissue(64, 3), energy, contact_range=None).tissue
     dense = mechanics.modes(rest, energy, 8, method="dense")
@@ -69,7 +69,7 @@ def test_sparse_modes_of_a_relaxed_tissue_are_the_dense_ones():
 
 
 @pytest.mark.slow
-def test_sparse_modes_with_arcs_and_pins_are_the_dense_ones():
+def test_sparse_and_dense_modes_with_arcs_and_pins_agree():
     start = cluster(19, 2)
     energy = AreaElasticity(20.0, 1.0) + LineTension(jnp.linspace(0.8, 1.2, start.n_edges))
     free = vx.equilibrate(start, energy, contact_range=None).tissue
@@ -91,9 +91,9 @@ def test_derivatives_of_eigenvalues_against_differences():
     direction, h = jnp.cos(jnp.arange(N)), 1e-6
     values = jax.jit(lambda p: mechanics.modes(tissue, ShapeFactorEnergy(p), 6).values[2:])
     p0 = ENERGY.target_shape_factor
-    wanted = (values(p0 + h * direction) - values(p0 - h * direction)) / (2 * h)
-    found = jax.jit(lambda p: jax.jvp(values, (p,), (direction,))[1])(p0)
-    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-7)
+    expected = (values(p0 + h * direction) - values(p0 - h * direction)) / (2 * h)
+    tangent = jax.jit(lambda p: jax.jvp(values, (p,), (direction,))[1])(p0)
+    np.testing.assert_allclose(tangent, expected, rtol=1e-5, atol=1e-7)
 
 
 def test_density_of_states():
@@ -104,23 +104,23 @@ def test_density_of_states():
     assert np.sum(density) * 2 == pytest.approx(0.8)
 
 
-def test_states_of_self_stress_balance_and_are_counted():
-    found = mechanics.self_stresses(tissue)
+def test_self_stresses_are_in_equilibrium_and_satisfy_the_maxwell_calladine_count():
+    self_stress = mechanics.self_stresses(tissue)
     matrix = mechanics.compatibility(tissue)
-    np.testing.assert_allclose(found.states @ matrix, 0, atol=1e-9)
-    assert found.degrees_of_freedom == 4 * N
-    assert found.number == found.zero_modes + 2 * N - 4 * N
-    # Areas sum to that of the box: equal pressures balance.
-    assert found.number == 1
-    np.testing.assert_allclose(np.abs(found.states[0, :N]), 1 / np.sqrt(N), atol=1e-9)
-    # Tensions of all edges constrain more.
+    np.testing.assert_allclose(self_stress.states @ matrix, 0, atol=1e-9)
+    assert self_stress.degrees_of_freedom == 4 * N
+    assert self_stress.number == self_stress.zero_modes + 2 * N - 4 * N
+    # The areas sum to the area of the box, so equal pressures are a state of self-stress.
+    assert self_stress.number == 1
+    np.testing.assert_allclose(np.abs(self_stress.states[0, :N]), 1 / np.sqrt(N), atol=1e-9)
+    # With the tensions of all edges in place of perimeters there are more constraints.
     edges = mechanics.self_stresses(tissue, ["areas", "edge_lengths"])
     assert edges.number == edges.zero_modes
 
 
 @pytest.mark.slow
-def test_the_count_of_a_rigid_tissue_and_of_a_fluid_one():
-    # At rest under its own tensions and pressures a rigid tissue has one state more.
+def test_numbers_of_self_stresses_and_zero_modes_of_rigid_and_fluid_tissues():
+    # The tensions and pressures of a rigid tissue at rest are one more state.
     for p0, states, zero in ((3.6, 2, 2), (4.1, 1, 2 * N + 1)):
         energy = ShapeFactorEnergy(jnp.full(N, p0))
         rest = vx.equilibrate(tissue, energy, contact_range=None, tolerance=1e-11).tissue
@@ -128,7 +128,7 @@ def test_the_count_of_a_rigid_tissue_and_of_a_fluid_one():
         assert mechanics.zero_modes(rest, energy, tolerance=1e-7) == zero
 
 
-def test_what_is_refused(without_type_checks):
+def test_invalid_arguments_raise(without_type_checks):
     with pytest.raises(ValueError, match="must be at most"):
         mechanics.modes(tissue, ENERGY, 49)
     with pytest.raises(ValueError, match='"dense" or "sparse"'):

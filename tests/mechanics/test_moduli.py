@@ -1,4 +1,4 @@
-"""Elastic moduli: closed results of the hexagonal lattice, and disordered tissues by differences."""
+"""Elastic moduli: closed forms for the hexagonal lattice, finite differences for disordered tissues."""
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ def lattice():
     return vx.initialise.hexagonal(4, 4, softening=0.0)
 
 
-# One kind of energy and number of cells for all tests: what is compiled is shared.
+# One class of energy and one number of cells for all tests, which then share compiled functions.
 def elastic(k_a, k_p, p0):
     perimeters = PerimeterElasticity(jnp.array(k_p), jnp.broadcast_to(p0, N))
     return AreaElasticity(jnp.array(k_a), jnp.array(1.0)) + perimeters
@@ -34,8 +34,8 @@ def test_moduli_of_the_hexagonal_lattice(lattice, p0):
     energy = elastic(k_a, k_p, p0)
     scale = k_p * C * (C - p0)
     for angle in (None, 0.0, 0.4):
-        found = mechanics.shear_modulus(lattice, energy, angle=angle)
-        assert found == pytest.approx(scale / 4, rel=1e-9)
+        modulus = mechanics.shear_modulus(lattice, energy, angle=angle)
+        assert modulus == pytest.approx(scale / 4, rel=1e-9)
     affine = mechanics.shear_modulus(lattice, energy, affine=True)
     assert affine == pytest.approx(3 / 8 * scale, rel=1e-9)
     stiffness = k_a + k_p * C * p0 / 4
@@ -57,14 +57,14 @@ def exponential(strain):
 
 
 def tensor_by_differences(energy_at, stress, area, step):
-    """From energies at logarithmic strains, fourth order."""
+    """The elastic tensor by fourth-order differences of energies at logarithmic strains."""
     basis = np.array(STRAINS)
     along = lambda v: np.tensordot(v, basis, 1)
-    here = energy_at(np.zeros((2, 2)))
+    energy_0 = energy_at(np.zeros((2, 2)))
 
     def curvature(v):
         e = {s: energy_at(s * step * along(v)) for s in (-2, -1, 1, 2)}
-        return (16 * (e[1] + e[-1]) - e[2] - e[-2] - 30 * here) / (12 * step**2)
+        return (16 * (e[1] + e[-1]) - e[2] - e[-2] - 30 * energy_0) / (12 * step**2)
 
     tensor, unit = np.zeros((3, 3)), np.eye(3)
     for i in range(3):
@@ -85,26 +85,26 @@ def test_moduli_of_a_disordered_tissue_against_relaxed_energies(disordered):
         return float(PRECISE(mechanics.deformed(tissue, exponential(strain)), energy).energy)
 
     stress, area = mechanics.stress(tissue, energy), float(tissue.boundary.area)
-    wanted = tensor_by_differences(energy_at, stress, area, 2e-3)
-    found = mechanics.elastic_tensor(tissue, energy)
-    np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
+    expected = tensor_by_differences(energy_at, stress, area, 2e-3)
+    tensor = mechanics.elastic_tensor(tissue, energy)
+    np.testing.assert_allclose(tensor, expected, atol=1e-6 * np.abs(expected).max())
     affine = mechanics.shear_modulus(tissue, energy, affine=True)
     assert 0 < mechanics.shear_modulus(tissue, energy) < affine
 
 
-def test_simple_shear_of_the_box_has_the_same_modulus(disordered):
-    # Along x: a normal stress difference adds to the curvature of the energy, since simple shear turns.
+def test_modulus_equals_the_energy_curvature_under_simple_shear(disordered):
+    # Simple shear along x includes a rotation, which adds half the normal stress difference to the curvature.
     tissue, energy = disordered
     stress, h = mechanics.stress(tissue, energy), 2e-3
     at = lambda g: float(
         PRECISE(mechanics.deformed(tissue, jnp.array([[1.0, g], [0.0, 1.0]])), energy).energy
     )
     curvature = (16 * (at(h) + at(-h)) - at(2 * h) - at(-2 * h) - 30 * at(0.0)) / (12 * h**2)
-    wanted = float(curvature / tissue.boundary.area + (stress[0, 0] - stress[1, 1]) / 2)
-    assert mechanics.shear_modulus(tissue, energy, angle=0.0) == pytest.approx(wanted, rel=1e-5)
+    expected = float(curvature / tissue.boundary.area + (stress[0, 0] - stress[1, 1]) / 2)
+    assert mechanics.shear_modulus(tissue, energy, angle=0.0) == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_mean_over_directions(disordered):
+def test_default_shear_modulus_is_the_mean_over_directions(disordered):
     tissue, energy = disordered
     along = [mechanics.shear_modulus(tissue, energy, angle=a) for a in np.pi * np.arange(8) / 8]
     assert mechanics.shear_modulus(tissue, energy) == pytest.approx(np.mean(along))
@@ -123,9 +123,9 @@ def test_derivatives_of_relaxed_moduli_against_differences(disordered):
 
     p0, direction, h = energy.terms[1].target_perimeter, np.cos(np.arange(N)), 1e-4
     at = lambda s: float(moduli(p0 + s * h * direction))
-    wanted = (8 * (at(1) - at(-1)) - at(2) + at(-2)) / (12 * h)
+    expected = (8 * (at(1) - at(-1)) - at(2) + at(-2)) / (12 * h)
     slope = jax.jit(jax.grad(moduli))(p0)
-    assert np.sum(slope * direction) == pytest.approx(wanted, rel=1e-6)
+    assert np.sum(slope * direction) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -139,8 +139,8 @@ def test_second_derivatives_of_moduli_against_differences(disordered):
     p0, direction, h = energy.terms[1].target_perimeter, jnp.cos(jnp.arange(N)), 1e-4
     along = jax.jit(lambda p: jax.jvp(modulus, (p,), (direction,))[1])
     curvature = jax.jit(lambda p: jax.jvp(along, (p,), (direction,))[1])(p0)
-    wanted = (along(p0 + h * direction) - along(p0 - h * direction)) / (2 * h)
-    assert curvature == pytest.approx(float(wanted), rel=1e-5)
+    expected = (along(p0 + h * direction) - along(p0 - h * direction)) / (2 * h)
+    assert curvature == pytest.approx(float(expected), rel=1e-5)
 
 
 @pytest.mark.slow
@@ -152,15 +152,15 @@ def test_a_fluid_tissue_has_no_shear_modulus():
     assert mechanics.shear_modulus(tissue, energy, affine=True) > 0.1
 
 
-def test_a_coarser_solve_knows_the_modulus_as_well(disordered):
+def test_coarser_fallback_solve_gives_the_same_modulus(disordered):
     exact = mechanics.shear_modulus(*disordered)
-    # Of so few steps the first one comes to no end.
-    again = mechanics.shear_modulus(*disordered, linear_solver=vx.MINRES(max_steps=3))
-    assert again != exact
-    assert again == pytest.approx(float(exact), rel=1e-8)
+    # In 3 steps the first solve fails, and the fallback runs.
+    coarse = mechanics.shear_modulus(*disordered, linear_solver=vx.MINRES(max_steps=3))
+    assert coarse != exact
+    assert coarse == pytest.approx(float(exact), rel=1e-8)
 
 
-def test_what_is_refused(disordered):
+def test_invalid_arguments_raise(disordered):
     with pytest.raises(ValueError, match="must be periodic"):
         mechanics.shear_modulus(cluster(4, 1), AreaElasticity(1.0, 1.0))
     tissue, energy = disordered

@@ -30,74 +30,73 @@ FRICTION = SubstrateFriction(jnp.array(0.7)) + PerimeterViscosity(jnp.array(0.0)
 
 def test_plateaus_of_the_hexagonal_lattice(lattice):
     # Tong et al. 2022: with energies ½ K_P (P - P0)² and P0 = 0 these are 2√3 and 3√3 K_P.
-    found = mechanics.complex_modulus(lattice, elastic(jnp.array(0.0)), FRICTION, OMEGAS)
-    assert float(found[0].real) == pytest.approx(2 * np.sqrt(3), rel=1e-9)
-    assert float(found[-1].real) == pytest.approx(3 * np.sqrt(3), rel=1e-6)
-    assert (np.diff(found.real) > 0).all()
-    assert (found.imag[1:] > 0).all()
+    modulus = mechanics.complex_modulus(lattice, elastic(jnp.array(0.0)), FRICTION, OMEGAS)
+    assert float(modulus[0].real) == pytest.approx(2 * np.sqrt(3), rel=1e-9)
+    assert float(modulus[-1].real) == pytest.approx(3 * np.sqrt(3), rel=1e-6)
+    assert (np.diff(modulus.real) > 0).all()
+    assert (modulus.imag[1:] > 0).all()
     # One relaxation time: a standard linear solid.
     g0, g1 = 2 * np.sqrt(3), 3 * np.sqrt(3)
-    tau = np.asarray(found.imag / ((g1 - found.real) * OMEGAS))[1:3]
+    tau = np.asarray(modulus.imag / ((g1 - modulus.real) * OMEGAS))[1:3]
     np.testing.assert_allclose(tau, tau[0], rtol=1e-6)
     np.testing.assert_allclose(
-        found[1:3],
+        modulus[1:3],
         g0 + (g1 - g0) * (1j * OMEGAS[1:3] * tau) / (1 + 1j * OMEGAS[1:3] * tau),
         rtol=1e-6,
     )
 
 
 @pytest.mark.slow
-def test_viscosity_of_perimeters_against_a_dense_solution(lattice):
-    # A disordered configuration of as many cells, so that nothing vanishes by symmetry.
+def test_perimeter_viscosity_against_a_dense_solution(lattice):
+    # A disordered configuration, so that nothing vanishes by symmetry.
     tissue = random_tissue(16, 3)
     energy = elastic(jnp.array(3.0))
-    resistance = SubstrateFriction(jnp.array(0.7)) + PerimeterViscosity(jnp.array(0.4))
-    found = mechanics.complex_modulus(tissue, energy, resistance, OMEGAS, angle=0.0)
+    viscosity = SubstrateFriction(jnp.array(0.7)) + PerimeterViscosity(jnp.array(0.4))
+    modulus = mechanics.complex_modulus(tissue, energy, viscosity, OMEGAS, angle=0.0)
 
     strain = jnp.array([[0.0, 0.5], [0.5, 0.0]])
 
-    def there(z):
+    def displaced(z):
         gradient = jnp.eye(2) + z[0] * strain + 0.5 * z[0] ** 2 * strain @ strain
         return mechanics.deformed(
             tissue.with_vertices(tissue.vertices + z[1:].reshape(-1, 2)), gradient
         )
 
     zero = jnp.zeros(65)
-    stiff = np.asarray(jax.jit(jax.hessian(lambda z: energy(there(z))))(zero))
-    viscous = np.asarray(jax.jit(jax.hessian(lambda z: resistance(there(z), tissue, 1.0)))(zero))
-    for omega, value in zip(OMEGAS[1:3], found[1:3], strict=True):
+    stiff = np.asarray(jax.jit(jax.hessian(lambda z: energy(displaced(z))))(zero))
+    viscous = np.asarray(jax.jit(jax.hessian(lambda z: viscosity(displaced(z), tissue, 1.0)))(zero))
+    for omega, value in zip(OMEGAS[1:3], modulus[1:3], strict=True):
         k = stiff + 1j * float(omega) * viscous
-        wanted = (k[0, 0] - k[0, 1:] @ np.linalg.solve(k[1:, 1:], k[1:, 0])) / 16
-        assert complex(value) == pytest.approx(wanted, rel=1e-7)
+        expected = (k[0, 0] - k[0, 1:] @ np.linalg.solve(k[1:, 1:], k[1:, 0])) / 16
+        assert complex(value) == pytest.approx(expected, rel=1e-7)
 
 
-def test_sparse_factorisations_give_what_the_dense_decomposition_does():
-    # Not at rest, but under so much tension that the Hessian is positive all the same.
-    # Near enough to rest that the Hessian is positive, and nothing vanishes by symmetry.
+def test_sparse_and_dense_methods_agree():
+    # Not at rest, but the tension makes the Hessian positive, and nothing vanishes by symmetry.
     tissue, energy = vx.initialise.hexagonal(6, 6), ShapeFactorEnergy(shape_factors(36, 3.5, 0.02))
     friction = SubstrateFriction(0.7) + PerimeterViscosity(0.4)
     omegas = jnp.array([0.0, 0.3, 2.0, 1e4])
-    found = [
+    tensors = [
         mechanics.complex_modulus(tissue, energy, friction, omegas, method="dense"),
         mechanics.complex_modulus(tissue, energy, friction, omegas, method="sparse"),
     ]
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-8)
-    by = lambda p: mechanics.complex_modulus(
+    np.testing.assert_allclose(tensors[1], tensors[0], rtol=1e-8)
+    sparse_modulus = lambda p: mechanics.complex_modulus(
         tissue, ShapeFactorEnergy(p), friction, 1.0, method="sparse"
     )
     with pytest.raises(TypeError, match='"sparse" only for an AbstractLocalEnergy'):
-        jax.jit(by)(3.4)
+        jax.jit(sparse_modulus)(3.4)
 
 
 @pytest.mark.slow
 def test_derivatives_against_differences(lattice):
     def loss(p0):
-        found = mechanics.complex_modulus(lattice, elastic(p0), FRICTION, OMEGAS)
-        return jnp.sum(found.real) + 2 * jnp.sum(found.imag)
+        modulus = mechanics.complex_modulus(lattice, elastic(p0), FRICTION, OMEGAS)
+        return jnp.sum(modulus.real) + 2 * jnp.sum(modulus.imag)
 
     p0, h = jnp.array(2.0), 1e-5
-    wanted = (loss(p0 + h) - loss(p0 - h)) / (2 * h)
-    assert jax.jit(jax.grad(loss))(p0) == pytest.approx(float(wanted), rel=1e-6)
+    expected = (loss(p0 + h) - loss(p0 - h)) / (2 * h)
+    assert jax.jit(jax.grad(loss))(p0) == pytest.approx(float(expected), rel=1e-6)
 
 
 @pytest.mark.thorough
@@ -113,7 +112,7 @@ def test_recoil_against_a_dense_solution():
 
 
 @pytest.mark.slow
-def test_recoil_at_rest_is_the_first_motion_of_a_tissue_without_that_tension():
+def test_recoil_is_the_initial_velocity_without_the_tension():
     n = 12
     energy = ShapeFactorEnergy(shape_factors(n, 3.5, 0.1))
     tissue = FIXED_TOPOLOGY(random_tissue(n, 1), energy).tissue
@@ -137,15 +136,15 @@ def test_recoil_at_rest_is_the_first_motion_of_a_tissue_without_that_tension():
     np.testing.assert_allclose(moved, velocity, atol=2e-3 * np.abs(velocity).max())
 
 
-def test_a_tissue_on_a_summit_has_no_modulus():
+def test_modulus_at_an_energy_maximum_is_nan():
     tissue = random_tissue(9, 1)
-    # The energy falls in all directions, and perimeters resist some.
+    # The energy decreases in all directions, and the viscosity of perimeters damps only some.
     energy = PerimeterElasticity(jnp.array(-1.0), jnp.zeros(9))
-    found = mechanics.complex_modulus(tissue, energy, PerimeterViscosity(1.0), jnp.ones(1))
-    assert np.isnan(found).all()
+    modulus = mechanics.complex_modulus(tissue, energy, PerimeterViscosity(1.0), jnp.ones(1))
+    assert np.isnan(modulus).all()
 
 
-def test_what_is_refused(lattice):
+def test_invalid_arguments_raise(lattice):
     with pytest.raises(ValueError, match="at least 0"):
         mechanics.complex_modulus(lattice, elastic(jnp.array(3.0)), FRICTION, jnp.array([-1.0]))
     with pytest.raises(ValueError, match="one of the 48 edges"):

@@ -22,16 +22,16 @@ ENERGY = (
 tissue = random_tissue(N, 2)
 
 
-def test_pressures_and_tensions_are_those_of_the_terms():
+def test_pressures_and_tensions_are_sums_over_terms():
     area, perimeter, tension = ENERGY.terms
     np.testing.assert_allclose(mechanics.pressures(tissue, ENERGY), area.pressures(tissue))
     pull = perimeter.stiffness * (tissue.perimeters - perimeter.target_perimeter)
-    wanted = tension.tension + np.sum(np.asarray(pull)[tissue.topology.edge_cells], axis=1)
-    np.testing.assert_allclose(mechanics.tensions(tissue, ENERGY), wanted)
+    expected = tension.tension + np.sum(np.asarray(pull)[tissue.topology.edge_cells], axis=1)
+    np.testing.assert_allclose(mechanics.tensions(tissue, ENERGY), expected)
 
 
-def test_pressures_and_tensions_give_all_forces_of_an_energy_of_shapes():
-    # E1 as another class would write it: of shape factors alone, which mix areas and lengths.
+def test_pressures_and_tensions_determine_all_forces():
+    # The energy of shape factors as another class, because shape factors mix areas and lengths.
     class Shapes(vx.AbstractEnergy):
         target: float
 
@@ -53,7 +53,7 @@ def energy_of(tissue, energy, gradient):
     return energy(mechanics.deformed(tissue, gradient))
 
 
-def by_differences(tissue, energy, step=1e-6):
+def stress_by_differences(tissue, energy, step=1e-6):
     slope = np.zeros((2, 2))
     for index in np.ndindex(2, 2):
         move = np.zeros((2, 2))
@@ -64,23 +64,23 @@ def by_differences(tissue, energy, step=1e-6):
 
 
 def test_stress_against_differences_of_the_box():
-    wanted = by_differences(tissue, ENERGY) / tissue.boundary.area
-    np.testing.assert_allclose(mechanics.stress(tissue, ENERGY), wanted, atol=1e-8)
+    expected = stress_by_differences(tissue, ENERGY) / tissue.boundary.area
+    np.testing.assert_allclose(mechanics.stress(tissue, ENERGY), expected, atol=1e-8)
 
 
 @settings(max_examples=5, deadline=None)
 @given(turn=st.floats(-3, 3), shift=st.floats(-2, 2))
-def test_stress_is_symmetric_and_turns_with_the_tissue(turn, shift):
+def test_stress_is_symmetric_and_rotates_with_the_tissue(turn, shift):
     c, s = np.cos(turn), np.sin(turn)
     rotation = jnp.array([[c, -s], [s, c]])
     turned = mechanics.deformed(tissue.with_vertices(tissue.vertices + shift), rotation)
     stress = mechanics.stress(tissue, ENERGY)
-    found = mechanics.stress(turned, ENERGY)
-    np.testing.assert_allclose(found, found.T, atol=1e-12)
-    np.testing.assert_allclose(found, rotation @ stress @ rotation.T, atol=1e-12)
+    turned_stress = mechanics.stress(turned, ENERGY)
+    np.testing.assert_allclose(turned_stress, turned_stress.T, atol=1e-12)
+    np.testing.assert_allclose(turned_stress, rotation @ stress @ rotation.T, atol=1e-12)
 
 
-def test_cells_average_to_the_whole():
+def test_area_weighted_mean_of_cell_stresses_is_the_stress():
     cells = mechanics.cell_stress(tissue, ENERGY)
     mean = np.tensordot(tissue.areas, cells, 1) / tissue.boundary.area
     np.testing.assert_allclose(mean, mechanics.stress(tissue, ENERGY), atol=1e-12)
@@ -88,20 +88,20 @@ def test_cells_average_to_the_whole():
 
 
 @pytest.mark.slow
-def test_a_free_cluster_at_rest_is_without_stress_and_its_cells_are_not():
+def test_stress_of_a_free_cluster_at_rest_is_zero():
     start = cluster(7, 1)
     energy = AreaElasticity(20.0, 1.0) + LineTension(jnp.linspace(0.8, 1.2, start.n_edges))
     free = vx.equilibrate(start, energy, transitions=None, contact_range=None).tissue
     cells = np.asarray(mechanics.cell_stress(free, energy))
     assert np.abs(cells).max() > 0.1
     np.testing.assert_allclose(mechanics.stress(free, energy), 0, atol=1e-8)
-    # To the softening of lengths, which areas do not have.
+    # Zero up to the softening of lengths, which areas do not have.
     np.testing.assert_allclose(np.tensordot(free.areas, cells, 1), 0, atol=1e-6)
 
 
 @pytest.mark.slow
-def test_the_integral_of_tangents_along_arcs():
-    # Against many points on each arc; not at rest, and some arcs bulge inward.
+def test_cell_stress_of_arcs_against_sums_over_points():
+    # The reference sums over 4000 segments of each arc. The tissue is not at rest; some arcs bulge inward.
     start = cluster(5, 3)
     free = start.with_angles(jnp.linspace(-1.2, 1.3, start.n_edges))
     one = LineTension(jnp.zeros(start.n_edges).at[:].set(1.0))
@@ -110,12 +110,12 @@ def test_the_integral_of_tangents_along_arcs():
     lengths = np.linalg.norm(steps, axis=-1, keepdims=True)
     tangents = np.einsum("eni,enj->eij", steps / np.where(lengths > 0, lengths, 1), steps)
     cells = np.asarray(free.topology.edge_cells)
-    wanted = np.zeros((free.n_cells, 2, 2))
+    expected = np.zeros((free.n_cells, 2, 2))
     for e, pair in enumerate(cells):
         inside = pair[pair < free.n_cells]
-        wanted[inside] += tangents[e] / inside.size
-    found = np.asarray(mechanics.cell_stress(free, one)) * np.asarray(free.areas)[:, None, None]
-    np.testing.assert_allclose(found, wanted, atol=2e-5)
+        expected[inside] += tangents[e] / inside.size
+    moments = np.asarray(mechanics.cell_stress(free, one)) * np.asarray(free.areas)[:, None, None]
+    np.testing.assert_allclose(moments, expected, atol=2e-5)
 
 
 def test_principal_stresses():

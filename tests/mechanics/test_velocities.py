@@ -1,4 +1,4 @@
-"""Velocities, and what other solvers of differential equations make of them."""
+"""Velocities, and their integration by the solvers of Diffrax."""
 
 import diffrax
 import equinox as eqx
@@ -16,7 +16,7 @@ from vertax.mechanics import velocities
 ENERGY = ShapeFactorEnergy(jnp.linspace(3.5, 3.8, 9))
 
 
-def test_they_balance_forces_and_resistance():
+def test_velocities_balance_forces_and_dissipation():
     tissue = random_tissue(9, 4)
     friction, viscosity = jnp.linspace(0.5, 2, 18), 0.3
     force = -jax.grad(lambda x: ENERGY(tissue.with_vertices(x)))(tissue.vertices)
@@ -30,7 +30,7 @@ def test_they_balance_forces_and_resistance():
     np.testing.assert_allclose(both.ravel(), dense, rtol=1e-8, atol=1e-10)
 
 
-def test_pinned_vertices_stand_still_and_gradients_are_right():
+def test_pinned_vertices_have_zero_velocity_and_gradients_match_differences():
     free = random_tissue(9, 4)
     tissue = vx.Tissue(
         free.vertices, free.topology, free.boundary, free.softening, pinned=jnp.arange(18) < 2
@@ -39,19 +39,21 @@ def test_pinned_vertices_stand_still_and_gradients_are_right():
 
     @eqx.filter_jit
     def work(targets):
-        found = velocities(tissue, ShapeFactorEnergy(targets), SubstrateFriction(2.0), throw=False)
-        return jnp.sum(weights * found), found
+        velocity = velocities(
+            tissue, ShapeFactorEnergy(targets), SubstrateFriction(2.0), throw=False
+        )
+        return jnp.sum(weights * velocity), velocity
 
     targets = ENERGY.target_shape_factor
-    gradient, found = jax.grad(work, has_aux=True)(targets)
-    np.testing.assert_array_equal(found[:2], 0)
+    gradient, velocity = jax.grad(work, has_aux=True)(targets)
+    np.testing.assert_array_equal(velocity[:2], 0)
     direction = random_like(targets, 3)
     slope = central_difference(lambda p: work(p)[0], targets, direction)
     np.testing.assert_allclose(jnp.sum(gradient * direction), slope, rtol=1e-6)
 
 
 @pytest.mark.thorough
-def test_explicit_steps_of_diffrax_go_where_implicit_ones_go():
+def test_explicit_steps_of_diffrax_converge_to_evolve():
     tissue = FIXED_TOPOLOGY(random_tissue(9, 4), ENERGY).tissue
     start = tissue.with_vertices(tissue.vertices + 0.02 * random_like(tissue.vertices, 7))
     friction = SubstrateFriction(1.5)

@@ -1,4 +1,4 @@
-"""Adjoints: how to differentiate through an equilibrium."""
+"""Adjoints: methods to differentiate through an equilibrium."""
 
 from vertax.adjoints._adjoint import (
     AbstractAdjoint as AbstractAdjoint,

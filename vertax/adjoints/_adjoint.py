@@ -1,4 +1,4 @@
-"""What every adjoint here has in common."""
+"""The abstract class of adjoints, and functions that all of them share."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from vertax._base.tracing import is_concrete
 
 
 def _floating(x: ArrayLike) -> Array:
-    # An outcome is handed over as a gradient, and gradients are floating-point arrays.
+    # An outcome is returned in the place of a gradient, and gradients are floating-point arrays.
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
 
 
 class GradientOutcome(eqx.Module):
-    r"""How a gradient through an equilibrium came about.
+    r"""Diagnostics of a gradient through an equilibrium.
 
-    All methods solve $H\,\lambda = \partial C / \partial X$ in their own way, so their outcomes compare.
+    All methods solve $H\,\lambda = \partial C / \partial X$, each in a different way, so their diagnostics
+    are comparable.
 
-    Plain JAX hands it over as the "gradient" with respect to an empty outcome that was given to the
-    adjoint; [`InverseProblem.value_and_gradient`][vertax.InverseProblem.value_and_gradient] and
-    [`fit`][vertax.fit] do that by themselves:
+    [`InverseProblem.value_and_gradient`][vertax.InverseProblem.value_and_gradient] and
+    [`fit`][vertax.fit] return it. In plain JAX it is the "gradient" with respect to an empty outcome that is
+    passed to the adjoint:
 
     ```python
     def loss(energy, outcome):
@@ -38,60 +39,61 @@ class GradientOutcome(eqx.Module):
     """
 
     residual: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """What is left of the linear system, relative to its right-hand side."""
+    """Norm of the residual of the linear system, relative to its right-hand side."""
     num_steps: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
     """Steps of the linear solver, of the nudged relaxations, or of the unrolled relaxation."""
     negative_curvature: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """1 if the Hessian was seen to have a negative eigenvalue, so that the equilibrium is a saddle; NaN
-    if the method cannot tell."""
+    """1 if the method detected a negative eigenvalue of the Hessian, so that the equilibrium is a saddle; NaN
+    if the method does not compute this."""
     failed: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """1 if the gradient cannot be trusted, otherwise 0."""
+    """1 if the gradient is unreliable, otherwise 0."""
     degenerate: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """1 if the equilibrium is not unique along motions that the cost depends on, so that there is no
-    gradient, or if these motions are too soft for the nudge of equilibrium propagation; NaN if the method
-    cannot tell."""
+    """1 if the equilibrium is not unique along motions that the cost depends on, so that the gradient does
+    not exist, or if these motions are too soft for the nudge of equilibrium propagation; NaN if the method
+    does not compute this."""
 
     @property
     def trusted(self) -> Bool[Array, "*batch"]:
-        """Whether the gradient can be trusted."""
+        """Whether the gradient is reliable, `failed == 0`."""
         return self.failed == 0
 
 
 class AbstractAdjoint(optx.AbstractAdjoint):
-    """A way to differentiate through an equilibrium.
+    """A method to differentiate through an equilibrium.
 
-    [`equilibrate`][vertax.equilibrate] first finds the equilibrium and its topology without gradients.
-    The adjoint then sees a minimisation in this topology that starts, and ends, there. The options of
-    the minimisation hold what found it: the `relaxation`, a minimiser; the configuration that it set
-    out from after the last T1 transition, `start`; and typical sizes, `stiffness` and `length_scale`.
-    An adjoint that `unrolls` the steps of the relaxation needs a solver that is `unrollable`.
+    1. [`equilibrate`][vertax.equilibrate] computes the equilibrium and its topology without gradients.
+    2. The adjoint differentiates a minimisation in this topology that starts and ends at this equilibrium.
+
+    The options of the minimisation are: `relaxation`, the minimiser of the first step; `start`, its
+    configuration after the last T1 transition; and the units `stiffness` and `length_scale`. An adjoint
+    with `unrolls = True` needs a solver with `unrollable = True`.
 
     **Arguments:**
 
-    - `throw`: raise an error rather than return a gradient that cannot be trusted.
-    - `outcome`: an empty [`GradientOutcome`][vertax.GradientOutcome], whose own "gradient" becomes the
-        outcome; reverse mode only.
+    - `throw`: raise an error for an unreliable gradient instead of returning it.
+    - `outcome`: an empty [`GradientOutcome`][vertax.GradientOutcome]: its "gradient" is the outcome; reverse
+        mode only.
     """
 
     unrolls: ClassVar[bool] = False
     reasons: ClassVar[tuple[str, str]]
-    """The errors for a gradient that cannot be trusted: in general, and where it is degenerate."""
+    """The error messages for an unreliable gradient: in general, and at a degenerate equilibrium."""
 
     throw: eqx.AbstractVar[bool]
     outcome: eqx.AbstractVar[GradientOutcome | None]
 
     def without_outcome(self) -> AbstractAdjoint:
-        """The same adjoint, which tells nobody how it went."""
+        """A copy without diagnostics."""
         return eqx.tree_at(lambda a: a.outcome, self, None, is_leaf=lambda x: x is None)
 
     def with_outcome(self, outcome: GradientOutcome) -> AbstractAdjoint:
-        """The same adjoint with somewhere to put its outcome."""
+        """A copy with an empty outcome, to return diagnostics."""
         return eqx.tree_at(lambda a: a.outcome, self, outcome, is_leaf=lambda x: x is None)
 
 
-UNTRUSTED = 0.01
-"""The largest relative residual of a gradient that counts as solved: of the linear system, or of the force of
-a nudged tissue."""
+MAX_RELATIVE_RESIDUAL = 0.01
+"""The largest relative residual of a reliable gradient: of the linear system, or of the force on a nudged
+tissue."""
 
 DEGENERATE = (
     "the equilibrium is not unique. Along some motions (vertax.mechanics.zero_modes counts them) the tissue "
@@ -101,33 +103,33 @@ DEGENERATE = (
 
 
 def frozen(tree: PyTree) -> PyTree:
-    """The same values, taken for constants by differentiation."""
-    # (An array that is no tracer is a constant already, and a call of JAX takes ten microseconds.)
+    """The same values as constants: derivatives through them are 0."""
+    # (Concrete arrays are constants already, and a call of `stop_gradient` takes ten microseconds.)
     constant = lambda x: x if is_concrete(x) else jax.lax.stop_gradient(x)
     return jax.tree.map(constant, tree)
 
 
-def settle(
+def finish_gradient(
     gradient: PyTree,
     outcome: GradientOutcome,
     throw: bool,
     like: GradientOutcome | None,
     reasons: tuple[str, str],
 ) -> tuple[PyTree, GradientOutcome | None]:
-    """Raise an error for a gradient that cannot be trusted, and shape the outcome as the slot it goes to.
+    """Raise an error for an unreliable gradient if `throw`, and cast the outcome to the dtypes of `like`.
 
-    The second of the reasons is that of a degenerate equilibrium.
+    The second of the reasons is for a degenerate equilibrium.
     """
     if throw:
-        number = jnp.where(outcome.degenerate == 1, 1, 0)
-        gradient = eqx.branched_error_if(gradient, ~outcome.trusted, number, reasons)
+        index = jnp.where(outcome.degenerate == 1, 1, 0)
+        gradient = eqx.branched_error_if(gradient, ~outcome.trusted, index, reasons)
     if like is None:
         return gradient, None
     return gradient, jax.tree.map(lambda x, slot: jnp.asarray(x, slot.dtype), outcome, like)
 
 
 def materialise(cotangent: PyTree[Array | None], like: PyTree[Array]) -> PyTree[Array]:
-    """A cotangent with its symbolic zeros written out."""
+    """A cotangent with arrays in the place of symbolic zeros."""
     zero = lambda g, x: jnp.zeros_like(x) if g is None else g
     return jax.tree.map(zero, cotangent, like, is_leaf=lambda g: g is None)
 

@@ -16,9 +16,9 @@ from vertax.adjoints._adjoint import (
     AbstractAdjoint,
     GradientOutcome,
     differentiable,
+    finish_gradient,
     frozen,
     materialise,
-    settle,
 )
 
 _REASON = (
@@ -31,27 +31,27 @@ _REASON = (
 class AutomaticDifferentiation(AbstractAdjoint):
     r"""Gradients through the unrolled steps of the relaxation (paper, Methods, "AD").
 
-    Reverse mode, with binomial checkpointing: of all steps a few are remembered and the others
-    computed again on the way back. The steps are those after the last T1 transition, which start from
-    a fixed configuration.
+    Reverse mode, with binomial checkpointing: some steps are stored and the others are computed again in the
+    backward pass. Only the steps after the last T1 transition are differentiated; their initial
+    configuration is a constant.
 
-    A tissue may be at rest long before the derivative of its position is: one that starts at rest takes
-    no step, and a gradient through no steps is zero. So the steps go on, at rest, until the derivative
-    along a random direction of the parameters has converged too, or `max_steps` are done.
+    The derivative of the configuration converges later than the configuration: a tissue that starts at rest
+    takes no step, and the gradient through no steps is 0. Therefore the steps continue at rest until the
+    derivative along a random direction of the parameters has converged, or up to `max_steps`.
 
-    It needs a solver whose steps can be differentiated: gradient descent, or an Optax optimiser without
-    a line search, such as `optax.sgd(1e-2, momentum=0.9)`.
+    The solver must have differentiable steps: gradient descent, or an Optax optimiser without a line
+    search, such as `optax.sgd(1e-2, momentum=0.9)`.
 
     **Arguments:**
 
-    - `checkpoints`: number of remembered steps. Fewer take less memory and more time: 16 take half as
-        much memory again as equilibrium propagation, and a fifth more time than
-        $\sqrt{2\,\mathtt{max\_steps}}$ of them.
+    - `checkpoints`: number of stored steps. Fewer need less memory and more time: 16 need 1.5 times the
+        memory of equilibrium propagation, and 1.2 times the time of
+        $\sqrt{2\,\mathtt{max\_steps}}$ checkpoints.
     - `rtol`: the derivative has converged when its residual force
         $H \frac{dX}{d\theta} + \nabla^2_{X\theta} E$ is smaller than its initial value by this factor.
         By default 1e-8 in float64 and 1e-3 in float32.
-    - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is not
-        trusted if `max_steps` ended it before it had converged.
+    - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is
+        unreliable if it has not converged after `max_steps`.
 
     **Raises:**
 
@@ -89,31 +89,31 @@ class AutomaticDifferentiation(AbstractAdjoint):
         root, residual = frozen(frozen(minimisation).run())
         vjp_arg = (minimisation.fn, minimisation.args, self.outcome)
         others = frozen(minimisation.replaced(fn=None, args=None))
-        return _unroll(vjp_arg, root, others, self.without_outcome()), residual
+        return _differentiate_steps(vjp_arg, root, others, self.without_outcome()), residual
 
-    def _rehearse(self, fn: Callable, args: PyTree, options: dict[str, Any]) -> GradientOutcome:
-        """How many steps it takes until the position and its derivative are at rest."""
-        # The gradient that a solver keeps in its state is g(X_n, θ). Its derivative along a direction of
-        # θ, H dX_n/dθ + ∂g/∂θ, is what is left of the linear system that the derivative solves.
+    def _count_steps(self, fn: Callable, args: PyTree, options: dict[str, Any]) -> GradientOutcome:
+        """Run the steps until the configuration and its derivative have converged, and count them."""
+        # The state of a solver holds the gradient g(X_n, θ). Its derivative along a direction of θ,
+        # H dX_n/dθ + ∂g/∂θ, is the residual of the linear system for dX/dθ.
         relaxation, y0 = options["relaxation"], options["start"]
         parameters, constants = differentiable(args)
         direction = _random_direction(parameters)
 
-        def begin(p: PyTree) -> tuple[tuple, tuple]:
+        def init(p: PyTree) -> tuple[tuple, tuple]:
             state = relaxation.init(fn, y0, eqx.combine(p, constants), options, None, None, None)
             return differentiable((y0, state))
 
         def step(p: PyTree, floats: tuple, others: tuple) -> tuple[tuple, tuple]:
             y, state = eqx.combine(floats, others)
-            at = eqx.combine(p, constants)
-            y, state, _ = relaxation.step(fn, y, at, options, state, None)
+            args = eqx.combine(p, constants)
+            y, state, _ = relaxation.step(fn, y, args, options, state, None)
             return differentiable((y, state))
 
         def residual(tangents: tuple) -> Float[Array, ""]:
             _, state = tangents
             return optx.max_norm(relaxation.gradient(state))
 
-        floats, tangents, others = jax.jvp(begin, (parameters,), (direction,), has_aux=True)
+        floats, tangents, others = jax.jvp(init, (parameters,), (direction,), has_aux=True)
         arrays, static = eqx.partition(others, eqx.is_array)
         initial = residual(tangents)
         rtol = (1e-8 if initial.dtype == jnp.float64 else 1e-3) if self.rtol is None else self.rtol
@@ -121,9 +121,9 @@ class AutomaticDifferentiation(AbstractAdjoint):
         def unfinished(carry: tuple) -> Bool[Array, ""]:
             floats, tangents, arrays = carry
             _, state = eqx.combine(floats, arrays, static)
-            settled = relaxation.at_rest(state) & (residual(tangents) <= rtol * initial)
+            converged = relaxation.at_rest(state) & (residual(tangents) <= rtol * initial)
             finite = jnp.isfinite(state.force) & jnp.isfinite(residual(tangents))
-            return ~settled & finite & (state.num_steps < options["max_steps"])
+            return ~converged & finite & (state.num_steps < options["max_steps"])
 
         def body(carry: tuple) -> tuple:
             floats, tangents, arrays = carry
@@ -135,18 +135,18 @@ class AutomaticDifferentiation(AbstractAdjoint):
 
         floats, tangents, arrays = jax.lax.while_loop(unfinished, body, (floats, tangents, arrays))
         _, state = eqx.combine(floats, arrays, static)
-        left = residual(tangents)
+        final = residual(tangents)
         return GradientOutcome(
-            left / jnp.where(initial > 0, initial, 1),
-            jnp.asarray(state.num_steps, left.dtype),
+            final / jnp.where(initial > 0, initial, 1),
+            jnp.asarray(state.num_steps, final.dtype),
             jnp.nan,
-            jnp.asarray(~(left <= rtol * initial), left.dtype),
+            jnp.asarray(~(final <= rtol * initial), final.dtype),
             jnp.nan,
         )
 
 
 def _random_direction(parameters: PyTree[Array]) -> PyTree[Array]:
-    """A change of all parameters that is of the order of each."""
+    """A random change of all parameters, scaled by the size of each."""
     leaves, structure = jax.tree.flatten(parameters)
     keys = jax.random.split(jax.random.key(0), max(len(leaves), 1))
 
@@ -157,17 +157,16 @@ def _random_direction(parameters: PyTree[Array]) -> PyTree[Array]:
 
 
 @eqx.filter_custom_vjp
-def _unroll(
+def _differentiate_steps(
     vjp_arg: tuple[Any, Any, GradientOutcome | None],
     root: PyTree[Array],
     others: Minimisation,
     adjoint: AutomaticDifferentiation,
 ) -> PyTree[Array]:
-    # Who does not differentiate needs no second run.
-    return root
+    return root  # without differentiation no second run is needed
 
 
-@_unroll.def_fwd
+@_differentiate_steps.def_fwd
 def _(
     perturbed: Any,
     vjp_arg: Any,
@@ -177,7 +176,7 @@ def _(
 ) -> tuple:
     fn, args, _ = vjp_arg
     options = others.options
-    outcome = adjoint._rehearse(fn, args, options)
+    outcome = adjoint._count_steps(fn, args, options)
     unrolled = others.replaced(
         solver=options["relaxation"],
         y0=options["start"],
@@ -190,11 +189,11 @@ def _(
         steps = unrolled.replaced(fn=fn, args=args)
         return steps.run("checkpointed", checkpoints=adjoint.checkpoints)[0]
 
-    root, pull = jax.vjp(minimum, moving)
-    return root, (pull, outcome)
+    root, vjp = jax.vjp(minimum, moving)
+    return root, (vjp, outcome)
 
 
-@_unroll.def_bwd
+@_differentiate_steps.def_bwd
 def _(
     residuals: tuple,
     cotangent: PyTree,
@@ -205,7 +204,9 @@ def _(
     adjoint: AutomaticDifferentiation,
 ) -> Any:
     *_, slot = vjp_arg
-    pull, outcome = residuals
-    (gradient,) = pull(materialise(cotangent, root))
-    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, adjoint.reasons)
+    vjp, outcome = residuals
+    (gradient,) = vjp(materialise(cotangent, root))
+    (d_fn, d_args), outcome = finish_gradient(
+        gradient, outcome, adjoint.throw, slot, adjoint.reasons
+    )
     return d_fn, d_args, outcome

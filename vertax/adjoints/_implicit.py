@@ -17,12 +17,12 @@ from jaxtyping import Array, PyTree
 from vertax._base.optimistix import Minimisation
 from vertax.adjoints._adjoint import (
     DEGENERATE,
-    UNTRUSTED,
+    MAX_RELATIVE_RESIDUAL,
     AbstractAdjoint,
     GradientOutcome,
+    finish_gradient,
     frozen,
     materialise,
-    settle,
 )
 from vertax.precondition._preconditioned_minres import PreconditionedMINRES
 from vertax.precondition._recycled_hessian import RecycledHessian
@@ -44,26 +44,26 @@ class ImplicitDifferentiation(AbstractAdjoint):
 
     $$\frac{dX^*}{d\theta} = -H^{-1}\, \nabla^2_{X\theta} E, \qquad H = \nabla^2_X E.$$
 
-    Memory does not grow with the number of relaxation steps. The equilibrium must be a true one: an
-    error $g$ in the force leaves an error of order $H^{-1} g$ in the gradient. Forward and reverse mode
-    work, and higher derivatives.
+    Memory does not grow with the number of relaxation steps. The relaxation must have converged: a residual
+    force $g$ gives an error of order $H^{-1} g$ in the gradient. Forward and reverse mode work, and higher
+    derivatives.
 
     **Arguments:**
 
-    - `mode`: `"adjoint"` (Adj-ID) solves one system for each derivative asked for: in reverse mode one
-        for a cost, whatever the number of parameters. `"sensitivity"` (Sen-ID) solves the systems of
-        all parameters as one batch and multiplies by the result: for a forward-mode Jacobian, or for
-        comparison with the paper; time and memory grow with the number of parameters.
+    - `mode`: `"adjoint"` (Adj-ID) solves one system per derivative: in reverse mode one per cost,
+        independent of the number of parameters. `"sensitivity"` (Sen-ID) solves the systems of all
+        parameters as one batch and multiplies by the result: for a forward-mode Jacobian, or for comparison
+        with the paper; time and memory grow with the number of parameters.
     - `linear_solver`: solves the systems with the Hessian, which is symmetric and may be indefinite.
-    - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is not
-        trusted if the linear solver reports failure, or if the system $H \lambda = b$ is degenerate: it has
-        only a least-squares solution, with a residual above 1 %; the residual grew above $\|b\|$; or the
-        effective stiffness $\|b\| / \|\lambda\|$ is below
+    - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is unreliable
+        if the linear solver reports failure, or if the system $H \lambda = b$ is degenerate. It is degenerate
+        if (1) it has only a least-squares solution, with a relative residual above 1 %; or (2) the residual
+        is above $\|b\|$; or (3) the effective stiffness $\|b\| / \|\lambda\|$ is below
         $\max(\sqrt{\epsilon}\,k, 10\, f / \ell)$ with the mean stiffness $k$, the size of a cell $\ell$,
-        and the largest force $f$ that counts as equilibrium. (In units of $k$ that is 1.5e-8 in float64;
-        with less, $\lambda$ has no correct digit, or the position is not known to within $\ell / 10$.) The
-        systems of forward and of `"sensitivity"` mode do not hold the cost. There the result is the response
-        of least length, and degenerate if a parameter pushes along motions without stiffness.
+        and the force tolerance $f$ of the relaxation. (In units of $k$ that is 1.5e-8 in float64; below it
+        $\lambda$ has no correct digit, or the error of the position is above $\ell / 10$.) In forward and in
+        `"sensitivity"` mode the systems do not depend on the cost: their solution is the one of least norm,
+        and degenerate if a parameter exerts forces along motions without stiffness.
 
     **Raises:**
 
@@ -97,17 +97,13 @@ class ImplicitDifferentiation(AbstractAdjoint):
         options = minimisation.options
         preconditioner = options.get("preconditioner", Preconditioner(None, None))
         coarse = preconditioner.coarse
-        # (For a batch of systems products with a dense matrix take more time than they save.)
+        # (A dense matrix does not pay for a batch of systems.)
         dense = isinstance(coarse, RecycledHessian) and self.mode == "sensitivity"
         if coarse is not None and not dense and isinstance(self.linear_solver, MINRES):
             solver = PreconditionedMINRES(self.linear_solver, preconditioner, options["stiffness"])
             adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
         system = _System(
-            adjoint,
-            rewrite_fn,
-            residual,
-            tags | {lx.symmetric_tag},
-            _least_stiffness(options, root),
+            adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag}, _min_stiffness(options, root)
         )
         if self.outcome is None:
             return _follow(inputs, root, system), residual
@@ -121,7 +117,7 @@ class _System(eqx.Module):
     rewrite_fn: Callable = eqx.field(static=True)
     residual: PyTree
     tags: frozenset[object] = eqx.field(static=True)
-    least_stiffness: Array
+    min_stiffness: Array
 
     def force(self, root: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
         return self.rewrite_fn(root, self.residual, inputs)
@@ -130,14 +126,14 @@ class _System(eqx.Module):
         self, root: PyTree[Array], inputs: PyTree, rhs: PyTree[Array], *, strict: bool = False
     ) -> tuple[PyTree[Array], GradientOutcome]:
         operator = lx.JacobianLinearOperator(self.force, root, inputs, tags=self.tags)
-        solver = _Judged(self.adjoint.linear_solver, self.least_stiffness, strict)
+        solver = _ReportingSolver(self.adjoint.linear_solver, self.min_stiffness, strict)
         solution = lx.linear_solve(operator, rhs, solver, throw=False)
         return solution.value, solution.stats["outcome"]
 
     def tangent(
         self, root: PyTree[Array], inputs: PyTree, t_inputs: PyTree, *, strict: bool = False
     ) -> tuple[PyTree[Array], GradientOutcome]:
-        """How the root moves with the inputs; `t_inputs` is None where they are fixed."""
+        """The derivative of the root along a tangent of the inputs; None entries are fixed inputs."""
         moving, fixed = _split(inputs, t_inputs)
         force = lambda m: self.force(root, eqx.combine(m, fixed))
         _, rhs = jax.jvp(force, (moving,), (t_inputs,))
@@ -147,27 +143,27 @@ class _System(eqx.Module):
     def sensitivities(
         self, root: PyTree[Array], inputs: PyTree, t_inputs: PyTree, *, strict: bool = False
     ) -> tuple[PyTree[Array], GradientOutcome]:
-        """How the root moves with each number in those inputs that have a tangent, along a new first
+        """The Jacobian of the root by the inputs that have a tangent: one row per number, on a new first
         axis."""
         moving, _ = _split(inputs, t_inputs)
         flat, unravel = ravel_pytree(moving)
 
         def one(direction: Array) -> tuple[PyTree[Array], GradientOutcome]:
-            t = _like(unravel(direction), t_inputs)
+            t = _with_structure_of(unravel(direction), t_inputs)
             return self.tangent(root, inputs, t, strict=strict)
 
         return jax.vmap(one)(jnp.eye(flat.size, dtype=flat.dtype))
 
 
-class _Judged(lx.AbstractLinearSolver):
+class _ReportingSolver(lx.AbstractLinearSolver):
     """A linear solver that returns a `GradientOutcome` in its statistics, and always reports success.
 
-    If `strict`, it raises an error for an outcome that cannot be trusted. (Lineax raises its own errors in
-    transposed solves, whatever `throw` is, and does not know what a failure means for an equilibrium.)
+    If `strict`, it raises an error for an unreliable outcome. (Lineax raises errors in transposed solves
+    even with `throw=False`, and its messages do not mention the equilibrium.)
     """
 
     solver: lx.AbstractLinearSolver
-    least_stiffness: Array
+    min_stiffness: Array
     strict: bool = eqx.field(static=True)
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
@@ -177,26 +173,28 @@ class _Judged(lx.AbstractLinearSolver):
         self, state: Any, vector: PyTree[Array], options: dict[str, Any]
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         solution, result, stats = self.solver.compute(state, vector, options)
-        known = lambda name: jnp.asarray(stats.get(name, jnp.nan), float)
-        residual, failed = known("residual_norm"), result != lx.RESULTS.successful
+        stat = lambda name: jnp.asarray(stats.get(name, jnp.nan), float)
+        residual, failed = stat("residual_norm"), result != lx.RESULTS.successful
         rhs, response = optx.two_norm(vector), optx.two_norm(solution)
-        soft = (rhs > 0) & (rhs < self.least_stiffness * response)
-        # MINRES lowers the residual in each step. It ends above that of 0, or far from a solution, only where
-        # rounding errors along null vectors grow without bound.
-        far = (residual > 1) | ((known("stagnated") == 1) & (residual > UNTRUSTED))
-        diverged = failed & (far | (result == lx.RESULTS.singular))
-        degenerate = soft | diverged | ((known("inconsistent") == 1) & (residual > UNTRUSTED))
+        soft = (rhs > 0) & (rhs < self.min_stiffness * response)
+        # The residual of MINRES decreases in each step. A final residual above |b|, or stagnation at a large
+        # residual, occurs only if rounding errors along null vectors grow without bound.
+        large = (residual > 1) | ((stat("stagnated") == 1) & (residual > MAX_RELATIVE_RESIDUAL))
+        diverged = failed & (large | (result == lx.RESULTS.singular))
+        degenerate = (
+            soft | diverged | ((stat("inconsistent") == 1) & (residual > MAX_RELATIVE_RESIDUAL))
+        )
         outcome = GradientOutcome(
             residual,
-            known("num_steps"),
-            known("negative_curvature"),
+            stat("num_steps"),
+            stat("negative_curvature"),
             failed | degenerate,
             degenerate,
         )
         outcome = jax.tree.map(lambda x: x.astype(float), outcome)
         if self.strict:
-            number = jnp.where(degenerate, 1, 0)
-            solution = eqx.branched_error_if(solution, ~outcome.trusted, number, _REASONS)
+            index = jnp.where(degenerate, 1, 0)
+            solution = eqx.branched_error_if(solution, ~outcome.trusted, index, _REASONS)
         return solution, lx.RESULTS.successful, stats | {"outcome": outcome}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
@@ -209,14 +207,14 @@ class _Judged(lx.AbstractLinearSolver):
         return self.solver.assume_full_rank()
 
 
-def _least_stiffness(options: dict[str, Any], root: PyTree[Array]) -> Array:
-    """The effective stiffness below which a system counts as degenerate, see the class; 0 if unknown."""
+def _min_stiffness(options: dict[str, Any], root: PyTree[Array]) -> Array:
+    """The effective stiffness below which a system is degenerate, see the class; 0 without units."""
     dtype = jnp.result_type(*jax.tree.leaves(root))
     if not {"stiffness", "length_scale", "tolerance"} <= options.keys():
         return jnp.zeros((), dtype)
     rounding = jnp.finfo(dtype).eps ** 0.5 * options["stiffness"]
-    uncertain = 10 * options["tolerance"] / options["length_scale"]
-    return jnp.asarray(jnp.maximum(rounding, uncertain), dtype)
+    positional = 10 * options["tolerance"] / options["length_scale"]
+    return jnp.asarray(jnp.maximum(rounding, positional), dtype)
 
 
 def _split(inputs: PyTree, t_inputs: PyTree) -> tuple[PyTree, PyTree]:
@@ -225,7 +223,7 @@ def _split(inputs: PyTree, t_inputs: PyTree) -> tuple[PyTree, PyTree]:
     return moving, fixed
 
 
-def _like(tangent: PyTree, structure: PyTree) -> PyTree:
+def _with_structure_of(tangent: PyTree, structure: PyTree) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(structure), jax.tree.leaves(tangent))
 
 
@@ -238,7 +236,7 @@ def _follow(inputs: PyTree, root: PyTree[Array], system: _System) -> PyTree[Arra
 def _(primals: tuple, tangents: tuple) -> tuple[PyTree[Array], PyTree[Array]]:
     inputs, _, system = primals
     t_inputs, *_ = tangents
-    # The root itself depends on the inputs, which matters for second derivatives.
+    # The root depends on the inputs too: second derivatives need its tangent.
     root = _follow(*primals)
     strict = system.adjoint.throw
     if system.adjoint.mode == "adjoint":
@@ -272,8 +270,8 @@ def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, root: Any, 
     cotangent = materialise(cotangent, root)
     if system.adjoint.mode == "adjoint":
         multiplier, outcome = system.solve(root, inputs, cotangent)
-        _, pull = jax.vjp(lambda m: system.force(root, eqx.combine(m, fixed)), moving)
-        gradient = jax.tree.map(jnp.negative, pull(multiplier)[0])
+        _, vjp = jax.vjp(lambda m: system.force(root, eqx.combine(m, fixed)), moving)
+        gradient = jax.tree.map(jnp.negative, vjp(multiplier)[0])
     else:
         columns, outcomes = system.sensitivities(root, inputs, moving)
         parts = jax.tree.map(lambda c, g: jnp.tensordot(c, g, g.ndim), columns, cotangent)
@@ -285,4 +283,4 @@ def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, root: Any, 
             jnp.max(outcomes.failed),
             jnp.max(outcomes.degenerate),
         )
-    return settle(gradient, outcome, system.adjoint.throw, slot, _REASONS)
+    return finish_gradient(gradient, outcome, system.adjoint.throw, slot, _REASONS)

@@ -16,22 +16,22 @@ from jaxtyping import Array, Float, PyTree
 from vertax._base.optimistix import Minimisation, num_steps_of
 from vertax.adjoints._adjoint import (
     DEGENERATE,
-    UNTRUSTED,
+    MAX_RELATIVE_RESIDUAL,
     AbstractAdjoint,
     GradientOutcome,
     differentiable,
+    finish_gradient,
     frozen,
     materialise,
-    settle,
 )
 
-# For a force h x + c x² / 2 the nonlinearity is η = ε / 4 with ε = c f / h² under a nudge f. Expanding x in f
-# gives the relative error of the gradient: ε / 2 = 2 η for one nudge, ε² / 2 = 8 η² for two opposite ones. At
-# η = 1/2, which is also that of a force of second order alone, both are as large as the gradient or larger.
-_NONLINEAR = 0.5
+# For a force h x + c x² / 2 under a nudge f the nonlinearity is η = ε / 4 with ε = c f / h². Expanding x in f
+# gives the relative error of the gradient: ε / 2 = 2 η for one nudge, ε² / 2 = 8 η² for two opposite nudges.
+# At η = 1/2 both errors are at least as large as the gradient. (A purely quadratic force has η = 1/2.)
+_MAX_NONLINEARITY = 0.5
 NOT_LINEAR = (
     "The gradient by equilibrium propagation cannot be trusted: a small nudge moved the tissue so far that "
-    f"its response is not linear. As a rule {DEGENERATE}. (For a cost of shapes use "
+    f"its response is not linear. The usual reason: {DEGENERATE}. (For a cost of shapes use "
     "ImplicitDifferentiation: a nudged tissue also moves along motions that change them in second order "
     "only.) Otherwise the nudge is too strong: take a smaller `beta`. "
     "EquilibriumPropagation(throw=False) allows it."
@@ -47,37 +47,37 @@ _REASONS = (
 class EquilibriumPropagation(AbstractAdjoint):
     r"""Gradients from the response of the equilibrium to a nudge (paper, Methods, "EP").
 
-    A weak force along the gradient of the cost moves the equilibrium from $X^*$ to $X_{\pm\beta}$, and
+    A weak force along the gradient of the cost displaces the equilibrium from $X^*$ to $X_{\pm\beta}$, and
 
     $$\frac{dC}{d\theta} = \lim_{\beta\to 0} \frac1\beta \left(\frac{\partial E}{\partial\theta}
       (X_{+\beta}, \theta) - \frac{\partial E}{\partial\theta}(X_{-\beta}, \theta)\right).$$
 
-    It needs nothing but relaxations and $\partial E / \partial \theta$: no second derivative (other
-    than those of the solver) and no linear system. Reverse mode only. (Scellier & Bengio 2017,
+    It needs only relaxations and $\partial E / \partial \theta$: no second derivatives (other than
+    those of the solver) and no linear system. Reverse mode only. (Scellier & Bengio 2017,
     doi:10.3389/fncom.2017.00024; centred: Laborieux et al. 2021, doi:10.3389/fnins.2021.633674.)
 
     **Arguments:**
 
-    - `beta`: strength of the nudge. With a linear nudge it is the largest nudging force in units of
-        the mean stiffness times the size of a cell, so that one value suits every cost; by default
-        1e-5 in float64 and 1e-3 in float32, where a weaker nudge drowns in rounding. With the nudge by
-        the cost it is the $\beta$ of the paper, energy per cost; by default it is chosen so that the
+    - `beta`: strength of the nudge. With `nudge="linear"` it is the largest nudging force in units of
+        the mean stiffness times the size of a cell, so that the default suits every cost: 1e-5 in float64
+        and 1e-3 in float32, because rounding errors dominate the response to a weaker nudge. With
+        `nudge="cost"` it is the $\beta$ of the paper, energy per cost; by default it is chosen so that the
         nudging force is as above.
     - `nudge`: `"linear"` adds $\pm\tfrac\beta2\,\partial C/\partial X \cdot X$, a constant force on
-        each vertex. `"cost"` adds $\pm\tfrac\beta2\,C$ itself, and the nudged tissue may undergo T1
-        transitions, so that a cost of the topology steers them; the cost must be known, so this works
-        in an [`InverseProblem`][vertax.InverseProblem] only.
+        each vertex. `"cost"` adds $\pm\tfrac\beta2\,C$, and allows T1 transitions of the nudged tissue, so
+        that a cost can depend on the topology; the relaxation needs the cost, so this works in an
+        [`InverseProblem`][vertax.InverseProblem] only.
     - `centred`: relax with both signs, error $O(\beta^2)$; otherwise with one, error $O(\beta)$.
-    - `rtol`: tolerance of the nudged relaxations relative to the nudging force; they are never
-        coarser than the first relaxation. By default 1e-6 in float64 and 1e-3 in float32.
-    - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is not
-        trusted if a nudged relaxation ended with a force above 1 % of the nudging one, or if the response
-        to a linear nudge is not linear. Let $g(u)$ be $\nabla_X E$ after the fraction $u$ of the
-        displacement $D$ of a nudged tissue. In linear response
-        $(g(\tfrac12) - g(0)) \cdot D = \tfrac12 (g(1) - g(0)) \cdot D$; of a force that grows as $u^p$
-        the ratio of the two products is $2^{-p}$. The response counts as linear if the ratio lies between
-        1/4 and 3/4, $0.4 < p < 2$. Along motions without stiffness it does not: either nothing resists
-        ($p = 0$), or only terms of higher order do ($p \ge 2$).
+    - `rtol`: tolerance of the nudged relaxations relative to the nudging force; it never exceeds the
+        tolerance of the first relaxation. By default 1e-6 in float64 and 1e-3 in float32.
+    - `throw`, `outcome`: see [`AbstractAdjoint`][vertax.adjoints.AbstractAdjoint]. A gradient is
+        unreliable if a nudged relaxation ends with a force above 1 % of the nudging force, or if the response
+        to a linear nudge is not linear. Let $D$ be the displacement of a nudged tissue and $g(u)$ the
+        gradient $\nabla_X E$ after the fraction $u$ of it. The ratio
+        $(g(\tfrac12) - g(0)) \cdot D \,/\, (g(1) - g(0)) \cdot D$ is $\tfrac12$ for a linear response, and
+        $2^{-p}$ for a force that grows as $u^p$. The response counts as linear if the ratio lies between
+        1/4 and 3/4, $0.4 < p < 2$. Along motions without stiffness the ratio is outside: the force is zero
+        ($p = 0$), or of higher order ($p \ge 2$).
 
     **Raises:**
 
@@ -136,7 +136,7 @@ class EquilibriumPropagation(AbstractAdjoint):
 
 
 class _Nudged(eqx.Module):
-    """An objective with a constant force on every degree of freedom."""
+    """An objective plus a term linear in the configuration: a constant force on each degree of freedom."""
 
     fn: Callable
     slope: PyTree[Array]
@@ -173,9 +173,9 @@ def _(
 ) -> Any:
     fn, args, slot = vjp_arg
     options = others.options
-    # The solver of an equilibrium that is known takes no step; the relaxation that found it does.
+    # (`others.solver` may take no step, if the equilibrium is given. The nudged phases need the relaxation.)
     nudge = others.replaced(solver=options.get("relaxation", others.solver), y0=root, args=args)
-    coarsest = options.get("tolerance", jnp.inf)
+    max_tolerance = options.get("tolerance", jnp.inf)
     moving, fixed = differentiable((fn, args))
 
     def slope(y: PyTree[Array]) -> PyTree[Array]:
@@ -187,41 +187,42 @@ def _(
 
     def phase(force: PyTree[Array], strength: Float[Array, ""]) -> Phase:
         nudged = _Nudged(fn, force)
-        tolerance = jnp.minimum(coarsest, adjoint.tolerance(strength))
+        tolerance = jnp.minimum(max_tolerance, adjoint.tolerance(strength))
         y, residual = nudge.replaced(
             fn=nudged, options=options | {"tolerance": tolerance}
         ).run_as_constant()
-        along = Resistance.along(jax.grad(lambda y: fn(y, args)[0]), root, y)
-        left = optx.max_norm(jax.tree.map(jnp.add, along.force, force))
-        return Phase(slope(y), left, num_steps_of(residual), along.nonlinearity)
+        restoring = RestoringForce.along(jax.grad(lambda y: fn(y, args)[0]), root, y)
+        max_force = optx.max_norm(jax.tree.map(jnp.add, restoring.force, force))
+        return Phase(slope(y), max_force, num_steps_of(residual), restoring.nonlinearity)
 
     cotangent = materialise(cotangent, root)
     at_rest = None if adjoint.centred else slope(root)
-    gradient, outcome = two_phases(adjoint, cotangent, options, phase, at_rest)
-    (d_fn, d_args), outcome = settle(gradient, outcome, adjoint.throw, slot, _REASONS)
+    gradient, outcome = gradient_from_phases(adjoint, cotangent, options, phase, at_rest)
+    (d_fn, d_args), outcome = finish_gradient(gradient, outcome, adjoint.throw, slot, _REASONS)
     return d_fn, d_args, outcome
 
 
 class Phase(NamedTuple):
-    """A relaxation under a nudge."""
+    """The result of a relaxation under a nudge."""
 
     slope: PyTree[Array]
     """The partial derivative of the energy with respect to the parameters at the nudged equilibrium."""
-    left: Float[Array, ""]
+    max_force: Float[Array, ""]
     """The largest force there."""
     num_steps: Array
     """Steps of the relaxation."""
     nonlinearity: Float[Array, ""]
-    """See `Resistance`; NaN if it is not known."""
+    """See `RestoringForce`; NaN if it is not computed."""
 
 
-class Resistance(NamedTuple):
-    r"""The force that resists a displacement $D$, and how far it is from linear.
+class RestoringForce(NamedTuple):
+    r"""The restoring force after a displacement $D$, and its nonlinearity.
 
-    The nonlinearity is $\lvert 2\,(g(\tfrac12) - g(0)) \cdot D / (g(1) - g(0)) \cdot D - 1 \rvert$ with the
-    gradient $g$ of the energy after a fraction of the displacement: 0 of a quadratic energy, 1 if nothing
-    resists half of the displacement, $\lvert 2^{1 - p} - 1 \rvert$ if the force grows with the power $p$ of
-    the displacement.
+    $$\eta = \lvert 2\,(g(\tfrac12) - g(0)) \cdot D \,/\, (g(1) - g(0)) \cdot D - 1 \rvert$$
+
+    with the gradient $g$ of the energy after a fraction of the displacement. It is 0 for a quadratic energy,
+    1 if the force over the first half of the displacement is 0, and $\lvert 2^{1 - p} - 1 \rvert$ for a
+    force proportional to the power $p$ of the displacement.
     """
 
     force: PyTree[Array]
@@ -230,44 +231,44 @@ class Resistance(NamedTuple):
     @classmethod
     def along(
         cls, gradient: Callable[[PyTree[Array]], PyTree[Array]], start: PyTree, end: PyTree
-    ) -> Resistance:
-        """From the gradients at both ends of a displacement and in its middle."""
+    ) -> RestoringForce:
+        """Evaluate the gradient at both ends of a displacement and at its midpoint."""
         displacement = jax.tree.map(jnp.subtract, end, start)
         points = jax.tree.map(
             lambda a, d, b: jnp.stack([a, a + d / 2, b]), start, displacement, end
         )
-        # (As a loop, so that the gradient is compiled once.)
+        # (A loop, so that the gradient is compiled once.)
         gradients = jax.lax.map(gradient, points)
-        middle, whole = (jax.tree.map(lambda g, i=i: g[i] - g[0], gradients) for i in (1, 2))
-        half, work = (jnp.asarray(optax.tree.vdot(g, displacement)) for g in (middle, whole))
+        middle, final = (jax.tree.map(lambda g, i=i: g[i] - g[0], gradients) for i in (1, 2))
+        half, work = (jnp.asarray(optax.tree.vdot(g, displacement)) for g in (middle, final))
         nonlinearity = jnp.abs(2 * half - work) / jnp.where(work == 0, 1, jnp.abs(work))
         return cls(jax.tree.map(lambda g: g[2], gradients), nonlinearity)
 
 
-def two_phases(
+def gradient_from_phases(
     adjoint: EquilibriumPropagation,
     cotangent: PyTree[Array],
     options: dict[str, Any],
     phase: Callable[[PyTree[Array], Float[Array, ""]], Phase],
     at_rest: PyTree[Array] | None,
 ) -> tuple[PyTree[Array], GradientOutcome]:
-    """The gradient from relaxations under weak forces, whoever does them, and how it came about.
+    """The gradient from relaxations under constant forces, and its outcome.
 
     **Arguments:**
 
-    - `adjoint`: how strong, and with which signs.
+    - `adjoint`: the strength and the signs of the nudges.
     - `cotangent`: derivative of the cost with respect to the configuration.
-    - `options`: the typical sizes `stiffness` and `length_scale`.
-    - `phase`: a function of a term linear in the configuration that is added to the energy, and of its
-        largest entry, that relaxes the nudged system.
-    - `at_rest`: that derivative without a nudge, for a difference that is one-sided.
+    - `options`: the units `stiffness` and `length_scale`.
+    - `phase`: a function that relaxes the nudged system. Its arguments are the coefficients of the linear
+        term that is added to the energy, and the largest of them.
+    - `at_rest`: the derivative of the energy by the parameters without a nudge, for a one-sided difference.
 
     **Returns:** the gradient, shaped as the derivatives; and its outcome.
     """
     size = optx.max_norm(cotangent)
     direction = optax.tree.scale(1 / jnp.where(size > 0, size, 1), cotangent)
     strength = adjoint.strength(adjoint.beta, options, size.dtype)
-    # One phase is a batch of the two signs. A one-sided difference needs no second relaxation.
+    # The two signs are a batch. A one-sided difference needs no second relaxation.
     signs = jnp.asarray([s for s in adjoint.signs if s != 0], size.dtype)
     nudged = lambda sign: phase(optax.tree.scale(sign * strength, direction), strength)
     phases = jax.vmap(nudged)(signs)
@@ -277,31 +278,31 @@ def two_phases(
     else:
         difference = jax.tree.map(lambda s, at_rest: s[0] - at_rest, slopes, at_rest)
     gradient = jax.tree.map(lambda d: size / strength * d, difference)
-    # (Without a nudge there is no displacement but that of rounding.)
+    # (With a zero cotangent the displacement is rounding error.)
     nonlinearity = jnp.where(size > 0, jnp.max(phases.nonlinearity), 0)
-    residual = jnp.max(phases.left) / strength
-    return gradient, _outcome(residual, jnp.sum(phases.num_steps), nonlinearity)
+    residual = jnp.max(phases.max_force) / strength
+    return gradient, _gradient_outcome(residual, jnp.sum(phases.num_steps), nonlinearity)
 
 
-class AbstractNudging(eqx.Module):
-    """A system at rest that its own cost can nudge, as the paper's form of the method needs it.
+class AbstractNudgedSystem(eqx.Module):
+    """A system at rest that is nudged by its cost, as in the paper.
 
-    `parameters` are what the gradient is taken with respect to.
+    The gradient is taken with respect to `parameters`.
     """
 
     @abc.abstractmethod
     def cost(self, parameters: PyTree) -> Float[Array, ""]:
-        """The cost where the system is at rest."""
+        """The cost of the system at rest."""
 
     @abc.abstractmethod
     def sizes(self, parameters: PyTree) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The force that a nudge of strength 1 exerts, and the unit of force."""
+        """The largest force of a nudge of strength 1, and the unit of force."""
 
     @abc.abstractmethod
     def relax(
         self, parameters: PyTree, nudge: Float[Array, ""], tolerance: Float[Array, ""]
     ) -> tuple[PyTree, Float[Array, ""], Float[Array, ""]]:
-        """Where the nudged system comes to rest, the largest force there, and the steps it took."""
+        """The nudged system at rest, the largest force on it, and the number of steps."""
 
     @abc.abstractmethod
     def energy(
@@ -310,65 +311,69 @@ class AbstractNudging(eqx.Module):
         """The energy of the nudged system, nudge included."""
 
 
-# Equilibrium propagation in the form of the paper: X± minimise E ± (β/2) C, with the whole cost and with
-# T1 transitions, and the gradient is the difference of the partial derivatives of these two energies
-# with respect to the parameters, over β.
+# Equilibrium propagation in the form of the paper, with the full cost and with T1 transitions:
+#     X± = argmin E± with E± = E ± (β/2) C,    dC/dθ = (∂E₊/∂θ (X₊) - ∂E₋/∂θ (X₋)) / β.
 @eqx.filter_custom_vjp
-def cost_by_nudging(
+def nudged_cost(
     vjp_arg: tuple[PyTree, GradientOutcome | None],
-    system: AbstractNudging,
+    system: AbstractNudgedSystem,
     adjoint: EquilibriumPropagation,
 ) -> Float[Array, ""]:
-    """The cost of a system, with a gradient from the two sides that the cost pulls and pushes it to."""
+    """The cost of a system; its gradient is computed from relaxations nudged by the cost."""
     parameters, _ = vjp_arg
     return system.cost(parameters)
 
 
-@cost_by_nudging.def_fwd
+@nudged_cost.def_fwd
 def _(
-    perturbed: Any, vjp_arg: Any, system: AbstractNudging, adjoint: EquilibriumPropagation
+    perturbed: Any, vjp_arg: Any, system: AbstractNudgedSystem, adjoint: EquilibriumPropagation
 ) -> tuple[Float[Array, ""], None]:
     parameters, _ = vjp_arg
     return system.cost(parameters), None
 
 
-@cost_by_nudging.def_bwd
+@nudged_cost.def_bwd
 def _(
     residuals: None,
     cotangent: Float[Array, ""],
     perturbed: Any,
     vjp_arg: Any,
-    system: AbstractNudging,
+    system: AbstractNudgedSystem,
     adjoint: EquilibriumPropagation,
 ) -> Any:
     parameters, slot = vjp_arg
-    pull, unit = system.sizes(parameters)
+    force_per_nudge, unit = system.sizes(parameters)
+    dtype = force_per_nudge.dtype
     if adjoint.beta is None:
-        half_beta = adjoint.strength(None, {"stiffness": unit}, pull.dtype) / pull
+        half_beta = adjoint.strength(None, {"stiffness": unit}, dtype) / force_per_nudge
     else:
-        half_beta = jnp.asarray(adjoint.beta, pull.dtype) / 2
-    force = half_beta * pull
+        half_beta = jnp.asarray(adjoint.beta, dtype) / 2
+    force = half_beta * force_per_nudge
     moving, fixed = differentiable(parameters)
 
     def phase(sign: Array) -> tuple[PyTree[Array], Array, Array]:
         nudge = sign * half_beta
-        state, left, num_steps = frozen(system.relax(parameters, nudge, adjoint.tolerance(force)))
+        state, max_force, num_steps = frozen(
+            system.relax(parameters, nudge, adjoint.tolerance(force))
+        )
         energy = lambda m: system.energy(eqx.combine(m, fixed), nudge, state)
-        return jax.grad(energy)(moving), left, num_steps
+        return jax.grad(energy)(moving), max_force, num_steps
 
     signs = jnp.asarray(adjoint.signs, half_beta.dtype)
-    slopes, left, num_steps = jax.vmap(phase)(signs)
+    slopes, max_forces, num_steps = jax.vmap(phase)(signs)
     beta = half_beta * (signs[0] - signs[1])
     gradient = jax.tree.map(lambda s: cotangent * (s[0] - s[1]) / beta, slopes)
-    # (A nudge by the cost may be strong, and flip edges: its response need not be linear.)
-    outcome = _outcome(jnp.max(left) / force, jnp.sum(num_steps), jnp.full_like(force, jnp.nan))
-    return settle(gradient, outcome, adjoint.throw, slot, _REASONS)
+    # (A nudge by the cost may be strong, and flip edges, so linearity is not checked.)
+    outcome = _gradient_outcome(
+        jnp.max(max_forces) / force, jnp.sum(num_steps), jnp.full_like(force, jnp.nan)
+    )
+    return finish_gradient(gradient, outcome, adjoint.throw, slot, _REASONS)
 
 
-def _outcome(
+def _gradient_outcome(
     residual: Float[Array, ""], num_steps: Array, nonlinearity: Float[Array, ""]
 ) -> GradientOutcome:
-    degenerate = nonlinearity >= _NONLINEAR
-    failed = ~(residual < UNTRUSTED) | degenerate
-    known = jnp.where(jnp.isnan(nonlinearity), jnp.nan, degenerate)
-    return GradientOutcome(residual, num_steps, jnp.nan, failed, known)
+    degenerate = nonlinearity >= _MAX_NONLINEARITY
+    failed = ~(residual < MAX_RELATIVE_RESIDUAL) | degenerate
+    reported = jnp.where(jnp.isnan(nonlinearity), jnp.nan, degenerate)
+    return GradientOutcome(residual, num_steps, jnp.nan, failed, reported)

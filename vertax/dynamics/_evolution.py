@@ -1,4 +1,4 @@
-"""Dynamics: overdamped motion, each step a relaxation."""
+"""Time evolution: overdamped motion by implicit steps, each a relaxation."""
 
 from __future__ import annotations
 
@@ -34,40 +34,38 @@ from vertax.relax._response import AbstractResponse
 
 
 class Evolution(AbstractResponse):
-    r"""The tissue moves, overdamped: $\partial R / \partial \dot x = - \partial E / \partial x$.
+    r"""Overdamped motion of a tissue: $\partial R / \partial \dot x = - \partial E / \partial x$.
 
-    Each step is a minimising movement: from $x_0$ it goes to where
+    Each step minimises the incremental potential (a minimising movement),
 
-    $$E(x) + \Delta t\, R\left(\frac{x - x_0}{\Delta t}; x_0\right)$$
+    $$x_{n+1} = \arg\min_x\; E(x) + \Delta t\, R\left(\frac{x - x_n}{\Delta t}; x_n\right).$$
 
-    has a minimum. That is the implicit Euler method: stable for every length of a step, and without anything
-    that drives it the energy never rises, through transitions either. And a step is a
-    [`Relaxation`][vertax.Relaxation], with its solvers, transitions, contacts and adjoints.
+    This is the implicit Euler method: stable for every $\Delta t$, and without an activity the energy never
+    increases, also through T1 transitions. Each step is a [`Relaxation`][vertax.Relaxation], with its
+    solvers, transitions, contacts and adjoints.
 
     **Arguments:**
 
-    - `dissipation`: what resists the motion, see `vertax.dissipations`.
-    - `times`: when there is to be a frame; they increase, and at the first one the tissue is where it
-        begins.
-    - `activity`: what drives the tissue besides its energy, see `vertax.activities`.
-    - `key`: for the random numbers of the activity, a key or a seed. Steps draw from it one after the other.
-    - `drive`: in place of a key, that of an [`Evolved`][vertax.dynamics.Evolved] which is to go on.
-    - `substeps`: steps from one frame to the next.
-    - `control`: in place of `substeps`, [`StepControl`][vertax.dynamics.StepControl]: as many steps as a
-        tolerance of their error asks for.
-    - `order`: 1, or 2 for two stages a step (an SDIRK method, which is stable for every step, but of which
-        the energy may rise). The dissipation must be a sum of squares for that.
-    - `boundary`: a function of time that returns the space at that time, such as a box that is sheared; the
-        tissue is carried along, and then moves. By default it stays as it is.
-    - `pins`: a function of time that returns the positions of all vertices, of which those of pinned ones
-        count.
-    - `relaxation`: how each step is found.
+    - `dissipation`: the dissipation $R$, see `vertax.dissipations`.
+    - `times`: the times of the frames, increasing; the first one is the time of the initial tissue.
+    - `activity`: active forces or noise, see `vertax.activities`.
+    - `key`: the random key or seed of the activity. Each step uses a new key that is split from it.
+    - `drive`: instead of a key, the field `drive` of an [`Evolved`][vertax.dynamics.Evolved] to continue.
+    - `substeps`: steps per frame.
+    - `control`: instead of `substeps`, a [`StepControl`][vertax.dynamics.StepControl]: step sizes from an
+        error tolerance.
+    - `order`: 1, or 2 for two stages per step (an SDIRK method, stable for every $\Delta t$, but the energy
+        may increase). Order 2 requires a dissipation that is half a sum of squares.
+    - `boundary`: a function of time that returns the boundary, such as a sheared box. The tissue is mapped
+        affinely into it before each step. By default the boundary is constant.
+    - `pins`: a function of time that returns positions of all vertices; those of pinned vertices are used.
+    - `relaxation`: the relaxation of each step.
 
     **Raises:**
 
-    - `TypeError` for a dissipation, an activity or a relaxation that is none, or functions that are none.
-    - `ValueError` for an activity without a key, times that do not increase, substeps or an order that do
-        not exist, or a second order of a dissipation that is no sum of squares.
+    - `TypeError` for an argument of the wrong class, or if `boundary` or `pins` is not a function.
+    - `ValueError` for an activity without a key, times that do not increase, `substeps` below 1, an order
+        other than 1 and 2, or order 2 with a dissipation that is not a sum of squares.
     """
 
     dissipation: AbstractDissipation
@@ -110,7 +108,7 @@ class Evolution(AbstractResponse):
         if activity is not None and key is None and drive is None:
             raise ValueError(
                 "Argument `key` is missing: an activity draws random numbers. Pass a seed, e.g. key=0, or "
-                "the `drive` of an evolution that is to go on."
+                "the `drive` of an evolution to continue."
             )
         self.activity, self.drive = activity, drive
         self.key = None if key is None else as_key(key)
@@ -122,8 +120,8 @@ class Evolution(AbstractResponse):
         for name, function in (("boundary", boundary), ("pins", pins)):
             if function is not None and not callable(function):
                 raise TypeError(
-                    f"Argument `{name}` must be a function of time, but is {describe(function)}. For one "
-                    "that stays, leave it out."
+                    f"Argument `{name}` must be a function of time, but is {describe(function)}. Omit it "
+                    "if it is constant."
                 )
         check_integer("substeps", substeps, at_least=1)
         if order not in (1, 2):
@@ -139,13 +137,13 @@ class Evolution(AbstractResponse):
                 f"{describe(control)}."
             )
         if control is not None and (substeps != 1 or activity is not None):
-            wrong = "`substeps`" if activity is None else "`activity`"
+            conflict = "`substeps`" if activity is None else "`activity`"
             raise ValueError(
-                f"Argument `control` does not go with {wrong}: "
+                f"Argument `control` does not go with {conflict}: "
                 + (
-                    "it says itself how many steps there are."
+                    "it determines the number of steps."
                     if activity is None
-                    else "random numbers must not depend on which steps are refused. Take `substeps`."
+                    else "random numbers must not depend on which steps are rejected. Use `substeps`."
                 )
             )
         self.dissipation, self.control = dissipation, control
@@ -163,11 +161,11 @@ class Evolution(AbstractResponse):
         progress: bool = False,
         checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
     ) -> Evolved:
-        """Let a tissue move.
+        """Evolve a tissue in time.
 
         **Arguments:** as [`evolve`][vertax.evolve].
 
-        **Returns:** what happened, [`Evolved`][vertax.dynamics.Evolved].
+        **Returns:** an [`Evolved`][vertax.dynamics.Evolved].
 
         **Raises:** as [`evolve`][vertax.evolve].
         """
@@ -179,89 +177,89 @@ class Evolution(AbstractResponse):
         response._check(tissue)
         response._check_drive(tissue)
         warn_of_memory_maps()
-        given = (*traced((tissue, energy), tissue.vertices.dtype), response.traced(), adjoint)
+        args = (*traced((tissue, energy), tissue.vertices.dtype), response.traced(), adjoint)
         with announce_compilations(f"the evolution of {tissue.n_cells} cells"):
             if progress or checkpoint is not None:
-                evolved = evolve_by_frames(*given, checkpoint, progress=progress, throw=throw)
+                evolved = evolve_by_frames(*args, checkpoint, progress=progress, throw=throw)
             else:
-                evolved = evolve_at_once(*given)
+                evolved = evolve_at_once(*args)
         return evolved.checked() if throw else evolved
 
     def check_compatible(
         self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
     ) -> None:
-        """Refuse what goes with tissues at rest alone.
+        """Raise an error for options that require a tissue at rest.
 
         **Arguments:** as for every response.
 
         **Raises:**
 
-        - `ValueError` for a cost that pulls the tissue, and for a position that is fitted.
+        - `ValueError` for guidance, a nudge by the cost, and a fitted position.
         """
         by_cost = isinstance(adjoint, EquilibriumPropagation) and adjoint.nudge == "cost"
-        for what, wrong in (
+        for option, is_set in (
             ("`fit_position`", placed),
             ("`guidance`", guided),
             ("EquilibriumPropagation(nudge='cost')", by_cost),
         ):
-            if wrong:
+            if is_set:
                 raise ValueError(
-                    f"{what} goes with a tissue at rest, but the response is an Evolution. Leave it out."
+                    f"{option} goes with a tissue at rest, but the response is an Evolution. Leave it out."
                 )
 
     @property
     def supports_warm_start(self) -> bool:
-        """Each epoch of a fit begins at the first of the times."""
+        """False: each epoch of a fit starts from the tissue at the first of the times."""
         return False
 
     def of(self, material: Material) -> Evolution:
-        """The same for a material with a dissipation or an activity of its own."""
+        """A copy with the dissipation and the activity of a material, where it has them."""
         dissipation, activity = material.dissipation, material.activity
         parts = {"dissipation": dissipation, "activity": activity}
-        own = {name: part for name, part in parts.items() if part is not None}
+        replaced = {name: part for name, part in parts.items() if part is not None}
         return Evolution(
-            **({f.name: getattr(self, f.name) for f in dataclasses.fields(self)} | own)
+            **({f.name: getattr(self, f.name) for f in dataclasses.fields(self)} | replaced)
         )
 
     def traced(self) -> Evolution:
-        """The same with its numbers as arrays, of which another one compiles nothing anew."""
+        """A copy with its numbers as arrays: other values need no recompilation."""
         new = (*traced((self.dissipation, self.activity, self.control)), self.relaxation.traced())
         parts = lambda e: (e.dissipation, e.activity, e.control, e.relaxation)
         return eqx.tree_at(parts, self, new, is_leaf=lambda x: x is None)
 
     def finer(self, tolerance: Float[Array, ""]) -> Evolution:
-        """The same, each step at rest only where the largest force is below this tolerance too."""
+        """A copy in which each step also requires the largest force to be below this tolerance."""
         return eqx.tree_at(lambda e: e.relaxation, self, self.relaxation.finer(tolerance))
 
     def placed(self, tissue: Tissue, time: Float[Array, ""]) -> Tissue:
-        """A tissue carried into the space of a time, with its pinned vertices where they are then."""
+        """A tissue mapped into the boundary at a time, with its pinned vertices at their positions then."""
         if self.boundary is not None:
             tissue = tissue.carried(self.boundary(time))
         if self.pins is not None and tissue.pinned is not None:
-            held = jnp.where(tissue.pinned[:, None], self.pins(time), tissue.vertices)
-            tissue = tissue.with_vertices(held)
+            vertices = jnp.where(tissue.pinned[:, None], self.pins(time), tissue.vertices)
+            tissue = tissue.with_vertices(vertices)
         return tissue
 
     def _check_drive(self, tissue: Tissue) -> None:
-        """Refuse the drive of another activity, or of another tissue."""
+        """Raise an error for the drive of another activity, or of another tissue."""
         if self.activity is None or self.drive is None:
             return
         key = jax.eval_shape(lambda: jax.random.key(0))
-        own = eqx.filter_eval_shape(self.activity.init, tissue, key)
-        kinds = lambda tree: jax.tree.map(lambda x: (jnp.shape(x), jnp.result_type(x)), tree)
-        whole = isinstance(self.drive, tuple) and len(self.drive) == 2
-        if not whole or not eqx.tree_equal(kinds(own), kinds(self.drive[0])):
+        expected = eqx.filter_eval_shape(self.activity.init, tissue, key)
+        types = lambda tree: jax.tree.map(lambda x: (jnp.shape(x), jnp.result_type(x)), tree)
+        is_pair = isinstance(self.drive, tuple) and len(self.drive) == 2
+        if not is_pair or not eqx.tree_equal(types(expected), types(self.drive[0])):
             raise ValueError(
                 "Argument `drive` does not go with this activity and this tissue: it must be that of an "
-                "evolution of a tissue of this size with this activity. Pass a key to begin anew."
+                "evolution of a tissue of this size with this activity. Pass a key to start anew."
             )
 
     def _check(self, tissue: Tissue) -> None:
-        """Refuse pins without pinned vertices, and a dissipation that resists no motion of some vertices."""
+        """Raise an error for pins without pinned vertices, and for vertices without dissipation."""
         if self.pins is not None:
             if tissue.pinned is None:
                 raise ValueError(
-                    "Argument `pins` says where pinned vertices are, but the tissue has none: name them, "
+                    "Argument `pins` needs pinned vertices, but the tissue has none. Select them with "
                     "vertax.Tissue(..., pinned=mask)."
                 )
             shape = jax.eval_shape(self.pins, self.times[0]).shape
@@ -277,12 +275,12 @@ class Evolution(AbstractResponse):
         if tissue.held is not None:
             free &= ~np.asarray(tissue.held)
         if free.any():
-            which = np.nonzero(free)[0]
-            some = ", ".join(map(str, which[:5])) + (", ..." if len(which) > 5 else "")
+            indices = np.nonzero(free)[0]
+            listed = ", ".join(map(str, indices[:5])) + (", ..." if len(indices) > 5 else "")
             raise ValueError(
-                f"Argument `dissipation` resists no motion of {len(which)} of {tissue.n_vertices} vertices "
-                f"({some}): they would move at once. Add friction there, e.g. "
-                "+ vertax.dissipations.SubstrateFriction(0.01)."
+                f"Argument `dissipation` must resist the motion of every vertex, but is 0 for {len(indices)} "
+                f"of {tissue.n_vertices} vertices ({listed}): their velocities would be infinite. Add "
+                "friction there, e.g. + vertax.dissipations.SubstrateFriction(0.01)."
             )
 
 
@@ -298,7 +296,7 @@ def evolve(
     checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
     **settings: Any,
 ) -> Evolved:
-    r"""Let a tissue move in time, overdamped: $\partial R / \partial \dot x = - \partial E / \partial x$.
+    r"""Overdamped motion of a tissue in time, $\partial R / \partial \dot x = - \partial E / \partial x$.
 
     ```python
     friction = vx.dissipations.SubstrateFriction(1.0)
@@ -307,34 +305,34 @@ def evolve(
     ```
 
     Works under `jax.jit`, `jax.vmap` and `jax.grad` with respect to the energy, the dissipation, the box
-    and where the tissue begins. A gradient takes a linear system for each step, backwards in time, and
-    keeps one configuration for each. It tells how the course changes as long as the same transitions happen
-    in the same steps.
+    and the initial tissue. A gradient solves one linear system per step, backwards in time, and stores one
+    configuration per step. It is valid as long as the same transitions happen in the same steps.
 
     **Arguments:**
 
-    - `tissue`: where it begins, at the first of the times.
+    - `tissue`: the initial tissue, at the first of the times.
     - `energy`: its energy, or a function of time that returns one (a function, or an `equinox.Module` to
-        differentiate with respect to what it holds).
-    - `dissipation`: what resists the motion.
-    - `times`: when there is to be a frame; they increase.
-    - `adjoint`: how to differentiate each step, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation]
-        by default.
-    - `throw`: raise an error if a step finds no end. If False, look at `converged`.
+        differentiate with respect to its fields).
+    - `dissipation`: the dissipation $R$.
+    - `times`: the times of the frames, increasing.
+    - `adjoint`: the differentiation method of each step,
+        [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by default.
+    - `throw`: raise an error if a step does not converge. If False, check `converged`.
     - `progress`: show a progress bar (only on a terminal).
-    - `checkpoint`: a file, or a [`Checkpoint`][vertax.Checkpoint], to write down the frames so far, and to go
-        on from if it is there, to the same bits as if it had not stopped. With either of these two each frame
-        is a call of its own of a compiled function, which is no part of a larger one.
-    - `settings`: those of [`Evolution`][vertax.Evolution], whose convenient form this is: `activity`, `key`,
-        `drive`, `substeps`, `control`, `order`, `boundary`, `pins`, `relaxation`.
+    - `checkpoint`: a file, or a [`Checkpoint`][vertax.Checkpoint], to which the frames are written. If it
+        exists, the run continues from it, with bitwise the same results as without the interruption. With
+        `progress` or `checkpoint` each frame is a separate call of a compiled function, so the call cannot be
+        inside `jax.jit`.
+    - `settings`: further arguments of [`Evolution`][vertax.Evolution]: `activity`, `key`, `drive`,
+        `substeps`, `control`, `order`, `boundary`, `pins`, `relaxation`.
 
     **Returns:** an [`Evolved`][vertax.dynamics.Evolved]: `tissue` at the end, and `frames`.
 
     **Raises:**
 
-    - `TypeError` for arguments of the wrong kind.
-    - `ValueError` for times that do not increase, a dissipation that leaves vertices without any
-        resistance, which are named, or a checkpoint that is broken or of another movement.
+    - `TypeError` for an argument of the wrong class.
+    - `ValueError` for times that do not increase, a dissipation that is 0 for some vertices, or a checkpoint
+        that is broken or of another run.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a step did not converge, or cells overlap.
     """
     evolution = Evolution(dissipation, times, **settings)
@@ -345,9 +343,9 @@ def evolve(
 
 @eqx.filter_jit
 def _resistance(tissue: Tissue, dissipation: AbstractDissipation) -> Float[Array, " vertices"]:
-    """How much each vertex is held back if all move in different directions."""
+    """Squared resistance of each vertex to a motion of all vertices in different directions."""
     size = 1e-3 * cell_size(tissue)
     angles = 2.4 * jnp.arange(tissue.n_vertices, dtype=tissue.vertices.dtype)
-    away = size * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-    moved = lambda vertices: dissipation(tissue.with_vertices(vertices), tissue, 1.0)
-    return jnp.sum(jax.grad(moved)(tissue.vertices + away) ** 2, axis=-1)
+    displacements = size * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+    dissipated = lambda vertices: dissipation(tissue.with_vertices(vertices), tissue, 1.0)
+    return jnp.sum(jax.grad(dissipated)(tissue.vertices + displacements) ** 2, axis=-1)

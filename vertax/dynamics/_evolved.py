@@ -1,4 +1,4 @@
-"""What happened while a tissue moved."""
+"""The result of a time evolution: frames, transitions and convergence."""
 
 from __future__ import annotations
 
@@ -17,69 +17,69 @@ from vertax.relax._response import _NOT_FINITE, Equilibrium
 
 
 class Evolved(Equilibrium):
-    """Where a tissue has gone in time; as an [`Equilibrium`][vertax.Equilibrium] it is the last frame.
+    """The result of a time evolution; as an [`Equilibrium`][vertax.Equilibrium] it is the last frame.
 
-    Its `max_force` is the largest that any step was left with, `num_steps` and `num_t1` count those of all
-    steps, `valid` and `result` hold if they do for every step. Forces are those of energy and friction
-    together.
+    `max_force` is the maximum over the steps of the residual force (of energy and dissipation together),
+    `num_steps` and `num_t1` are sums over the steps, and `valid` and `result` are successful if they are for
+    every step.
     """
 
     times: Float[Array, "*batch times"]
-    """The times of the frames, of which the first is the start."""
+    """The times of the frames, starting with the initial time."""
     frames: Tissue
-    """The tissue at these times: the same tissue with a leading axis."""
+    """The tissue at these times: one tissue with a leading axis."""
     energies: Float[Array, "*batch times"]
-    """Its energies."""
+    """The energy of each frame."""
     transitions: Int[Array, "*batch times"]
-    """T1 transitions from the frame before."""
+    """T1 transitions since the previous frame."""
 
     drive: PyTree[Array]
-    """The state of the activity at the end, and of the random numbers: a run that begins there with `drive`
-    goes on as if it had not stopped, to rounding. None without an activity."""
+    """The final state of the activity and of its random numbers. A run from the last frame with this `drive`
+    continues this run, up to rounding. None without an activity."""
     sound: Bool[Array, "*batch times"]
-    """Whether all steps up to a frame came to an end, in tissues without overlaps."""
+    """Whether all steps up to each frame converged, without overlaps."""
     steps: Float[Array, "*batch times steps"]
-    """Lengths in time of the steps to each frame from the one before; 0 where there were no more."""
+    """Sizes of the time steps since the previous frame, padded with 0."""
     refused: Int[Array, "*batch times"]
-    """How many more were tried and were too long, see [`StepControl`][vertax.dynamics.StepControl]."""
+    """Number of rejected steps since the previous frame, see [`StepControl`][vertax.dynamics.StepControl]."""
 
     @property
     def flipped(self) -> Bool[Array, "*batch times edges"]:
-        """Which edges lie between other cells than a frame before."""
-        # (Half-edges do not change places when an edge flips, and cells of half-edges do.)
-        each = lambda topology: topology.edge_cells
+        """Whether the cells on both sides of each edge changed since the previous frame."""
+        # (A flip changes the cells of an edge, but not the indices of its half-edges.)
+        edge_cells = lambda topology: topology.edge_cells
         for _ in self.times.shape:
-            each = jax.vmap(each)
-        cells = each(self.frames.topology)
+            edge_cells = jax.vmap(edge_cells)
+        cells = edge_cells(self.frames.topology)
         changed = jnp.any(cells[..., 1:, :, :] != cells[..., :-1, :, :], axis=-1)
         return jnp.concatenate([jnp.zeros_like(changed[..., :1, :]), changed], axis=-2)
 
     def checked(self) -> Evolved:
-        """The same, if all steps came to an end.
+        """Return self if all steps converged.
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox inside `jax.jit`) if one did not, or if cells overlap.
+        - `RuntimeError` (of Equinox inside `jax.jit`) if a step did not converge, or if cells overlap.
         """
         if not is_concrete(self.sound):
-            # Of a batch the message with the largest index is raised.
+            # In a batch the message with the largest index is raised.
             messages = (
-                f"A step in time did not converge. {_REMEDY}",
-                f"On the way of a movement cells overlap, or the box folds. {_REMEDY}",
-                f"A movement broke down: {_NOT_FINITE}",
+                f"A time step did not converge. {_REMEDY}",
+                f"During a time evolution cells overlap, or the box folds. {_REMEDY}",
+                f"A time evolution broke down: {_NOT_FINITE}",
             )
-            which = jnp.where(jnp.isfinite(self.max_force), jnp.where(self.valid, 0, 1), 2)
-            which = jnp.where(self.converged, 0, which)
-            # (A callback to the host takes no keys.)
+            index = jnp.where(jnp.isfinite(self.max_force), jnp.where(self.valid, 0, 1), 2)
+            index = jnp.where(self.converged, 0, index)
+            # (Random keys cannot be arguments of a callback to the host.)
             keys, rest = eqx.partition(self, _is_key)
-            checked = eqx.branched_error_if(rest, ~self.converged, which, messages)
+            checked = eqx.branched_error_if(rest, ~self.converged, index, messages)
             return eqx.combine(checked, keys)
         if np.all(self.sound):
             return self
         raise RuntimeError(self._first_failure())
 
     def _first_failure(self) -> str:
-        """The message for the member of a batch that fails in the earliest frame, at its own time."""
+        """The error message for the member of a batch that fails in the earliest frame."""
         sound = np.asarray(self.sound)
         n_times = sound.shape[-1]
         sound = sound.reshape(-1, n_times)
@@ -89,13 +89,13 @@ class Evolved(Equilibrium):
         of_member = lambda x: np.asarray(x).reshape(len(sound), -1)[number]
         frame, (force,), (valid,) = frames[number], of_member(self.max_force), of_member(self.valid)
         time = of_member(self.times)[frame]
-        where = f"On the way to time {time:g} (frame {frame})"
+        context = f"Before time {time:g} (frame {frame})"
         if self.sound.ndim > 1:
-            where += f" of member {number} ({failed.sum()} of {failed.size} failed)"
+            context += f" of member {number} ({failed.sum()} of {failed.size} failed)"
         if not np.isfinite(force):
-            return f"{where} a step broke down: {_NOT_FINITE}"
-        reason = "a step in time did not converge" if valid else "cells overlap, or the box folds"
-        return f"{where} {reason} (largest force {force:.1e}). {_REMEDY}"
+            return f"{context} a step broke down: {_NOT_FINITE}"
+        reason = "a time step did not converge" if valid else "cells overlap, or the box folds"
+        return f"{context} {reason} (largest force {force:.1e}). {_REMEDY}"
 
     @property
     def trajectory(self) -> Trajectory:
@@ -107,15 +107,15 @@ class Evolved(Equilibrium):
         """
         if self.times.ndim != 1:
             raise ValueError(
-                f"This is a batch of {self.times.shape[:-1]} movies, and a trajectory is one. Take a member: "
-                "vertax.fitting.member(movies, 0).trajectory."
+                f"This is a batch of shape {self.times.shape[:-1]}, but a trajectory is a single evolution. "
+                "Select a member: vertax.fitting.member(movies, 0).trajectory."
             )
         trajectory = Trajectory()
         arrays, static = eqx.partition(self.frames, eqx.is_array)
         values = {"time": self.times, "energy": self.energies, "num_t1": self.transitions}
         for number in range(len(self.times)):
-            arrays_then, values_then = jax.tree.map(lambda x, i=number: x[i], (arrays, values))
-            trajectory.append(eqx.combine(arrays_then, static), **values_then)
+            frame, frame_values = jax.tree.map(lambda x, i=number: x[i], (arrays, values))
+            trajectory.append(eqx.combine(frame, static), **frame_values)
         return trajectory
 
 
@@ -124,6 +124,6 @@ def _is_key(x: Any) -> bool:
 
 
 _REMEDY = (
-    "Take shorter steps (more `substeps`, or a greater `most` of their control), raise `max_steps` of its "
-    "relaxation or loosen its `tolerance`, or pass throw=False and look at `sound`."
+    "Take shorter steps (more `substeps`, or a greater `most` of the StepControl), raise `max_steps` of the "
+    "relaxation or loosen its `tolerance`, or pass throw=False and check `sound`."
 )

@@ -1,4 +1,4 @@
-"""What a step in time minimises."""
+"""The incremental potential, which a time step minimises."""
 
 from __future__ import annotations
 
@@ -14,57 +14,58 @@ from vertax.mesh._topology import edge_neighbourhood, source, take
 from vertax.relax._inversion_barrier import REACH, inversion_energy_of_all
 
 
-class Incremental(AbstractEnergy):
-    """The energy at the end of a step, and what the step dissipates.
+class IncrementalPotential(AbstractEnergy):
+    r"""$E(x) + \Delta t\, R((x - x_0) / \Delta t; x_0)$, plus an inversion barrier if the tissue is driven.
 
     **Arguments:**
 
-    - `energy`: that of the tissue, less the work of what drives it.
-    - `dissipation`: what resists.
-    - `before`: where the step begins.
-    - `dt`: its length.
-    - `strained`: strains that an earlier stage of the step is to be extrapolated by, for second order.
-    - `flips`: whether edges may flip in the step.
-    - `pressed`: the largest force of what drives the tissue, if anything does.
+    - `energy`: the energy of the tissue minus the work of the driving forces.
+    - `dissipation`: the dissipation $R$.
+    - `before`: the tissue $x_0$ at the start of the step.
+    - `dt`: the time step $\Delta t$.
+    - `previous_strains`: for order 2, strains of the earlier stage that are subtracted from those of this
+        stage.
+    - `may_flip`: whether edges may flip in the step.
+    - `max_driving_force`: the largest driving force; None without a drive.
     """
 
     energy: AbstractEnergy
     dissipation: AbstractDissipation
     before: Tissue
     dt: Float[Array, ""]
-    strained: Float[Array, " strains"] | None = None
-    flips: bool = eqx.field(static=True, default=True)
-    pressed: Float[Array, ""] | None = None
+    previous_strains: Float[Array, " strains"] | None = None
+    may_flip: bool = eqx.field(static=True, default=True)
+    max_driving_force: Float[Array, ""] | None = None
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The incremental potential."""
-        before = flipped_as(self.before, tissue) if self.flips else self.before
+        before = with_flips_of(self.before, tissue) if self.may_flip else self.before
         value = self.energy(tissue)
-        if self.pressed is not None:
+        if self.max_driving_force is not None:
             reach = REACH * cell_size(self.before)
-            value += inversion_energy_of_all(tissue, reach, self.pressed)
-        if self.strained is None or not isinstance(self.dissipation, AbstractViscosity):
+            value += inversion_energy_of_all(tissue, reach, self.max_driving_force)
+        if self.previous_strains is None or not isinstance(self.dissipation, AbstractViscosity):
             return value + self.dissipation(tissue, before, self.dt)
-        strains = self.dissipation.strains(tissue, before) - self.strained
+        strains = self.dissipation.strains(tissue, before) - self.previous_strains
         return value + 0.5 * jnp.sum(strains**2) / self.dt
 
 
-def flipped_as(before: Tissue, tissue: Tissue) -> Tissue:
-    """Where a step begins, with the edges flipped that flip in it, each about its middle.
+def with_flips_of(before: Tissue, tissue: Tissue) -> Tissue:
+    """The tissue at the start of a step, with the T1 flips of the step applied by rotation about midpoints.
 
-    A T1 turns an edge at once, and nothing resists that: what a step dissipates counts from the turned edge.
-    Otherwise friction would forbid transitions in steps so short that no edge shrinks to nothing in one.
+    A T1 rotates an edge instantaneously and without dissipation: the dissipation of the step is measured from
+    the rotated edge. Otherwise friction would forbid transitions in short time steps.
     """
     m = before.topology
     h = m.half_edge
     t, a, _, c, _ = edge_neighbourhood(m)
     ends = take(m.cell, jnp.stack([a, c], axis=-1))  # the cells that a flip makes neighbours
-    now = tissue.topology.edge_cells
-    flipped = jnp.all(now == ends, axis=-1) | jnp.all(now == ends[:, ::-1], axis=-1)
+    sides = tissue.topology.edge_cells
+    flipped = jnp.all(sides == ends, axis=-1) | jnp.all(sides == ends[:, ::-1], axis=-1)
     vector = before.edge_vectors
-    turned = jnp.stack([vector[:, 1], -vector[:, 0]], axis=-1)  # clockwise, as a T1 does
-    half = jnp.where(flipped[:, None], 0.5 * (turned - vector), 0)
+    rotated = jnp.stack([vector[:, 1], -vector[:, 0]], axis=-1)  # clockwise, as a T1 does
+    half = jnp.where(flipped[:, None], 0.5 * (rotated - vector), 0)
     vertices = before.vertices.at[source(h)].add(-half).at[source(t)].add(half)
-    placed = before.with_vertices(vertices)
-    # (A tissue with spare slots may have lost a cell as well: that is no flip.)
-    return placed if m.spare else placed.with_topology(tissue.topology)
+    moved = before.with_vertices(vertices)
+    # (With spare slots the topology may also differ by a removed cell, which is not a flip.)
+    return moved if m.spare else moved.with_topology(tissue.topology)

@@ -1,4 +1,4 @@
-"""Movement in time frame by frame, which shows how far it has come and can be resumed."""
+"""Time evolution frame by frame, with a progress bar and checkpoints."""
 
 from __future__ import annotations
 
@@ -24,7 +24,14 @@ from vertax._base.checkpoints import (
 from vertax._base.tracing import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.dynamics._evolved import Evolved
-from vertax.dynamics._time_integration import Frames, State, begin, evolved, first_frame, march
+from vertax.dynamics._time_integration import (
+    Frames,
+    State,
+    evolved,
+    first_frame,
+    initial_state,
+    integrate,
+)
 from vertax.mesh import Tissue
 
 
@@ -38,57 +45,55 @@ def evolve_by_frames(
     progress: bool,
     throw: bool,
 ) -> Evolved:
-    """As `evolve_at_once`, one compiled function a frame.
+    """As `evolve_at_once`, with one call of a compiled function per frame.
 
-    Each frame is the same program, which begins with the state that the last one ended with: a run that goes
-    on from a file is the one that never stopped.
+    Each frame is computed by the same program from the final state of the previous frame. Therefore a run
+    that continues from a checkpoint gives bitwise the same results as an uninterrupted one.
 
     **Raises:**
 
     - `TypeError` inside `jax.jit`, `jax.vmap` or `jax.grad`.
-    - `ValueError` for a checkpoint that is broken or of something else.
-    - `RuntimeError` if `throw` and a step came to no end: at once, and the checkpoint stays before it.
+    - `ValueError` for a checkpoint that is broken or of another run.
+    - `RuntimeError` if `throw` and a step did not converge; the checkpoint then holds the frames before it.
     """
     if not all(map(is_concrete, jax.tree.leaves((tissue, energy, evolution)))):
         raise TypeError(
-            "`progress` and `checkpoint` belong to movements that run outside jax.jit, jax.vmap and "
-            "jax.grad: leave them out there."
+            "Arguments `progress` and `checkpoint` do not work inside jax.jit, jax.vmap and jax.grad. Leave "
+            "them out there."
         )
     times = np.asarray(evolution.times)
     file = CheckpointFile(checkpoint, lambda: _identity(tissue, energy, evolution), "movement")
-    start, first = _begin(tissue, energy, evolution)
-    done = file.load(start)
-    if not done.rows:
-        done = Progress(start, (_row(times[0], first),))
-    _check_times(np.array([row["time"] for row in done.rows]), times)
+    start, first = _initial_state_and_frame(tissue, energy, evolution)
+    reached = file.load(start)
+    if not reached.rows:
+        reached = Progress(start, (_row(times[0], first),))
+    _check_times(np.array([row["time"] for row in reached.rows]), times)
     bar = tqdm(
         total=len(times) - 1,
-        initial=len(done.rows) - 1,
+        initial=len(reached.rows) - 1,
         unit="frame",
         disable=None if progress else True,
-        desc="compiling",  # while the first frame stands at 0
+        desc="compiling",  # until the first frame is done
     )
     try:
-        while len(done.rows) < len(times):
-            ends = times[len(done.rows) - 1 : len(done.rows) + 1]
-            state, frame = _advance(done.state, energy, _between(evolution, ends), adjoint)
-            rows = (*done.rows, _row(ends[1], frame))
+        while len(reached.rows) < len(times):
+            ends = times[len(reached.rows) - 1 : len(reached.rows) + 1]
+            state, frame = _advance(reached.state, energy, _for_one_frame(evolution, ends), adjoint)
+            rows = (*reached.rows, _row(ends[1], frame))
             if throw and not bool(frame.sound[0]):
-                _joined(
-                    times[: len(rows)], state, rows, first
-                ).checked()  # says what happened, and when
-            done = Progress(state, rows)
+                _joined_frames(times[: len(rows)], state, rows, first).checked()  # raises the error
+            reached = Progress(state, rows)
             bar.set_description(refresh=False)
             bar.set_postfix(time=f"{ends[1]:g}", t1=int(state.num_t1))
             bar.update()
-            file.save_if_due(done)
+            file.save_if_due(reached)
     except KeyboardInterrupt:
-        file.save(done)
+        file.save(reached)
         raise
     finally:
         bar.close()
-    file.save(done)
-    return _joined(times, done.state, done.rows, first)
+    file.save(reached)
+    return _joined_frames(times, reached.state, reached.rows, first)
 
 
 def _check_times(stored: np.ndarray, times: np.ndarray) -> None:
@@ -100,16 +105,16 @@ def _check_times(stored: np.ndarray, times: np.ndarray) -> None:
     tolerance = max(_EQUAL_TIMES * np.min(np.diff(times)), rounding)
     if len(stored) <= len(times) and np.all(differences <= tolerance):
         return
-    where = ""
+    difference = ""
     if np.any(differences > tolerance):
         frame = int(np.argmax(differences > tolerance))
-        where = (
+        difference = (
             f"; frame {frame} differs first: {stored[frame]:.17g} there, {times[frame]:.17g} here"
         )
     raise ValueError(
         f"The checkpoint holds frames at other times ({len(stored)}, from {stored[0]:g} to {stored[-1]:g}) "
-        f"than argument `times` begins with ({len(times)}, from {times[0]:g} to {times[-1]:g}{where}). Give "
-        "the same times again, with more after them if it is to go on for longer, or delete the file to "
+        f"than argument `times` begins with ({len(times)}, from {times[0]:g} to {times[-1]:g}{difference}). "
+        "Give the same times again, followed by further times to continue for longer, or delete the file to "
         "start anew."
     )
 
@@ -118,16 +123,16 @@ def _check_times(stored: np.ndarray, times: np.ndarray) -> None:
 _EQUAL_TIMES = 1e-9
 
 
-def _joined(times: np.ndarray, end: State, rows: tuple[Row, ...], like: Frames) -> Evolved:
-    """All frames as one."""
+def _joined_frames(times: np.ndarray, end: State, rows: tuple[Row, ...], like: Frames) -> Evolved:
+    """The result of an evolution from the rows of its frames."""
     columns = [jnp.asarray(np.stack([row[name] for row in rows])) for name in _names(like)]
     frames = jax.tree.unflatten(jax.tree.structure(like), columns)
     return evolved(jnp.asarray(times), end, frames)
 
 
 @announced_jit
-def _begin(tissue: Tissue, energy: Any, evolution: Any) -> tuple[State, Frames]:
-    start = begin(tissue, evolution)
+def _initial_state_and_frame(tissue: Tissue, energy: Any, evolution: Any) -> tuple[State, Frames]:
+    start = initial_state(tissue, evolution)
     return start, first_frame(start, energy, evolution)
 
 
@@ -135,13 +140,13 @@ def _begin(tissue: Tissue, energy: Any, evolution: Any) -> tuple[State, Frames]:
 def _advance(
     state: State, energy: Any, evolution: Any, adjoint: AbstractAdjoint
 ) -> tuple[State, Frames]:
-    return march(state, energy, evolution, adjoint)
+    return integrate(state, energy, evolution, adjoint)
 
 
-def _between(evolution: Any, ends: np.ndarray) -> Any:
-    """The same evolution from one frame to the next; its key and its first drive are used up."""
-    pieces: Callable = lambda e: (e.times, e.key, e.drive)
-    return eqx.tree_at(pieces, evolution, (jnp.asarray(ends), None, None), is_leaf=_is_none)
+def _for_one_frame(evolution: Any, ends: np.ndarray) -> Any:
+    """The evolution over one frame; without its key and first drive, which the state replaces."""
+    parts: Callable = lambda e: (e.times, e.key, e.drive)
+    return eqx.tree_at(parts, evolution, (jnp.asarray(ends), None, None), is_leaf=_is_none)
 
 
 def _is_none(x: Any) -> bool:
@@ -153,16 +158,16 @@ def _names(frames: Frames) -> list[str]:
 
 
 def _row(time: Any, frames: Frames) -> Row:
-    """A frame as arrays of the host by name."""
+    """A frame as NumPy arrays by name."""
     leaves = [np.asarray(x)[0] for x in jax.tree.leaves(frames)]
     return {"time": np.asarray(time)} | dict(zip(_names(frames), leaves, strict=True))
 
 
 def _identity(tissue: Tissue, energy: Any, evolution: Any) -> dict[str, str]:
-    """What makes this movement another one than others."""
-    # Of times those that are done must agree, and others may follow.
-    endless = eqx.tree_at(lambda e: e.times, evolution, None)
-    parts = (tissue, energy, endless)
+    """A description of the run, which a checkpoint must match."""
+    # The times are left out: `_check_times` compares the stored ones, and further times may follow.
+    without_times = eqx.tree_at(lambda e: e.times, evolution, None)
+    parts = (tissue, energy, without_times)
     return {
         "tissue, energy or setting": without_addresses(
             eqx.tree_pformat(parts, short_arrays=True, width=100)

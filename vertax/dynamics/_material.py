@@ -1,4 +1,4 @@
-"""What a tissue is made of: its energy, what resists and what drives it."""
+"""A material: an energy, a dissipation and an activity, as one object to fit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vertax.mesh import Tissue
 
 
 class Material(AbstractEnergy):
-    """An energy together with what resists the motion and what drives it, to be fitted as one.
+    """An energy with a dissipation and an activity, to be fitted together.
 
     ```python
     material = vx.dynamics.Material(energy, vx.dissipations.SubstrateFriction(1.0))
@@ -24,17 +24,18 @@ class Material(AbstractEnergy):
     vx.fit(problem, optimiser, 20).energy.dissipation.coefficient
     ```
 
-    Positions and times tell energies over frictions, so one of them must be known: `trainable` says which.
+    Positions and times determine only the ratio of energy to dissipation, so the scale of one of them must be
+    fixed: select the others with `trainable`.
 
     **Arguments:**
 
     - `energy`: an energy, or a function of time that returns one.
-    - `dissipation`: in place of that of the [`Evolution`][vertax.Evolution]; None leaves that.
-    - `activity`: in place of that of the evolution; None leaves that.
+    - `dissipation`: replaces the dissipation of the [`Evolution`][vertax.Evolution], unless None.
+    - `activity`: replaces the activity of the evolution, unless None.
 
     **Raises:**
 
-    - `TypeError` for what is none of these.
+    - `TypeError` for an argument of the wrong class.
     """
 
     energy: AbstractEnergy | Callable[[Float[Array, ""]], AbstractEnergy]
@@ -55,7 +56,7 @@ class Material(AbstractEnergy):
                 )
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
-        """The energy of a tissue, if that is no function of time."""
+        """The energy of a tissue; a `TypeError` if the energy is a function of time."""
         if isinstance(self.energy, AbstractEnergy):
             return self.energy(tissue)
         raise TypeError(

@@ -1,4 +1,4 @@
-"""Steps in time, one after the other, as a part of a compiled function."""
+"""The time integration loop, as a part of a compiled function."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractViscosity
 from vertax.dynamics._evolved import Evolved
-from vertax.dynamics._incremental_potential import Incremental, flipped_as
+from vertax.dynamics._incremental_potential import IncrementalPotential, with_flips_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Periodic, Tissue
 from vertax.relax import RESULTS, Equilibrium
 
-# Of a method of second order with two stages of this share of a step each (SDIRK: Alexander 1977,
-# doi:10.1137/0714068), which damps what is fast as the implicit Euler method does.
-_SHARE = 1 - 0.5**0.5
+# The coefficient γ of the two-stage SDIRK method of order 2 (Alexander 1977, doi:10.1137/0714068). The method
+# is L-stable: fast modes are damped, as by the implicit Euler method.
+_GAMMA = 1 - 0.5**0.5
 
 
 class State(eqx.Module):
-    """How far an evolution has come."""
+    """The state of a time evolution between two steps."""
 
     tissue: Tissue
     drive: PyTree[Array]
     dt: Float[Array, ""]
-    """How long the next step is to be, if that is controlled."""
+    """The next time step, with a `StepControl`."""
     error: Float[Array, ""]
-    """Of the last one, in units of the tolerance."""
+    """The error of the last step, in units of the tolerance."""
     max_force: Float[Array, ""]
     num_steps: Int[Array, ""]
     num_t1: Int[Array, ""]
     valid: Bool[Array, ""]
-    arrived: Bool[Array, ""]
+    converged: Bool[Array, ""]
 
     def after(self, step: Equilibrium) -> State:
-        """What is known when one more step is done."""
+        """The state after one more step."""
         return State(
             step.tissue,
             self.drive,
@@ -52,43 +52,43 @@ class State(eqx.Module):
             self.num_steps + step.num_steps,
             self.num_t1 + step.num_t1,
             self.valid & step.valid & _right_handed(step.tissue.boundary),
-            self.arrived & (step.result == RESULTS.successful),
+            self.converged & (step.result == RESULTS.successful),
         )
 
     @property
     def result(self) -> RESULTS:
-        """The outcome of all steps."""
-        reached = RESULTS.where(
-            self.arrived, RESULTS.successful, RESULTS.nonlinear_max_steps_reached
+        """The result of all steps together."""
+        result = RESULTS.where(
+            self.converged, RESULTS.successful, RESULTS.nonlinear_max_steps_reached
         )
-        return RESULTS.where(jnp.isfinite(self.max_force), reached, RESULTS.nonfinite)
+        return RESULTS.where(jnp.isfinite(self.max_force), result, RESULTS.nonfinite)
 
 
 class Frames(NamedTuple):
-    """What is known of each time after the first, and with `first` of that too."""
+    """The data of frames, along a leading axis."""
 
     tissue: PyTree[Array]
     energies: Float[Array, " times"]
     transitions: Int[Array, " times"]
     sound: Bool[Array, " times"]
     steps: Float[Array, "times steps"]
-    refused: Int[Array, " times"]
+    num_rejected: Int[Array, " times"]
 
 
-def begin(tissue: Tissue, evolution: Any) -> State:
-    """The state that an `Evolution` (whose module imports this one) begins with."""
+def initial_state(tissue: Tissue, evolution: Any) -> State:
+    """The initial state of an `Evolution`. (Its module imports this one, therefore the type `Any`.)"""
     times = evolution.times.astype(tissue.vertices.dtype)
-    yes, none, zero = jnp.array(True), jnp.array(0), jnp.zeros((), times.dtype)
+    true, zero_count, zero = jnp.array(True), jnp.array(0), jnp.zeros((), times.dtype)
     drive = evolution.drive
     if drive is None and evolution.activity is not None:
         first, rest = jax.random.split(evolution.key)
         drive = (evolution.activity.init(tissue, first), rest)
     dt = zero if evolution.control is None else evolution.control.begin(times)
-    return State(tissue, drive, dt, zero + 1, zero, none, none, yes, yes)
+    return State(tissue, drive, dt, zero + 1, zero, zero_count, zero_count, true, true)
 
 
 def first_frame(state: State, energy: Any, evolution: Any) -> Frames:
-    """The frame of the first time, one row as those that `march` makes."""
+    """The frame of the initial time, as one row of `Frames`."""
     time = evolution.times.astype(state.tissue.vertices.dtype)[0]
     tissue = eqx.filter(state.tissue, eqx.is_array)
     n_steps = evolution.substeps if evolution.control is None else evolution.control.most
@@ -98,127 +98,142 @@ def first_frame(state: State, energy: Any, evolution: Any) -> Frames:
     return jax.tree.map(lambda x: x[None], row)
 
 
-def march(
+def integrate(
     state: State, energy: Any, evolution: Any, adjoint: AbstractAdjoint
 ) -> tuple[State, Frames]:
-    """From the first of the times of an `Evolution` to the last."""
+    """Integrate from the first of the times of an `Evolution` to the last; return the later frames."""
     times = evolution.times.astype(state.tissue.vertices.dtype)
-    control, flips = evolution.control, evolution.relaxation.transitions is not None
+    control, may_flip = evolution.control, evolution.relaxation.transitions is not None
 
     def stage(
-        state: State, before: Tissue, acts: Any, start: Any, end: Any, strained: Any
+        state: State,
+        before: Tissue,
+        active_energy: Any,
+        start: Any,
+        end: Any,
+        previous_strains: Any,
     ) -> State:
-        """A relaxation of the energy at the end, and what the way there from `before` dissipates."""
-        there = evolution.placed(state.tissue, end)
-        pulls = _energy_at(energy, end)
-        pressed = None
-        if acts is not None:
-            pulls += acts
-            forces = jax.grad(lambda x: acts(before.with_vertices(x)))(before.vertices)
+        """Minimise the energy at time `end` plus the dissipation of the motion from `before`."""
+        start_of_stage = evolution.placed(state.tissue, end)
+        total_energy = _energy_at(energy, end)
+        max_driving_force = None
+        if active_energy is not None:
+            total_energy += active_energy
+            forces = jax.grad(lambda x: active_energy(before.with_vertices(x)))(before.vertices)
             largest = jnp.max(jnp.sum(forces**2, axis=-1))
-            pressed = jnp.sqrt(jnp.maximum(largest, jnp.finfo(largest.dtype).tiny))
-        potential = Incremental(
-            pulls, evolution.dissipation, before, end - start, strained, flips, pressed
+            max_driving_force = jnp.sqrt(jnp.maximum(largest, jnp.finfo(largest.dtype).tiny))
+        potential = IncrementalPotential(
+            total_energy,
+            evolution.dissipation,
+            before,
+            end - start,
+            previous_strains,
+            may_flip,
+            max_driving_force,
         )
-        return state.after(evolution.relaxation.solve(there, potential, adjoint, recompute=True))
+        return state.after(
+            evolution.relaxation.solve(start_of_stage, potential, adjoint, recompute=True)
+        )
 
     def step(state: State, start: Any, end: Any) -> State:
-        before, acts, dt = state.tissue, None, end - start
+        before, active_energy, dt = state.tissue, None, end - start
         if evolution.activity is not None:
             inner, key = state.drive
-            key, now = jax.random.split(key)
-            acts, inner = evolution.activity.drive(
-                inner, before, evolution.dissipation, start, dt, now
+            key, step_key = jax.random.split(key)
+            active_energy, inner = evolution.activity.drive(
+                inner, before, evolution.dissipation, start, dt, step_key
             )
             state = eqx.tree_at(lambda s: s.drive, state, (inner, key))
         if evolution.order == 1:
-            return stage(state, before, acts, start, end, None)
-        middle = stage(state, before, acts, start, start + _SHARE * dt, None)
+            return stage(state, before, active_energy, start, end, None)
+        middle = stage(state, before, active_energy, start, start + _GAMMA * dt, None)
         assert isinstance(evolution.dissipation, AbstractViscosity)
-        base = flipped_as(before, middle.tissue) if flips else before
-        strained = evolution.dissipation.strains(middle.tissue, base) * (1 - _SHARE) / _SHARE
-        return stage(middle, before, acts, end - _SHARE * dt, end, strained)
+        base = with_flips_of(before, middle.tissue) if may_flip else before
+        previous_strains = (
+            evolution.dissipation.strains(middle.tissue, base) * (1 - _GAMMA) / _GAMMA
+        )
+        return stage(middle, before, active_energy, end - _GAMMA * dt, end, previous_strains)
 
     def attempt(state: State, start: Any, stop: Any) -> tuple[State, Any, Array]:
-        """A step that may be too long: the state after it, where that is, and the length if it was not."""
-        dt, left = frozen(state.dt), stop - start
-        last = dt >= 0.999 * left
-        end = jnp.where(last, stop, start + jnp.minimum(dt, left))
+        """Try one step: the state after it, its time, and the time step; 0 if the step was rejected."""
+        dt, remaining = frozen(state.dt), stop - start
+        last = dt >= 0.999 * remaining
+        end = jnp.where(last, stop, start + jnp.minimum(dt, remaining))
         middle = start + (end - start) / 2
 
-        def part(now: State, marks: tuple[Array, Array, Array]) -> tuple[State, State]:
-            whole_step, *ends = marks
-            after = step(whole(now), *ends)
+        def part(now: State, interval: tuple[Array, Array, Array]) -> tuple[State, State]:
+            is_full_step, *ends = interval
+            after = step(combined(now), *ends)
             arrays = eqx.filter(after, eqx.is_array)
-            return tree_where(whole_step, now, arrays), arrays
+            return tree_where(is_full_step, now, arrays), arrays
 
-        # The whole step and its halves by the code of one: compiling is what takes long.
-        marks = (
+        # The full step and the two half steps, in a loop: so the step is compiled once.
+        intervals = (
             jnp.array([True, False, False]),
             jnp.stack([start, start, middle]),
             jnp.stack([end, middle, end]),
         )
         now = eqx.filter(state, eqx.is_array)
-        now, parts = jax.lax.scan(part, now, marks)
-        fine, coarse = whole(now), whole(jax.tree.map(lambda x: x[0], parts))
-        error = control.error(fine.tissue, coarse.tissue, evolution.order)
-        # (What was wrong before this step is no reason to refuse it.)
-        sound = (fine.arrived & fine.valid) | ~(state.arrived & state.valid)
-        accepted = sound & (error <= 1)
-        following = control.next_step(end - start, error, state.error, sound, evolution.order)
-        # One that a frame cut short says little of how long the next may be.
-        following = jnp.where(accepted & last, jnp.maximum(following, dt), following)
-        after = tree_where(accepted, fine, state)
-        timing = (frozen(following), frozen(jnp.where(accepted, error, state.error)))
+        now, parts = jax.lax.scan(part, now, intervals)
+        halves, full = combined(now), combined(jax.tree.map(lambda x: x[0], parts))
+        error = control.error(halves.tissue, full.tissue, evolution.order)
+        # (After an earlier failure steps are accepted by their error alone.)
+        converged = (halves.converged & halves.valid) | ~(state.converged & state.valid)
+        accepted = converged & (error <= 1)
+        next_dt = control.next_step(end - start, error, state.error, converged, evolution.order)
+        # A step that was shortened to end at a frame does not shorten the next one.
+        next_dt = jnp.where(accepted & last, jnp.maximum(next_dt, dt), next_dt)
+        after = tree_where(accepted, halves, state)
+        timing = (frozen(next_dt), frozen(jnp.where(accepted, error, state.error)))
         after = eqx.tree_at(lambda s: (s.dt, s.error), after, timing)
         return after, jnp.where(accepted, end, start), jnp.where(accepted, end - start, 0)
 
     def controlled(arrays: State, ends: tuple[Array, Array]) -> tuple[State, Array, Array]:
-        """As many steps as it takes, their lengths, and how many were refused."""
+        """Steps of controlled size to the end of a frame, their sizes, and the number of rejected ones."""
 
         def one(carry: tuple[State, Array], _: None) -> tuple[tuple[State, Array], tuple]:
-            def go(carry: tuple[State, Array]) -> tuple[tuple[State, Array], tuple]:
-                state, time, dt = attempt(whole(carry[0]), carry[1], ends[1])
+            def take_step(carry: tuple[State, Array]) -> tuple[tuple[State, Array], tuple]:
+                state, time, dt = attempt(combined(carry[0]), carry[1], ends[1])
                 return (eqx.filter(state, eqx.is_array), time), (dt, dt == 0)
 
-            none = (jnp.zeros((), times.dtype), jnp.array(False))
-            return jax.lax.cond(carry[1] < ends[1], go, lambda c: (c, none), carry)
+            no_step = (jnp.zeros((), times.dtype), jnp.array(False))
+            return jax.lax.cond(carry[1] < ends[1], take_step, lambda c: (c, no_step), carry)
 
-        (arrays, time), (steps, refused) = jax.lax.scan(
+        (arrays, time), (steps, num_rejected) = jax.lax.scan(
             one, (arrays, ends[0]), None, length=control.most
         )
-        arrived = arrays.arrived & (time >= ends[1])
-        arrays = eqx.tree_at(lambda s: s.arrived, arrays, arrived)
-        # Those that were accepted first, in their order.
+        converged = arrays.converged & (time >= ends[1])
+        arrays = eqx.tree_at(lambda s: s.converged, arrays, converged)
+        # Accepted steps first, in their order.
         steps = steps[jnp.argsort(steps == 0, stable=True)]
-        return arrays, steps, refused.sum()
+        return arrays, steps, num_rejected.sum()
 
     def interval(arrays: State, ends: tuple[Array, Array]) -> tuple[State, Frames]:
         before = arrays.num_t1
         if control is not None:
-            arrays, steps, refused = controlled(arrays, ends)
+            arrays, steps, num_rejected = controlled(arrays, ends)
         else:
-            shares = jnp.linspace(0, 1, evolution.substeps + 1, dtype=times.dtype)
-            marks = ends[0] + shares * (ends[1] - ends[0])
+            fractions = jnp.linspace(0, 1, evolution.substeps + 1, dtype=times.dtype)
+            times_of_steps = ends[0] + fractions * (ends[1] - ends[0])
 
             def substep(arrays: State, ends: tuple[Array, Array]) -> tuple[State, None]:
-                return eqx.filter(step(whole(arrays), *ends), eqx.is_array), None
+                return eqx.filter(step(combined(arrays), *ends), eqx.is_array), None
 
-            arrays, _ = jax.lax.scan(substep, arrays, (marks[:-1], marks[1:]))
-            steps, refused = jnp.diff(marks), jnp.array(0)
-        value = _energy_at(energy, ends[1])(whole(arrays).tissue)
-        sound = arrays.arrived & arrays.valid
-        flips = arrays.num_t1 - before
-        return arrays, Frames(arrays.tissue, value, flips, sound, steps, refused)
+            arrays, _ = jax.lax.scan(substep, arrays, (times_of_steps[:-1], times_of_steps[1:]))
+            steps, num_rejected = jnp.diff(times_of_steps), jnp.array(0)
+        value = _energy_at(energy, ends[1])(combined(arrays).tissue)
+        sound = arrays.converged & arrays.valid
+        transitions = arrays.num_t1 - before
+        return arrays, Frames(arrays.tissue, value, transitions, sound, steps, num_rejected)
 
     arrays, static = eqx.partition(state, eqx.is_array)
-    whole = lambda arrays: eqx.combine(arrays, static)
+    combined = lambda arrays: eqx.combine(arrays, static)
     arrays, frames = jax.lax.scan(interval, arrays, (times[:-1], times[1:]))
-    return whole(arrays), frames
+    return combined(arrays), frames
 
 
 def evolved(times: Float[Array, " times"], end: State, frames: Frames) -> Evolved:
-    """What happened, of the state at the end and all frames."""
+    """The result of an evolution from its final state and all frames."""
     static = eqx.filter(end.tissue, eqx.is_array, inverse=True)
     return Evolved(
         tissue=end.tissue,
@@ -235,7 +250,7 @@ def evolved(times: Float[Array, " times"], end: State, frames: Frames) -> Evolve
         drive=end.drive,
         sound=frames.sound,
         steps=frames.steps,
-        refused=frames.refused,
+        refused=frames.num_rejected,
     )
 
 
@@ -244,23 +259,23 @@ def evolve_at_once(
     tissue: Tissue, energy: Any, evolution: Any, adjoint: AbstractAdjoint
 ) -> Evolved:
     """All frames by one compiled function."""
-    start = begin(tissue, evolution)
+    start = initial_state(tissue, evolution)
     first = first_frame(start, energy, evolution)
-    end, frames = march(start, energy, evolution, adjoint)
+    end, frames = integrate(start, energy, evolution, adjoint)
     frames = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), first, frames)
     return evolved(evolution.times, end, frames)
 
 
 def _energy_at(energy: Any, time: Any) -> AbstractEnergy:
-    found = energy if isinstance(energy, AbstractEnergy) else energy(time)
-    if not isinstance(found, AbstractEnergy):
+    value = energy if isinstance(energy, AbstractEnergy) else energy(time)
+    if not isinstance(value, AbstractEnergy):
         raise TypeError(
             "Argument `energy` must be an energy, or a function of time that returns one, but returned "
-            f"{describe(found)}."
+            f"{describe(value)}."
         )
-    return found
+    return value
 
 
 def _right_handed(boundary: AbstractBoundary) -> Bool[Array, ""]:
-    """Whether a box that depends on time has not folded over."""
+    """Whether the lattice of a box has a positive determinant."""
     return boundary.area > 0 if isinstance(boundary, Periodic) else jnp.array(True)

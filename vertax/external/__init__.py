@@ -1,4 +1,4 @@
-"""Other programs as forward models."""
+"""External programs as forward models."""
 
 from vertax.external._evolver import SurfaceEvolver as SurfaceEvolver
 from vertax.external._external import External as External

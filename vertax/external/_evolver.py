@@ -14,48 +14,48 @@ from jaxtyping import Float
 
 from vertax._base.checks import check_integer, check_number
 from vertax.energies import AbstractEnergy
-from vertax.external._evolver_datafile import datafile, leveller
-from vertax.external._evolver_model import Terms, slope_of
+from vertax.external._evolver_datafile import datafile, spacing_commands
+from vertax.external._evolver_model import Terms, parameter_derivatives
 from vertax.external._evolver_strings import Strings
-from vertax.external._evolver_t1 import can_flip, shortest, swapped
+from vertax.external._evolver_t1 import can_flip, flip_by_program, shortest_edge
 from vertax.external._program import run_program, tail
 from vertax.external._simulator import AbstractSimulator, Edges, Relaxed, SimulatorError
 from vertax.mesh import Tissue
 
 # T1 transitions in one relaxation, at most, per edge: as `T1.max_flips`.
-_MOST_T1 = 20
+_MAX_T1_PER_EDGE = 20
 
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceEvolver(AbstractSimulator):
     r"""Surface Evolver (Brakke 1992, doi:10.1080/10586458.1992.10504253) as a simulator, run as a process.
 
-    A tissue is written as a datafile: its edges in the string model, its energy as named quantities, and the
-    nudge as one more of them. The program relaxes it by its own commands, and prints where the vertices are.
-    Energies may consist of `LineTension`, `BoundedTension`, `AreaElasticity`, `PerimeterElasticity` and
-    `ShapeFactorEnergy`. Tissues may be periodic or free.
+    The tissue is written as a datafile: its edges in the string model, its energy and the nudge as named
+    quantities. The program relaxes it and prints the positions of the vertices. The energy must be a sum of
+    `LineTension`, `BoundedTension`, `AreaElasticity`, `PerimeterElasticity` and `ShapeFactorEnergy`. Tissues
+    may be periodic or free.
 
-    Arcs are chains of straight pieces, all of whose points relax. Their angles are those of arcs that enclose
-    as much, so areas are exact; lengths, and with them energies, are those of chains, shorter by parts in
-    $n^2$ with $n$ pieces. So the program, and not the energy, says what the derivatives are: use
-    `External(..., slope="program", stiffness=...)` for tissues with arcs.
+    Arcs are chains of $n$ straight pieces; all points of a chain relax. The angle of an arc is computed from
+    the area between chain and chord, so areas are exact. Lengths, and therefore energies, are those of the
+    chains, with a relative error of order $1/n^2$. Therefore the derivatives must be those of the program:
+    use `External(..., slope="program", stiffness=...)` for tissues with arcs.
 
-    The Debian package `evolver-nox` has the program. It takes some milliseconds to begin.
+    The program is in the Debian package `evolver-nox`. Its start takes some milliseconds.
 
     **Arguments:**
 
     - `command`: the program.
-    - `areas`: `"elastic"`, as the energy says, or `"fixed"` at the `target_area` of its `AreaElasticity`,
-        whose stiffness is infinite then, as in a foam. (In a periodic box the targets are scaled such that
-        they fill it.) Then the energy does not describe the program: use
+    - `areas`: `"elastic"`, as in the energy, or `"fixed"` at the `target_area` of its `AreaElasticity`, the
+        limit of infinite stiffness, as in a foam. (In a periodic box the targets are scaled to sum to its
+        area.) With `"fixed"` the energy does not describe the program: use
         `External(..., slope="program", stiffness=...)`.
-    - `pieces`: of each arc.
-    - `tolerance`: the program has relaxed when a step lowers the energy by less than this share.
-    - `steps`: of conjugate gradients to begin with, where a tissue is far from rest.
-    - `newton_steps`: at most; 0 for conjugate gradients only, until the tolerance ends them.
-    - `timeout`: seconds after which a run is ended.
-    - `t1`: a length; shorter edges flip by the program's `t1_edgeswap`, one after another, if the tissue then
-        comes to rest with a lower energy. Of straight edges, and not at the outline. None for no transitions.
+    - `pieces`: number of pieces per arc.
+    - `tolerance`: the relative decrease of the energy in a step at which the relaxation ends.
+    - `steps`: number of initial steps of conjugate gradients, for tissues far from rest.
+    - `newton_steps`: maximum number of Newton steps; 0 for conjugate gradients only.
+    - `timeout`: seconds after which a run is killed.
+    - `t1`: a length; shorter edges flip by the program's `t1_edgeswap`, one after another, if the relaxed
+        energy decreases. Only straight edges away from the outline. None for no transitions.
 
     **Raises:**
 
@@ -93,61 +93,68 @@ class SurfaceEvolver(AbstractSimulator):
         forces: Float[np.ndarray, "vertices 2"] | None,
         torques: Float[np.ndarray, " edges"] | None = None,
     ) -> Relaxed:
-        """Bring a tissue to rest, see [`AbstractSimulator`][vertax.external.AbstractSimulator].
+        """Relax a tissue, see [`AbstractSimulator`][vertax.external.AbstractSimulator].
 
         **Raises:**
 
-        - [`SimulatorError`][vertax.external.SimulatorError], with the tail of the log, if the program fails,
-            and for an energy that it cannot be told of.
+        - [`SimulatorError`][vertax.external.SimulatorError], with the end of the log, if the program fails,
+            and for an unsupported energy.
         """
         if self.t1 is None or forces is not None:
-            return self._at_rest(tissue, energy, forces, torques)
+            return self._relax_in_topology(tissue, energy, forces, torques)
         if tissue.arcs is not None:
             raise SimulatorError(
                 "T1 transitions by Surface Evolver are for straight edges: `t1=None`."
             )
-        found, there, refused = self._at_rest(tissue, energy, None, None), tissue, set()
+        relaxed, current, rejected = (
+            self._relax_in_topology(tissue, energy, None, None),
+            tissue,
+            set(),
+        )
         number = 0
         while True:
-            there = eqx.tree_at(lambda t: t.vertices, there, found.vertices)
-            allowed = can_flip(there.topology)
-            allowed[list(refused)] = False
-            lengths = np.hypot(*Edges.of(there).vectors(found.vertices).T)
-            edge = shortest(lengths, self.t1, allowed)
+            current = eqx.tree_at(lambda t: t.vertices, current, relaxed.vertices)
+            allowed = can_flip(current.topology)
+            allowed[list(rejected)] = False
+            lengths = np.hypot(*Edges.of(current).vectors(relaxed.vertices).T)
+            edge = shortest_edge(lengths, self.t1, allowed)
             if edge is None:
-                return found._replace(tissue=there, num_t1=number)
-            if number >= _MOST_T1 * tissue.n_edges:
+                return relaxed._replace(tissue=current, num_t1=number)
+            if number >= _MAX_T1_PER_EDGE * tissue.n_edges:
                 raise SimulatorError(
-                    f"T1 transitions by Surface Evolver came to no end after {number}. Lower `t1`, or pass "
+                    f"T1 transitions by Surface Evolver did not end after {number}. Lower `t1`, or pass "
                     "`t1=None`."
                 )
-            other = swapped(there, edge, 0.5 * self.t1, self._ask)
+            flipped = flip_by_program(current, edge, 0.5 * self.t1, self._run_commands)
             trial = None
-            if other is not None:
-                with suppress(SimulatorError):  # it comes to no rest that way
-                    trial = self._at_rest(other, energy, None, None)
-            # The energy falls with each transition, and between two of them each edge is refused once.
-            if trial is not None and trial.energy < found.energy - 1e-9 * abs(found.energy):
-                found, there, refused, number = trial, other, set(), number + 1
+            if flipped is not None:
+                with suppress(SimulatorError):  # the relaxation after the flip did not converge
+                    trial = self._relax_in_topology(flipped, energy, None, None)
+            # The loop ends: each transition lowers the energy, and between two of them each edge is
+            # rejected at most once.
+            if trial is not None and trial.energy < relaxed.energy - 1e-9 * abs(relaxed.energy):
+                relaxed, current, rejected, number = trial, flipped, set(), number + 1
             else:
-                refused.add(edge)
+                rejected.add(edge)
 
-    def _at_rest(
+    def _relax_in_topology(
         self,
         tissue: Tissue,
         energy: AbstractEnergy,
         forces: Float[np.ndarray, "vertices 2"] | None,
         torques: Float[np.ndarray, " edges"] | None,
     ) -> Relaxed:
-        """Where a tissue rests in its topology."""
+        """Relax a tissue without transitions."""
         strings = Strings.of(tissue, self.pieces)
         terms = Terms.of(energy, strings.pieces.n_cells, len(strings.parts))
-        given, held = terms, ()
+        elastic_terms, fixed_cells = terms, ()
         if self.areas == "fixed":
-            terms, held = self._fixed(strings, given)
-        text = datafile(strings, terms, forces, torques, held=held)
+            terms, fixed_cells = self._fixed(strings, elastic_terms)
+        text = datafile(strings, terms, forces, torques, fixed_cells=fixed_cells)
         points, pressures, numbers = self._run(
-            text, self._commands(strings, near=forces is not None) + _report(held), strings
+            text,
+            self._commands(strings, near=forces is not None) + _report_commands(fixed_cells),
+            strings,
         )
         measures = (strings.lengths(points), strings.areas(points), strings.perimeters(points))
         return Relaxed(
@@ -155,78 +162,85 @@ class SurfaceEvolver(AbstractSimulator):
             angles=_angles(strings, points, tissue),
             energy=numbers["energy"],
             num_steps=int(numbers["steps"]),
-            slope=slope_of(
-                energy, *measures, _by_targets(strings, given, pressures) if held else None
+            slope=parameter_derivatives(
+                energy,
+                *measures,
+                _target_derivatives(strings, elastic_terms, pressures) if fixed_cells else None,
             ),
         )
 
     def energy(self, tissue: Tissue, energy: AbstractEnergy) -> float:
-        """The energy of a tissue as it is, by the program.
+        """The energy of a tissue without relaxation, computed by the program.
 
         **Arguments:**
 
         - `tissue`, `energy`: the tissue, and its energy.
 
-        **Returns:** its energy.
+        **Returns:** the energy.
         """
         strings = Strings.of(tissue, self.pieces)
         terms = Terms.of(energy, strings.pieces.n_cells, len(strings.parts))
         text = datafile(strings, terms)
-        return self._run(text, "steps_done := 0;\nrecalc;\n" + _report(), strings)[2]["energy"]
+        return self._run(text, "steps_done := 0;\nrecalc;\n" + _report_commands(), strings)[2][
+            "energy"
+        ]
 
     def _fixed(self, strings: Strings, terms: Terms) -> tuple[Terms, Sequence[int]]:
-        """The terms of an energy whose areas are fixed, and the cells to hold."""
+        """The terms without area elasticity, and the cells with a fixed area."""
         if not terms.area_stiffness.any():
             raise SimulatorError(
-                "Areas that are fixed need targets: add an AreaElasticity to the energy, of any stiffness."
+                "Fixed areas need targets: add an AreaElasticity to the energy, of any stiffness."
             )
         n = strings.pieces.n_cells
-        targets, held = terms.area, range(n)
+        targets, fixed_cells = terms.area, range(n)
         if strings.periodic:
-            # The box holds the area of the last cell, once it holds the others.
-            targets, held = targets * _share(strings, terms), range(n - 1)
-        return terms._replace(area_stiffness=np.zeros(n), area=targets), held
+            # The last area follows from the area of the box.
+            targets, fixed_cells = targets * _target_scale(strings, terms), range(n - 1)
+        return terms._replace(area_stiffness=np.zeros(n), area=targets), fixed_cells
 
-    def _ask(self, text: str, commands: str) -> str:
-        """What the program writes, given a datafile and commands."""
+    def _run_commands(self, text: str, commands: str) -> str:
+        """Run the program with a datafile and commands; return the text of its result."""
         command = [self.command, "-i", "-frelax.cmd", "tissue.fe"]
         files = {"tissue.fe": text, "relax.cmd": commands}
-        found, _ = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
-        return found["result"]
+        results, _ = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
+        return results["result"]
 
     def _run(
         self, text: str, commands: str, strings: Strings
     ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
         command = [self.command, "-i", "-frelax.cmd", "tissue.fe"]
         files = {"tissue.fe": text, "relax.cmd": commands}
-        found, log = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
-        return _read(found["result"], strings, log)
+        results, log = run_program(
+            command, files, ["result"], timeout=self.timeout, install=INSTALL
+        )
+        return _parse_result(results["result"], strings, log)
 
     def _commands(self, strings: Strings, *, near: bool) -> str:
-        """How it relaxes: conjugate gradients, and then Newton's method with a search along each step.
+        """The commands of a relaxation: conjugate gradients, then Newton's method with a line search.
 
-        A tissue that is `near` to rest needs no first steps.
+        For a tissue `near` rest the conjugate gradients are left out.
         """
-        # (With the first toggle on, as it is, the index of the Hessian is wrong and its steps stall; so do
-        # they with areas that are held if the last one is off.)
+        # (With the first toggle on, its default, the index of the Hessian is wrong and Newton steps stall;
+        # with fixed areas they stall too if the last toggle is off.)
         lines = ["function_quantity_sparse off;", "hessian_normal off;", "augmented_hessian on;"]
-        lines += [leveller(strings, near=near), "steps_done := 0;", "recalc;"]
+        lines += [spacing_commands(strings, near=near), "steps_done := 0;", "recalc;"]
         first = 0 if near and self.newton_steps else self.steps
         if first:
-            # (Areas that are held are reached by steps along the gradient.)
+            # (Steps along the gradient move the areas to their fixed targets.)
             lines += [f"g 5; U; g {first}; U;", f"steps_done := {first + 5};"]
         elif self.areas == "fixed":
-            lines.append("g 1;")  # which the multipliers of areas that are held take to be known
+            lines.append("g 1;")  # computes the multipliers of fixed areas
         step = "hessian_seek" if self.newton_steps else "g 5"
-        most = first + (self.newton_steps or 100000)
+        max_steps = first + (self.newton_steps or 100000)
         lines += [
             "gain := 1;",
-            f"while (gain > {self.tolerance:.3g}*abs(total_energy) and steps_done < {most}) do "
+            f"while (gain > {self.tolerance:.3g}*abs(total_energy) and steps_done < {max_steps}) do "
             f"{{ level; before := total_energy; {step}; gain := abs(before - total_energy); "
             "steps_done += 1; };",
         ]
         if self.newton_steps and self.tolerance < 1e-10:
-            # The energy cannot tell steps below the root of its rounding: last ones in full.
+            # Near the minimum the energy changes by less than its rounding error, so a line search is
+            # useless: take the last steps in full.
             last = 2 if not strings.chains.any() else 3 if near else 5
             lines.append(f"weaken; {'level; hessian; ' * last}steps_done += {last};")
         return "\n".join([*lines, ""])
@@ -235,25 +249,25 @@ class SurfaceEvolver(AbstractSimulator):
 def _angles(
     strings: Strings, points: Float[np.ndarray, "points 2"], tissue: Tissue
 ) -> Float[np.ndarray, " edges"] | None:
-    """The angles of arcs; those of straight edges stay as they were."""
+    """The angles of arcs; those of straight edges do not change."""
     if tissue.arcs is None:
         return None
     return np.where(strings.chains, strings.angles(points), np.asarray(tissue.arcs.angles))
 
 
-def _share(strings: Strings, terms: Terms) -> float:
-    """By how much target areas are too small for a periodic box."""
+def _target_scale(strings: Strings, terms: Terms) -> float:
+    """The ratio of the area of a periodic box to the sum of the target areas."""
     return float(abs(np.linalg.det(strings.lattice)) / np.sum(terms.area))
 
 
-def _by_targets(
+def _target_derivatives(
     strings: Strings, terms: Terms, pressures: Float[np.ndarray, " cells"]
 ) -> Float[np.ndarray, " cells"]:
-    """Derivatives of the energy with respect to the targets of areas that are held."""
+    """Derivatives of the energy with respect to the targets of fixed areas."""
     if not strings.periodic:
         return pressures
     mean = pressures @ terms.area / np.sum(terms.area)
-    return _share(strings, terms) * (pressures - mean)
+    return _target_scale(strings, terms) * (pressures - mean)
 
 
 INSTALL = (
@@ -262,19 +276,21 @@ INSTALL = (
 )
 
 
-def _report(held: Sequence[int] = ()) -> str:
-    """Commands that write where all points are, and the multipliers of areas held; and end the program."""
+def _report_commands(fixed_cells: Sequence[int] = ()) -> str:
+    """Commands that write all points and the multipliers of fixed areas, and end the program."""
     lines = [
         'printf "energy %.17g\\n", total_energy-nudge.value-spacing.value >> "result";',
         'printf "steps %g\\n", steps_done >> "result";',
         'foreach vertex vv do printf "point %d %.17g %.17g\\n", vv.id, vv.x, vv.y >> "result";',
-        *(f'printf "pressure {c} %.17g\\n", keep_{c}.pressure >> "result";' for c in held),
+        *(f'printf "pressure {c} %.17g\\n", keep_{c}.pressure >> "result";' for c in fixed_cells),
     ]
     return "\n".join([*lines, 'printf "end\\n" >> "result";', "quit", "quit", ""])
 
 
-def _read(text: str, strings: Strings, log: str) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
-    """Points, pressures (of areas that are held) and numbers that the program wrote."""
+def _parse_result(
+    text: str, strings: Strings, log: str
+) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+    """Points, pressures (of fixed areas) and numbers from the output of the program."""
     points = np.full_like(strings.points, np.nan)
     pressures = np.zeros(strings.pieces.n_cells)
     numbers: dict[str, float] = {}
@@ -289,8 +305,10 @@ def _read(text: str, strings: Strings, log: str) -> tuple[np.ndarray, np.ndarray
             elif kind != "end":
                 numbers[kind] = float(values[0])
     except (ValueError, IndexError) as error:
-        raise SimulatorError(f"What evolver wrote cannot be read ({error}). {tail(log)}") from error
-    complete = bool(lines) and lines[-1] == "end" and {"energy", "steps"} <= numbers.keys()
-    if re.search("ERROR", log) or not complete or not np.isfinite(points).all():
-        raise SimulatorError(f"evolver did not come to an end. {tail(log)}")
+        raise SimulatorError(
+            f"The output of evolver cannot be read ({error}). {tail(log)}"
+        ) from error
+    is_complete = bool(lines) and lines[-1] == "end" and {"energy", "steps"} <= numbers.keys()
+    if re.search("ERROR", log) or not is_complete or not np.isfinite(points).all():
+        raise SimulatorError(f"The output of evolver is incomplete. {tail(log)}")
     return points, pressures, numbers

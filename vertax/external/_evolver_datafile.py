@@ -1,4 +1,4 @@
-"""Tissues, their energies and weak forces as datafiles of Surface Evolver."""
+"""Datafiles of Surface Evolver from tissues, their energies and weak forces."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from jaxtyping import Float
 from vertax.external._evolver_model import Terms
 from vertax.external._evolver_strings import Strings
 
-# Points of a chain may slide along it at next to no cost of energy. Springs between them, whose rest length
-# is the mean length of the pieces of their edge, keep these equal: where chains are at rest, the springs are
-# slack. They lag behind while an edge grows, so they lose strength as the relaxation goes on.
-_WEAKER, _WEAKEST = 0.6, 1e-3
-_OF_POINTS = ("pull_x", "pull_y", "arm_x", "arm_y")
-_OF_PIECES = ("gam", "soft", "spring", "rest", "chain", "along")
-# (`chain` is the first piece of the same edge, 0 if there is no other; `along` is for adding up.)
+# Points of a chain can slide along it at nearly constant energy. Springs along the pieces, with the mean
+# length of the pieces of their edge as rest length, keep the pieces equal. At equilibrium the springs are
+# relaxed. Rest lengths are updated between steps and lag behind a growing edge, so the springs are weakened
+# during the relaxation: by the factor _SPRING_DECAY at each update, down to _MIN_SPRING.
+_SPRING_DECAY, _MIN_SPRING = 0.6, 1e-3
+_POINT_ATTRIBUTES = ("pull_x", "pull_y", "arm_x", "arm_y")
+_PIECE_ATTRIBUTES = ("gam", "soft", "spring", "rest", "chain", "along")
+# (`chain` is the first piece of the edge, 0 for a straight edge; `along` accumulates the length of the edge.)
 _LENGTH = "sqrt(x3^2+x4^2+soft)"
 
 
@@ -26,37 +27,39 @@ def datafile(
     forces: Float[np.ndarray, "vertices 2"] | None = None,
     torques: Float[np.ndarray, " edges"] | None = None,
     *,
-    held: Sequence[int] = (),
+    fixed_cells: Sequence[int] = (),
 ) -> str:
     """A tissue, its energy and a nudge in the language of Surface Evolver.
 
-    The areas of the cells `held` stay at their targets.
+    The areas of `fixed_cells` are constrained to their targets.
     """
     lines = ["STRING", "SPACE_DIMENSION 2", "KEEP_ORIGINALS"]
     if strings.periodic:
         lines += ["TORUS", "PERIODS", *(f"{a:.17g} {b:.17g}" for a, b in strings.lattice)]
-    lines += [f"define vertex attribute {name} real" for name in _OF_POINTS]
-    lines += [f"define edge attribute {name} real" for name in _OF_PIECES]
+    lines += [f"define vertex attribute {name} real" for name in _POINT_ATTRIBUTES]
+    lines += [f"define edge attribute {name} real" for name in _PIECE_ATTRIBUTES]
     edges = "method edge_general_integral scalar_integrand:"
     lines += [
         f"quantity tensions energy {edges} gam*{_LENGTH}",
         f"quantity spacing energy {edges} 0.5*spring*({_LENGTH}-rest)^2",
         "quantity nudge energy method vertex_scalar_integral scalar_integrand: -(pull_x*x+pull_y*y)",
     ]
-    of_piece: list[list[str]] = [["tensions"] for _ in strings.edge]
+    quantities: list[list[str]] = [["tensions"] for _ in strings.edge]
     for piece in np.flatnonzero(strings.chains[strings.edge]):
-        of_piece[piece].append("spacing")
-    _areas(lines, of_piece, strings, terms, held)
-    _perimeters(lines, of_piece, strings, terms)
-    pulls, arms = strings.pulls(forces, torques), np.zeros_like(strings.points)
+        quantities[piece].append("spacing")
+    _areas(lines, quantities, strings, terms, fixed_cells)
+    _perimeters(lines, quantities, strings, terms)
+    pulls, arms = strings.point_forces(forces, torques), np.zeros_like(strings.points)
     springs = _springs(lines, strings, terms, arms)
     pinned = set(strings.fixed.tolist())
     lines.append("vertices")
     rows = np.concatenate([pulls, arms], axis=1)
     for i, ((x, y), row) in enumerate(zip(strings.points, rows, strict=True)):
         fix = " fixed" if i in pinned else ""
-        own = " ".join(springs) if i < strings.n_vertices else ""
-        lines.append(f"{i + 1} {x:.17g} {y:.17g}{fix} {_given(_OF_POINTS, row)} nudge {own}")
+        names = " ".join(springs) if i < strings.n_vertices else ""
+        lines.append(
+            f"{i + 1} {x:.17g} {y:.17g}{fix} {_attributes(_POINT_ATTRIBUTES, row)} nudge {names}"
+        )
     lines.append("edges")
     parts = strings.parts[strings.edge]
     spring = parts * _stiffness(strings, terms)
@@ -68,72 +71,72 @@ def datafile(
     )
     sign = {0: "*", 1: "+", -1: "-"}
     for i, ((a, b), wrap) in enumerate(zip(strings.pieces.ends, strings.wraps, strict=True)):
-        around = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
-        names = " ".join(of_piece[i])
+        wrap_text = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
+        names = " ".join(quantities[i])
         lines.append(
-            f"{i + 1} {a + 1} {b + 1}{around} density 0 {_given(_OF_PIECES, rows[i])} {names}"
+            f"{i + 1} {a + 1} {b + 1}{wrap_text} density 0 {_attributes(_PIECE_ATTRIBUTES, rows[i])} {names}"
         )
     return "\n".join([*lines, "read", ""])
 
 
-def leveller(strings: Strings, *, near: bool) -> str:
-    """A command `level` that gives the springs along chains new rest lengths, and less strength.
+def spacing_commands(strings: Strings, *, near: bool) -> str:
+    """The commands `level`, which updates the rest lengths of springs and weakens them, and `weaken`.
 
-    Where a tissue is `near` to rest they are weak to begin with, and all are after `weaken`.
+    For a tissue `near` rest the springs are weak from the start.
     """
     if not strings.chains.any():
         return "level := { recalc; };\nweaken := {};\n"
-    per = int(strings.parts.max())
+    n_pieces = int(strings.parts.max())
     each = "foreach edge ee where ee.chain > 0 do"
     return (
-        f"weaken := {{ spacing.modulus := {_WEAKEST}; }};\n{'weaken' if near else ''};\n"
+        f"weaken := {{ spacing.modulus := {_MIN_SPRING}; }};\n{'weaken' if near else ''};\n"
         f"level := {{ {each} {{ edge[ee.chain].along := 0; }};\n"
         f"{each} {{ edge[ee.chain].along := edge[ee.chain].along + ee.length; }};\n"
-        f"{each} {{ ee.rest := edge[ee.chain].along/{per}; }};\n"
-        f"spacing.modulus := maximum({_WEAKER}*spacing.modulus, {_WEAKEST}); recalc; }};\n"
+        f"{each} {{ ee.rest := edge[ee.chain].along/{n_pieces}; }};\n"
+        f"spacing.modulus := maximum({_SPRING_DECAY}*spacing.modulus, {_MIN_SPRING}); recalc; }};\n"
     )
 
 
-def _given(names: Sequence[str], values: Float[np.ndarray, " names"]) -> str:
+def _attributes(names: Sequence[str], values: Float[np.ndarray, " names"]) -> str:
     return " ".join(f"{name} {value:.17g}" for name, value in zip(names, values, strict=True))
 
 
 def _areas(
     lines: list[str],
-    of_piece: list[list[str]],
+    quantities: list[list[str]],
     strings: Strings,
     terms: Terms,
-    held: Sequence[int],
+    fixed_cells: Sequence[int],
 ) -> None:
-    """A quantity for the area of each cell that wants one."""
+    """A quantity for each cell with area elasticity or a fixed area."""
     pieces = strings.pieces
-    wanted = terms.area_stiffness != 0
-    wanted[list(held)] = True
+    has_elasticity = terms.area_stiffness != 0
+    has_elasticity[list(fixed_cells)] = True
     instances: dict[tuple, str] = {}
     parts: dict[int, list[str]] = {}
     for e in range(len(pieces.ends)):
         for side, sign in ((0, 1), (1, -1)):
             cell = int(pieces.cells[e, side])
-            if cell == pieces.n_cells or not wanted[cell]:
+            if cell == pieces.n_cells or not has_elasticity[cell]:
                 continue
             x, y = pieces.shifts[e, side]
             key = (cell, sign, round(float(x), 9), round(float(y), 9))
             if key not in instances:
-                # Half the integral of x dy - y dx, as the cell sees the edge.
+                # Half the integral of x dy - y dx along the edge, in the frame of the cell.
                 name = instances[key] = f"surface_{cell}_{len(parts.get(cell, []))}"
                 parts.setdefault(cell, []).append(name)
                 lines.append(
                     f"method_instance {name} method edge_vector_integral vector_integrand: "
                     f"q1: {-0.5 * sign:g}*(y+({y:.17g})) q2: {0.5 * sign:g}*(x+({x:.17g}))"
                 )
-            of_piece[e].append(instances[key])
-    for cell, some in parts.items():
-        area = "+".join(f"{name}.value" for name in some)
+            quantities[e].append(instances[key])
+    for cell, names in parts.items():
+        area = "+".join(f"{name}.value" for name in names)
         target = terms.area[cell]
-        if cell in held:
-            # (Not as a function of the instances: its Hessian would be dense, for each cell.)
-            parts_of = " ".join(f"method {name}" for name in some)
-            lines.append(f"quantity keep_{cell} fixed = {target:.17g} {parts_of}")
+        if cell in fixed_cells:
+            # (A function of the instances would have a dense Hessian for each cell.)
+            methods = " ".join(f"method {name}" for name in names)
+            lines.append(f"quantity keep_{cell} fixed = {target:.17g} {methods}")
             continue
         k = terms.area_stiffness[cell]
         lines.append(
@@ -142,9 +145,9 @@ def _areas(
 
 
 def _perimeters(
-    lines: list[str], of_piece: list[list[str]], strings: Strings, terms: Terms
+    lines: list[str], quantities: list[list[str]], strings: Strings, terms: Terms
 ) -> None:
-    """A quantity for the perimeter of each cell that wants one."""
+    """A quantity for each cell with perimeter elasticity."""
     for cell in np.flatnonzero(terms.perimeter_stiffness):
         lines.append(
             f"method_instance around_{cell} method edge_general_integral scalar_integrand: {_LENGTH}"
@@ -154,15 +157,15 @@ def _perimeters(
             f"quantity tighten_{cell} energy function "
             f"{0.5 * k:.17g}*(around_{cell}.value-({target:.17g}))^2"
         )
-    wanted = set(np.flatnonzero(terms.perimeter_stiffness).tolist())
-    for names, cells in zip(of_piece, strings.pieces.cells.tolist(), strict=True):
-        names += [f"around_{c}" for c in cells if c in wanted]
+    has_elasticity = set(np.flatnonzero(terms.perimeter_stiffness).tolist())
+    for names, cells in zip(quantities, strings.pieces.cells.tolist(), strict=True):
+        names += [f"around_{c}" for c in cells if c in has_elasticity]
 
 
 def _springs(
     lines: list[str], strings: Strings, terms: Terms, arms: Float[np.ndarray, "points 2"]
 ) -> list[str]:
-    """Springs that hold the whole where it is; they change no shape, and make the Hessian regular."""
+    """Springs against rigid motions; they do not change the shape, and make the Hessian regular."""
     n = strings.n_vertices
     points = strings.points[:n]
     k = _stiffness(strings, terms)
@@ -173,7 +176,7 @@ def _springs(
     if not strings.periodic and len(strings.fixed) <= 1:
         arms[:n] = (points - centre) / np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1)))
         modes |= {"turn": "arm_x*y-arm_y*x"}
-    at = {
+    initial_sums = {
         "x": points[:, 0].sum(),
         "y": points[:, 1].sum(),
         "turn": np.sum(arms[:n, 0] * points[:, 1] - arms[:n, 1] * points[:, 0]),
@@ -184,7 +187,7 @@ def _springs(
         )
         lines.append(
             f"quantity hold_{name} energy function "
-            f"{0.5 * k / n:.17g}*(sum_{name}.value-({at[name]:.17g}))^2"
+            f"{0.5 * k / n:.17g}*(sum_{name}.value-({initial_sums[name]:.17g}))^2"
         )
     return [f"sum_{name}" for name in modes]
 

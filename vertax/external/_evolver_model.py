@@ -1,4 +1,4 @@
-"""Energies as Surface Evolver knows them: named quantities of edges and cells."""
+"""Energies in the form of Surface Evolver: coefficients of edges and cells."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vertax.external._simulator import SimulatorError
 
 
 class Terms(NamedTuple):
-    """What an energy asks of edges and cells; NaN where it asks nothing."""
+    """The coefficients of an energy: tensions of edges, quadratic terms of areas and perimeters."""
 
     tension: Float[np.ndarray, " edges"]
     area_stiffness: Float[np.ndarray, " cells"]
@@ -30,13 +30,13 @@ class Terms(NamedTuple):
 
     @classmethod
     def of(cls, energy: AbstractEnergy, n_cells: int, n_edges: int) -> Terms:
-        """Those of an energy."""
+        """The coefficients of a sum of supported energies."""
         tension = np.zeros(n_edges)
         targets: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         per_cell = lambda x: np.broadcast_to(np.asarray(x, float), n_cells)
 
         def add(name: str, stiffness: Any, target: Any) -> None:
-            # Two parabolas are one, up to a constant.
+            # The sum of two parabolas is a parabola, up to a constant.
             k, x = per_cell(stiffness), per_cell(target)
             if name in targets:
                 k0, x0 = targets[name]
@@ -56,11 +56,11 @@ class Terms(NamedTuple):
                 add("perimeter", 2 / area, np.asarray(term.target_shape_factor) * np.sqrt(area))
             else:
                 raise SimulatorError(
-                    f"Surface Evolver is not told of a {type(term).__name__}: its energy may consist of "
+                    f"Surface Evolver does not support {type(term).__name__}: the energy must be a sum of "
                     "LineTension, BoundedTension, AreaElasticity, PerimeterElasticity and ShapeFactorEnergy."
                 )
-        none = (np.zeros(n_cells), np.zeros(n_cells))
-        return cls(tension, *targets.get("area", none), *targets.get("perimeter", none))
+        zeros = (np.zeros(n_cells), np.zeros(n_cells))
+        return cls(tension, *targets.get("area", zeros), *targets.get("perimeter", zeros))
 
 
 def terms_of(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:
@@ -69,26 +69,26 @@ def terms_of(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:
 
 
 def tension_of(term: Any) -> Any:
-    """The tensions of a term, by NumPy."""
+    """The tensions of a term, computed by NumPy."""
     if isinstance(term, BoundedTension):
         low, high = (np.asarray(x, float) for x in (term.low, term.high))
         return low + (high - low) / (1 + np.exp(-np.asarray(term.logits, float)))
     return np.asarray(term.tension, float)
 
 
-def slope_of(
+def parameter_derivatives(
     energy: AbstractEnergy,
     lengths: Float[np.ndarray, " edges"],
     areas: Float[np.ndarray, " cells"],
     perimeters: Float[np.ndarray, " cells"],
     pressures: Float[np.ndarray, " cells"] | None,
 ) -> AbstractEnergy:
-    """The partial derivatives of an energy with respect to its parameters, in their place.
+    """The energy with its partial derivatives in the place of its parameters.
 
-    With `pressures`, areas are held at their targets, and these are the multipliers.
+    `pressures` are the multipliers of fixed areas; None for elastic areas.
     """
 
-    def put(term: Any, **slopes: np.ndarray) -> Any:
+    def with_derivatives(term: Any, **slopes: np.ndarray) -> Any:
         for name, slope in slopes.items():
             old = getattr(term, name)
             if not isinstance(old, np.ndarray | np.generic):
@@ -99,25 +99,27 @@ def slope_of(
 
     def derived(term: Any) -> Any:
         if isinstance(term, LineTension):
-            return put(term, tension=lengths)
+            return with_derivatives(term, tension=lengths)
         if isinstance(term, BoundedTension):
             tension, low, high = tension_of(term), float(term.low), float(term.high)
-            return put(term, logits=lengths * (tension - low) * (high - tension) / (high - low))
+            return with_derivatives(
+                term, logits=lengths * (tension - low) * (high - tension) / (high - low)
+            )
         if isinstance(term, AreaElasticity):
             if pressures is not None:
-                return put(term, stiffness=0 * areas, target_area=pressures)
+                return with_derivatives(term, stiffness=0 * areas, target_area=pressures)
             excess = areas - np.asarray(term.target_area)
-            return put(
+            return with_derivatives(
                 term, stiffness=0.5 * excess**2, target_area=-np.asarray(term.stiffness) * excess
             )
         if isinstance(term, PerimeterElasticity):
             excess = perimeters - np.asarray(term.target_perimeter)
             slopes = (0.5 * excess**2, -np.asarray(term.stiffness) * excess)
-            return put(term, stiffness=slopes[0], target_perimeter=slopes[1])
+            return with_derivatives(term, stiffness=slopes[0], target_perimeter=slopes[1])
         area = np.asarray(term.mean_area, float)
-        off = perimeters / np.sqrt(area) - np.asarray(term.target_shape_factor)
-        by_area = -2 * (areas / area - 1) * areas / area**2 - off * perimeters / area**1.5
-        return put(term, target_shape_factor=-2 * off, mean_area=by_area)
+        excess = perimeters / np.sqrt(area) - np.asarray(term.target_shape_factor)
+        by_area = -2 * (areas / area - 1) * areas / area**2 - excess * perimeters / area**1.5
+        return with_derivatives(term, target_shape_factor=-2 * excess, mean_area=by_area)
 
     terms = tuple(derived(term) for term in terms_of(energy))
     if hasattr(energy, "terms"):

@@ -1,4 +1,4 @@
-"""Tissues as Surface Evolver knows them: points, and straight strings between them."""
+"""Tissues in the string model of Surface Evolver: points, and straight strings between them."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from vertax.mesh import Periodic, Tissue
 from vertax.mesh._arcs import LARGEST_FREE_ANGLE, angle_of_area
 
 
-# An arc is a chain of n straight strings of the same length between points on a circle. Such a chain is at
-# rest exactly where an arc is: the tension pulls at each point as the pressures on both sides push. Over a
-# chord c, with the angle α' between it and the circle, the radius is R = c / (2 sin α'), and it encloses
+# An arc is a chain of n straight strings of equal length between points on a circle. Such a chain is at rest
+# under the same tension and pressure difference as an arc. With the chord c and the angle α' between chord
+# and circle, the radius is R = c / (2 sin α'), and the area between chain and chord is
 #
 #     S = R² (n sin(2 α'/n) - sin 2 α') / 2.
 #
-# The angle of an arc of a tissue means the area that it encloses: S is c² g(α), with α a little below α'.
+# The angle α of the arc of a tissue is defined by the same area: S = c² g(α), with α slightly below α'.
 class Strings(NamedTuple):
-    """A tissue as points and straight strings between them; in a periodic one, in the home box."""
+    """A tissue as points and straight strings between them; periodic tissues are wrapped into the box."""
 
     points: Float[np.ndarray, "points 2"]
-    """First the vertices, then those inside of chains, edge by edge."""
+    """The vertices, followed by the inner points of chains, edge by edge."""
     pieces: Edges
-    """The strings, seen from these points, edge by edge."""
+    """The strings between these points, edge by edge."""
     edge: Int[np.ndarray, " pieces"]
-    """Of which edge each is."""
+    """Index of the edge of each string."""
     parts: Int[np.ndarray, " edges"]
-    """How many strings each edge has."""
+    """Number of strings of each edge."""
     wraps: Int[np.ndarray, "pieces 2"]
-    """How often each goes around the box."""
+    """Number of periods that each string crosses."""
     images: Int[np.ndarray, "vertices 2"]
-    """In which image of the box each vertex is."""
+    """Indices of the image of the box that each vertex was in."""
     lattice: Float[np.ndarray, "2 2"]
     periodic: bool
     softening: float
@@ -41,7 +41,7 @@ class Strings(NamedTuple):
 
     @classmethod
     def of(cls, tissue: Tissue, n: int = 8) -> Strings:
-        """Those of a tissue, with `n` for each arc."""
+        """Convert a tissue, with `n` strings per arc."""
         edges = Edges.of(tissue)
         vertices = np.asarray(tissue.vertices, float)
         lattice = np.zeros((2, 2))
@@ -56,9 +56,9 @@ class Strings(NamedTuple):
         wraps = across + images[last] - images[first]
         if np.abs(wraps).max(initial=0) > 1:
             raise SimulatorError(
-                "An edge is longer than the periodic box, which Surface Evolver's datafiles cannot say."
+                "An edge is longer than the periodic box, which Surface Evolver's datafiles cannot represent."
             )
-        home = vertices - images @ lattice
+        wrapped = vertices - images @ lattice
         shifts = edges.shifts + (images[first] @ lattice)[:, None]
         edges = edges._replace(across=wraps @ lattice, shifts=shifts)
         parts = np.ones(len(edges.ends), int)
@@ -67,18 +67,18 @@ class Strings(NamedTuple):
             is_arc = (edges.cells == edges.n_cells).any(axis=1) | tissue.arcs.inner
             parts[is_arc] = n
             angles = np.asarray(tissue.arcs.angles, float)[is_arc]
-            inner = _between(home[first[is_arc]], edges.vectors(home)[is_arc], angles, n)
+            inner = _chain_points(wrapped[first[is_arc]], edges.vectors(wrapped)[is_arc], angles, n)
         pinned = () if tissue.pinned is None else np.flatnonzero(np.asarray(tissue.pinned))
         pieces, edge = _pieces(edges, parts, len(vertices))
         ends = np.cumsum(parts) - 1
-        around = np.zeros((len(edge), 2), int)
-        around[ends] = wraps
+        piece_wraps = np.zeros((len(edge), 2), int)
+        piece_wraps[ends] = wraps
         return cls(
-            points=np.concatenate([home, inner.reshape(-1, 2)]),
+            points=np.concatenate([wrapped, inner.reshape(-1, 2)]),
             pieces=pieces,
             edge=edge,
             parts=parts,
-            wraps=around,
+            wraps=piece_wraps,
             images=images,
             lattice=lattice,
             periodic=periodic,
@@ -110,56 +110,58 @@ class Strings(NamedTuple):
 
     def angles(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " edges"]:
         """The angle of each edge; 0 where it is straight."""
-        chords, bulges, _ = self._bulges(points)
-        enclosed = bulges / np.sum(chords**2, axis=1)
-        angles = angle_of_area(bulges, np.hypot(*chords.T))
-        for _ in range(2):  # the first guess is exact to half of its digits
-            angles = angles - (_enclosed(angles) - enclosed) / _enclosed_slope(angles)
+        chords, segment_areas, _ = self._chords_and_areas(points)
+        enclosed = segment_areas / np.sum(chords**2, axis=1)
+        angles = angle_of_area(segment_areas, np.hypot(*chords.T))
+        for _ in range(2):  # Newton steps; the first guess has half of the digits
+            angles = angles - (_segment_area(angles) - enclosed) / _segment_area_derivative(angles)
         return angles
 
-    def pulls(
+    def point_forces(
         self,
         forces: Float[np.ndarray, "vertices 2"] | None,
         torques: Float[np.ndarray, " edges"] | None,
     ) -> Float[np.ndarray, "points 2"]:
-        """Forces on all points that do the same, near these points, as some on vertices and angles."""
-        pulls = np.zeros_like(self.points)
+        """Forces on all points that do the same virtual work as forces on vertices and torques on angles."""
+        point_forces = np.zeros_like(self.points)
         if forces is not None:
-            pulls[: self.n_vertices] = forces
+            point_forces[: self.n_vertices] = forces
         if torques is None:
-            return pulls
-        # From S = c² g(α) follows dα = (dS - 2 g c dc) / (c² g').
-        chords, bulges, vectors = self._bulges(self.points)
+            return point_forces
+        # S = c² g(α), so dα = (dS - 2 g c dc) / (c² g').
+        chords, segment_areas, vectors = self._chords_and_areas(self.points)
         squared = np.sum(chords**2, axis=1)
-        slope = _enclosed_slope(self.angles(self.points))
-        share = np.where(self.chains, torques, 0) / (squared * slope)
-        # S is half the sum of cross(p, next p), with places p counted from the first end.
-        places = self._places(self.points)
+        slope = _segment_area_derivative(self.angles(self.points))
+        coefficient = np.where(self.chains, torques, 0) / (squared * slope)
+        # S = Σ p × p_next / 2, with positions p relative to the first end of the edge.
+        offsets = self._offsets(self.points)
         turned = lambda x: np.stack([x[:, 1], -x[:, 0]], axis=-1)
-        shares, (tail, head) = share[self.edge], self.pieces.ends.T
+        coefficients, (tail, head) = coefficient[self.edge], self.pieces.ends.T
         starts = np.cumsum(self.parts) - self.parts
-        np.add.at(pulls, head, -0.5 * shares[:, None] * turned(places))
-        np.add.at(pulls, tail, 0.5 * shares[:, None] * turned(places + vectors))
-        by_chord = (2 * share * bulges / squared)[:, None] * chords
+        np.add.at(point_forces, head, -0.5 * coefficients[:, None] * turned(offsets))
+        np.add.at(point_forces, tail, 0.5 * coefficients[:, None] * turned(offsets + vectors))
+        by_chord = (2 * coefficient * segment_areas / squared)[:, None] * chords
         first, last = tail[starts], head[starts + self.parts - 1]
-        np.add.at(pulls, last, -by_chord)
-        # The first end takes what the others leave.
+        np.add.at(point_forces, last, -by_chord)
+        # The force on the first end makes the total force zero.
         total = np.zeros_like(chords)
         np.add.at(
-            total, self.edge, 0.5 * shares[:, None] * (turned(places + vectors) - turned(places))
+            total,
+            self.edge,
+            0.5 * coefficients[:, None] * (turned(offsets + vectors) - turned(offsets)),
         )
-        np.add.at(pulls, first, by_chord - total)
-        return pulls
+        np.add.at(point_forces, first, by_chord - total)
+        return point_forces
 
-    def _bulges(self, points: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, ...]:
-        """Chords of edges, what they enclose to the right of these, and the vectors of pieces."""
-        vectors, places = self.pieces.vectors(points), self._places(points)
+    def _chords_and_areas(self, points: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, ...]:
+        """Chords of edges, the areas between chains and chords (on their right), and vectors of pieces."""
+        vectors, offsets = self.pieces.vectors(points), self._offsets(points)
         chords = np.stack([np.bincount(self.edge, v) for v in vectors.T], axis=-1)
-        cross = places[:, 0] * vectors[:, 1] - places[:, 1] * vectors[:, 0]
+        cross = offsets[:, 0] * vectors[:, 1] - offsets[:, 1] * vectors[:, 0]
         return chords, 0.5 * np.bincount(self.edge, cross), vectors
 
-    def _places(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "pieces 2"]:
-        """Where each piece begins, seen from the beginning of its edge."""
+    def _offsets(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "pieces 2"]:
+        """The start of each piece relative to the start of its edge."""
         tail = self.pieces.ends[:, 0]
         starts = np.cumsum(self.parts) - self.parts
         return points[tail] - points[tail[starts]][self.edge]
@@ -172,7 +174,7 @@ class Strings(NamedTuple):
 def _pieces(
     edges: Edges, parts: Int[np.ndarray, " edges"], n_vertices: int
 ) -> tuple[Edges, Int[np.ndarray, " pieces"]]:
-    """Edges in pieces, and of which edge each is."""
+    """The pieces of all edges, and the index of the edge of each piece."""
     edge = np.repeat(np.arange(len(parts)), parts)
     ends = np.cumsum(parts) - 1
     starts = ends - parts + 1
@@ -194,52 +196,54 @@ def _pieces(
     )
 
 
-def _between(
+def _chain_points(
     start: Float[np.ndarray, "arcs 2"],
     chord: Float[np.ndarray, "arcs 2"],
     angle: Float[np.ndarray, " arcs"],
     n: int,
 ) -> Float[np.ndarray, "arcs inner 2"]:
-    """The points inside of chains of `n` equal pieces that enclose what arcs do."""
+    """The inner points of chains of `n` equal pieces that enclose the same areas as arcs."""
     a = np.minimum(np.abs(angle), LARGEST_FREE_ANGLE)
-    wanted = _enclosed(a)
+    target = _segment_area(a)
     low, high = a, np.minimum(1.5 * a, 0.999 * np.pi)
     for _ in range(54):
         middle = 0.5 * (low + high)
-        more = _enclosed(middle, n) < wanted
-        low, high = np.where(more, middle, low), np.where(more, high, middle)
+        below = _segment_area(middle, n) < target
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
     a = (np.sign(angle) * low)[:, None]
-    # In units of half the chord, from its middle: sin(α s) / sin α along it, and as far to its right as
-    # (cos(α s) - cos α) / sin α.
+    # In units of half the chord, relative to its midpoint: sin(α s) / sin α along the chord, and
+    # (cos(α s) - cos α) / sin α to its right.
     s = (2 * np.arange(1, n) / n - 1)[None, :]
-    flat = np.abs(a) < 1e-8
-    b = np.where(flat, 1, a)
-    along = np.where(flat, s, np.sin(b * s) / np.sin(b))
+    is_straight = np.abs(a) < 1e-8
+    b = np.where(is_straight, 1, a)
+    along = np.where(is_straight, s, np.sin(b * s) / np.sin(b))
     rise = 2 * np.sin(0.5 * b * (1 + s)) * np.sin(0.5 * b * (1 - s)) / np.sin(b)
-    aside = np.where(flat, 0.5 * a * (1 - s**2), rise)
+    across = np.where(is_straight, 0.5 * a * (1 - s**2), rise)
     half = 0.5 * chord[:, None, :]
     right = np.stack([half[..., 1], -half[..., 0]], axis=-1)
-    return start[:, None, :] + half + along[..., None] * half + aside[..., None] * right
+    return start[:, None, :] + half + along[..., None] * half + across[..., None] * right
 
 
-def _enclosed(a: Float[np.ndarray, " arcs"], n: int | None = None) -> Float[np.ndarray, " arcs"]:
-    """What a chain on a circle, or the circle, encloses over its chord, by the square of the chord."""
-    area = _beyond_sine(2 * a)
+def _segment_area(
+    a: Float[np.ndarray, " arcs"], n: int | None = None
+) -> Float[np.ndarray, " arcs"]:
+    """The area between the chord and a circular arc, or a chain of n pieces on it, per chord squared."""
+    area = _x_minus_sin(2 * a)
     if n is not None:
-        area = area - n * _beyond_sine(2 * a / n)
+        area = area - n * _x_minus_sin(2 * a / n)
     straight = a == 0
     return np.where(straight, 0, area / (8 * np.sin(np.where(straight, 1, a)) ** 2))
 
 
-def _enclosed_slope(a: Float[np.ndarray, " arcs"]) -> Float[np.ndarray, " arcs"]:
-    """Its derivative, of the circle."""
+def _segment_area_derivative(a: Float[np.ndarray, " arcs"]) -> Float[np.ndarray, " arcs"]:
+    """The derivative of `_segment_area` of an arc by its angle."""
     straight = np.abs(a) < 1e-8
     tangent = np.tan(np.where(straight, 1, a))
-    return np.where(straight, 1 / 6, 0.5 - 2 * _enclosed(a) / tangent)
+    return np.where(straight, 1 / 6, 0.5 - 2 * _segment_area(a) / tangent)
 
 
-def _beyond_sine(x: Float[np.ndarray, " arcs"]) -> Float[np.ndarray, " arcs"]:
-    """x - sin(x), to all digits."""
+def _x_minus_sin(x: Float[np.ndarray, " arcs"]) -> Float[np.ndarray, " arcs"]:
+    """x - sin(x) without cancellation."""
     squared = np.where(np.abs(x) < 1, x, 0) ** 2
     total = np.zeros_like(x)
     for k in range(19, 1, -2):  # x³/3! - x⁵/5! + …

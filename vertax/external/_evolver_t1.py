@@ -13,17 +13,17 @@ from vertax.external._simulator import Edges, SimulatorError
 from vertax.mesh import Tissue, Topology
 
 
-def swapped(
-    tissue: Tissue, edge: int, length: float, ask: Callable[[str, str], str]
+def flip_by_program(
+    tissue: Tissue, edge: int, length: float, run: Callable[[str, str], str]
 ) -> Tissue | None:
-    """A tissue with an edge flipped by the program's `t1_edgeswap`; None if it does not flip this one.
+    """A tissue with an edge flipped by the program's `t1_edgeswap`; None if it rejects the flip.
 
     **Arguments:**
 
     - `tissue`: the tissue, in NumPy arrays.
-    - `edge`: which one.
-    - `length`: how long it is then, at least.
-    - `ask`: what the program writes, given a datafile and commands.
+    - `edge`: the index of the edge.
+    - `length`: minimum length of the flipped edge.
+    - `run`: a function of a datafile and commands that returns the output of the program.
     """
     commands = [
         f"t1_edgeswap edge[{edge + 1}];",
@@ -33,63 +33,65 @@ def swapped(
         "quit",
         "",
     ]
-    rows = [line.split() for line in ask(_mesh(tissue), "\n".join(commands)).splitlines()]
+    rows = [line.split() for line in run(_mesh(tissue), "\n".join(commands)).splitlines()]
     if rows[-1:] != [["end"]]:
-        raise SimulatorError("evolver did not come to the end of a T1 transition.")
-    said = np.array(rows[:-1], int)
-    ends = np.sort(said[np.argsort(said[:, 0]), 1:] - 1, axis=1)
+        raise SimulatorError("The output of evolver after a T1 transition is incomplete.")
+    reported = np.array(rows[:-1], int)
+    ends = np.sort(reported[np.argsort(reported[:, 0]), 1:] - 1, axis=1)
     before = Edges.of(tissue)
     if np.array_equal(ends, np.sort(before.ends, axis=1)):
         return None
-    topology = flipped(tissue.topology, edge)
+    topology = flip_edge(tissue.topology, edge)
     v, w = before.ends[edge]
-    # The edge turns by a quarter, clockwise by our rule; the program may turn it the other way.
+    # vertax rotates the edge clockwise by 90 degrees; the program may rotate it counter-clockwise.
     after = Edges.of(eqx.tree_at(lambda t: t.topology, tissue, topology)).ends
-    turned = after.copy()
-    turned[after == v], turned[after == w] = w, v
+    swapped_ends = after.copy()
+    swapped_ends[after == v], swapped_ends[after == w] = w, v
     if np.array_equal(ends, np.sort(after, axis=1)) or np.array_equal(
-        ends, np.sort(turned, axis=1)
+        ends, np.sort(swapped_ends, axis=1)
     ):
-        return _turned(tissue, topology, before, edge, length)
-    raise SimulatorError(f"evolver flipped edge {edge} in a way that is no T1 transition.")
+        return _with_rotated_edge(tissue, topology, before, edge, length)
+    raise SimulatorError(f"The flip of edge {edge} by evolver is not a T1 transition.")
 
 
-def _turned(tissue: Tissue, topology: Topology, edges: Edges, edge: int, length: float) -> Tissue:
-    """The tissue in its new topology, the flipped edge turned by a quarter about its middle."""
+def _with_rotated_edge(
+    tissue: Tissue, topology: Topology, edges: Edges, edge: int, length: float
+) -> Tissue:
+    """The tissue in its new topology, with the flipped edge rotated by 90 degrees about its midpoint."""
     vertices = np.array(tissue.vertices)
     v, w = edges.ends[edge]
     along = edges.vectors(vertices)[edge]
     middle = vertices[v] + 0.5 * along
     size = max(float(np.hypot(*along)), length)
-    way = along / max(float(np.hypot(*along)), 1e-300)
-    half = 0.5 * size * np.array([-way[1], way[0]])
+    direction = along / max(float(np.hypot(*along)), 1e-300)
+    half = 0.5 * size * np.array([-direction[1], direction[0]])
     vertices[v], vertices[w] = middle + half, middle - half - edges.across[edge]
     return eqx.tree_at(lambda t: (t.topology, t.vertices), tissue, (topology, vertices))
 
 
 def can_flip(topology: Topology) -> Bool[np.ndarray, " edges"]:
-    """Which edges may flip: no cell is left with two sides, and none is at an outline."""
-    h, t, *_ = _around(topology, np.asarray(topology.half_edge))
+    """Whether each edge may flip: no cell gets two sides, and no neighbour is the exterior."""
+    h, t, *_ = _edge_neighbourhood(topology, np.asarray(topology.half_edge))
     cell = np.asarray(topology.cell)
-    # On the left, on the right, and (one slot on) at both ends.
+    # The cells on the left, on the right, and at both ends.
     left, right = cell[h], cell[t]
     first, last = cell[_counter_clockwise(h)], cell[_counter_clockwise(t)]
     sides = np.bincount(cell, minlength=topology.n_cells + 2)
     inner = np.max([left, right, first, last], axis=0) < topology.n_cells
-    # (A cell at both ends would be on both sides.)
+    # (After the flip the cells at the ends are on both sides of the edge, so they must differ.)
     return inner & (sides[left] > 3) & (sides[right] > 3) & (first != last)
 
 
-def flipped(topology: Topology, edge: int) -> Topology:
-    """A topology with one edge flipped, by NumPy: within a call to a program nothing can be computed by JAX.
+def flip_edge(topology: Topology, edge: int) -> Topology:
+    """A topology with one edge flipped, as `vertax.mesh._topology.flip_edges`, in NumPy.
 
-    See `vertax.mesh._topology.flip_edges`, which this follows.
+    (A simulator runs inside a callback, where JAX must not be called.)
     """
     twin, cell, frame, number, half_edge = (
         np.array(x)
         for x in (topology.twin, topology.cell, topology.frame, topology.edge, topology.half_edge)
     )
-    h, t, a, b, c, d = (int(x[0]) for x in _around(topology, half_edge[[edge]]))
+    h, t, a, b, c, d = (int(x[0]) for x in _edge_neighbourhood(topology, half_edge[[edge]]))
     old_cell, old_frame = cell.copy(), frame.copy()
     roll = np.arange(len(twin))
     roll[[a, b, c, d]] = [b, c, d, a]
@@ -111,8 +113,8 @@ def flipped(topology: Topology, edge: int) -> Topology:
     return eqx.tree_at(lambda m: (m.twin, m.cell, m.frame, m.edge, m.half_edge), topology, arrays)
 
 
-def _around(topology: Topology, h: Int[np.ndarray, " edges"]) -> tuple[np.ndarray, ...]:
-    """Half-edges, their twins, and the four others at their ends, counter-clockwise."""
+def _edge_neighbourhood(topology: Topology, h: Int[np.ndarray, " edges"]) -> tuple[np.ndarray, ...]:
+    """Half-edges, their twins, and the four other half-edges at their ends, counter-clockwise."""
     t = np.asarray(topology.twin)[h]
     return h, t, _counter_clockwise(h), _clockwise(h), _counter_clockwise(t), _clockwise(t)
 
@@ -126,7 +128,7 @@ def _counter_clockwise(h: Int[np.ndarray, " edges"]) -> Int[np.ndarray, " edges"
 
 
 def _mesh(tissue: Tissue) -> str:
-    """Vertices, edges and faces of a tissue, which the program's T1 transitions look at."""
+    """Vertices, edges and faces of a tissue as a datafile, for the program's T1 transitions."""
     strings, topology = Strings.of(tissue), tissue.topology
     lines = ["STRING", "SPACE_DIMENSION 2"]
     if strings.periodic:
@@ -140,26 +142,26 @@ def _mesh(tissue: Tissue) -> str:
     lines.append("edges")
     sign = {0: "*", 1: "+", -1: "-"}
     for i, ((a, b), wrap) in enumerate(zip(strings.pieces.ends, strings.wraps, strict=True)):
-        around = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
-        lines.append(f"{i + 1} {a + 1} {b + 1}{around}")
+        wrap_text = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
+        lines.append(f"{i + 1} {a + 1} {b + 1}{wrap_text}")
     lines.append("faces")
     twin, cell, number = (np.asarray(x) for x in (topology.twin, topology.cell, topology.edge))
-    way = np.where(np.asarray(topology.half_edge)[number] == np.arange(len(twin)), 1, -1)
+    direction = np.where(np.asarray(topology.half_edge)[number] == np.arange(len(twin)), 1, -1)
     following = _clockwise(twin)
     for face in range(topology.n_cells):
         first = int(np.flatnonzero(cell == face)[0])
         loop, h = [], first
         while not loop or h != first:
-            loop.append(f"{way[h] * (number[h] + 1)}")
+            loop.append(f"{direction[h] * (number[h] + 1)}")
             h = int(following[h])
         lines.append(f"{face + 1} {' '.join(loop)}")
     return "\n".join([*lines, "read", ""])
 
 
-def shortest(
+def shortest_edge(
     lengths: Float[np.ndarray, " edges"], below: float, allowed: Bool[np.ndarray, " edges"]
 ) -> int | None:
-    """The shortest edge below a length of those that are allowed; None if there is none."""
+    """The shortest allowed edge below a length; None if there is none."""
     lengths = np.where(allowed, lengths, np.inf)
     edge = int(np.argmin(lengths))
     return edge if lengths[edge] < below else None

@@ -1,4 +1,4 @@
-"""The side of a call to another program that JAX does not see: many at a time, and what comes back."""
+"""Calls of simulators on the host: parallel runs, checks of their results, and conversion to arrays."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ import numpy as np
 from jaxtyping import PyTree, Shaped
 
 from vertax.external._simulator import AbstractSimulator, Relaxed, SimulatorError, ledger_of
-from vertax.external._workers import elsewhere
+from vertax.external._workers import run_in_process
 from vertax.mesh import Tissue
 
 
 class Request(NamedTuple):
-    """What a simulator is asked, in arrays."""
+    """The arguments of a simulator, in arrays."""
 
     tissue: Tissue
     energy: Any
     forces: Any
-    """On the vertices; None for none."""
+    """Forces on the vertices, or None."""
     torques: Any
-    """On the angles of arcs."""
+    """Torques on the angles of arcs, or None."""
 
 
-class Answer(NamedTuple):
-    """What it says, in arrays: what is not known is NaN."""
+class Result(NamedTuple):
+    """The result of a simulator, in arrays; missing values are NaN."""
 
     vertices: Any
     angles: Any
@@ -41,33 +41,33 @@ class Answer(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One question to a simulator, in a form that goes to another process."""
+    """One run of a simulator, as a picklable function."""
 
     simulator: AbstractSimulator
     request: Request
     slope: str
     step: float
 
-    def __call__(self) -> Answer:
+    def __call__(self) -> Result:
         tissue, energy, forces, torques = self.request
-        bends = torques is not None and np.any(torques != 0)
-        if bends and not self.simulator.bends:
+        needs_torques = torques is not None and np.any(torques != 0)
+        if needs_torques and not self.simulator.bends:
             raise SimulatorError(
-                "The cost depends on the angles of arcs, and this program cannot be told to pull on them. "
-                "Use a cost of the vertices, or let `relax` take `torques` and say so by `bends = True`."
+                "The cost depends on the angles of arcs, and this simulator does not support torques on "
+                "them. Use a cost of the vertices, or let `relax` take `torques` and set `bends = True`."
             )
         relax: Any = self.simulator.relax
-        said = relax(tissue, energy, forces, *([torques] if bends else []))
-        said = said if isinstance(said, Relaxed) else Relaxed(said)
-        vertices = _array("vertices", said.vertices, np.shape(tissue.vertices))
+        relaxed = relax(tissue, energy, forces, *([torques] if needs_torques else []))
+        relaxed = relaxed if isinstance(relaxed, Relaxed) else Relaxed(relaxed)
+        vertices = _array("vertices", relaxed.vertices, np.shape(tissue.vertices))
         angles = None if tissue.arcs is None else tissue.arcs.angles
-        if said.angles is not None:
+        if relaxed.angles is not None:
             if angles is None:
                 raise SimulatorError("The program returned `angles`, but the tissue has no arcs.")
-            angles = _array("angles", said.angles, np.shape(angles))
+            angles = _array("angles", relaxed.angles, np.shape(angles))
         topology = tissue.topology
-        if said.tissue is not None:
-            topology = said.tissue.topology
+        if relaxed.tissue is not None:
+            topology = relaxed.tissue.topology
             if _shapes(topology) != _shapes(tissue.topology):
                 raise SimulatorError("The program returned a tissue of another size.")
         changed = np.any(np.asarray(topology.twin) != tissue.topology.twin)
@@ -75,73 +75,74 @@ class Job(NamedTuple):
             raise SimulatorError("The program changed the topology of a tissue that was nudged.")
         slope = None
         if self.slope != "energy":
-            there = _there(tissue, topology, vertices, angles)
-            slope = _slope(self, said, there, energy)
-        return Answer(
+            relaxed_tissue = _with_result(tissue, topology, vertices, angles)
+            slope = _slope(self, relaxed, relaxed_tissue, energy)
+        return Result(
             vertices,
             angles,
             topology,
-            np.asarray(said.energy, vertices.dtype),
-            np.asarray(said.max_force, vertices.dtype),
-            np.asarray(said.num_steps, np.int32),
-            np.asarray(said.num_t1, np.int32),
+            np.asarray(relaxed.energy, vertices.dtype),
+            np.asarray(relaxed.max_force, vertices.dtype),
+            np.asarray(relaxed.num_steps, np.int32),
+            np.asarray(relaxed.num_t1, np.int32),
             slope,
         )
 
 
-def ask(
+def run_jobs(
     requests: Sequence[Job],
     workers: int,
     processes: bool,
     throw: bool,
     timeout: float | None = None,
-) -> tuple[list[Answer | None], SimulatorError | None]:
-    """The answers to some questions, side by side; None, and the first reason, where there is none.
+) -> tuple[list[Result | None], SimulatorError | None]:
+    """Run jobs in parallel; return their results (None for failed ones) and the first error, if any.
 
-    In processes of their own they may take `timeout` seconds each.
+    With `processes` each job is killed after `timeout` seconds.
     """
     reasons: list[SimulatorError] = []
 
-    def one(job: Job) -> Answer | None:
+    def one(job: Job) -> Result | None:
         try:
             with ledger_of(job.simulator).run():
-                return elsewhere(job, timeout) if processes else job()
+                return run_in_process(job, timeout) if processes else job()
         except Exception as error:
             reasons.append(_as_error(error))
             return None
 
-    # An array that is not finite has no equilibrium: the relaxation before, say, has failed already.
-    sound = [all(map(_finite, jax.tree.leaves(job.request))) for job in requests]
-    asked = [job for job, ok in zip(requests, sound, strict=True) if ok]
-    if min(len(asked), workers) > 1:
-        with ThreadPoolExecutor(min(len(asked), workers)) as pool:
-            found = list(pool.map(one, asked))
+    # Requests with NaN, for example from a relaxation that failed before, are not run.
+    is_finite = [all(map(_finite, jax.tree.leaves(job.request))) for job in requests]
+    valid_jobs = [job for job, ok in zip(requests, is_finite, strict=True) if ok]
+    if min(len(valid_jobs), workers) > 1:
+        with ThreadPoolExecutor(min(len(valid_jobs), workers)) as pool:
+            results = list(pool.map(one, valid_jobs))
     else:
-        found = [one(job) for job in asked]
-    answers = iter(found)
-    return [next(answers) if ok else None for ok in sound], reasons[0] if reasons else None
+        results = [one(job) for job in valid_jobs]
+    remaining = iter(results)
+    return [next(remaining) if ok else None for ok in is_finite], reasons[0] if reasons else None
 
 
-def stacked(
-    answers: list[Answer | None], requests: list[Request], wanted: Answer, batch: tuple[int, ...]
-) -> Answer:
-    """The answers of a batch as JAX expects them; NaN where there is none."""
-    structure = jax.tree.structure(wanted)
-    like = jax.tree.leaves(wanted)
+def stack_results(
+    results: list[Result | None],
+    requests: list[Request],
+    structures: Result,
+    batch: tuple[int, ...],
+) -> Result:
+    """The results of a batch as arrays of the shapes that JAX expects; NaN for failed runs."""
+    structure = jax.tree.structure(structures)
+    like = jax.tree.leaves(structures)
 
-    def leaves(answer: Answer | None, request: Request) -> list[Any]:
-        if answer is None:
-            nothing = [
-                np.full(x.shape, np.nan if x.dtype.kind == "f" else 0, x.dtype) for x in like
-            ]
-            empty = jax.tree.unflatten(structure, nothing)
-            # An index that is none would be worse than a position.
-            answer = empty._replace(topology=eqx.filter(request.tissue.topology, _numeric))
+    def leaves(result: Result | None, request: Request) -> list[Any]:
+        if result is None:
+            fill = [np.full(x.shape, np.nan if x.dtype.kind == "f" else 0, x.dtype) for x in like]
+            empty = jax.tree.unflatten(structure, fill)
+            # (Topologies must hold valid indices, so that of the request is returned.)
+            result = empty._replace(topology=eqx.filter(request.tissue.topology, _numeric))
         else:
-            answer = answer._replace(topology=eqx.filter(answer.topology, _numeric))
-        return jax.tree.leaves(answer)
+            result = result._replace(topology=eqx.filter(result.topology, _numeric))
+        return jax.tree.leaves(result)
 
-    rows = [leaves(*pair) for pair in zip(answers, requests, strict=True)]
+    rows = [leaves(*pair) for pair in zip(results, requests, strict=True)]
     columns = [
         np.stack([np.asarray(row[i]) for row in rows]).astype(x.dtype).reshape((*batch, *x.shape))
         for i, x in enumerate(like)
@@ -152,42 +153,43 @@ def stacked(
 def _as_error(error: Exception) -> SimulatorError:
     if isinstance(error, SimulatorError):
         return error
-    told = SimulatorError(f"{type(error).__name__}: {error}")
-    told.__cause__ = error
-    return told
+    wrapped = SimulatorError(f"{type(error).__name__}: {error}")
+    wrapped.__cause__ = error
+    return wrapped
 
 
-def _slope(job: Job, said: Relaxed, tissue: Tissue, energy: Any) -> PyTree[np.ndarray]:
-    """The partial derivatives of the energy as the program has it."""
-    wanted = eqx.filter(energy, _floating)
+def _slope(job: Job, relaxed: Relaxed, tissue: Tissue, energy: Any) -> PyTree[np.ndarray]:
+    """The partial derivatives of the energy, from the program or from differences."""
+    parameters = eqx.filter(energy, _floating)
     if job.slope == "differences":
         return _differences(job, tissue, energy)
-    slope = said.slope
+    slope = relaxed.slope
     if slope is None:
         slope = job.simulator.parameter_gradient(tissue, energy)
-    leaves, structure = jax.tree.flatten(wanted)
-    given = jax.tree.leaves(eqx.filter(slope, _numeric))
-    if len(given) != len(leaves):
+    leaves, structure = jax.tree.flatten(parameters)
+    derivatives = jax.tree.leaves(eqx.filter(slope, _numeric))
+    if len(derivatives) != len(leaves):
         raise SimulatorError(
-            f"The program returned derivatives for {len(given)} arrays, but the energy has {len(leaves)}."
+            f"The program returned derivatives for {len(derivatives)} arrays, but the energy has "
+            f"{len(leaves)}."
         )
-    named = [
+    cast = [
         _array("the derivatives", g, x.shape).astype(x.dtype)
-        for g, x in zip(given, leaves, strict=True)
+        for g, x in zip(derivatives, leaves, strict=True)
     ]
-    return jax.tree.unflatten(structure, named)
+    return jax.tree.unflatten(structure, cast)
 
 
 def _differences(job: Job, tissue: Tissue, energy: Any) -> PyTree[np.ndarray]:
-    """Centred differences of the energy of the program, two for each parameter."""
+    """Centred differences of the energy of the program, two evaluations per parameter."""
     parameters, constants = eqx.partition(energy, _floating)
     leaves, structure = jax.tree.flatten(parameters)
 
-    def at(number: int, place: int, step: float) -> float:
-        moved = [np.array(x) for x in leaves]
-        moved[number].flat[place] += step
-        there = eqx.combine(jax.tree.unflatten(structure, moved), constants)
-        energy = float(job.simulator.energy(tissue, there))
+    def energy_at(number: int, entry: int, step: float) -> float:
+        values = [np.array(x) for x in leaves]
+        values[number].flat[entry] += step
+        shifted = eqx.combine(jax.tree.unflatten(structure, values), constants)
+        energy = float(job.simulator.energy(tissue, shifted))
         if not np.isfinite(energy):
             raise SimulatorError(f"The energy by the program is {energy}.")
         return energy
@@ -196,18 +198,20 @@ def _differences(job: Job, tissue: Tissue, energy: Any) -> PyTree[np.ndarray]:
     for number, x in enumerate(leaves):
         slope = np.zeros_like(x)
         typical = float(np.sqrt(np.mean(np.square(x)))) or 1.0
-        for place, value in enumerate(np.ravel(x)):
+        for entry, value in enumerate(np.ravel(x)):
             step = job.step * max(abs(float(value)), typical)
-            slope.flat[place] = (at(number, place, step) - at(number, place, -step)) / (2 * step)
+            slope.flat[entry] = (
+                energy_at(number, entry, step) - energy_at(number, entry, -step)
+            ) / (2 * step)
         slopes.append(slope)
     return jax.tree.unflatten(structure, slopes)
 
 
-def _there(tissue: Tissue, topology: Any, vertices: np.ndarray, angles: Any) -> Tissue:
-    there = eqx.tree_at(lambda t: (t.vertices, t.topology), tissue, (vertices, topology))
+def _with_result(tissue: Tissue, topology: Any, vertices: np.ndarray, angles: Any) -> Tissue:
+    moved = eqx.tree_at(lambda t: (t.vertices, t.topology), tissue, (vertices, topology))
     if angles is None:
-        return there
-    return eqx.tree_at(lambda t: t.arcs.angles, there, angles)
+        return moved
+    return eqx.tree_at(lambda t: t.arcs.angles, moved, angles)
 
 
 def _array(name: str, value: Any, shape: tuple[int, ...]) -> Shaped[np.ndarray, "..."]:

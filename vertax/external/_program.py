@@ -1,4 +1,4 @@
-"""Running a program in a folder of its own, of which nothing stays."""
+"""Run a program in a temporary folder."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ def run_program(
     timeout: float,
     install: str = "",
 ) -> tuple[dict[str, str], str]:
-    """Run a program in a new folder, and read what it leaves there.
+    """Run a program in a temporary folder, and read its results.
 
     **Arguments:**
 
-    - `command`: the program and its arguments, in which files are those of the folder.
-    - `files`: what to put into the folder, text by name.
-    - `results`: names of the files that it is to write.
-    - `timeout`: seconds after which it is ended, with all that it started.
-    - `install`: what to tell somebody who does not have the program.
+    - `command`: the program and its arguments; paths are relative to the folder.
+    - `files`: input files, text by name.
+    - `results`: names of the output files.
+    - `timeout`: seconds after which the program and its child processes are killed.
+    - `install`: a sentence for the error message if the program is not installed.
 
-    **Returns:** the text of its results by name, and its log, which is all that it printed.
+    **Returns:** the text of the output files by name, and the log, everything that the program printed.
 
     **Raises:**
 
-    - [`SimulatorError`][vertax.external.SimulatorError] with the tail of its log if it is not there,
-        crashes, takes too long, or leaves a result out.
+    - [`SimulatorError`][vertax.external.SimulatorError] with the end of the log if the program is not
+        installed, crashes, exceeds the timeout, or does not write a result.
     """
     program = shutil.which(command[0])
     if program is None:
-        raise SimulatorError(f"There is no program {command[0]!r} here. {install}".rstrip())
+        raise SimulatorError(f"There is no program {command[0]!r}. {install}".rstrip())
     with tempfile.TemporaryDirectory(prefix="vertax-") as name:
         folder = Path(name)
         for file, text in files.items():
             (folder / file).write_text(text, encoding="utf-8")
         log_path = folder / "log"
         with log_path.open("wb") as log:
-            # What it keeps at home (a history of commands, say) goes with the folder.
+            # Files in the home directory, such as a history of commands, are deleted with the folder.
             process = subprocess.Popen(
                 [program, *command[1:]],
                 cwd=folder,
@@ -62,28 +62,28 @@ def run_program(
                 code = process.wait(timeout)
                 reason = None if code == 0 else f"ended with {_exit(code)}"
             except subprocess.TimeoutExpired:
-                reason = f"was not done after {timeout:g} s, and was ended"
+                reason = f"was not done after {timeout:g} s, and was killed"
             finally:
                 _end(process)
         log_text = log_path.read_text(encoding="utf-8", errors="replace")
-        found = {}
+        texts = {}
         for file in results:
             path = folder / file
             if reason is None and not path.is_file():
                 reason = f"wrote no {file!r}"
             elif reason is None:
-                found[file] = path.read_text(encoding="utf-8", errors="replace")
+                texts[file] = path.read_text(encoding="utf-8", errors="replace")
     if reason is not None:
         raise SimulatorError(f"{command[0]} {reason}. {tail(log_text)}")
-    return found, log_text
+    return texts, log_text
 
 
 def tail(log: str, lines: int = 12) -> str:
-    """The end of a log, as a message quotes it."""
+    """The last lines of a log, for an error message."""
     last = [line for line in log.splitlines() if line.strip()][-lines:]
     if not last:
         return "It printed nothing."
-    return "The end of what it printed:\n" + "\n".join(f"    {line[:200]}" for line in last)
+    return "The end of its output:\n" + "\n".join(f"    {line[:200]}" for line in last)
 
 
 def _exit(code: int) -> str:
@@ -95,7 +95,7 @@ def _exit(code: int) -> str:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a program that still runs, and what it started."""
+    """Kill a running program and its child processes."""
     if process.poll() is None:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""What a program must be able to do that takes the place of the relaxation."""
+"""The interface of external simulators, and their results."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ from vertax.mesh import Periodic, Tissue
 
 
 class SimulatorError(RuntimeError):
-    """A program came to no result: it crashed, took too long, or said what cannot be read."""
+    """A program failed: it crashed, exceeded its timeout, or its output is invalid."""
 
 
 class Relaxed(NamedTuple):
-    """Where a program has come to rest, in NumPy arrays."""
+    """The result of a relaxation by a program, in NumPy arrays."""
 
     vertices: Float[np.ndarray, "vertices 2"]
-    """Where the vertices are; of a periodic tissue in the same images of the box as before."""
+    """Positions of the vertices; in periodic tissues in the same images of the box as in the input."""
     tissue: Tissue | None = None
-    """The tissue in its new topology if that changed (`vertices` count, not its own); its arrays have the
-    shapes that they had, and cells and edges keep their numbers."""
+    """The tissue with its new topology if the topology changed; the field `vertices` above overrides its
+    vertices. Shapes of arrays and indices of cells and edges must be those of the input."""
     angles: Float[np.ndarray, " edges"] | None = None
-    """The angles of its arcs, if it has some."""
+    """The angles of arcs, for tissues with arcs."""
     energy: float = float("nan")
-    """Its energy, without the nudge."""
+    """The energy, without the nudge."""
     max_force: float = float("nan")
-    """The largest force left, if the program knows."""
+    """The largest residual force, if available."""
     num_steps: int = 0
-    """Its steps."""
+    """Number of steps."""
     num_t1: int = 0
-    """T1 transitions on the way."""
+    """Number of T1 transitions."""
     slope: PyTree[np.ndarray] = None
-    r"""$\partial E/\partial\theta$ there, shaped as the energy, if the program knows: `slope="program"`."""
+    r"""$\partial E/\partial\theta$ at the result, shaped as the energy, for `slope="program"`."""
 
 
 class AbstractSimulator(abc.ABC):
-    r"""A program that brings a tissue to rest, for [`External`][vertax.External].
+    r"""A program that relaxes a tissue, for [`External`][vertax.External].
 
-    Subclass it and write `relax`, in NumPy, or by running a program. All arrays that it is given are NumPy
-    arrays, those of `tissue` and `energy` too; [`Edges`][vertax.external.Edges] says who is where. It is
-    called from within a compiled program, in which nothing can be computed by JAX: so use no property of the
-    tissue beyond its fields.
+    Subclass it and write `relax`, in NumPy, or by running a program. All arrays in its arguments are NumPy
+    arrays, including those of `tissue` and `energy`; [`Edges`][vertax.external.Edges] gives the connectivity.
+    The method is called inside a callback from a compiled function, where JAX must not be called: use the
+    fields of the tissue only, not its properties.
 
-    A program that can pull at arcs says so by `bends = True`; then its `relax` takes a fourth argument,
+    A simulator that supports torques on arcs sets `bends = True`; then its `relax` takes a fourth argument,
     `torques`, of shape `(edges,)`: minimise $E(X) - \sum_v f_v \cdot x_v - \sum_e \tau_e \alpha_e$ with the
     angles $\alpha$ of the arcs.
     """
@@ -66,32 +66,31 @@ class AbstractSimulator(abc.ABC):
         energy: AbstractEnergy,
         forces: Float[np.ndarray, "vertices 2"] | None,
     ) -> Relaxed | Shaped[np.ndarray, "vertices 2"]:
-        r"""Bring a tissue to rest.
+        r"""Relax a tissue.
 
         **Arguments:**
 
-        - `tissue`: where to begin.
-        - `energy`: what to minimise: its fields hold the parameters.
-        - `forces`: a constant force on each vertex, $f$: minimise $E(X) - \sum_v f_v \cdot x_v$. They are
-            weak and `tissue` is at rest without them, so there is only a short way to go, and the topology
-            must stay. None for the first relaxation.
+        - `tissue`: the initial tissue.
+        - `energy`: the energy to minimise: its fields hold the parameters.
+        - `forces`: a constant force on each vertex, $f$: minimise $E(X) - \sum_v f_v \cdot x_v$. The forces
+            are weak and `tissue` is at rest without them, so displacements are small, and the topology must
+            not change. None for the first relaxation.
 
-        **Returns:** the positions at rest, or more of what is known, as
-        [`Relaxed`][vertax.external.Relaxed].
+        **Returns:** the positions at rest, or a [`Relaxed`][vertax.external.Relaxed] with further results.
 
-        **Raises:** whatever it likes, with a reason, if it comes to no end: the relaxation has failed then.
+        **Raises:** any exception, with a message, if the relaxation fails.
         """
 
     def parameter_gradient(self, tissue: Tissue, energy: AbstractEnergy) -> PyTree[np.ndarray]:
-        r"""$\partial E / \partial\theta$ of a tissue as it is, for `slope="program"`.
+        r"""$\partial E / \partial\theta$ of a tissue without relaxation, for `slope="program"`.
 
         **Arguments:**
 
-        - `tissue`: where it came to rest.
-        - `energy`: holds the parameters.
+        - `tissue`: the relaxed tissue.
+        - `energy`: the energy, which stores the parameters.
 
-        **Returns:** the same energy with derivatives in place of its arrays (`equinox.tree_at`, or a new
-        one). What is no array does not matter.
+        **Returns:** the energy with derivatives in the place of its arrays (`equinox.tree_at`, or a new
+            object). Other fields are ignored.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has no `parameter_gradient`, which slope='program' needs. Write it, let "
@@ -99,11 +98,11 @@ class AbstractSimulator(abc.ABC):
         )
 
     def energy(self, tissue: Tissue, energy: AbstractEnergy) -> float:
-        """The energy of a tissue as it is, for `slope="differences"`.
+        """The energy of a tissue without relaxation, for `slope="differences"`.
 
         **Arguments:** as in `parameter_gradient`.
 
-        **Returns:** its energy by the program.
+        **Returns:** the energy.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has no `energy`, which slope='differences' needs. Write it, or choose "
@@ -111,7 +110,7 @@ class AbstractSimulator(abc.ABC):
         )
 
     def __repr__(self) -> str:
-        # A checkpoint knows a simulator by this text.
+        # Checkpoints compare simulators by this text.
         settings = ", ".join(f"{k}={v!r}" for k, v in sorted(vars(self).items()) if k[0] != "_")
         return f"{type(self).__name__}({settings})"
 
@@ -120,18 +119,18 @@ class Edges(NamedTuple):
     """The edges of a tissue as NumPy arrays: all that an energy of lengths, areas and perimeters needs."""
 
     ends: Int[np.ndarray, "edges 2"]
-    """The vertices that each edge joins."""
+    """Indices of the two vertices of each edge."""
     across: Float[np.ndarray, "edges 2"]
-    """What to add to the second one to see it from the first, across the periodic boundary; else 0."""
+    """The periodic translation of the second vertex relative to the first; 0 inside the box."""
     cells: Int[np.ndarray, "edges 2"]
-    """The cells on its left and on its right; the number of cells for the outside."""
+    """The cells on the left and on the right of each edge; the number of cells for the exterior."""
     shifts: Float[np.ndarray, "edges 2 2"]
-    """What to add to the first vertex to see it in the frame of the cell on the left, and on the right."""
+    """The translation of the first vertex into the frame of the cell on the left, and on the right."""
     n_cells: int
 
     @classmethod
     def of(cls, tissue: Tissue) -> Edges:
-        """Those of a tissue.
+        """The edges of a tissue.
 
         **Arguments:**
 
@@ -167,12 +166,12 @@ class Edges(NamedTuple):
         return self.sums((0.5 * shares * [1, -1]).ravel())
 
     def sums(self, values: Float[np.ndarray, " sides"]) -> Float[np.ndarray, " cells"]:
-        """Of values on the left and on the right of each edge, in turn, the sum for each cell."""
+        """Sum values over the edges of each cell; values alternate between left and right sides of edges."""
         return np.bincount(self.cells.ravel(), values, self.n_cells + 1)[: self.n_cells]
 
 
 class Ledger:
-    """What the runs of a program came to so far."""
+    """Statistics of the runs of a program: counts, time, and error messages."""
 
     def __init__(self) -> None:
         self.runs = 0
@@ -183,7 +182,7 @@ class Ledger:
 
     @contextmanager
     def run(self) -> Iterator[None]:
-        """Count a run, and keep why it failed."""
+        """Time a run, and store its error message if it fails."""
         began = time.perf_counter()
         reason = None
         try:
@@ -206,5 +205,5 @@ _LEDGERS: weakref.WeakKeyDictionary[Any, Ledger] = weakref.WeakKeyDictionary()
 
 
 def ledger_of(simulator: AbstractSimulator) -> Ledger:
-    """The ledger of a simulator: equal ones share it."""
+    """The ledger of a simulator; equal simulators share one."""
     return _LEDGERS.setdefault(simulator, Ledger())

@@ -1,4 +1,4 @@
-"""Processes that run simulators: each does one thing at a time, and may hang or die by itself."""
+"""Worker processes of simulators: each runs one job at a time, and can be killed."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ import jax
 
 from vertax.external._simulator import SimulatorError
 
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 
 
 class _Worker:
-    """A process that waits for work."""
+    """A process that runs jobs."""
 
     def __init__(self) -> None:
         # Forking a process in which JAX has threads may deadlock.
         context = multiprocessing.get_context("spawn")
         self.pool = ProcessPoolExecutor(1, context, initializer=_prepare)
-        # (It takes seconds to begin, which are not those of the first thing that it does.)
-        self.pool.submit(_nothing).result()
+        # (Wait for its start, which takes seconds, so that it does not count towards the first timeout.)
+        self.pool.submit(_no_operation).result()
 
     def end(self) -> None:
-        """End the process, whatever it does."""
+        """Kill the process."""
         processes = list((getattr(self.pool, "_processes", None) or {}).values())
         self.pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
@@ -39,54 +39,54 @@ _IDLE: list[_Worker] = []
 _LOCK = threading.Lock()
 
 
-def elsewhere(job: Callable[[], Answer], timeout: float | None) -> Answer:
-    """What a function returns that runs in another process.
+def run_in_process(job: Callable[[], Result], timeout: float | None) -> Result:
+    """Run a function in another process and return its result.
 
     **Raises:**
 
-    - `SimulatorError` if that dies, or is not done after `timeout` seconds; then it is ended.
-    - Whatever the function raises.
+    - `SimulatorError` if the process dies, or is killed after `timeout` seconds.
+    - The exceptions of the function.
     """
     with _LOCK:
         worker = _IDLE.pop() if _IDLE else None
-    future: Future[Answer] | None = None
+    future: Future[Result] | None = None
     try:
         worker = _Worker() if worker is None else worker
         future = worker.pool.submit(job)
-        answer = future.result(timeout)
+        result = future.result(timeout)
     except BrokenProcessPool as error:
         if worker is not None:
             worker.end()
         raise SimulatorError(
-            "The process that ran the program died. If that was when it began: a script whose simulator "
-            'runs in processes needs `if __name__ == "__main__":` around what it does.'
+            "The process that ran the program died. If it died at its start: a script with a simulator in "
+            'processes needs `if __name__ == "__main__":` around its code.'
         ) from error
     except BaseException as error:
-        late = isinstance(error, TimeoutError) and future is not None and not future.done()
+        timed_out = isinstance(error, TimeoutError) and future is not None and not future.done()
         if worker is not None:
-            # (What raised has done its work. What was interrupted has not.)
-            _back(worker) if future is not None and future.done() else worker.end()
-        if late:
+            # (A job that raised an error is done, and its process free. An interrupted job is not.)
+            _release(worker) if future is not None and future.done() else worker.end()
+        if timed_out:
             raise SimulatorError(
-                f"The program was not done after {timeout:g} s, and its process was ended. If that is too "
+                f"The program was not done after {timeout:g} s, and its process was killed. If that is too "
                 "short, raise `timeout`."
             ) from error
         raise
-    _back(worker)
-    return answer
+    _release(worker)
+    return result
 
 
-def _back(worker: _Worker) -> None:
+def _release(worker: _Worker) -> None:
     with _LOCK:
         _IDLE.append(worker)
 
 
-def _nothing() -> None:
+def _no_operation() -> None:
     pass
 
 
 def _prepare() -> None:
-    """Leave the accelerator to the process that asks."""
+    """Use the CPU, and leave the accelerator to the main process."""
     jax.config.update("jax_platforms", "cpu")
 
 

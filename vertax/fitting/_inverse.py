@@ -22,8 +22,8 @@ from vertax.adjoints import (
     GradientOutcome,
     ImplicitDifferentiation,
 )
-from vertax.adjoints._adjoint import frozen, settle
-from vertax.adjoints._propagation import AbstractNudging, cost_by_nudging
+from vertax.adjoints._adjoint import finish_gradient, frozen
+from vertax.adjoints._propagation import AbstractNudgedSystem, nudged_cost
 from vertax.costs import AbstractCost
 from vertax.dynamics import Evolved
 from vertax.energies import AbstractEnergy
@@ -166,7 +166,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
             )
             system = _Nudging(frozen(problem), settled.tissue)
             vjp_arg = ((energy, shift), adjoint.outcome)
-            cost = cost_by_nudging(vjp_arg, system, problem.adjoint)
+            cost = nudged_cost(vjp_arg, system, problem.adjoint)
             return cost, _placed(settled, shift)
         relaxed = self.relax(
             tissue, energy, shift, adjoint=self.adjoint, primal=primal, throw=throw
@@ -231,7 +231,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         evaluation = problem.evaluate(*arguments)
         if self.adjoint.throw and not problem.adjoint.throw:
             outcome, reasons = evaluation.outcome, self.adjoint.reasons
-            gradient, _ = settle(evaluation.gradient, outcome, True, None, reasons)
+            gradient, _ = finish_gradient(evaluation.gradient, outcome, True, None, reasons)
             evaluation = eqx.tree_at(lambda e: e.gradient, evaluation, gradient)
         if not throw:
             return evaluation
@@ -363,7 +363,7 @@ class _GuidedEnergy(AbstractEnergy):
         return self.energy(tissue) + self.strength * self.cost(placed, self.energy)
 
 
-class _Nudging(AbstractNudging):
+class _Nudging(AbstractNudgedSystem):
     """An inverse problem at an equilibrium; its parameters are an energy and a displacement of the tissue."""
 
     problem: InverseProblem

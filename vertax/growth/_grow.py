@@ -16,7 +16,7 @@ from vertax._base.checks import as_key, as_times, check_integer, describe
 from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
-from vertax.dynamics._incremental_potential import Incremental
+from vertax.dynamics._incremental_potential import IncrementalPotential
 from vertax.energies import AbstractEnergy
 from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, initial_lineage, record_deaths, record_division
@@ -284,7 +284,7 @@ def _grow(
         state = combine(arrays)
         before, potential = state.tissue, energy(state.cells)
         if dissipation is not None:
-            potential = Incremental(potential, dissipation, before, end - start)
+            potential = IncrementalPotential(potential, dissipation, before, end - start)
         moved = relaxation.solve(before, potential, adjoint, recompute=True)
         died = before.alive & ~moved.tissue.alive
         lineage, number = record_deaths(state.lineage, state.number, died, end)

@@ -1,4 +1,4 @@
-"""Mechanics: what one measures at an equilibrium."""
+"""Mechanics: stresses, moduli and vibrational modes of tissues at rest, and slow deformations."""
 
 from vertax.mechanics._box import BoxRelaxation as BoxRelaxation
 from vertax.mechanics._elasticity import (

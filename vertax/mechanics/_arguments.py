@@ -1,4 +1,4 @@
-"""What functions of mechanics are given: refused with the name of the argument and the remedy."""
+"""Checks of the arguments of this package: each error names the argument and the remedy."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ from vertax.relax import Relaxation
 
 
 def check_system(tissue: Any, energy: Any, *, box: str | None = None) -> None:
-    """Refuse what is no tissue, or no energy.
+    """Raise an error unless the arguments are one tissue and an energy.
 
     **Arguments:**
 
-    - `tissue`: what is to be a single tissue.
-    - `energy`: what is to be an energy.
-    - `box`: what needs a periodic box, if something does, for the message.
+    - `tissue`, `energy`: the objects to check.
+    - `box`: name of the calculation, for the message, if it needs a periodic box.
 
     **Raises:**
 
-    - `TypeError` for another object in the place of either.
-    - `ValueError` for a batch of tissues, or a free tissue where a box is needed.
+    - `TypeError` for objects of other classes.
+    - `ValueError` for a batch of tissues, or for a free tissue if `box` is given.
     """
     check_tissue(tissue, box=box)
     check_energy(energy)
 
 
 def check_tissue(tissue: Any, *, box: str | None = None) -> None:
-    """Refuse what is no tissue; see `check_system`."""
+    """Raise an error unless the argument is one tissue; see `check_system`."""
     if not isinstance(tissue, Tissue):
         raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {describe(tissue)}.")
     if np.ndim(tissue.vertices) != 2:
@@ -51,12 +50,7 @@ def check_tissue(tissue: Any, *, box: str | None = None) -> None:
 
 
 def check_dissipation(dissipation: Any) -> None:
-    """Refuse what is no dissipation.
-
-    **Raises:**
-
-    - `TypeError` for it.
-    """
+    """Raise a `TypeError` unless the argument is a dissipation."""
     if not isinstance(dissipation, AbstractDissipation):
         raise TypeError(
             "Argument `dissipation` must be a dissipation, e.g. vertax.dissipations.SubstrateFriction(1.0), "
@@ -65,12 +59,7 @@ def check_dissipation(dissipation: Any) -> None:
 
 
 def check_linear_solver(solver: Any) -> None:
-    """Refuse what is no linear solver.
-
-    **Raises:**
-
-    - `TypeError` for it.
-    """
+    """Raise a `TypeError` unless the argument is a linear solver."""
     if not isinstance(solver, lx.AbstractLinearSolver):
         raise TypeError(
             "Argument `linear_solver` must be a linear solver, e.g. vertax.MINRES(), but is "
@@ -79,12 +68,7 @@ def check_linear_solver(solver: Any) -> None:
 
 
 def check_relaxation(relaxation: Any) -> None:
-    """Refuse what is no relaxation.
-
-    **Raises:**
-
-    - `TypeError` for it.
-    """
+    """Raise a `TypeError` unless the argument is a `Relaxation`."""
     if not isinstance(relaxation, Relaxation):
         raise TypeError(
             "Argument `relaxation` must be a vertax.Relaxation, but is "
@@ -94,12 +78,7 @@ def check_relaxation(relaxation: Any) -> None:
 
 
 def as_angle(angle: ArrayLike) -> Float[Array, ""]:
-    """An angle as an array.
-
-    **Raises:**
-
-    - `ValueError` for several of them.
-    """
+    """An angle as a scalar array; a `ValueError` for any other shape."""
     value = as_real("angle", angle)
     if value.shape != ():
         raise ValueError(
@@ -110,22 +89,17 @@ def as_angle(angle: ArrayLike) -> Float[Array, ""]:
 
 
 def as_matrix(name: str, value: ArrayLike, *, symmetric: bool = False) -> Float[Array, "2 2"]:
-    """A matrix of two rows.
-
-    **Raises:**
-
-    - `ValueError` for another shape, or one that should be symmetric and is not.
-    """
+    """A 2-by-2 matrix; a `ValueError` for any other shape, or if `symmetric` and it is not."""
     matrix = as_real(name, value)
     if matrix.shape != (2, 2):
         raise ValueError(
             f"Argument `{name}` must have shape (2, 2), but its shape is {matrix.shape}."
         )
     if symmetric and is_concrete(matrix):
-        off, size = abs(float(matrix[0, 1] - matrix[1, 0])), float(jnp.max(jnp.abs(matrix)))
-        if off > 1e-5 * size:
+        difference, size = abs(float(matrix[0, 1] - matrix[1, 0])), float(jnp.max(jnp.abs(matrix)))
+        if difference > 1e-5 * size:
             raise ValueError(
-                f"Argument `{name}` must be symmetric, but its entries beside the diagonal are "
+                f"Argument `{name}` must be symmetric, but its off-diagonal entries are "
                 f"{matrix[0, 1]} and {matrix[1, 0]}."
             )
     return matrix

@@ -1,4 +1,4 @@
-"""A box that comes to rest together with the tissue in it."""
+"""Joint relaxation of a tissue and its periodic box, at a given stress or a given area."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue
 from vertax.relax import RESULTS, AbstractResponse, Equilibrium, Relaxation
 
-# Orthogonal directions of strain, in components xx, yy and γ = 2 xy.
-_FREEDOMS = {
+# Orthogonal basis of the free strains, in components xx, yy and γ = 2 xy.
+_FREE_STRAINS = {
     "all": np.eye(3),
     "area": np.array([[1.0, 1.0, 0.0]]),
     "shape": np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]),
@@ -31,46 +31,49 @@ _FREEDOMS = {
     "y": np.array([[0.0, 1.0, 0.0]]),
     "shear": np.array([[0.0, 0.0, 1.0]]),
 }
-# The furthest that a box is strained at a time.
-_LARGEST = 0.05
+# Largest strain of the box in one Newton step.
+_MAX_STRAIN_STEP = 0.05
 
 
 def _as_stress(value: ArrayLike) -> Float[Array, "2 2"]:
-    given = as_real("stress", value)
-    if given.shape not in ((), (2, 2)):
+    stress = as_real("stress", value)
+    if stress.shape not in ((), (2, 2)):
         raise ValueError(
-            f"Argument `stress` must be a number or have shape (2, 2), but its shape is {given.shape}."
+            f"Argument `stress` must be a number or have shape (2, 2), but its shape is {stress.shape}."
         )
-    if given.shape == ():
-        return given * jnp.eye(2, dtype=given.dtype)
-    return as_matrix("stress", given, symmetric=True)
+    if stress.shape == ():
+        return stress * jnp.eye(2, dtype=stress.dtype)
+    return as_matrix("stress", stress, symmetric=True)
 
 
 class BoxRelaxation(AbstractResponse):
-    r"""The tissue comes to rest, and its periodic box with it: at a given stress, or at a given area.
+    r"""Relax a tissue and its periodic box together, at a given stress or at a given area.
 
-    The box is strained until the stress of the relaxed tissue is the one given, in those components that
-    are free: $\sigma(\theta) = \sigma_\mathrm{given}$ (Farhadifar et al. 2007,
-    doi:10.1016/j.cub.2007.11.049, relax the box like that). Newton steps by the
-    [`elastic_tensor`][vertax.mechanics.elastic_tensor] find it, and a last one is what is
-    differentiated, so the derivative is that of the box at rest. The box never turns.
+    The free components of the strain of the box are solved for such that the stress of the relaxed tissue
+    equals the target in these components:
 
-    Give it to an [`InverseProblem`][vertax.InverseProblem] as its response, or call it.
+    $$\sigma_\mathrm{free} = \sigma_\mathrm{target}$$
+
+    (Farhadifar et al. 2007, doi:10.1016/j.cub.2007.11.049, relax the box in this way). The method is Newton's
+    with the [`elastic_tensor`][vertax.mechanics.elastic_tensor] as the Jacobian. The last Newton step is
+    differentiated, which gives the derivative of the relaxed box. The box does not rotate.
+
+    Pass it to an [`InverseProblem`][vertax.InverseProblem] as its response, or call it.
 
     **Arguments:**
 
-    - `stress`: the stress to come to: a number, the isotropic stress (minus a pressure from outside), or
-        a symmetric matrix; energy per area, positive to pull. 0 by default: nothing acts from outside.
-    - `free`: what the box may do: `"all"`; `"area"`, at a given shape; `"shape"`, at a given area; or only
-        one strain, `"x"`, `"y"` or `"shear"`.
-    - `relaxation`: how the tissue comes to rest in each box.
-    - `tolerance`: the largest difference of stress that counts as rest; by default $10^{-9}$ of the largest
+    - `stress`: the target: a number, the isotropic stress (minus the external pressure), or a symmetric
+        matrix; energy per area, positive in tension. 0 by default: no external load.
+    - `free`: the free strains of the box: `"all"`; `"area"`, at a given shape; `"shape"`, at a given area; or
+        only one strain, `"x"`, `"y"` or `"shear"`.
+    - `relaxation`: the relaxation of the tissue in each box.
+    - `tolerance`: the largest difference of stress at convergence; by default $10^{-9}$ of the largest
         modulus in float64, and $10^{-4}$ of it in float32.
-    - `max_steps`: most steps of the box.
+    - `max_steps`: maximum number of Newton steps of the box.
 
     **Raises:**
 
-    - `TypeError` for a relaxation that is none.
+    - `TypeError` if `relaxation` is not a `Relaxation`.
     - `ValueError` for a stress of the wrong shape or that is not symmetric, another `free`, or numbers that
         are not positive.
     """
@@ -82,9 +85,9 @@ class BoxRelaxation(AbstractResponse):
     max_steps: int = eqx.field(static=True, default=50)
 
     def __check_init__(self):
-        if not isinstance(self.free, str) or self.free not in _FREEDOMS:
+        if not isinstance(self.free, str) or self.free not in _FREE_STRAINS:
             raise ValueError(
-                f"Argument `free` must be one of {', '.join(_FREEDOMS)}, but is {self.free!r}."
+                f"Argument `free` must be one of {', '.join(_FREE_STRAINS)}, but is {self.free!r}."
             )
         check_relaxation(self.relaxation)
         if self.tolerance is not None:
@@ -103,13 +106,13 @@ class BoxRelaxation(AbstractResponse):
 
         **Arguments:**
 
-        - `tissue`: where it starts, periodic.
-        - `energy`: what to minimise, apart from the work of the stress.
-        - `adjoint`: how to differentiate, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
-            default; not one that unrolls a relaxation.
-        - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
+        - `tissue`: the initial tissue, periodic.
+        - `energy`: the energy to minimise, without the work of the external stress.
+        - `adjoint`: the differentiation method, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation]
+            by default; a method that unrolls a relaxation is rejected.
+        - `throw`: raise an error if no equilibrium is reached. If False, check `converged`.
 
-        **Returns:** an [`Equilibrium`][vertax.Equilibrium]; `energy` is that of the tissue alone.
+        **Returns:** an [`Equilibrium`][vertax.Equilibrium]; `energy` is the energy of the tissue alone.
 
         **Raises:**
 
@@ -120,19 +123,17 @@ class BoxRelaxation(AbstractResponse):
         adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.relaxation.check(tissue, energy, adjoint)
         self.check_compatible(adjoint)
-        found = _relax_box(*traced((tissue, energy), tissue.vertices.dtype), self.traced(), adjoint)
-        return found.checked() if throw else found
+        relaxed = _relax_box(
+            *traced((tissue, energy), tissue.vertices.dtype), self.traced(), adjoint
+        )
+        return relaxed.checked() if throw else relaxed
 
     def check_compatible(
         self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False
     ) -> None:
-        """Refuse adjoints that unroll a relaxation.
+        """Raise a `ValueError` for an adjoint that unrolls a relaxation.
 
         **Arguments:** as for every response.
-
-        **Raises:**
-
-        - `ValueError` for one that does.
         """
         if adjoint.unrolls:
             raise ValueError(
@@ -141,99 +142,115 @@ class BoxRelaxation(AbstractResponse):
             )
 
     def traced(self) -> BoxRelaxation:
-        """The same with its numbers as arrays, of which another one compiles nothing anew."""
+        """A copy with its numbers as arrays: other values need no recompilation."""
         parts = lambda r: (r.relaxation, r.tolerance)
         new = (self.relaxation.traced(), traced(self.tolerance))
         return eqx.tree_at(parts, self, new, is_leaf=lambda x: x is None)
 
     def finer(self, tolerance: Float[Array, ""]) -> BoxRelaxation:
-        """The same, at rest only where the largest force is below this tolerance too."""
+        """A copy that also requires the largest force of the relaxation to be below this tolerance."""
         return eqx.tree_at(lambda r: r.relaxation, self, self.relaxation.finer(tolerance))
 
 
 class _State(eqx.Module):
     tissue: Tissue
-    missing: Float[Array, " free"]
-    """What is missing to the stress, along what is free."""
+    stress_residual: Float[Array, " free"]
+    """Target minus stress, in the free components."""
     stiffness: Float[Array, "free free"]
-    largest: Float[Array, ""]
+    modulus_scale: Float[Array, ""]
     num_t1: Int[Array, ""]
     num_steps: Int[Array, ""]
-    count: Int[Array, ""]
+    num_box_steps: Int[Array, ""]
 
 
 @eqx.filter_jit
 def _relax_box(
     tissue: Tissue, energy: AbstractEnergy, response: BoxRelaxation, adjoint: AbstractAdjoint
 ) -> Equilibrium:
-    constant, held = frozen(energy), frozen(response)
-    basis = jnp.asarray(_FREEDOMS[response.free], tissue.vertices.dtype)
+    constant_energy, constant_response = frozen(energy), frozen(response)
+    basis = jnp.asarray(_FREE_STRAINS[response.free], tissue.vertices.dtype)
     default = 1e-9 if tissue.vertices.dtype == jnp.float64 else 1e-4
 
-    def missing(stressed: Float[Array, "2 2"], response: BoxRelaxation) -> Float[Array, " free"]:
+    def stress_residual(
+        stressed: Float[Array, "2 2"], response: BoxRelaxation
+    ) -> Float[Array, " free"]:
         difference = stressed - response.stress.astype(stressed.dtype)
         return -basis @ _voigt(difference)
 
     def at_rest(start: Tissue, before: _State | None) -> _State:
-        found = held.relaxation.solve(start, constant, ImplicitDifferentiation())
-        stressed, tensor = (
-            stress(found.tissue, constant),
-            elastic_tensor(found.tissue, constant, throw=False),
+        relaxed = constant_response.relaxation.solve(
+            start, constant_energy, ImplicitDifferentiation()
         )
-        # Stress answers to strain by C and, if it is not isotropic, by a part that is not symmetric.
+        stressed, tensor = (
+            stress(relaxed.tissue, constant_energy),
+            elastic_tensor(relaxed.tissue, constant_energy, throw=False),
+        )
+        # dσ/dε is C plus a part that is not symmetric, which vanishes if the stress is isotropic.
         trace = jnp.array([1.0, 1.0, 0.0], tensor.dtype)
-        turn = jnp.outer(trace, _voigt(stressed))
-        stiffness = basis @ (tensor + 0.5 * (turn - turn.T)) @ basis.T
-        counts = (found.num_t1, found.num_steps, jnp.array(0))
+        product = jnp.outer(trace, _voigt(stressed))
+        stiffness = basis @ (tensor + 0.5 * (product - product.T)) @ basis.T
+        counts = (relaxed.num_t1, relaxed.num_steps, jnp.array(0))
         if before is not None:
             counts = (
                 before.num_t1 + counts[0],
                 before.num_steps + counts[1],
-                before.count + 1,
+                before.num_box_steps + 1,
             )
-        largest = jnp.max(jnp.abs(tensor))
-        return _State(found.tissue, missing(stressed, held), stiffness, largest, *counts)
+        modulus_scale = jnp.max(jnp.abs(tensor))
+        residual = stress_residual(stressed, constant_response)
+        return _State(relaxed.tissue, residual, stiffness, modulus_scale, *counts)
 
-    def done(state: _State) -> Bool[Array, ""]:
-        limit = default * state.largest if held.tolerance is None else held.tolerance
-        return jnp.max(jnp.abs(state.missing)) <= limit
+    def has_converged(state: _State) -> Bool[Array, ""]:
+        limit = (
+            default * state.modulus_scale
+            if constant_response.tolerance is None
+            else constant_response.tolerance
+        )
+        return jnp.max(jnp.abs(state.stress_residual)) <= limit
 
     def strained(state: _State) -> Tissue:
-        # Against softening, a step goes where the stress pushes.
-        sizes, vectors = jnp.linalg.eigh(0.5 * (state.stiffness + state.stiffness.T))
-        sound = jnp.min(sizes) > 1e-6 * state.largest
-        exact = jnp.linalg.solve(state.stiffness, state.missing)
-        safe = jnp.maximum(jnp.abs(sizes), 1e-3 * state.largest)
-        amount = jnp.where(sound, exact, vectors @ ((vectors.T @ state.missing) / safe))
-        furthest = jnp.max(jnp.abs(amount))
-        amount = amount * jnp.minimum(1, _LARGEST / jnp.where(furthest > 0, furthest, 1))
-        return deformed(state.tissue, _gradient(amount @ basis))
+        # Newton's step. If the stiffness is not positive definite, its eigenvalues are replaced by their
+        # absolute values, so that the step descends.
+        eigenvalues, vectors = jnp.linalg.eigh(0.5 * (state.stiffness + state.stiffness.T))
+        is_definite = jnp.min(eigenvalues) > 1e-6 * state.modulus_scale
+        newton = jnp.linalg.solve(state.stiffness, state.stress_residual)
+        absolute = jnp.maximum(jnp.abs(eigenvalues), 1e-3 * state.modulus_scale)
+        strain = jnp.where(
+            is_definite, newton, vectors @ ((vectors.T @ state.stress_residual) / absolute)
+        )
+        size = jnp.max(jnp.abs(strain))
+        strain = strain * jnp.minimum(1, _MAX_STRAIN_STEP / jnp.where(size > 0, size, 1))
+        return deformed(state.tissue, _gradient(strain @ basis))
 
     first = at_rest(frozen(tissue), None)
     arrays, static = eqx.partition(first, eqx.is_array)
 
     def unfinished(arrays: _State) -> Bool[Array, ""]:
-        sound = jnp.all(jnp.isfinite(arrays.missing))
-        return ~done(arrays) & sound & (arrays.count < held.max_steps)
+        finite = jnp.all(jnp.isfinite(arrays.stress_residual))
+        return (
+            ~has_converged(arrays) & finite & (arrays.num_box_steps < constant_response.max_steps)
+        )
 
     def iterate(arrays: _State) -> _State:
         state = eqx.combine(arrays, static)
         return eqx.filter(at_rest(strained(state), state), eqx.is_array)
 
     end = frozen(eqx.combine(jax.lax.while_loop(unfinished, iterate, arrays), static))
-    # One more Newton step, of which only the derivative matters: how the stress in this box depends on the
-    # parameters, and so how the box that makes up for it does.
-    here = response.relaxation.solve(end.tissue, energy, adjoint)
-    amount = jnp.linalg.solve(end.stiffness, missing(stress(here.tissue, energy), response))
-    box = deformed(end.tissue, _gradient(amount @ basis)).boundary
-    final = response.relaxation.solve(here.tissue.carried(box), energy, adjoint)
-    result = RESULTS.where(done(end), final.result, RESULTS.nonlinear_max_steps_reached)
+    # One more Newton step, for its derivative: by the implicit function theorem dε/dθ = -C⁻¹ dσ/dθ, with the
+    # derivative of the stress in this box.
+    before = response.relaxation.solve(end.tissue, energy, adjoint)
+    strain = jnp.linalg.solve(
+        end.stiffness, stress_residual(stress(before.tissue, energy), response)
+    )
+    box = deformed(end.tissue, _gradient(strain @ basis)).boundary
+    final = response.relaxation.solve(before.tissue.carried(box), energy, adjoint)
+    result = RESULTS.where(has_converged(end), final.result, RESULTS.nonlinear_max_steps_reached)
     return Equilibrium(
         tissue=final.tissue,
         energy=final.energy,
         max_force=final.max_force,
-        num_steps=end.num_steps + here.num_steps + final.num_steps,
-        num_t1=end.num_t1 + here.num_t1 + final.num_t1,
+        num_steps=end.num_steps + before.num_steps + final.num_steps,
+        num_t1=end.num_t1 + before.num_t1 + final.num_t1,
         valid=final.valid,
         result=cast(RESULTS, result),
     )
@@ -244,7 +261,7 @@ def _voigt(matrix: Float[Array, "2 2"]) -> Float[Array, "3"]:
 
 
 def _gradient(strain: Float[Array, "3"]) -> Float[Array, "2 2"]:
-    """The deformation gradient of a logarithmic strain, by its components xx, yy and γ."""
+    """The deformation gradient of a logarithmic strain, given its components xx, yy and γ."""
     half = 0.5 * strain[2]
     matrix = jnp.stack([jnp.stack([strain[0], half]), jnp.stack([half, strain[1]])])
     return jax.scipy.linalg.expm(matrix)

@@ -1,4 +1,4 @@
-"""Elastic moduli: how the stress of a tissue answers to strain."""
+"""Elastic moduli: derivatives of the stress with respect to strain."""
 
 from __future__ import annotations
 
@@ -37,32 +37,32 @@ def elastic_tensor(
 ) -> Float[Array, "3 3"]:
     r"""The elastic tensor of a tissue at rest, in Voigt's notation, energy per area.
 
-    How the (Cauchy) stress answers to a further strain while the vertices come to rest again:
+    The response of the (Cauchy) stress to a small strain, with the vertices relaxed:
 
     $$C_{ijkl} = \frac1A \left( \frac{\partial^2 E}{\partial\epsilon_{ij} \partial\epsilon_{kl}}
       - \Xi_{ij} \cdot H^+ \Xi_{kl} \right)
       - \tfrac12 (\sigma_{ij} \delta_{kl} + \delta_{ij} \sigma_{kl}),$$
 
     with logarithmic strain $F = e^\epsilon$ of box and vertices, the forces
-    $\Xi_{ij} = \partial^2 E / \partial X \partial\epsilon_{ij}$ that an affine strain leaves, and the
+    $\Xi_{ij} = \partial^2 E / \partial X \partial\epsilon_{ij}$ after an affine strain, and the
     pseudo-inverse of the Hessian $H$ (Lutsko 1989, doi:10.1063/1.342716; Merkel & Manning 2018,
-    doi:10.1088/1367-2630/aaaa13). In a tissue under stress moduli depend on how strain is measured. With
+    doi:10.1088/1367-2630/aaaa13). In a tissue under stress the moduli depend on the measure of strain. With
     the last term these are the stress-strain coefficients of Barron & Klein 1965
     (doi:10.1088/0370-1328/85/3/313), symmetrised: $\mathrm d\sigma / \mathrm d\epsilon$ itself if the
     stress is isotropic.
 
-    Derivatives are exact and solve no further system, for moduli are stationary in the motion of the
-    vertices; if the tissue comes from [`equilibrate`][vertax.equilibrate], whose adjoint adds how the
-    equilibrium depends on the parameters, they are those of the relaxed tissue.
+    Derivatives are exact and solve no further linear system, because moduli are stationary in the motion of
+    the vertices. If the tissue is a result of [`equilibrate`][vertax.equilibrate], its adjoint adds the
+    derivative of the equilibrium, and the sum is the derivative of the modulus of the relaxed tissue.
 
     **Arguments:**
 
-    - `tissue`: a periodic tissue at rest. Contacts between vertices that nearly meet are not part of
-        the energy.
-    - `energy`: the energy that it is at rest under.
-    - `affine`: vertices only follow the strain, and do not come to rest.
-    - `linear_solver`: for systems with the Hessian, [`MINRES`][vertax.MINRES] by default; where that fails,
-        as it may in fluid tissues, again with a residual of a millionth.
+    - `tissue`: a periodic tissue at rest. The contact energy between vertices that nearly meet is not
+        included.
+    - `energy`: the energy of which the tissue is at a minimum.
+    - `affine`: if True, vertices follow the affine strain and do not relax.
+    - `linear_solver`: for systems with the Hessian, [`MINRES`][vertax.MINRES] by default; if it fails, as it
+        may in fluid tissues, it is repeated with a relative tolerance of $10^{-6}$.
     - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
 
     **Returns:** a symmetric matrix, shape `(3, 3)`, for the strains $\epsilon_{xx}$, $\epsilon_{yy}$ and
@@ -70,7 +70,7 @@ def elastic_tensor(
 
     **Raises:**
 
-    - `TypeError` for what is no tissue, no energy or no linear solver.
+    - `TypeError` if `tissue`, `energy` or `linear_solver` is an object of another class.
     - `ValueError` for a free tissue, or a batch of them.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
@@ -91,9 +91,9 @@ def shear_modulus(
     **Arguments:**
 
     - `tissue`: a periodic tissue at rest.
-    - `energy`: the energy that it is at rest under.
+    - `energy`: the energy of which the tissue is at a minimum.
     - `angle`: direction of the shear, in radians from the x axis; 0 is $C_{xyxy}$, and π/4 pure shear
-        along the axes. By default the mean over all directions, which is no matter of the choice of axes:
+        along the axes. By default the mean over all directions, which does not depend on the axes:
         $(C_{xxxx} + C_{yyyy} - 2 C_{xxyy}) / 8 + C_{xyxy} / 2$.
     - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
         `throw`.
@@ -113,7 +113,7 @@ def bulk_modulus(tissue: Tissue, energy: AbstractEnergy, **options: Any) -> Floa
     **Arguments:**
 
     - `tissue`: a periodic tissue at rest.
-    - `energy`: the energy that it is at rest under.
+    - `energy`: the energy of which the tissue is at a minimum.
     - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
         `throw`.
 
@@ -127,14 +127,14 @@ def bulk_modulus(tissue: Tissue, energy: AbstractEnergy, **options: Any) -> Floa
 def youngs_modulus(
     tissue: Tissue, energy: AbstractEnergy, *, angle: ArrayLike = 0.0, **options: Any
 ) -> Float[Array, ""]:
-    r"""Young's modulus along a direction: stress over strain of a tissue that may contract across.
+    r"""Young's modulus along a direction: uniaxial stress over strain, at zero stress across.
 
-    In an isotropic tissue it is $4 B G / (B + G)$. It must resist in all directions.
+    In an isotropic tissue it is $4 B G / (B + G)$. The elastic tensor must be regular.
 
     **Arguments:**
 
     - `tissue`: a periodic tissue at rest.
-    - `energy`: the energy that it is at rest under.
+    - `energy`: the energy of which the tissue is at a minimum.
     - `angle`: the direction, in radians from the x axis.
     - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
         `throw`.
@@ -147,7 +147,7 @@ def youngs_modulus(
 
 
 def young_part(tensor: Float[Array, "3 3"], angle: ArrayLike) -> Float[Array, ""]:
-    """Young's modulus along a direction, of an elastic tensor."""
+    """Young's modulus along a direction, from an elastic tensor."""
     angle = as_angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     stress = jnp.stack([c**2, s**2, c * s]).astype(tensor.dtype)
@@ -155,7 +155,7 @@ def young_part(tensor: Float[Array, "3 3"], angle: ArrayLike) -> Float[Array, ""
 
 
 def shear_part(tensor: Float[Array, "3 3"], angle: ArrayLike | None = None) -> Float[Array, ""]:
-    """The shear modulus of an elastic tensor, along a direction or the mean over all."""
+    """The shear modulus from an elastic tensor, along a direction or the mean over all directions."""
     if angle is None:
         return (tensor[0, 0] + tensor[1, 1] - 2 * tensor[0, 1]) / 8 + tensor[2, 2] / 2
     angle = as_angle(angle)
@@ -166,42 +166,43 @@ def shear_part(tensor: Float[Array, "3 3"], angle: ArrayLike | None = None) -> F
 
 
 class _Elasticity(eqx.Module):
-    """The elastic tensor as a stationary value: the energy of strain and of what vertices add to it."""
+    """The elastic tensor as a stationary value over the non-affine motions of the vertices."""
 
     solver: lx.AbstractLinearSolver
     affine: bool = eqx.field(static=True)
 
     def solve(self, args: tuple[Tissue, AbstractEnergy]) -> PyTree[Array]:
-        """How vertices move by themselves, for each of the three strains."""
+        """The non-affine motion of the vertices for each of the three strains, -H⁺ Ξ."""
         tissue, energy = args
         basis = voigt_basis(tissue)
         if self.affine:
             return basis[1]
-        curvature = Landscape(tissue, energy).curvature()
-        still = jnp.zeros((2, 2), tissue.vertices.dtype)
-        hessian = lambda change: curvature((still, change))[1]
-        left = jax.vmap(curvature)(basis)[1]
-        rhs = jax.tree.map(jnp.negative, left)
-        # A fluid tissue has modes whose stiffness is of the size of the forces that are left in it: no
-        # answer has a residual of nothing. One that leaves a millionth knows the modulus as well, for
-        # that is stationary, and takes no notice of those modes.
+        hessian_product = Landscape(tissue, energy).hessian_product()
+        no_strain = jnp.zeros((2, 2), tissue.vertices.dtype)
+        hessian = lambda change: hessian_product((no_strain, change))[1]
+        affine_forces = jax.vmap(hessian_product)(basis)[1]
+        rhs = jax.tree.map(jnp.negative, affine_forces)
+        # In a fluid tissue some modes are as soft as the residual forces allow, and MINRES stagnates above
+        # its default tolerance. A residual of 1e-6 is enough: the modulus is stationary in the solution, so
+        # that its error is of second order.
         coarse = None
         if isinstance(self.solver, MINRES):
             coarse = MINRES(rtol=max(1e-6, float(jnp.finfo(tissue.vertices.dtype).eps) ** 0.5))
-        # One after the other, which takes less time than a batch that waits for its slowest.
+        # One by one: a batch would run until its slowest member has converged.
         return jax.lax.map(lambda one: solve(hessian, one, self.solver, coarse), rhs)
 
     def value(
         self, args: tuple[Tissue, AbstractEnergy], solution: PyTree[Array]
     ) -> Float[Array, "3 3"]:
-        """The tensor, given those motions."""
+        """The tensor for given non-affine motions."""
         tissue, energy = args
         landscape = Landscape(tissue, energy)
         motions = (voigt_basis(tissue)[0], solution)
-        pulled = jax.vmap(landscape.curvature())(motions)
-        products = jax.vmap(lambda a: jax.vmap(partial(dot, a))(pulled))(motions)
-        # That of the log of the strain; first derivatives make it one of the stress.
-        slope = landscape.pushes()[0]
+        forces = jax.vmap(landscape.hessian_product())(motions)
+        products = jax.vmap(lambda a: jax.vmap(partial(dot, a))(forces))(motions)
+        # `products` are second derivatives by the logarithmic strain. The stress converts them to
+        # derivatives of the stress.
+        slope = landscape.gradient()[0]
         stress = jnp.stack([slope[0, 0], slope[1, 1], 0.5 * (slope[0, 1] + slope[1, 0])])
         trace = jnp.array([1.0, 1.0, 0.0], stress.dtype)
         prestress = jnp.outer(stress, trace)
@@ -216,7 +217,7 @@ def _elastic_tensor(
 
 
 _REASON = (
-    "The elastic tensor is not known: the linear solve with the Hessian failed. Relax the tissue to a "
-    "smaller "
+    "The elastic tensor could not be computed: the linear solve with the Hessian failed. Relax the tissue to "
+    "a smaller "
     "tolerance, give MINRES(rtol=..., max_steps=...) as `linear_solver`, or pass throw=False to get NaN."
 )

@@ -14,27 +14,27 @@ from vertax.mesh import Tissue
 from vertax.mesh._tissue import Measurements
 
 
-class _Slackened(Tissue):
-    """A tissue whose areas and edge lengths are what its vertices say, and something more."""
+class _OffsetTissue(Tissue):
+    """A tissue with offsets added to its areas and edge lengths."""
 
-    more_area: Float[Array, " cells"]
-    more_length: Float[Array, " edges"]
+    area_offset: Float[Array, " cells"]
+    length_offset: Float[Array, " edges"]
 
     def __init__(
         self, tissue: Tissue, area: Float[Array, " cells"], length: Float[Array, " edges"]
     ):
         for name in Tissue.__dataclass_fields__:
             setattr(self, name, getattr(tissue, name))
-        self.more_area, self.more_length = area, length
+        self.area_offset, self.length_offset = area, length
 
     def measured(self) -> Measurements:
-        """Areas and edge lengths, and more; perimeters follow."""
-        known = super().measured()
-        around = self.cell_sums((self.more_length, self.more_length))
+        """Areas and edge lengths with their offsets, and the perimeters that follow."""
+        measures = super().measured()
+        perimeter_offset = self.cell_sums((self.length_offset, self.length_offset))
         return Measurements(
-            known.lengths + self.more_length,
-            known.areas + self.more_area,
-            known.perimeters + around,
+            measures.lengths + self.length_offset,
+            measures.areas + self.area_offset,
+            measures.perimeters + perimeter_offset,
         )
 
 
@@ -44,10 +44,10 @@ def pressures(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " cells"]:
     **Arguments:**
 
     - `tissue`: the tissue, relaxed or not.
-    - `energy`: any energy. What it knows of areas it must have from `tissue.areas` or
-        `tissue.shape_factors`; what it has from vertices is not seen.
+    - `energy`: any energy that takes areas from `tissue.areas` or `tissue.shape_factors`. Areas that it
+        computes from vertices do not contribute.
 
-    **Returns:** one pressure a cell, positive in a cell that would expand.
+    **Returns:** one pressure per cell, positive in a cell that would expand.
 
     **Raises:** as [`stress`][vertax.mechanics.stress].
     """
@@ -57,15 +57,16 @@ def pressures(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " cells"]:
 def tensions(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " edges"]:
     r"""Tension of each edge, $T_e = \partial E / \partial \ell_e$ at given areas, energy per length.
 
-    An edge between two cells has the tensions of both their perimeters, and its own.
+    The tension of an edge between two cells is the sum of its line tension and of the perimeter tensions of
+    both cells.
 
     **Arguments:**
 
     - `tissue`: the tissue, relaxed or not.
-    - `energy`: any energy. What it knows of lengths it must have from `tissue.edge_lengths`,
-        `tissue.perimeters` or `tissue.shape_factors`; what it has from vertices is not seen.
+    - `energy`: any energy that takes lengths from `tissue.edge_lengths`, `tissue.perimeters` or
+        `tissue.shape_factors`. Lengths that it computes from vertices do not contribute.
 
-    **Returns:** one tension an edge, positive in an edge that would contract.
+    **Returns:** one tension per edge, positive in an edge that would contract.
 
     **Raises:** as [`stress`][vertax.mechanics.stress].
     """
@@ -75,7 +76,7 @@ def tensions(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " edges"]:
 def pressures_and_tensions(
     tissue: Tissue, energy: AbstractEnergy
 ) -> tuple[Float[Array, " cells"], Float[Array, " edges"]]:
-    """Both at once."""
+    """Pressures of cells and tensions of edges, from one gradient."""
     check_system(tissue, energy)
     return _pressures_and_tensions(*traced((tissue, energy), tissue.vertices.dtype))
 
@@ -85,6 +86,6 @@ def _pressures_and_tensions(
     tissue: Tissue, energy: AbstractEnergy
 ) -> tuple[Float[Array, " cells"], Float[Array, " edges"]]:
     dtype = tissue.vertices.dtype
-    none = (jnp.zeros(tissue.n_cells, dtype), jnp.zeros(tissue.n_edges, dtype))
-    by_area, by_length = jax.grad(lambda more: energy(_Slackened(tissue, *more)))(none)
+    zeros = (jnp.zeros(tissue.n_cells, dtype), jnp.zeros(tissue.n_edges, dtype))
+    by_area, by_length = jax.grad(lambda offsets: energy(_OffsetTissue(tissue, *offsets)))(zeros)
     return -by_area, by_length

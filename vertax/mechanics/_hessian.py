@@ -17,14 +17,14 @@ from scipy.sparse.linalg import splu
 from vertax.mechanics._landscape import Landscape
 from vertax.mesh import Tissue
 
-# A dense eigenproblem of that size takes a fraction of a second.
-DENSE = 800
-# As many products at a time as memory has room for in a large tissue.
+# Degrees of freedom up to which dense methods are the default: an eigenproblem takes less than a second.
+MAX_DENSE_SIZE = 800
+# Hessian products per batch, limited by the memory of a large tissue.
 _BATCH = 64
 
 
 def movable(tissue: Tissue) -> PyTree[Bool[Array, "..."]]:
-    """Which entries of the configuration can move: not those of pinned vertices and of straight edges."""
+    """A mask of the entries of the configuration that can move: not pinned vertices, not straight edges."""
     free = jnp.ones(tissue.vertices.shape, bool)
     if tissue.pinned is not None:
         free &= ~tissue.pinned[:, None]
@@ -32,21 +32,21 @@ def movable(tissue: Tissue) -> PyTree[Bool[Array, "..."]]:
 
 
 def flat_hessian(landscape: Landscape) -> Callable[[Float[Array, " dofs"]], Float[Array, " dofs"]]:
-    """Products of the second derivatives by the configuration with flat vectors."""
-    curvature, (still, y) = landscape.curvature(), landscape.still
+    """The product of the Hessian with a flat vector, v -> H v."""
+    product, (no_strain, y) = landscape.hessian_product(), landscape.zero
     unravel = ravel_pytree(y)[1]
-    return lambda v: ravel_pytree(curvature((still, unravel(v)))[1])[0]
+    return lambda v: ravel_pytree(product((no_strain, unravel(v)))[1])[0]
 
 
 def hessian_products(
     landscape: Landscape, vectors: Float[Array, "vectors dofs"]
 ) -> Float[Array, "vectors dofs"]:
-    """Products of the second derivatives by the configuration with rows of a matrix."""
+    """Products of the Hessian with the rows of a matrix."""
     return jax.lax.map(flat_hessian(landscape), vectors, batch_size=_BATCH)
 
 
 def dense_hessian(landscape: Landscape) -> Float[Array, "dofs dofs"]:
-    """All second derivatives by the configuration; rows of what cannot move are 0."""
+    """The Hessian as a matrix; rows of entries that cannot move are 0."""
     tissue = landscape.tissue
     size = ravel_pytree(tissue.configuration)[0].size
     matrix = hessian_products(landscape, jnp.eye(size, dtype=tissue.vertices.dtype))
@@ -54,37 +54,37 @@ def dense_hessian(landscape: Landscape) -> Float[Array, "dofs dofs"]:
 
 
 def sparse_hessian(landscape: Landscape) -> sparse.csr_array | None:
-    """All of the Hessian of a local potential, from a few dozen products, for the host.
+    """The Hessian of a local potential from a few dozen products; it runs on the host.
 
-    Vertices without a cell in common do not feel each other. Those so far apart that no vertex feels two of
-    them share a product (Curtis, Powell & Reid 1974, doi:10.1093/imamat/13.1.117). None if the potential
-    turns out not to be local.
+    H_ij = 0 for vertices i, j without a common cell. Columns without a common nonzero row share a product:
+    the graph of second neighbours is coloured, one product per colour (Curtis, Powell & Reid 1974,
+    doi:10.1093/imamat/13.1.117). None if a test product shows that the potential is not local.
     """
     tissue = landscape.tissue
     owner, component = _degrees_of_freedom(tissue)
     incidence = _incidence(tissue)
-    near = sparse.csr_array((incidence @ incidence.T).astype(bool))
-    # (A vertex of a spare slot has no cell: with the identity it is at least its own neighbour.)
-    itself = sparse.eye_array(near.indptr.size - 1, dtype=bool)
-    colour = _colours(sparse.csr_array(near @ near + itself))
+    neighbours = sparse.csr_array((incidence @ incidence.T).astype(bool))
+    # (The vertices of a spare slot have no cell. The identity makes each vertex its own neighbour.)
+    identity = sparse.eye_array(neighbours.indptr.size - 1, dtype=bool)
+    colour = _colours(sparse.csr_array(neighbours @ neighbours + identity))
     seed = 2 * colour[owner] + component
-    # A multiple, lest each tissue compile another program. The last one asks everything at once.
+    # Rounded up to a multiple of 32 rows, so that few shapes are compiled. The last row is the test product.
     seeds = np.zeros((32 * ((seed.max() + 1) // 32 + 1), seed.size))
     seeds[seed, np.arange(seed.size)] = 1
     seeds[-1] = probe = np.cos(np.arange(seed.size) * (np.arange(seed.size) + 0.5))
     products = np.asarray(_products(landscape, jnp.asarray(seeds, tissue.vertices.dtype)), float)
-    rows, columns = sparse.csr_array(near[owner][:, owner]).nonzero()
+    rows, columns = sparse.csr_array(neighbours[owner][:, owner]).nonzero()
     values = products[seed[columns], rows]
     matrix = sparse.csr_array((values, (rows, columns)), shape=(seed.size, seed.size))
-    whole, size = products[-1], abs(matrix) @ np.abs(probe)
+    expected, size = products[-1], abs(matrix) @ np.abs(probe)
     rounding = 1e4 * float(jnp.finfo(tissue.vertices.dtype).eps)
-    if np.abs(matrix @ probe - whole).max() > rounding * size.max(initial=0):
+    if np.abs(matrix @ probe - expected).max() > rounding * size.max(initial=0):
         return None
     return 0.5 * (matrix + matrix.T)
 
 
 def factorised(matrix: sparse.sparray) -> Any:
-    """A factorisation of a symmetric sparse matrix, with its method `solve`."""
+    """A sparse factorisation of a symmetric matrix; its method `solve` takes right-hand sides."""
     return splu(
         sparse.csc_array(matrix),
         permc_spec="MMD_AT_PLUS_A",
@@ -99,14 +99,15 @@ _products = eqx.filter_jit(hessian_products)
 def _degrees_of_freedom(
     tissue: Tissue,
 ) -> tuple[Int[np.ndarray, " dofs"], Int[np.ndarray, " dofs"]]:
-    """Of each entry of the flat configuration the vertex or edge (counted on), and which of its numbers."""
+    """For each entry of the flat configuration: index of its vertex, or of its edge plus the number of
+    vertices, and its component."""
     vertices, edges = tissue.n_vertices, tissue.n_edges if tissue.arcs is not None else 0
     owner = np.concatenate([np.repeat(np.arange(vertices), 2), vertices + np.arange(edges)])
     return owner, np.concatenate([np.tile([0, 1], vertices), np.zeros(edges, int)])
 
 
 def _incidence(tissue: Tissue) -> sparse.csr_array:
-    """Which cell each vertex, and each edge that may be an arc, belongs to."""
+    """The incidence matrix of cells with vertices and, in tissues with arcs, edges."""
     m = tissue.topology
     of_vertices = np.asarray(m.cell).reshape(-1, 3)
     cells = np.concatenate([of_vertices[:, i] for i in range(3)])
@@ -116,16 +117,16 @@ def _incidence(tissue: Tissue) -> sparse.csr_array:
         cells = np.concatenate([cells, sides[:, 0], sides[:, 1]])
         owners = np.concatenate([owners, np.tile(tissue.n_vertices + np.arange(m.n_edges), 2)])
     # The exterior has no energy.
-    known = cells < m.n_cells
+    inside = cells < m.n_cells
     shape = (int(owners.max()) + 1, m.n_cells)
-    return sparse.csr_array((np.ones(known.sum()), (owners[known], cells[known])), shape=shape)
+    return sparse.csr_array((np.ones(inside.sum()), (owners[inside], cells[inside])), shape=shape)
 
 
 def _colours(graph: sparse.csr_array) -> Int[np.ndarray, " nodes"]:
-    """Colours such that neighbours differ, each as often as it can be (Luby 1986, doi:10.1137/0215074).
+    """A graph colouring by maximal independent sets (Luby 1986, doi:10.1137/0215074).
 
-    Each node must be a neighbour of itself: then the open node of the highest rank is chosen, and the loops
-    end.
+    Each node must be a neighbour of itself: then the remaining node of the highest rank is always chosen, and
+    the loops end.
     """
     pointers, neighbours = graph.indptr[:-1], graph.indices
     n = pointers.size
@@ -134,11 +135,11 @@ def _colours(graph: sparse.csr_array) -> Int[np.ndarray, " nodes"]:
     colour = np.full(n, -1)
     number = 0
     while (colour < 0).any():
-        open_ = colour < 0
-        while open_.any():
-            rank = np.where(open_, order, -1)
-            chosen = open_ & (rank == largest(rank))
+        candidates = colour < 0
+        while candidates.any():
+            rank = np.where(candidates, order, -1)
+            chosen = candidates & (rank == largest(rank))
             colour[chosen] = number
-            open_ &= ~largest(chosen)
+            candidates &= ~largest(chosen)
         number += 1
     return colour

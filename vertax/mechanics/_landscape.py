@@ -1,4 +1,4 @@
-"""A potential around a tissue, as a function of a strain of the whole and of further motions in it."""
+"""A potential as a function of an affine strain of the tissue and of additional displacements."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from vertax.mechanics._arguments import as_matrix, check_tissue
 from vertax.mesh import Periodic, Tissue
 
 Motion: TypeAlias = tuple[Float[Array, "2 2"], PyTree[Float[Array, "..."]]]
-"""A strain of box and vertices, and what moves in addition: a change of the configuration."""
+"""An affine strain of box and vertices, and an additional change of the configuration."""
 
 
 def deformed(tissue: Tissue, gradient: Float[Array, "2 2"]) -> Tissue:
-    r"""A tissue deformed uniformly, box and vertices alike: $x \to F x$.
+    r"""A tissue after a uniform deformation of box and vertices: $x \to F x$.
 
-    Pinned vertices move too. The angles of arcs stay what they are.
+    Pinned vertices move too. The angles of arcs do not change.
 
     **Arguments:**
 
@@ -42,16 +42,16 @@ def deformed(tissue: Tissue, gradient: Float[Array, "2 2"]) -> Tissue:
     gradient = as_matrix("gradient", gradient)
     if is_concrete(gradient) and not np.linalg.det(np.asarray(gradient, float)) > 0:
         raise ValueError(
-            "Argument `gradient` must have a positive determinant, lest cells be turned inside out, but is "
+            "Argument `gradient` must have a positive determinant, otherwise cells are inverted, but is "
             f"{np.asarray(gradient).tolist()}."
         )
-    # Written out: a matrix product would run in reduced precision on some accelerators.
-    moved = lambda x: x[:, :1] * gradient[:, 0] + x[:, 1:] * gradient[:, 1]
+    # Written out, because a matrix product runs in reduced precision on some accelerators.
+    mapped = lambda x: x[:, :1] * gradient[:, 0] + x[:, 1:] * gradient[:, 1]
     boundary = tissue.boundary
     if isinstance(boundary, Periodic):
-        boundary = eqx.tree_at(lambda b: b.lattice, boundary, moved(boundary.lattice))
-    places = (boundary, moved(tissue.vertices))
-    return eqx.tree_at(lambda t: (t.boundary, t.vertices), tissue, places)
+        boundary = eqx.tree_at(lambda b: b.lattice, boundary, mapped(boundary.lattice))
+    positions = (boundary, mapped(tissue.vertices))
+    return eqx.tree_at(lambda t: (t.boundary, t.vertices), tissue, positions)
 
 
 def area_of(tissue: Tissue) -> Float[Array, ""]:
@@ -61,9 +61,9 @@ def area_of(tissue: Tissue) -> Float[Array, ""]:
 
 
 class Landscape(eqx.Module):
-    r"""A potential $\Phi(\epsilon, u)$: that of the tissue displaced by $u$, then strained by $\epsilon$.
+    r"""$\Phi(\epsilon, u)$: the potential of the tissue after displacements $u$ and then a strain $\epsilon$.
 
-    The strain is logarithmic, $F = e^\epsilon$, up to its second order.
+    The strain is logarithmic, $F = e^\epsilon$, up to second order.
     """
 
     tissue: Tissue
@@ -72,27 +72,27 @@ class Landscape(eqx.Module):
     def __call__(self, motion: Motion) -> Float[Array, ""]:
         """The potential after a motion."""
         strain, change = motion
-        there = jax.tree.map(jnp.add, self.tissue.configuration, change)
+        configuration = jax.tree.map(jnp.add, self.tissue.configuration, change)
         gradient = jnp.eye(2, dtype=strain.dtype) + strain + 0.5 * strain @ strain
-        return self.potential(deformed(self.tissue.with_configuration(there), gradient))
+        return self.potential(deformed(self.tissue.with_configuration(configuration), gradient))
 
     @property
-    def still(self) -> Motion:
-        """No motion."""
+    def zero(self) -> Motion:
+        """The motion 0."""
         y = self.tissue.configuration
         return jnp.zeros((2, 2), self.tissue.vertices.dtype), jax.tree.map(jnp.zeros_like, y)
 
-    def pushes(self) -> Motion:
-        """First derivatives: the stress times the area, and minus the forces."""
-        return jax.grad(self)(self.still)
+    def gradient(self) -> Motion:
+        """First derivatives at the motion 0: the stress times the area, and minus the forces."""
+        return jax.grad(self)(self.zero)
 
-    def curvature(self) -> Callable[[Motion], Motion]:
-        """Products with the second derivatives."""
-        return jax.linearize(jax.grad(self), self.still)[1]
+    def hessian_product(self) -> Callable[[Motion], Motion]:
+        """The linear map from a motion to the product of the second derivatives with it."""
+        return jax.linearize(jax.grad(self), self.zero)[1]
 
 
 class _Dissipation(eqx.Module):
-    """What a motion from a tissue dissipates if it takes the time 1."""
+    """The dissipation of a motion from `before` in unit time."""
 
     dissipation: AbstractDissipation
     before: Tissue
@@ -102,20 +102,20 @@ class _Dissipation(eqx.Module):
 
 
 def dissipation_landscape(tissue: Tissue, dissipation: AbstractDissipation) -> Landscape:
-    """What motions of the rate 1 dissipate: its second derivatives are those of the dissipation R."""
+    """The dissipation of motions in unit time; its second derivatives are those of R."""
     return Landscape(tissue, _Dissipation(dissipation, tissue))
 
 
-# Engineering strains: of the third, γ = 2 ε_xy = 1.
+# Unit strains in Voigt's notation; the third has γ = 2 ε_xy = 1.
 VOIGT = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]], [[0.0, 0.5], [0.5, 0.0]]])
 
 
 def voigt_basis(
     tissue: Tissue,
 ) -> tuple[Float[Array, "3 2 2"], PyTree[Float[Array, "3 ..."]]]:
-    """The three affine strains xx, yy and xy, along a first axis."""
-    still = jax.tree.map(lambda x: jnp.zeros((3, *x.shape), x.dtype), tissue.configuration)
-    return jnp.asarray(VOIGT, tissue.vertices.dtype), still
+    """The motions of the affine strains xx, yy and xy, along a leading axis."""
+    zeros = jax.tree.map(lambda x: jnp.zeros((3, *x.shape), x.dtype), tissue.configuration)
+    return jnp.asarray(VOIGT, tissue.vertices.dtype), zeros
 
 
 def dot(a: PyTree[Array], b: PyTree[Array]) -> Float[Array, ""]:
@@ -128,26 +128,26 @@ def solve(
     product: Callable[[PyTree[Array]], PyTree[Array]],
     rhs: PyTree[Array],
     solver: lx.AbstractLinearSolver,
-    otherwise: lx.AbstractLinearSolver | None = None,
+    fallback: lx.AbstractLinearSolver | None = None,
 ) -> PyTree[Array]:
-    """A symmetric system, of which each product is given; NaN where the solver failed, and the other too."""
+    """Solve a symmetric system given by its matrix-vector product; NaN if solver and fallback fail."""
     structure = jax.eval_shape(lambda: rhs)
     operator = lx.FunctionLinearOperator(product, structure, tags=lx.symmetric_tag)
     solution = lx.linear_solve(operator, rhs, solver, throw=False)
-    good = solution.result == lx.RESULTS.successful
-    unknown = lambda: jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rhs)
-    again = unknown if otherwise is None else lambda: solve(product, rhs, otherwise)
-    return jax.lax.cond(good, lambda: solution.value, again)
+    successful = solution.result == lx.RESULTS.successful
+    nan = lambda: jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rhs)
+    retry = nan if fallback is None else lambda: solve(product, rhs, fallback)
+    return jax.lax.cond(successful, lambda: solution.value, retry)
 
 
-# Moduli are minima of a quadratic form over motions u, and eigenvalues stationary values of one. Their
-# derivatives are those of the form with u held, so none of them needs the derivative of u; derivatives of
-# higher order do, and get it, since the rule below solves for u as a function of the arguments.
+# A modulus is the minimum over motions u of a quadratic form q(θ, u), and an eigenvalue a stationary value of
+# one. With ∂q/∂u = 0 the first derivative is dq/dθ = ∂q/∂θ at fixed u. Higher derivatives need du/dθ: the
+# rule below solves for u as a function of the arguments, so JAX differentiates that solve.
 @eqx.filter_custom_jvp
 def stationary(args: Any, system: Any) -> Array:
-    """The stationary value of a system, which has a method `solve(args)` and one `value(args, solution)`.
+    """The stationary value of a system with methods `solve(args)` and `value(args, solution)`.
 
-    Its first derivatives solve nothing that is not solved anyway.
+    Its first derivatives need no further solve.
     """
     return system.value(args, system.solve(args))
 
@@ -161,7 +161,7 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def checked(value: Array, reason: str) -> Array:
-    """The same value, and an error if it is not finite."""
+    """Return the value; raise an error if it is not finite."""
     failed = ~jnp.all(jnp.isfinite(value))
     if not is_concrete(value):
         return eqx.error_if(value, failed, reason)

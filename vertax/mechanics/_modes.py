@@ -18,7 +18,7 @@ from vertax._base.tracing import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mechanics._arguments import check_system
 from vertax.mechanics._hessian import (
-    DENSE,
+    MAX_DENSE_SIZE,
     dense_hessian,
     factorised,
     flat_hessian,
@@ -35,19 +35,19 @@ class Modes(eqx.Module):
     values: Float[Array, " modes"]
     """Eigenvalues of the Hessian, energy per length squared. Differentiable, if they are distinct."""
     vectors: PyTree[Float[Array, "modes ..."]]
-    """Unit eigenvectors as changes of the configuration (with arcs a pair); taken for constants."""
+    """Unit eigenvectors as changes of the configuration (with arcs a pair); not differentiated."""
 
     @property
     def displacements(self) -> Float[Array, "modes vertices 2"]:
-        """How vertices move."""
+        """Displacements of the vertices."""
         return self.vectors[0] if isinstance(self.vectors, tuple) else self.vectors
 
     @property
     def participation_ratios(self) -> Float[Array, " modes"]:
-        r"""Which share of the vertices takes part, $(\sum_v |u_v|^2)^2 / (V \sum_v |u_v|^4)$.
-
-        1 if all move alike, and one over their number if one moves alone (Bell & Dean 1970,
+        r"""Participation ratio of each mode, $(\sum_v |u_v|^2)^2 / (V \sum_v |u_v|^4)$ (Bell & Dean 1970,
         doi:10.1039/DF9705000055).
+
+        It is 1 if all $V$ vertices move by the same distance, and $1/V$ if one vertex moves alone.
         """
         squared = jnp.sum(self.displacements**2, axis=-1)
         return jnp.sum(squared, axis=-1) ** 2 / (squared.shape[-1] * jnp.sum(squared**2, axis=-1))
@@ -62,27 +62,26 @@ def modes(
 ) -> Modes:
     r"""The $k$ softest modes of a tissue at rest, $H u = \lambda u$ with the Hessian $H$ of the energy.
 
-    The motions of the whole that cost nothing are among them: in a periodic tissue two, of the
-    eigenvalue 0.
+    Rigid motions are included: in a periodic tissue two translations with the eigenvalue 0.
 
     **Arguments:**
 
     - `tissue`: a tissue at rest.
-    - `energy`: the energy that it is at rest under.
-    - `k`: how many modes.
-    - `method`: `"dense"` takes the whole spectrum of the matrix, and works under `jax.jit`, `jax.vmap` and
-        `jax.grad`. `"sparse"` takes the eigenvalues next to 0 by ARPACK with one sparse factorisation,
-        on the host: for energies that are local (see
-        [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]) and large tissues. By default that, if the
-        tissue has more than 200 cells or so and nothing is traced.
+    - `energy`: the energy of which the tissue is at a minimum.
+    - `k`: number of modes.
+    - `method`: `"dense"` computes all eigenvalues of the matrix, and works under `jax.jit`, `jax.vmap` and
+        `jax.grad`. `"sparse"` computes the eigenvalues closest to 0 by ARPACK with one sparse factorisation,
+        on the host: for local energies (see [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy]) and large
+        tissues. It is the default for local energies, tissues of more than about 200 cells, and arrays that
+        are not traced.
 
     **Returns:** [`Modes`][vertax.mechanics.Modes].
 
     **Raises:**
 
     - `ValueError` for more modes than degrees of freedom, or another method.
-    - `TypeError` for what is no tissue or no energy, and for `"sparse"` with an energy that is not local,
-        or inside `jax.jit`.
+    - `TypeError` if `tissue` or `energy` is an object of another class, and for `"sparse"` with an energy
+        that is not local, or inside `jax.jit`.
     """
     check_system(tissue, energy)
     check_integer("k", k, at_least=1)
@@ -93,17 +92,23 @@ def modes(
         raise ValueError(
             f"Argument `k` must be at most the number of degrees of freedom, {size}, but is {k}."
         )
-    known = all(map(is_concrete, jax.tree.leaves((tissue, energy))))
-    possible = known and isinstance(energy, AbstractLocalEnergy)
-    if method == "sparse" and not possible:
+    is_eager = all(map(is_concrete, jax.tree.leaves((tissue, energy))))
+    can_be_sparse = is_eager and isinstance(energy, AbstractLocalEnergy)
+    if method == "sparse" and not can_be_sparse:
         raise TypeError(
             'Argument `method` can be "sparse" only for an AbstractLocalEnergy and outside of jax.jit, '
             'jax.vmap and jax.grad: pass method="dense".'
         )
     tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
-    sparse = possible and size > max(DENSE, 4 * k) if method is None else method == "sparse"
+    sparse = (
+        can_be_sparse and size > max(MAX_DENSE_SIZE, 4 * k)
+        if method is None
+        else method == "sparse"
+    )
     if sparse and isinstance(energy, AbstractLocalEnergy):
-        vectors = jnp.asarray(_softest(Landscape(tissue, energy), k), tissue.vertices.dtype)
+        vectors = jnp.asarray(
+            _soft_eigenvectors(Landscape(tissue, energy), k), tissue.vertices.dtype
+        )
         return _modes_along(tissue, energy, vectors)
     return _dense_modes(tissue, energy, k)
 
@@ -111,18 +116,18 @@ def modes(
 def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
     """All eigenvalues of the Hessian, ascending: one for each degree of freedom.
 
-    Those of pinned vertices and straight edges are left out, and for that the arrays must not be traced.
+    Pinned vertices and the angles of straight edges are left out; therefore the arrays must not be traced.
 
     **Arguments:**
 
     - `tissue`: a tissue at rest.
-    - `energy`: the energy that it is at rest under.
+    - `energy`: the energy of which the tissue is at a minimum.
 
     **Returns:** the eigenvalues, energy per length squared.
 
     **Raises:**
 
-    - `TypeError` inside `jax.jit`, and for what is no tissue or no energy.
+    - `TypeError` inside `jax.jit`, and if `tissue` or `energy` is an object of another class.
     """
     check_system(tissue, energy)
     check_concrete("spectrum", tissue, energy)
@@ -132,15 +137,15 @@ def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
 
 
 def zero_modes(tissue: Tissue, energy: AbstractEnergy, *, tolerance: float = 1e-8) -> int:
-    """Number of modes that cost nothing, motions of the whole among them.
+    """Number of modes without stiffness, rigid motions included.
 
-    A periodic tissue has 2 if it is rigid.
+    A rigid periodic tissue has 2, the translations.
 
     **Arguments:**
 
     - `tissue`: a tissue at rest.
-    - `energy`: the energy that it is at rest under.
-    - `tolerance`: an eigenvalue counts as 0 if it is that much smaller than the largest one.
+    - `energy`: the energy of which the tissue is at a minimum.
+    - `tolerance`: an eigenvalue counts as 0 if it is at most this fraction of the largest one.
 
     **Returns:** their number.
 
@@ -158,27 +163,27 @@ def density_of_states(
 
     **Arguments:**
 
-    - `values`: a whole [`spectrum`][vertax.mechanics.spectrum].
+    - `values`: all eigenvalues, see [`spectrum`][vertax.mechanics.spectrum].
     - `bins`: number of bins, from 0 to the largest frequency.
-    - `tolerance`: eigenvalues that are that much smaller than the largest one are zero modes, and left out.
+    - `tolerance`: eigenvalues of at most this fraction of the largest one are zero modes, and left out.
 
-    **Returns:** the middle of each bin, and the share of all modes per frequency in it: its integral is the
-        share of the modes that are no zero modes.
+    **Returns:** the centre of each bin, and the fraction of all modes per unit of frequency in it. Its
+        integral is the fraction of modes that are not zero modes.
 
     **Raises:**
 
-    - `ValueError` for what is no list of finite eigenvalues, or no bins.
+    - `ValueError` for eigenvalues that are not finite or not a list, or a number of bins below 1.
     """
     check_integer("bins", bins, at_least=1)
-    found = as_float64("values", values)
-    if found.ndim != 1 or found.size == 0:
+    eigenvalues = as_float64("values", values)
+    if eigenvalues.ndim != 1 or eigenvalues.size == 0:
         raise ValueError(
-            f"Argument `values` must be one list of eigenvalues, but its shape is {found.shape}."
+            f"Argument `values` must be one list of eigenvalues, but its shape is {eigenvalues.shape}."
         )
     check_number("tolerance", tolerance, above=0)
-    frequencies = np.sqrt(found[found > tolerance * np.abs(found).max()])
+    frequencies = np.sqrt(eigenvalues[eigenvalues > tolerance * np.abs(eigenvalues).max()])
     counts, edges = np.histogram(frequencies, bins, (0, frequencies.max(initial=0) or 1))
-    return 0.5 * (edges[1:] + edges[:-1]), counts / (found.size * np.diff(edges))
+    return 0.5 * (edges[1:] + edges[:-1]), counts / (eigenvalues.size * np.diff(edges))
 
 
 class _Spectrum(eqx.Module):
@@ -189,10 +194,10 @@ class _Spectrum(eqx.Module):
     def solve(self, args: tuple[Tissue, AbstractEnergy]) -> Float[Array, "modes dofs"]:
         tissue, energy = args
         matrix = dense_hessian(Landscape(tissue, energy))
-        # What cannot move comes last.
-        held = ~ravel_pytree(movable(tissue))[0]
-        above = 2 * jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + 1
-        _, vectors = jnp.linalg.eigh(matrix + jnp.diag(jnp.where(held, above, 0)))
+        # Shift the eigenvalues of entries that cannot move above all others.
+        fixed = ~ravel_pytree(movable(tissue))[0]
+        shift = 2 * jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + 1
+        _, vectors = jnp.linalg.eigh(matrix + jnp.diag(jnp.where(fixed, shift, 0)))
         return vectors[:, : self.k].T
 
     def value(
@@ -236,25 +241,25 @@ def _unravelled(
     return jax.vmap(ravel_pytree(tissue.configuration)[1])(vectors)
 
 
-def _softest(landscape: Landscape, k: int) -> Float[np.ndarray, "modes dofs"]:
-    """The eigenvectors of the eigenvalues next to 0, by shift and invert."""
+def _soft_eigenvectors(landscape: Landscape, k: int) -> Float[np.ndarray, "modes dofs"]:
+    """The eigenvectors of the eigenvalues closest to 0, by shift and invert."""
     tissue = landscape.tissue
     free = np.flatnonzero(np.asarray(ravel_pytree(movable(tissue))[0]))
-    found = sparse_hessian(landscape)
-    if found is None:
+    hessian = sparse_hessian(landscape)
+    if hessian is None:
         raise TypeError(
-            "Argument `energy` says that it is local, but vertices without a cell in common feel each other: "
-            'pass method="dense".'
+            "Argument `energy` must be local, but vertices without a common cell interact, although it is an "
+            'AbstractLocalEnergy. Pass method="dense".'
         )
-    matrix = found[free][:, free]
-    # So little below 0 that it changes no order, and far enough that zero modes can be inverted.
+    matrix = hessian[free][:, free]
+    # A shift below 0 that is smaller than differences of eigenvalues, and makes zero modes invertible.
     shift = 1e-7 * matrix.diagonal().mean()
     factors = factorised(matrix + diags_array(np.full(free.size, shift)))
-    # Its constructor makes one of a class that type checkers do not see.
+    # (`LinearOperator(...)` returns an object of a subclass, which type checkers cannot infer.)
     linear: Any = LinearOperator
     inverse = linear(matrix.shape, matvec=factors.solve, dtype=float)
     start = np.cos(np.arange(free.size) * (np.arange(free.size) + 0.5))
     values, vectors = eigsh(matrix, k, sigma=-shift, OPinv=inverse, v0=start)
-    found = np.zeros((k, ravel_pytree(tissue.configuration)[0].size))
-    found[:, free] = vectors[:, np.argsort(values)].T
-    return found
+    modes = np.zeros((k, ravel_pytree(tissue.configuration)[0].size))
+    modes[:, free] = vectors[:, np.argsort(values)].T
+    return modes

@@ -1,4 +1,4 @@
-"""Slow deformation: a tissue that comes to rest again after each small strain of its box."""
+"""Quasi-static deformation: a relaxation after each small strain of the box."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def simple_shear(strain: ArrayLike) -> Float[Array, "2 2"]:
 
 
 def pure_shear(strain: ArrayLike) -> Float[Array, "2 2"]:
-    r"""Pure shear that stretches along x by $e^\epsilon$, at fixed area."""
+    r"""Pure shear at fixed area: the deformation gradient `diag(exp(ε), exp(-ε))`."""
     strain = _as_strain(strain)
     return jnp.diag(jnp.stack([jnp.exp(strain), jnp.exp(-strain)]))
 
@@ -46,24 +46,24 @@ def _as_strain(strain: ArrayLike) -> Float[Array, ""]:
 
 
 class Ramp(eqx.Module):
-    """A tissue on its way through some strains, at rest at each."""
+    """The relaxed tissue at each strain of a quasi-static deformation."""
 
     strains: Float[Array, " strains"]
     """The strains."""
     frames: Tissue
-    """The tissue at each: the same tissue with a leading axis."""
+    """The relaxed tissues: one tissue with a leading axis."""
     energies: Float[Array, " strains"]
-    """Its energies."""
+    """Their energies."""
     stresses: Float[Array, "strains 2 2"]
-    """Its stresses, energy per area."""
+    """Their stresses, energy per area."""
     num_t1: Int[Array, " strains"]
-    """T1 transitions since the strain before."""
+    """T1 transitions since the previous strain."""
     converged: Bool[Array, " strains"]
-    """Whether it came to rest there."""
+    """Whether the relaxation at each strain converged."""
 
     @property
     def plastic(self) -> Bool[Array, " strains"]:
-        """At which strains cells have changed neighbours."""
+        """Whether cells changed neighbours at each strain."""
         return self.num_t1 > 0
 
 
@@ -77,36 +77,40 @@ def ramp(
     adjoint: AbstractAdjoint | None = None,
     throw: bool = True,
 ) -> Ramp:
-    r"""Deform a tissue slowly: athermal and quasi-static, through its T1 transitions.
+    r"""Deform a tissue quasi-statically at zero temperature (AQS), through its T1 transitions.
 
-    At each strain the box is deformed, from where it began, and the tissue, carried along from the
-    strain before, comes to rest. Between transitions the work of the stress is the change of the energy;
-    at one, energy is lost (Maloney & Lemaître 2006, doi:10.1103/PhysRevE.74.016118).
+    For each strain:
+
+    1. Deform the initial box by the strain.
+    2. Map the relaxed tissue of the previous strain affinely into that box.
+    3. Relax the tissue.
+
+    Between transitions the work of the stress equals the change of the energy; at a transition energy is
+    dissipated (Maloney & Lemaître 2006, doi:10.1103/PhysRevE.74.016118).
 
     **Arguments:**
 
     - `tissue`: a periodic tissue.
     - `energy`: its energy.
-    - `strains`: strains one after the other, in steps small enough that each leads to the next state at
-        rest.
+    - `strains`: the strains in order, in steps small enough for the tissue to follow the same branch of
+        minima.
     - `deformation`: a function from a strain to the deformation gradient of the box, shape `(2, 2)`:
-        [`simple_shear`][vertax.mechanics.simple_shear], [`pure_shear`][vertax.mechanics.pure_shear], or
-        your own.
-    - `relaxation`: how it comes to rest, by default [`Relaxation()`][vertax.Relaxation].
-    - `adjoint`: how to differentiate, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
+        [`simple_shear`][vertax.mechanics.simple_shear], [`pure_shear`][vertax.mechanics.pure_shear], or any
+        other function.
+    - `relaxation`: the relaxation, by default [`Relaxation()`][vertax.Relaxation].
+    - `adjoint`: the differentiation method, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
         default.
-    - `throw`: raise an error if it does not come to rest at a strain.
+    - `throw`: raise an error if a relaxation does not converge.
 
-    **Returns:** a [`Ramp`][vertax.mechanics.Ramp]; `frames` of it make a trajectory. Differentiable with
-    respect
-        to the energy, as long as the same transitions happen in the same steps.
+    **Returns:** a [`Ramp`][vertax.mechanics.Ramp]; its `frames` form a trajectory. Differentiable with
+        respect to the energy, as long as the same transitions happen in the same steps.
 
     **Raises:**
 
-    - `TypeError` for what is no tissue, energy, relaxation or function.
-    - `ValueError` for a free tissue, strains that are no list of numbers, or a deformation of another shape.
-    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the tissue did not come to rest at some
-        strain.
+    - `TypeError` for an argument of the wrong class.
+    - `ValueError` for a free tissue, strains that are not a list of numbers, or a deformation of another
+        shape.
+    - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a relaxation did not converge.
     """
     check_system(tissue, energy, box="a ramp")
     values = as_real("strains", strains).astype(tissue.vertices.dtype)
@@ -125,19 +129,19 @@ def ramp(
     adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
     tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     relaxation.check(tissue, energy, adjoint)
-    found = _ramp(tissue, energy, values, deformation, relaxation.traced(), adjoint)
+    result = _ramp(tissue, energy, values, deformation, relaxation.traced(), adjoint)
     if not throw:
-        return found
+        return result
     reason = (
         "A tissue did not come to rest at some strain of a ramp. Take smaller steps, raise `max_steps` of "
         "its "
-        "`relaxation`, or pass throw=False and look at `converged`."
+        "`relaxation`, or pass throw=False and check `converged`."
     )
-    if not is_concrete(found.converged):
-        return eqx.error_if(found, ~jnp.all(found.converged), reason)
-    if not found.converged.all():
+    if not is_concrete(result.converged):
+        return eqx.error_if(result, ~jnp.all(result.converged), reason)
+    if not result.converged.all():
         raise RuntimeError(reason)
-    return found
+    return result
 
 
 @eqx.filter_jit
@@ -153,11 +157,11 @@ def _ramp(
 
     def step(arrays: Tissue, strain: Array) -> tuple[Tissue, tuple]:
         box = deformed(tissue, deformation(strain)).boundary
-        there = eqx.combine(arrays, static).carried(box)
-        rest = relaxation.solve(there, energy, adjoint, recompute=True)
+        start = eqx.combine(arrays, static).carried(box)
+        rest = relaxation.solve(start, energy, adjoint, recompute=True)
         arrays = eqx.filter(rest.tissue, eqx.is_array)
-        known = (arrays, rest.energy, stress(rest.tissue, energy), rest.num_t1, rest.converged)
-        return arrays, known
+        frame = (arrays, rest.energy, stress(rest.tissue, energy), rest.num_t1, rest.converged)
+        return arrays, frame
 
     _, (frames, *rest) = jax.lax.scan(step, arrays, strains)
     return Ramp(strains, eqx.combine(frames, static), *rest)

@@ -1,4 +1,4 @@
-"""How fast vertices move now: of their own, and after an edge is cut."""
+"""Velocities of vertices: overdamped motion, and recoil after an edge is cut."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def velocities(
 ) -> Float[Array, "vertices 2"]:
     r"""Velocities of vertices, $\Gamma\,\dot x = - \nabla_X E$ with the matrix $\Gamma$ of the dissipation.
 
-    This is what [`evolve`][vertax.evolve] integrates, in a fixed topology: the right-hand side of an ordinary
-    differential equation for any other solver, such as those of Diffrax.
+    [`evolve`][vertax.evolve] integrates these velocities. In a fixed topology they are the right-hand side of
+    an ordinary differential equation, for example for the solvers of Diffrax:
 
     ```python
     move = lambda t, x, args: vx.mechanics.velocities(tissue.with_vertices(x), energy, friction)
@@ -40,27 +40,26 @@ def velocities(
 
     **Arguments:**
 
-    - `tissue`: where it is.
-    - `energy`: what pulls.
-    - `dissipation`: what resists.
-    - `linear_solver`: for systems with $\Gamma$, [`MINRES`][vertax.MINRES] by default. Motions that nothing
-        resists do not take place.
+    - `tissue`: the tissue.
+    - `energy`: its energy.
+    - `dissipation`: the dissipation, which defines $\Gamma$.
+    - `linear_solver`: for systems with $\Gamma$, [`MINRES`][vertax.MINRES] by default. Null vectors of
+        $\Gamma$ get the velocity 0.
     - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
 
-    **Returns:** velocities, length per time. (Those of the angles of arcs are solved for, but not
-    returned.)
+    **Returns:** velocities, length per time. (The velocities of arc angles are solved for, but not returned.)
 
     **Raises:**
 
-    - `TypeError` for what is no tissue, energy, dissipation or linear solver.
+    - `TypeError` for an argument of the wrong class.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
     check_system(tissue, energy)
     check_dissipation(dissipation)
     solver = MINRES() if linear_solver is None else linear_solver
     check_linear_solver(solver)
-    found = _velocities(*traced((tissue, energy, dissipation), tissue.vertices.dtype), solver)
-    return checked(found, _REASON) if throw else found
+    velocity = _velocities(*traced((tissue, energy, dissipation), tissue.vertices.dtype), solver)
+    return checked(velocity, _REASON) if throw else velocity
 
 
 @eqx.filter_jit
@@ -70,11 +69,11 @@ def _velocities(
     dissipation: AbstractDissipation,
     solver: lx.AbstractLinearSolver,
 ) -> Float[Array, "vertices 2"]:
-    pulls = jax.grad(lambda configuration: energy(tissue.with_configuration(configuration)))
-    forces = jax.tree.map(jnp.negative, pulls(tissue.configuration))
-    resistance = dissipation_landscape(tissue, dissipation).curvature()
-    still = jnp.zeros((2, 2), tissue.vertices.dtype)
-    velocity = solve(lambda v: resistance((still, v))[1], forces, solver)
+    gradient = jax.grad(lambda configuration: energy(tissue.with_configuration(configuration)))
+    forces = jax.tree.map(jnp.negative, gradient(tissue.configuration))
+    viscosity = dissipation_landscape(tissue, dissipation).hessian_product()
+    no_strain = jnp.zeros((2, 2), tissue.vertices.dtype)
+    velocity = solve(lambda v: viscosity((no_strain, v))[1], forces, solver)
     return velocity if tissue.arcs is None else velocity[0]
 
 
@@ -87,30 +86,29 @@ def recoil(
     linear_solver: lx.AbstractLinearSolver | None = None,
     throw: bool = True,
 ) -> Float[Array, "vertices 2"]:
-    r"""Velocities of all vertices right after the tension of an edge is gone, as after laser ablation.
+    r"""Initial velocities of all vertices after the tension of an edge is removed, as by laser ablation.
 
     $$\Gamma\,\dot x = - \nabla_X (E - T_e\,\ell_e), \qquad T_e = \partial E / \partial \ell_e$$
 
-    with the matrix $\Gamma$ of the dissipation, and $T_e$ held: in a tissue at rest all that acts is
-    what the edge pulled with (Mayer et al. 2010, doi:10.1038/nature09376).
+    with the matrix $\Gamma$ of the dissipation and a constant $T_e$. In a tissue at rest the forces are
+    $T_e \nabla_X \ell_e$ (Mayer et al. 2010, doi:10.1038/nature09376).
 
     **Arguments:**
 
     - `tissue`: a tissue at rest.
     - `energy`: an energy of areas and lengths, see [`tensions`][vertax.mechanics.tensions].
-    - `edge`: the number of the edge.
-    - `dissipation`: what resists.
-    - `linear_solver`: for systems with $\Gamma$, [`MINRES`][vertax.MINRES] by default. Motions that nothing
-        resists do not take place.
+    - `edge`: the index of the edge.
+    - `dissipation`: the dissipation, which defines $\Gamma$.
+    - `linear_solver`: for systems with $\Gamma$, [`MINRES`][vertax.MINRES] by default. Null vectors of
+        $\Gamma$ get the velocity 0.
     - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
 
-    **Returns:** velocities, length per time. (Those of the angles of arcs are solved for, but not
-    returned.)
+    **Returns:** velocities, length per time. (The velocities of arc angles are solved for, but not returned.)
 
     **Raises:**
 
-    - `TypeError` for what is no tissue, energy, dissipation or linear solver, or no whole number.
-    - `ValueError` for an edge that is none.
+    - `TypeError` for an argument of the wrong class.
+    - `ValueError` for an edge index out of range.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
     check_system(tissue, energy)
@@ -125,8 +123,8 @@ def recoil(
     solver = MINRES() if linear_solver is None else linear_solver
     check_linear_solver(solver)
     tissue, energy, dissipation = traced((tissue, energy, dissipation), tissue.vertices.dtype)
-    found = _recoil(tissue, energy, jnp.asarray(edge), dissipation, solver)
-    return checked(found, _REASON) if throw else found
+    velocity = _recoil(tissue, energy, jnp.asarray(edge), dissipation, solver)
+    return checked(velocity, _REASON) if throw else velocity
 
 
 @eqx.filter_jit
@@ -139,11 +137,11 @@ def _recoil(
 ) -> Float[Array, "vertices 2"]:
     tension = tensions(tissue, energy)[edge]
 
-    return _velocities(tissue, _Without(energy, edge, tension), dissipation, solver)
+    return _velocities(tissue, _WithoutTension(energy, edge, tension), dissipation, solver)
 
 
-class _Without(AbstractEnergy):
-    """An energy without the tension that an edge has now."""
+class _WithoutTension(AbstractEnergy):
+    """An energy minus a constant tension of one edge."""
 
     energy: AbstractEnergy
     edge: Int[Array, ""]
@@ -154,6 +152,6 @@ class _Without(AbstractEnergy):
 
 
 _REASON = (
-    "The velocities are not known: the linear solve with the dissipation failed. Give another "
+    "The velocities could not be computed: the linear solve with the dissipation failed. Pass another "
     "`linear_solver`, add some friction, or pass throw=False to get NaN."
 )

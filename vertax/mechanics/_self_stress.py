@@ -1,4 +1,4 @@
-"""States of self-stress: pressures and tensions that balance everywhere."""
+"""States of self-stress: pressures and tensions in mechanical equilibrium without external load."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from vertax.mechanics._arguments import check_tissue
 from vertax.mechanics._hessian import movable
 from vertax.mesh import Tissue
 
-_KINDS = ("areas", "perimeters", "edge_lengths")
+_CONSTRAINTS = ("areas", "perimeters", "edge_lengths")
 
 
 def compatibility(
     tissue: Tissue,
     constraints: Sequence[Literal["areas", "perimeters", "edge_lengths"]] = ("areas", "perimeters"),
 ) -> Float[Array, "constraints dofs"]:
-    r"""The compatibility matrix $\mathcal C = \partial f / \partial X$ of what the energy constrains.
+    r"""The compatibility matrix $\mathcal C = \partial f / \partial X$ of constraint functions $f$.
 
     **Arguments:**
 
     - `tissue`: the tissue.
-    - `constraints`: what the energy asks for: `"areas"`, `"perimeters"`, `"edge_lengths"`. By default
-        those of area and perimeter elasticity, two a cell.
+    - `constraints`: the quantities $f$ in the energy: `"areas"`, `"perimeters"`, `"edge_lengths"`. By default
+        those of area and perimeter elasticity, two per cell.
 
-    **Returns:** one row a constraint, one column a degree of freedom (with arcs, vertices first). Its
+    **Returns:** one row per constraint, one column per degree of freedom (with arcs, vertices first). Its
         transpose is the equilibrium matrix.
 
     **Raises:**
 
-    - `ValueError` for another kind of constraint, or none.
+    - `ValueError` for another kind of constraint, or an empty sequence.
     """
     check_tissue(tissue)
     names = tuple(constraints) if isinstance(constraints, Sequence) else ()
-    if isinstance(constraints, str) or not names or not set(names) <= set(_KINDS):
+    if isinstance(constraints, str) or not names or not set(names) <= set(_CONSTRAINTS):
         raise ValueError(
-            f"Argument `constraints` must name some of {', '.join(_KINDS)}, but is {constraints!r}."
+            f"Argument `constraints` must name some of {', '.join(_CONSTRAINTS)}, but is {constraints!r}."
         )
     return _compatibility(tissue, names)
 
@@ -53,21 +53,21 @@ def _compatibility(tissue: Tissue, names: tuple[str, ...]) -> Float[Array, "cons
     y, unravel = ravel_pytree(tissue.configuration)
 
     def values(y: Array) -> Array:
-        there = tissue.with_configuration(unravel(y))
-        return jnp.concatenate([getattr(there, name) for name in names])
+        moved = tissue.with_configuration(unravel(y))
+        return jnp.concatenate([getattr(moved, name) for name in names])
 
     return jax.jacrev(values)(y)
 
 
 class SelfStress(eqx.Module):
-    """States of self-stress and the count of Maxwell and Calladine."""
+    """States of self-stress and the Maxwell-Calladine count."""
 
     states: Float[Array, "states constraints"]
-    """Orthonormal generalised tensions (minus pressures for areas, tensions for lengths) in balance."""
+    """Orthonormal generalised tensions (minus pressures for areas, tensions for lengths) in equilibrium."""
     zero_modes: int
-    """Number of motions that change no constraint to first order, those of the whole among them."""
+    """Number of motions that change no constraint to first order, rigid motions included."""
     degrees_of_freedom: int
-    """Number of numbers that can move."""
+    """Number of coordinates that can move."""
 
     @property
     def number(self) -> int:
@@ -84,15 +84,15 @@ def self_stresses(
     r"""States of self-stress: null vectors of the transposed compatibility matrix.
 
     $N_\mathrm{states} = N_\mathrm{zero} + N_\mathrm{constraints} - N_\mathrm{dof}$ (Calladine 1978,
-    doi:10.1016/0020-7683(78)90052-5). A tissue in a box always has one, since its areas sum to that of
-    the box; a rigid one has one more, which is what its tensions and pressures are (Merkel & Manning 2018,
+    doi:10.1016/0020-7683(78)90052-5). A periodic tissue always has one, because its areas sum to the area of
+    the box. A rigid tissue has one more, its own tensions and pressures (Merkel & Manning 2018,
     doi:10.1088/1367-2630/aaaa13).
 
     **Arguments:**
 
     - `tissue`: the tissue; its arrays must not be traced.
     - `constraints`: see [`compatibility`][vertax.mechanics.compatibility].
-    - `tolerance`: singular values that are that much smaller than the largest one count as 0.
+    - `tolerance`: singular values of at most this fraction of the largest one count as 0.
 
     **Returns:** a [`SelfStress`][vertax.mechanics.SelfStress].
 

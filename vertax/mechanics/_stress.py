@@ -21,24 +21,24 @@ def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
     r"""Stress of a tissue, $\sigma = \frac1A\,\partial E / \partial F$, energy per area.
 
     $F$ deforms box and vertices together, and $A$ is the area of the box, or of all cells of a free
-    tissue. Where areas and lengths are all that the energy knows,
+    tissue. If the energy depends on areas and lengths only,
 
     $$\sigma = \frac1A \Big( -\sum_c p_c A_c\, I + \sum_e T_e \frac{\ell_e \otimes \ell_e}{|\ell_e|} \Big)$$
 
-    (Batchelor 1970; Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017). A free tissue at rest, on
-    which nothing acts from outside, has the stress 0.
+    (Batchelor 1970; Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017). The stress of a free tissue at
+    rest without external load is 0.
 
     **Arguments:**
 
-    - `tissue`: the tissue; for its stress at rest, a relaxed one.
+    - `tissue`: the tissue, relaxed or not.
     - `energy`: any energy.
 
-    **Returns:** a symmetric matrix, shape `(2, 2)` (symmetric unless the energy knows directions); positive
-        where the tissue would contract. Differentiable with respect to everything.
+    **Returns:** a matrix, shape `(2, 2)`, symmetric if the energy is invariant under rotations; positive in
+        tension. Differentiable with respect to all arguments.
 
     **Raises:**
 
-    - `TypeError` for what is no tissue, or no energy.
+    - `TypeError` if `tissue` or `energy` is an object of another class.
     - `ValueError` for a batch of tissues.
     """
     check_system(tissue, energy)
@@ -47,25 +47,25 @@ def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
 
 @eqx.filter_jit
 def _stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
-    whole = jnp.eye(2, dtype=tissue.vertices.dtype)
-    return jax.grad(lambda gradient: energy(deformed(tissue, gradient)))(whole) / area_of(tissue)
+    identity = jnp.eye(2, dtype=tissue.vertices.dtype)
+    return jax.grad(lambda gradient: energy(deformed(tissue, gradient)))(identity) / area_of(tissue)
 
 
 def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2 2"]:
-    r"""Stress of each cell: its pressure, and half of the tension of each of its edges.
+    r"""Stress of each cell, from its pressure and half of the tension of each of its edges.
 
     $$\sigma_c = -p_c\, I + \frac1{2 A_c} \sum_{e \in c} T_e \int_e t \otimes t\, \mathrm ds$$
 
     with unit tangents $t$. An edge on the outline of a free tissue has one cell only, which gets all of
     its tension. At rest the mean over cells, weighted by their areas, is the
-    [`stress`][vertax.mechanics.stress] of the whole (if all edges are straight, anywhere).
+    [`stress`][vertax.mechanics.stress] of the tissue (if all edges are straight, also away from rest).
 
     **Arguments:**
 
     - `tissue`: the tissue.
     - `energy`: an energy of areas and lengths, see [`pressures`][vertax.mechanics.pressures].
 
-    **Returns:** one symmetric matrix a cell, energy per area, positive where it would contract.
+    **Returns:** one symmetric matrix per cell, energy per area, positive in tension.
 
     **Raises:** as `stress`.
     """
@@ -77,14 +77,16 @@ def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2
 def _cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2 2"]:
     pressure, tension = pressures_and_tensions(tissue, energy)
     cells = tissue.topology.edge_cells
-    # An edge whose other side is the exterior belongs to its one cell.
+    # An edge with the exterior on one side belongs to its one cell.
     inside = cells < tissue.n_cells
-    share = tension / jnp.maximum(jnp.sum(inside, axis=1), 1)
-    pull = share[:, None, None] * _directed_lengths(tissue)
+    tension_per_cell = tension / jnp.maximum(jnp.sum(inside, axis=1), 1)
+    moments = tension_per_cell[:, None, None] * _directed_lengths(tissue)
     sums = jax.ops.segment_sum(
-        jnp.concatenate([pull, pull]), jnp.concatenate([cells[:, 0], cells[:, 1]]), tissue.n_cells
+        jnp.concatenate([moments, moments]),
+        jnp.concatenate([cells[:, 0], cells[:, 1]]),
+        tissue.n_cells,
     )
-    isotropic = pressure[:, None, None] * jnp.eye(2, dtype=pull.dtype)
+    isotropic = pressure[:, None, None] * jnp.eye(2, dtype=moments.dtype)
     areas = tissue.areas
     if tissue.topology.spare:
         areas = jnp.where(tissue.alive, areas, 1)
@@ -92,8 +94,8 @@ def _cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 
 
 
 def _directed_lengths(tissue: Tissue) -> Float[Array, "edges 2 2"]:
-    """The integral of t ⊗ t along each edge, whose trace is its length."""
-    # Of an arc with the half-angle α over the chord c, with R = c / (2 sin α), it is
+    """The integral of t ⊗ t along each edge; its trace is the length of the edge."""
+    # For an arc with half-angle α and chord c, with R = c / (2 sin α), the principal values are
     # R (α + sin α cos α) along the chord and R (α - sin α cos α) = 2 c g sin α across it.
     chord, angle = tissue.edge_vectors, tissue.edge_angles
     squared = chord[:, 0] ** 2 + chord[:, 1] ** 2 + tissue.softening**2
@@ -103,8 +105,8 @@ def _directed_lengths(tissue: Tissue) -> Float[Array, "edges 2 2"]:
         return outer(chord)
     across = 2 * area_factor(angle) * jnp.sin(angle)
     along = length_factor(angle) - across
-    aside = jnp.stack([-chord[:, 1], chord[:, 0]], axis=-1)
-    return along[:, None, None] * outer(chord) + across[:, None, None] * outer(aside)
+    normal = jnp.stack([-chord[:, 1], chord[:, 0]], axis=-1)
+    return along[:, None, None] * outer(chord) + across[:, None, None] * outer(normal)
 
 
 def principal(
@@ -114,10 +116,10 @@ def principal(
 
     **Arguments:**
 
-    - `stresses`, shape `(…, 2, 2)`: symmetric matrices, of the whole or of cells.
+    - `stresses`, shape `(…, 2, 2)`: symmetric matrices, of the tissue or of cells.
 
-    **Returns:** the principal stresses, the larger one first, shape `(…, 2)`; and the unit vectors along
-        them as rows, shape `(…, 2, 2)`. (Where both are equal the directions mean nothing.)
+    **Returns:** the principal stresses, the larger one first, shape `(…, 2)`; and unit vectors along their
+        directions as rows, shape `(…, 2, 2)`. (If both stresses are equal the directions are arbitrary.)
 
     **Raises:**
 

@@ -1,4 +1,4 @@
-"""Symmetric linear systems by one factorisation, for many right-hand sides."""
+"""Symmetric linear systems by one dense factorisation, for many right-hand sides."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
-# Columns of the matrix that are computed at a time.
+# Number of columns of the matrix per batch of products.
 _BATCH = 64
 
 
@@ -22,14 +22,15 @@ class _Factors(NamedTuple):
 
 
 class Direct(lx.AbstractLinearSolver[Any]):
-    r"""A dense factorisation of $A + \delta$, and steps of refinement: for many right-hand sides.
+    r"""LU factorisation of $A + \delta I$ with iterative refinement, for many right-hand sides.
 
-    Where many systems have the same matrix, as in a Jacobian by forward sensitivities, it is set up and
-    factorised once. That takes as many products as there are unknowns, time with their cube and memory with
-    their square: it is what Levenberg-Marquardt with a thousand parameters needs, and for a single
-    right-hand side it is a waste. $\delta$ is $10^{-10}$ (float32: $10^{-4}$) of the size of $A$, so that
-    motions which cost no energy, such as those of the whole, do not matter: the solution has a millionth of
-    them, if the right-hand side has none.
+    The matrix is set up and factorised once, and used for all right-hand sides, such as those of a Jacobian
+    by forward sensitivities. Cost for $n$ unknowns: $n$ products with $A$, time $O(n^3)$, memory $O(n^2)$.
+    This pays for Levenberg-Marquardt with a thousand parameters, but not for a single right-hand side.
+
+    The shift $\delta = 10^{-10} \|A\|_\infty$ (float32: $10^{-4} \|A\|_\infty$) makes the matrix regular if
+    $A$ has null vectors, such as rigid motions. If the right-hand side has no component along them, their
+    relative weight in the solution is about $10^{-6}$.
 
     Pass it as `ImplicitDifferentiation(linear_solver=vx.solvers.Direct())`.
     """
@@ -41,7 +42,9 @@ class Direct(lx.AbstractLinearSolver[Any]):
         matrix = as_matrix(operator.mv, operator.in_structure())
         size = jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
         identity = jnp.eye(len(matrix), dtype=matrix.dtype)
-        factors, pivots = jax.scipy.linalg.lu_factor(matrix + _share(matrix) * size * identity)
+        factors, pivots = jax.scipy.linalg.lu_factor(
+            matrix + _relative_shift(matrix) * size * identity
+        )
         return _Factors(operator, factors, pivots)
 
     def compute(
@@ -53,15 +56,15 @@ class Direct(lx.AbstractLinearSolver[Any]):
         solve = lambda r: jax.scipy.linalg.lu_solve((state.factors, state.pivots), r)
         rhs = ravel_pytree(vector)[0]
         x = solve(rhs)
-        for _ in range(_REFINED):
+        for _ in range(_REFINEMENT_STEPS):
             x += solve(rhs - product(x))
-        left = jnp.sqrt(jnp.sum((rhs - product(x)) ** 2))
+        residual = jnp.sqrt(jnp.sum((rhs - product(x)) ** 2))
         size = jnp.sqrt(jnp.sum(rhs**2))
-        solved = left <= 1e3 * _share(zero) * size
+        solved = residual <= 1e3 * _relative_shift(zero) * size
         result = lx.RESULTS.where(solved, lx.RESULTS.successful, lx.RESULTS.singular)
         stats = {
-            "residual_norm": left / jnp.where(size > 0, size, 1),
-            "num_steps": jnp.array(_REFINED),
+            "residual_norm": residual / jnp.where(size > 0, size, 1),
+            "num_steps": jnp.array(_REFINEMENT_STEPS),
         }
         return unravel(x), result, stats
 
@@ -78,21 +81,21 @@ class Direct(lx.AbstractLinearSolver[Any]):
     def assume_full_rank(self) -> bool:
         """True: derivatives of the solution are those of a nonsingular matrix.
 
-        They hold for a singular one too, as long as its null space stays the same when it changes and the
-        right-hand sides of the differentiated systems have no part in it. Otherwise the result is
-        `singular`; take [`MINRES`][vertax.MINRES], which differentiates the pseudo-inverse.
+        For a singular matrix they hold if its null space is constant and the right-hand sides of the
+        differentiated systems have no component in it. Otherwise the result is `singular`; use
+        [`MINRES`][vertax.MINRES], which differentiates the pseudo-inverse.
         """
         return True
 
 
-_REFINED = 2
+_REFINEMENT_STEPS = 2
 
 
 def as_matrix(product: Callable[[PyTree], PyTree], like: PyTree) -> Float[Array, "n n"]:
-    """The matrix of a symmetric operator, from its products with vectors of the shapes of `like`."""
+    """The matrix of a symmetric operator, from products with unit vectors of the shapes of `like`."""
     zero, unravel = _flat(like)
     column = lambda v: ravel_pytree(product(unravel(v)))[0]
-    # (A smaller last batch would be compiled as well.)
+    # (Padded to full batches: a smaller last batch would be compiled separately.)
     batches = -(-zero.size // _BATCH)
     unit_vectors = jnp.eye(batches * _BATCH, zero.size, dtype=zero.dtype)
     each = jax.lax.map(jax.vmap(column), unit_vectors.reshape(batches, _BATCH, zero.size))
@@ -103,5 +106,5 @@ def _flat(structure: PyTree) -> tuple[Float[Array, " n"], Any]:
     return ravel_pytree(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), structure))
 
 
-def _share(like: Array) -> float:
+def _relative_shift(like: Array) -> float:
     return 1e-10 if like.dtype == jnp.float64 else 1e-4

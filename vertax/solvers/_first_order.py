@@ -26,8 +26,8 @@ class _State(eqx.Module):
 class GradientDescent(AbstractSolver):
     r"""Gradient descent with a fixed step, $X \leftarrow X - \eta\,\nabla E$ (paper, Methods).
 
-    Here for comparison with the paper: it ends in two-cycles wherever an eigenvalue of the Hessian
-    exceeds $2/\eta$.
+    For comparison with the paper. It does not converge, but ends in two-cycles, if an eigenvalue of the
+    Hessian exceeds $2/\eta$.
 
     **Arguments:**
 
@@ -72,12 +72,12 @@ class Optax(AbstractSolver):
 
     **Arguments:**
 
-    - `optimiser`: e.g. `optax.adam(1e-2)`; schedules work, and so do optimisers with a line search
-        (`optax.lbfgs()`), which are passed the value, gradient and value function.
+    - `optimiser`: e.g. `optax.adam(1e-2)`. Schedules and optimisers with a line search (`optax.lbfgs()`)
+        work; the latter get the value, the gradient and the function.
 
     **Raises:**
 
-    - `TypeError` for what is no Optax optimiser.
+    - `TypeError` if it is not an Optax optimiser.
     """
 
     optimiser: optax.GradientTransformation = eqx.field(static=True)
@@ -91,7 +91,7 @@ class Optax(AbstractSolver):
 
     @property
     def unrollable(self) -> bool:
-        """Whether the optimiser has no line search: whether it never evaluates the energy itself."""
+        """Whether the optimiser has no line search, so that its steps are differentiable."""
         return not has_line_search(self.optimiser)
 
     def init(
@@ -104,7 +104,7 @@ class Optax(AbstractSolver):
         self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
     ) -> tuple[Any, _State, Any]:
         def value_fn(x: Any) -> Array:
-            # Line searches of Optax work in the default precision, whatever that of the tissue is.
+            # Line searches of Optax use the default precision, which may differ from that of the tissue.
             return fn(jax.tree.map(lambda a, b: a.astype(b.dtype), x, y), args)[0]
 
         update = optax.with_extra_args_support(self.optimiser).update
@@ -147,11 +147,11 @@ def has_line_search(optimiser: optax.GradientTransformation) -> bool:
 def LBFGS(history: int = 10) -> Optax:
     """Limited-memory BFGS with a zoom line search (Optax's).
 
-    Stalls near forces of 1e-7 in float64, from rounding of the energy in its line search.
+    It stalls at forces near 1e-7 in float64, because of the rounding of the energy in its line search.
 
     **Arguments:**
 
-    - `history`: number of past steps that shape the metric.
+    - `history`: number of stored steps for the approximate inverse Hessian.
 
     **Raises:**
 
@@ -167,23 +167,24 @@ class _FIREState(eqx.Module):
     velocity: PyTree[Float[Array, "..."]]
     time_step: Float[Array, ""]
     mixing: Float[Array, ""]
-    downhill: Float[Array, ""]
+    num_downhill: Float[Array, ""]
     aux: PyTree
 
 
 class FIRE(AbstractSolver):
     r"""Fast inertial relaxation engine (Bitzek et al. 2006, doi:10.1103/PhysRevLett.97.170201).
 
-    Damped dynamics that speeds up while the power $F \cdot v$ is positive and stops dead when it turns
-    negative; semi-implicit Euler steps (Guénolé et al. 2020, doi:10.1016/j.commatsci.2020.109584).
+    Damped dynamics: while the power $F \cdot v$ is positive the time step grows, and when it becomes negative
+    the velocity is set to 0. Semi-implicit Euler steps (Guénolé et al. 2020,
+    doi:10.1016/j.commatsci.2020.109584).
 
     **Arguments:**
 
-    - `time_step`: first and smallest useful time step, for unit mass where the mean stiffness is 12 (that
-        of the paper's first energy); elsewhere in proportion to the period of oscillation.
-    - `max_time_step`: largest time step, likewise.
-    - `max_displacement`: furthest that one vertex may move in a step, in units of the length scale (in
-        [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
+    - `time_step`: initial time step, for unit mass and a mean stiffness of 12 (of the paper's first
+        energy); scaled with the period of oscillation for other stiffnesses.
+    - `max_time_step`: largest time step, scaled likewise.
+    - `max_displacement`: largest displacement of a vertex in one step, in units of the length scale (in
+        [`equilibrate`][vertax.equilibrate] the square root of the mean cell area; otherwise 1).
 
     **Raises:**
 
@@ -215,7 +216,7 @@ class FIRE(AbstractSolver):
             gradient,
             rest,
             scalar(self.time_step * _unit_of_time(options)),
-            scalar(_MIXING),
+            scalar(_INITIAL_MIXING),
             scalar(0),
             aux,
         )
@@ -226,24 +227,26 @@ class FIRE(AbstractSolver):
         force = optax.tree.scale(-1, state.gradient)
         power = jnp.asarray(optax.tree.vdot(force, state.velocity))
         downhill = power > 0
-        n_downhill = jnp.where(downhill, state.downhill + 1, 0)
+        n_downhill = jnp.where(downhill, state.num_downhill + 1, 0)
         fast = n_downhill > _DELAY
         unit = _unit_of_time(options)
         dt = jnp.where(downhill, state.time_step, 0.5 * state.time_step)
         dt = jnp.where(fast, jnp.minimum(1.1 * dt, self.max_time_step * unit), dt)
-        # Without a floor a long uphill passage could shrink the step to nothing.
+        # A lower bound, because the step is halved in each step with negative power.
         dt = jnp.maximum(dt, 0.02 * self.time_step * unit)
-        mixing = jnp.where(downhill, jnp.where(fast, 0.99 * state.mixing, state.mixing), _MIXING)
+        mixing = jnp.where(
+            downhill, jnp.where(fast, 0.99 * state.mixing, state.mixing), _INITIAL_MIXING
+        )
 
         velocity = jax.tree.map(lambda v: jnp.where(downhill, v, 0), state.velocity)
         velocity = optax.tree.add_scale(velocity, dt, force)
-        speed, strength = optax.tree.norm(velocity), optax.tree.norm(force)
-        steer = mixing * speed / jnp.where(strength > 0, strength, 1)
+        speed, force_norm = optax.tree.norm(velocity), optax.tree.norm(force)
+        steer = mixing * speed / jnp.where(force_norm > 0, force_norm, 1)
         velocity = jax.tree.map(lambda v, f: (1 - mixing) * v + steer * f, velocity, force)
-        reach = self.max_displacement * options.get("length_scale", 1.0)
-        furthest = dt * optax.tree.norm(velocity, ord=jnp.inf)
-        limit = jnp.minimum(1.0, reach / jnp.where(furthest > 0, furthest, 1))
-        y = optax.tree.add_scale(y, limit * dt, velocity)
+        max_length = self.max_displacement * options.get("length_scale", 1.0)
+        length = dt * optax.tree.norm(velocity, ord=jnp.inf)
+        scale = jnp.minimum(1.0, max_length / jnp.where(length > 0, length, 1))
+        y = optax.tree.add_scale(y, scale * dt, velocity)
         value, gradient, aux = value_and_gradient(fn, y, args)
         return y, _FIREState(value, gradient, velocity, dt, mixing, n_downhill, aux), aux
 
@@ -259,6 +262,6 @@ def _unit_of_time(options: dict[str, Any]) -> Any:
     return (12 / options.get("stiffness", 12.0)) ** 0.5
 
 
-# Bitzek et al.: α_start = 0.1, and acceleration begins after five steps downhill.
-_MIXING = 0.1
+# Bitzek et al.: α_start = 0.1, and N_min = 5 steps with positive power before the time step grows.
+_INITIAL_MIXING = 0.1
 _DELAY = 5

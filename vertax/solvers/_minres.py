@@ -28,25 +28,25 @@ from vertax.solvers._lanczos import (
 )
 
 # |r| from the recurrence and |b - A x| recomputed agree if they differ by less than this factor.
-_SLACK = 2
+_RESIDUAL_SLACK = 2
 
 
 class _Solve(NamedTuple):
-    """What one of the solves in Krylov spaces, four at most, hands to the next."""
+    """The state between the solves in Krylov spaces, of which there are four at most."""
 
     number: Int[Array, ""]
     more: Bool[Array, ""]
     rhs: Float[Array, "n"]
     target: Float[Array, ""]
-    last: "_Looks"
+    last: "_Evaluations"
     step: Int[Array, ""]
     status: Int[Array, ""]
     operator_norm: Float[Array, ""]
     negative_curvature: Bool[Array, ""]
 
 
-class _Looks(NamedTuple):
-    """What is looked at after a solve, each with a product or what the preconditioner makes of it."""
+class _Evaluations(NamedTuple):
+    """Vectors and norms that are recomputed after a solve, with products with A and P."""
 
     rest: Float[Array, "n"]  # of this solve, rhs - A P end.u
     norm_rest: Float[Array, ""]
@@ -65,63 +65,62 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     $$x_k = \arg\min_{x \in \mathcal{K}_k(A, b)} \|b - A x\|, \qquad
     \mathcal{K}_k(A, b) = \mathrm{span}\{b, A b, \dots, A^{k-1} b\}$$
 
-    One product with $A$ in each step, and memory for a dozen vectors. It suits Hessians at a
-    minimum that is degenerate (zero modes) or is no minimum (saddles), where CG breaks down. The
-    result is the pseudo-inverse solution $A^+ b$, also if $A$ is singular, and also if the system
-    then has no solution (is inconsistent).
+    Each step takes one product with $A$; the memory is a dozen vectors. The method suits Hessians with zero
+    modes and Hessians at saddles, where CG breaks down. The result is the pseudo-inverse solution
+    $A^+ b$, also if $A$ is singular and the system inconsistent.
 
-    It ends if one of these holds, where $\|A\|$ is estimated on the way:
+    The iteration ends if one of these conditions holds, with an estimate of $\|A\|$ from the iteration:
 
     - $\|r\| \le \mathtt{atol} + \mathtt{rtol}\,\|b\|$, with $r = b - A x$: solved.
-    - $\|r\| \le \epsilon\,(\|A\|\|x\| + \|b\|)$: as good as rounding allows. If the first test then
-        fails for the recomputed $r$, this is told by `stats["stagnated"]`. It still is called
-        successful if $\|r\| \le \mathtt{rtol}\,(\|A\|\|x\| + \|b\|)$, which allows for a large $x$,
-        and $\|r\| \le \epsilon^{1/8} \|b\|$, so that some of $b$ is explained.
-    - $\|A r\| \le \mathtt{rtol}\,\|A\|\|r\|$: a least-squares solution. Rounding lets the left side
-        come down to about $\sqrt{\epsilon}\,\|A\|\|r\|$ only, and then $x$ grows without bound.
-        The rest is therefore done, from the last good $x$, by two more solves, $A y = A r$ and
-        $A d = y$, which are consistent. Finally $x + d$ is freed of its part along the remaining
-        $r$, which is a null vector. Inconsistent systems take two to three times as many steps.
+    - $\|r\| \le \epsilon\,(\|A\|\|x\| + \|b\|)$: the residual is at the level of rounding errors. If the
+        first test then fails for the recomputed $r$, `stats["stagnated"]` is true. The result is still
+        `successful` if $\|r\| \le \mathtt{rtol}\,(\|A\|\|x\| + \|b\|)$, which allows for a large $x$,
+        and $\|r\| \le \epsilon^{1/8} \|b\|$, which excludes $x = 0$.
+    - $\|A r\| \le \mathtt{rtol}\,\|A\|\|r\|$: a least-squares solution. With rounding errors the left side
+        decreases to about $\sqrt{\epsilon}\,\|A\|\|r\|$ only, and then $x$ grows without bound.
+        Therefore the solution is completed, from the last good $x$, by two further solves, $A y = A r$ and
+        $A d = y$, which are consistent. Finally the component along the remaining $r$, a null vector,
+        is removed from $x + d$. Inconsistent systems take two to three times as many steps.
 
     The relative rounding error of $x$ can be as large as $\epsilon$ times the square of the
-    condition number. Above a condition of $1/\sqrt{\epsilon}$ (in float32 some thousands) be
-    prepared for `stagnation`, and for small eigenvalues to be taken for zero.
+    condition number. Above a condition number of $1/\sqrt{\epsilon}$ (in float32 some thousands) the result
+    may be `stagnation`, and small eigenvalues may be treated as zero.
 
     This supports the following `options`, passed as `lineax.linear_solve(..., options=...)`:
 
     - `preconditioner`: a positive definite operator $P \approx A^{-1}$, tagged as such. Residuals
         are then measured as $\sqrt{r \cdot P r}$, and lengths of $x$ as $\sqrt{x \cdot P^{-1} x}$.
-        If $A$ is nonsingular, that changes the number of steps and nothing else. If it is singular,
-        the result is the pseudo-inverse solution in these lengths, which is not $A^+ b$, and for
-        which the derivative that Lineax computes does not hold.
-    - `y0`: a first guess. If $A$ is singular, the result is the solution nearest to it. Give none
-        when differentiating through a singular system: Lineax hands it to the tangent system too.
+        If $A$ is nonsingular, this changes only the number of steps. If $A$ is singular, the result is the
+        pseudo-inverse solution in these norms, which is not $A^+ b$, and the derivative that Lineax computes
+        is not valid for it.
+    - `y0`: an initial guess. If $A$ is singular, the result is the solution nearest to it. Do not pass it
+        when differentiating through a singular system: Lineax passes it to the tangent system too.
 
     **Arguments:**
 
     - `rtol`: tolerance of the residual relative to $\|b\|$. Defaults to $\epsilon^{2/3}$ of the
         dtype, which is 3.7e-11 in float64 and 2.4e-5 in float32.
     - `atol`: absolute tolerance of the residual, added to the relative one.
-    - `max_steps`: the most steps to take, all solves together. Defaults to 50 times the size of the
-        system: without rounding one solve takes as many as there are distinct eigenvalues.
+    - `max_steps`: maximum number of steps of all solves together. Defaults to 50 times the size of the
+        system. (Without rounding errors one solve takes as many steps as there are distinct eigenvalues.)
 
     **Returns:**
 
     From `lineax.linear_solve`, a solution with one of the results `successful`;
-    `max_steps_reached`; `stagnation` (rounding ended it too far from a solution); `breakdown` (the
+    `max_steps_reached`; `stagnation` (rounding errors prevent a smaller residual); `breakdown` (the
     preconditioner is not positive definite); `nonfinite_input` ($A$, $b$ or `y0` has nan or inf;
     the value is nan). Its `stats` are
 
-    - `num_steps` and `max_steps`: the steps taken and allowed. Each makes one product with $A$;
-        another one is made at the beginning, one for `y0`, and three after each solve.
+    - `num_steps` and `max_steps`: the number of steps and its maximum. Each step takes one product with $A$;
+        further products are one at the start, one for `y0`, and three after each solve.
     - `residual_norm`: $\|b - A x\| / \|b\|$ recomputed at the end, or $\|A x\|$ if $b = 0$.
     - `operator_norm`: a lower bound of $\|A\|$, or of $\|P^{1/2} A P^{1/2}\|$.
-    - `negative_curvature`: whether a direction $z$ with $z \cdot A z < 0$ was met. Without
-        rounding, and if solved to the end, it is so exactly if $b$ has a part in an eigenspace
-        of a negative eigenvalue. A loose tolerance can miss a small part.
+    - `negative_curvature`: whether a direction $z$ with $z \cdot A z < 0$ was found. Without rounding errors
+        and after a full solve this holds if and only if $b$ has a component in an eigenspace of a negative
+        eigenvalue. With a loose tolerance a small component can be missed.
     - `inconsistent`: whether the result is a least-squares solution with a residual that is not
         small.
-    - `stagnated`: whether rounding ended the solve with a residual above the tolerances.
+    - `stagnated`: whether the solve ended by rounding errors with a residual above the tolerances.
 
     **Raises:**
 
@@ -190,7 +189,7 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     def transpose(
         self, state: lx.AbstractLinearOperator, options: dict[str, Any]
     ) -> tuple[lx.AbstractLinearOperator, dict[str, Any]]:
-        """The same state: the operator is symmetric. A first guess is for this vector only."""
+        """The same state: the operator is symmetric. The initial guess is valid for this vector only."""
         return state, {name: value for name, value in options.items() if name != "y0"}
 
     def conj(
@@ -200,7 +199,7 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         return state, options
 
     def assume_full_rank(self) -> bool:
-        """False: the result is the pseudo-inverse solution whatever the rank."""
+        """False: the result is the pseudo-inverse solution for any rank."""
         return False
 
 
@@ -215,11 +214,11 @@ def _solve(
     rtol = eps ** (2 / 3) if solver.rtol is None else solver.rtol
     max_steps = 50 * max(b.size, 1) if solver.max_steps is None else solver.max_steps
     rounding = ROUNDING_UNITS * eps
-    hardly_solved = eps**0.125
-    # Why √eps: see the end of the derivation. If no more than that is asked for, solve 0 stops
-    # there at once and the others have nothing to add.
+    loose_tolerance = eps**0.125
+    # For √eps see the end of the derivation in `_lanczos`. If `rtol` is not smaller, solve 0 stops there and
+    # the others are not needed.
     nearly_null = max(rtol, 4 * eps**0.5)
-    coarse = rtol == nearly_null
+    is_coarse = rtol == nearly_null
 
     flat = lambda operator: lambda v: jfu.ravel_pytree(operator.mv(unravel(v)))[0]
     a = flat(state)
@@ -227,30 +226,30 @@ def _solve(
     p = None if preconditioner is None else flat(preconditioner)
     precondition = (lambda z: z) if p is None else p
 
-    # The cotangents of a float32 loss can be so small that their squares vanish.
+    # Scale b: the squares of small float32 cotangents would underflow.
     scale = _power_of_two_near(jnp.max(jnp.abs(b), initial=0))
     b = b / scale
     norm_b = norm(b, precondition(b))
     target = solver.atol / scale + rtol * norm_b
     x_0, r_0 = jnp.zeros_like(b), b
     if options.get("y0") is not None:
-        x_0 = _first_guess(vector, options) / scale
+        x_0 = _initial_guess(vector, options) / scale
         r_0 = b - a(x_0)
 
-    # |A| must be known before Lanczos can tell it: if b is a null vector, A b is rounding
-    # error, and this shows only in comparison with |A|. With no pattern in g, the mean square
-    # of |A g|/|g| is that of the eigenvalues.
+    # An estimate of |A| is needed before the Lanczos iteration: if b is a null vector, A b is rounding error,
+    # which can be detected only by comparison with |A|. For a random g the mean square of |A g|/|g| is the
+    # mean square of the eigenvalues.
     g = probe_vector(b)
     norm_g = norm(g, precondition(g))
 
-    # Solve 0 is the system itself; solve -1 solves nothing, and has A P g looked at instead. If the
-    # system has only a least-squares solution, two more follow:
-    #     solve 1, A P y = A P r, makes y the part of r in the range of A,
-    #     solve 2, A P d = y,     makes A⁺ r to be added to u.
-    # Both are consistent, and so do not blow up. Without rounding, A P r and y would be zero.
+    # Solve -1 computes only A P g. Solve 0 is the system itself. If it has only a least-squares solution, two
+    # more follow:
+    #     solve 1, A P y = A P r: y is the component of r in the range of A,
+    #     solve 2, A P d = y:     d = A⁺ r is added to u.
+    # Both are consistent, so their solutions are bounded. Without rounding errors A P r and y would be zero.
     def one_solve(solve: _Solve) -> _Solve:
         probing, first, second = (solve.number == k for k in (-1, 0, 1))
-        null = jnp.where(first & coarse, rtol, ROUNDING_UNITS * rounding).astype(b.dtype)
+        null = jnp.where(first & is_coarse, rtol, ROUNDING_UNITS * rounding).astype(b.dtype)
         end = solve_in_krylov_space(
             a,
             p,
@@ -265,29 +264,30 @@ def _solve(
         )
         norm_rhs = end.norm_rhs
 
-        # The looks, one in a turn of a loop: what takes long to compile is the operator, and it stands
-        # here once.
-        def look(turn: Int[Array, ""], seen: _Looks) -> _Looks:
+        # The evaluations, one in each iteration of a loop, so that the operator is compiled once here.
+        def evaluate(index: Int[Array, ""], evaluations: _Evaluations) -> _Evaluations:
             begin = jnp.where(probing, g, end.u)
-            v = lax.select_n(turn, begin, seen.rest, seen.u, seen.r, seen.a_r)
+            v = lax.select_n(
+                index, begin, evaluations.rest, evaluations.u, evaluations.r, evaluations.a_r
+            )
             p_v = precondition(v)
-            turns = [turn == k for k in range(5)]
-            a_v = lax.cond(turns[1] | turns[4], lambda: v, lambda: a(p_v))
+            is_index = [index == k for k in range(5)]
+            a_v = lax.cond(is_index[1] | is_index[4], lambda: v, lambda: a(p_v))
 
-            # The level of rounding grows with u, so a u that blows up at one stroke reaches it. It
-            # shows in the recomputed residual, which is that of the suspect or larger.
+            # The rounding level grows with u, so a u that diverges in one step passes the test for
+            # CONVERGED. Its recomputed residual is not smaller than that of the suspect.
             norm_v = norm(v, p_v)
-            no_gain = (end.residual_suspect > 0) & (norm_v > 0.5 * end.residual_suspect)
+            is_not_smaller = (end.residual_suspect > 0) & (norm_v > 0.5 * end.residual_suspect)
             blown_up = (
                 (end.status == CONVERGED)
-                & (norm_v > _SLACK * solve.target)
-                & (no_gain | (norm_v > hardly_solved * norm_rhs))
+                & (norm_v > _RESIDUAL_SLACK * solve.target)
+                & (is_not_smaller | (norm_v > loose_tolerance * norm_rhs))
             )
-            # The test for LEAST_SQUARES, too, can be late, when u has already grown.
+            # The test for LEAST_SQUARES can also be late, after u has grown.
             least_squares = blown_up | (end.status == LEAST_SQUARES)
             change = jnp.where(least_squares, end.u_suspect, end.u)
-            u = jnp.where(second, seen.u, seen.u + change)
-            new = _Looks(
+            u = jnp.where(second, evaluations.u, evaluations.u + change)
+            new = _Evaluations(
                 rest=solve.rhs - a_v,
                 norm_rest=norm_v,
                 u=u,
@@ -298,26 +298,26 @@ def _solve(
                 norm_a_r=norm_v,
                 status=jnp.where(least_squares, LEAST_SQUARES, end.status),
             )
-            when = (0, 1, 1, 2, 2, 3, 3, 4, 1)
-            each = zip(when, new, seen, strict=True)
-            return _Looks(*(jnp.where(turns[k], now, before) for k, now, before in each))
+            order = (0, 1, 1, 2, 2, 3, 3, 4, 1)
+            each = zip(order, new, evaluations, strict=True)
+            return _Evaluations(*(jnp.where(is_index[k], now, before) for k, now, before in each))
 
-        seen = lax.fori_loop(0, jnp.where(probing, 2, 5), look, solve.last)
-        least_squares = seen.status == LEAST_SQUARES
+        evaluations = lax.fori_loop(0, jnp.where(probing, 2, 5), evaluate, solve.last)
+        least_squares = evaluations.status == LEAST_SQUARES
         change = jnp.where(least_squares, end.u_suspect, end.u)
-        ended = least_squares | (seen.status == CONVERGED)
-        more = jnp.where(first, least_squares & (not coarse), second & ended)
-        operator_norm = jnp.where(probing, over(seen.norm_rest, norm_g), end.operator_norm)
-        # Solve 1 goes as far as A P r means anything.
-        finest = rounding * operator_norm * norm(seen.r, seen.p_r)
+        ended = least_squares | (evaluations.status == CONVERGED)
+        more = jnp.where(first, least_squares & (not is_coarse), second & ended)
+        operator_norm = jnp.where(probing, over(evaluations.norm_rest, norm_g), end.operator_norm)
+        # The target of solve 1 is the rounding error of A P r.
+        finest = rounding * operator_norm * norm(evaluations.r, evaluations.p_r)
         return _Solve(
             number=solve.number + 1,
             more=more | probing,
-            rhs=jnp.where(probing, r_0, jnp.where(first, seen.a_r, change)),
+            rhs=jnp.where(probing, r_0, jnp.where(first, evaluations.a_r, change)),
             target=jnp.where(first, finest, target),
-            last=tree_where(probing, solve.last, seen),
+            last=tree_where(probing, solve.last, evaluations),
             step=end.step,
-            status=seen.status,
+            status=evaluations.status,
             operator_norm=operator_norm,
             negative_curvature=end.negative_curvature,
         )
@@ -328,7 +328,7 @@ def _solve(
         more=jnp.array(True),
         rhs=zeros,
         target=zero,
-        last=_Looks(zeros, zero, zeros, zeros, zeros, zeros, zeros, zero, running),
+        last=_Evaluations(zeros, zero, zeros, zeros, zeros, zeros, zeros, zero, running),
         step=jnp.array(0),
         status=running,
         operator_norm=zero,
@@ -336,12 +336,17 @@ def _solve(
     )
     solve = lax.while_loop(lambda solve: solve.more, one_solve, start)
 
-    seen = solve.last
-    u, r, p_u, p_r, norm_a_r = seen.u, seen.r, seen.p_u, seen.p_r, seen.norm_a_r
+    evaluations = solve.last
+    u, r, p_u, p_r, norm_a_r = (
+        evaluations.u,
+        evaluations.r,
+        evaluations.p_u,
+        evaluations.p_r,
+        evaluations.norm_a_r,
+    )
     norm_r = norm(r, p_r)
     x = x_0 + p_u
-    # With a preconditioner this is the lower bound of |x| by Cauchy and Schwarz, for x_0 is not
-    # known in the form P u.
+    # With a preconditioner this is the Cauchy-Schwarz lower bound of |x|, because x_0 is not given as P u.
     size_x = jnp.sqrt(dot(x, x)) if p is None else over(jnp.abs(dot(x, b)), norm_b)
     size_x = jnp.maximum(size_x, norm(u, p_u))
     reach = solve.operator_norm * size_x + norm_b
@@ -349,29 +354,29 @@ def _solve(
     noise = ROUNDING_UNITS * rounding * reach
 
     ended = (solve.status == CONVERGED) | (solve.status == LEAST_SQUARES)
-    within = norm_r <= _SLACK * target
+    is_within_tolerance = norm_r <= _RESIDUAL_SLACK * target
     inconsistent = (
         ended
-        & ~within
+        & ~is_within_tolerance
         & ((solve.number > 1) | (solve.status == LEAST_SQUARES))
         & (norm_r > noise)
-        & (norm_a_r <= solve.operator_norm * (_SLACK * nearly_null * norm_r + noise))
+        & (norm_a_r <= solve.operator_norm * (_RESIDUAL_SLACK * nearly_null * norm_r + noise))
     )
-    stagnated = ended & ~within & ~inconsistent
-    explained = norm_r <= hardly_solved * norm_b
+    stagnated = ended & ~is_within_tolerance & ~inconsistent
+    explained = norm_r <= loose_tolerance * norm_b
     acceptable = explained & (norm_r <= jnp.maximum(rtol * reach, noise))
-    # P r is a null vector, and the only one along which P u can have a part: u is in the span
-    # of b, A P b, ..., of which only b has a part outside the range.
-    lifted = x - over(dot(r, p_u), norm_r**2) * p_r
-    x = jnp.where(inconsistent, lifted, x)
+    # P r is a null vector, and the only one along which P u can have a component: u is in the span of b,
+    # A P b, ..., of which only b has a component outside the range.
+    projected = x - over(dot(r, p_u), norm_r**2) * p_r
+    x = jnp.where(inconsistent, projected, x)
 
     result = lx.RESULTS.where(ended, lx.RESULTS.successful, lx.RESULTS.max_steps_reached)
-    for where, what in (
+    for condition, code in (
         (stagnated & ~acceptable, lx.RESULTS.stagnation),
         (solve.status == BREAKDOWN, lx.RESULTS.breakdown),
         (solve.status == NONFINITE, lx.RESULTS.nonfinite_input),
     ):
-        result = lx.RESULTS.where(where, what, result)
+        result = lx.RESULTS.where(condition, code, result)
     x = jnp.where(solve.status == NONFINITE, jnp.nan, x)
     stats = {
         "num_steps": solve.step,
@@ -386,7 +391,7 @@ def _solve(
 
 
 def _power_of_two_near(size: Float[Array, ""]) -> Float[Array, ""]:
-    """A power of two, because dividing by it costs no rounding; 1 for zero, inf and nan."""
+    """A power of two, because division by it is exact; 1 for zero, inf and nan."""
     usable = jnp.isfinite(size) & (size > 0)
     _, exponent = jnp.frexp(jnp.where(usable, size, 1))
     return jnp.where(usable, jnp.ldexp(jnp.ones_like(size), exponent - 1), 1)
@@ -399,7 +404,7 @@ def _same_structure(x: PyTree[Any], y: PyTree[Any]) -> bool:
     return equal_trees and jtu.tree_all(jtu.tree_map(same, x, y))
 
 
-def _first_guess(vector: PyTree[Array], options: dict[str, Any]) -> Float[Array, "n"]:
+def _initial_guess(vector: PyTree[Array], options: dict[str, Any]) -> Float[Array, "n"]:
     y0 = jtu.tree_map(jnp.asarray, options["y0"])
     if not _same_structure(y0, vector):
         raise ValueError(
@@ -412,7 +417,7 @@ def _first_guess(vector: PyTree[Array], options: dict[str, Any]) -> Float[Array,
 def _preconditioner(
     structure: PyTree[jax.ShapeDtypeStruct], options: dict[str, Any]
 ) -> lx.AbstractLinearOperator | None:
-    """The preconditioner of `options`, checked and linearised; `None` if it would do nothing."""
+    """The preconditioner of `options`, checked and linearised; None if it is missing or the identity."""
     preconditioner = options.get("preconditioner")
     if preconditioner is None or isinstance(preconditioner, lx.IdentityLinearOperator):
         return None

@@ -1,4 +1,4 @@
-"""Optimistix's own minimisers, with the force they leave out."""
+"""Minimisers of Optimistix, extended by the gradient at each step."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class _WrappedState(eqx.Module):
 
 
 def check_solver(solver: Any) -> None:
-    """Refuse what is no minimiser with a `TypeError` that says what to write."""
+    """Raise a `TypeError` with a remedy unless the argument is a minimiser."""
     if isinstance(solver, optx.AbstractMinimiser):
         return
     remedy = "Pass one of vertax.solvers, such as LBFGS(), or a minimiser of Optimistix."
@@ -35,11 +35,11 @@ def check_solver(solver: Any) -> None:
 
 
 class Wrapped(AbstractSolver):
-    """A minimiser of Optimistix, judged by its force.
+    """A minimiser of Optimistix, with convergence by the largest force.
 
-    [`equilibrate`][vertax.equilibrate] wraps Optimistix minimisers by itself. The minimiser's own
-    termination is ignored. The force costs one gradient a step, except for quasi-Newton minimisers,
-    with a state that already holds it.
+    [`equilibrate`][vertax.equilibrate] wraps Optimistix minimisers automatically. The termination test of the
+    minimiser is ignored. The force costs one gradient per step, except for quasi-Newton minimisers, which
+    store it in their state.
 
     **Arguments:**
 
@@ -84,7 +84,7 @@ class Wrapped(AbstractSolver):
 
 
 def _as_precise_as(old: PyTree, new: PyTree) -> PyTree:
-    """New values in the precision of the old ones: some minimisers turn float32 into float64."""
+    """New values in the dtypes of the old ones, because some minimisers promote float32 to float64."""
 
     def cast(a: Any, b: Any) -> Any:
         return b.astype(a.dtype) if eqx.is_inexact_array(a) and eqx.is_inexact_array(b) else b

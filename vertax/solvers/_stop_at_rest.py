@@ -1,4 +1,4 @@
-"""A stopping rule for minimisers: the largest force."""
+"""Termination of a relaxation by its largest force."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ class StopAtRestState(eqx.Module):
 
     inner: PyTree
     force: Float[Array, ""]
-    n_below: Int[Array, ""]
+    num_below: Int[Array, ""]
     num_steps: Int[Array, ""]
 
 
 class StopAtRest(optx.AbstractMinimiser):
-    """A solver that is at rest when the largest force has stayed below a tolerance for some steps.
+    """A solver that stops after a number of consecutive steps with the largest force below a tolerance.
 
-    Options in addition to those of the solver: `tolerance`, the largest force at rest; `max_steps`, the
-    largest number of steps; `num_steps`, an exact number of steps, whatever the force is.
+    It has three options in addition to those of the solver: `tolerance`, for the largest force; `max_steps`,
+    the maximum number of steps; and `num_steps`, an exact number of steps, without a test of the force.
 
     **Arguments:**
 
-    - `solver`: takes the steps.
+    - `solver`: computes the steps.
     - `consecutive_steps`: number of consecutive steps for which the force must stay below the tolerance.
     """
 
@@ -44,14 +44,14 @@ class StopAtRest(optx.AbstractMinimiser):
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> StopAtRestState:
         inner = self.solver.init(fn, y, args, options, f_struct, aux_struct, tags)
-        state = self._judge(inner, options, jnp.array(0), jnp.array(0))
+        state = self._count_steps_at_rest(inner, options, jnp.array(0), jnp.array(0))
         return eqx.tree_at(lambda s: s.num_steps, state, jnp.array(0))
 
     def step(
         self, fn: Any, y: Any, args: Any, options: Any, state: StopAtRestState, tags: Any
     ) -> tuple[Any, StopAtRestState, Any]:
         y, inner, aux = self.solver.step(fn, y, args, options, state.inner, tags)
-        return y, self._judge(inner, options, state.n_below, state.num_steps), aux
+        return y, self._count_steps_at_rest(inner, options, state.num_below, state.num_steps), aux
 
     def terminate(
         self, fn: Any, y: Any, args: Any, options: Any, state: StopAtRestState, tags: Any
@@ -69,24 +69,24 @@ class StopAtRest(optx.AbstractMinimiser):
         return y, aux, {}
 
     def at_rest(self, state: StopAtRestState) -> Bool[Array, ""]:
-        """Whether the force has been below the tolerance for long enough."""
-        return state.n_below >= self.consecutive_steps
+        """Whether the force was below the tolerance for `consecutive_steps`."""
+        return state.num_below >= self.consecutive_steps
 
     def gradient(self, state: StopAtRestState) -> PyTree[Float[Array, "..."]]:
         """Gradient at the point that the last step (or `init`) returned."""
         return self.solver.gradient(state.inner)
 
-    def _judge(
-        self, inner: Any, options: Any, n_below: Int[Array, ""], num_steps: Int[Array, ""]
+    def _count_steps_at_rest(
+        self, inner: Any, options: Any, num_below: Int[Array, ""], num_steps: Int[Array, ""]
     ) -> StopAtRestState:
         progress = self.solver.progress(inner)
-        below = jnp.where(progress.force < options["tolerance"], n_below + 1, 0)
-        n_below = jnp.where(progress.accepted, below, n_below)
-        return StopAtRestState(inner, progress.force, n_below, num_steps + progress.stepped)
+        incremented = jnp.where(progress.force < options["tolerance"], num_below + 1, 0)
+        num_below = jnp.where(progress.accepted, incremented, num_below)
+        return StopAtRestState(inner, progress.force, num_below, num_steps + progress.stepped)
 
 
 class AtRest(optx.AbstractMinimiser):
-    """Returns its initial point, which is a minimum."""
+    """A minimiser that takes no step: it returns its initial point, which must be a minimum."""
 
     rtol: float = 0.0
     atol: float = 0.0
