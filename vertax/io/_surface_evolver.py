@@ -11,10 +11,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from vertax.mesh import Free, Tissue, Topology
+from vertax.mesh import Free, Tissue
 from vertax.mesh._arcs import angle_of_area
+from vertax.mesh._faces import Names, Sides, build_faces
 
 
 class Foam(eqx.Module):
@@ -193,60 +194,43 @@ def _counter_clockwise(
 
 
 def _foam(pieces: _Pieces, path: Path) -> Foam:
-    n_cells, n_pieces = len(pieces.loops), len(pieces.edges)
     # A directed piece is 2 e along edge e and 2 e + 1 against it.
-    directed = [2 * (np.abs(loop) - 1) + (loop < 0) for loop in pieces.loops]
-    face = np.full(2 * n_pieces, n_cells)
-    for cell, loop in enumerate(directed):
-        face[loop] = cell
-    used = np.minimum(face[0::2], face[1::2]) < n_cells
-    source = np.stack([pieces.edges[:, 0], pieces.edges[:, 1]], axis=1).ravel()
-    degree = np.bincount(pieces.edges[used].ravel(), minlength=len(pieces.points))
-    if degree.max() > 3:
-        raise ValueError(
-            f"{path}: {degree.max()} edges meet at the point {pieces.points[np.argmax(degree)].tolist()}, "
-            "and in a tissue three do. Split it by a short edge, e.g. with `pop`."
-        )
-    junction = degree == 3
-    following = np.full(2 * n_pieces, -1)
-    for loop in directed:
-        following[loop] = np.roll(loop, -1)
-    # Around the exterior the next piece leaves from where one arrives, and there is one such.
-    outside = (face == n_cells) & np.repeat(used, 2)
-    leaving = np.full(len(pieces.points), -1)
-    leaving[source[outside]] = np.flatnonzero(outside)
-    following[outside] = leaving[source[np.flatnonzero(outside) ^ 1]]
-
-    begins = np.flatnonzero(junction[source] & np.repeat(used, 2))
-    if len(begins) == 0:
-        raise ValueError(
-            f"{path}: no three edges meet anywhere, so there are no cells side by side."
-        )
-    chains = {int(first): _chain(int(first), following, junction[source]) for first in begins}
-    # Half-edges 3 v, 3 v + 1, 3 v + 2 leave vertex v counter-clockwise.
-    way = pieces.points[source[begins ^ 1]] - pieces.points[source[begins]]
-    order = np.lexsort((np.arctan2(way[:, 1], way[:, 0]), source[begins]))
-    begins = begins[order]
-    slot = {int(first): number for number, first in enumerate(begins)}
-    twin = np.array([slot[chains[int(first)][-1] ^ 1] for first in begins])
-    topology = Topology(twin, face[begins], np.zeros((len(begins), 2), int), exterior=True)
+    directed = np.concatenate([2 * (np.abs(loop) - 1) + (loop < 0) for loop in pieces.loops])
+    cell = np.repeat(np.arange(len(pieces.loops)), [len(loop) for loop in pieces.loops])
+    corner = pieces.edges.ravel()[directed]
+    names = Names(
+        f"{path} is no planar foam in one piece: its bodies",
+        lambda point: f"the point {pieces.points[point].tolist()}",
+        lambda body: f"body {pieces.bodies[body]}",
+    )
+    sides = Sides(corner, np.zeros((len(corner), 2), int), cell)
+    mesh = build_faces(pieces.points, sides, names, exterior=True)
+    topology, vertices = mesh.topology, pieces.points[mesh.points]
 
     length = np.linalg.norm(np.diff(pieces.points[pieces.edges], axis=1)[:, 0], axis=1)
-    tensions, spreads, angles, courses = [], [], [], []
-    for half_edge in np.asarray(topology.half_edge):
-        chain = chains[int(begins[half_edge])]
-        which = np.array(chain) // 2
-        course = pieces.points[[source[chain[0]], *(source[piece ^ 1] for piece in chain)]]
+    ends = np.asarray(topology.edge_vertices)
+    n_edges = topology.n_edges
+    tensions, spreads, angles = np.full(n_edges, np.nan), np.zeros(n_edges), np.zeros(n_edges)
+    courses, chains = [], mesh.chains()
+    for edge, half_edge in enumerate(np.asarray(topology.half_edge)):
+        chain = chains[half_edge]
+        course = np.append(pieces.points[corner[chain]], vertices[ends[edge, 1:]], axis=0)
+        if not len(chain):  # an edge of length 0
+            courses.append(vertices[ends[edge]])
+            continue
+        which = directed[chain] // 2
         density = pieces.density[which]
-        tensions.append(np.average(density, weights=np.maximum(length[which], 1e-300)))
-        spreads.append(np.ptp(density))
+        tensions[edge] = np.average(density, weights=np.maximum(length[which], 1e-300))
+        spreads[edge] = np.ptp(density)
         courses.append(course)
         chord = course[-1] - course[0]
         rest = course - course[0]
         bulge = 0.5 * np.sum(rest[:-1, 0] * rest[1:, 1] - rest[:-1, 1] * rest[1:, 0])
-        angles.append(angle_of_area(np.array([bulge]), np.array([np.linalg.norm(chord)]))[0])
-    vertices = pieces.points[source[begins[::3]]]
-    tissue = Tissue(vertices, topology, Free(), angles=np.array(angles), inner_arcs=True)
+        angles[edge] = angle_of_area(np.array([bulge]), np.array([np.linalg.norm(chord)]))[0]
+    points = mesh.points[ends]
+    for edge in np.flatnonzero(np.isnan(tensions)):
+        tensions[edge] = np.nanmean(tensions[np.any(points == points[edge, 0], axis=1)])
+    tissue = Tissue(vertices, topology, Free(), angles=angles, inner_arcs=True)
     areas = np.asarray(tissue.areas)
     volumes = np.where(np.isnan(pieces.volumes), areas, pieces.volumes)
     as_numbers = lambda values: jnp.asarray(values, tissue.vertices.dtype)
@@ -260,13 +244,3 @@ def _foam(pieces: _Pieces, path: Path) -> Foam:
         chains=tuple(courses),
         bodies=pieces.bodies,
     )
-
-
-def _chain(
-    first: int, following: Int[np.ndarray, " directed"], begins: Bool[np.ndarray, " directed"]
-) -> list[int]:
-    """Pieces from one junction to the next."""
-    chain = [first]
-    while not begins[following[chain[-1]]]:
-        chain.append(int(following[chain[-1]]))
-    return chain
