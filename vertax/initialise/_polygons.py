@@ -35,9 +35,8 @@ class PolygonTissue(eqx.Module):
     side_edges: Int[np.ndarray, " sides"]
     """The edge of each given side, one cell after the other: side k of a cell leads from its corner k to its
     next one. -1 for sides of cells that were left out."""
-    whole: Bool[np.ndarray, " cells"]
-    """False for open cells: their areas and perimeters are those of a closed outline that is not in the
-    data."""
+    open_cells: Bool[np.ndarray, " cells"]
+    """Open cells: their areas and perimeters are those of a closed outline that is not in the data."""
     closing_edges: Bool[np.ndarray, " edges"]
     """Edges that close an open cell, at least in part."""
     removed_points: Int[np.ndarray, " removed"]
@@ -79,7 +78,7 @@ def from_polygons(
 
     A tissue that was cut out of a larger one, by the border of an image for instance, has cells at its border
     without a closed outline. Name them by `open_cells`: a straight side from the last to the first corner
-    closes each of them (`closing_edges`, `whole`), or, with `keep_open=False`, they are left out.
+    closes each of them (`closing_edges`), or, with `keep_open=False`, they are left out.
 
     **Arguments:**
 
@@ -205,7 +204,7 @@ def tissue_from_corners(
         cells=kept,
         points=mesh.points,
         side_edges=all_edges,
-        whole=~is_open[kept],
+        open_cells=is_open[kept],
         closing_edges=closing,
         removed_points=np.flatnonzero(mesh.degree == 2),
         split_points=np.flatnonzero(mesh.degree > 3),
@@ -324,8 +323,8 @@ def _checked_open(open_cells: ArrayLike | None, n_cells: int) -> Bool[np.ndarray
     given = np.asarray(open_cells)
     if given.dtype.kind == "b" and given.shape == (n_cells,):
         return given.copy()
-    whole_numbers = given.ndim == 1 and (given.size == 0 or given.dtype.kind in "iu")
-    if not whole_numbers or (given.size and (given.min() < 0 or given.max() >= n_cells)):
+    integers = given.ndim == 1 and (given.size == 0 or given.dtype.kind in "iu")
+    if not integers or (given.size and (given.min() < 0 or given.max() >= n_cells)):
         raise ValueError(
             f"Argument `open_cells` must hold numbers of cells, 0 … {n_cells - 1}, or one boolean for each "
             f"cell, but is {named(open_cells)}."

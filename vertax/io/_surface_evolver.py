@@ -26,7 +26,8 @@ class Foam(eqx.Module):
     so areas are those of the file."""
     tensions: Float[Array, " edges"]
     """Line tension of each edge, energy per length: the `density` of its pieces. Where they differ, as they
-    may on the outline, their mean by length."""
+    may on the outline, their mean by length. Of an edge of length 0 (where more than three edges meet), the
+    mean of the edges that meet there."""
     tension_spreads: Float[Array, " edges"]
     """The largest difference between pieces of an edge; 0 where they agree."""
     pressures: Float[Array, " cells"]
@@ -46,8 +47,10 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
     doi:10.1080/10586458.1992.10504253).
 
     Vertices, edges (with `density`), faces and bodies (with `volume` and `lagrange_multiplier`) are read, in
-    the string model; commands at the end are not. Vertices at which three edges meet become those of the
-    tissue, and what lies between is one edge.
+    the string model; commands at the end are not. Points at which three edges meet become the vertices of the
+    tissue; a chain of pieces between two of them becomes one edge. A point at which k > 3 edges meet becomes
+    k - 2 vertices, joined by edges of length 0. The order of edges at a vertex is that of the faces there,
+    also where chains cross.
 
     **Arguments:**
 
@@ -59,7 +62,7 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
 
     - `OSError` if the file cannot be read.
     - `ValueError`, naming the file and the place, for one that is no such file or ends too soon, a foam that
-        is not planar, vertices at which more than three edges meet, and cells that make no cluster.
+        is not planar, and bodies that overlap, touch in a point only, enclose a hole or lie apart.
     """
     path = Path(path)
     pieces = _parsed(path)

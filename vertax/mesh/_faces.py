@@ -337,8 +337,7 @@ def _check_orbits(
     names: Names,
 ) -> None:
     """Refuse points that cells surround in several groups, and more than one outline."""
-    here = np.arange(len(start))
-    n_fans, fan = _components(len(start), here, turned)
+    n_fans, fan = _components(len(start), np.arange(len(start)), turned)
     fans_at = np.bincount(start[np.unique(fan, return_index=True)[1]], minlength=len(points))
     if n_fans > np.count_nonzero(fans_at):
         point = int(np.argmax(fans_at > 1))
