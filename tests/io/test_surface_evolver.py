@@ -76,8 +76,8 @@ def test_a_doublet(doublet):
     [
         (lambda t: t[: t.index("bodies")], "no section `bodies`"),
         (lambda t: t.replace("DIMENSION 2", "DIMENSION 3"), "3 dimensions"),
-        (lambda t: t.replace(" 6   7 1  color red\n", ""), "element 6 is used and not there"),
-        (lambda t: t.replace("1 2 5 6", "1 2 5 -6"), "no closed loop"),
+        (lambda t: t.replace(" 6   7 1  color red\n", ""), "element 6 is used but missing"),
+        (lambda t: t.replace("1 2 5 6", "1 2 5 -6"), "not a closed loop"),
         (lambda t: t.replace(" 5   0   1", " 5   0"), "a line cannot be read"),
         (lambda t: "nothing", "no section `vertices`"),
         (lambda t: t.replace(" 1   1  volume", " 0   1  volume"), "a body has the number 0"),
@@ -85,7 +85,7 @@ def test_a_doublet(doublet):
 )
 def test_a_broken_file_is_refused(doublet, change, message):
     doublet.write_text(change(DOUBLET), encoding="utf-8")
-    with pytest.raises(ValueError, match=f"doublet.fe is no planar foam.*{message}"):
+    with pytest.raises(ValueError, match=f"doublet.fe is not a planar foam.*{message}"):
         vx.io.read_surface_evolver(doublet)
 
 
@@ -122,7 +122,7 @@ def test_a_point_where_four_edges_meet_becomes_two_vertices(fan):
     np.testing.assert_allclose(foam.tissue.areas, 2, rtol=1e-9)
 
 
-def test_no_text(tmp_path):
+def test_binary_files_raise(tmp_path):
     path = tmp_path / "image.dmp"
     path.write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(ValueError, match="not text"):

@@ -1,4 +1,4 @@
-"""Files: tissues, energies, inverse problems and trajectories; and for other programs."""
+"""Files: tissues, energies, problems, trajectories; tables and formats of other programs."""
 
 from vertax._base.atomic import atomic_write as atomic_write
 from vertax.io._bounded_tables import BoundedTables as BoundedTables

@@ -20,7 +20,7 @@ from vertax.mesh._faces import Names, Sides, build_faces
 def from_edge_table(
     table: Mapping[str, Any], *, box: ArrayLike | None = None, softening: float | None = None
 ) -> Tissue:
-    """The tissue whose edges a table lists: the reverse of [`edge_table`][vertax.io.edge_table].
+    """Build a tissue from the table of its edges: the inverse of [`edge_table`][vertax.io.edge_table].
 
     ```python
     vx.io.write_csv("edges.csv", vx.io.edge_table(tissue))

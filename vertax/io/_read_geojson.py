@@ -48,8 +48,8 @@ def read_geojson(
     - `tolerance`: in units of length; by default 10⁻⁶ of the root mean cell area.
     - `inner_arcs`, `softening`: as of [`from_polygons`][vertax.initialise.from_polygons].
 
-    **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], whose points are numbered in the
-    order of the file, and the properties of the features as columns, one row a cell.
+    **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], with points numbered in the order of
+    the file, and the properties of the features as columns with one row for each cell.
 
     **Raises:**
 

@@ -1,4 +1,4 @@
-"""Dumps of Surface Evolver: planar foams whose tensions and pressures are known."""
+"""Dumps of Surface Evolver: planar foams with their tensions and pressures."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Foam(eqx.Module):
     """A foam of Surface Evolver."""
 
     tissue: Tissue
-    """Its cells as a free tissue with arcs, inner ones too. Each arc encloses what its chain of pieces does,
-    so areas are those of the file."""
+    """Its cells as a free tissue with inner arcs. Each arc encloses the same area over its chord as its chain
+    of pieces: areas are those of the file."""
     tensions: Float[Array, " edges"]
     """Line tension of each edge, energy per length: the `density` of its pieces. Where they differ, as they
     may on the outline, their mean by length. Of an edge of length 0 (where more than three edges meet), the
@@ -33,7 +33,7 @@ class Foam(eqx.Module):
     pressures: Float[Array, " cells"]
     """Lagrange multipliers of the areas, energy per area; 0 for cells without."""
     target_areas: Float[Array, " cells"]
-    """What the areas are held at; the area where a cell has none."""
+    """Fixed areas (`volume`) of the cells; the area where a cell has none."""
     time: float
     """`TOTAL_TIME`."""
     chains: tuple[Float[np.ndarray, "_ 2"], ...]
@@ -61,7 +61,7 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
     **Raises:**
 
     - `OSError` if the file cannot be read.
-    - `ValueError`, naming the file and the place, for one that is no such file or ends too soon, a foam that
+    - `ValueError`, naming the file and the place, for a file of another kind or a truncated one, a foam that
         is not planar, and bodies that overlap, touch in a point only, enclose a hole or lie apart.
     """
     path = Path(path)
@@ -70,12 +70,12 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
 
 
 class _Pieces(NamedTuple):
-    """What the file holds, numbered from 0."""
+    """The elements of the file, numbered from 0."""
 
     points: Float[np.ndarray, "points 2"]
     edges: Int[np.ndarray, "edges 2"]
     density: Float[np.ndarray, " edges"]
-    # Of each body: edges from 1, negative if backwards; counter-clockwise.
+    # Of each body: numbers of its edges from 1, counter-clockwise; negative: against the edge.
     loops: list[Int[np.ndarray, " _"]]
     pressures: Float[np.ndarray, " bodies"]
     volumes: Float[np.ndarray, " bodies"]
@@ -89,7 +89,7 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def _parsed(path: Path) -> _Pieces:
-    broken = lambda what: ValueError(f"{path} is no planar foam of Surface Evolver: {what}.")
+    broken = lambda what: ValueError(f"{path} is not a planar foam of Surface Evolver: {what}.")
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -116,7 +116,7 @@ def _parsed(path: Path) -> _Pieces:
             rows[section].append(words)
     for name in _SECTIONS:
         if not rows[name]:
-            raise broken(f"it has no section `{name}`, or ends before")
+            raise broken(f"it has no section `{name}`, or is truncated")
     try:
         points = {int(w[0]): (float(w[1]), float(w[2])) for w in rows["vertices"]}
         edges = {
@@ -141,7 +141,7 @@ def _parsed(path: Path) -> _Pieces:
             for body, *_ in bodies
         ]
     except KeyError as error:
-        raise broken(f"element {error} is used and not there; it may end too soon") from error
+        raise broken(f"element {error} is used but missing; the file may be truncated") from error
     where = np.array(list(points.values()))
     loops = [_counter_clockwise(loop, ends, where, broken) for loop in loops]
     return _Pieces(
@@ -163,13 +163,13 @@ def _after(words: list[str], name: str, default: float) -> float:
 
 
 def _integers(words: list[str]) -> list[int]:
-    """The integers that a row begins with."""
-    found = []
+    """The leading integers of a row."""
+    integers = []
     for word in words:
         if not re.fullmatch(r"[-+]?\d+", word):
             break
-        found.append(int(word))
-    return found
+        integers.append(int(word))
+    return integers
 
 
 def _turned(faces: dict[int, list[int]], body: list[int]) -> list[int]:
@@ -190,7 +190,7 @@ def _counter_clockwise(
     start = np.where(loop > 0, ends[np.abs(loop) - 1, 0], ends[np.abs(loop) - 1, 1])
     stop = np.where(loop > 0, ends[np.abs(loop) - 1, 1], ends[np.abs(loop) - 1, 0])
     if not np.array_equal(stop, np.roll(start, -1)):
-        raise broken("the edges of a face make no closed loop")
+        raise broken("the edges of a face are not a closed loop")
     x, y = points[start].T
     area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
     return loop if area > 0 else -loop[::-1]
@@ -202,7 +202,7 @@ def _foam(pieces: _Pieces, path: Path) -> Foam:
     cell = np.repeat(np.arange(len(pieces.loops)), [len(loop) for loop in pieces.loops])
     corner = pieces.edges.ravel()[directed]
     names = Names(
-        f"{path} is no planar foam in one piece: its bodies",
+        f"{path} is not a planar foam: its bodies",
         lambda point: f"the point {pieces.points[point].tolist()}",
         lambda body: f"body {pieces.bodies[body]}",
     )

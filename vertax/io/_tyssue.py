@@ -52,13 +52,13 @@ def from_tyssue(
         `sheet.settings["boundaries"]`.
     - `inner_arcs`, `softening`: as of [`from_polygons`][vertax.initialise.from_polygons].
 
-    **Returns:** a [`PolygonTissue`][vertax.initialise.PolygonTissue], whose `cells` and `points` are rows of
-    the face and vertex tables, from 0, and whose `side_edges` are in the order of the edge table.
+    **Returns:** a [`PolygonTissue`][vertax.initialise.PolygonTissue]: `cells` and `points` are rows of the
+    face and vertex tables, from 0, and `side_edges` has the order of the edge table.
 
     **Raises:**
 
-    - `ValueError` for tables or columns that are missing, edges that name no vertex or face, faces whose
-        edges make no closed outline, a sheet that is not planar, and as
+    - `ValueError` for tables or columns that are missing, edges of a vertex or face that does not
+        exist, faces without a closed outline, a sheet that is not planar, and as
         [`from_polygons`][vertax.initialise.from_polygons].
     - `TypeError` for something else than tables.
     """
@@ -133,17 +133,17 @@ def _index(table: Any, name: str, length: int | None) -> Int[np.ndarray, " rows"
 def _rows(
     numbers: Int[np.ndarray, " edges"], index: Int[np.ndarray, " rows"], name: str, table: str
 ) -> Int[np.ndarray, " edges"]:
-    """The rows of a table whose numbers a column of the edge table holds."""
+    """The rows of a table that a column of the edge table refers to."""
     order = np.argsort(index)
     place = np.minimum(np.searchsorted(index, numbers, sorter=order), max(len(index) - 1, 0))
-    found_rows = order[place] if len(index) else np.zeros(len(numbers), int)
-    wrong = np.flatnonzero(index[found_rows] != numbers) if len(index) else np.arange(len(numbers))
+    rows = order[place] if len(index) else np.zeros(len(numbers), int)
+    wrong = np.flatnonzero(index[rows] != numbers) if len(index) else np.arange(len(numbers))
     if wrong.size:
         raise ValueError(
             f"Column `{name}` of table `edge` must hold numbers of rows of table `{table}`, but holds "
             f"{numbers[wrong[0]]}, which is none. Reset the sheet's index first: sheet.reset_index()."
         )
-    return found_rows
+    return rows
 
 
 def _outlines(
