@@ -253,7 +253,7 @@ def test_cells_apart_are_refused():
     both = [*CELLS, *([corner + 6 for corner in cell] for cell in CELLS)]
     with pytest.raises(ValueError, match="one piece, but cell 2 and cell 3 have no side in common"):
         vx.initialise.from_polygons(far, both)
-    # Each cell with corners of its own.
+    # No corner is shared.
     doubled = POINTS[np.concatenate(CELLS)]
     with pytest.raises(ValueError, match="point 1 and point 4 are two points at one place"):
         vx.initialise.from_polygons(doubled, [[0, 1, 2, 3], [4, 5, 6, 7]])
