@@ -84,7 +84,7 @@ def test_sense_of_rotation_and_first_corner_do_not_matter(flipped, shift):
 
 
 def test_sides_take_the_shortest_way_through_a_periodic_box():
-    tissue = vx.initialise.periodic_voronoi(40, key=0, lattice=[[6.0, 0.0], [2.5, 7.0]])
+    tissue = vx.initialise.periodic_voronoi(40, key=0, lattice=np.array([[6.0, 0.0], [2.5, 7.0]]))
     result = vx.initialise.from_polygons(
         tissue.vertices, corners_of(tissue)[0], box=tissue.boundary.lattice
     )
@@ -215,7 +215,7 @@ def test_arcs_are_flattened_where_cells_would_overlap():
         ({"open_cells": [2]}, r"`open_cells` must hold numbers of cells, 0 … 1"),
         ({"open_cells": [0, 1], "keep_open": False}, "`open_cells` must leave closed cells"),
         ({"images": [[[0, 0]]]}, "`images` must come with `box`"),
-        ({"box": (2, 1)}, "fill the periodic box, but the side from point .* belongs to cell"),
+        ({"box": (9, 9)}, "fill the periodic box, but the side from point .* belongs to cell"),
         ({"box": (2, -1)}, "`box` must have a positive area"),
         ({"box": (2, 2, 2)}, r"`box` must be width and height"),
         (
@@ -268,8 +268,32 @@ def test_cells_that_touch_in_a_point_are_refused():
 def test_polygons_that_cross_themselves_are_refused():
     points = POINTS.copy()
     points[1], points[4] = [1.0, 1.2], [1.0, -0.1]
-    with pytest.raises(ValueError, match=r"do not overlap, but cell 0.*`inner_arcs=True`"):
-        vx.initialise.from_polygons(points, [[0, 2, 1, 4, 3, 5], [1, 2, 4]])
+    message = "do not overlap, but the sides from point . to point . and from point . to point . of cell 0"
+    with pytest.raises(ValueError, match=message):
+        vx.initialise.from_polygons(points, CELLS)
+
+
+def test_an_outline_that_crosses_itself_is_refused():
+    # A row of squares in a ring that meets itself, with the ends on top of each other.
+    angle = np.linspace(0, 2.2 * np.pi, 24)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = np.concatenate([ring, (2.0 + 0.05 * angle[:, None]) * ring])
+    cells = [[k, k + 24, k + 25, k + 1] for k in range(23)]
+    with pytest.raises(ValueError, match=r"not overlap, but the sides .* of the outline cross"):
+        vx.initialise.from_polygons(points, cells)
+
+
+def test_edges_that_overlap_without_removed_points_are_refused():
+    # A cell in a notch of the other one, with a notch itself: a straight interface leaves it no area.
+    points = [[0, 0], [4, 0], [4, 3], [0, 3], [1, 3], [1, 1], [3, 1], [3, 3], [2, 1.5]]
+    cells = [[0, 1, 2, 7, 6, 5, 4, 3], [4, 5, 6, 7, 8]]
+    with pytest.raises(
+        ValueError, match=r"without the points .* overlaps at .*cell 1: .*`inner_arcs=True`"
+    ):
+        vx.initialise.from_polygons(points, cells)
+    result = vx.initialise.from_polygons(points, cells, inner_arcs=True)
+    np.testing.assert_allclose(result.tissue.areas, [8, 2.5], rtol=1e-9)
+    assert not result.tissue.overlaps.any
 
 
 def test_a_box_that_is_too_small_for_the_shortest_way_needs_images():

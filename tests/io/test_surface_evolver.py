@@ -134,17 +134,18 @@ def test_chains_that_cross_near_a_junction_are_read(tmp_path):
     text = (DATA / "movie_0.dmp").read_text(encoding="utf-8")
     original = vx.io.read_surface_evolver(DATA / "movie_0.dmp")
     ends = np.asarray(original.tissue.topology.edge_vertices)
-    # Mirror the point next to a junction at another chain that leaves from there.
+    # Move the point next to a junction by 20 degrees beyond the other chain that leaves from there.
     vertex = int(ends[int(np.argmin(np.asarray(original.tissue.topology.on_outline))), 0])
     chains = [
-        chain if v == vertex else chain[::-1]
-        for chain, (v, w) in zip(original.chains, ends, strict=True)
-        if vertex in (v, w)
+        chain if start == vertex else chain[::-1]
+        for chain, (start, end) in zip(original.chains, ends, strict=True)
+        if vertex in (start, end)
     ]
     junction, first, other = chains[0][0], chains[0][1], chains[1][1]
-    axis = (other - junction) / np.linalg.norm(other - junction)
-    step = 0.2 * (first - junction)
-    moved = junction + 2 * (step @ axis) * axis - step
+    axis, step = other - junction, first - junction
+    turn = -np.deg2rad(20) * np.sign(axis[0] * step[1] - axis[1] * step[0])
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    moved = junction + 0.2 * rotation @ axis
     old = next(
         line
         for line in text.splitlines()

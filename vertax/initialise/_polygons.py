@@ -9,10 +9,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float, Int, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from vertax._base.checks import as_doubles, check_concrete, named
-from vertax.initialise._tidy import without_overlaps
+from vertax.initialise._tidy import crossed_by, without_overlaps
 from vertax.mesh import Free, Periodic, Tissue
 from vertax.mesh._arcs import angle_of_area
 from vertax.mesh._faces import FaceMesh, Names, Sides, build_faces
@@ -48,12 +48,12 @@ class PolygonTissue(eqx.Module):
 
 
 def from_polygons(
-    points: ArrayLike,
-    cells: Sequence[ArrayLike] | ArrayLike,
+    points: ArrayLike | Sequence[Any],
+    cells: Sequence[Any] | Shaped[np.ndarray | Array, "cells corners"],
     *,
-    box: ArrayLike | None = None,
-    images: Sequence[ArrayLike] | None = None,
-    open_cells: ArrayLike | None = None,
+    box: ArrayLike | Sequence[Any] | None = None,
+    images: Sequence[Any] | None = None,
+    open_cells: ArrayLike | Sequence[Any] | None = None,
     keep_open: bool = True,
     inner_arcs: bool = False,
     softening: float | None = None,
@@ -121,13 +121,13 @@ def from_polygons(
 
 
 def tissue_from_corners(
-    points: ArrayLike,
-    cells: Sequence[ArrayLike] | ArrayLike,
+    points: ArrayLike | Sequence[Any],
+    cells: Sequence[Any] | Shaped[np.ndarray | Array, "cells corners"],
     names: Names,
     *,
-    box: ArrayLike | None,
-    images: Sequence[ArrayLike] | None = None,
-    open_cells: ArrayLike | None = None,
+    box: ArrayLike | Sequence[Any] | None,
+    images: Sequence[Any] | None = None,
+    open_cells: ArrayLike | Sequence[Any] | None = None,
     keep_open: bool = True,
     inner_arcs: bool = False,
     softening: float | None = None,
@@ -172,6 +172,7 @@ def tissue_from_corners(
     )
     sides, given = _counter_clockwise(sides, position, lattice, of_kept)
     mesh = build_faces(position, sides, of_kept, exterior=lattice is None)
+    _check_crossings(mesh, sides, position, lattice, of_kept)
     if lattice is not None:
         _check_cover(sides, position, lattice, of_kept)
 
@@ -227,27 +228,47 @@ def _without_overlaps(result: PolygonTissue, names: Names) -> PolygonTissue:
             return result
         flattened = np.asarray(flatter.angles) != np.asarray(tissue.angles)
         return dataclasses.replace(result, tissue=flatter, flattened_edges=flattened)
-    overlaps = tissue.overlaps
-    bad = np.flatnonzero(np.asarray(overlaps.cells))
-    crossing = np.flatnonzero(np.asarray(overlaps.sides))
-    fact = (
-        f"{names.cells(bad)} cross themselves or a neighbour"
-        if bad.size
-        else "the outline crosses itself"
+    bad = np.flatnonzero(np.asarray(tissue.overlaps.cells))
+    names.refuse(
+        "hold cells that do not overlap without the points where only two edges meet",
+        f"there are overlaps at {names.cells(bad) if bad.size else 'the outline'}: edges without "
+        f"{names.points(result.removed_points)} are straight or arcs",
+        "Pass `inner_arcs=True`, or leave out these cells.",
     )
-    if crossing.size:
-        fact += f", at the side that begins at {names.point(int(result.points[crossing[0] // 3]))}"
-    remedy = "Correct the order or the positions of their corners."
-    if result.removed_points.size:
-        remedy += (
-            " If the polygons themselves do not overlap, then edges do that have become straight or an arc "
-            f"where points were removed ({names.points(result.removed_points)}): pass `inner_arcs=True`, or "
-            "leave out these cells."
-        )
-    names.refuse("hold cells that do not overlap", fact, remedy)
 
 
-def _checked_points(points: ArrayLike, names: Names) -> Float[np.ndarray, "points 2"]:
+def _check_crossings(
+    mesh: FaceMesh,
+    sides: Sides,
+    position: Float[np.ndarray, "points 2"],
+    lattice: Float[np.ndarray, "2 2"] | None,
+    names: Names,
+) -> None:
+    """Refuse polygons that cross themselves, and an outline that does."""
+    n_sides, n_cells = len(sides.corner), int(sides.cell.max()) + 1
+    place = np.concatenate([_places(sides, position, lattice), position[mesh.start[n_sides:]]])
+    face = np.append(sides.cell, np.full(len(place) - n_sides, n_cells))
+    vectors = place[mesh.following] - place
+    crossed = crossed_by(np.concatenate([place, vectors], axis=1), mesh.following, face)
+    bad = np.flatnonzero(crossed != np.arange(len(crossed)))
+    if not bad.size:
+        return
+    pair = " and ".join(
+        f"from {names.point(int(mesh.start[side]))} to "
+        f"{names.point(int(mesh.start[mesh.following[side]]))}"
+        for side in (bad[0], crossed[bad[0]])
+    )
+    owner = "the outline" if face[bad[0]] == n_cells else names.cell(int(face[bad[0]]))
+    names.refuse(
+        "hold cells that do not overlap",
+        f"the sides {pair} of {owner} cross",
+        "Correct the order or the positions of the corners.",
+    )
+
+
+def _checked_points(
+    points: ArrayLike | Sequence[Any], names: Names
+) -> Float[np.ndarray, "points 2"]:
     array: Shaped[Any, "..."] = np.asarray(points)
     if array.ndim == 2 and array.dtype.kind == "f" and not np.isfinite(array).all():
         bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
@@ -264,7 +285,7 @@ def _checked_points(points: ArrayLike, names: Names) -> Float[np.ndarray, "point
 
 
 def _checked_cells(
-    cells: Sequence[ArrayLike] | ArrayLike, position: Float[np.ndarray, "points 2"], names: Names
+    cells: Any, position: Float[np.ndarray, "points 2"], names: Names
 ) -> list[Int[np.ndarray, " corners"]]:
     """The corners of each cell as integers."""
     if isinstance(cells, str) or not hasattr(cells, "__len__"):
@@ -273,7 +294,7 @@ def _checked_cells(
             f"{named(cells)}."
         )
     corners = []
-    for cell, given in enumerate(cells):  # pyright: ignore[reportArgumentType]
+    for cell, given in enumerate(cells):
         corner = np.asarray(given)
         if corner.ndim != 1 or (corner.size and corner.dtype.kind not in "iu"):
             raise TypeError(
@@ -298,7 +319,7 @@ def _checked_cells(
     return corners
 
 
-def checked_lattice(box: ArrayLike) -> Float[np.ndarray, "2 2"]:
+def checked_lattice(box: ArrayLike | Sequence[Any]) -> Float[np.ndarray, "2 2"]:
     """The two lattice vectors of a box."""
     lattice = as_doubles("box", box)
     if lattice.shape == (2,):
@@ -316,7 +337,9 @@ def checked_lattice(box: ArrayLike) -> Float[np.ndarray, "2 2"]:
     return lattice
 
 
-def _checked_open(open_cells: ArrayLike | None, n_cells: int) -> Bool[np.ndarray, " cells"]:
+def _checked_open(
+    open_cells: ArrayLike | Sequence[Any] | None, n_cells: int
+) -> Bool[np.ndarray, " cells"]:
     is_open = np.zeros(n_cells, bool)
     if open_cells is None:
         return is_open
@@ -334,7 +357,7 @@ def _checked_open(open_cells: ArrayLike | None, n_cells: int) -> Bool[np.ndarray
 
 
 def _checked_images(
-    images: Sequence[ArrayLike] | None,
+    images: Sequence[Any] | None,
     corners: list[Int[np.ndarray, " corners"]],
     position: Float[np.ndarray, "points 2"],
     lattice: Float[np.ndarray, "2 2"] | None,

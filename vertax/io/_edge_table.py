@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +18,10 @@ from vertax.mesh._faces import Names, Sides, build_faces
 
 
 def from_edge_table(
-    table: Mapping[str, Any], *, box: ArrayLike | None = None, softening: float | None = None
+    table: Mapping[str, Any],
+    *,
+    box: ArrayLike | Sequence[Any] | None = None,
+    softening: float | None = None,
 ) -> Tissue:
     """Build a tissue from the table of its edges: the inverse of [`edge_table`][vertax.io.edge_table].
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from vertax.mesh._faces import Names
 def read_geojson(
     path: str | os.PathLike[str],
     *,
-    box: ArrayLike | None = None,
+    box: ArrayLike | Sequence[Any] | None = None,
     tolerance: float | None = None,
     inner_arcs: bool = False,
     softening: float | None = None,

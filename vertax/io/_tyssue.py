@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ _TABLES = ("vert", "edge", "face")
 def from_tyssue(
     datasets: Mapping[str, Any],
     *,
-    box: ArrayLike | None = None,
+    box: ArrayLike | Sequence[Any] | None = None,
     inner_arcs: bool = False,
     softening: float | None = None,
 ) -> PolygonTissue:

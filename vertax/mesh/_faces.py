@@ -68,6 +68,10 @@ class FaceMesh(NamedTuple):
     """Its place among the sides of that half-edge, from 0."""
     degree: Int[np.ndarray, " points"]
     """Number of edges that meet at each point: two at those that are no vertex."""
+    start: Int[np.ndarray, " all_sides"]
+    """The point at which each side begins; after the sides of the cells come those of the exterior."""
+    following: Int[np.ndarray, " all_sides"]
+    """The next side of the cell, or of the exterior."""
 
     def chains(self) -> list[Int[np.ndarray, " chain"]]:
         """The sides of each half-edge, in order; none on the exterior, and for edges of length 0."""
@@ -189,7 +193,9 @@ def build_faces(
     half_cell, half_frame = cell[slots], frame[slots]
     _check_side_counts(half_cell, half_twin, n_cells, names)
     topology = Topology(half_twin, half_cell, half_frame, exterior=exterior)
-    return FaceMesh(topology, start[slots[::3]], owner[:n_sides], rank[:n_sides], degree)
+    return FaceMesh(
+        topology, start[slots[::3]], owner[:n_sides], rank[:n_sides], degree, start, following
+    )
 
 
 def _twins(sides: Sides, names: Names) -> Int[np.ndarray, " sides"]:
@@ -210,16 +216,16 @@ def _twins(sides: Sides, names: Names) -> Int[np.ndarray, " sides"]:
         bad = int(np.argmax(times[forward_code] > 1))
         both = (forward_code == forward_code[bad]) | (backward_code == forward_code[bad])
         cells = sides.cell[both]
-        side = f"the side from {names.point(sides.corner[bad])} to {names.point(end[bad])}"
+        ends = f"{names.point(sides.corner[bad])} to {names.point(end[bad])}"
         if len(cells) > 2:
             names.refuse(
                 "have at most two cells at each side",
-                f"{side} belongs to {names.cells(cells)}",
+                f"the side from {ends} belongs to {names.cells(cells)}",
                 "Cells overlap there: correct their corners, or leave one of them out.",
             )
         names.refuse(
             "hold cells that do not overlap",
-            f"{names.cells(cells)} are on the same side of {side.removeprefix('the side ')}",
+            f"{names.cells(cells)} are on the same side of the line from {ends}",
             "Correct the corners of one of them, or leave it out.",
         )
     place = np.full(len(unique), -1)
