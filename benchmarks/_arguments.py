@@ -1,4 +1,4 @@
-"""What the scripts here take."""
+"""Arguments of the scripts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 
 
 def count(text: str) -> int:
-    """A number of things, for `argparse`: at least one."""
+    """A positive integer, for `argparse`."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, and not {number}")

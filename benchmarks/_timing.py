@@ -13,7 +13,7 @@ import jax
 def first_and_best(
     function: Callable[..., Any], *args: Any, repeats: int = 7
 ) -> tuple[float, float]:
-    """Seconds of the first call (which compiles) and of the fastest of some later ones."""
+    """Seconds of the first call (which compiles) and of the fastest of `repeats` later ones."""
 
     def once() -> float:
         began = time.perf_counter()

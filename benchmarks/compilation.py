@@ -1,7 +1,6 @@
-"""What the first call waits for: seconds of tracing, of lowering to StableHLO and of XLA.
+"""Compile time of the parts of an epoch: seconds of tracing, of lowering to StableHLO and of XLA.
 
-For parts of an epoch, each compiled by itself, without a cache. Kernels are what XLA compiles one by one,
-after fusion.
+Each part is compiled separately, without a cache. Kernels are the fusions of the compiled program.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ PARTS = {
     "and gradient, bare": _gradient(contact_range=None, transitions=None),
     "and gradient": _gradient(),
 }
-"""Parts of an epoch; bare is without contacts and transitions."""
+"""Parts of an epoch; bare: without contacts and transitions."""
 
 
 def main() -> None:

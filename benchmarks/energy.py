@@ -14,7 +14,7 @@ jax.config.update("jax_enable_x64", True)
 
 @eqx.filter_jit
 def gradients(tissue: vx.Tissue, energy: vx.AbstractEnergy, times: int) -> jax.Array:
-    """Energy and gradient, again and again at slightly different places."""
+    """Energy and gradient, `times` times at slightly different positions."""
     f = jax.value_and_grad(lambda x: energy(tissue.with_configuration(x)))
     move = lambda _, x: x - 1e-9 * f(x)[1]
     return jax.lax.fori_loop(0, times, move, tissue.vertices)
@@ -22,14 +22,14 @@ def gradients(tissue: vx.Tissue, energy: vx.AbstractEnergy, times: int) -> jax.A
 
 @eqx.filter_jit
 def products(tissue: vx.Tissue, energy: vx.AbstractEnergy, times: int) -> jax.Array:
-    """Hessian-vector products at one place."""
+    """Hessian-vector products at one configuration."""
     force = jax.grad(lambda x: energy(tissue.with_configuration(x)))
     _, hessian = jax.linearize(force, tissue.vertices)
     return jax.lax.fori_loop(0, times, lambda _, x: 1e-3 * hessian(x), tissue.vertices)
 
 
 def main() -> None:
-    """Print one row a size."""
+    """Print one row for each size."""
     print(f"{'cells':>7} {'voronoi s':>10} {'E + gradient ns/vertex':>23} {'H·v ns/vertex':>14}")
     for n_cells in (100, 1000, 10_000, 100_000):
         make = lambda n=n_cells: vx.initialise.periodic_voronoi(n, key=jax.random.key(0))

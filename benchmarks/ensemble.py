@@ -1,11 +1,11 @@
-"""Ensembles: the time of a tissue in a batch against that of the same tissues one by one.
+"""Relaxation of ensembles: time per tissue in a batch against that of separate calls.
 
     python benchmarks/ensemble.py [--cells 20 64] [--tissues 100 1000] [--shape-factor 3.7]
 
-Random tissues relax. The first figure is the time of a tissue, without compilation, if each is a call of a
-compiled function. The others are ratios to it: all tissues by one `jax.vmap` (a loop on a CPU), by
-`jax.lax.map`, and by `jax.vmap` of two halves on two devices with `jax.shard_map` (this script makes two
-devices of the cores of a CPU).
+The first number is the time per tissue, without compilation, of one call of a compiled function for each
+tissue. The others are ratios to it: all tissues by one `jax.vmap` (a loop on a CPU), by `jax.lax.map`, and by
+`jax.vmap` on each half of the batch on two devices with `jax.shard_map` (this script makes two devices of the
+cores of a CPU).
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Milliseconds per epoch of an inference (relaxation, gradient, update), and its compile time.
 
-Small tissues take shorter epochs once their Hessian is known: so there is the median of those before it has
-been worked out first, and the mean of those after (not that of the epoch which compiles this). And how much
-longer than without contacts an epoch takes, from several fits of both kinds in turn.
+Fits of small tissues reuse a Hessian from epoch `FIRST_LOOK` on, which shortens the epochs. Printed are
+the median of the epochs before and the mean of those after (without the epoch that compiles this), and the
+ratio of the time of an epoch with contacts to that without, from several fits of both kinds in turn.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ def run(problem: vx.InverseProblem, truth: vx.AbstractEnergy, epochs: int) -> vx
 
 
 def epochs_of(history: vx.fitting.History) -> tuple[float, float]:
-    """Milliseconds of an epoch at first, and of those that come later."""
+    """Milliseconds of an epoch before and after the Hessian is reused."""
     seconds = 1e3 * history.seconds
     return float(np.median(seconds[1:FIRST_LOOK])), float(np.mean(seconds[FIRST_LOOK + 1 :]))
 
 
 def main() -> None:
-    """Print one row a size."""
+    """Print one row for each size."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cells", type=count, nargs="*", default=[20, 100, 1000])
     parser.add_argument("--adjoint", choices=list(ADJOINTS), default="implicit")
@@ -70,7 +70,9 @@ def main() -> None:
             (run(problem, truth, chosen.epochs), run(free, truth, chosen.epochs)) for _ in range(3)
         ]
         ratio = np.median([epochs_of(a)[1] / epochs_of(b)[1] for a, b in pairs])
-        at_first, later = np.median([epochs_of(held) for held, _ in pairs], axis=0)
+        at_first, later = np.median(
+            [epochs_of(with_contacts) for with_contacts, _ in pairs], axis=0
+        )
         h = pairs[0][0]
         print(
             f"{n:6d} {h.seconds[0]:14.1f} {at_first:9.2f} {later:9.2f} "

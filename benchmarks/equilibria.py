@@ -1,4 +1,4 @@
-"""Share of random tissues that reach a true equilibrium: force, steps, transitions, seconds."""
+"""Fraction of random tissues that reach equilibrium; force, steps, transitions, seconds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def relax(tissue: vx.Tissue, p0: jax.Array) -> vx.Equilibrium:
 
 
 def main(n_tissues: int = 100, n_cells: int = 64) -> None:
-    """Print one row a mean target shape factor."""
+    """Print one row for each mean target shape factor."""
     print(f"{n_tissues} random Voronoi tissues of {n_cells} cells, s.d. of p0 0.1, force < 1e-8")
     print(f"{'mean p0':>8} {'share':>6} {'steps':>12} {'T1s':>6} {'ms':>15} {'largest force':>14}")
     tissues = [
@@ -33,9 +33,9 @@ def main(n_tissues: int = 100, n_cells: int = 64) -> None:
             p0 = mean + 0.1 * jax.random.normal(jax.random.key(1000 + seed), (n_cells,))
             relax(tissue, p0)
             began = time.perf_counter()
-            found = jax.block_until_ready(relax(tissue, p0))
+            end = jax.block_until_ready(relax(tissue, p0))
             seconds = time.perf_counter() - began
-            rows.append((found.converged, found.num_steps, found.num_t1, seconds, found.max_force))
+            rows.append((end.converged, end.num_steps, end.num_t1, seconds, end.max_force))
         converged, steps, t1s, seconds, force = np.array(rows, float).T
         print(
             f"{mean:8.2f} {converged.mean():6.2f} {np.median(steps):5.0f} ≤{steps.max():5.0f} "

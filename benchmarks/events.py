@@ -1,7 +1,7 @@
-"""What it costs that cells come and go: time of an event, and of relaxations with spare slots.
+"""Cost of a changing number of cells: time of an event, and of relaxations with spare slots.
 
-Prints the time of one division, one removal and one sweep of T2 transitions in tissues of some sizes, within
-one compiled program; and how much longer a relaxation takes if a fourth of the slots is spare.
+Prints the time of one division, one removal and one sweep of T2 transitions, within one compiled program; and
+the additional time of a relaxation if a quarter of the slots is spare.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ EVENTS = 20
 
 @eqx.filter_jit
 def divisions(tissue: vx.Tissue) -> vx.Tissue:
-    """Some divisions, one after the other."""
+    """`EVENTS` divisions, one after the other."""
     return jax.lax.fori_loop(0, EVENTS, lambda i, t: divide(t, i, throw=False).tissue, tissue)
 
 
 @eqx.filter_jit
 def removals(tissue: vx.Tissue) -> vx.Tissue:
-    """Some removals, one after the other."""
+    """`EVENTS` removals, one after the other."""
     return jax.lax.fori_loop(0, EVENTS, lambda i, t: remove(t, 2 * i, throw=False).tissue, tissue)
 
 
 @eqx.filter_jit
 def sweeps(tissue: vx.Tissue) -> vx.Tissue:
-    """Sweeps of T2 transitions in which nothing happens, as in each step of a relaxation."""
+    """`EVENTS` sweeps of T2 transitions without a transition, as in most steps of a relaxation."""
     rule = vx.T2()
     once = lambda _, t: rule.sweep(t, ENERGY, rule.init(t))[0]
     return jax.lax.fori_loop(0, EVENTS, once, tissue)
@@ -49,7 +49,7 @@ def relax(tissue: vx.Tissue) -> vx.Equilibrium:
 
 
 def main() -> None:
-    """Print one row a size."""
+    """Print one row for each size."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cells", type=count, nargs="*", default=[100, 500])
     chosen = parser.parse_args()

@@ -1,15 +1,18 @@
-"""Movement in time: a step against a relaxation, and a gradient against the way forward.
+"""Time integration: time of a step relative to a relaxation, and of a gradient relative to the simulation.
 
     python benchmarks/evolution.py [--cells 100 1000] [--steps 20]
 
-A random tissue relaxes against friction, first in T1 transitions and then slowly, in so many steps over five
-units of time. Printed are steps a second, the time of one step as a share of a whole relaxation from the
-same start, the time of a gradient (with respect to all target shape factors and the friction) as a share of
-the way forward, and what the gradient keeps in memory for each step, as XLA counts it. And what explicit
-steps are: evaluations of the velocities a second (`vx.mechanics.velocities`; the steps of Diffrax with the
-explicit Euler method are one each, of which the rate is shown too), and the most units of time that they may
-cover in a second without becoming unstable, 2 ζ / λ with the largest eigenvalue λ of the Hessian, beside
-those of implicit steps as long as here.
+A random tissue relaxes against friction over five units of time in `--steps` steps. Printed are:
+
+- steps per second;
+- time of one step relative to a relaxation from the same start;
+- time of a gradient with respect to all target shape factors and the friction, relative to the simulation;
+- memory of the gradient for each step, from XLA;
+- number of T1 transitions;
+- evaluations of the velocities per second (`vx.mechanics.velocities`), and steps per second of Diffrax with
+  the explicit Euler method, which needs one evaluation for each step;
+- simulated time per second with the implicit steps, and with the largest stable explicit steps, 2 ζ / λ,
+  where λ is the largest eigenvalue of the Hessian.
 """
 
 import argparse
@@ -28,7 +31,7 @@ jax.config.update("jax_enable_x64", True)
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description="Measure movement in time.")
+    parser = argparse.ArgumentParser(description="Measure time integration.")
     parser.add_argument("--cells", type=count, nargs="+", default=[100, 1000])
     parser.add_argument("--steps", type=count, default=20)
     chosen = parser.parse_args()
@@ -61,7 +64,7 @@ def main() -> None:
             )
         )
         step = best(forward, parameters, times) / chosen.steps
-        rest = best(relax, parameters)
+        relaxation = best(relax, parameters)
         back = best(gradient, parameters, times) / chosen.steps
         sizes = []
         for part in (times, times[: chosen.steps // 2 + 1]):
@@ -71,8 +74,8 @@ def main() -> None:
         num_t1 = movie(parameters, times).num_t1
         explicit, velocity, stable = _explicit(movie(parameters, times).tissue, parameters, best)
         print(
-            f"{n_cells:5d}  {1 / step:7.1f}  {step / rest:15.2f}  {back / step:16.2f}  {kept / 1e3:9.1f}  "
-            f"{num_t1:3d}  {1 / velocity:12.0f}  {1 / explicit:16.0f}  "
+            f"{n_cells:5d}  {1 / step:7.1f}  {step / relaxation:15.2f}  {back / step:16.2f}  "
+            f"{kept / 1e3:9.1f}  {num_t1:3d}  {1 / velocity:12.0f}  {1 / explicit:16.0f}  "
             f"{5 / chosen.steps / step:15.2f}  {stable / explicit:8.2f}",
             flush=True,
         )

@@ -1,7 +1,8 @@
-"""Gradients by two nudged runs of Surface Evolver, against the implicit gradient of vertax.
+"""Gradients by equilibrium propagation with Surface Evolver, against the implicit gradient of vertax.
 
-Of the vertex distance with respect to the tensions of a periodic foam of 20 cells: against the strength of
-the nudge, one-sided and centred; with a program that stops early; and against finite differences.
+The gradient is that of the vertex distance with respect to the tensions of a periodic foam of 20 cells.
+Varied are the strength β of the nudge, one-sided and centred, and the tolerance of the program; the last
+table compares with finite differences.
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ BETAS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 
 
 class Program(AbstractSimulator):
-    """Surface Evolver with settings that change from run to run: nothing is compiled for them."""
+    """Surface Evolver with settings that change between runs without recompilation."""
 
     def __init__(self) -> None:
         self.evolver = SurfaceEvolver()
 
     def relax(self, tissue: Any, energy: Any, forces: Any) -> Relaxed:
-        """As the program does."""
+        """Relax with the present settings."""
         return self.evolver.relax(tissue, energy, forces)
 
 
-def compared(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
-    """The relative error of a gradient, and 1 less its cosine with the true one."""
-    error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
-    cosine = found @ expected / np.linalg.norm(found) / np.linalg.norm(expected)
+def compared(gradient: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """The relative error of a gradient, and 1 minus its cosine with the expected one."""
+    error = np.linalg.norm(gradient - expected) / np.linalg.norm(expected)
+    cosine = gradient @ expected / np.linalg.norm(gradient) / np.linalg.norm(expected)
     return float(error), float(1 - cosine)
 
 
@@ -62,9 +63,9 @@ def main(n_cells: int = 20) -> None:
             start, energy_of(tensions), cost, response=response, adjoint=adjoint
         )
 
-    still = vx.Relaxation(transitions=None)
+    fixed_topology = vx.Relaxation(transitions=None)
     gradient_of = lambda problem: problem.value_and_gradient(throw=False).gradient.terms[1].tension
-    implicit = np.asarray(gradient_of(problem(vx.ImplicitDifferentiation(), still)))
+    implicit = np.asarray(gradient_of(problem(vx.ImplicitDifferentiation(), fixed_topology)))
 
     @eqx.filter_jit
     def propagated(beta: jax.Array, centred: bool) -> jax.Array:
@@ -114,7 +115,7 @@ def main(n_cells: int = 20) -> None:
     )
     for tolerance in TOLERANCES[::2]:
         program.evolver = SurfaceEvolver(tolerance=tolerance, newton_steps=0, steps=0)
-        by_pulls = [
+        nudged = [
             compared(np.asarray(propagated(jnp.array(beta), True)), implicit) for beta in BETAS[2:]
         ]
         along, differences = [], []
@@ -126,7 +127,7 @@ def main(n_cells: int = 20) -> None:
             along.append(compared(float(slope(signs)) * signs, implicit))
             full = np.array([float(slope(e)) for e in np.eye(tensions.size)])
             differences.append(compared(full, implicit))
-        cells = [f"{e:.1e}, {c:.1e}" for e, c in map(min, (by_pulls, along, differences))]
+        cells = [f"{e:.1e}, {c:.1e}" for e, c in map(min, (nudged, along, differences))]
         print(f"{tolerance:9.0e} " + " ".join(f"{cell:>27}" for cell in cells), flush=True)
 
 

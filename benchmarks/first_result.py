@@ -1,10 +1,11 @@
-"""What a user waits for: seconds from a fresh process to the first results, with and without a cache.
+"""Seconds from the start of a process to the first results, with and without a compilation cache.
 
-Each row is a step of one process, in this order; the first column of seconds is without a cache of compiled
-functions, the second with the cache that an earlier process has filled. `programs` counts what XLA compiles
-in the step without a cache, of which most are small. `--masks` adds tensions of 20 masks of 90 to 110 cells.
+Each row is a step of one process, in this order; the first column of seconds is without a cache of
+compiled functions, the second with the cache of an earlier process. `programs` is the number of programs
+that XLA compiles in the step without a cache; most are small. `--masks` adds tensions of 20 masks of 90 to
+110 cells.
 
-To compare with another version run this file with the Python of an environment where that is installed.
+To compare with another version run this file with the Python of an environment that has that version.
 """
 
 from __future__ import annotations
@@ -121,14 +122,14 @@ def mask_steps() -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def session(kind: str) -> None:
-    """One process: print each step, its seconds, and the programs that it compiled."""
+    """Print each step of one process, its seconds, and the number of programs compiled."""
     began = time.perf_counter()
     import jax
 
     jax.config.update("jax_enable_x64", True)
     import vertax as vx
 
-    vx.equilibrate  # noqa: B018  what is imported when it is first used
+    vx.equilibrate  # noqa: B018  imports the package, which is lazy
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, duration_secs, **_: compiled.append(event)
@@ -145,7 +146,7 @@ def session(kind: str) -> None:
 
 
 def measured(kind: str, folder: str | None) -> list[tuple[str, float, int]]:
-    """The steps of a fresh process."""
+    """Run the steps in a new process; return their names, seconds and numbers of programs."""
     environment = os.environ | {"PYTHONWARNINGS": "ignore", "VERTAX_CACHE": "off"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     if folder is not None:

@@ -46,7 +46,7 @@ def errors(n_cells: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print one row a size."""
+    """Print one row for each size."""
     print(f"{'cells':>6} {'dense pseudo-inverse':>21} {'finite differences':>19}")
     for n_cells in (20, 64):
         dense, central = errors(n_cells)

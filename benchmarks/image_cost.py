@@ -12,7 +12,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 def main() -> None:
-    """Print one row a size."""
+    """Print one row for each size."""
     print(f"{'cells':>6} {'pixels':>12} {'cost + gradient ms':>19}")
     for n, side in ((20, 128), (100, 256), (1000, 1024)):
         tissue = vx.initialise.periodic_voronoi(n, key=jax.random.key(0), lloyd_steps=2)

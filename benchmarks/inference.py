@@ -1,10 +1,11 @@
-"""Tensions and pressures inferred from shapes whose tensions are known: how well, how sure, how fast.
+"""Tensions and pressures inferred from shapes with known tensions: accuracy, error bars and run time.
 
-Foams of Surface Evolver (`--data`), as they are and as images of 1000 and 500 pixels, and synthetic clusters
-as images with rough outlines. Beside each the bare balance of forces: non-negative least squares at inner
-junctions, with the tangents of arcs. With `--forsys PYTHON`, the interpreter of an environment that has
-ForSys (`pip install forsys`), its static inference of the same foams stands beside it, and its dynamic one of
-the movie. Last real masks, of which no tensions are known: how many are determined.
+The shapes are foams of Surface Evolver (`--data`), exact and as images of 1000 and 500 pixels, and
+synthetic clusters as images with rough outlines. For comparison each row has the unweighted balance of
+forces: non-negative least squares at inner junctions, with the tangents of arcs. With `--forsys PYTHON`,
+the interpreter of an environment that has ForSys (`pip install forsys`), rows for its static inference of
+the same foams and its dynamic inference of the movie follow. The last rows are real masks without known
+tensions: the number of determined edges.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ HEADER = (
     f"{'what':>34} | determined | r tension | error | r pressure | "
     "within 1, 1.96 s.d., both | s | bare: r, error"
 )
-# Runs in an environment with ForSys: both sides scaled to mean 1, inner edges.
+# Run by the interpreter of ForSys: inner edges, true and inferred tensions scaled to mean 1.
 FORSYS = """
 import sys, time
 import numpy as np
@@ -54,7 +55,7 @@ true, found = true / true.mean(), found / found.mean()
 print(len(true), np.corrcoef(true, found)[0, 1], np.mean(abs(found - true) / true), time.time() - began)
 """
 
-# The same of a movie; the frame is the second argument.
+# The same for a movie; the frame is the first argument.
 FORSYS_MOVIE = """
 import sys, time
 import numpy as np
@@ -86,66 +87,66 @@ class Truth(NamedTuple):
     foam: vx.io.Foam | None = None
 
 
-def compare(truth: Truth, found: InferredTensions) -> tuple[np.ndarray, ...]:
+def compare(truth: Truth, result: InferredTensions) -> tuple[np.ndarray, ...]:
     """True and inferred tensions, their standard scores, and the same of pressures."""
     tissue = truth.tissue
-    exact = found.pixel_size is None
+    exact = result.pixel_size is None
     # An exact shape has the cells of the truth; an image labels them from 1.
-    cell = np.append(np.arange(tissue.n_cells) if exact else found.labels - 1, tissue.n_cells)
+    cell = np.append(np.arange(tissue.n_cells) if exact else result.labels - 1, tissue.n_cells)
     pairs = np.sort(np.asarray(tissue.topology.edge_cells), axis=1).tolist()
     number = {tuple(pair): k for k, pair in enumerate(pairs) if pairs.count(pair) == 1}
-    between = np.sort(cell[np.asarray(found.tissue.topology.edge_cells)], axis=1).tolist()
+    between = np.sort(cell[np.asarray(result.tissue.topology.edge_cells)], axis=1).tolist()
     edge = np.array([number.get(tuple(pair), -1) for pair in between])
-    use = found.determined & (edge >= 0)
-    true, inferred = truth.tension[edge[use]], found.tensions[use]
+    use = result.determined & (edge >= 0)
+    true, inferred = truth.tension[edge[use]], result.tensions[use]
     scale = true.mean() / inferred.mean()
-    scores = (inferred - true / scale) / found.tension_deviations[use]
-    known = found.pressures_determined
-    length = np.sqrt(np.mean(np.asarray(tissue.areas)) / np.mean(np.asarray(found.tissue.areas)))
-    pressure = truth.pressure[cell[:-1][known]] / scale * length
-    away = found.pressures[known] - pressure + pressure.mean() - found.pressures[known].mean()
+    scores = (inferred - true / scale) / result.tension_deviations[use]
+    certain = result.pressures_determined
+    length = np.sqrt(np.mean(np.asarray(tissue.areas)) / np.mean(np.asarray(result.tissue.areas)))
+    pressure = truth.pressure[cell[:-1][certain]] / scale * length
+    away = result.pressures[certain] - pressure + pressure.mean() - result.pressures[certain].mean()
     return (
         true / true.mean(),
         inferred / inferred.mean(),
         scores,
         pressure,
-        found.pressures[known],
-        away / found.pressure_deviations[known],
+        result.pressures[certain],
+        away / result.pressure_deviations[certain],
     )
 
 
-def bare(found: InferredTensions) -> InferredTensions:
-    """The same with the tensions of a bare balance at inner junctions: of equal weight, and not negative."""
-    tissue, m = found.tissue, found.tissue.topology
+def bare(result: InferredTensions) -> InferredTensions:
+    """The same with tensions from non-negative least squares, with equal weights of all inner junctions."""
+    tissue, m = result.tissue, result.tissue.topology
     edge, forward = np.asarray(m.edge).reshape(-1, 3), np.asarray(m.forward).reshape(-1, 3)
     inner = np.all(np.asarray(m.cell).reshape(-1, 3) < tissue.n_cells, axis=1)
     chord = np.asarray(tissue.edge_vectors)
     direction, angle = np.arctan2(chord[:, 1], chord[:, 0]), np.asarray(tissue.edge_angles)
     away = np.where(forward, (direction - angle)[edge], (direction + angle)[edge] + np.pi)[inner]
-    asked = np.isfinite(found.tensions)
+    asked = np.isfinite(result.tensions)
     matrix = np.zeros((2, inner.sum(), tissue.n_edges))
     row = np.arange(inner.sum())[:, None]
     np.add.at(matrix[0], (row, edge[inner]), np.cos(away))
     np.add.at(matrix[1], (row, edge[inner]), np.sin(away))
     forces = np.concatenate([*matrix, np.full((1, tissue.n_edges), 1e3)])[:, asked]
     given = np.append(np.zeros(2 * inner.sum()), 1e3 * asked.sum())
-    tensions = found.tensions.copy()
+    tensions = result.tensions.copy()
     tensions[asked] = nnls(forces, given, maxiter=50 * len(given))[0]
-    return eqx.tree_at(lambda f: f.tensions, found, tensions)
+    return eqx.tree_at(lambda r: r.tensions, result, tensions)
 
 
 def row(name: str, cases: Sequence[tuple[Truth, object]]) -> None:
-    """Infer all, and print what came out."""
+    """Infer the tensions of all cases, and print a row of results."""
     parts, determined, seconds, plain = [], [], [], []
     for truth, image in cases:
         began = time.perf_counter()
-        found = infer_tensions((truth.foam or truth.tissue) if image is None else image)  # pyright: ignore[reportArgumentType]
+        result = infer_tensions((truth.foam or truth.tissue) if image is None else image)  # pyright: ignore[reportArgumentType]
         seconds.append(time.perf_counter() - began)
-        asked = np.isfinite(found.tensions).sum()
-        determined.append(found.determined.sum() / asked)
-        if found.determined.sum() > 2:
-            parts.append(compare(truth, found))
-            plain.append(compare(truth, bare(found)))
+        asked = np.isfinite(result.tensions).sum()
+        determined.append(result.determined.sum() / asked)
+        if result.determined.sum() > 2:
+            parts.append(compare(truth, result))
+            plain.append(compare(truth, bare(result)))
     if not parts:
         print(f"{name:>34} | {np.mean(determined):10.0%} | nothing is determined", flush=True)
         return
@@ -183,7 +184,7 @@ def cluster(n_cells: int, seed: int) -> Truth:
 def drawn(
     truth: Truth, pixels_per_cell: int, rough: float, random: np.random.Generator
 ) -> np.ndarray:
-    """A label image of the cluster, turned at random, its outlines off by so many pixels."""
+    """A label image of the cluster, rotated at random, its outlines displaced by `rough` pixels (r.m.s.)."""
     angle = random.uniform(0, 2 * np.pi)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     turned = truth.tissue.with_vertices(jnp.asarray(np.asarray(truth.tissue.vertices) @ turn.T))
@@ -200,15 +201,15 @@ def drawn(
 
 
 def forsys(interpreter: str, name: str, program: str, arguments: Sequence[object]) -> None:
-    """What ForSys finds of the same."""
+    """Print a row of results of ForSys."""
     command = [interpreter, "-c", program, *map(str, arguments)]
-    told = subprocess.run(command, capture_output=True, text=True)
-    last = (told.stdout.strip() or told.stderr.strip() or "nothing").splitlines()[-1]
+    process = subprocess.run(command, capture_output=True, text=True)
+    last = (process.stdout.strip() or process.stderr.strip() or "nothing").splitlines()[-1]
     print(f"{name:>34} | edges, r, error, s: {last}", flush=True)
 
 
 def main() -> None:
-    """Print one row a case."""
+    """Print one row for each case."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of dumps")
     parser.add_argument(
@@ -246,12 +247,12 @@ def main() -> None:
                 row(f"{n} cells, {pixels} px each, rough {rough}", cases)
     for path in sorted((arguments.data.parent / "segmentations").glob("*.tif")):
         began = time.perf_counter()
-        found = infer_tensions(path)
+        result = infer_tensions(path)
         seconds = time.perf_counter() - began
-        asked = np.isfinite(found.tensions).sum()
+        asked = np.isfinite(result.tensions).sum()
         print(
-            f"{path.stem:>34} | {found.determined.sum()} of {asked}, s.d. "
-            f"{np.median(found.tension_deviations[found.determined]):.2f}, {seconds:.1f} s; {found.doubts}"
+            f"{path.stem:>34} | {result.determined.sum()} of {asked}, s.d. "
+            f"{np.median(result.tension_deviations[result.determined]):.2f}, {seconds:.1f} s; {result.doubts}"
         )
 
 

@@ -1,6 +1,6 @@
-"""Share of random tissues that come to rest, and that overlap there, with contacts and without.
+"""Fraction of random tissues that reach equilibrium, and that overlap there, with contacts and without.
 
-What overlaps is judged by brute force, with the check of the tests.
+Overlaps are ends by brute force, with the function of the tests.
 """
 
 from __future__ import annotations
@@ -41,26 +41,26 @@ def relax(tissue: vx.Tissue, energy: vx.AbstractEnergy, reach: jax.Array | None)
 
 
 def row(name: str, cases: list[tuple[vx.Tissue, vx.AbstractEnergy]]) -> None:
-    """Relax all, without contacts and with them, and print what came out."""
+    """Relax all cases, without contacts and with them, and print a row of results."""
     text = f"{name:>34}"
     medians = []
     for reach in (None, jnp.asarray(0.01)):
         jax.block_until_ready(relax(*cases[0], reach).energy)
-        found, seconds = [], []
+        ends, seconds = [], []
         for tissue, energy in cases:
             began = time.perf_counter()
-            found.append(jax.block_until_ready(relax(tissue, energy, reach)))
+            ends.append(jax.block_until_ready(relax(tissue, energy, reach)))
             seconds.append(time.perf_counter() - began)
-        at_rest = np.mean([bool(e.result == vx.RESULTS.successful) for e in found])
-        overlap = np.mean([bool(faces_that_overlap(e.tissue)) for e in found])
-        steps = np.array([int(e.num_steps) for e in found])
+        at_rest = np.mean([bool(e.result == vx.RESULTS.successful) for e in ends])
+        overlap = np.mean([bool(faces_that_overlap(e.tissue)) for e in ends])
+        steps = np.array([int(e.num_steps) for e in ends])
         medians.append(np.median(seconds))
         text += f" | {at_rest:7.1%} {overlap:7.1%} {np.median(steps):5.0f} {steps.max():5d}"
     print(f"{text} | {medians[1] / medians[0]:5.2f}", flush=True)
 
 
 def main() -> None:
-    """Print one row a kind of tissue."""
+    """Print one row for each kind of tissue."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tissues", type=count, default=100)
     parser.add_argument("--cells", type=count, default=64)

@@ -1,8 +1,8 @@
-"""Relaxations of many kinds: share at rest, overlaps by brute force, steps, time, kernels, compile time.
+"""Relaxations of many kinds: fraction converged, overlaps (brute force), steps, time, kernels, compile time.
 
-To compare with another version run this file with PYTHONPATH set to its folder, right after the other one.
-Kernels are the fusions of the compiled program, as in `compilation.py`. Seconds of tracing and compilation
-are 0 where an earlier case has compiled the same program.
+To compare with another version run this file again with PYTHONPATH set to its folder. Kernels are the
+fusions of the compiled program, as in `compilation.py`. Seconds of tracing and compilation are 0 where an
+earlier case has compiled the same program.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Case = Callable[[int], tuple[vx.Tissue, vx.AbstractEnergy]]
 
 
 def shapes(n_cells: int, shape_factor: float) -> Case:
-    """A periodic tissue; its target shape factors have a standard deviation of 0.1."""
+    """A periodic tissue with target shape factors of standard deviation 0.1."""
 
     def case(seed: int) -> tuple[vx.Tissue, vx.AbstractEnergy]:
         tissue = vx.initialise.periodic_voronoi(n_cells, key=jax.random.key(seed))
@@ -103,7 +103,7 @@ def row(name: str, case: Case, n_seeds: int) -> str:
         ends.append(jax.block_until_ready(program(*given)))
         seconds.append(time.perf_counter() - start)
     at_rest = np.mean([bool(e.converged) for e in ends])
-    # (The check by brute force takes too long for large tissues.)
+    # The check by brute force takes too long for large tissues.
     checked = [e for e in ends if e.tissue.n_cells <= 400]
     overlap = sum(bool(faces_that_overlap(e.tissue)) for e in checked)
     steps = np.mean([int(e.num_steps) for e in ends])

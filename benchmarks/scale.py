@@ -1,9 +1,10 @@
-"""How relaxations and gradients grow with the tissue, with the preconditioner of large tissues and without.
+"""Scaling of relaxations and gradients with the number of cells, with the coarse preconditioner and without.
 
-Of relaxations from random tissues to forces below 1e-8: steps on average and at most, T1s, products with the
-Hessian, and seconds (without compilation); and steps and seconds of a gradient at the first one. A tissue
-has a random target shape factor in each cell, of s.d. 0.1, or, where `tensions` is asked for, line tensions
-of ratio 3. (A single large tissue says little: rounding decides which way it takes.)
+Of relaxations from random tissues to forces below 1e-8: mean and largest number of steps, T1s, products
+with the Hessian, and seconds (without compilation); and steps and seconds of a gradient at the first
+equilibrium. Each cell has a random target shape factor, of s.d. 0.1, or, for the kind `tensions`, each
+edge a random line tension of ratio 3. (Average over several tissues: the path of a single large one
+depends on rounding errors.)
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ TOLERANCE = 1e-8
 
 
 def energy_of(kind: str, tissue: vx.Tissue, seed: int = 0) -> vx.AbstractEnergy:
-    """Target shape factors about a number, or `tensions`."""
+    """Target shape factors with the mean `kind`, or line tensions if it is `tensions`."""
     key = jax.random.key(1 + seed)
     if kind == "tensions":
         gamma = jax.random.uniform(key, (tissue.n_edges,), minval=0.2, maxval=0.6)
@@ -38,7 +39,7 @@ def energy_of(kind: str, tissue: vx.Tissue, seed: int = 0) -> vx.AbstractEnergy:
 
 
 def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str:
-    """What relaxations and a gradient take if tissues from this number of cells on are preconditioned."""
+    """Results with the coarse preconditioner used from `fewest` cells on."""
     ElasticMedium.min_cells = fewest
     objective_module.MIN_CELLS_OF_EDGE_BLOCKS = max(fewest, FEWEST_FOR_EDGES)
     jax.clear_caches()
@@ -57,13 +58,13 @@ def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str
     def timed(seed: int) -> tuple[vx.Tissue, tuple]:
         given = tissue_and_energy(seed)
         began = time.perf_counter()
-        there, counts = relax(*given)
+        relaxed, counts = relax(*given)
         counts = tuple(map(int, counts))
-        return there, (*counts, time.perf_counter() - began)
+        return relaxed, (*counts, time.perf_counter() - began)
 
     with_compilation = timed(0)[1][-1]
-    relaxed, seen = zip(*map(timed, range(tissues)), strict=True)
-    steps, t1s, products, seconds = np.array(seen).T
+    relaxed, rows = zip(*map(timed, range(tissues)), strict=True)
+    steps, t1s, products, seconds = np.array(rows).T
 
     (_, energy), first = tissue_and_energy(0), relaxed[0]
     kicks = 0.01 * jax.random.normal(jax.random.key(2), first.vertices.shape)

@@ -16,7 +16,7 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def execute(path: Path, timeout: int) -> NotebookNode:
-    """The notebook, executed from its first cell to its last in a process of its own."""
+    """Execute a notebook from its first cell to its last in a new process."""
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(
         notebook,
@@ -29,7 +29,7 @@ def execute(path: Path, timeout: int) -> NotebookNode:
 
 
 def tidied(notebook: NotebookNode) -> NotebookNode:
-    """Without what differs from run to run or from machine to machine, so that changes show."""
+    """Remove metadata that differs between runs or machines, so that a diff shows only changes."""
     notebook.metadata = NotebookNode(
         kernelspec={"display_name": "Python 3", "language": "python", "name": "python3"},
         language_info={"name": "python"},
@@ -41,9 +41,9 @@ def tidied(notebook: NotebookNode) -> NotebookNode:
 
 
 def main() -> None:
-    """Execute some notebooks, or all; the first error ends it."""
+    """Execute some notebooks, or all; stop at the first error."""
     parser = argparse.ArgumentParser(description="Execute the notebooks.")
-    parser.add_argument("notebooks", nargs="*", type=Path, help="which ones; all by default")
+    parser.add_argument("notebooks", nargs="*", type=Path, help="paths; all by default")
     parser.add_argument("--light", action="store_true", help="fewer epochs, smaller tissues")
     parser.add_argument("--write", action="store_true", help="keep the outputs in the notebooks")
     parser.add_argument("--timeout", type=int, default=600, help="seconds for a cell, at most")
@@ -63,7 +63,7 @@ def main() -> None:
         if options.write:
             nbformat.write(notebook, path)
 
-    # Each has a process of its own, and this one only waits for them.
+    # Threads, because each notebook runs in a separate process.
     with ThreadPoolExecutor(options.jobs) as pool:
         for _ in pool.map(one, options.notebooks or sorted(FOLDER.glob("*.ipynb"))):
             pass

@@ -48,7 +48,7 @@ def area_of(ring):
 
 
 def fan_area(ring):
-    """The area that a program covers that draws a polygon as a fan about its first corner."""
+    """The area of a fan of triangles about the first corner of a polygon."""
     corners = np.asarray(ring, float)[:, :2] - ring[0, :2]
     turns = corners[1:-1, 0] * corners[2:, 1] - corners[1:-1, 1] * corners[2:, 0]
     return 0.5 * np.sum(np.abs(turns))
@@ -68,7 +68,7 @@ class TestTables:
         assert "".join(table["kind"]) == "abcdefg"
         outside = {int(c) for pair in tissue.topology.edge_cells for c in pair if 7 in pair}
         assert set(np.flatnonzero(table["on_outline"])) == outside - {7}
-        # A multiple of lattice vectors away from where the tissue has it, and in the box.
+        # Shifted by lattice vectors into the box.
         offset = np.stack([table["x"], table["y"]], axis=1) - np.asarray(tissue.centroids)
         if isinstance(tissue.boundary, vx.Periodic):
             inverse = np.linalg.inv(tissue.boundary.lattice)
@@ -89,7 +89,7 @@ class TestTables:
         assert (table["left_cell"] >= 0).all()
         np.testing.assert_array_equal(table["start_vertex"], tissue.topology.edge_vertices[:, 0])
 
-    def test_refusals(self, periodic):
+    def test_invalid_arguments_raise(self, periodic):
         with pytest.raises(ValueError, match=r"a column `area` already.*Choose another"):
             cell_table(periodic, area=np.ones(7))
         with pytest.raises(
@@ -107,7 +107,7 @@ class TestTables:
 
 
 class TestCSV:
-    def test_numbers_come_back_bit_for_bit(self, tissue, tmp_path):
+    def test_csv_round_trip_is_exact(self, tissue, tmp_path):
         table = cell_table(tissue)
         write_csv(tmp_path / "cells.csv", table)
         with open(tmp_path / "cells.csv", newline="") as file:
@@ -125,7 +125,7 @@ class TestCSV:
         assert [row[0] for row in rows] == ["x", "0.1", "", "Inf", "-Inf"]
         assert [row[1] for row in rows[1:]] == table["word"]
 
-    def test_refusals(self, tmp_path):
+    def test_invalid_arguments_raise(self, tmp_path):
         with pytest.raises(ValueError, match=r"one length, but they have \{'a': 2, 'b': 3\}"):
             write_csv(tmp_path / "a.csv", {"a": [1, 2], "b": [1, 2, 3]})
         with pytest.raises(ValueError, match=r"`a` has shape \(2, 2\)"):
@@ -156,7 +156,7 @@ class TestGeoJSON:
             (ring,) = feature["geometry"]["coordinates"]
             assert feature["geometry"]["type"] == "Polygon"
             assert ring[0] == ring[-1]
-            # Counter-clockwise, as RFC 7946 wants it.
+            # Counter-clockwise, as RFC 7946 requires.
             np.testing.assert_allclose(area_of(ring[:-1]), tissue.areas[k], rtol=1e-4)
             properties = feature["properties"]
             assert properties["cell"] == k
@@ -183,7 +183,7 @@ class TestGeoJSON:
         ]
         np.testing.assert_allclose(lengths, tissue.edge_lengths, rtol=1e-3, atol=2e-3)
 
-    def test_refusals(self, periodic, tmp_path):
+    def test_invalid_arguments_raise(self, periodic, tmp_path):
         path = tmp_path / "a.geojson"
         lost = periodic.with_vertices(periodic.vertices.at[0].set(jnp.nan))
         with pytest.raises(ValueError, match="finite positions"):
@@ -223,12 +223,12 @@ class TestVTK:
         assert set(shown) == set(range(tissue.n_edges))
         first, last = (mesh.points[block.data[:, k]] for k in (0, 1))
         length = np.bincount(shown, np.linalg.norm(last - first, axis=1))
-        # Those across a periodic boundary are there twice.
+        # Edges across a periodic boundary occur twice.
         times = np.round(length / np.asarray(tissue.edge_lengths))
         assert set(times) <= ({1, 2} if isinstance(tissue.boundary, vx.Periodic) else {1})
         np.testing.assert_allclose(length, times * tissue.edge_lengths, rtol=1e-3, atol=4e-3)
 
-    def test_refusals(self, periodic, tmp_path):
+    def test_invalid_arguments_raise(self, periodic, tmp_path):
         with pytest.raises(ValueError, match=r"`path` must end in \.vtu or \.vtk"):
             write_vtk(tmp_path / "a.obj", periodic)
         with pytest.raises(ValueError, match=r"`kind` must hold numbers or booleans.*<U1"):
@@ -243,7 +243,7 @@ class TestVTK:
             write_vtk(tmp_path / "a.vtu", periodic)
 
 
-def test_what_is_not_known_is_an_empty_field(tmp_path):
+def test_missing_values_are_empty_fields(tmp_path):
     path = tmp_path / "table.csv"
     nan = float("nan")
     table = {
@@ -274,7 +274,7 @@ def test_what_is_not_known_is_an_empty_field(tmp_path):
         ({"a": [[1], [2, 3]]}, ValueError, "Column `a` must hold one entry a row"),
     ],
 )
-def test_what_is_no_table_is_refused(tmp_path, table, error, message, without_type_checks):
+def test_invalid_tables_raise(tmp_path, table, error, message, without_type_checks):
     path = tmp_path / "table.csv"
     with pytest.raises(error, match=message):
         vx.io.write_csv(path, table)
@@ -287,7 +287,7 @@ def test_tables_are_of_one_tissue(read, without_type_checks):
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
     with pytest.raises(ValueError, match=r"one by one: jax.tree.map\(lambda x: x\[0\], tissue\)"):
         read(batch)
-    member = jax.tree.map(lambda x: x[0], batch)  # what the message says
+    member = jax.tree.map(lambda x: x[0], batch)  # as the message proposes
     np.testing.assert_array_equal(read(member)["on_outline"], read(tissue)["on_outline"])
     with pytest.raises(TypeError, match=r"`tissue` must be a vertax.Tissue, but is None"):
         read(None)
@@ -298,18 +298,24 @@ def test_tables_are_of_one_tissue(read, without_type_checks):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"cells": {"a": np.full(5, 1j)}}, TypeError, "Column `a` must hold .* which is what JSON"),
+        (
+            {"cells": {"a": np.full(5, 1j)}},
+            TypeError,
+            "Column `a` must hold .* which JSON can store",
+        ),
         (
             {"cells": {"a": np.full(5, b"x")}},
             TypeError,
-            "Column `a` must hold .* which is what JSON",
+            "Column `a` must hold .* which JSON can store",
         ),
         ({"cells": np.ones(5)}, TypeError, "Columns of the cells must be given by name"),
         ({"edges": [1]}, TypeError, "Columns of the edges must be given by name"),
         ({"points_per_arc": 1.5}, TypeError, "`points_per_arc` must be at least 1"),
     ],
 )
-def test_what_has_no_place_in_geojson(tmp_path, options, error, message, without_type_checks):
+def test_columns_that_json_cannot_hold_raise(
+    tmp_path, options, error, message, without_type_checks
+):
     path = tmp_path / "cells.geojson"
     with pytest.raises(error, match=message):
         vx.io.write_geojson(path, random_tissue(5), **options)
@@ -325,7 +331,7 @@ def test_dates_are_text_in_geojson(tmp_path):
 
 
 @pytest.mark.parametrize("write", [vx.io.save_tissue, lambda path, tissue: vx.io.to_tables(tissue)])
-def test_what_is_no_tissue_is_not_written(tmp_path, write, without_type_checks):
+def test_writers_raise_without_a_tissue(tmp_path, write, without_type_checks):
     with pytest.raises(TypeError, match=r"`tissue` must be a vertax.Tissue, but is 'tissue'"):
         write(tmp_path / "tissue.npz", "tissue")
 
@@ -344,7 +350,7 @@ def test_what_is_no_tissue_is_not_written(tmp_path, write, without_type_checks):
         (lambda t: t._replace(height=np.nan), ValueError, "`height` must be positive"),
     ],
 )
-def test_what_are_no_tables_is_named(change, error, message, without_type_checks):
+def test_error_names_invalid_tables(change, error, message, without_type_checks):
     with pytest.raises(error, match=message):
         vx.io.from_tables(change(vx.io.to_tables(random_tissue(5))))
 
@@ -352,7 +358,7 @@ def test_what_are_no_tables_is_named(change, error, message, without_type_checks
 @pytest.mark.parametrize(
     "classes", [["a"], vx.energies.LineTension, [vx.energies.LineTension(1.0)]]
 )
-def test_what_are_no_classes_is_named(tmp_path, classes, without_type_checks):
+def test_error_names_invalid_classes(tmp_path, classes, without_type_checks):
     path = tmp_path / "energy.npz"
     vx.io.save_energy(path, vx.energies.LineTension(1.0))
     with pytest.raises(TypeError, match="`classes` must"):

@@ -26,7 +26,7 @@ def _close():
 
 
 def round_cells(seed=0, n=12, size=200, radius=22):
-    """Cells of a random cluster, as far as they lie within a radius of their seeds."""
+    """Cells of a random cluster, cut at a radius about their seeds."""
     rng = np.random.default_rng(seed)
     seeds = rng.random((n, 2)) * size / 2 + size / 4
     y, x = np.mgrid[:size, :size] + 0.5
@@ -54,7 +54,7 @@ def test_a_cluster_of_round_cells(seed):
     made = from_labels(mask, boundary="free", pixel_size=1.0, gap_width=0.0)
     made.tissue.topology.validate()
     assert isinstance(made.tissue.boundary, vx.Free)
-    # (Isolated cells and smaller clusters are gone.)
+    # Isolated cells and smaller clusters are dropped.
     kept = set(made.labels.tolist()) | {0}
     assert len(kept) > 8
     assert pairs_in(made) == {(a, b) for a, b in pairs_of(mask) if {a, b} <= kept}
@@ -65,21 +65,21 @@ def test_a_cluster_of_round_cells(seed):
     assert made.whole.all()
 
 
-def test_lines_between_cells_and_holes_are_no_exterior():
+def test_gaps_between_cells_and_holes_are_not_exterior():
     mask = round_cells(0)
-    whole = from_labels(mask, boundary="free", pixel_size=1.0)
+    uncut = from_labels(mask, boundary="free", pixel_size=1.0)
     inner = np.zeros_like(mask, bool)
     for axis in (0, 1):
         other = np.roll(mask, 1, axis)
         inner |= (mask != other) & (mask > 0) & (other > 0)
     cut = from_labels(np.where(inner, 0, mask), boundary="free", pixel_size=1.0)
-    assert pairs_in(cut) == pairs_in(whole)
-    y, x = np.argwhere(mask == whole.labels[3]).mean(0).astype(int)
+    assert pairs_in(cut) == pairs_in(uncut)
+    y, x = np.argwhere(mask == uncut.labels[3]).mean(0).astype(int)
     holed = mask.copy()
     holed[y - 4 : y + 5, x - 4 : x + 5] = 0
     np.testing.assert_array_equal(
         from_labels(holed, boundary="free", pixel_size=1.0).tissue.topology.twin,
-        whole.tissue.topology.twin,
+        uncut.tissue.topology.twin,
     )
 
 
@@ -144,7 +144,7 @@ def test_from_microscopy_passes_the_boundary_on():
 
 
 @pytest.mark.parametrize("inner_arcs", [False, True])
-def test_files_keep_every_bit(tmp_path, inner_arcs):
+def test_file_round_trip_is_exact(tmp_path, inner_arcs):
     tissue = cluster(7, 2, inner_arcs=inner_arcs)
     tissue = eqx.tree_at(
         lambda t: t.pinned, tissue, jnp.arange(12) % 5 == 0, is_leaf=lambda x: x is None

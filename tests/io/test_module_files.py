@@ -52,7 +52,7 @@ class Steepest(vx.solvers.GradientDescent):
 
 
 def same(a, b):
-    """Whether two objects are of the same types and bits through and through."""
+    """Whether two objects have equal types and bits in all parts."""
     if type(a) is not type(b) and not (isinstance(a, jax.Array) and isinstance(b, jax.Array)):
         return False
     if isinstance(a, eqx.Module):
@@ -254,7 +254,7 @@ class TestRoundTrip:
 
 
 @pytest.mark.parametrize("generator", ["threefry2x32", "rbg"])
-def test_keys_of_random_numbers_come_back(tmp_path, generator):
+def test_random_keys_are_restored(tmp_path, generator):
     energy = Anything({"one": jax.random.key(3, impl=generator), "text": "a", "none": None})
     energy = Anything((energy, jax.random.split(energy.value["one"], 4)))
     save_energy(tmp_path / "energy.npz", energy)
@@ -266,7 +266,7 @@ def test_keys_of_random_numbers_come_back(tmp_path, generator):
             assert new.dtype == old.dtype
             assert jax.random.normal(new.ravel()[0]) == jax.random.normal(old.ravel()[0])
     rewritten(tmp_path / "energy.npz", **{"data.value.1": np.zeros((4, 7), np.uint32)})
-    with pytest.raises(ValueError, match="is no key of the generator"):
+    with pytest.raises(ValueError, match="is not a key of the generator"):
         load_energy(tmp_path / "energy.npz", classes=[Anything])
 
 
@@ -286,7 +286,7 @@ class TestRefusedToSave:
             ({"energy": Anything(optax.EmptyState())}, r"`energy\.value` is of type EmptyState"),
         ],
     )
-    def test_what_has_no_place_in_a_file(self, path, tissues, options, message):
+    def test_fields_that_cannot_be_stored_raise(self, path, tissues, options, message):
         problem = problem_of(tissues["periodic"], **options)
         with pytest.raises(ValueError, match=rf"Argument `problem`.*{message}"):
             save_problem(path, problem)
@@ -410,7 +410,7 @@ class TestRefusedToLoad:
             ({"tree": "{"}, "`tree` cannot be read"),
             ({"tree": "[" * 100_000}, "`tree` cannot be read"),
             ({"tree": "3"}, "must hold an AbstractEnergy, but holds int"),
-            ({"tree": '{"kind": "set", "items": []}'}, "none of the things"),
+            ({"tree": '{"kind": "set", "items": []}'}, "not one of the things"),
             ({"tree": '{"kind": "vertax", "class": "Free", "fields": {}}'}, "but holds Free"),
             ({"data.terms.0.tension": None}, r"no array `data\.terms\.0\.tension`"),
             ({"version": 0}, "broken header"),
@@ -442,7 +442,7 @@ class TestRefusedToLoad:
     ],
     ids=["transitions that add", "movement", "box"],
 )
-def test_every_response_has_a_place_in_files(path, tissues, response):
+def test_every_response_can_be_stored(path, tissues, response):
     target, energy = tissues["periodic"], vx.energies.ShapeFactorEnergy(3.7)
     cost = vx.costs.VertexDistance(target)
     problem = vx.InverseProblem(target, energy, cost, response=response)
@@ -450,8 +450,8 @@ def test_every_response_has_a_place_in_files(path, tissues, response):
     assert same(load_problem(path), problem)
 
 
-def test_every_public_part_of_a_problem_has_a_place_in_files():
-    # A new boundary or rule of transitions is one more entry; the families are looked through.
+def test_every_public_part_of_a_problem_can_be_stored():
+    # A new boundary or transition rule is one more entry; families are scanned.
     parts = (vx.AbstractBoundary, vx.AbstractTransitions, vx.AbstractCost, vx.AbstractEnergy)
     parts += (vx.adjoints.AbstractAdjoint, vx.solvers.AbstractSolver)
     for family in (vx, vx.adjoints, vx.costs, vx.energies, vx.solvers):

@@ -16,7 +16,7 @@ def tissue():
     return vx.transitions.remove(divided, 0).tissue
 
 
-def test_files_keep_them_bit_for_bit(tissue, tmp_path):
+def test_files_keep_spare_slots_exactly(tissue, tmp_path):
     vx.save_tissue(tmp_path / "tissue.npz", tissue)
     assert eqx.tree_equal(vx.load_tissue(tmp_path / "tissue.npz"), tissue)
     trajectory = vx.mesh.Trajectory()
@@ -26,7 +26,7 @@ def test_files_keep_them_bit_for_bit(tissue, tmp_path):
     assert eqx.tree_equal(vx.io.load_trajectory(tmp_path / "movie.npz")[1], tissue)
 
 
-def test_tables_have_rows_for_what_there_is(tissue, tmp_path):
+def test_tables_omit_spare_slots(tissue, tmp_path):
     alive = np.flatnonzero(np.asarray(tissue.alive))
     cells = vx.io.cell_table(tissue, number=np.arange(9))
     np.testing.assert_array_equal(cells["cell"], alive)
@@ -41,7 +41,7 @@ def test_tables_have_rows_for_what_there_is(tissue, tmp_path):
     np.testing.assert_array_equal(vx.io.to_tables(tissue).he_table, tables.he_table)
 
 
-def test_pictures_leave_them_out(tissue):
+def test_figures_omit_spare_slots(tissue):
     ax = vx.plot_tissue(tissue, tissue.neighbour_counts)
     (faces,) = (c for c in ax.collections if isinstance(c, PolyCollection))
     assert len(faces.get_paths()) == int(tissue.alive.sum())

@@ -76,8 +76,8 @@ def test_a_doublet(doublet):
     [
         (lambda t: t[: t.index("bodies")], "no section `bodies`"),
         (lambda t: t.replace("DIMENSION 2", "DIMENSION 3"), "3 dimensions"),
-        (lambda t: t.replace(" 6   7 1  color red\n", ""), "element 6 is used and not there"),
-        (lambda t: t.replace("1 2 5 6", "1 2 5 -6"), "no closed loop"),
+        (lambda t: t.replace(" 6   7 1  color red\n", ""), "element 6 is used but missing"),
+        (lambda t: t.replace("1 2 5 6", "1 2 5 -6"), "not a closed loop"),
         (lambda t: t.replace(" 5   0   1", " 5   0"), "a line cannot be read"),
         (lambda t: "nothing", "no section `vertices`"),
         (lambda t: t.replace(" 1   1  volume", " 0   1  volume"), "a body has the number 0"),
@@ -85,23 +85,91 @@ def test_a_doublet(doublet):
 )
 def test_a_broken_file_is_refused(doublet, change, message):
     doublet.write_text(change(DOUBLET), encoding="utf-8")
-    with pytest.raises(ValueError, match=f"doublet.fe is no planar foam.*{message}"):
+    with pytest.raises(ValueError, match=f"doublet.fe is not a planar foam.*{message}"):
         vx.io.read_surface_evolver(doublet)
 
 
-def test_four_edges_at_a_point_are_refused(doublet):
+def test_cells_that_touch_in_a_point_are_refused(doublet):
     text = DOUBLET.replace("edges\n", " 8 0.5 2\n 9 -0.5 2\nedges\n 7 5 8\n 8 8 9\n 9 9 5\n")
     text = text.replace("bodies", " 3 7 8 9\nbodies").replace("read", " 3 3\nread", 1)
     doublet.write_text(text.replace("/* facets */ 3 3\nread", ""), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"5 edges meet at the point \[0.0, 1.0\]"):
+    with pytest.raises(ValueError, match=r"bodies must .* touch in the point \[0.0, 1.0\] only"):
         vx.io.read_surface_evolver(doublet)
 
 
-def test_no_text(tmp_path):
+@pytest.fixture
+def fan(tmp_path):
+    """Three triangles at the origin, which is on the outline: four edges meet there."""
+    path = tmp_path / "fan.fe"
+    path.write_text(
+        "vertices\n1 0 0\n2 2 0\n3 1 2\n4 -1 2\n5 -2 0\n"
+        "edges\n1 1 2\n2 2 3\n3 3 1 density 2\n4 3 4\n5 4 1 density 3\n6 4 5\n7 5 1\n"
+        "faces\n1 1 2 3\n2 -3 4 5\n3 -5 6 7\nbodies\n1 1\n2 2\n3 3\nread\n",
+        encoding="utf-8",
+    )
+    return path
+
+
+def test_a_point_where_four_edges_meet_becomes_two_vertices(fan):
+    foam = vx.io.read_surface_evolver(fan)
+    lengths = np.asarray(foam.tissue.edge_lengths)
+    assert np.sum(np.all(np.asarray(foam.tissue.vertices) == 0, axis=1)) == 2
+    link = int(np.argmin(lengths))
+    assert not foam.tissue.topology.on_outline[link]
+    # The mean of the tensions of the four edges that meet there.
+    np.testing.assert_allclose(foam.tensions[link], (1 + 2 + 3 + 1) / 4)
+    np.testing.assert_array_equal(foam.chains[link], np.zeros((2, 2)))
+    np.testing.assert_allclose(foam.tissue.areas, 2, rtol=1e-9)
+
+
+def test_binary_files_raise(tmp_path):
     path = tmp_path / "image.dmp"
     path.write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(ValueError, match="not text"):
         vx.io.read_surface_evolver(path)
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="the folder shared/data is not there")
+def test_chains_that_cross_near_a_junction_are_read(tmp_path):
+    text = (DATA / "movie_0.dmp").read_text(encoding="utf-8")
+    original = vx.io.read_surface_evolver(DATA / "movie_0.dmp")
+    ends = np.asarray(original.tissue.topology.edge_vertices)
+    # Move the point next to a junction by 20 degrees beyond the other chain that leaves from there.
+    vertex = int(ends[int(np.argmin(np.asarray(original.tissue.topology.on_outline))), 0])
+    chains = [
+        chain if start == vertex else chain[::-1]
+        for chain, (start, end) in zip(original.chains, ends, strict=True)
+        if vertex in (start, end)
+    ]
+    junction, first, other = chains[0][0], chains[0][1], chains[1][1]
+    axis, step = other - junction, first - junction
+    turn = -np.deg2rad(20) * np.sign(axis[0] * step[1] - axis[1] * step[0])
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    moved = junction + 0.2 * rotation @ axis
+    old = next(
+        line
+        for line in text.splitlines()
+        if re.match(r"\s*\d+\s+\S+\s+\S+", line)
+        and np.allclose(_numbers(line)[1:3], first, rtol=0, atol=1e-12)
+    )
+    number = old.split()[0]
+    path = tmp_path / "crossed.dmp"
+    path.write_text(
+        text.replace(old, f"{number} {moved[0]:.17g} {moved[1]:.17g}", 1), encoding="utf-8"
+    )
+    foam = vx.io.read_surface_evolver(path)
+    np.testing.assert_array_equal(
+        foam.tissue.topology.edge_cells, original.tissue.topology.edge_cells
+    )
+    np.testing.assert_array_equal(foam.tissue.topology.edge_vertices, ends)
+
+
+def _numbers(line: str) -> list[float]:
+    words = line.split()[:3]
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return [np.nan] * 3
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="the folder shared/data is not there")

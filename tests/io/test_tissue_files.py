@@ -52,7 +52,7 @@ class TestRoundTrip:
             assert same_bits(load_tissue(tmp_path / "single"), single)
 
     def test_after_a_transition(self, tissue, tmp_path):
-        # A flip turns edges around: their labels and directions no longer follow from their order.
+        # After a flip the labels and directions of edges do not follow from their order.
         flipped = tissue
         for edge in (0, 7, 20):
             flip = jnp.arange(tissue.n_edges) == edge
@@ -142,7 +142,7 @@ class TestRefusedToLoad:
                 loaded = load_tissue(saved)
             except ValueError as error:
                 refused += str(saved) in str(error)
-            else:  # a byte of the archive that nobody reads (a date, say) may change
+            else:  # a byte of the archive that is not read (of a date, for example) may change
                 harmless += same_bits(loaded, tissue)
         assert refused + harmless == 60
         assert refused > 40
@@ -176,7 +176,7 @@ class TestRefusedToLoad:
 
     def test_unknown_boundary(self, saved):
         rewritten(saved, boundary="sphere")
-        with pytest.raises(ValueError, match=r"'sphere'; known are: periodic"):
+        with pytest.raises(ValueError, match=r"'sphere'; the kinds are: periodic"):
             load_tissue(saved)
 
     @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ class TestRefusedToLoad:
             ({"twin": np.zeros(66)}, "`twin`.*hold integers"),
             ({"frame": np.zeros((66, 3), int)}, r"`frame`.*\(66, 2\)"),
             ({"boundary_lattice": np.eye(3)}, r"`boundary_lattice`.*\(2, 2\)"),
-            # The mesh and the box judge for themselves; the file's name is put in front.
+            # The classes of mesh and box raise; the file's name precedes their message.
             ({"twin": np.zeros(66, int)}, "is broken: Argument `twin` must be an involution"),
             ({"cell": np.zeros(66, int)}, "is broken: The topology is broken: .*one face"),
             ({"half_edge": np.zeros(33, int)}, "`half_edge` must point into its edge"),
@@ -218,7 +218,7 @@ class TestAtomicWrite:
         assert (tmp_path / "a.csv").read_bytes() == b"1,2\r\n"
 
     @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
-    def test_a_failure_leaves_everything_as_it_was(self, tmp_path, failure):
+    def test_failed_write_keeps_the_old_file(self, tmp_path, failure):
         path = tmp_path / "a.txt"
         path.write_text("old")
 
@@ -262,7 +262,7 @@ class TestAtomicWrite:
         assert (tmp_path / "link").is_symlink()
         assert (tmp_path / "runs" / "a.txt").read_text() == "new"
 
-    def test_refusals(self, tmp_path):
+    def test_invalid_arguments_raise(self, tmp_path):
         with pytest.raises(ValueError, match="`mode`"), atomic_write(tmp_path / "a", "a"):
             pass
         with (
@@ -277,7 +277,7 @@ class TestAtomicWrite:
 
 @pytest.mark.parametrize("name", ["twin", "cell", "frame", "edge", "half_edge"])
 @pytest.mark.parametrize("value", [-1, 10**6, 2**31, 2**32, 2**62])
-def test_a_number_that_numbers_nothing_is_named(tmp_path, name, value):
+def test_error_names_numbers_out_of_range(tmp_path, name, value):
     path = tmp_path / "tissue.npz"
     vx.io.save_tissue(path, random_tissue(5))
     with np.load(path) as archive:

@@ -1,4 +1,4 @@
-"""Movies for ParaView."""
+"""VTK time series for ParaView."""
 
 import xml.etree.ElementTree as ET
 
@@ -27,7 +27,7 @@ def test_each_time_has_a_file_with_its_frame(tmp_path, movie):
     meshes = [meshio.read(tmp_path / each.attrib["file"]) for each in sets]
     for mesh, row in zip(meshes, strain, strict=True):
         np.testing.assert_array_equal(np.concatenate(mesh.cell_data["strain"]), row)
-    # Cells are drawn with their centroids in the box, and each moved by as much as the tissue or a box less.
+    # Cells have their centroids in the box: each moved by the displacement of the tissue, modulo the box.
     assert len({mesh.points.tobytes() for mesh in meshes}) == 3
 
 

@@ -94,7 +94,7 @@ def test_pyvista_measures_and_draws_the_areas(tmp_path, boundary):
     tissue = bent(boundary)
     vx.io.write_vtk(tmp_path / "a.vtu", tissue, points_per_arc=64)
     mesh = pyvista.read(tmp_path / "a.vtu")
-    # VTK measures a polygon as a fan about its first corner, also where it draws it right.
+    # VTK integrates over a polygon as a fan about its first corner, also in versions that draw it correctly.
     sizes = mesh.compute_cell_sizes(length=False, volume=False)["Area"]
     measured = np.bincount(mesh.cell_data["cell"], sizes)
     np.testing.assert_allclose(measured, tissue.areas, rtol=1e-3)

@@ -1,4 +1,4 @@
-"""Tissues that move, and edges that are marked."""
+"""Animations and marked edges."""
 
 from typing import Any
 
@@ -65,14 +65,14 @@ def test_a_gif_has_a_picture_for_each_frame_and_marks_transitions(way, tmp_path)
     vx.animate(way, path, values, fps=20, linger=1, mark_t1=2, captions=list("abcd"), dpi=60)
     frames, times = frames_of(path)
     assert [has(frame, _style.MARK) for frame in frames] == [False, True, True, False]
-    # What stands still between frames is one longer frame in no case here: values change.
+    # Values change between all frames, so no two frames are merged.
     assert times == [50, 50, 50, 1050]
     assert [file.name for file in tmp_path.iterdir()] == ["way.gif"]
     corners = {tuple(frame[0, 0]) for frame in frames}
     assert corners == {(255, 255, 255)}
 
 
-def test_the_bar_says_what_it_cuts_off(way, tmp_path, monkeypatch):
+def test_colour_bar_shows_values_beyond_its_limits(way, tmp_path, monkeypatch):
     bars = []
     keep = lambda *args, **options: bars.append(add_bar(*args, **options))
     monkeypatch.setattr(_animation, "add_bar", keep)
@@ -120,7 +120,7 @@ def test_no_cell_jumps_across_a_periodic_box():
         ({"mark_t1": -1}, "`mark_t1` must not be negative"),
     ],
 )
-def test_refusals(way, tmp_path, monkeypatch, changes, message):
+def test_invalid_arguments_raise(way, tmp_path, monkeypatch, changes, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=message):
         vx.animate(**({"trajectory": way, "path": "way.gif"} | changes))
@@ -165,10 +165,10 @@ def test_a_periodic_tissue_covers_an_image(way):
     side = float(np.sqrt(8))
     ax = vx.plot_tissue(tissue, image=np.zeros((32, 32)), pixel_size=side / 32)
     (lines,) = (c for c in ax.collections if c.get_zorder() == 2)
-    seen = np.concatenate(lines.get_segments())
-    # Every vertex, wherever it lies, is drawn at its place in the image.
+    visible = np.concatenate(lines.get_segments())
+    # Every vertex is drawn at its position in the image.
     for vertex in np.asarray(tissue.vertices) % side:
-        assert np.linalg.norm(seen - vertex, axis=1).min() < 1e-6
+        assert np.linalg.norm(visible - vertex, axis=1).min() < 1e-6
 
 
 def test_repeated_shapes_are_all_that_can_be_seen():

@@ -78,7 +78,7 @@ def test_stress_over_strain_breaks_at_plastic_events():
     curve, event = ax.lines
     np.testing.assert_allclose(np.asarray(curve.get_ydata()), [0, 1, np.nan, 0.5, 1.5, np.nan])
     np.testing.assert_allclose(np.asarray(event.get_xydata()), [[0.1, 1], [0.2, 0.5]])
-    # What happened before the first strain is no event of the ramp.
+    # Transitions before the first strain are not events of the ramp.
     (dots,) = ax.collections
     np.testing.assert_allclose(np.asarray(dots.get_offsets()), [[0.2, 0.5]])
     assert ax.get_ylabel() == r"stress $\sigma_{xy}$"
@@ -86,7 +86,7 @@ def test_stress_over_strain_breaks_at_plastic_events():
     np.testing.assert_allclose(np.asarray(ax.lines[0].get_ydata()), [3, 3, np.nan, 3, 3, np.nan])
 
 
-def test_what_is_refused(without_type_checks):
+def test_invalid_arguments_raise(without_type_checks):
     with pytest.raises(ValueError, match="`stresses` must have shape"):
         plot_stress(tissue, np.zeros((4, 2, 2)))
     with pytest.raises(ValueError, match="`scale` must be positive"):

@@ -23,13 +23,13 @@ def bricks() -> np.ndarray:
 
 def test_a_layer_has_each_edge_where_it_is_in_the_image():
     mask = bricks()
-    found = infer_tensions(mask)
-    paths, options, kind = tension_layer(found)
+    inferred = infer_tensions(mask)
+    paths, options, kind = tension_layer(inferred)
     assert kind == "shapes"
-    assert len(paths) == found.tissue.n_edges == len(options["edge_color"])
+    assert len(paths) == inferred.tissue.n_edges == len(options["edge_color"])
     assert len(options["features"]["tension"]) == len(paths)
     # An edge in the middle lies between its two labels.
-    inner = np.flatnonzero(found.determined)
+    inner = np.flatnonzero(inferred.determined)
     assert inner.size
     for edge in inner:
         path = paths[edge]
@@ -38,11 +38,11 @@ def test_a_layer_has_each_edge_where_it_is_in_the_image():
         near = mask[row - 2 : row + 3, column - 2 : column + 3]
         sides = options["features"]["left_label"][edge], options["features"]["right_label"][edge]
         assert set(sides) <= set(near.ravel().tolist())
-    unknown = options["edge_color"][~found.determined]
+    unknown = options["edge_color"][~inferred.determined]
     assert np.ptp(unknown[:, :3]) == 0
 
 
-def test_what_has_no_image_makes_no_layer():
+def test_layer_of_a_tissue_without_an_image_raises():
     tissue = from_labels(bricks(), boundary="free", inner_arcs=True).tissue
     with pytest.raises(ValueError, match="no pixels"):
         tension_layer(infer_tensions(tissue))
@@ -72,19 +72,19 @@ viewer.close()
 
 @pytest.mark.slow
 def test_the_widget_runs_in_napari(tmp_path):
-    # Another interpreter may have it: it does not belong to what tests need.
+    # Another interpreter may have napari: the tests do not depend on it.
     interpreter = os.environ.get("NAPARI_PYTHON", sys.executable)
     if interpreter == sys.executable and importlib.util.find_spec("napari") is None:
         pytest.skip(
             "napari is not installed: pip install 'vertax[napari]', or name a NAPARI_PYTHON"
         )
     np.save(tmp_path / "mask.npy", bricks())
-    told = subprocess.run(
+    process = subprocess.run(
         [interpreter, "-c", WIDGET],
         cwd=tmp_path,
         env=os.environ | {"QT_QPA_PLATFORM": "offscreen", "NAPARI_ASYNC": "0"},
         capture_output=True,
         text=True,
     )
-    assert told.returncode == 0, told.stderr
-    assert told.stdout.splitlines()[-1].startswith(f"{infer_tensions(bricks()).tissue.n_edges} ")
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.splitlines()[-1].startswith(f"{infer_tensions(bricks()).tissue.n_edges} ")

@@ -50,7 +50,7 @@ class TestTissues:
         sizes = [ax.get_window_extent().size for ax in axes]
         np.testing.assert_allclose(sizes[0], sizes[1], rtol=0.01)
 
-    def test_everything_is_in_view(self, tissues):
+    def test_axes_show_all_cells(self, tissues):
         for ax, tissue in zip(plot_tissues(tissues), tissues.values(), strict=True):
             points = vx.plotting.cell_polygons(tissue)[0].reshape(-1, 2)
             low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
@@ -194,7 +194,7 @@ class TestLabels:
         assert values.max() < 0.5
 
     def test_a_mesh_shows_on_every_label(self):
-        # As texts on a web page should: contrast of relative luminances.
+        # Contrast of relative luminances, as recommended for text on web pages.
         labels = np.arange(400).reshape(20, 20)
         linear = lambda c: np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
         luminance = lambda c: linear(c) @ np.array([0.2126, 0.7152, 0.0722])

@@ -1,4 +1,4 @@
-"""What pictures show, not how they look."""
+"""Contents of figures."""
 
 from typing import Any, ClassVar
 
@@ -59,12 +59,12 @@ def shoelace(polygon):
 
 
 class TestPolygons:
-    def test_cells_are_whole_and_have_their_areas(self, any_tissue):
+    def test_polygons_have_the_areas_of_their_cells(self, any_tissue):
         polygons, sides = cell_polygons(any_tissue)
         np.testing.assert_array_equal(sides, any_tissue.neighbour_counts)
         areas = [shoelace(p[:n]) for p, n in zip(polygons, sides, strict=True)]
         np.testing.assert_allclose(areas, any_tissue.areas, rtol=1e-12)
-        # Filled up with the first corner, so a closed line round the whole row is the same.
+        # Rows are padded with the first corner, which does not change a closed line.
         np.testing.assert_allclose([shoelace(p) for p in polygons], areas, rtol=1e-12)
 
     def test_cells_lie_in_the_home_box(self, any_tissue):
@@ -79,7 +79,7 @@ class TestPolygons:
         assert fractions.max() < 1 + 1e-9
 
     def test_cells_of_a_regular_lattice_stay_side_by_side_with_rounding(self):
-        # Centroids on the sides of the box: rounding must not throw them to either side.
+        # Centroids on the sides of the box: rounding must not move them to the other side.
         tissue = vx.initialise.hexagonal(4, 4)
         start = np.asarray(tissue.vertices - tissue.centroids[0])
         places = set()
@@ -88,7 +88,7 @@ class TestPolygons:
             places.add(tuple(np.round(cell_polygons(moved)[0].ravel(), 6) + 0.0))
         assert len(places) == 1
 
-    def test_arcs_are_as_fine_as_asked_for(self):
+    def test_number_of_points_per_arc(self):
         tissue = cluster(5)
         off = []
         for points in (1, 8, 64):
@@ -96,7 +96,7 @@ class TestPolygons:
             np.testing.assert_array_equal(sides, points * np.asarray(tissue.neighbour_counts))
             areas = [shoelace(p[:n]) for p, n in zip(polygons, sides, strict=True)]
             off.append(np.abs(areas - np.asarray(tissue.areas)).max())
-        # A polygon in an arc misses an area that falls with the square of the number of pieces.
+        # The missing area of an inscribed polygon decreases with the square of the number of pieces.
         assert off[0] > 10 * off[1]
         assert off[1] == pytest.approx(64 * off[2], rel=0.1)
         with pytest.raises(ValueError, match="`points_per_arc` must be a positive whole number"):
@@ -104,7 +104,7 @@ class TestPolygons:
 
 
 def centroid(polygon):
-    # In a frame of its own: the formula loses digits far from the origin.
+    # Relative to a corner: the formula loses digits far from the origin.
     p = polygon - polygon[0]
     q = np.roll(p, -1, axis=0)
     cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
@@ -128,9 +128,9 @@ class TestTissue:
         drawn = [key(*segment) for segment in lines_of(plot_tissue(any_tissue)).get_segments()]
         assert set(drawn) == expected
         assert len(drawn) == len(expected)
-        assert len(drawn) > any_tissue.n_edges  # those across the boundary show twice
+        assert len(drawn) > any_tissue.n_edges  # edges across the boundary are drawn twice
 
-    def test_values_go_to_their_cells_and_edges(self, any_tissue):
+    def test_values_colour_their_cells_and_edges(self, any_tissue):
         ax = plot_tissue(any_tissue, cells=any_tissue.areas, edges=any_tissue.edge_lengths)
         faces, lines = faces_of(ax), lines_of(ax)
         areas = [shoelace(path.vertices[:-1]) for path in faces.get_paths()]
@@ -138,7 +138,7 @@ class TestTissue:
         lengths = [np.linalg.norm(b - a) for a, b in lines.get_segments()]
         np.testing.assert_allclose(lines.get_array(), lengths, atol=1e-12)
 
-    def test_everything_is_in_view(self, any_tissue):
+    def test_axes_show_all_cells(self, any_tissue):
         ax = plot_tissue(any_tissue)
         polygons, _ = cell_polygons(any_tissue)
         lattice = np.asarray(any_tissue.boundary.lattice)
@@ -175,7 +175,7 @@ class TestTissue:
         ):
             faces = faces_of(plot_tissue(tissue, areas, **limits))
             assert faces.colorbar.extend == extend
-            # The bar says how far the values go that it does not show.
+            # The bar shows the extreme of the values beyond its limits.
             beyond = {"min": [areas.min()], "max": [areas.max()], "neither": []}
             beyond["both"] = beyond["min"] + beyond["max"]
             texts = [text.get_text() for text in faces.colorbar.ax.texts]
@@ -291,7 +291,7 @@ class TestOverlay:
         drawn = [abs(shoelace(path.vertices[:-1])) for path in faces.get_paths()]
         np.testing.assert_allclose(drawn, 0.64 * values, rtol=1e-9)
 
-    def test_with_an_opacity_cells_are_whole(self, tissue):
+    def test_cells_with_an_opacity_have_full_size(self, tissue):
         faces = faces_of(plot_tissue(tissue, tissue.areas, image=self.IMAGE, alpha=0.2))
         assert faces.get_alpha() == 0.2
         drawn = [abs(shoelace(path.vertices[:-1])) for path in faces.get_paths()]
@@ -304,7 +304,7 @@ class TestOverlay:
         assert 60 < low < 90
         assert 110 < high < 140
 
-    def test_flat_images_are_black_and_colour_images_are_as_they_are(self, tissue):
+    def test_flat_images_are_black_and_colour_images_are_unchanged(self, tissue):
         colours = np.random.default_rng(0).integers(0, 256, (4, 5, 3)).astype(np.uint8)
         for image, expected in (
             (np.full((4, 5), 7.0), np.zeros((4, 5, 3))),
@@ -372,7 +372,7 @@ class TestRecovery:
         assert diagonal.get_xy1() == (0, 0)
         assert diagonal.get_slope() == 1
 
-    def test_several_in_one_figure_share_one_diagonal_and_all_are_seen(self):
+    def test_several_fits_share_a_diagonal_and_are_in_the_limits(self):
         ax = plot_recovery(self.TRUE, self.TRUE + 5, label="far", deviation=np.full(4, 0.5))
         plot_recovery(self.TRUE - 3, self.TRUE - 3, ax=ax, label="near", colour="red", marker="^")
         assert len([line for line in ax.lines if hasattr(line, "get_slope")]) == 1
@@ -384,7 +384,7 @@ class TestRecovery:
         (bars,) = (c for c in ax.collections if isinstance(c, LineCollection))
         np.testing.assert_allclose([np.ptp(s[:, 1]) for s in bars.get_segments()], 1.0)
 
-    def test_what_is_not_known_is_left_out(self):
+    def test_missing_parameters_are_omitted(self):
         true, inferred = np.append(self.TRUE, np.nan), np.append(self.TRUE, 100.0)
         ax = plot_recovery(true, inferred)
         points: Any = ax.collections[0].get_offsets()
@@ -392,7 +392,7 @@ class TestRecovery:
         assert "$r$ = 1.0000" in ax.texts[0].get_text()
         assert ax.get_ylim()[1] < 5
 
-    def test_in_a_given_figure_that_no_window_shows(self):
+    def test_draws_in_a_given_figure(self):
         figure = Figure()
         assert plot_recovery(self.TRUE, self.TRUE, figure=figure).figure is figure
         assert plt.get_fignums() == []

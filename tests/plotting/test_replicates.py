@@ -54,7 +54,7 @@ class TestBand:
         np.testing.assert_allclose(line, [50.5, 10.0, 2.5])
         np.testing.assert_allclose([band(8).min(), band(8).max()], [1, 4])
 
-    def test_what_is_missing_or_has_no_logarithm_is_left_out(self):
+    def test_missing_and_nonpositive_values_are_omitted(self):
         curves = np.array([[1.0, 4.0], [np.nan, 9.0], [0.0, 3.0], [0.0, np.inf]])
         line, _ = line_and_band(plot_band(curves, log=True))
         np.testing.assert_allclose(line, [2.0, 9.0, 3.0, np.nan])

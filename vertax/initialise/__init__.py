@@ -7,6 +7,10 @@ from vertax.initialise._labels import (
     from_labels as from_labels,
 )
 from vertax.initialise._microscopy import from_microscopy as from_microscopy
+from vertax.initialise._polygons import (
+    PolygonTissue as PolygonTissue,
+    from_polygons as from_polygons,
+)
 from vertax.initialise._segmenters import (
     AbstractSegmenter as AbstractSegmenter,
     Cellpose as Cellpose,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from vertax._base.announce import announced_jit
 from vertax.mesh import Periodic, Tissue
@@ -58,9 +58,7 @@ def _crossing_sides(
     tissue: Tissue, following: Int[np.ndarray, " halfedges"], cell: Int[np.ndarray, " halfedges"]
 ) -> Bool[np.ndarray, " halfedges"]:
     """Which half-edges cross another side of their face."""
-    # Pad to a power of two, so that different sizes share the compiled function.
     n = following.size
-    more = max(64, 1 << (n - 1).bit_length()) - n
     start = np.repeat(np.asarray(tissue.vertices), 3, axis=0)
     if isinstance(tissue.boundary, Periodic):
         start = start + np.asarray(tissue.topology.frame) @ np.asarray(tissue.boundary.lattice)
@@ -74,13 +72,32 @@ def _crossing_sides(
             )
         forward = half_edge[edge] == np.arange(n)
         sides = np.column_stack([sides, np.where(forward, 1, -1) * angles[edge]])
-    last = np.bincount(cell)[cell] - 2
+    return crossed_by(sides, following, cell) != np.arange(n)
+
+
+def crossed_by(
+    sides: Float[np.ndarray, "sides parts"],
+    following: Int[np.ndarray, " sides"],
+    face: Int[np.ndarray, " sides"],
+) -> Int[np.ndarray, " sides"]:
+    """For each side another side of its face that it crosses, or itself.
+
+    **Arguments:**
+
+    - `sides`: start, vector, and if there are arcs the angle of each side.
+    - `following`: the next side of the face.
+    - `face`: the number of the face.
+    """
+    # Padded to a power of two: tissues of similar sizes share the compiled function.
+    n = following.size
+    more = max(64, 1 << (n - 1).bit_length()) - n
+    last = np.bincount(face)[face] - 2
     padded = (
         np.pad(sides, ((0, more), (0, 0))),
         np.concatenate([following, np.arange(n, n + more)]).astype(np.int32),
         np.pad(last, (0, more)).astype(np.int32),
     )
-    return np.asarray(_compiled(*map(jnp.asarray, padded)))[:n] != np.arange(n)
+    return np.asarray(_compiled(*map(jnp.asarray, padded)))[:n]
 
 
 _compiled = announced_jit(crossed_sides)

@@ -1,4 +1,4 @@
-"""Files: tissues, energies, inverse problems and trajectories; and for other programs."""
+"""Files: tissues, energies, problems, trajectories; tables and formats of other programs."""
 
 from vertax._base.atomic import atomic_write as atomic_write
 from vertax.io._bounded_tables import BoundedTables as BoundedTables
@@ -7,6 +7,8 @@ from vertax.io._data_tables import (
     edge_table as edge_table,
     write_csv as write_csv,
 )
+from vertax.io._edge_table import from_edge_table as from_edge_table
+from vertax.io._force_inference import read_force_inference as read_force_inference
 from vertax.io._geojson import write_geojson as write_geojson
 from vertax.io._image import read_image as read_image
 from vertax.io._module_file import (
@@ -15,6 +17,8 @@ from vertax.io._module_file import (
     save_energy as save_energy,
     save_problem as save_problem,
 )
+from vertax.io._read_geojson import read_geojson as read_geojson
+from vertax.io._read_table import read_table as read_table
 from vertax.io._surface_evolver import (
     Foam as Foam,
     read_surface_evolver as read_surface_evolver,
@@ -25,5 +29,6 @@ from vertax.io._trajectory import (
     load_trajectory as load_trajectory,
     save_trajectory as save_trajectory,
 )
+from vertax.io._tyssue import from_tyssue as from_tyssue
 from vertax.io._vtk import write_vtk as write_vtk
 from vertax.io._vtk_series import write_vtk_series as write_vtk_series

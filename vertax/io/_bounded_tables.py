@@ -1,4 +1,4 @@
-"""The paper's tables of a bounded tissue, whose outline is made of arcs."""
+"""The paper's tables of a bounded tissue: the outline is made of arcs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-# Vertex numbers in these tables start here: 0 and 1 mean that there is none.
+# The number of the first vertex in these tables: 0 and 1 stand for no vertex.
 _FIRST_VERTEX = 2
 
 
@@ -22,8 +22,8 @@ class BoundedTables(NamedTuple):
     - `ang_table`: the angle of each edge's arc; any number for straight edges.
     - `he_table`: the columns are previous, next and twin half-edge; source and target vertex of an
         inner edge, or 0 and 1; source and target of an arc, or 0 and 1; the face on the left. Vertices
-        are numbered from 2. Faces are counter-clockwise. The exterior side of an arc is a row of
-        zeros but for its twin.
+        are numbered from 2. Faces are counter-clockwise. The row of the exterior side of an arc is zero
+        except for its twin.
     - `face_table`: one half-edge of each face, and the type of the cell.
     """
 
@@ -54,7 +54,7 @@ def with_exterior(tables: BoundedTables) -> tuple[np.ndarray, np.ndarray]:
         )
     ends = np.where(he[:, 3:4] < _FIRST_VERTEX, he[:, 5:7], he[:, 3:5]) - _FIRST_VERTEX
     ends = np.where(outside[:, None], ends[twin][:, ::-1], ends)
-    # Around the exterior, too, the next half-edge leaves from where one arrives.
+    # Around the exterior, the next half-edge leaves the vertex at which this one ends.
     leaving = np.full(len(tables.vert_table), -1)
     leaving[ends[outside, 0]] = rows[outside]
     following[outside] = leaving[ends[outside, 1]]
@@ -72,12 +72,12 @@ def without_exterior(
     ends = np.stack([source, target], axis=1) + _FIRST_VERTEX
     outside = face == n_cells
     arc = (outside | outside[twin])[:, None]
-    nowhere = np.array([0, 1])
+    no_vertex = np.array([0, 1])
     columns = np.concatenate(
         [
             he_table[:, :3],
-            np.where(arc, nowhere, ends),
-            np.where(arc & ~outside[:, None], ends, nowhere),
+            np.where(arc, no_vertex, ends),
+            np.where(arc & ~outside[:, None], ends, no_vertex),
             face[:, None],
         ],
         axis=1,

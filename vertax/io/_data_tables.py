@@ -23,7 +23,7 @@ Column: TypeAlias = Array | np.ndarray | Sequence[Any]
 
 
 def cell_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray, " cells"]]:
-    """The cells of a tissue as a table, one row a cell.
+    """The cells of a tissue as a table with one row for each cell.
 
     ```python
     table = vx.io.cell_table(fit.tissue, p0=fit.energy.target_shape_factor)
@@ -33,7 +33,7 @@ def cell_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
-    - `columns`: columns of your own, one entry a cell.
+    - `columns`: more columns by name, one entry for each cell.
 
     **Returns:** NumPy arrays by the name of the column: `cell`, the number, from 0; `x` and `y`, the
     centroid, in the home box of a periodic tissue; `area`, `perimeter` and `shape_factor`; `sides`, the
@@ -42,26 +42,26 @@ def cell_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray
 
     **Raises:**
 
-    - `ValueError` for a batch of tissues, and for a column of another length or with a name that is
-        taken.
-    - `TypeError` for what is no tissue, and inside `jax.jit` or `jax.vmap`.
+    - `ValueError` for a batch of tissues, and for a column of another length or with the name of
+        another column.
+    - `TypeError` if `tissue` is not a tissue, and inside `jax.jit` or `jax.vmap`.
     """
     check_single(tissue)
     return cell_columns(tissue, Drawing(tissue), columns)
 
 
 def edge_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray, " edges"]]:
-    """The edges of a tissue as a table, one row an edge.
+    """The edges of a tissue as a table with one row for each edge.
 
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
-    - `columns`: columns of your own, one entry an edge.
+    - `columns`: more columns by name, one entry for each edge.
 
     **Returns:** NumPy arrays by the name of the column: `edge`, the number, from 0; `left_cell` and
     `right_cell`, where -1 is the exterior; `start_vertex` and `end_vertex`; `start_x`, `start_y`,
-    `end_x` and `end_y`, where the cell on the left is; `length`; `angle`, between chord and tangents, 0
-    for a straight edge; `on_outline`; and those of `columns`.
+    `end_x` and `end_y`, in the periodic image of the cell on the left; `length`; `angle`, between chord
+    and tangents, 0 for a straight edge; `on_outline`; and those of `columns`.
 
     **Raises:** as [`cell_table`][vertax.io.cell_table].
     """
@@ -76,9 +76,10 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
     vx.io.write_csv("cells.csv", vx.io.cell_table(tissue))
     ```
 
-    Numbers are written such that reading them gives the same bits. What is not known (NaN, NaT, None, and
-    what is masked) is an empty field, which pandas and R take for a missing value; an infinite number is
-    `Inf` or `-Inf`, a boolean `True` or `False`. The file is written atomically.
+    Numbers are written with all digits: reading them gives the same bits. Missing values (NaN, NaT, None and
+    masked entries) are empty fields, which pandas and R read as missing; an infinite number is `Inf` or
+    `-Inf`, a boolean `True` or `False`. The file is written atomically. [`read_table`][vertax.io.read_table]
+    reads it.
 
     **Arguments:**
 
@@ -88,7 +89,7 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
     **Raises:**
 
     - `ValueError` for columns of different lengths, or of more than one dimension.
-    - `TypeError` for what is no table, or holds something else than numbers, booleans, text and dates.
+    - `TypeError` if `table` is not a table, or holds other things than numbers, booleans, text and dates.
     """
     if not isinstance(table, Mapping):
         raise TypeError(
@@ -161,7 +162,7 @@ def edge_columns(
 
 
 def check_single(tissue: Tissue) -> None:
-    """Refuse a batch, what is no tissue, and one that is traced."""
+    """Raise an error unless `tissue` is one concrete tissue."""
     if not isinstance(tissue, Tissue):
         raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {describe(tissue)}.")
     if tissue.vertices.ndim != 2:
@@ -170,7 +171,7 @@ def check_single(tissue: Tissue) -> None:
             f"{tissue.vertices.shape}. Write the members of a batch one by one: "
             "jax.tree.map(lambda x: x[0], tissue) is the first."
         )
-    check_concrete("What writes a tissue", tissue)
+    check_concrete("A function that writes a tissue", tissue)
 
 
 def _joined(
@@ -204,7 +205,7 @@ def _as_column(name: str, column: Column) -> np.ndarray:
         raise ValueError(
             f"Column `{name}` must hold one entry a row, but its entries have different lengths."
         ) from error
-    # bfloat16 and the like are no numbers to other programs.
+    # Other programs cannot read bfloat16 and similar types.
     foreign = array.dtype.kind == "V" and jnp.issubdtype(array.dtype, jnp.floating)
     return array.astype(np.float32) if foreign else array
 
@@ -219,10 +220,10 @@ def _text(name: str, value: Any) -> str:
             return ""
         if math.isinf(value):
             return "Inf" if value > 0 else "-Inf"
-    known = str | bool | np.bool_ | numbers.Real | np.datetime64 | datetime.date | datetime.time
-    if not isinstance(value, known) and not isinstance(value, os.PathLike):
+    writable = str | bool | np.bool_ | numbers.Real | np.datetime64 | datetime.date | datetime.time
+    if not isinstance(value, writable) and not isinstance(value, os.PathLike):
         raise TypeError(
-            f"Column `{name}` must hold numbers, booleans or text, but holds {describe(value)}. Write the "
-            "parts of what is more (the real and the imaginary one, say) as columns of their own."
+            f"Column `{name}` must hold numbers, booleans or text, but holds {describe(value)}. Write parts "
+            "(the real and the imaginary one, for example) as separate columns."
         )
     return str(value)

@@ -29,10 +29,11 @@ def write_geojson(
 ) -> None:
     """Write the cells of a tissue as polygons to a GeoJSON file (RFC 7946).
 
-    A `FeatureCollection` with one `Polygon` a cell, whose properties are the columns of
-    [`cell_table`][vertax.io.cell_table]. Periodic cells are whole, as in pictures. Coordinates are in
-    the tissue's units of length, and stand for no place on earth. The JSON is strict: a property that
-    is not finite is null. The file is written atomically.
+    A `FeatureCollection` with one `Polygon` for each cell. Its properties are the columns of
+    [`cell_table`][vertax.io.cell_table]. Periodic cells are drawn in one piece, as in pictures.
+    Coordinates are in the tissue's units of length, not longitude and latitude. The JSON is strict: a
+    property that is not finite is null. The file is written atomically. See
+    [`read_geojson`][vertax.io.read_geojson] and [`read_table`][vertax.io.read_table].
 
     ```python
     vx.io.write_geojson("cells.geojson", tissue, cells={"pressure": pressure})
@@ -42,24 +43,24 @@ def write_geojson(
 
     - `path`: the file.
     - `tissue`: the [`Tissue`][vertax.Tissue].
-    - `cells`: more properties of the cells by name, one entry a cell.
-    - `edges`: properties of the edges. If given (`{}` will do), the edges are written as `LineString`,
+    - `cells`: more properties of the cells by name, one entry for each cell.
+    - `edges`: properties of the edges. If given (an empty `{}` too), the edges are written as `LineString`,
         with the columns of [`edge_table`][vertax.io.edge_table], to a second file:
         `cells-edges.geojson` next to `cells.geojson`.
     - `points_per_arc`: number of straight pieces of an arc.
 
     **Raises:**
 
-    - `ValueError` for a batch of tissues, positions that are not finite, less than one point an arc,
+    - `ValueError` for a batch of tissues, positions that are not finite, `points_per_arc` below 1,
         and as [`cell_table`][vertax.io.cell_table].
     """
     drawing = checked_drawing(tissue, points_per_arc)
     if not np.isfinite(drawing.lines[drawing.cell < drawing.n_cells]).all():
         raise ValueError(
-            "Argument `tissue` must have finite positions: JSON has no numbers that are not."
+            "Argument `tissue` must have finite positions: JSON has no NaN and no infinity."
         )
     polygons, counts = drawing.polygons()
-    # A ring ends where it began.
+    # The last point of a ring repeats the first.
     rings = [
         [[*polygon[:n].tolist(), polygon[0].tolist()]]
         for polygon, n in zip(polygons, counts, strict=True)
@@ -83,14 +84,14 @@ def write_geojson(
 
 
 def checked_drawing(tissue: Tissue, points_per_arc: int) -> Drawing:
-    """The geometry that files need, arguments checked."""
+    """The geometry of one tissue, for files; checks the arguments."""
     check_single(tissue)
     check_integer("points_per_arc", points_per_arc, at_least=1)
     return Drawing(tissue, points_per_arc)
 
 
 def edge_path(path: str | os.PathLike[str]) -> Path:
-    """The file of the edges that goes with a file of the cells."""
+    """The path of the edges, from that of the cells: `cells-edges.geojson`."""
     path = Path(path)
     return path.with_name(f"{path.stem}-edges{path.suffix}")
 
@@ -112,7 +113,7 @@ def _strict(name: str, value: Any) -> Any:
         return value.isoformat()
     if not (value is None or isinstance(value, str | bool | int | float)):
         raise TypeError(
-            f"Column `{name}` must hold numbers, booleans or text, which is what JSON has, but holds "
+            f"Column `{name}` must hold numbers, booleans or text, which JSON can store, but holds "
             f"{describe(value)}."
         )
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -17,10 +17,10 @@ _TIFF = (".tif", ".tiff")
 def read_image(
     path: str | os.PathLike[str], *, channel: int | None = None, plane: int | None = None
 ) -> Shaped[np.ndarray, "rows columns"]:
-    """One two-dimensional image from a TIFF, PNG, JPEG, … file, in the numbers it is stored in.
+    """Read one two-dimensional image from a TIFF, PNG, JPEG, … file, with the number type of the file.
 
-    A grey image that is stored in colours, with three channels alike, is read without a choice of the
-    channel; and a channel of transparency that is the same everywhere does not count.
+    A grey image stored as a colour image (three equal channels) needs no `channel`. A constant alpha
+    channel is ignored.
 
     **Arguments:**
 
@@ -34,10 +34,10 @@ def read_image(
     **Raises:**
 
     - `FileNotFoundError` if there is no such file.
-    - `ValueError` if it is not an image of real numbers, if it has channels or planes and none was chosen,
-        or not the one that was.
-    - `TypeError` for a channel or plane that is no whole number.
-    - `ImportError` if what reads the file is not installed: the extra `[image]`.
+    - `ValueError` if it is not an image of real numbers, if it has several channels or planes and the
+        argument is missing, or if there is no such channel or plane.
+    - `TypeError` for a channel or plane that is not an integer.
+    - `ImportError` if the package that reads the file is not installed: the extra `[image]`.
     """
     file = Path(path)
     if not file.exists():
@@ -51,7 +51,7 @@ def read_image(
     if pixels.dtype.kind not in "biuf":
         raise ValueError(
             f"Argument `path` must name an image of real numbers, but {file} holds {pixels.dtype}. Save "
-            "what you need of it, such as numpy.abs of complex numbers, as another file."
+            "real numbers, such as numpy.abs of complex ones, as another file."
         )
     rows, columns = axes.index("Y"), axes.index("X")
     channels = [i for i, axis in enumerate(axes) if axis in "CS"]
@@ -68,14 +68,16 @@ def read_image(
 
 
 def _read(file: Path) -> tuple[np.ndarray, str]:
-    """The whole file, and a letter for each of its axes."""
+    """All pixels of the file, and a letter for each axis."""
     try:
         pixels, axes = (_read_tiff if file.suffix.lower() in _TIFF else _read_picture)(file)
         if pixels.ndim != len(axes) or not {"Y", "X"} <= set(axes):
             raise ValueError(f"its axes are {axes} with shape {pixels.shape}")
     except ImportError:
         raise
-    except Exception as error:  # each reader has exceptions of its own for what it cannot decode
+    except (
+        Exception
+    ) as error:  # each reader raises other exceptions for files that it cannot decode
         raise ValueError(
             f"Argument `path` must name an image file, but {file} cannot be read as one: {error}"
         ) from error
@@ -99,7 +101,7 @@ def _read_picture(file: Path) -> tuple[np.ndarray, str]:
         from PIL import Image
 
     with Image.open(file) as picture:
-        # Palette indices are no intensities.
+        # Palette indices are not intensities.
         pixels = np.asarray(picture.convert("RGB") if picture.mode == "P" else picture)
         transparent = pixels.ndim == 3 and picture.mode.endswith(("A", "a"))
     if transparent:
@@ -110,7 +112,7 @@ def _read_picture(file: Path) -> tuple[np.ndarray, str]:
 def _without_transparency(
     pixels: Shaped[np.ndarray, "*shape samples"],
 ) -> Shaped[np.ndarray, "*shape fewer_samples"]:
-    """Without the last channel, if it says nothing."""
+    """Drop the last channel if it is constant."""
     alpha = pixels[..., -1]
     return pixels[..., :-1] if np.all(alpha == alpha.flat[0]) else pixels
 

@@ -1,4 +1,4 @@
-"""Energies and inverse problems in files: a tree of class names and fields, and the arrays beside it."""
+"""Files of energies and inverse problems: a tree of class names and fields, and the arrays."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _VERSION = 1
 
 _Module = TypeVar("_Module", bound=eqx.Module)
 
-# The functions that a field may hold, by the name that a file knows them by.
+# The functions that a field may hold, by their names in files.
 _FUNCTIONS: dict[str, Callable] = {
     "equinox.is_array": eqx.is_array,
     "equinox.is_array_like": eqx.is_array_like,
@@ -58,8 +58,8 @@ _ODD_FLOATS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 def save_energy(path: str | os.PathLike[str], energy: AbstractEnergy) -> None:
     """Save an energy with its parameters to a file, exactly.
 
-    Arrays keep their bits and their precision, and Python numbers stay what they are: what a fit
-    adjusts by default, and what not, is the same after loading.
+    Arrays keep their bits and their precision, and Python numbers stay Python numbers: a fit adjusts the
+    same parameters by default after loading.
 
     The file is a NumPy `.npz` archive without pickles: `format` and `version` (the header), `tree` (the
     classes and their fields, as JSON), and each array by its place in the tree, such as
@@ -69,14 +69,14 @@ def save_energy(path: str | os.PathLike[str], energy: AbstractEnergy) -> None:
     **Arguments:**
 
     - `path`: the file, by custom with the ending `.npz`; taken as it is.
-    - `energy`: an energy of vertax or of your own, or a sum of such. Fields may hold arrays, keys of random
-        numbers, numbers, text, None, tuples, lists, dictionaries and modules.
+    - `energy`: an energy of vertax, one of your classes, or a sum of energies. Fields may hold arrays,
+        keys of random numbers, numbers, text, None, tuples, lists, dictionaries and modules.
 
     **Raises:**
 
-    - `TypeError` if `energy` is none.
-    - `ValueError`, naming the field, for what has no place in a file (functions, say), and for
-        numbers of a precision that NumPy does not know.
+    - `TypeError` if `energy` is not an energy.
+    - `ValueError`, naming the field, for objects that cannot be stored (functions, for example), and for
+        number types that NumPy does not have.
     - `OSError` if the file cannot be written.
     """
     _save(path, "energy", energy, AbstractEnergy)
@@ -87,7 +87,7 @@ def load_energy(
 ) -> AbstractEnergy:
     """Load an energy that [`save_energy`][vertax.io.save_energy] wrote.
 
-    A file names classes, but brings no code: they are those of vertax, and those that you pass.
+    A file holds the names of classes but no code: the classes are those of vertax and those in `classes`.
 
     ```python
     energy = vx.io.load_energy("energy.npz", classes=[Contractility])
@@ -96,36 +96,36 @@ def load_energy(
     **Arguments:**
 
     - `path`: the file.
-    - `classes`: classes of your own that the energy is made of, found by their name. Objects are made
-        without calling `__init__`. A field that was added to a class since gets its default.
+    - `classes`: your classes that the energy contains, identified by their names. Objects are made
+        without calling `__init__`. A field that was added to a class later gets its default.
 
     **Returns:** the energy, bit for bit as it was saved.
 
     **Raises:**
 
     - `FileNotFoundError` if there is no such file.
-    - `ValueError`, with the file's name, if it is no energy file, is truncated or damaged, was written
-        by a newer version, names a class that is not known, or holds 64-bit numbers while JAX is
+    - `ValueError`, with the file's name, if it is not an energy file, is truncated or damaged, was written
+        by a newer version, contains a class that is not in `classes`, or holds 64-bit numbers while JAX is
         limited to 32 bits (nothing is rounded silently: enable `jax_enable_x64`).
     """
     return _load(path, "energy", AbstractEnergy, classes)
 
 
 def save_problem(path: str | os.PathLike[str], problem: InverseProblem[Any]) -> None:
-    """Save an inverse problem with all that it consists of: tissue, energy, cost and settings.
+    """Save an inverse problem: tissue, energy, cost and settings.
 
-    The file is like that of [`save_energy`][vertax.io.save_energy]. A batch of problems, as
-    [`fit`][vertax.fit] takes it, is one file too.
+    The format is that of [`save_energy`][vertax.io.save_energy]. A batch of problems for
+    [`fit`][vertax.fit] is saved as one file too.
 
-    Functions have no place in a file (but the default `trainable`, and a few others of Equinox and
-    Optimistix). So a solver such as [`Optax`][vertax.solvers.Optax] is left out and given again:
+    Functions cannot be stored (except the default `trainable`, and a few of Equinox and Optimistix). So
+    remove a solver such as [`Optax`][vertax.solvers.Optax] before saving, and set it again after loading:
 
     ```python
     vx.io.save_problem("problem.npz", dataclasses.replace(problem, response=vx.Relaxation()))
     problem = dataclasses.replace(vx.io.load_problem("problem.npz"), response=problem.response)
     ```
 
-    and a `trainable` of your own is written as booleans, `jax.tree.map(trainable, energy)`.
+    and write another `trainable` as booleans, `jax.tree.map(trainable, energy)`.
 
     **Arguments:**
 
@@ -188,7 +188,7 @@ def _load(
         if user_classes.setdefault(cls.__name__, cls) is not cls:
             raise ValueError(
                 f"Argument `classes` holds two classes of the name {cls.__name__}, which a file cannot "
-                "tell apart. Rename one."
+                "distinguish. Rename one."
             )
     arrays = read_archive(path, what, _VERSION)
     try:
@@ -205,7 +205,7 @@ def _load(
 
 @functools.cache
 def _public_classes() -> dict[str, type[eqx.Module]]:
-    """The classes of vertax by the name that a file knows them by."""
+    """The classes of vertax by their names in files."""
     single = (Arcs, Free, InTurn, InverseProblem, Periodic, T1, T2, Tissue, Topology)
     classes: dict[str, type[eqx.Module]] = {cls.__name__: cls for cls in single}
     families = (
@@ -232,7 +232,7 @@ def _public_classes() -> dict[str, type[eqx.Module]]:
 
 
 class _Writer:
-    """Turns modules into what JSON can hold, and puts arrays aside."""
+    """Convert modules to JSON, and collect their arrays."""
 
     def __init__(self, argument: str):
         self.argument = argument
@@ -282,10 +282,10 @@ class _Writer:
 
     def array(self, kind: str, value: Any, path: str) -> dict[str, Any]:
         dtype = value.dtype
-        # bfloat16 and the like come back from a file as raw bytes.
+        # NumPy would read bfloat16 and similar types as raw bytes.
         if not isinstance(dtype, np.dtype) or dtype.kind not in "biufc":
             raise ValueError(
-                f"Argument `{self.argument}` must hold numbers of a type NumPy knows, but its "
+                f"Argument `{self.argument}` must hold numbers of a NumPy type, but its "
                 f"`{path[1:]}` is {dtype}. Convert it before saving, such as to float32."
             )
         name = f"data{path}"
@@ -298,7 +298,8 @@ class _Writer:
         if name is None and cls.__module__.split(".")[0] == "vertax":
             raise ValueError(
                 f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is of class {cls.__name__}, "
-                f"which is no energy, cost, adjoint, solver or other part of a problem. {self.remedy(path)}"
+                f"which is not an energy, cost, adjoint, solver or other part of a problem. "
+                f"{self.remedy(path)}"
             )
         held = vars(module)
         names = [field.name for field in dataclasses.fields(cls) if field.name in held]
@@ -308,7 +309,7 @@ class _Writer:
 
 
 class _Reader:
-    """The way back from what `_Writer` wrote; nothing in a file is taken for granted."""
+    """Rebuild the modules that `_Writer` wrote; everything in the file is checked."""
 
     def __init__(
         self,
@@ -348,7 +349,7 @@ class _Reader:
             case {"kind": "vertax" | "own" as kind, "class": str(name), "fields": dict(fields)}:
                 return self.module(self.find(kind, name, path), fields, path)
         raise ValueError(
-            f"{self.file} is broken: `{path}` is none of the things that a file may hold."
+            f"{self.file} is broken: `{path}` is not one of the things that a file may hold."
         )
 
     def array(self, name: str) -> np.ndarray:
@@ -357,20 +358,20 @@ class _Reader:
         return self.arrays[name]
 
     def key(self, name: str, generator: str, path: str) -> jax.Array:
-        """Keys of random numbers, from what they consist of."""
+        """Keys of random numbers, from their data."""
         data = as_jax(self.array(name), self.file)
         try:
             return jax.random.wrap_key_data(data, impl=generator)
         except Exception as error:
             raise ValueError(
-                f"{self.file} is broken: `{path}` is no key of the generator {generator!r} ({error})."
+                f"{self.file} is broken: `{path}` is not a key of the generator {generator!r} ({error})."
             ) from error
 
     def find(self, kind: str, name: str, path: str) -> type[eqx.Module]:
         if kind == "vertax":
             if name not in _public_classes():
                 raise ValueError(
-                    f"{self.file} names {name} of vertax (at `{path}`), which this vertax does not have. "
+                    f"{self.file} contains {name} of vertax (at `{path}`), which this version does not have. "
                     "Update vertax."
                 )
             return _public_classes()[name]
@@ -382,16 +383,16 @@ class _Reader:
         return self.user_classes[name]
 
     def module(self, cls: type[eqx.Module], nodes: dict[str, Any], path: str) -> eqx.Module:
-        known = {field.name: field for field in dataclasses.fields(cls)}
+        declared = {field.name: field for field in dataclasses.fields(cls)}
         for name in nodes:
-            if name not in known:
+            if name not in declared:
                 raise ValueError(
                     f"{self.file} has a field `{name}` (at `{path}`) that the class {cls.__name__} does "
                     "not have: it was written with another version of that class."
                 )
-        # As Equinox does when it rebuilds a tree. What `__init__` makes of its arguments has happened.
+        # As Equinox rebuilds a tree, without `__init__`: the fields hold its results.
         module = object.__new__(cls)
-        for name, field in known.items():
+        for name, field in declared.items():
             if name in nodes:
                 value = self.node(nodes[name], f"{path}.{name}")
             else:
@@ -412,23 +413,23 @@ class _Reader:
         )
 
     def check(self, module: eqx.Module, path: str) -> None:
-        """Check what would go unnoticed later: JAX has no error for an index that is out of range."""
-        # In a batch, and where booleans stand for what is trainable, there is no single tissue.
+        """Check tissues and topologies: JAX raises no error for an index that is out of range."""
+        # In a batch, and in a tree of booleans (`trainable`), there is no single tissue.
         try:
             if isinstance(module, Topology) and np.ndim(module.twin) == 1:
                 module.validate()
             if isinstance(module, Tissue) and np.ndim(module.vertices) == 2:
-                wanted = (module.topology.n_vertices, 2)
-                if module.vertices.shape != wanted:
+                expected = (module.topology.n_vertices, 2)
+                if module.vertices.shape != expected:
                     raise ValueError(
-                        f"`vertices` has shape {module.vertices.shape}, but must have {wanted}."
+                        f"`vertices` has shape {module.vertices.shape}, but must have {expected}."
                     )
         except Exception as error:
             raise ValueError(f"{self.file} is broken: `{path}`: {error}") from error
 
 
 def _weakly_typed(array: jax.Array) -> jax.Array:
-    """The same numbers as what JAX makes of a Python number, which takes the precision of its partner."""
+    """The same numbers with a weak type, as JAX gives Python numbers."""
     zero = {"i": 0, "f": 0.0, "c": 0j}.get(array.dtype.kind)
     filled = None if zero is None else jnp.full(array.shape, zero)
     if filled is None or filled.dtype != array.dtype:

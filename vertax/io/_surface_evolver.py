@@ -1,4 +1,4 @@
-"""Dumps of Surface Evolver: planar foams whose tensions and pressures are known."""
+"""Dumps of Surface Evolver: planar foams with their tensions and pressures."""
 
 from __future__ import annotations
 
@@ -11,27 +11,29 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from vertax.mesh import Free, Tissue, Topology
+from vertax.mesh import Free, Tissue
 from vertax.mesh._arcs import angle_of_area
+from vertax.mesh._faces import Names, Sides, build_faces
 
 
 class Foam(eqx.Module):
     """A foam of Surface Evolver."""
 
     tissue: Tissue
-    """Its cells as a free tissue with arcs, inner ones too. Each arc encloses what its chain of pieces does,
-    so areas are those of the file."""
+    """Its cells as a free tissue with inner arcs. Each arc encloses the same area over its chord as its chain
+    of pieces: areas are those of the file."""
     tensions: Float[Array, " edges"]
     """Line tension of each edge, energy per length: the `density` of its pieces. Where they differ, as they
-    may on the outline, their mean by length."""
+    may on the outline, their mean by length. Of an edge of length 0 (where more than three edges meet), the
+    mean of the edges that meet there."""
     tension_spreads: Float[Array, " edges"]
     """The largest difference between pieces of an edge; 0 where they agree."""
     pressures: Float[Array, " cells"]
     """Lagrange multipliers of the areas, energy per area; 0 for cells without."""
     target_areas: Float[Array, " cells"]
-    """What the areas are held at; the area where a cell has none."""
+    """Fixed areas (`volume`) of the cells; the area where a cell has none."""
     time: float
     """`TOTAL_TIME`."""
     chains: tuple[Float[np.ndarray, "_ 2"], ...]
@@ -45,8 +47,10 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
     doi:10.1080/10586458.1992.10504253).
 
     Vertices, edges (with `density`), faces and bodies (with `volume` and `lagrange_multiplier`) are read, in
-    the string model; commands at the end are not. Vertices at which three edges meet become those of the
-    tissue, and what lies between is one edge.
+    the string model; commands at the end are not. Points at which three edges meet become the vertices of the
+    tissue; a chain of pieces between two of them becomes one edge. A point at which k > 3 edges meet becomes
+    k - 2 vertices, joined by edges of length 0. The order of edges at a vertex is that of the faces there,
+    also where chains cross.
 
     **Arguments:**
 
@@ -57,8 +61,8 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
     **Raises:**
 
     - `OSError` if the file cannot be read.
-    - `ValueError`, naming the file and the place, for one that is no such file or ends too soon, a foam that
-        is not planar, vertices at which more than three edges meet, and cells that make no cluster.
+    - `ValueError`, naming the file and the place, for a file of another kind or a truncated one, a foam that
+        is not planar, and bodies that overlap, touch in a point only, enclose a hole or lie apart.
     """
     path = Path(path)
     pieces = _parsed(path)
@@ -66,12 +70,12 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
 
 
 class _Pieces(NamedTuple):
-    """What the file holds, numbered from 0."""
+    """The elements of the file, numbered from 0."""
 
     points: Float[np.ndarray, "points 2"]
     edges: Int[np.ndarray, "edges 2"]
     density: Float[np.ndarray, " edges"]
-    # Of each body: edges from 1, negative if backwards; counter-clockwise.
+    # Of each body: numbers of its edges from 1, counter-clockwise; negative: against the edge.
     loops: list[Int[np.ndarray, " _"]]
     pressures: Float[np.ndarray, " bodies"]
     volumes: Float[np.ndarray, " bodies"]
@@ -85,7 +89,7 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def _parsed(path: Path) -> _Pieces:
-    broken = lambda what: ValueError(f"{path} is no planar foam of Surface Evolver: {what}.")
+    broken = lambda what: ValueError(f"{path} is not a planar foam of Surface Evolver: {what}.")
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -112,7 +116,7 @@ def _parsed(path: Path) -> _Pieces:
             rows[section].append(words)
     for name in _SECTIONS:
         if not rows[name]:
-            raise broken(f"it has no section `{name}`, or ends before")
+            raise broken(f"it has no section `{name}`, or is truncated")
     try:
         points = {int(w[0]): (float(w[1]), float(w[2])) for w in rows["vertices"]}
         edges = {
@@ -137,7 +141,7 @@ def _parsed(path: Path) -> _Pieces:
             for body, *_ in bodies
         ]
     except KeyError as error:
-        raise broken(f"element {error} is used and not there; it may end too soon") from error
+        raise broken(f"element {error} is used but missing; the file may be truncated") from error
     where = np.array(list(points.values()))
     loops = [_counter_clockwise(loop, ends, where, broken) for loop in loops]
     return _Pieces(
@@ -159,13 +163,13 @@ def _after(words: list[str], name: str, default: float) -> float:
 
 
 def _integers(words: list[str]) -> list[int]:
-    """The integers that a row begins with."""
-    found = []
+    """The leading integers of a row."""
+    integers = []
     for word in words:
         if not re.fullmatch(r"[-+]?\d+", word):
             break
-        found.append(int(word))
-    return found
+        integers.append(int(word))
+    return integers
 
 
 def _turned(faces: dict[int, list[int]], body: list[int]) -> list[int]:
@@ -186,67 +190,50 @@ def _counter_clockwise(
     start = np.where(loop > 0, ends[np.abs(loop) - 1, 0], ends[np.abs(loop) - 1, 1])
     stop = np.where(loop > 0, ends[np.abs(loop) - 1, 1], ends[np.abs(loop) - 1, 0])
     if not np.array_equal(stop, np.roll(start, -1)):
-        raise broken("the edges of a face make no closed loop")
+        raise broken("the edges of a face are not a closed loop")
     x, y = points[start].T
     area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
     return loop if area > 0 else -loop[::-1]
 
 
 def _foam(pieces: _Pieces, path: Path) -> Foam:
-    n_cells, n_pieces = len(pieces.loops), len(pieces.edges)
     # A directed piece is 2 e along edge e and 2 e + 1 against it.
-    directed = [2 * (np.abs(loop) - 1) + (loop < 0) for loop in pieces.loops]
-    face = np.full(2 * n_pieces, n_cells)
-    for cell, loop in enumerate(directed):
-        face[loop] = cell
-    used = np.minimum(face[0::2], face[1::2]) < n_cells
-    source = np.stack([pieces.edges[:, 0], pieces.edges[:, 1]], axis=1).ravel()
-    degree = np.bincount(pieces.edges[used].ravel(), minlength=len(pieces.points))
-    if degree.max() > 3:
-        raise ValueError(
-            f"{path}: {degree.max()} edges meet at the point {pieces.points[np.argmax(degree)].tolist()}, "
-            "and in a tissue three do. Split it by a short edge, e.g. with `pop`."
-        )
-    junction = degree == 3
-    following = np.full(2 * n_pieces, -1)
-    for loop in directed:
-        following[loop] = np.roll(loop, -1)
-    # Around the exterior the next piece leaves from where one arrives, and there is one such.
-    outside = (face == n_cells) & np.repeat(used, 2)
-    leaving = np.full(len(pieces.points), -1)
-    leaving[source[outside]] = np.flatnonzero(outside)
-    following[outside] = leaving[source[np.flatnonzero(outside) ^ 1]]
-
-    begins = np.flatnonzero(junction[source] & np.repeat(used, 2))
-    if len(begins) == 0:
-        raise ValueError(
-            f"{path}: no three edges meet anywhere, so there are no cells side by side."
-        )
-    chains = {int(first): _chain(int(first), following, junction[source]) for first in begins}
-    # Half-edges 3 v, 3 v + 1, 3 v + 2 leave vertex v counter-clockwise.
-    way = pieces.points[source[begins ^ 1]] - pieces.points[source[begins]]
-    order = np.lexsort((np.arctan2(way[:, 1], way[:, 0]), source[begins]))
-    begins = begins[order]
-    slot = {int(first): number for number, first in enumerate(begins)}
-    twin = np.array([slot[chains[int(first)][-1] ^ 1] for first in begins])
-    topology = Topology(twin, face[begins], np.zeros((len(begins), 2), int), exterior=True)
+    directed = np.concatenate([2 * (np.abs(loop) - 1) + (loop < 0) for loop in pieces.loops])
+    cell = np.repeat(np.arange(len(pieces.loops)), [len(loop) for loop in pieces.loops])
+    corner = pieces.edges.ravel()[directed]
+    names = Names(
+        f"{path} is not a planar foam: its bodies",
+        lambda point: f"the point {pieces.points[point].tolist()}",
+        lambda body: f"body {pieces.bodies[body]}",
+    )
+    sides = Sides(corner, np.zeros((len(corner), 2), int), cell)
+    mesh = build_faces(pieces.points, sides, names, exterior=True)
+    topology, vertices = mesh.topology, pieces.points[mesh.points]
 
     length = np.linalg.norm(np.diff(pieces.points[pieces.edges], axis=1)[:, 0], axis=1)
-    tensions, spreads, angles, courses = [], [], [], []
-    for half_edge in np.asarray(topology.half_edge):
-        chain = chains[int(begins[half_edge])]
-        which = np.array(chain) // 2
-        course = pieces.points[[source[chain[0]], *(source[piece ^ 1] for piece in chain)]]
+    ends = np.asarray(topology.edge_vertices)
+    n_edges = topology.n_edges
+    tensions, spreads, angles = np.full(n_edges, np.nan), np.zeros(n_edges), np.zeros(n_edges)
+    courses, chains = [], mesh.chains()
+    for edge, half_edge in enumerate(np.asarray(topology.half_edge)):
+        chain = chains[half_edge]
+        course = np.append(pieces.points[corner[chain]], vertices[ends[edge, 1:]], axis=0)
+        if not len(chain):  # an edge of length 0
+            courses.append(vertices[ends[edge]])
+            continue
+        which = directed[chain] // 2
         density = pieces.density[which]
-        tensions.append(np.average(density, weights=np.maximum(length[which], 1e-300)))
-        spreads.append(np.ptp(density))
+        tensions[edge] = np.average(density, weights=np.maximum(length[which], 1e-300))
+        spreads[edge] = np.ptp(density)
         courses.append(course)
         chord = course[-1] - course[0]
         rest = course - course[0]
         bulge = 0.5 * np.sum(rest[:-1, 0] * rest[1:, 1] - rest[:-1, 1] * rest[1:, 0])
-        angles.append(angle_of_area(np.array([bulge]), np.array([np.linalg.norm(chord)]))[0])
-    vertices = pieces.points[source[begins[::3]]]
-    tissue = Tissue(vertices, topology, Free(), angles=np.array(angles), inner_arcs=True)
+        angles[edge] = angle_of_area(np.array([bulge]), np.array([np.linalg.norm(chord)]))[0]
+    points = mesh.points[ends]
+    for edge in np.flatnonzero(np.isnan(tensions)):
+        tensions[edge] = np.nanmean(tensions[np.any(points == points[edge, 0], axis=1)])
+    tissue = Tissue(vertices, topology, Free(), angles=angles, inner_arcs=True)
     areas = np.asarray(tissue.areas)
     volumes = np.where(np.isnan(pieces.volumes), areas, pieces.volumes)
     as_numbers = lambda values: jnp.asarray(values, tissue.vertices.dtype)
@@ -260,13 +247,3 @@ def _foam(pieces: _Pieces, path: Path) -> Foam:
         chains=tuple(courses),
         bodies=pieces.bodies,
     )
-
-
-def _chain(
-    first: int, following: Int[np.ndarray, " directed"], begins: Bool[np.ndarray, " directed"]
-) -> list[int]:
-    """Pieces from one junction to the next."""
-    chain = [first]
-    while not begins[following[chain[-1]]]:
-        chain.append(int(following[chain[-1]]))
-    return chain

@@ -83,7 +83,7 @@ def from_tables(tables: Tables | BoundedTables, *, softening: float | None = Non
     **Arguments:**
 
     - `tables`: the [`Tables`][vertax.io.Tables], or the [`BoundedTables`][vertax.io.BoundedTables] of
-        a free tissue (whose cell types are not part of a tissue).
+        a free tissue (its cell types are not stored in the tissue).
     - `softening`: passed on to [`Tissue`][vertax.Tissue]; the paper's code has none, that is 0.
 
     **Returns:** a [`Tissue`][vertax.Tissue] with a rectangular [`Periodic`][vertax.Periodic]
@@ -130,7 +130,7 @@ def _from_bounded_tables(tables: BoundedTables, softening: float | None) -> Tiss
     closed = Tables(vert_table, he_table, face_table, 1.0, 1.0)
     _check_rows(closed)
     topology = _topology(closed, np.zeros((len(he_table), 2), int), exterior=True)
-    # The polygon of the outline shows which way the faces run.
+    # The sign of the area gives the sense of rotation of the faces.
     x, y = vert_table[he_table[:, 3]].T
     u, v = vert_table[he_table[:, 4]].T
     cover = 0.5 * np.sum((x * v - y * u)[he_table[:, 5] < len(tables.face_table)])
@@ -161,7 +161,7 @@ def _topology(tables: Tables, frame: np.ndarray, *, exterior: bool) -> Topology:
 
 
 def _dtype(positions: np.ndarray) -> Any:
-    """Positions in float32 stay so; all others get the precision that JAX is set to."""
+    """float32 for float32 positions, otherwise the default precision of JAX."""
     return np.float32 if positions.dtype == np.float32 else jnp.result_type(float)
 
 
@@ -170,14 +170,13 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
 
     Vertices and cells keep their numbers; edge `e` becomes rows `2 e` (in the edge's direction) and
     `2 e + 1`, as in the paper's files, so `np.repeat(values, 2)` takes values per edge to the rows.
-    Spare slots are left out, and what there is numbered anew. Vertices outside the box are moved into it by
-    whole boxes; the others keep their bits. The
-    tables have no softening.
+    Spare slots are left out, and the rest is renumbered in order. Vertices outside the box are moved into it
+    by multiples of its sides; the others keep their bits. The tables have no softening.
 
     **Arguments:**
 
-    - `tissue`: a [`Tissue`][vertax.Tissue] in a rectangular periodic box, or a free one whose inner
-        edges are straight.
+    - `tissue`: a [`Tissue`][vertax.Tissue] in a rectangular periodic box, or a free one with straight
+        inner edges.
 
     **Returns:** the [`Tables`][vertax.io.Tables], or the [`BoundedTables`][vertax.io.BoundedTables] of
     a free tissue (all cells of type 0).
@@ -323,22 +322,22 @@ def _check_rows(tables: Tables) -> None:
 def _frames(
     following: np.ndarray, start: np.ndarray, offset: np.ndarray, sides: np.ndarray
 ) -> np.ndarray:
-    """Box that each row's source lies in, seen from its face's first row (`start`).
+    """Box of each row's source, relative to the first row of its face (`start`).
 
-    Walks around all faces at once, one side at a time, adding up offsets.
+    Sums the offsets around all faces at once, one side at a time.
     """
     frame = np.zeros_like(offset)
-    row, here = start, np.zeros((len(start), 2), offset.dtype)
+    row, image = start, np.zeros((len(start), 2), offset.dtype)
     for _ in range(sides.max()):
-        frame[row] = here
-        here = here + offset[row]
+        frame[row] = image
+        image = image + offset[row]
         row = following[row]
-        # A face that is back at its first row has to be back in its first box.
-        back = row == start
-        torn = np.flatnonzero(back & np.any(here != 0, axis=1))
-        if torn.size:
+        # At its first row a face must be in its first box again.
+        closed = row == start
+        broken = np.flatnonzero(closed & np.any(image != 0, axis=1))
+        if broken.size:
             raise ValueError(
                 "Table `he_table` is broken: offsets must add up to zero around every face (first "
-                f"offenders: faces {torn[:3].tolist()})."
+                f"offenders: faces {broken[:3].tolist()})."
             )
     return frame

@@ -1,4 +1,4 @@
-"""One tissue, one file."""
+"""Files of one tissue."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _INT32 = np.iinfo(np.int32)
 
 
 class _BoundaryRecord(NamedTuple):
-    """How one class of boundary is written: its arrays by field name, handed back as keywords."""
+    """How one class of boundary is stored: its arrays by field name, which are arguments of `build`."""
 
     build: Callable[..., AbstractBoundary]
     fields: dict[str, tuple[int | None, ...]]
     """Shape of each array; None is any length."""
 
 
-# A new boundary class is one more entry. Names and fields are part of the file format: they stay.
+# A new boundary class is one more entry. Names and fields are part of the file format: do not change them.
 _BOUNDARIES: dict[str, _BoundaryRecord] = {
     "periodic": _BoundaryRecord(Periodic, {"lattice": (2, 2)}),
     "free": _BoundaryRecord(Free, {}),
@@ -49,9 +49,9 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
 
     **Raises:**
 
-    - `ValueError` for a batch of tissues, for a precision NumPy does not know, or for a boundary
-        that has no place in the format.
-    - `TypeError` for what is no tissue.
+    - `ValueError` for a batch of tissues, for number types that NumPy does not have, or for a
+        boundary class that the format does not have.
+    - `TypeError` if `tissue` is not a tissue.
     - `OSError` if the file cannot be written.
     """
     write_archive(path, "tissue", _VERSION, tissue_arrays(tissue))
@@ -77,7 +77,7 @@ def load_tissue(path: str | os.PathLike[str]) -> Tissue:
 
 
 def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
-    """All that a tissue consists of by name, see `save_tissue`; the way back is `tissue_from`."""
+    """All arrays of a tissue by name, see `save_tissue`; `tissue_from` is the inverse."""
     if not isinstance(tissue, Tissue):
         raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {describe(tissue)}.")
     topology = tissue.topology
@@ -107,10 +107,10 @@ def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
             f"{arrays['vertices'].shape}. Save the members of a batch one by one."
         )
     for name, array in arrays.items():
-        # bfloat16 and the like come back from a file as raw bytes.
+        # NumPy would read bfloat16 and similar types as raw bytes.
         if name != "boundary" and array.dtype.kind not in "fi":
             raise ValueError(
-                "Argument `tissue` must hold numbers of a type NumPy knows, but "
+                "Argument `tissue` must hold numbers of a NumPy type, but "
                 f"`{name}` is {array.dtype}."
             )
     return arrays
@@ -119,13 +119,13 @@ def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
 def tissue_from(
     arrays: Mapping[str, np.ndarray], name: str, topology: Topology | None = None
 ) -> Tissue:
-    """The tissue of some arrays, checked.
+    """Build a tissue from arrays, and check it.
 
     **Arguments:**
 
     - `arrays`: as of `tissue_arrays`.
     - `name`: of the file they come from.
-    - `topology`: that of `arrays`, if it is known already.
+    - `topology`: that of `arrays`, if it was built before.
 
     **Returns:** the tissue.
 
@@ -134,7 +134,7 @@ def tissue_from(
     kind = str(arrays.get("boundary"))
     if kind not in _BOUNDARIES:
         raise ValueError(
-            f"{name} has a boundary of an unknown kind, {kind!r}; known are: "
+            f"{name} has a boundary of an unknown kind, {kind!r}; the kinds are: "
             f"{', '.join(_BOUNDARIES)}."
         )
     record = _BOUNDARIES[kind]
@@ -145,21 +145,21 @@ def tissue_from(
             raise ValueError(f"{name} is incomplete: it has no array `{key}`.")
         array = arrays[key]
         fits = len(shape) == array.ndim and all(
-            want in (None, have) for want, have in zip(shape, array.shape, strict=True)
+            size in (None, have) for size, have in zip(shape, array.shape, strict=True)
         )
         if array.dtype.kind not in kinds or not fits:
-            wanted = f"({', '.join('any' if n is None else str(n) for n in shape)})"
+            expected = f"({', '.join('any' if n is None else str(n) for n in shape)})"
             what = "integers" if kinds == "i" else "real numbers"
             raise ValueError(
                 f"{name} is broken: `{key}` has shape {array.shape} and type {array.dtype}, but "
-                f"must have shape {wanted} and hold {what}."
+                f"must have shape {expected} and hold {what}."
             )
         if array.dtype.kind == "f":
             as_jax(array, name)
         elif array.size and not (_INT32.min <= array.min() and array.max() <= _INT32.max):
             raise ValueError(
                 f"{name} is broken: `{key}` holds numbers from {array.min()} to {array.max()}, which "
-                "number nothing in a tissue."
+                "are out of range in a tissue."
             )
         return array
 
@@ -212,6 +212,6 @@ def _record_of(boundary: AbstractBoundary) -> tuple[str, _BoundaryRecord]:
         if type(boundary) is record.build:
             return kind, record
     raise ValueError(
-        f"The tissue format has no place for a boundary of class {type(boundary).__name__}; it "
-        f"knows: {', '.join(_BOUNDARIES)}."
+        f"The tissue format has no boundary of class {type(boundary).__name__}; it "
+        f"has: {', '.join(_BOUNDARIES)}."
     )

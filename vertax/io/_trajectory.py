@@ -1,4 +1,4 @@
-"""Trajectories in files."""
+"""Files of trajectories."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> Non
     """Save a trajectory to a file, exactly.
 
     The file is a NumPy `.npz` archive without pickles. Its arrays are those of
-    [`save_tissue`][vertax.io.save_tissue] with a first axis for the frames; but those of the topology
-    have one for the distinct topologies, and `topology` says which each frame has. The values are there
-    as `value_…`. It is written atomically.
+    [`save_tissue`][vertax.io.save_tissue] with a first axis for the frames; those of the topology
+    have a first axis for the distinct topologies, and `topology` is the number of that of each frame. Values
+    are stored as `value_…`. It is written atomically.
 
     **Arguments:**
 
@@ -68,7 +68,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     **Raises:**
 
     - `FileNotFoundError` if there is no such file.
-    - `ValueError`, with the file's name, for what is no trajectory, or a broken one, as
+    - `ValueError`, with the file's name, if it is not a trajectory file or is broken, as
         [`load_tissue`][vertax.io.load_tissue].
     """
     name = os.fspath(path)
@@ -85,7 +85,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
                 f"{name} is broken: `{key}` has shape {array.shape}, but must have {n} entries."
             )
     if number.min() < 0 or any(array.shape != number.shape for array in values.values()):
-        raise ValueError(f"{name} is broken: `topology` or the values do not go with the frames.")
+        raise ValueError(f"{name} is broken: `topology` or the values do not match the frames.")
     topologies: dict[int, Topology] = {}
     trajectory = Trajectory()
     once = {key: arrays[key] for key in _ONCE if key in arrays}

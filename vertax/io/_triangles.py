@@ -1,4 +1,4 @@
-"""Polygons that are not convex as triangles, which every program draws alike."""
+"""Triangulation of polygons that are not convex, for programs that draw them wrongly."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ def is_convex(polygon: Float[np.ndarray, "corners 2"]) -> bool:
 
     - `polygon`: its corners.
 
-    **Returns:** whether it is convex. A polygon that is inside out is not.
+    **Returns:** whether it is convex. A clockwise polygon is not.
     """
-    # Two corners at one place hide the angle between their sides: one of them is left out.
+    # Of two corners at one place one is left out: the side between them has no direction.
     apart = np.linalg.norm(polygon - np.roll(polygon, 1, axis=0), axis=1)
     corners = polygon[~(apart <= 1e-9 * np.max(np.ptp(polygon, axis=0)))]
     turns = _turn(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0))
@@ -29,7 +29,7 @@ def triangulate(polygon: Float[np.ndarray, "corners 2"]) -> Int[np.ndarray, "tri
        and its two neighbours.
     2. The triangle of an ear is a part of the polygon; the rest is a polygon with one corner less.
 
-    Every simple polygon has an ear. Where rounding, or sides that cross, leave none, the rest becomes a fan.
+    Every simple polygon has an ear. If rounding errors or crossing sides leave none, the rest becomes a fan.
 
     **Arguments:**
 
@@ -52,9 +52,9 @@ def triangulate(polygon: Float[np.ndarray, "corners 2"]) -> Int[np.ndarray, "tri
         # The next corner but one: neighbouring ears in turn would make a fan of slivers.
         place, misses = (place + 1) % (size - 1), 0
     triangles += [(rest[0], rest[k], rest[k + 1]) for k in range(1, len(rest) - 1)]
-    found = np.array(triangles)
-    area = _turn(*(polygon[found[:, k]] for k in range(3)))
-    return found[np.abs(area) > tolerance]
+    corners = np.array(triangles)
+    area = _turn(*(polygon[corners[:, k]] for k in range(3)))
+    return corners[np.abs(area) > tolerance]
 
 
 def _is_ear(
@@ -90,6 +90,6 @@ def _turn(
 
 
 def _rounding(polygon: Float[np.ndarray, "corners 2"]) -> float:
-    """Size of the rounding of the area of a triangle of its corners."""
+    """Rounding error of the area of a triangle of its corners."""
     extent = float(np.max(np.ptp(polygon, axis=0)))
     return 16 * np.finfo(float).eps * float(np.max(np.abs(polygon))) * extent

@@ -1,4 +1,4 @@
-"""Cells and edges as meshes of the Visualization Toolkit, for ParaView."""
+"""VTK files of cells and edges, for ParaView."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def write_vtk(
 ) -> None:
     """Write the cells of a tissue for ParaView and PyVista, through meshio.
 
-    A convex cell is a polygon. Any other cell is several triangles: VTK measures a polygon as a fan of
-    triangles about its first corner, which spills over the neighbours, and some versions draw it so. Periodic
-    cells are whole, as in pictures. The data of the elements are the columns of
+    A convex cell is a polygon. Any other cell is several triangles: VTK integrates over a polygon as a fan of
+    triangles about its first corner, which overlaps the neighbours, and some versions draw it so. Periodic
+    cells are drawn in one piece, as in pictures. The data of the elements are the columns of
     [`cell_table`][vertax.io.cell_table], in its order; all triangles of a cell have the row of the cell, and
     `cell` is its number. The file is written atomically.
 
@@ -45,17 +45,17 @@ def write_vtk(
 
     - `path`: the file, which ends in `.vtu` (XML, compressed) or `.vtk` (legacy).
     - `tissue`: the [`Tissue`][vertax.Tissue].
-    - `cells`: more numbers on the cells by name, one entry a cell.
-    - `edges`: numbers on the edges. If given (`{}` will do), the edges are written with the columns of
+    - `cells`: more numbers of the cells by name, one entry for each cell.
+    - `edges`: numbers of the edges. If given (an empty `{}` too), the edges are written with the columns of
         [`edge_table`][vertax.io.edge_table] to a second file, `tissue-edges.vtu` next to `tissue.vtu`.
-        Edges across a periodic boundary are there twice, once at either cell.
+        Edges across a periodic boundary occur twice, once at each cell.
     - `points_per_arc`: number of straight pieces of an arc.
 
     **Raises:**
 
     - `ImportError` if meshio is not installed: `pip install "vertax[files]"`.
-    - `ValueError` for another ending, values that are no numbers, a batch of tissues, less than one
-        point an arc, and as [`cell_table`][vertax.io.cell_table].
+    - `ValueError` for another ending, values that are not numbers, a batch of tissues, `points_per_arc`
+        below 1, and as [`cell_table`][vertax.io.cell_table].
     """
     with requires_extra("files", "Writing VTK files"):
         import meshio
@@ -71,7 +71,7 @@ def write_vtk(
     if edges is not None:
         lines, shown = drawing.sides(np.ones(tissue.n_cells, bool))
         table = edge_columns(tissue, drawing, edges)
-        # meshio has no lines of many pieces: each piece is an element of its own.
+        # meshio has no polylines: each piece is one element.
         pieces = np.stack([lines[:, :-1], lines[:, 1:]], axis=2)
         row = np.cumsum(drawing.alive_edges) - 1
         ends = np.arange(pieces.size // 2).reshape(-1, 2)
@@ -92,18 +92,18 @@ class _Block(NamedTuple):
 
 
 def _cell_blocks(polygons: list[Float[np.ndarray, "_ 2"]]) -> list[_Block]:
-    """Convex cells as polygons and others as triangles, of corners numbered throughout."""
+    """Convex cells as polygons and others as triangles, with global corner numbers."""
     elements, first = [], 0
     for row, polygon in enumerate(polygons):
-        whole = np.arange(len(polygon))[None]
-        triangles = whole[:0] if is_convex(polygon) else triangulate(polygon)
-        # (A cell without an area has no triangles.)
-        kind, corners = ("triangle", triangles) if len(triangles) else ("polygon", whole)
+        polygon_corners = np.arange(len(polygon))[None]
+        triangles = polygon_corners[:0] if is_convex(polygon) else triangulate(polygon)
+        # (A cell of area 0 has no triangles.)
+        kind, corners = ("triangle", triangles) if len(triangles) else ("polygon", polygon_corners)
         elements += [(kind, first + each, row) for each in corners]
         first += len(polygon)
-    # Neighbours that are alike share a block, so the order of the cells stays.
-    alike = itertools.groupby(elements, lambda element: (element[0], len(element[1])))
-    blocks = [(kind, list(block)) for (kind, _), block in alike]
+    # Successive elements of one kind and size share a block, so the order of the cells stays.
+    groups = itertools.groupby(elements, lambda element: (element[0], len(element[1])))
+    blocks = [(kind, list(block)) for (kind, _), block in groups]
     return [
         _Block(kind, np.stack([each[1] for each in block]), np.array([each[2] for each in block]))
         for kind, block in blocks
@@ -128,13 +128,13 @@ def _numbers(name: str, column: np.ndarray) -> np.ndarray:
         return column.astype(np.uint8)
     if column.dtype.kind not in "iuf" or column.dtype == np.float16:
         raise ValueError(
-            f"Column `{name}` must hold numbers or booleans, which is all that VTK files have, but its "
+            f"Column `{name}` must hold numbers or booleans, the types of VTK files, but its "
             f"type is {column.dtype}."
         )
     return column
 
 
 def _write(path: Path, mesh: Any) -> None:
-    # meshio writes to a name and not to an open file.
+    # meshio writes to a path, not to an open file.
     with atomic_draft(path) as draft:
         mesh.write(draft)

@@ -1,4 +1,4 @@
-"""Trajectories as time series of the Visualization Toolkit, for ParaView."""
+"""VTK time series of trajectories, for ParaView."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def write_vtk_series(
 ) -> None:
     """Write the frames of a trajectory for ParaView: a `.pvd` file, and a `.vtu` file for each frame.
 
-    The times are the value `time` of the trajectory, which that of a movement has, or else the numbers of
-    the frames. The `.pvd` file is written last.
+    The times are the values `time` of the trajectory, if it has them (as from
+    [`evolve`][vertax.evolve]), or else the numbers of the frames. The `.pvd` file is written last.
 
     ```python
     movie = vx.evolve(tissue, energy, friction, times)
@@ -36,7 +36,7 @@ def write_vtk_series(
 
     - `path`: the file, which ends in `.pvd`.
     - `trajectory`: with at least one frame.
-    - `cells`: more numbers on the cells by name, with one row for each frame and one entry a cell in it.
+    - `cells`: more numbers of the cells by name, shape `(frames, cells)`.
     - `points_per_arc`: number of straight pieces of an arc.
 
     **Raises:**

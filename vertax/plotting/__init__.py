@@ -1,4 +1,4 @@
-"""Pictures of tissues and of fits."""
+"""Figures of tissues, fits and measurements."""
 
 from vertax._base.extras import requires_extra as _requires_extra
 from vertax.mesh import cell_polygons as cell_polygons

@@ -1,4 +1,4 @@
-"""Tissues that move."""
+"""Animations of trajectories."""
 
 from __future__ import annotations
 
@@ -58,24 +58,24 @@ def animate(
 
     - `trajectory`: the tissues, of one size: a [`Trajectory`][vertax.mesh.Trajectory] of a relaxation
         or of a fit, or a list.
-    - `path`: the file, which is complete or not there at all: a GIF if it ends in `.gif`; a film if it ends
-        in `.mp4`, for which Matplotlib has to find the program ffmpeg.
+    - `path`: the file: a GIF if it ends in `.gif`; a video if it ends in `.mp4`, for which Matplotlib has to
+        find the program ffmpeg. It is written atomically.
     - `cells`: the value of each cell: a function of the tissue, or an array of shape `(frames, cells)`.
-        Left out: pale faces.
+        By default the cells are pale.
     - `fps`: frames a second.
-    - `mark_t1`: for how many frames edges that have flipped are marked; 0 is not at all.
+    - `mark_t1`: number of frames for which flipped edges are marked; 0: none.
     - `cmap`, `label`: colour map of the cells, and label of its bar.
-    - `vmin`, `vmax`: limits of the colours; by default those of all frames together. Where values of a frame
-        lie beyond, the bar has an arrow and says how far they go.
+    - `vmin`, `vmax`: limits of the colours; by default those of all frames together. Where values lie
+        beyond, the bar has an arrow with the extreme value.
     - `captions`: a text above each frame.
-    - `linger`: seconds that the last frame stays.
+    - `linger`: additional duration of the last frame in seconds.
     - `dpi`: pixels an inch; the tissue is about three inches wide.
 
     **Raises:**
 
     - `ValueError`, naming the argument, for no frame or frames of different sizes, values or captions that
-        do not go with the frames, `fps` or `dpi` that are not positive, or a path of another kind.
-    - `RuntimeError` for a film without ffmpeg.
+        do not match the frames, `fps` or `dpi` that are not positive, or a path with another ending.
+    - `RuntimeError` for a video without ffmpeg.
     - `OSError` if the file cannot be written.
     """
     frames = list(trajectory)
@@ -89,7 +89,7 @@ def animate(
 
 
 def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
-    """Edges that lie between other cells than before: those of T1 transitions.
+    """Edges with other cells on their sides than before: those of T1 transitions.
 
     ```python
     vx.plot_tissue(after, highlight=vx.plotting.flipped_edges(before, after))
@@ -99,7 +99,7 @@ def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
 
     - `before`, `after`: two states of one tissue.
 
-    **Returns:** a boolean for each edge. Edges of cells that came or went in between did not flip.
+    **Returns:** a boolean for each edge. Edges of cells that appeared or vanished in between are False.
 
     **Raises:**
 
@@ -162,7 +162,7 @@ def _cell_values(cells: CellValues | None, frames: list[Tissue]) -> np.ndarray |
 
 
 def _marks(frames: list[Tissue], duration: int) -> Iterator[np.ndarray]:
-    """Edges to mark in each frame: those that flipped in the last few."""
+    """Edges to mark in each frame: those that flipped within the last `duration` frames."""
     left = np.zeros(frames[0].n_edges, int)
     for before, after in zip([frames[0], *frames], frames, strict=False):
         left = np.where(flipped_edges(before, after), duration, np.maximum(left - 1, 0))
@@ -191,11 +191,11 @@ def _pictures(
         width = line_width(drawings[0], ax)
     for k, (drawing, marked) in enumerate(zip(drawings, _marks(frames, mark_t1), strict=True)):
         ax.clear()
-        own = None if values is None else values[k]
+        frame_values = None if values is None else values[k]
         with _style.house_style():
             draw(
                 drawing,
-                own,
+                frame_values,
                 ax=ax,
                 highlight=marked,
                 cell_colours=colours,
@@ -209,7 +209,7 @@ def _pictures(
 
 
 def _placed(frames: list[Tissue]) -> list[Drawing]:
-    """The drawings of all frames, in which no cell jumps from one side of a periodic box to the other."""
+    """The drawings of all frames; each cell is drawn in the periodic image nearest to the previous frame."""
     drawings: list[Drawing] = []
     for tissue in frames:
         near = drawings[-1].centroids if drawings else None
@@ -231,7 +231,7 @@ def _pixels(figure: Figure) -> np.ndarray:
     assert isinstance(canvas, FigureCanvasAgg)
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]
-    # Films are made of blocks of two by two.
+    # The video format needs even numbers of rows and columns.
     rows, columns = (2 * (n // 2) for n in pixels.shape[:2])
     return pixels[:rows, :columns].copy()
 
@@ -241,7 +241,7 @@ _Write: TypeAlias = Callable[[Path, Iterator[np.ndarray], float, float], None]
 
 def _writer(path: str | os.PathLike[str]) -> _Write:
     ending = Path(path).suffix.lower()
-    writers: dict[str, _Write] = {".gif": _write_gif, ".mp4": _write_film}
+    writers: dict[str, _Write] = {".gif": _write_gif, ".mp4": _write_video}
     if ending not in writers:
         raise ValueError(
             f"Argument `path` must end in {' or '.join(writers)}, but is {os.fspath(path)!r}."
@@ -252,11 +252,11 @@ def _writer(path: str | os.PathLike[str]) -> _Write:
 
 
 def _check_ffmpeg() -> None:
-    from matplotlib.animation import FFMpegWriter  # here: only films need it
+    from matplotlib.animation import FFMpegWriter  # only videos need it
 
     if not FFMpegWriter.isAvailable():
         raise RuntimeError(
-            "Cannot write a film: Matplotlib finds no program ffmpeg. Install ffmpeg, or set "
+            "Cannot write a video: Matplotlib finds no program ffmpeg. Install ffmpeg, or set "
             'matplotlib.rcParams["animation.ffmpeg_path"] to where it is, or write a GIF (a path that ends '
             "in .gif)."
         )
@@ -266,7 +266,7 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: f
     images = [Image.fromarray(pixels) for pixels in pictures]
     palette = _palette(images)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    # The format counts in hundredths of a second, and viewers slow down what is shorter than two.
+    # The format counts in hundredths of a second, and viewers slow down frames shorter than two.
     frame = 10 * max(2, round(100 / fps))
     durations = [frame] * (len(images) - 1) + [frame + round(1000 * linger)]
     first, *others = indexed
@@ -276,21 +276,21 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: f
 
 
 def _palette(images: list[Image.Image]) -> Image.Image:
-    """One palette for all frames: with one each, colours that stand still would flicker."""
+    """One palette for all frames: with one palette each, constant colours would flicker."""
     some = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), 8)).astype(int)]
     montage = np.concatenate([np.asarray(image) for image in some])
     frequent = Image.fromarray(montage).quantize(250, Image.Quantize.MEDIANCUT)
     colours = np.reshape(frequent.getpalette() or [], (-1, 3))
-    # The paper is white and nothing near it, and marks keep their colour, however small they are.
-    sure = np.array([to_rgb("white"), to_rgb(_style.MARK)]) * 255
-    away = np.abs(colours[:, None] - sure).max(axis=-1).min(axis=-1)
+    # White and the colour of marks are kept exactly; similar colours are replaced by them.
+    fixed = np.array([to_rgb("white"), to_rgb(_style.MARK)]) * 255
+    distance = np.abs(colours[:, None] - fixed).max(axis=-1).min(axis=-1)
     palette = Image.new("P", (1, 1))
-    palette.putpalette(np.concatenate([colours[away > 8], sure]).astype(np.uint8).tobytes())
+    palette.putpalette(np.concatenate([colours[distance > 8], fixed]).astype(np.uint8).tobytes())
     palette.load()
     return palette
 
 
-def _write_film(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: float) -> None:
+def _write_video(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: float) -> None:
     from matplotlib.animation import FFMpegWriter
 
     first = next(pictures)
@@ -298,7 +298,7 @@ def _write_film(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: 
     figure = Figure(figsize=(columns / 100, rows / 100), dpi=100)
     FigureCanvasAgg(figure)
     shown = figure.figimage(first)
-    # A pixel format that every player knows.
+    # A pixel format that every player supports.
     rate: Any = fps  # ffmpeg takes any number
     writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "18"])
     with writer.saving(figure, str(path), 100):

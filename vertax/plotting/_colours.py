@@ -1,4 +1,4 @@
-"""How values become colours, and the bars that say so."""
+"""Colour scales and colour bars."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from matplotlib.colors import Colormap, ListedColormap, Normalize
 
 from vertax.plotting import _style
 
-# Of inferno, the light end would vanish on pale faces, and the dark end on an image.
+# The light end of inferno is invisible on pale faces, the dark end on an image.
 EDGES_ON_PALE = ListedColormap(colormaps["inferno"](np.linspace(0, 0.82, 256)), "inferno_dark")
 EDGES_ON_DARK = ListedColormap(colormaps["inferno"](np.linspace(0.38, 1, 256)), "inferno_light")
 
 
 class Colours(NamedTuple):
-    """How values become colours."""
+    """A colour map, its limits and the label of its bar."""
 
     cmap: str | Colormap | None = None
     low: SupportsFloat | None = None
@@ -29,7 +29,7 @@ class Colours(NamedTuple):
     label: str | None = None
 
     def limits(self, values: np.ndarray) -> tuple[float, float]:
-        """Those given, or else those of the finite values."""
+        """The given limits, or else those of the finite values."""
         finite = values[np.isfinite(values)]
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
         return (
@@ -38,7 +38,7 @@ class Colours(NamedTuple):
         )
 
     def scale(self, values: np.ndarray) -> ScalarMappable:
-        """The scale of a bar, for what is drawn with these colours."""
+        """The mappable for a colour bar."""
         return ScalarMappable(Normalize(*self.limits(values)), colour_map(self.cmap))
 
     def apply(self, artist: PolyCollection | LineCollection, values: np.ndarray) -> None:
@@ -49,7 +49,7 @@ class Colours(NamedTuple):
 
 
 def colour_map(cmap: str | Colormap | None) -> Colormap:
-    """A colour map with the colour of what has no value."""
+    """A colour map with the colour of missing values."""
     named = colormaps[cmap or "viridis"] if not isinstance(cmap, Colormap) else cmap
     return named.with_extremes(bad=_style.MISSING)
 
@@ -61,7 +61,7 @@ def add_bar(
     label: str | None,
     **options: Any,
 ) -> Colorbar:
-    """A colour bar with arrows where values lie beyond its ends, and how far they go."""
+    """A colour bar with arrows and the extreme values where values lie beyond its ends."""
     figure = _style.figure_of(axes if isinstance(axes, Axes) else axes[0])
     finite = values[np.isfinite(values)]
     low, high = (finite.min(), finite.max()) if finite.size else (np.inf, -np.inf)
@@ -74,7 +74,7 @@ def add_bar(
     bar.outline.set_linewidth(0.4)
     if bar.solids is not None:
         bar.solids.set_alpha(1)
-    # The tip of an arrow is at a twentieth of the bar beyond its end.
+    # The arrows extend 5 % of the bar beyond its ends.
     for shown, value, place, side in ((below, low, -0.06, "top"), (above, high, 1.06, "bottom")):
         if shown:
             text = f"{value:.3g}"
@@ -87,13 +87,13 @@ def bar_beside(
 ) -> None:
     """A colour bar right of the axes, about as high as the tissue."""
     figure = _style.figure_of(ax)
-    # In a place that is higher than the tissue is, an equal aspect leaves room above and below. The
-    # bar, its ticks and label take about 0.7 inches off the width.
+    # If the axes are higher than the tissue, an equal aspect leaves room above and below. The bar,
+    # its ticks and its label take about 0.7 inches of the width.
     box = ax.get_position(original=True)
     width, height = np.array([box.width, box.height]) * figure.get_size_inches()
     (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
     tissue_height = max(width - 0.7, 0.3) * abs((y1 - y0) / (x1 - x0))
-    # Only a layout engine knows how much room the ticks and the label of another bar will take.
+    # Only a layout engine computes the room for the ticks and the label of another bar.
     pad = 0.02 if innermost or figure.get_layout_engine() is not None else 0.25
     shrink = min(1.0, tissue_height / height)
     add_bar(ax, mappable, values, label, fraction=0.05, pad=pad, aspect=22, shrink=shrink)

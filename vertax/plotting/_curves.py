@@ -1,4 +1,4 @@
-"""Curves of a fit: how it converged."""
+"""Convergence curves of a fit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from vertax.fitting import History
 from vertax.plotting import _style
 
-# What a history may hold, in the order of the panels: its name there, and the scale of its axis.
+# Columns of a history in the order of the panels, with title and scale of the axis.
 _CURVES = {
     "cost": ("cost", "log"),
     "relative_error": ("relative error of parameters", "log"),
@@ -29,17 +29,17 @@ def plot_history(
     figure: Figure | None = None,
     label: str | None = None,
 ) -> list[Axes]:
-    """Draw how a fit converged: one panel for each curve that the history holds.
+    """Draw the convergence of a fit: one panel for each curve of the history.
 
-    Curves are drawn on a logarithmic axis; where a curve has negative values or nothing but zeros
-    (a number of transitions, say), on a linear one. Epochs without a finite value leave a gap.
+    Curves are drawn on a logarithmic axis; curves with negative values or only zeros (a number of
+    transitions, for example) on a linear one. Epochs without a finite value leave a gap.
 
     **Arguments:**
 
-    - `history`: of a [`Fit`][vertax.Fit], or values per epoch under the names `cost`, and if there
-        `relative_error`, `max_force` and `num_t1`; other entries are left out.
+    - `history`: of a [`Fit`][vertax.Fit], or values per epoch by name: `cost`, and optionally
+        `relative_error`, `max_force` and `num_t1`; other entries are ignored.
     - `axes`: where to draw, one for each panel, to compare several fits; by default a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
+    - `figure`: an empty figure to draw in instead; no window is opened.
     - `label`: name of this fit in the legend.
 
     **Returns:** the axes of the panels.
@@ -77,15 +77,15 @@ def plot_history(
             epochs = np.arange(len(curve))
             title, scale = _CURVES[name]
             logarithmic = scale == "log" and not np.any(curve < 0) and np.any(curve > 0)
-            # Zeros have no place on a logarithmic axis: gaps, like missing values.
+            # On a logarithmic axis zeros are gaps, like missing values.
             values = np.where(curve > 0, curve, np.nan) if logarithmic else curve
-            # A curve of one epoch, or between two gaps, shows as points only.
+            # A curve of one epoch, or between two gaps, is visible only as a point.
             few = {"marker": "o", "markersize": 2.5} if len(curve) < 15 else {}
             panel.plot(epochs, values, color=colour, label=label, **few)
             panel.set_yscale("log" if logarithmic else "linear")
             if np.issubdtype(np.asarray(history[name]).dtype, np.integer):
                 panel.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
-                top = max(1.0, panel.dataLim.y1)  # nothing but zeros would be an axis of fractions
+                top = max(1.0, panel.dataLim.y1)  # with only zeros the ticks would be fractions
                 panel.set_ylim(-0.03 * top, 1.05 * top)
             panel.set_xlabel("epoch")
             panel.set_ylabel(title)

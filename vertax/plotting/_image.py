@@ -1,4 +1,4 @@
-"""Images under tissues: grey ones, colour ones, labels; and how large things are in them."""
+"""Images under tissues, label images and scale bars."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ def plot_image(
     **Arguments:**
 
     - `image`: a grey image, shown with robust contrast, or a colour image (red, green, blue; 8 bits, or
-        floats in 0 … 1); labels are made one by [`label_colours`][vertax.plotting.label_colours]. The y
-        axis points down.
+        floats in 0 … 1); [`label_colours`][vertax.plotting.label_colours] makes one of labels. The y axis
+        points down.
     - `pixel_size`: size of a pixel, in units of length.
     - `ax`: the axes to draw in; by default those of a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
+    - `figure`: an empty figure to draw in instead; no window is opened.
 
     **Returns:** the axes.
 
     **Raises:**
 
-    - `ValueError`, naming the argument, for an image that is not one, or a `pixel_size` out of range.
+    - `ValueError`, naming the argument, for an image of the wrong shape, or a `pixel_size` that is not
+        positive.
     """
     image, pixel_size = np.asarray(image), float(pixel_size)
     _style.one_of(ax, figure)
@@ -53,11 +54,11 @@ def plot_image(
 
 
 def draw_image(ax: Axes, image: np.ndarray, pixel_size: float) -> None:
-    """An image, its first row at the top, the y axis pointing down."""
+    """Draw an image with its first row at the top and the y axis pointing down."""
     size = extent_of(image, pixel_size)
     grey: dict[str, Any] = {}
     if image.ndim == 2:
-        # A few saturated or dead pixels must not set the contrast.
+        # Percentiles, because a few saturated or dead pixels must not set the contrast.
         dark, bright = np.nanpercentile(image, [1, 99.7])
         grey = {"cmap": "gray", "vmin": dark, "vmax": max(bright, np.nextafter(dark, np.inf))}
     extent = (0.0, float(size[0]), float(size[1]), 0.0)
@@ -79,7 +80,7 @@ def extent_of(image: np.ndarray, pixel_size: float) -> np.ndarray:
 def label_colours(
     labels: Shaped[np.ndarray | Array, " ..."],
 ) -> Float[np.ndarray, "rows columns 3"]:
-    """A picture of a label image: a dark colour for each label, so that a mesh shows on top.
+    """A colour image of a label image: a dark colour for each label, so that a mesh is visible on top.
 
     ```python
     vx.plot_tissue(found.tissue, image=vx.plotting.label_colours(labels), pixel_size=found.pixel_size)
@@ -93,7 +94,7 @@ def label_colours(
 
     **Raises:**
 
-    - `ValueError` for anything but whole numbers in rows and columns.
+    - `ValueError` unless `labels` is a two-dimensional array of integers.
     """
     labels = np.asarray(labels)
     if labels.ndim != 2 or labels.dtype.kind not in "iub":
@@ -102,7 +103,7 @@ def label_colours(
             f"{labels.shape} and type {labels.dtype}."
         )
     values, place = np.unique(labels, return_inverse=True)
-    # Multiples of the golden ratio: labels that follow each other, often neighbours, differ most.
+    # Multiples of the golden ratio: the colours of consecutive labels, often neighbours, differ most.
     number = np.arange(len(values))
     hue, value = np.modf(number * 0.618034)[0], 0.34 + 0.14 * np.modf(number * 0.381966)[0]
     colours = hsv_to_rgb(np.stack([hue, np.full(len(values), 0.45), value], axis=-1))
@@ -127,10 +128,10 @@ def scale_bar(
 
     **Arguments:**
 
-    - `ax`: the axes, after all is drawn.
-    - `unit`: what lengths are told in.
-    - `unit_length`: how long that is, in the tissue's units of length.
-    - `length`: of the bar, in `unit`s; by default 1, 2 or 5 times a power of ten, and at most a quarter
+    - `ax`: the axes; call this after drawing everything else.
+    - `unit`: name of the unit of the label.
+    - `unit_length`: length of that unit, in the tissue's units of length.
+    - `length`: of the bar, in that unit; by default 1, 2 or 5 times a power of ten, and at most a quarter
         of the width.
 
     **Raises:**
@@ -147,7 +148,7 @@ def scale_bar(
     colour = "w" if over_image else _style.INK
     end = right - 0.04 * (right - left)
     height = 0.05 if over_image else -0.03
-    # Along x in units of length, along y in parts of the picture, whichever way y points.
+    # x in units of length, y in fractions of the axes: independent of the direction of y.
     with _style.house_style():
         transform = ax.get_xaxis_transform()
         style: dict[str, Any] = {"transform": transform, "clip_on": False, "zorder": 5}
@@ -173,12 +174,12 @@ def scale_bar(
             size=7,
             zorder=5,
         )
-    if over_image:  # white on black can be read on anything
+    if over_image:  # white with a black border is readable on any image
         line.set_path_effects([withStroke(linewidth=line.get_linewidth() + 1.6, foreground="k")])
         text.set_path_effects([withStroke(linewidth=1.8, foreground="k")])
 
 
 def _round_length(most: float) -> float:
-    """The largest of …, 1, 2, 5, 10, … that is not larger."""
+    """The largest number 1, 2 or 5 times a power of ten that is at most `most`."""
     power = 10.0 ** np.floor(np.log10(most))
     return float(power * max(step for step in (1, 2, 5) if step * power <= most * (1 + 1e-9)))

@@ -1,4 +1,4 @@
-"""Stress and motions drawn over a tissue."""
+"""Stresses and displacements drawn over a tissue."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def plot_stress(
 ) -> Axes:
     """Draw the stress of each cell as a cross over it.
 
-    Its two bars lie along the principal directions and are as long as the principal stresses: red where
-    the cell would contract (tension), blue where it would expand (pressure).
+    Its two bars are parallel to the principal directions, with lengths proportional to the principal
+    stresses: red for tension (positive), blue for pressure (negative).
 
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
     - `stresses`: one symmetric matrix for each cell, from
-        [`cell_stress`][vertax.mechanics.cell_stress]. Less their trace they show what is anisotropic.
-    - `scale`: the stress whose bar is as long as a cell; by default the largest one there is.
+        [`cell_stress`][vertax.mechanics.cell_stress]. Subtract half their trace to see the anisotropic part.
+    - `scale`: the stress for which a bar is as long as a cell; by default the largest one.
     - `options`: of [`plot_tissue`][vertax.plot_tissue].
 
     **Returns:** the axes.
@@ -55,7 +55,7 @@ def plot_stress(
     return ax
 
 
-# Red and blue that colour-blind readers tell apart.
+# Red and blue that colour-blind readers can distinguish.
 _TENSION, _PRESSURE = "#c8322d", "#2b6cb0"
 
 
@@ -66,14 +66,14 @@ def plot_mode(
     scale: SupportsFloat | None = None,
     **options: Any,
 ) -> Axes:
-    """Draw how vertices move, as arrows: a mode, or velocities after a cut.
+    """Draw displacements of the vertices as arrows: a mode, or velocities after a cut.
 
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
     - `displacements`: of each vertex, such as one of the `displacements` of
         [`Modes`][vertax.mechanics.Modes] or what [`recoil`][vertax.mechanics.recoil] returns.
-    - `scale`: the displacement whose arrow is as long as a cell; by default the largest one there is.
+    - `scale`: the displacement for which an arrow is as long as a cell; by default the largest one.
     - `options`: of [`plot_tissue`][vertax.plot_tissue].
 
     **Returns:** the axes.
@@ -106,15 +106,15 @@ def plot_mode(
 
 
 def _shaped(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Values of the shape that goes with the tissue."""
-    found = np.asarray(values, float)
-    if found.shape != shape:
-        raise ValueError(f"Argument `{name}` must have shape {shape}, but has {found.shape}.")
-    return found
+    """The values as an array; raise an error unless it has the given shape."""
+    array = np.asarray(values, float)
+    if array.shape != shape:
+        raise ValueError(f"Argument `{name}` must have shape {shape}, but has {array.shape}.")
+    return array
 
 
 def _unit(sizes: np.ndarray, scale: SupportsFloat | None) -> float:
-    """The size that is drawn as long as a cell: by default the largest, or 1 if there is nothing."""
+    """The size that is drawn as long as a cell: by default the largest, or 1 if all are 0."""
     if scale is None:
         return float(sizes.max()) or 1.0
     if not float(scale) > 0:

@@ -1,4 +1,4 @@
-"""Curves of what is measured of a tissue: moduli, densities of states, stress against strain."""
+"""Curves of moduli, densities of states, and stress against strain."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ def plot_moduli(
     figure: Figure | None = None,
     label: str | None = None,
 ) -> Axes:
-    """Draw storage and loss modulus over the frequency, on logarithmic axes.
+    """Draw storage and loss modulus against frequency on logarithmic axes.
 
-    Frequencies of 0 have no place there and are left out.
+    Frequencies of 0 are left out.
 
     **Arguments:**
 
     - `frequencies`: angular frequencies.
     - `moduli`: the complex modulus at each, from
         [`complex_modulus`][vertax.mechanics.complex_modulus].
-    - `ax`: the axes to draw in, also one after the other to compare; by default those of a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
+    - `ax`: the axes to draw in, also for several curves to compare; by default those of a new figure.
+    - `figure`: an empty figure to draw in instead; no window is opened.
     - `label`: name of this tissue in the legend.
 
     **Returns:** the axes.
@@ -70,7 +70,7 @@ def plot_density_of_states(
 
     - `frequencies`, `density`: from [`density_of_states`][vertax.mechanics.density_of_states].
     - `ax`, `figure`: as in [`plot_moduli`][vertax.plotting.plot_moduli].
-    - `label`: name in the legend, which is up to the caller.
+    - `label`: name in the legend, which the caller draws.
 
     **Returns:** the axes.
 
@@ -97,19 +97,19 @@ def plot_stress_strain(
 ) -> Axes:
     r"""Draw stress against strain, with the plastic events.
 
-    Where cells have changed neighbours since the strain before, the step is dashed and ends in a dot, the
-    larger the more T1 transitions there were; those before the first strain are not drawn. Where the tissue
-    did not come to rest, there is a gap.
+    Steps with T1 transitions are dashed and end in a dot, with an area proportional to the square root of the
+    number of transitions; those before the first strain are not drawn. Strains at which the relaxation did
+    not converge are gaps.
 
     **Arguments:**
 
     - `ramp`: from [`ramp`][vertax.mechanics.ramp].
-    - `component`: of the stress: `"xy"`, which does the work in
+    - `component`: of the stress: `"xy"`, the conjugate of the strain in
         [`simple_shear`][vertax.mechanics.simple_shear];
-        `"xx-yy"`, $\sigma_{xx} - \sigma_{yy}$, which does it in [`pure_shear`][vertax.mechanics.pure_shear];
+        `"xx-yy"`, $\sigma_{xx} - \sigma_{yy}$, that in [`pure_shear`][vertax.mechanics.pure_shear];
         `"xx"` or `"yy"`.
     - `ax`, `figure`: as in [`plot_moduli`][vertax.plotting.plot_moduli].
-    - `label`: name in the legend, which is up to the caller.
+    - `label`: name in the legend, which the caller draws.
 
     **Returns:** the axes.
 
@@ -129,7 +129,7 @@ def plot_stress_strain(
     number = np.asarray(ramp.num_t1) * (np.arange(x.size) > 0)
     with _style.house_style():
         ax = _axes(ax, figure)
-        # Elastic branches: each begins where the last event has led to.
+        # Elastic branches: each begins after an event.
         branch = np.cumsum(number > 0)
         (line,) = ax.plot(*_branches(x, y, branch), label=label)
         colour = line.get_color()
@@ -142,7 +142,7 @@ def plot_stress_strain(
     return ax
 
 
-# What each weighs of the stress tensor, and its symbol.
+# The weight of each entry of the stress tensor, and the symbol.
 _COMPONENTS: dict[str, tuple[Any, str]] = {
     "xy": (np.array([[0.0, 0.5], [0.5, 0.0]]), r"\sigma_{xy}"),
     "xx-yy": (np.diag([1.0, -1.0]), r"\sigma_{xx} - \sigma_{yy}"),
@@ -169,6 +169,6 @@ def _curve(x_name: str, x: Any, y_name: str, y: np.ndarray) -> tuple[np.ndarray,
 
 
 def _axes(ax: Axes | None, figure: Figure | None) -> Axes:
-    """Those given, or new ones."""
+    """The given axes, or new ones."""
     _style.one_of(ax, figure)
     return _style.new_axes(width=3.0, height=2.3, figure=figure)[0] if ax is None else ax

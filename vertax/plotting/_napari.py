@@ -1,4 +1,4 @@
-"""Tensions as a layer of napari (https://napari.org), from a layer of labels."""
+"""A layer of tensions for napari (https://napari.org), inferred from a layer of labels."""
 
 from __future__ import annotations
 
@@ -16,46 +16,46 @@ _POINTS = 13
 _UNKNOWN = (0.5, 0.5, 0.5, 1.0)
 
 
-def tension_layer(found: InferredTensions, *, colours: str = "viridis") -> tuple[Any, dict, str]:
+def tension_layer(inferred: InferredTensions, *, colours: str = "viridis") -> tuple[Any, dict, str]:
     """The edges of an image, coloured by their tension, as a layer for napari.
 
     ```python
-    data, options, kind = vx.plotting.tension_layer(found)
+    data, options, kind = vx.plotting.tension_layer(inferred)
     viewer.add_shapes(data, **options)
     ```
 
     **Arguments:**
 
-    - `found`: what was inferred of an image.
-    - `colours`: name of a map of colours. What is not determined is grey.
+    - `inferred`: the tensions inferred from an image.
+    - `colours`: name of a colour map. Edges that are not determined are grey.
 
-    **Returns:** the course of each edge in pixels, row and column; options of the layer, among them the table
-    of edges as `features`; and its kind, `"shapes"`.
+    **Returns:** points on each edge in pixels, row and column; options of the layer, with the table of edges
+    as `features`; and its kind, `"shapes"`.
 
     **Raises:**
 
     - `ValueError` for tensions of a tissue without an image.
     """
-    if found.pixel_size is None:
+    if inferred.pixel_size is None:
         raise ValueError(
-            "Argument `found` must have been inferred of an image, but it has no pixels. "
+            "Argument `inferred` must come from an image, but has no pixels. "
             "vx.plot_tissue draws it."
         )
-    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=found.tissue.vertices.dtype)
-    course = np.asarray(found.tissue.edge_points(fractions), float) / found.pixel_size
-    known = found.tensions[found.determined]
-    scale = Normalize(*(known.min(), known.max()) if known.size else (0.0, 1.0))
-    colour = colormaps[colours](scale(np.where(found.determined, found.tensions, 0.0)))
-    colour[~found.determined] = _UNKNOWN
-    # To napari the middle of a pixel is a whole number, to us its corner; and rows come first.
+    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=inferred.tissue.vertices.dtype)
+    course = np.asarray(inferred.tissue.edge_points(fractions), float) / inferred.pixel_size
+    determined = inferred.tensions[inferred.determined]
+    scale = Normalize(*(determined.min(), determined.max()) if determined.size else (0.0, 1.0))
+    colour = colormaps[colours](scale(np.where(inferred.determined, inferred.tensions, 0.0)))
+    colour[~inferred.determined] = _UNKNOWN
+    # In napari the middle of a pixel has integer coordinates, in vertax its corner; and rows come first.
     options = {
         "name": "tensions",
         "shape_type": "path",
         "edge_color": colour,
         "face_color": "transparent",
         "edge_width": 2,
-        "features": found.edge_table(),
-        "metadata": {"vertax": found},
+        "features": inferred.edge_table(),
+        "metadata": {"vertax": inferred},
     }
     return list(course[..., ::-1] - 0.5), options, "shapes"
 
@@ -78,14 +78,14 @@ def napari_tensions(
     mask = np.asarray(cells.data)
     # The activity dock is drawn before the computation, which blocks the window.
     with progress(total=1, desc="vertax: tensions (first compiles for this size)"):
-        found = infer_tensions(mask, kind="labels")
-    for doubt in found.doubts:
+        inferred = infer_tensions(mask, kind="labels")
+    for doubt in inferred.doubts:
         notifications.show_warning(doubt)
     placed = {"scale": cells.scale, "translate": cells.translate}
-    edges, options, kind = tension_layer(found)
+    edges, options, kind = tension_layer(inferred)
     # Row 0 of the table of a layer of labels is the background.
-    table = found.cell_table()
-    column = {"index": np.append(0, found.labels)}
+    table = inferred.cell_table()
+    column = {"index": np.append(0, inferred.labels)}
     column |= {
         name: np.concatenate([[np.nan], np.asarray(table[name], float)])
         for name in ("pressure", "pressure_deviation", "area")

@@ -46,7 +46,7 @@ def plot_tissues(
     image: Real[np.ndarray, " ..."] | None = None,
     pixel_size: SupportsFloat = 1.0,
 ) -> list[Axes]:
-    """Draw tissues side by side, to compare them: on one scale of colours and one scale of lengths.
+    """Draw tissues side by side with one colour scale and one length scale.
 
     ```python
     vx.plotting.plot_tissues({"start": start, "fitted": fit.tissue}, lambda t: t.shape_factors)
@@ -55,11 +55,11 @@ def plot_tissues(
 
     **Arguments:**
 
-    - `tissues`: the tissue of each panel by its title; over an image None for the image alone.
+    - `tissues`: the tissue of each panel by its title; None: only the image.
     - `cells`, `edges`: the values of the cells and of the edges, in the order of the panels; or a function
-        of the tissue. None of a panel: not coloured.
+        of the tissue. None for a panel: not coloured.
     - `axes`: where to draw, one for each panel; by default a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
+    - `figure`: an empty figure to draw in instead; no window is opened.
     - `image`, `pixel_size`: an image under all panels, as for [`plot_tissue`][vertax.plot_tissue].
     - `vmin`, `vmax`, `edge_vmin`, `edge_vmax`: limits of the colours; by default those of the finite values
         of all panels together.
@@ -71,7 +71,7 @@ def plot_tissues(
 
     **Raises:**
 
-    - `ValueError`, naming the argument, if there is no panel, for values or axes that do not go with the
+    - `ValueError`, naming the argument, if there is no panel, for values or axes that do not match the
         panels, for None without an image, and as `plot_tissue`.
     """
     _style.one_of(axes, figure, "axes")
@@ -80,8 +80,10 @@ def plot_tissues(
     cell_values = _values("cells", cells, tissues)
     edge_values = _values("edges", edges, tissues)
     cell_colours, all_cells = _common(Colours(cmap, vmin, vmax, label), cell_values)
-    own = edge_cmap or (EDGES_ON_PALE if image is None else EDGES_ON_DARK)
-    edge_colours, all_edges = _common(Colours(own, edge_vmin, edge_vmax, edge_label), edge_values)
+    edge_map = edge_cmap or (EDGES_ON_PALE if image is None else EDGES_ON_DARK)
+    edge_colours, all_edges = _common(
+        Colours(edge_map, edge_vmin, edge_vmax, edge_label), edge_values
+    )
     bars = [
         (colours, values)
         for name, colours, values in (
@@ -90,13 +92,13 @@ def plot_tissues(
         )
         if values is not None and colorbar in (True, name)
     ]
-    # Before there is a figure: one of pyplot would stay open.
-    for drawing, own_cells, own_edges in zip(
+    # Check before making a figure: one of pyplot would stay open after an error.
+    for drawing, panel_cells, panel_edges in zip(
         drawings.values(), cell_values, edge_values, strict=True
     ):
         if drawing is not None:
-            checked("cells", own_cells, drawing.n_cells)
-            checked("edges", own_edges, drawing.n_edges)
+            checked("cells", panel_cells, drawing.n_cells)
+            checked("edges", panel_edges, drawing.n_edges)
             checked("mask", mask, drawing.n_cells)
     pixel = float(pixel_size)
     views = _views(drawings, mask) if image is None else [None] * len(drawings)
@@ -130,7 +132,7 @@ def plot_tissues(
                     pixel_size=pixel,
                 )
             ax.set_title(name)
-        # A later bar goes between the axes and an earlier one.
+        # Matplotlib puts each new bar between the axes and the previous bar.
         for colours, values in reversed(bars):
             assert values is not None
             add_bar(
@@ -157,7 +159,7 @@ def _check(
         raise ValueError("Argument `tissues` must have at least one panel, but is empty.")
     if image is None and None in tissues.values():
         raise ValueError(
-            "Argument `tissues` must have a tissue in each panel, unless there is an `image` to show alone."
+            "Argument `tissues` must have a tissue in each panel, unless an `image` is given."
         )
     if axes is not None and len(axes) != len(tissues):
         raise ValueError(
@@ -178,12 +180,12 @@ def _values(
             f"Argument `{name}` must have values for each of the {len(tissues)} panels, but has "
             f"{len(values)}."
         )
-    return [None if own is None else np.asarray(own) for own in values]
+    return [None if panel is None else np.asarray(panel) for panel in values]
 
 
 def _common(colours: Colours, values: list[np.ndarray | None]) -> tuple[Colours, np.ndarray | None]:
-    """Colours with the same limits for all panels, and all values."""
-    some = [np.asarray(own, float).ravel() for own in values if own is not None]
+    """Colours with common limits for all panels, and all values."""
+    some = [np.asarray(panel, float).ravel() for panel in values if panel is not None]
     if not some:
         return colours, None
     together = np.concatenate(some)
@@ -194,7 +196,7 @@ def _common(colours: Colours, values: list[np.ndarray | None]) -> tuple[Colours,
 def _views(
     drawings: Mapping[str, Drawing | None], mask: Any
 ) -> list[tuple[np.ndarray, np.ndarray] | None]:
-    """A part of the plane for each panel: of one size, with the tissue in its middle."""
+    """The part of the plane that each panel shows: of one size, centred on the tissue."""
     views = []
     for drawing in drawings.values():
         assert drawing is not None

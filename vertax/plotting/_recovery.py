@@ -1,4 +1,4 @@
-"""What a fit found, against what is true."""
+"""Inferred against true parameters."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def plot_recovery(
 
     Annotated with Pearson's correlation r (where both vary) and the mean relative error
     $\langle|\hat\theta_i-\theta_i|/|\theta_i|\rangle$ (where no true parameter is zero), unless it has a
-    `label`. Parameters of which the true or the inferred value is not finite are left out.
+    `label`. Parameters with a true or inferred value that is not finite are left out.
 
     ```python
     ax = vx.plot_recovery(true, by_image, label="image")
@@ -42,13 +42,13 @@ def plot_recovery(
 
     **Arguments:**
 
-    - `true`, `inferred`: the parameters; they may have any unit, the same.
-    - `initial`: what the fit started from, drawn pale.
+    - `true`, `inferred`: the parameters, in the same unit.
+    - `initial`: the parameters at the start of the fit, drawn pale.
     - `deviation`: standard deviations of the inferred parameters, drawn as bars.
-    - `ax`: the axes to draw in, also one after the other to compare; by default those of a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
-    - `name`: what the parameter is called on the axes.
-    - `label`: name of these parameters in the legend, which is then up to the caller.
+    - `ax`: the axes to draw in, also for several fits to compare; by default those of a new figure.
+    - `figure`: an empty figure to draw in instead; no window is opened.
+    - `name`: of the parameter, in the labels of the axes.
+    - `label`: name of these parameters in the legend, which the caller then draws.
     - `colour`, `marker`: of the inferred parameters.
 
     **Returns:** the axes.
@@ -72,9 +72,9 @@ def plot_recovery(
             f"Argument `true` must hold a list of at least one parameter, but has shape "
             f"{true.shape}."
         )
-    known = np.isfinite(true) & np.isfinite(inferred)
-    true, inferred = true[known], inferred[known]
-    first, bars = (None if v is None else v[known] for v in others.values())
+    finite = np.isfinite(true) & np.isfinite(inferred)
+    true, inferred = true[finite], inferred[finite]
+    first, bars = (None if v is None else v[finite] for v in others.values())
     with _style.house_style():
         if ax is None:
             (ax,) = _style.new_axes(width=2.6, height=2.6, figure=figure)
@@ -102,7 +102,7 @@ def plot_recovery(
         if label is None:
             text = _agreement(true, inferred)
             ax.text(0.04, 0.97, text, transform=ax.transAxes, va="top", ha="left", size=7)
-            if first is not None:  # above the axes, where no point is
+            if first is not None:  # above the axes, where it covers no point
                 ax.legend(
                     loc="lower right",
                     bbox_to_anchor=(1, 1),
@@ -115,7 +115,7 @@ def plot_recovery(
 
 
 def _ends(ax: Axes, values: np.ndarray) -> tuple[float, float]:
-    """Limits of both axes that show these values and what is there already."""
+    """Limits of both axes that show these values and those drawn before."""
     values = values[np.isfinite(values)]
     low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
@@ -127,10 +127,9 @@ def _ends(ax: Axes, values: np.ndarray) -> tuple[float, float]:
 
 
 def _agreement(true: np.ndarray, inferred: np.ndarray) -> str:
-    """Pearson's r and the mean relative error, as far as they are defined."""
+    """Pearson's r and the mean relative error, where they are defined."""
     lines = []
-    # Constant up to rounding has no correlation, and dividing by its tiny variance would make one
-    # up.
+    # Values that are constant up to rounding have no correlation: their variance is rounding error.
     varies = [x.size > 0 and np.ptp(x) > 1e-12 * np.abs(x).max() for x in (true, inferred)]
     if all(varies):
         lines.append(f"$r$ = {np.corrcoef(true, inferred)[0, 1]:.4f}")

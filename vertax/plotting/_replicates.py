@@ -1,4 +1,4 @@
-"""Many runs of one kind in one picture: bands and boxes."""
+"""Replicates in one figure: bands and box plots."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ def plot_band(
     label: str | None = None,
     colour: str | None = None,
 ) -> Axes:
-    """Draw curves of replicates as their mean in a band.
+    """Draw the mean of replicate curves with a band.
 
-    Values that are not finite are left out of the mean, and on a logarithmic axis those that are not
-    positive; where nothing is left, the curve has a gap.
+    The mean excludes values that are not finite, and on a logarithmic axis those that are not positive; where
+    no value is left, the curve has a gap.
 
     **Arguments:**
 
     - `curves`: shape `(epochs, replicates)`, a curve in each column, such as `fit.history.cost` of a batch
         of fits.
-    - `x`: where they are, by default 0, 1, 2, …
-    - `spread`: what the band shows: `"deviation"`, one standard deviation to either side, or `"range"`, all
-        from the least to the largest.
+    - `x`: the abscissa of each row, by default 0, 1, 2, …
+    - `spread`: of the band: `"deviation"`, plus and minus one standard deviation, or `"range"`, from the
+        smallest to the largest value.
     - `log`: take mean and deviation of the logarithm, and draw on a logarithmic axis.
-    - `ax`: the axes to draw in, also one after the other to compare; by default those of a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
-    - `label`: name in the legend, which is up to the caller.
+    - `ax`: the axes to draw in, also for several bands to compare; by default those of a new figure.
+    - `figure`: an empty figure to draw in instead; no window is opened.
+    - `label`: name in the legend, which the caller draws.
     - `colour`: by default the next of `SERIES`.
 
     **Returns:** the axes.
 
     **Raises:**
 
-    - `ValueError`, naming the argument, for shapes that do not go together or an unknown `spread`.
+    - `ValueError`, naming the argument, for shapes that do not match or an unknown `spread`.
     """
     values = np.asarray(curves, float)
     places = np.arange(len(values)) if x is None and values.ndim else np.asarray(x, float)
@@ -62,10 +62,10 @@ def plot_band(
         )
     if spread not in ("deviation", "range"):
         raise ValueError(f'Argument `spread` must be "deviation" or "range", but is {spread!r}.')
-    known = np.isfinite(values) & (values > 0 if log else True)
+    valid = np.isfinite(values) & (values > 0 if log else True)
     if log:
-        values = np.log(np.where(known, values, 1.0))
-    values = np.ma.array(values, mask=~known)
+        values = np.log(np.where(valid, values, 1.0))
+    values = np.ma.array(values, mask=~valid)
     middle = values.mean(axis=1)
     if spread == "range":
         low, high = values.min(axis=1), values.max(axis=1)
@@ -95,16 +95,16 @@ def plot_boxes(
     figure: Figure | None = None,
     colours: Mapping[str, str] | None = None,
 ) -> Axes:
-    """Draw a box for each group of numbers (median, quartiles), and every number as a point.
+    """Draw a box plot (median, quartiles) of each group of numbers, and every number as a point.
 
-    On a logarithmic axis numbers that are not positive have no place: they are triangles at its lower end.
+    On a logarithmic axis, numbers that are not positive are triangles at the lower end.
 
     **Arguments:**
 
     - `groups`: the numbers of each group by its name; those that are not finite are left out.
     - `log`: on a logarithmic axis.
     - `ax`: the axes to draw in; by default those of a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
+    - `figure`: an empty figure to draw in instead; no window is opened.
     - `colours`: of the points by the name of the group; by default those of `series_colours`.
 
     **Returns:** the axes.

@@ -1,4 +1,4 @@
-"""The look of all pictures."""
+"""Colours, Matplotlib settings and sizes of all figures."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ MISSING = "0.85"
 BLANK = "0.96"
 """Faces when cells are not coloured."""
 INK = "0.15"
-"""The dark grey of cell outlines, text and lines of reference."""
+"""The dark grey of cell outlines, text and reference lines."""
 HIGHLIGHT = "#ffb000"
 """Membranes over a grey image."""
 MARK = "#e8308a"
-"""Marked edges: not in viridis, not in inferno, and no grey."""
+"""Marked edges: a colour that is not in viridis or inferno, and not grey."""
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
-"""Colours of curves: six of Okabe and Ito, told apart with any colour vision, and a grey."""
+"""Colours of curves: six of Okabe and Ito, distinguishable with any colour vision, and a grey."""
 
 _STYLE: Any = {
     "font.size": 8,
@@ -55,7 +55,7 @@ _STYLE: Any = {
 
 @contextlib.contextmanager
 def house_style() -> Iterator[None]:
-    """Matplotlib settings of all pictures here, for pictures of one's own: a context, or a decorator.
+    """The Matplotlib settings of vertax's figures, for other figures: a context manager or a decorator.
 
     ```python
     @vx.plotting.house_style()
@@ -65,7 +65,7 @@ def house_style() -> Iterator[None]:
         return figure
     ```
 
-    The settings of the user are back afterwards.
+    It restores the previous settings.
     """
     with matplotlib.rc_context(_STYLE):
         yield
@@ -79,7 +79,7 @@ def new_figure(
     height: float | Sequence[float] = 2.3,
     room: float = 0.0,
 ) -> tuple[Figure, np.ndarray]:
-    """A figure of panels in rows and columns, for a file: no window shows it, and nothing has to close it.
+    """A figure of panels in rows and columns, for a file: it opens no window and needs not be closed.
 
     ```python
     figure, ((left, right),) = vx.plotting.new_figure(1, 2, width=[3.0, 2.4])
@@ -98,14 +98,14 @@ def new_figure(
 
     **Raises:**
 
-    - `ValueError` if there are no panels, or if widths or heights do not go with them.
+    - `ValueError` if there are no panels, or if the numbers of widths or heights are wrong.
     """
     if rows < 1 or columns < 1:
         raise ValueError(
             f"Arguments `rows` and `columns` must be positive, but are {rows} and {columns}."
         )
     widths, heights = _sizes("width", width, columns), _sizes("height", height, rows)
-    # Not pyplot: it keeps every figure open, and on a screen would open windows.
+    # Not pyplot: it keeps every figure open and opens windows.
     layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06)
     figure = Figure(figsize=(sum(widths) + room, sum(heights)), layout=layout)
     with house_style():
@@ -125,24 +125,24 @@ def _sizes(name: str, size: float | Sequence[float], n: int) -> list[float]:
 
 
 def series_colours(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each name, always the same for the same list.
+    """A colour for each name: the same list gives the same colours.
 
     **Arguments:**
 
     - `names`: of the curves or groups.
 
-    **Returns:** the colours of `SERIES` by name; after seven they begin anew.
+    **Returns:** the colours of `SERIES` by name; they repeat after seven.
     """
     return {name: SERIES[k % len(SERIES)] for k, name in enumerate(names)}
 
 
 def same_limits(axes: Iterable[Axes], *, x: bool = True, y: bool = True) -> None:
-    """Give panels the same limits, those that show all of them, so that they can be compared.
+    """Give panels common limits that show all data.
 
     **Arguments:**
 
-    - `axes`: the panels, after all is drawn.
-    - `x`, `y`: which of the two axes.
+    - `axes`: the panels; call this after drawing everything.
+    - `x`, `y`: whether to change that axis.
     """
     panels = list(axes)
     for wanted, limits, change in (
@@ -161,7 +161,7 @@ def new_axes(
     size = (n * width + room, height)
     layout = ConstrainedLayoutEngine(w_pad=0.06)
     if figure is None:
-        import matplotlib.pyplot as plt  # here: it picks a window system
+        import matplotlib.pyplot as plt  # imported late: it selects a window system
 
         figure = plt.figure(figsize=size, layout=layout)
     else:
@@ -175,13 +175,13 @@ def new_axes(
 
 
 def one_of(ax: Any, figure: Figure | None, name: str = "ax") -> None:
-    """Refuse a figure and axes at once."""
+    """Raise an error if both a figure and axes are given."""
     if ax is not None and figure is not None:
         raise ValueError(f"Arguments `{name}` and `figure` must not both be given.")
 
 
 def size_of(extent: np.ndarray) -> tuple[float, float]:
-    """Width and height of a new picture in inches: of one area, whatever its shape."""
+    """Width and height of a new figure in inches: 9 square inches for aspect ratios from 1/4 to 4."""
     ratio = float(np.clip(extent[1] / extent[0], 0.25, 4))
     return 3.0 / np.sqrt(ratio), 3.0 * np.sqrt(ratio)
 

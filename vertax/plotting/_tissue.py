@@ -1,4 +1,4 @@
-"""Pictures of a tissue."""
+"""Drawing of a tissue."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from vertax.plotting import _style
 from vertax.plotting._colours import EDGES_ON_DARK, EDGES_ON_PALE, Colours, bar_beside
 from vertax.plotting._image import draw_image, extent_of
 
-# Over an image coloured cells are opaque, so that their colours are those of the bar, and smaller than
-# they are, so that the membranes show between them.
+# Over an image coloured cells are opaque, so that their colours are those of the bar, and shrunk to this
+# fraction of their size, so that the membranes are visible between them.
 _INSET = 0.8
 
 
@@ -49,11 +49,11 @@ def plot_tissue(
 ) -> Axes:
     """Draw a tissue, its cells and edges coloured by values.
 
-    Periodic cells are drawn whole, each with its centroid in the home box (a thin dashed outline),
-    so edges across the boundary show twice, once at either cell.
+    Periodic cells are drawn in one piece, with the centroid in the box (a thin dashed outline), so edges
+    across the boundary are drawn twice, once at each cell.
 
     Over a microscopy image the y axis points down, the membranes are drawn as lines, and a periodic tissue
-    is repeated as far as the image goes:
+    is repeated over the whole image:
 
     ```python
     vx.plot_tissue(tissue, image=membranes, pixel_size=0.2)
@@ -62,25 +62,24 @@ def plot_tissue(
     **Arguments:**
 
     - `tissue`: the [`Tissue`][vertax.Tissue].
-    - `cells`: one value for each cell; cells whose value is not finite are grey. Left out: pale
-        faces, or none over an image.
+    - `cells`: one value for each cell; cells with a value that is not finite are grey. By default the
+        cells are pale, and transparent over an image.
     - `edges`: one value for each edge, drawn as thick coloured lines.
     - `ax`: the axes to draw in; by default those of a new figure.
-    - `figure`: an empty figure to draw in instead, which no window shows.
+    - `figure`: an empty figure to draw in instead; no window is opened.
     - `mask`: which cells to draw, a boolean for each; by default all.
     - `highlight`: edges to mark, a boolean for each, such as those of
         [`flipped_edges`][vertax.plotting.flipped_edges].
-    - `cmap`, `edge_cmap`: colour maps, by default even steps to the eye that colour-blind readers
-        see too. For values with a meaningful zero pass a diverging one (`"RdBu_r"`) and symmetric
-        limits.
+    - `cmap`, `edge_cmap`: colour maps, by default perceptually uniform ones that suit colour-blind
+        readers. For values with a meaningful zero pass a diverging one (`"RdBu_r"`) and symmetric limits.
     - `vmin`, `vmax`, `edge_vmin`, `edge_vmax`: limits of the colours; by default those of the
-        finite values drawn. Where values lie beyond, the bar has an arrow and says how far they go.
+        finite values drawn. Where values lie beyond, the bar has an arrow with the extreme value.
     - `label`, `edge_label`: labels of the colour bars.
     - `colorbar`: whether to draw colour bars.
-    - `alpha`: opacity of the faces, from 0 to 1. Left out, they have the colours of the bar, also over an
-        image, where cells are then drawn smaller, so that the membranes show between them. With a number
-        cells are drawn whole, and mix with the image, so that their colours are not those of the bar.
-    - `linewidth`: of the cell outlines, in points; by default it follows the size of a cell.
+    - `alpha`: opacity of the faces, from 0 to 1. By default they are opaque, and over an image drawn
+        smaller, so that the membranes are visible between them. With a number cells have their full size,
+        and mix with the image: their colours are not those of the bar.
+    - `linewidth`: of the cell outlines, in points; by default 3.5 % of the size of a cell.
         Coloured edges are three times as wide.
     - `image`: a grey image, shown with robust contrast, or a colour image (red, green, blue; 8
         bits, or floats in 0 … 1). The pixel in row r and column c covers [c, c + 1] × [r, r + 1],
@@ -92,7 +91,7 @@ def plot_tissue(
     **Raises:**
 
     - `ValueError`, naming the argument, for a batch of tissues, values of the wrong length, an
-        image that is not one, or a `pixel_size` or `alpha` out of range.
+        image of the wrong shape, or a `pixel_size` or `alpha` out of range.
     """
     return draw(
         Drawing(single(tissue)),
@@ -113,7 +112,7 @@ def plot_tissue(
 
 
 def single(tissue: Tissue) -> Tissue:
-    """The tissue, refused if it is a batch."""
+    """The tissue; raise an error if it is a batch."""
     if tissue.vertices.ndim != 2:
         raise ValueError(
             "Argument `tissue` must be a single tissue, but its vertices have shape "
@@ -143,7 +142,7 @@ def draw(
     image: np.ndarray | None = None,
     pixel_size: float = 1.0,
 ) -> Axes:
-    """Draw what `plot_tissue` draws, with cells placed as in `drawing`; `view` is what to show."""
+    """Like `plot_tissue`, with cells placed as in `drawing`; `view` is the part of the plane to show."""
     _style.one_of(ax, figure)
     cell_values = checked("cells", cells, drawing.n_cells)
     edge_values = checked("edges", edges, drawing.n_edges)
@@ -171,7 +170,7 @@ def draw(
     with _style.house_style():
         if ax is None:
             width, height = _style.size_of(high - low)
-            # The room for bars is ample: their height is then that of the tissue.
+            # With enough room for the bars their height is that of the tissue.
             (ax,) = _style.new_axes(
                 width=width + 0.1 + 0.8 * n_bars, height=height + 0.1, figure=figure
             )
@@ -201,10 +200,12 @@ def draw(
         if edge_values is not None:
             drawn = edge_values[segment_edges]
             if edge_colours.cmap is None:
-                own = EDGES_ON_PALE if image is None else EDGES_ON_DARK
-                edge_colours = edge_colours._replace(cmap=own)
+                edge_map = EDGES_ON_PALE if image is None else EDGES_ON_DARK
+                edge_colours = edge_colours._replace(cmap=edge_map)
             edge_colours.apply(lines, drawn)
-            if cell_values is not None:  # a casing sets coloured lines off from coloured faces
+            if (
+                cell_values is not None
+            ):  # a white casing separates coloured lines from coloured faces
                 casing = LineCollection(list(segments), colors="w", linewidths=4.5 * linewidth)
                 casing.set(capstyle="round", zorder=1.5)
                 ax.add_collection(casing, autolim=False)
@@ -217,7 +218,7 @@ def draw(
         if marked is not None:
             _mark(ax, segments[marked[segment_edges].astype(bool)], linewidth)
         if n_bars:
-            # A later bar goes between the axes and an earlier one.
+            # Matplotlib puts each new bar between the axes and the previous bar.
             for place, bar in enumerate(reversed(bars)):
                 bar_beside(ax, *bar, innermost=place == len(bars) - 1)
             ax.set_anchor("E")  # next to its bars
@@ -234,13 +235,13 @@ def checked(name: str, values: Any, n: int) -> np.ndarray | None:
 
 
 def line_width(drawing: Drawing, ax: Axes) -> float:
-    """Width of the outlines of cells in points: a few per cent of a cell, within what prints well."""
+    """Width of the outlines of cells in points: 3.5 % of the cell size, between 0.2 and 1."""
     return float(np.clip(0.035 * drawing.cell_size * _scale(ax), 0.2, 1.0))
 
 
 def _mark(ax: Axes, segments: np.ndarray, linewidth: float) -> None:
-    """Marked edges: thick, in a colour that no colour map of cells or edges has, on a white casing."""
-    width = max(4.5 * linewidth, 2.5)  # an edge that has just flipped is short, and must be seen
+    """Draw marked edges: thick lines on a white casing, in a colour outside the default colour maps."""
+    width = max(4.5 * linewidth, 2.5)  # an edge that has just flipped is short
     for extra, colour in ((1.6, "w"), (0.0, _style.MARK)):
         lines = LineCollection(list(segments), colors=colour, linewidths=width + extra)
         lines.set(capstyle="round", zorder=2.5)
@@ -254,7 +255,7 @@ def _repeated(
     low: np.ndarray,
     high: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """All periodic images of some shapes that can be seen between two corners, and their numbers."""
+    """All periodic images of some shapes that intersect the rectangle from `low` to `high`; their numbers."""
     if lattice is None or len(shapes) == 0:
         return shapes, numbers
     corners = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
@@ -263,8 +264,8 @@ def _repeated(
     first, last = np.floor(fractions.min(axis=0)) - 1, np.ceil(fractions.max(axis=0)) + 1
     steps = np.stack(np.meshgrid(*map(np.arange, first, last)), axis=-1).reshape(-1, 2) @ lattice
     shifted = shapes[None] + steps[:, None, None]
-    seen = np.all((shifted.max(axis=2) >= low) & (shifted.min(axis=2) <= high), axis=-1)
-    return shifted[seen], np.broadcast_to(numbers, seen.shape)[seen]
+    visible = np.all((shifted.max(axis=2) >= low) & (shifted.min(axis=2) <= high), axis=-1)
+    return shifted[visible], np.broadcast_to(numbers, visible.shape)[visible]
 
 
 def view_of(polygons: np.ndarray, outline: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

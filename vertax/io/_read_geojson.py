@@ -1,0 +1,170 @@
+"""Tissues from polygons in GeoJSON files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike, Float, Int, Shaped
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from vertax._base.checks import check_number
+from vertax.initialise._polygons import PolygonTissue, checked_lattice, tissue_from_corners
+from vertax.io._read_table import properties, read_features
+from vertax.mesh._faces import Names
+
+
+def read_geojson(
+    path: str | os.PathLike[str],
+    *,
+    box: ArrayLike | Sequence[Any] | None = None,
+    tolerance: float | None = None,
+    inner_arcs: bool = False,
+    softening: float | None = None,
+) -> tuple[PolygonTissue, dict[str, Shaped[np.ndarray, " cells"]]]:
+    """Read a tissue from a GeoJSON file with a polygon for each cell (RFC 7946).
+
+    ```python
+    polygons, table = vx.io.read_geojson("cells.geojson")
+    tissue, pressure = polygons.tissue, table["pressure"]
+    ```
+
+    Corners of different polygons that are closer together than `tolerance` are one point. The points and
+    cells then make a tissue as in [`from_polygons`][vertax.initialise.from_polygons].
+
+    [`write_geojson`][vertax.io.write_geojson] draws an arc as a chain of straight pieces, so an arc read from
+    polygons has the area of that chain. For exactly the same tissue write the edges too (`edges={}`), and
+    read them: `vx.io.from_edge_table(vx.io.read_table("cells-edges.geojson"))`.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `box`: of a periodic tissue, width and height, or two lattice vectors as rows. Polygons must be whole;
+        they may stick out of the box.
+    - `tolerance`: in units of length; by default 10⁻⁶ of the root mean cell area.
+    - `inner_arcs`, `softening`: as of [`from_polygons`][vertax.initialise.from_polygons].
+
+    **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], with points numbered in the order of
+    the file, and the properties of the features as columns with one row for each cell.
+
+    **Raises:**
+
+    - `OSError` if the file cannot be read.
+    - `ValueError`, naming the file and the feature, for features that are no polygons or have holes, and as
+        [`from_polygons`][vertax.initialise.from_polygons].
+    """
+    path = Path(path)
+    features = read_features(path)
+    rings = [_ring(feature, number, path) for number, feature in enumerate(features)]
+    lattice = None if box is None else checked_lattice(box)
+    if tolerance is None:
+        tolerance = 1e-6 * float(np.sqrt(np.mean([abs(_area(ring)) for ring in rings])))
+    check_number("tolerance", tolerance, at_least=0)
+    corner = np.concatenate(rings)
+    point = _merged(corner, lattice, tolerance)
+    first = np.unique(point, return_index=True)[1]
+    images = np.zeros((len(corner), 2), int)
+    if lattice is not None:
+        way = (corner - corner[first][point]) @ np.linalg.inv(lattice)
+        images = np.rint(way).astype(int)
+    splits = np.cumsum([len(ring) for ring in rings])[:-1]
+    cells, places = [], []
+    for cell, image in zip(np.split(point, splits), np.split(images, splits), strict=True):
+        # Corners within the tolerance of the one before are the same corner.
+        both = np.column_stack([cell, image])
+        kept = np.any(both != np.roll(both, 1, axis=0), axis=1)
+        cells.append(cell[kept])
+        places.append(image[kept])
+    names = Names(f"The polygons of {path}", _at(corner[first]), "feature {}".format)
+    polygons = tissue_from_corners(
+        corner[first],
+        cells,
+        names,
+        box=box,
+        images=None if box is None else places,
+        inner_arcs=inner_arcs,
+        softening=softening,
+    )
+    return polygons, properties(features, path)
+
+
+def _at(points: Float[np.ndarray, "points 2"]) -> Any:
+    return lambda point: f"the corner {points[point].tolist()}"
+
+
+def _ring(feature: dict[str, Any], number: int, path: Path) -> Float[np.ndarray, "corners 2"]:
+    """The outline of a polygon, without its first corner at the end."""
+    geometry = feature["geometry"]
+    kind, coordinates = geometry.get("type"), geometry.get("coordinates")
+    if kind == "LineString":
+        raise ValueError(
+            f"{path} must hold polygons, but feature {number} is a line. Read the edges that vertax "
+            "writes by "
+            "vx.io.from_edge_table(vx.io.read_table(path))."
+        )
+    if kind == "MultiPolygon" and isinstance(coordinates, list) and len(coordinates) == 1:
+        kind, coordinates = "Polygon", coordinates[0]
+    if kind != "Polygon" or not isinstance(coordinates, list):
+        raise ValueError(
+            f"{path} must hold polygons, but feature {number} is of type {kind}. Remove it, or split it "
+            "into one "
+            "polygon for each cell."
+        )
+    if len(coordinates) != 1:
+        raise ValueError(
+            f"{path} must hold polygons without holes, but feature {number} has {len(coordinates) - 1}. "
+            "Give the cells inside it, and divide the cell around them."
+        )
+    try:
+        ring = np.array([[float(place[0]), float(place[1])] for place in coordinates[0]])
+    except (TypeError, ValueError, IndexError) as error:
+        raise ValueError(
+            f"{path}: the coordinates of feature {number} are no pairs of numbers."
+        ) from error
+    if len(ring) > 1 and np.array_equal(ring[0], ring[-1]):
+        ring = ring[:-1]
+    if len(ring) < 3 or not np.isfinite(ring).all():
+        raise ValueError(
+            f"{path} must hold polygons of three corners or more at finite places, but feature {number} "
+            "does not. "
+            "Remove it."
+        )
+    return ring
+
+
+def _area(ring: Float[np.ndarray, "corners 2"]) -> float:
+    x, y = (ring - ring[0]).T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+
+
+def _merged(
+    corner: Float[np.ndarray, "corners 2"],
+    lattice: Float[np.ndarray, "2 2"] | None,
+    tolerance: float,
+) -> Int[np.ndarray, " corners"]:
+    """One number for all corners at one place, in order of appearance."""
+    place, source = corner, np.arange(len(corner))
+    if lattice is not None:
+        # In the box, with a rim of images, so that corners on both sides of its border meet.
+        fraction = (corner @ np.linalg.inv(lattice)) % 1.0
+        place = fraction @ lattice
+        rim = 2 * tolerance * np.linalg.norm(np.linalg.inv(lattice), axis=0)
+        images, origins = [place], [source]
+        for step in np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]):
+            shifted = fraction + step
+            near = np.flatnonzero(np.all((shifted > -rim) & (shifted < 1 + rim), axis=1))
+            images.append(shifted[near] @ lattice)
+            origins.append(near)
+        place, source = np.concatenate(images), np.concatenate(origins)
+    pairs = KDTree(place).query_pairs(tolerance, output_type="ndarray")
+    links = source[pairs]
+    n = len(corner)
+    graph = coo_array((np.ones(len(links), bool), (links[:, 0], links[:, 1])), shape=(n, n))
+    group = connected_components(graph, directed=False)[1]
+    first = np.unique(group, return_index=True)[1]
+    return np.argsort(np.argsort(first))[group]
