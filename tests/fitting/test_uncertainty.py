@@ -195,7 +195,7 @@ def test_invalid_arguments_are_rejected(hidden, without_type_checks):
     with pytest.raises(TypeError, match="`n_independent` must be one real number"):
         vx.uncertainty(problem, fit, n_independent=every)
     stack = lambda tree: jax.tree.map(lambda x: jnp.stack([x, x]) if eqx.is_array(x) else x, tree)
-    with pytest.raises(ValueError, match="must be single ones"):
+    with pytest.raises(ValueError, match="must be single, but are a batch"):
         vx.uncertainty(stack(problem), stack(fit))
     with pytest.raises(ValueError, match="more independent residuals than parameters"):
         vx.uncertainty(problem, fit, n_independent=8)
