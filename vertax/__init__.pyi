@@ -20,6 +20,7 @@ from . import (
     transitions as transitions,
 )
 from ._base.compilation_cache import enable_compilation_cache as enable_compilation_cache
+from ._base.fast_compilation import enable_fast_compilation as enable_fast_compilation
 from .activities import AbstractActivity as AbstractActivity
 from .adjoints import (
     AutomaticDifferentiation as AutomaticDifferentiation,

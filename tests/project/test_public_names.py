@@ -9,11 +9,11 @@ NAMES = """
 AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnergy
 AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiation Checkpoint
 Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free
-GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic RESULTS Record Relaxation
-T1 T2 Tissue Topology Uncertainty activities adjoints animate costs dissipations dynamics
-enable_compilation_cache energies equilibrate evolve external fit fitting growth inference
-initialise io load_tissue mechanics mesh plot_history plot_recovery plot_tissue plotting relax
-runs save_tissue solvers transitions uncertainty
+GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic RESULTS Record
+Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate costs dissipations
+dynamics enable_compilation_cache enable_fast_compilation energies equilibrate evolve external
+fit fitting growth inference initialise io load_tissue mechanics mesh plot_history plot_recovery
+plot_tissue plotting relax runs save_tissue solvers transitions uncertainty
 """
 
 PACKAGES = {

@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 import equinox as eqx
 from tqdm import tqdm
 
+from vertax._base.fast_compilation import OPTIONS, compiles_fast
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 DELAY = 1.0
@@ -40,10 +42,13 @@ def announced_jit(function: Function, *, inline: bool = False) -> Function:
             timer.start()
         return function(*args, **kwargs)
 
-    compiled = eqx.filter_jit(traced, inline=inline)  # pyright: ignore[reportCallIssue]
+    jit: Any = eqx.filter_jit
+    optimised = jit(traced, inline=inline)
+    fast = jit(traced, inline=inline, compiler_options=OPTIONS)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
+        compiled = fast if compiles_fast((args, kwargs)) else optimised
         label = _thread.label or next(iter(_label_of_process), None)
         if label is None or _thread.timer is not None:
             return compiled(*args, **kwargs)
