@@ -25,8 +25,8 @@ def enable_fast_compilation(enabled: bool = True) -> None:
 
     Compiling takes about half of the time, and compiled functions take 1.3 to 1.8 times as long
     (`python benchmarks/compilation.py --fast`). It pays for up to a few hundred relaxations of one size. The
-    setting holds for functions of vertax that are called outside of `jax.jit`, `jax.vmap` and `jax.grad`, from
-    the next call on; both versions of a function are kept. It is no setting of JAX.
+    setting holds for functions of vertax that are called outside of `jax.jit`, `jax.vmap` and `jax.grad`,
+    from the next call on; both versions of a function are kept. It is no setting of JAX.
 
     ```python
     import vertax as vx
