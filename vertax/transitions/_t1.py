@@ -28,35 +28,34 @@ class T1(AbstractTransitions):
 
     An edge shorter than the threshold is compared in two configurations of the same length: stretched
     along itself, and flipped (the two cells at its ends become neighbours). If the flipped one has the
-    lower energy it is taken; otherwise the vertices stay where they are. Edges that a large step has
-    turned inside out are candidates too. A sweep tries every candidate once, all that share no cell
-    together, shortest first.
+    lower energy it is taken; otherwise the vertices do not move. Edges that a large step has inverted are
+    candidates too. A sweep tries every candidate once, shortest first; candidates that share no cell are
+    tried together.
 
-    This differs from the paper's rule in two points. An edge that does not flip stays as it is: there it
-    is stretched, which raises the energy again and again and never comes to rest. And the order is
-    shortest first: with another one, 3 to 5 % of the edges of a sweep may end otherwise where candidates
-    are neighbours.
+    The paper's rule differs in two points. There an edge that does not flip is stretched, which raises the
+    energy in every sweep and prevents convergence; here it stays as it is. And the order is shortest first:
+    another order changes the result for 3 to 5 % of the edges of a sweep, where candidates are neighbours.
 
-    An edge that flipped before in the same relaxation must also want to grow in its new place, from a
-    quarter of that length on: where four cells meet in one point because its tension is too high for
-    either configuration, it would otherwise flip to and fro for ever.
+    An edge that has flipped before in the same relaxation flips only if the flipped edge also lowers the
+    energy when it grows from a quarter of its length. Otherwise an edge with a tension too high for either
+    configuration, where four cells meet in one point, would flip back and forth.
 
-    Where a flipped edge makes cells overlap, a relaxation makes it shorter (`length_fraction` of
-    [`sweep`][vertax.AbstractTransitions]), and if that does not help the edge does not flip. An edge below
-    the threshold that is inside out, and does not flip, is put upright.
+    If a flipped edge makes cells overlap, a relaxation makes it shorter (`length_fraction` of
+    [`sweep`][vertax.AbstractTransitions]); if they still overlap, the edge does not flip. An inverted edge
+    below the threshold that does not flip is turned by half a turn.
 
     Lengths are those of arcs where edges are arcs; an edge that flips becomes straight, or an arc of
     angle 0.
 
     A flip that would leave a cell with two sides (with one, if the other is an arc on the outline), or
-    an edge with one cell or the exterior on both sides, is refused: so a free tissue stays in one
-    piece. Edges at pinned vertices do not flip.
+    an edge with one cell or the exterior on both sides, is refused: a free tissue stays connected. Edges at
+    pinned vertices do not flip.
 
     **Arguments:**
 
     - `threshold`: length below which an edge may flip, in units of the size of a cell (the root mean
         cell area). Smaller values (5e-3 in the paper) reach the same states in more steps.
-    - `max_flips`: how often one edge may flip in a relaxation: a last guard against flipping for ever.
+    - `max_flips`: most flips of one edge in a relaxation.
 
     **Raises:**
 
@@ -76,7 +75,7 @@ class T1(AbstractTransitions):
             raise ValueError(f"Argument `max_flips` must be at least 1, but is {self.max_flips}.")
 
     def init(self, tissue: Tissue) -> Int[Array, " edges"]:
-        """How often each edge flipped: never yet."""
+        """The number of flips of each edge: 0."""
         return jnp.zeros(tissue.n_edges, jnp.int32)
 
     def sweep(
@@ -90,8 +89,8 @@ class T1(AbstractTransitions):
         threshold = self.threshold * cell_size(tissue)
         length_fraction = jnp.broadcast_to(length_fraction, tissue.n_edges)
 
-        # Each round tries the candidates that share no cell, and the others wait: an edge that does not flip
-        # must not exclude its neighbours. A round removes at least one edge from `todo`, so the loop ends.
+        # Each round tries candidates that share no cell; the others wait for the next round. A round removes
+        # at least one edge from `todo`, so the loop ends.
         def unfinished(carry: tuple) -> Bool[Array, ""]:
             return any_of(carry[2])
 
@@ -110,7 +109,7 @@ class T1(AbstractTransitions):
             n_trials = _N_TRIALS if local else _N_TRIALS * jnp.sum(chosen)
             order = jnp.argsort(~chosen)
 
-            # The trials, and as the last pass of the same loop (compiled once) their outcome.
+            # The trials; the last pass of the same loop (compiled once) applies the result.
             def trial(i: Int[Array, ""], carry: tuple) -> tuple:
                 _, _, costs = carry
                 stretched, flipped, shorter = costs
@@ -143,20 +142,21 @@ class T1(AbstractTransitions):
         return tissue, counts
 
 
-# An edge is tried stretched along itself, flipped, and flipped with a quarter of the length.
 _N_TRIALS = 3
+"""Trials of an edge: stretched along itself, flipped, and flipped with a fraction of the length."""
 _SHORTER = 0.25
+"""That fraction."""
 
 
 def overlapping_faces(overlaps: Overlaps) -> Bool[Array, " faces"]:
-    """Which faces overlap, the exterior last."""
+    """The faces that overlap, the exterior last."""
     return jnp.append(overlaps.cells, overlaps.exterior)
 
 
 def has_new_overlaps(new: Tissue, before: Tissue) -> Bool[Array, ""]:
-    """Whether faces overlap after a change that did not before, or cells have no area but rounding errors."""
+    """Whether a change made faces overlap, or areas of cells vanish."""
     crossed = overlapping_faces(new.overlaps) & ~overlapping_faces(before.overlaps)
-    # (A cell of two sides has none if its arc is straight.)
+    # (A cell of two sides has no area if its arc is straight.)
     least = 1e3 * jnp.finfo(before.vertices.dtype).eps * mean_area(before)
     flat = new.alive & (new.areas <= least) & ~(before.alive & (before.areas <= least))
     return jnp.any(crossed) | jnp.any(flat)
@@ -167,18 +167,18 @@ def _independent(
 ) -> Bool[Array, " edges"]:
     """The candidates that are the shortest of all candidates at each of their four cells.
 
-    Two of them share no cell, hence no vertex and no neighbouring edge, so their flips commute. (An edge lies
-    between two faces, so sharing the exterior is no harm.) Of those of one length the first one counts.
+    Two of them share no cell, so no vertex and no neighbouring edge, and their flips commute. (They may share
+    the exterior: an edge lies between two faces.) Of candidates of equal length the first one counts.
     """
     cells, n_edges = frames.cells, candidates.size
 
     def least(values: Array, largest: Any, some: Bool[Array, " edges"]) -> Bool[Array, " edges"]:
-        """Which of some edges have the least value at each of their cells."""
+        """Those of `some` edges with the least value at each of their cells."""
         values = jnp.where(some, values, largest)
         of_cells = jnp.full(n_cells, largest, values.dtype)
         of_cells = of_cells.at[cells].min(values[:, None], mode="drop")
-        there = of_cells.at[cells].get(mode="clip")
-        is_least = (there == values[:, None]) | (cells == n_cells)
+        minima = of_cells.at[cells].get(mode="clip")
+        is_least = (minima == values[:, None]) | (cells == n_cells)
         return some & functools.reduce(jnp.logical_and, (is_least[:, k] for k in range(4)))
 
     shortest = least(frames.length, jnp.inf, candidates)
