@@ -73,7 +73,7 @@ class FaceMesh(NamedTuple):
     following: Int[np.ndarray, " all_sides"]
     """The next side of the cell, or of the exterior."""
 
-    def chains(self) -> list[Int[np.ndarray, " chain"]]:
+    def chains(self) -> list[Int[np.ndarray, " _"]]:
         """The sides of each half-edge, in order; none on the exterior, and for edges of length 0."""
         order = np.lexsort((self.rank, self.half_edge))
         count = np.bincount(self.half_edge, minlength=self.topology.n_half_edges)
