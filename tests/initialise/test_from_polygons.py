@@ -1,6 +1,7 @@
 """Tissues from the corners of their cells."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -96,7 +97,7 @@ def test_sides_take_the_shortest_way_through_a_periodic_box():
 def test_free_tissue_with_straight_edges():
     clusters = (vx.initialise.free_voronoi(15, key=key, lloyd_steps=2) for key in range(9))
     tissue = next(cluster for cluster in clusters if cluster.neighbour_counts.min() > 2)
-    straight = tissue.with_angles(0 * tissue.angles)
+    straight = tissue.with_angles(jnp.zeros(tissue.n_edges))
     result = vx.initialise.from_polygons(straight.vertices, corners_of(straight)[0])
     np.testing.assert_array_equal(result.tissue.vertices, tissue.vertices)
     np.testing.assert_array_equal(result.tissue.angles, 0)
@@ -242,7 +243,7 @@ def test_sides_of_three_cells_are_refused():
 @pytest.mark.usefixtures("as_a_user")
 def test_wrong_types_are_refused():
     with pytest.raises(TypeError, match="`cells` must hold the corner numbers of each cell"):
-        vx.initialise.from_polygons(POINTS, 7)
+        vx.initialise.from_polygons(POINTS, 7)  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"`cells` must hold integers.*cell 0 is"):
         vx.initialise.from_polygons(POINTS, [[0.5, 1.0, 4.0]])
     with pytest.raises(TypeError, match=r"jax\.jit"):

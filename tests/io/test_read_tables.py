@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -13,7 +14,9 @@ import vertax as vx
 WINGS = Path(__file__).parents[3] / "shared" / "data" / "wings"
 FREE = vx.initialise.free_voronoi(12, key=4, lloyd_steps=2)
 FOAM = vx.initialise.free_voronoi(8, key=5, lloyd_steps=2, inner_arcs=True)
-FOAM = FOAM.with_angles(FOAM.angles + 0.1 * jax.random.normal(jax.random.key(0), (FOAM.n_edges,)))
+FOAM = FOAM.with_angles(
+    FOAM.edge_angles + 0.1 * jax.random.normal(jax.random.key(0), (FOAM.n_edges,))
+)
 PERIODIC = vx.initialise.periodic_voronoi(9, key=6, lattice=np.array([[3.0, 0.0], [1.0, 3.0]]))
 BOX = PERIODIC.boundary.lattice
 
@@ -205,7 +208,7 @@ def tyssue_tables(tissue: vx.Tissue, first: int = 0) -> dict[str, dict[str, np.n
 def test_tables_of_tyssue(tmp_path, first):
     clusters = (vx.initialise.free_voronoi(12, key=key, lloyd_steps=2) for key in range(9))
     tissue = next(cluster for cluster in clusters if cluster.neighbour_counts.min() > 2)
-    tissue = tissue.with_angles(0 * tissue.angles)
+    tissue = tissue.with_angles(jnp.zeros(tissue.n_edges))
     tables = tyssue_tables(tissue, first)
     polygons = vx.io.from_tyssue(tables)
     np.testing.assert_array_equal(polygons.tissue.vertices, tissue.vertices)
@@ -252,9 +255,9 @@ def test_tables_that_are_not_those_of_tyssue_are_refused():
 @pytest.mark.usefixtures("as_a_user")
 def test_something_else_than_tables_is_refused():
     with pytest.raises(TypeError, match=r"such as sheet.datasets"):
-        vx.io.from_tyssue("sheet.hf5")
+        vx.io.from_tyssue("sheet.hf5")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="`table` must hold columns by name"):
-        vx.io.from_edge_table(7)
+        vx.io.from_edge_table(7)  # pyright: ignore[reportArgumentType]
 
 
 CLUSTER = """# a comment

@@ -114,14 +114,14 @@ def build_faces(
         names.refuse(
             "have an outline, where sides belong to one cell",
             "each side belongs to two",
-            "Argument `box` makes the tissue periodic.",
+            "Pass `box` for a periodic tissue.",
         )
     if not exterior and alone.size:
-        ends = sides.corner[[alone[0], sides.following[alone[0]]]]
+        first, last = sides.corner[[alone[0], sides.following[alone[0]]]].tolist()
         names.refuse(
             "fill the periodic box",
-            f"the side from {names.point(ends[0])} to {names.point(ends[1])} belongs to "
-            f"{names.cell(sides.cell[alone[0]])} only ({len(alone)} such sides)",
+            f"the side from {names.point(first)} to {names.point(last)} belongs to "
+            f"{names.cell(int(sides.cell[alone[0]]))} only ({len(alone)} such sides)",
             "Add the missing cells, or leave out `box` for a free tissue. Where edges are longer than half "
             "the box, give the `images` of the corners.",
         )
