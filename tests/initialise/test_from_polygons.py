@@ -95,7 +95,8 @@ def test_sides_take_the_shortest_way_through_a_periodic_box():
 
 
 def test_free_tissue_with_straight_edges():
-    tissue = vx.initialise.free_voronoi(15, key=2, lloyd_steps=2)
+    clusters = (vx.initialise.free_voronoi(15, key=key, lloyd_steps=2) for key in range(9))
+    tissue = next(cluster for cluster in clusters if cluster.neighbour_counts.min() > 2)
     straight = tissue.with_angles(jnp.zeros(tissue.n_edges))
     result = vx.initialise.from_polygons(straight.vertices, corners_of(straight)[0])
     np.testing.assert_array_equal(result.tissue.vertices, tissue.vertices)
@@ -303,7 +304,7 @@ def test_a_box_that_is_too_small_for_the_shortest_way_needs_images():
     box = tissue.boundary.lattice
     result = vx.initialise.from_polygons(tissue.vertices, cells, box=box, images=images)
     np.testing.assert_allclose(result.tissue.areas, tissue.areas, rtol=1e-12)
-    with pytest.raises(ValueError, match="Give the `images` of the corners"):
+    with pytest.raises(ValueError, match="the `images` of the corners"):
         vx.initialise.from_polygons(tissue.vertices, cells, box=box)
     with pytest.raises(ValueError, match="`images` must hold integers of shape"):
         vx.initialise.from_polygons(tissue.vertices, cells, box=box, images=images[:1])

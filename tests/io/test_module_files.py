@@ -293,7 +293,7 @@ class TestRefusedToSave:
         assert os.listdir(path.parent) == []
 
     def test_parts_of_vertax_that_belong_elsewhere(self, path):
-        with pytest.raises(ValueError, match=r"`value` is of class AtRest, .*no energy, cost"):
+        with pytest.raises(ValueError, match=r"`value` is of class AtRest, .*not an energy, cost"):
             save_energy(path, Anything(AtRest()))
 
     def test_something_else(self, path, tissues):

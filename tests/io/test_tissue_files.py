@@ -107,7 +107,7 @@ class TestRefusedToSave:
                 return jnp.zeros((0, *vertices.shape))
 
         odd = eqx.tree_at(lambda t: t.boundary, tissue, Sphere())
-        with pytest.raises(ValueError, match="no place for a boundary of class Sphere"):
+        with pytest.raises(ValueError, match="has no boundary of class Sphere"):
             save_tissue(tmp_path / "sphere.npz", odd)
 
 

@@ -286,7 +286,7 @@ def _checked_points(
 
 def _checked_cells(
     cells: Any, position: Float[np.ndarray, "points 2"], names: Names
-) -> list[Int[np.ndarray, " corners"]]:
+) -> list[Int[np.ndarray, " _"]]:
     """The corners of each cell as integers."""
     if isinstance(cells, str) or not hasattr(cells, "__len__"):
         raise TypeError(
@@ -358,7 +358,7 @@ def _checked_open(
 
 def _checked_images(
     images: Sequence[Any] | None,
-    corners: list[Int[np.ndarray, " corners"]],
+    corners: list[Int[np.ndarray, " _"]],
     position: Float[np.ndarray, "points 2"],
     lattice: Float[np.ndarray, "2 2"] | None,
     names: Names,
@@ -388,8 +388,12 @@ def _checked_images(
             bad = corner[np.setdiff1d(np.arange(len(corner)), first)]
             raise ValueError(
                 f"{names.subject} must not repeat a corner, but {names.cell(cell)} has "
-                f"{names.points(bad)} more than once. Leave out the first corner at the end, and corners to "
-                "which the outline comes back."
+                f"{names.points(bad)} more than once. "
+                + (
+                    "Leave out the first corner at the end, and corners to which the outline returns."
+                    if lattice is None or images is not None
+                    else "If they are different lattice images, give the `images` of the corners."
+                )
             )
     return np.concatenate(arrays).astype(int)
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from vertax._base.checks import as_float64
 from vertax.initialise._polygons import checked_lattice
 from vertax.io._read_table import column, whole_numbers
-from vertax.mesh import Free, Periodic, Tissue, Topology
-from vertax.mesh._faces import Names, Sides, build_faces
+from vertax.io._tables import Tables, frames_of, topology_of
+from vertax.mesh import Free, Periodic, Tissue
 
 
 def from_edge_table(
@@ -84,36 +85,32 @@ def from_edge_table(
     lattice = np.zeros((2, 2)) if box is None else checked_lattice(box)
     points = _positions(vertex, ends, None if box is None else lattice)
 
-    # Side 2 e is that of the cell on the left of edge e, in its direction; side 2 e + 1 that on the right.
+    # Row 2 e of the paper's half-edge table runs along edge e, row 2 e + 1 against it.
     cell_names = np.unique(cells[cells >= 0])
-    cell = np.where(cells >= 0, np.searchsorted(cell_names, cells), -1).ravel()
-    start, end = vertex.ravel(), vertex[:, ::-1].ravel()
+    face = np.where(cells >= 0, np.searchsorted(cell_names, cells), len(cell_names)).ravel()
+    source, target = vertex.ravel(), vertex[:, ::-1].ravel()
     vector = ends[:, 1] - ends[:, 0]
     offset = np.zeros((len(cells), 2), int)
     if box is not None:
         straight = points[vertex[:, 1]] - points[vertex[:, 0]]
         offset = np.rint((vector - straight) @ np.linalg.inv(lattice)).astype(int)
     offset = np.stack([offset, -offset], axis=1).reshape(-1, 2)
-    order, image = _outlines(start, end, cell, offset, _directions(vector, angles), cell_names)
-    names = Names(
-        "Argument `table`",
-        lambda point: f"vertex {vertex_names[point]}",
-        lambda index: f"cell {cell_names[index]}",
-    )
-    sides = Sides(start[order], image, cell[order])
-    mesh = build_faces(points, sides, names, exterior=exterior)
-
-    m, edge = mesh.topology, np.empty(mesh.topology.n_half_edges, int)
-    twin = np.asarray(m.twin)
-    edge[mesh.half_edge] = order // 2
-    edge[twin[mesh.half_edge]] = order // 2
-    topology = Topology(twin, np.asarray(m.cell), np.asarray(m.frame), edge, exterior=exterior)
-    half_edge = np.empty(len(cells), int)
-    forward = order % 2 == 0
-    half_edge[order[forward] // 2] = mesh.half_edge[forward]
-    topology = eqx.tree_at(
-        lambda t: t.half_edge, topology, jnp.asarray(half_edge, topology.half_edge.dtype)
-    )
+    following = _following(source, face, _directions(vector, angles, vertex), vertex_names)
+    _check_closed(face, offset, following, cell_names)
+    twin = np.arange(len(source)) ^ 1
+    columns = [np.argsort(following), following, twin, source, target, face, *offset.T]
+    face_table = np.unique(face, return_index=True)[1]
+    tables = Tables(points, np.stack(columns, axis=1), face_table, 1.0, 1.0)
+    frame = np.zeros_like(offset)
+    if box is not None:
+        frame = frames_of(following, face_table, offset, np.bincount(face))
+    try:
+        topology = topology_of(tables, frame, exterior=exterior)
+    except ValueError as error:
+        raise ValueError(
+            f"Argument `table` must list all edges of one tissue, but does not: {error} Give the rows of all "
+            "edges, with the `box` of a periodic tissue."
+        ) from error
     dtype = jnp.result_type(float)
     inner = cells[:, 1] >= 0
     return Tissue(
@@ -168,49 +165,69 @@ def _positions(
 
 
 def _directions(
-    vector: Float[np.ndarray, "edges 2"], angles: Float[np.ndarray, " edges"]
-) -> Float[np.ndarray, " sides"]:
-    """The angle, from the x axis, at which each side leaves its vertex."""
+    vector: Float[np.ndarray, "edges 2"],
+    angles: Float[np.ndarray, " edges"],
+    vertex: Int[np.ndarray, "edges 2"],
+) -> Float[np.ndarray, " rows"]:
+    """The angle, from the x axis, at which each row leaves its vertex."""
     chord = np.arctan2(vector[:, 1], vector[:, 0])
-    return np.stack([chord - angles, chord + np.pi + angles], axis=1).ravel()
+    direction = np.stack([chord - angles, chord + np.pi + angles], axis=1)
+    # An edge of length 0 points away from the other edges at its other end, as in a four-fold vertex that
+    # it is a part of: it separates them from those at its own end.
+    length = np.linalg.norm(vector, axis=1)
+    for edge in np.flatnonzero(length <= 1e-12 * length.max()):
+        for end in (0, 1):
+            beyond = (vertex == vertex[edge, 1 - end]) & (np.arange(len(vertex)) != edge)[:, None]
+            x, y = np.cos(direction[beyond]).sum(), np.sin(direction[beyond]).sum()
+            direction[edge, end] = np.arctan2(y, x)
+    return direction.ravel()
 
 
-def _outlines(
-    start: Int[np.ndarray, " sides"],
-    end: Int[np.ndarray, " sides"],
-    cell: Int[np.ndarray, " sides"],
-    offset: Int[np.ndarray, "sides 2"],
-    direction: Float[np.ndarray, " sides"],
+def _following(
+    source: Int[np.ndarray, " rows"],
+    face: Int[np.ndarray, " rows"],
+    direction: Float[np.ndarray, " rows"],
+    vertex_names: Int[np.ndarray, " vertices"],
+) -> Int[np.ndarray, " rows"]:
+    """The next row of the face of each row."""
+    # Counter-clockwise around a vertex, the face on the left of a row is on the right of the next one. One
+    # of the two orders of the three rows satisfies that; both do only where faces repeat, as in periodic
+    # tissues of a few cells: there the directions decide.
+    leaving = np.argsort(source, kind="stable").reshape(-1, 3)
+    left, right = face[leaving], face[leaving ^ 1]
+    ordered = np.all(left == right[:, [1, 2, 0]], axis=1)
+    reversed_order = np.all(left == right[:, [2, 0, 1]], axis=1)
+    neither = np.flatnonzero(~ordered & ~reversed_order)
+    if neither.size:
+        raise ValueError(
+            "Argument `table` must have the same cell on both sides of each corner, but the cells at vertex "
+            f"{vertex_names[neither[0]]} contradict each other. Correct `left_cell` and `right_cell` there."
+        )
+    turn = (direction[leaving] - direction[leaving[:, :1]]) % (2 * np.pi)
+    reverse = np.where(ordered & reversed_order, turn[:, 1] > turn[:, 2], reversed_order)
+    leaving = np.where(reverse[:, None], leaving[:, [0, 2, 1]], leaving)
+    following = np.empty_like(source)
+    # After a row that arrives, the face goes on with the row one step clockwise of its twin.
+    following[leaving ^ 1] = leaving[:, [2, 0, 1]]
+    return following
+
+
+def _check_closed(
+    face: Int[np.ndarray, " rows"],
+    offset: Int[np.ndarray, "rows 2"],
+    following: Int[np.ndarray, " rows"],
     cell_names: Int[np.ndarray, " cells"],
-) -> tuple[Int[np.ndarray, " used"], Int[np.ndarray, "used 2"]]:
-    """The sides in order around each cell, and the lattice image at which each begins."""
-    leaving: dict[tuple[int, int], list[int]] = {}
-    first: dict[int, int] = {}
-    for side in np.flatnonzero(cell >= 0).tolist():
-        leaving.setdefault((int(cell[side]), int(start[side])), []).append(side)
-        first.setdefault(int(cell[side]), side)
-    count = np.bincount(cell[cell >= 0])
-    order, images = [], []
-    for index, name in enumerate(cell_names):
-        side, image = first[index], np.zeros(2, int)
-        for _ in range(count[index]):
-            order.append(side)
-            images.append(image)
-            image = image + offset[side]
-            options = leaving.get((index, int(end[side])), [])
-            if not options:
-                side = -1
-                break
-            # A cell of a small periodic tissue may have several corners at a vertex: its next side is the
-            # next one clockwise of the one that arrives.
-            back = direction[side ^ 1]
-            side = min(
-                options, key=lambda other: (back - direction[other]) % (2 * np.pi) or 2 * np.pi
-            )
-        closed = side == first[index] and not image.any()
-        if not closed or len(set(order[len(order) - count[index] :])) < count[index]:
-            raise ValueError(
-                f"Argument `table` must list all sides of each cell, but those of cell {name} make no closed "
-                "outline. Give the rows of all edges, with the `box` of a periodic tissue."
-            )
-    return np.array(order), np.array(images)
+) -> None:
+    """Refuse cells in several pieces, or that lead from one image of the box to another."""
+    n = len(face)
+    links = coo_array((np.ones(n, bool), (np.arange(n), following)), shape=(n, n))
+    piece = connected_components(links, directed=False)[1]
+    pieces = np.bincount(face[np.unique(piece, return_index=True)[1]])
+    total = np.stack([np.bincount(face, step) for step in offset.T], axis=1)
+    bad = np.flatnonzero((pieces != 1) | np.any(total != 0, axis=1))
+    if bad.size:
+        name = f"cell {cell_names[bad[0]]}" if bad[0] < len(cell_names) else "the exterior"
+        raise ValueError(
+            f"Argument `table` must list all sides of each cell, but those of {name} make no closed outline. "
+            "Give the rows of all edges, with the `box` of a periodic tissue."
+        )

@@ -152,9 +152,8 @@ def _merged(
     if lattice is not None:
         # In the box, with a rim of images, so that corners on both sides of its border meet.
         fraction = (corner @ np.linalg.inv(lattice)) % 1.0
-        place = fraction @ lattice
         rim = 2 * tolerance * np.linalg.norm(np.linalg.inv(lattice), axis=0)
-        images, origins = [place], [source]
+        images, origins = [fraction @ lattice], [source]
         for step in np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]):
             shifted = fraction + step
             near = np.flatnonzero(np.all((shifted > -rim) & (shifted < 1 + rim), axis=1))

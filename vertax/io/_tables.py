@@ -106,8 +106,8 @@ def from_tables(tables: Tables | BoundedTables, *, softening: float | None = Non
     vert_table, he_table, face_table, width, height = tables
     _check_rows(tables)
     following, face = he_table[:, 1], he_table[:, 5]
-    frame = _frames(following, face_table, he_table[:, 6:], np.bincount(face))
-    topology = _topology(tables, frame, exterior=False)
+    frame = frames_of(following, face_table, he_table[:, 6:], np.bincount(face))
+    topology = topology_of(tables, frame, exterior=False)
     # The faces of a torus cover it a whole number of times, whatever their shapes: -1 if they all
     # run clockwise, and something else if offsets are wrong in a way that happens to close around
     # each face. (Shoelace formula, in NumPy: it would be a dozen small compilations.)
@@ -129,7 +129,7 @@ def _from_bounded_tables(tables: BoundedTables, softening: float | None) -> Tiss
     he_table, face_table = with_exterior(tables)
     closed = Tables(vert_table, he_table, face_table, 1.0, 1.0)
     _check_rows(closed)
-    topology = _topology(closed, np.zeros((len(he_table), 2), int), exterior=True)
+    topology = topology_of(closed, np.zeros((len(he_table), 2), int), exterior=True)
     # The sign of the area gives the sense of rotation of the faces.
     x, y = vert_table[he_table[:, 3]].T
     u, v = vert_table[he_table[:, 4]].T
@@ -144,7 +144,8 @@ def _from_bounded_tables(tables: BoundedTables, softening: float | None) -> Tiss
     return Tissue(vertices, topology, Free(), softening, angles=angles)
 
 
-def _topology(tables: Tables, frame: np.ndarray, *, exterior: bool) -> Topology:
+def topology_of(tables: Tables, frame: np.ndarray, *, exterior: bool) -> Topology:
+    """The topology of tables with the lattice image `frame` of each row; an exterior is the last face."""
     twin, face = tables.he_table[:, 2], tables.he_table[:, 5]
     # Row r of the table is half-edge number[r]; `row` is the inverse.
     number = tables.half_edges
@@ -319,7 +320,7 @@ def _check_rows(tables: Tables) -> None:
     )
 
 
-def _frames(
+def frames_of(
     following: np.ndarray, start: np.ndarray, offset: np.ndarray, sides: np.ndarray
 ) -> np.ndarray:
     """Box of each row's source, relative to the first row of its face (`start`).

@@ -151,7 +151,7 @@ def _outlines(
     end: Int[np.ndarray, " edges"],
     owner: Int[np.ndarray, " edges"],
     face_numbers: Int[np.ndarray, " faces"],
-) -> tuple[list[Int[np.ndarray, " corners"]], Int[np.ndarray, " edges"]]:
+) -> tuple[list[Int[np.ndarray, " _"]], Int[np.ndarray, " edges"]]:
     """The corners of each face in order, and the rows of the edge table in that order."""
     leaving = {
         (int(cell), int(point)): row

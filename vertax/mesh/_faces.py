@@ -73,7 +73,7 @@ class FaceMesh(NamedTuple):
     following: Int[np.ndarray, " all_sides"]
     """The next side of the cell, or of the exterior."""
 
-    def chains(self) -> list[Int[np.ndarray, " chain"]]:
+    def chains(self) -> list[Int[np.ndarray, " _"]]:
         """The sides of each half-edge, in order; none on the exterior, and for edges of length 0."""
         order = np.lexsort((self.rank, self.half_edge))
         count = np.bincount(self.half_edge, minlength=self.topology.n_half_edges)
@@ -114,13 +114,13 @@ def build_faces(
         names.refuse(
             "have an outline, where sides belong to one cell",
             "each side belongs to two",
-            "Argument `box` makes the tissue periodic.",
+            "Pass `box` for a periodic tissue.",
         )
     if not exterior and alone.size:
-        ends = sides.corner[[alone[0], sides.following[alone[0]]]]
+        first, last = sides.corner[[alone[0], sides.following[alone[0]]]].tolist()
         names.refuse(
             "fill the periodic box",
-            f"the side from {names.point(ends[0])} to {names.point(ends[1])} belongs to "
+            f"the side from {names.point(first)} to {names.point(last)} belongs to "
             f"{names.cell(int(sides.cell[alone[0]]))} only ({len(alone)} such sides)",
             "Add the missing cells, or leave out `box` for a free tissue. Where edges are longer than half "
             "the box, give the `images` of the corners.",
