@@ -191,7 +191,7 @@ class External(AbstractResponse):
                 "EquilibriumPropagation(), which adds a constant force, and no guidance."
             )
 
-    def complaint(self) -> str | None:
+    def last_error_message(self) -> str | None:
         """The error message of the last failure of the program; None if it never failed."""
         failures = self.ledger.failures
         return f"{type(self.simulator).__name__} failed: {failures[-1]}" if failures else None
