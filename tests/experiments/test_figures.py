@@ -11,17 +11,17 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 import vertax as vx
-from vertax.experiments.benchmark_adjoints import figures as benchmark
-from vertax.experiments.compare_conditions import figures as conditions
-from vertax.experiments.convergent_extension import figures as extension
-from vertax.experiments.design_mechanics import figures as mechanics
-from vertax.experiments.external_tensions import figures as external
-from vertax.experiments.infer_from_microscopy import figures as microscopy
-from vertax.experiments.infer_tensions import figures as tensions
-from vertax.experiments.inference_across_topologies import figures as topologies
-from vertax.experiments.rigidity_transition import figures as rigidity
-from vertax.experiments.salt_and_pepper import figures as patterns
-from vertax.experiments.tissue_moduli import figures as moduli
+from experiments.benchmark_adjoints import figures as benchmark
+from experiments.compare_conditions import figures as conditions
+from experiments.convergent_extension import figures as extension
+from experiments.external_tensions import figures as external
+from experiments.inference_across_topologies import figures as topologies
+from experiments.rigidity_transition import figures as rigidity
+from experiments.salt_and_pepper import figures as patterns
+from experiments.tissue_moduli import figures as moduli
+from vertax.jobs.design_mechanics import figures as mechanics
+from vertax.jobs.infer_from_microscopy import figures as microscopy
+from vertax.jobs.infer_tensions import figures as tensions
 from vertax.plotting import label_colours
 
 pytestmark = pytest.mark.experiments

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import vertax as vx
-from vertax.experiments.cell_diffusion import Config as Diffusion, figures as diffusion
-from vertax.experiments.movement_checks import Config as Checks, figures as checks
-from vertax.experiments.oscillatory_shear import figures as shear
-from vertax.experiments.timed_elongation import figures as elongation
+from experiments.cell_diffusion import Config as Diffusion, figures as diffusion
+from experiments.movement_checks import Config as Checks, figures as checks
+from experiments.oscillatory_shear import figures as shear
+from experiments.timed_elongation import figures as elongation
 
 pytestmark = pytest.mark.experiments
 

@@ -7,9 +7,9 @@ from helpers import random_tissue
 from run_helpers import run, table
 
 import vertax as vx
+from experiments.double_optimisation.experiment import TunedCells
+from experiments.tissue_moduli.stiffening import Stiffening, branch, compared
 from vertax.costs import aspect_ratio
-from vertax.experiments.double_optimisation.experiment import TunedCells
-from vertax.experiments.tissue_moduli.stiffening import Stiffening, branch, compared
 
 pytestmark = pytest.mark.experiments
 

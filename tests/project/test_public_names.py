@@ -82,7 +82,7 @@ def test_importing_changes_no_setting_of_jax():
     import sys
 
     code = (
-        "import jax; before = dict(jax.config.values); import vertax; import vertax.experiments; "
+        "import jax; before = dict(jax.config.values); import vertax; import vertax.jobs; "
         "assert dict(jax.config.values) == before"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

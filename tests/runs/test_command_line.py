@@ -119,9 +119,7 @@ def instead(monkeypatch):
     """Puts another function in the place of the experiment: nothing to compile."""
 
     def instead(run):
-        monkeypatch.setattr(
-            importlib.import_module("vertax.experiments.infer_shape_factors"), "run", run
-        )
+        monkeypatch.setattr(importlib.import_module("vertax.jobs.infer_shape_factors"), "run", run)
 
     return instead
 
@@ -390,7 +388,7 @@ def test_the_program_runs_as_a_process():
 COMPILES = """
 import os, signal, sys
 import jax, jax.numpy as jnp
-import vertax.experiments.infer_shape_factors as experiment
+import vertax.jobs.infer_shape_factors as experiment
 from vertax.__main__ import main
 
 class Crash:

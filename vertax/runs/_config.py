@@ -58,7 +58,7 @@ class ExperimentConfig(Section):
     """
 
     experiment: str = ""
-    """Which experiment this is: the name of its folder."""
+    """The job or experiment to run: the name of its module."""
     seed: int = pydantic.Field(default=0, ge=0)
     """Seed of everything random."""
     precision: Literal["float64", "float32"] = "float64"
@@ -76,12 +76,12 @@ class ExperimentConfig(Section):
 
 @functools.cache
 def named(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
-    """The configuration of the experiment of a name, which takes no other for its key `experiment`.
+    """A configuration class whose key `experiment` accepts one name only.
 
     **Arguments:**
 
-    - `config`: the class with the keys of the experiment.
-    - `name`: of the experiment.
+    - `config`: the class with the keys of the job or experiment.
+    - `name`: the name.
 
     **Returns:** a subclass.
     """

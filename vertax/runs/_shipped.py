@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import difflib
 import os
+import tomllib
 from pathlib import Path
+from typing import Any
 
 _PACKAGE = Path(__file__).parents[1]
+REPOSITORY = _PACKAGE.parent if (_PACKAGE.parent / "pyproject.toml").is_file() else None
+"""The repository that this package is part of; None for an installed wheel."""
 
 
 def shipped_configurations() -> dict[str, Path]:
@@ -48,6 +52,18 @@ def nearest_configuration(name: str | os.PathLike[str]) -> str:
     if near:
         return f" Did you mean {near[0]}, which comes with vertax?"
     return " `vertax list` shows those that come with vertax."
+
+
+def configuration_of(file: Path) -> Any:
+    """The experiment that a shipped configuration names.
+
+    **Arguments:**
+
+    - `file`: the configuration.
+
+    **Returns:** the value of its key `experiment`; None if there is none.
+    """
+    return tomllib.loads(file.read_text(encoding="utf-8")).get("experiment")
 
 
 def configuration_summary(file: Path) -> str:

@@ -12,7 +12,7 @@ import typer
 if TYPE_CHECKING:
     from vertax.runs import RunFolder
 
-# JAX and the experiments are imported by the commands that need them, so that help comes quickly.
+# JAX, jobs and experiments are imported by the commands that use them, so that help is printed quickly.
 
 app = typer.Typer(
     help="A differentiable vertex model of epithelial tissue.",
@@ -49,15 +49,27 @@ def _options(
 
 @app.command("list")
 def list_experiments() -> None:
-    """List all experiments, and the configurations that come with vertax."""
+    """List the jobs, the experiments of the repository, and the configurations of both."""
     from vertax.runs import EXPERIMENTS
-    from vertax.runs._shipped import configuration_summary, shipped_configurations
+    from vertax.runs._shipped import (
+        configuration_of,
+        configuration_summary,
+        shipped_configurations,
+    )
 
-    shipped = shipped_configurations()
+    shipped = {
+        name: file
+        for name, file in shipped_configurations().items()
+        if configuration_of(file) in EXPERIMENTS
+    }
     width = max(map(len, [*EXPERIMENTS, *shipped]))
-    typer.echo("Experiments; vertax describe NAME prints all keys of one:")
-    for name, experiment in EXPERIMENTS.items():
-        typer.echo(f"  {name:{width}}  {experiment.summary}")
+    jobs = [each for each in EXPERIMENTS.values() if each.is_job]
+    experiments = [each for each in EXPERIMENTS.values() if not each.is_job]
+    for title, group in (("Jobs", jobs), ("Experiments of the repository", experiments)):
+        if group:
+            typer.echo(f"{title}; vertax describe NAME prints all keys of one:")
+        for each in group:
+            typer.echo(f"  {each.name:{width}}  {each.summary}")
     typer.echo("Configurations; vertax run NAME runs one:")
     for name, file in shipped.items():
         typer.echo(f"  {name:{width}}  {configuration_summary(file)}")
@@ -65,9 +77,11 @@ def list_experiments() -> None:
 
 @app.command()
 def describe(
-    experiment: Annotated[str, typer.Argument(help="Name of an experiment, see `vertax list`.")],
+    experiment: Annotated[
+        str, typer.Argument(help="Name of a job or an experiment, see `vertax list`.")
+    ],
 ) -> None:
-    """Print a configuration file with every key of an experiment, explained and at its default."""
+    """Print a configuration file with every key of a job or an experiment, explained and at its default."""
     from vertax.runs import ConfigError, find_experiment, template
 
     try:
@@ -132,7 +146,7 @@ def run(
         bool, typer.Option("--debug", help="Show where in the program an error occurred.")
     ] = False,
 ) -> None:
-    """Run the experiment that a configuration file describes."""
+    """Run the job or the experiment that a configuration file describes."""
     import jax
 
     from vertax import FitError, enable_compilation_cache

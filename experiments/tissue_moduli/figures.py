@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from vertax.experiments.rigidity_transition.figures import REFERENCE
+from experiments.rigidity_transition.figures import REFERENCE
 from vertax.plotting import INK, SERIES, house_style, new_figure
 
 from ._branch import Branch
