@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 import vertax as vx
-from experiments.benchmark_adjoints import figures as benchmark
+from experiments import adjoint_scaling, benchmark_adjoints, hypergradient_accuracy
 from experiments.compare_conditions import figures as conditions
 from experiments.convergent_extension import figures as extension
 from experiments.external_tensions import figures as external
@@ -206,7 +206,7 @@ def test_the_benchmark_compares_on_one_scale():
         for n in (20, 50)
         for method in ("Adj-ID", "EP")
     ]
-    time, memory, time_too, memory_too = panels(benchmark.scaling(rows))
+    time, memory, time_too, memory_too = panels(adjoint_scaling.plot_scaling(rows))
     assert time.get_ylim() == time_too.get_ylim()
     assert memory.get_ylim() == memory_too.get_ylim()
     assert [label.get_text() for label in time.get_xticklabels()] == ["20", "50"]
@@ -217,7 +217,7 @@ def test_the_benchmark_compares_on_one_scale():
     )
     fits = {name: fit_with(history=history) for name in ("AD", "LM")}
     inferred = {"AD": true + 0.01 * RNG.normal(size=true.shape), "LM": true}
-    figure = benchmark.inference(fits, true, initial, inferred, title="here")
+    figure = benchmark_adjoints.plot_inference(fits, true, initial, inferred, title="here")
     start, end, *_ = panels(figure)
     assert start.get_xlim() == end.get_xlim() == start.get_ylim() == end.get_ylim()
 
@@ -226,10 +226,11 @@ def test_the_benchmark_compares_on_one_scale():
     }
     betas = {"linear": np.logspace(-6, -3, 4), "cost": np.logspace(-3, 0, 4)}
     linear, cost, _ = panels(
-        benchmark.beta_scan(betas, errors, {1.0: {"relative_error": [1e-3, 2e-3]}})
+        hypergradient_accuracy.plot_betas(betas, errors, {1.0: {"relative_error": [1e-3, 2e-3]}})
     )
     assert linear.get_ylim() == cost.get_ylim()
-    (ax,) = panels(benchmark.accuracy(np.logspace(-6, -3, 4), {"AD": RNG.uniform(size=(4, 2))}))
+    by_method = {"AD": RNG.uniform(size=(4, 2))}
+    (ax,) = panels(hypergradient_accuracy.plot_accuracy(np.logspace(-6, -3, 4), by_method))
     assert ax.get_xscale() == ax.get_yscale() == "log"
 
 

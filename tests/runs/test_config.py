@@ -166,7 +166,7 @@ def test_the_experiment_must_be_named_and_exist(write):
     assert "`experiment` is missing" in refusal(write("seed = 1"))
     message = refusal(write('experiment = "infer_shape_factor"'))
     assert "did you mean 'infer_shape_factors'?" in message
-    assert "there are: benchmark_adjoints" in refusal(write("experiment = 3"))
+    assert "there are: design_mechanics" in refusal(write("experiment = 3"))
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
