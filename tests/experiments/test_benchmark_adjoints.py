@@ -40,8 +40,8 @@ def test_inference_with_one_method(tmp_path):
     # Five epochs are not enough, and two hundred steps of the paper's relaxation neither.
     assert any("still falling" in warning for warning in metrics["warnings"])
     cells = table(folder, "shape_factors_equilibrium")
-    true, found = (cells[name].astype(float).reshape(2, 8) for name in ("true", "Adj-ID"))
-    error = np.mean(np.abs(found - true) / true, axis=1)
+    true, inferred = (cells[name].astype(float).reshape(2, 8) for name in ("true", "Adj-ID"))
+    error = np.mean(np.abs(inferred - true) / true, axis=1)
     np.testing.assert_allclose(metrics["equilibrium Adj-ID"]["relative_error"], error)
     history = table(folder, "history_equilibrium")
     assert len(history["epoch"]) == 2 * 5

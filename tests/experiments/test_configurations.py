@@ -97,6 +97,7 @@ SHORT = {
         "driving.cycles=1",
         "resamples=10",
     ],
+    "shear_stiffening": ["replicates=1", "excess=[0.01]", "tissue.n_cells=9"],
     "salt_and_pepper": [
         "boundaries=['free']",
         "n_types=[2]",
@@ -118,9 +119,6 @@ SHORT = {
         "shape_factors=[3.5, 3.7]",
         "replicates=2",
         "tissue.n_cells=9",
-        "stiffening.replicates=1",
-        "stiffening.excess=[0.01]",
-        "stiffening.tissue.n_cells=9",
     ],
     "trained_stresses": ["trained=[1, 4]", "replicates=1", "tissue.n_cells=4", "fit.epochs=2"],
 }
