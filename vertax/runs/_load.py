@@ -19,7 +19,7 @@ def load_config(
 
     **Arguments:**
 
-    - `path`: a TOML file, whose key `experiment` is the name of a job or an experiment; or the name of a
+    - `path`: a TOML file with the name of a job or an experiment as its key `experiment`; or the name of a
         configuration that comes with vertax, such as `"demo"`; `vertax list` shows them.
     - `overrides`: texts `key=value` that set single keys, see
         `apply_overrides`.

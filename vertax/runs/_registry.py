@@ -35,7 +35,7 @@ class Experiment(NamedTuple):
 
     @property
     def config(self) -> type[ExperimentConfig]:
-        """The class `Config` of the module, whose key `experiment` accepts only the name of the module."""
+        """The class `Config` of the module; its key `experiment` accepts only the name of the module."""
         from vertax.runs._config import named
 
         return named(self._module.Config, self.name)

@@ -37,11 +37,11 @@ def configuration_file(name: str | os.PathLike[str]) -> Path:
 
 
 def nearest_configuration(name: str | os.PathLike[str]) -> str:
-    """A hint for a configuration that is not there: names that are.
+    """A hint for a configuration that does not exist.
 
     **Arguments:**
 
-    - `name`: what was asked for.
+    - `name`: its name.
 
     **Returns:** a sentence that begins with a space, or an empty text if no configurations are installed.
     """
@@ -67,7 +67,7 @@ def configuration_of(file: Path) -> Any:
 
 
 def configuration_summary(file: Path) -> str:
-    """What a configuration is for: the first sentence of the comment that it begins with."""
+    """The first sentence of the comment at the start of a configuration."""
     words: list[str] = []
     for line in file.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):

@@ -85,10 +85,10 @@ def describe(
     from vertax.runs import ConfigError, find_experiment, template
 
     try:
-        found = find_experiment(experiment)
+        named = find_experiment(experiment)
     except ConfigError as error:
         _stop(error, USAGE)
-    typer.echo(template(found.config, experiment), nl=False)
+    typer.echo(template(named.config, experiment), nl=False)
 
 
 @app.command()
@@ -119,8 +119,8 @@ def run(
         Path | None,
         typer.Option(
             metavar="RUN",
-            help="Go on with the interrupted run in this folder: fits continue where they were, what is "
-            "no fit begins again.",
+            help="Resume the interrupted run in this folder: fits continue after their last epoch, "
+            "other steps begin again.",
         ),
     ] = None,
     figures: Annotated[
@@ -135,16 +135,14 @@ def run(
         bool,
         typer.Option(
             "--no-cache",
-            help="Compile everything anew, instead of keeping what was compiled in the user's cache folder "
-            "(the environment variable VERTAX_CACHE names another, or is off).",
+            help="Do not use the folder of compiled functions in the user's cache (the environment variable "
+            "VERTAX_CACHE names another folder, or is off).",
         ),
     ] = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", help="Show no progress bar and no summary.")
     ] = False,
-    debug: Annotated[
-        bool, typer.Option("--debug", help="Show where in the program an error occurred.")
-    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
     """Run the job or the experiment that a configuration file describes."""
     import jax
@@ -168,7 +166,7 @@ def run(
     matplotlib.use("Agg")
     try:
         experiment, settings = load_config(config, overrides or ())
-        # The library leaves the precision of JAX to the user; here the configuration decides.
+        # The configuration sets the precision; the library does not.
         jax.config.update("jax_enable_x64", settings.precision == "float64")
         if not no_cache:
             enable_compilation_cache()
@@ -182,7 +180,7 @@ def run(
         else:
             folder = RunFolder.unfinished(resume, settings, figures=formats)
         if not quiet:
-            typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
+            typer.echo(f"{experiment.name}: {config} → {folder.path}{_kept_parts(folder)}")
             announce_in_this_process(f"functions for {experiment.name}")
         folder.talkative = not quiet
         try:
@@ -195,7 +193,7 @@ def run(
     except KeyboardInterrupt:
         typer.echo(_interrupted(config, overrides or (), folder), err=True)
         raise typer.Exit(INTERRUPTED) from None
-    # What a user can cause and mend gets a message; anything else is our fault, with a traceback.
+    # Errors of the user are messages without a traceback; others are bugs.
     except (ConfigError, RunFolderError) as error:
         if debug:
             raise
@@ -229,8 +227,8 @@ def sweep(
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUES",
-            help="Values of one key, e.g. tissue.n_cells=50,100 or seed=0:20; of several grids all "
-            "combinations are run.",
+            help="Values of one key, e.g. tissue.n_cells=50,100 or seed=0:20; several grids give all "
+            "combinations.",
         ),
     ] = None,
     overrides: Annotated[
@@ -240,7 +238,7 @@ def sweep(
     output: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of all runs; by default runs/NAME-sweep. What is finished in it is kept.",
+            help="Folder of all runs; by default runs/NAME-sweep. Finished runs in it are kept.",
         ),
     ] = None,
     scheduler: Annotated[
@@ -251,7 +249,7 @@ def sweep(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Number of these processes; by default one a core.")
+        int | None, typer.Option(min=1, help="Number of these processes; by default one per core.")
     ] = None,
     figures: Annotated[
         list[str] | None,
@@ -325,13 +323,13 @@ def show(
 
 
 def _warn(warnings: Iterable[str]) -> None:
-    """What the numbers above do not tell."""
+    """Print warnings."""
     for warning in warnings:
         typer.secho(f"Warning: {warning}", err=True, fg=typer.colors.YELLOW)
 
 
-def _found(folder: RunFolder) -> str:
-    """What a resumed run begins with."""
+def _kept_parts(folder: RunFolder) -> str:
+    """The parts that a resumed run keeps."""
     parts = folder.parts()
     return f" (resumed; kept so far: {', '.join(part.stem for part in parts)})" if parts else ""
 
