@@ -27,7 +27,7 @@ class Config(benchmark.Scenes):
     epochs: int = Field(default=5, ge=1)
     """Epochs that are timed, each after a small change of the parameters; the result is the median."""
     largest_unrolled: int = Field(default=200, ge=0)
-    """Largest number of cells for AD, whose relaxations take ever more steps."""
+    """Largest number of cells for AD; its relaxations take ever more steps."""
     largest_sensitivity: int = Field(default=200, ge=0)
     """Largest number of cells for Sen-ID, which solves one linear system per cell."""
 
