@@ -11,11 +11,11 @@ from vertax.runs import RunFolder, find_experiment, validate
 pytestmark = pytest.mark.experiments
 
 
-def run(tmp_path, **changes):
-    experiment = find_experiment("benchmark_adjoints")
+def run(tmp_path, name="benchmark_adjoints", **changes):
+    experiment = find_experiment(name)
     small = {"replicates": 2, "tissue": {"n_cells": 8}}
     config = validate(experiment.config, small | changes)
-    folder = RunFolder.claim("benchmark", tmp_path / "run")
+    folder = RunFolder.claim("benchmark", tmp_path / name)
     folder.save_metrics(experiment.run(config, folder, progress=False))
     return folder, json.loads((folder.path / "metrics.json").read_text())
 
@@ -35,45 +35,48 @@ def test_inference_with_one_method(tmp_path):
         least_squares_steps=0,
         paper={"fit": fit, "relaxation": relaxation, "gradient": {"strict": False}},
         equilibrium={"fit": fit, "relaxation": {"contacts": False}},
-        scaling={"sizes": []},
-        accuracy={"tolerances": []},
     )
     assert set(metrics) == {"paper Adj-ID", "equilibrium Adj-ID", "warnings"}
     # Five epochs are not enough, and two hundred steps of the paper's relaxation neither.
     assert any("still falling" in warning for warning in metrics["warnings"])
     cells = table(folder, "shape_factors_equilibrium")
-    true, found = (cells[name].astype(float).reshape(2, 8) for name in ("true", "Adj-ID"))
-    error = np.mean(np.abs(found - true) / true, axis=1)
+    true, inferred = (cells[name].astype(float).reshape(2, 8) for name in ("true", "Adj-ID"))
+    error = np.mean(np.abs(inferred - true) / true, axis=1)
     np.testing.assert_allclose(metrics["equilibrium Adj-ID"]["relative_error"], error)
     history = table(folder, "history_equilibrium")
     assert len(history["epoch"]) == 2 * 5
     assert sorted(set(history["replicate"])) == ["0", "1"]
 
 
+SOLVER = {"solver": "gradient_descent", "tolerance": 1e-3, "max_steps": 300}
+PAPER = {
+    "fit": {"epochs": 40},
+    "relaxation": SOLVER,
+    "unrolled": SOLVER,
+    "gradient": {"strict": False, "nudge": "cost", "beta": 1.0},
+}
+
+
 @pytest.mark.slow
-def test_everything(tmp_path):
-    fit = {"epochs": 40}
-    _, metrics = run(
-        tmp_path,
-        paper={
-            "fit": fit,
-            "relaxation": {"solver": "gradient_descent", "tolerance": 1e-3, "max_steps": 300},
-            "unrolled": {"solver": "gradient_descent", "tolerance": 1e-3, "max_steps": 300},
-            "gradient": {"strict": False, "nudge": "cost", "beta": 1.0},
-        },
-        equilibrium={"fit": fit},
-        scaling={"sizes": [8]},
-        accuracy={
-            "tolerances": [1e-8, 1e-3],
-            "betas": [1e-5],
-            "cost_betas": [1e-2],
-            "fitted_betas": [1.0],
-            "n_cells": 8,
-        },
-    )
+def test_all_adjoints_and_least_squares_agree(tmp_path):
+    _, metrics = run(tmp_path, paper=PAPER, equilibrium={"fit": {"epochs": 40}})
     errors = [metrics[f"equilibrium {m}"]["relative_error_max"] for m in ("AD", "Adj-ID", "EP")]
     np.testing.assert_allclose(errors, errors[0], rtol=1e-3)
     assert metrics["equilibrium LM"]["relative_error_max"] < 1e-8
+
+
+@pytest.mark.slow
+def test_hypergradients_are_accurate_at_equilibrium_only(tmp_path):
+    scans = {"tolerances": [1e-8, 1e-3], "betas": [1e-5], "cost_betas": [1e-2]}
+    _, metrics = run(tmp_path, "hypergradient_accuracy", paper=PAPER, fitted_betas=[1.0], **scans)
     assert metrics["hypergradient"]["Adj-ID at tolerance 1e-08"] < 1e-5
     assert metrics["hypergradient"]["Adj-ID at tolerance 1e-03"] > 1e-4
     assert metrics["beta"]["linear, centred, smallest error"] < 1e-4
+
+
+@pytest.mark.slow
+def test_time_and_memory_are_measured_for_each_adjoint(tmp_path):
+    _, metrics = run(tmp_path, "adjoint_scaling", paper=PAPER, sizes=[8])
+    assert len(metrics) == 8
+    assert all(group["8 cells, ms per epoch"] > 0 for group in metrics.values())
+    assert metrics["paper EP"]["8 cells, memory over that of EP"] == 1

@@ -15,6 +15,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 ONE_METHOD = '[{name = "guided", distance = "centroids", guided = true}]'
 
 SHORT = {
+    "adjoint_scaling": ["methods=['Adj-ID', 'EP']", "sizes=[8]", "epochs=1"],
     "benchmark_adjoints": [
         "replicates=2",
         "tissue.n_cells=8",
@@ -22,9 +23,6 @@ SHORT = {
         "least_squares_steps=2",
         "paper.fit.epochs=2",
         "equilibrium.fit.epochs=2",
-        "accuracy.tolerances=[]",
-        "scaling.sizes=[8]",
-        "scaling.epochs=1",
     ],
     "cell_diffusion": [
         "shape_factors=[3.4, 3.9]",
@@ -64,6 +62,15 @@ SHORT = {
         "fit.epochs=2",
     ],
     "external_tensions": ["tissue.n_cells=6", "fit.epochs=2"],
+    "hypergradient_accuracy": [
+        "replicates=2",
+        "tissue.n_cells=8",
+        "paper.fit.epochs=2",
+        "tolerances=[1e-6]",
+        "betas=[1e-5]",
+        "cost_betas=[1e-2]",
+        "fitted_betas=[1.0]",
+    ],
     "infer_from_microscopy": ["image.pixels=96", "fit.epochs=2"],
     "infer_shape_factors": ["tissue.n_cells=6", "fit.epochs=2"],
     "infer_tensions": ["cluster.n_cells=6", "cluster.pixels=200"],
@@ -90,6 +97,7 @@ SHORT = {
         "driving.cycles=1",
         "resamples=10",
     ],
+    "shear_stiffening": ["replicates=1", "excess=[0.01]", "tissue.n_cells=9"],
     "salt_and_pepper": [
         "boundaries=['free']",
         "n_types=[2]",
@@ -111,9 +119,6 @@ SHORT = {
         "shape_factors=[3.5, 3.7]",
         "replicates=2",
         "tissue.n_cells=9",
-        "stiffening.replicates=1",
-        "stiffening.excess=[0.01]",
-        "stiffening.tissue.n_cells=9",
     ],
     "trained_stresses": ["trained=[1, 4]", "replicates=1", "tissue.n_cells=4", "fit.epochs=2"],
 }

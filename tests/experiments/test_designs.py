@@ -73,23 +73,23 @@ def test_a_cluster_elongates(tmp_path, method):
     (tmp_path / "tiny.toml").write_text(ELONGATION)
     folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out", f"gradient.method={method}")
     six = metrics["6 cells"]
-    said = six["targets"]["1.6"]["ratios"]
-    assert np.allclose(said, 1.6, atol=0.1)
+    ratios = six["targets"]["1.6"]["ratios"]
+    assert np.allclose(ratios, 1.6, atol=0.1)
     rows = table(folder / "aspect_ratios.csv")
-    np.testing.assert_allclose(np.array(rows["aspect_ratio"], float), said)
+    np.testing.assert_allclose(np.array(rows["aspect_ratio"], float), ratios)
     first = vx.load_tissue(folder / "designed.npz")
-    assert float(aspect_ratio(first)) == pytest.approx(said[0])
+    assert float(aspect_ratio(first)) == pytest.approx(ratios[0])
     assert six["max_force"] < 1e-9
     curve = np.array(table(folder / "history.csv")["aspect_ratio"], float).reshape(2, 15)
     best = six["targets"]["1.6"]["best_epoch"]
-    np.testing.assert_allclose(curve[[0, 1], best], said)
+    np.testing.assert_allclose(curve[[0, 1], best], ratios)
     assert "figures/design.png" in files(folder)
 
 
 @pytest.mark.parametrize(
     "method", ["implicit", pytest.param("propagation", marks=pytest.mark.slow)]
 )
-def test_cells_of_one_type_part(tmp_path, method):
+def test_interfaces_between_cells_of_one_type_shrink(tmp_path, method):
     (tmp_path / "tiny.toml").write_text(PATTERN)
     nudge = ("gradient.nudge=cost", "gradient.nudged_rtol=1e-3") if method != "implicit" else ()
     folder, metrics = run(

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.experiments
 CONFIG = Path(__file__).parents[2] / "configs" / "external_tensions.toml"
 
 
-def test_it_says_how_to_install_the_program(tmp_path):
+def test_a_missing_program_is_an_error_with_the_install_command(tmp_path):
     with pytest.raises(ConfigError, match="apt-get install evolver-nox"):
         run(CONFIG, tmp_path / "run", "program.command=no-such-evolver")
 
@@ -23,15 +23,15 @@ def test_it_says_how_to_install_the_program(tmp_path):
     shutil.which("evolver") is None,
     reason="Surface Evolver is not installed: apt-get install evolver-nox",
 )
-def test_both_forward_models_lead_the_same_way(tmp_path):
+def test_both_forward_models_give_the_same_tensions(tmp_path):
     small = ("tissue.n_cells=6", "fit.epochs=2")
     folder, metrics = run(CONFIG, tmp_path / "run", *small)
     # Each epoch relaxes the foam once, and twice for each of 24 coordinates.
     assert metrics["runs_of_the_program"] >= 2 * 49
     assert metrics["relative_error_evolver"] < 0.7 * metrics["relative_error_initial_evolver"]
     edges = table(folder / "edges.csv")
-    found = [np.array(edges[f"found_{name}"], float) for name in ("evolver", "vertax")]
-    np.testing.assert_allclose(*found, rtol=1e-6)
+    inferred = [np.array(edges[f"found_{name}"], float) for name in ("evolver", "vertax")]
+    np.testing.assert_allclose(*inferred, rtol=1e-6)
 
 
 # Two bubbles side by side.

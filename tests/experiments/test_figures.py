@@ -11,17 +11,19 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 import vertax as vx
-from vertax.experiments.benchmark_adjoints import figures as benchmark
-from vertax.experiments.compare_conditions import figures as conditions
-from vertax.experiments.convergent_extension import figures as extension
-from vertax.experiments.design_mechanics import figures as mechanics
-from vertax.experiments.external_tensions import figures as external
-from vertax.experiments.infer_from_microscopy import figures as microscopy
-from vertax.experiments.infer_tensions import figures as tensions
-from vertax.experiments.inference_across_topologies import figures as topologies
-from vertax.experiments.rigidity_transition import figures as rigidity
-from vertax.experiments.salt_and_pepper import figures as patterns
-from vertax.experiments.tissue_moduli import figures as moduli
+from experiments import (
+    adjoint_scaling,
+    benchmark_adjoints,
+    compare_conditions,
+    convergent_extension,
+    external_tensions,
+    hypergradient_accuracy,
+    inference_across_topologies as topologies,
+    rigidity_transition as rigidity,
+    salt_and_pepper,
+    tissue_moduli,
+)
+from vertax.jobs import design_mechanics, infer_from_microscopy, infer_tensions
 from vertax.plotting import label_colours
 
 pytestmark = pytest.mark.experiments
@@ -64,7 +66,7 @@ def limits(axes, kind) -> set[tuple[float, float]]:
 def test_designs_before_and_after_have_one_scale(tissue, cluster):
     observed = 3.9 + 0.1 * RNG.normal(size=(5, 9))
     shown = {"initial": (tissue, observed[0]), "designed": (tissue, observed[-1])}
-    figure = mechanics.mechanics(
+    figure = design_mechanics.plot_design(
         shown, observed, observed + 0.01, ("shape_factor", observed.mean(axis=1), 4.1)
     )
     first, second, curves = panels(figure)
@@ -77,14 +79,16 @@ def test_designs_before_and_after_have_one_scale(tissue, cluster):
     both = {"initial": (cluster, tension[0]), "designed": (cluster, tension[1])}
     targets = np.array([1.75, 2.0])
     ratios = {n: targets[:, None] + 0.01 * RNG.normal(size=(2, 3)) for n in (6, 12)}
-    first, second, reached, _ = panels(extension.elongation(both, (1.0, 2.0), targets, ratios))
+    first, second, reached, _ = panels(
+        convergent_extension.plot_elongation(both, (1.0, 2.0), targets, ratios)
+    )
     assert (1.0, 2.0) in limits((first, second), LineCollection)
     assert reached.get_legend_handles_labels()[1] == ["6 cells", "12 cells"]
 
     types = np.arange(6) % 2
     three = {name: (tissue, types, values) for name, (tissue, values) in both.items()}
     shares = {"free, 2 types": RNG.uniform(0.5, 1, (4, 3))}
-    figure = patterns.patterns(three, (1.0, 2.0), shares)
+    figure = salt_and_pepper.plot_patterns(three, (1.0, 2.0), shares)
     first, second, share = panels(figure)
     assert limits((first, second), PolyCollection) == {(-0.5, 3.5)}
     assert bars(figure) == [r"tension $\gamma$"]
@@ -95,7 +99,7 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
     labels = np.repeat(np.arange(7), 10).reshape(7, 10)
     picture = label_colours(labels)
     edges, cells = np.ones(cluster.n_edges), np.ones(cluster.n_cells)
-    found = vx.inference.InferredTensions(
+    result = vx.inference.InferredTensions(
         tissue=cluster,
         tensions=edges,
         tension_deviations=edges,
@@ -112,30 +116,29 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
         pixel_size=0.4,
         four_fold=edges < 0,
     )
-    left, right = panels(tensions.foam(picture, found))
+    left, right = panels(infer_tensions.plot_foam(picture, result))
     np.testing.assert_allclose(left.images[0].get_array(), picture)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 7
     assert (left.get_xlim(), left.get_ylim()) == (right.get_xlim(), right.get_ylim())
     assert [text.get_text() for text in left.texts] == ["2 pixels"]
 
 
-def test_cells_over_a_micrograph_are_those_asked_for(tissue):
+def test_cells_over_a_micrograph_are_those_of_the_mask(tissue):
     image = RNG.normal(size=(30, 30))
-    whole = np.arange(9) < 4
-    options: dict[str, Any] = {"pixel_size": 0.1, "label": "p"}
-    figure = microscopy.cells_on_image(image, tissue, np.arange(9.0), whole, **options)
+    complete = np.arange(9) < 4
+    figure = infer_from_microscopy.plot_cells(image, tissue, np.arange(9.0), complete, 0.1)
     (ax,) = panels(figure)
     (faces,) = (c for c in ax.collections if isinstance(c, PolyCollection))
     assert set(np.asarray(faces.get_array()).tolist()) == {0, 1, 2, 3}
-    assert bars(figure) == ["p"]
+    assert bars(figure) == ["target shape factor $p_0$"]
     shown = {"segmented": tissue, "fitted": tissue}
-    axes = panels(microscopy.overlays(image, shown, pixel_size=0.1))
+    axes = panels(infer_from_microscopy.plot_overlays(image, shown, pixel_size=0.1))
     assert [ax.get_title() for ax in axes] == ["segmented", "fitted"]
     assert all(len(ax.images) == 1 for ax in axes)
 
 
 def test_conditions_have_one_scale_for_all_ratios(tissue):
-    found = [
+    images = [
         SimpleNamespace(
             condition=kind,
             snr=snr,
@@ -146,19 +149,19 @@ def test_conditions_have_one_scale_for_all_ratios(tissue):
         for kind, mean in (("stiff", 3.6), ("fluid", 3.9))
         for snr in (20.0, 3.0)
     ]
-    axes = panels(conditions.conditions(found))
+    axes = panels(compare_conditions.plot_conditions(images))
     scatter, boxes = axes[:2], axes[2:]
     assert len({ax.get_xlim() for ax in scatter} | {ax.get_ylim() for ax in scatter}) == 1
     assert len({ax.get_ylim() for ax in boxes}) == 1
-    every = np.concatenate([x for i in found for x in (i.true, i.inferred)])
+    every = np.concatenate([x for i in images for x in (i.true, i.inferred)])
     low, high = scatter[0].get_xlim()
     assert low < every.min()
     assert every.max() < high
 
-    seen: Any = SimpleNamespace(pixel_size=0.1)
+    segmentation: Any = SimpleNamespace(pixel_size=0.1)
     outcome: Any = SimpleNamespace(tissue=tissue)
-    pictures = {f"SNR {k}": (RNG.normal(size=(30, 30)), seen, outcome) for k in range(3)}
-    with_image = [ax for ax in panels(conditions.images(pictures)) if ax.images]
+    pictures = {f"SNR {k}": (RNG.normal(size=(30, 30)), segmentation, outcome) for k in range(3)}
+    with_image = [ax for ax in panels(compare_conditions.plot_images(pictures)) if ax.images]
     assert len(with_image) == 6
 
 
@@ -178,7 +181,7 @@ def test_methods_across_topologies(tissue):
         }
         for name, c in curves.items()
     }
-    axes = panels(topologies.inference(curves, metrics))
+    axes = panels(topologies.plot_inference(curves, metrics))
     assert len(axes) == 6
     assert axes[0].get_legend_handles_labels()[1] == list(methods)
     np.testing.assert_allclose(
@@ -187,7 +190,7 @@ def test_methods_across_topologies(tissue):
     energy = lambda low: vx.energies.ShapeFactorEnergy(jnp.linspace(low, 4, 9))
     scene = vx.inference.Scene(energy(3.7), tissue, energy(3.6), tissue, converged=jnp.array(True))
     fits = {"guided": fit_with(tissue=tissue, energy=energy(3.5))}
-    axes = panels(topologies.tissues(scene, fits))
+    axes = panels(topologies.plot_tissues(scene, fits))
     assert [ax.get_title() for ax in axes] == ["start", "guided", "target"]
     assert limits(axes, PolyCollection) == {(3.5, 4.0)}
 
@@ -206,7 +209,7 @@ def test_the_benchmark_compares_on_one_scale():
         for n in (20, 50)
         for method in ("Adj-ID", "EP")
     ]
-    time, memory, time_too, memory_too = panels(benchmark.scaling(rows))
+    time, memory, time_too, memory_too = panels(adjoint_scaling.plot_scaling(rows))
     assert time.get_ylim() == time_too.get_ylim()
     assert memory.get_ylim() == memory_too.get_ylim()
     assert [label.get_text() for label in time.get_xticklabels()] == ["20", "50"]
@@ -217,7 +220,7 @@ def test_the_benchmark_compares_on_one_scale():
     )
     fits = {name: fit_with(history=history) for name in ("AD", "LM")}
     inferred = {"AD": true + 0.01 * RNG.normal(size=true.shape), "LM": true}
-    figure = benchmark.inference(fits, true, initial, inferred, title="here")
+    figure = benchmark_adjoints.plot_inference(fits, true, initial, inferred, title="here")
     start, end, *_ = panels(figure)
     assert start.get_xlim() == end.get_xlim() == start.get_ylim() == end.get_ylim()
 
@@ -226,10 +229,11 @@ def test_the_benchmark_compares_on_one_scale():
     }
     betas = {"linear": np.logspace(-6, -3, 4), "cost": np.logspace(-3, 0, 4)}
     linear, cost, _ = panels(
-        benchmark.beta_scan(betas, errors, {1.0: {"relative_error": [1e-3, 2e-3]}})
+        hypergradient_accuracy.plot_betas(betas, errors, {1.0: {"relative_error": [1e-3, 2e-3]}})
     )
     assert linear.get_ylim() == cost.get_ylim()
-    (ax,) = panels(benchmark.accuracy(np.logspace(-6, -3, 4), {"AD": RNG.uniform(size=(4, 2))}))
+    by_method = {"AD": RNG.uniform(size=(4, 2))}
+    (ax,) = panels(hypergradient_accuracy.plot_accuracy(np.logspace(-6, -3, 4), by_method))
     assert ax.get_xscale() == ax.get_yscale() == "log"
 
 
@@ -242,7 +246,7 @@ def test_more_cycles_than_colours_are_all_drawn():
         rigidity.Curve(f"{k} cycles", np.linspace(0, 1, 5), 3.8, 0.01, np.linspace(1, 0, 5), None)
         for k in range(9)
     ]
-    axes = panels(rigidity.transition(p0, curves, RNG.uniform(size=(5, 2)), np.zeros((5, 0))))
+    axes = panels(rigidity.plot_transition(p0, curves, RNG.uniform(size=(5, 2)), np.zeros((5, 0))))
     assert len(axes) == 3
     # Before, the sixth curve and those after it were left out without a word.
     assert len(axes[0].get_legend_handles_labels()[1]) == 9
@@ -252,7 +256,7 @@ def test_moduli_of_all_tissues_and_their_means():
     p0, shear = np.linspace(3.5, 4.0, 4), RNG.uniform(size=(4, 3))
     shear[3, 1] = np.nan
     means = {name: np.arange(4.0) for name in ("shear", "affine", "bulk", "tension")}
-    left, _, right = panels(moduli.moduli(p0, shear, means, np.array([1, 1, 0.5, 0])))
+    left, _, right = panels(tissue_moduli.plot_moduli(p0, shear, means, np.array([1, 1, 0.5, 0])))
     np.testing.assert_allclose(left.lines[0].get_ydata(), shear.ravel())
     assert [text.get_text() for text in left.get_legend().get_texts()] == [
         "relaxed",
@@ -264,10 +268,12 @@ def test_moduli_of_all_tissues_and_their_means():
 
 def test_tensions_through_another_program_are_beside_those_through_vertax(tissue):
     true = RNG.uniform(0.2, 0.4, tissue.n_edges)
-    found = {"Surface Evolver": true + 0.01, "vertax": true}
-    errors = dict.fromkeys(found, np.geomspace(0.1, 0.01, 5))
-    foam, recovered, history = panels(external.recovery(tissue, true, found, errors))
+    inferred = {"Surface Evolver": true + 0.01, "vertax": true}
+    errors = dict.fromkeys(inferred, np.geomspace(0.1, 0.01, 5))
+    foam, recovered, history = panels(
+        external_tensions.plot_recovery(tissue, true, inferred, errors)
+    )
     del foam
     lines = [line for line in recovered.lines if len(line.get_xdata()) == tissue.n_edges]
-    np.testing.assert_array_equal([line.get_ydata() for line in lines], list(found.values()))
+    np.testing.assert_array_equal([line.get_ydata() for line in lines], list(inferred.values()))
     assert len(history.lines) == 2

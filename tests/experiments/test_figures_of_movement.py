@@ -6,31 +6,30 @@ import numpy as np
 import pytest
 
 import vertax as vx
-from vertax.experiments.cell_diffusion import Config as Diffusion, figures as diffusion
-from vertax.experiments.movement_checks import Config as Checks, figures as checks
-from vertax.experiments.oscillatory_shear import figures as shear
-from vertax.experiments.timed_elongation import figures as elongation
+from experiments import cell_diffusion, movement_checks, oscillatory_shear, timed_elongation
 
 pytestmark = pytest.mark.experiments
 
 
 def test_moduli_have_points_on_lines():
     frequencies = np.geomspace(0.1, 10, 4)
-    known = 1 + 1j * frequencies
-    figure = shear.moduli(frequencies, {"one": known, "two": known}, {"one": known, "two": known})
+    expected = 1 + 1j * frequencies
+    figure = oscillatory_shear.plot_moduli(
+        frequencies, {"one": expected, "two": expected}, {"one": expected, "two": expected}
+    )
     figure.canvas.draw()
     assert [ax.get_title() for ax in figure.axes] == ["one", "two"]
     points, line = figure.axes[0].lines[:2]
     np.testing.assert_array_equal(points.get_ydata(), line.get_ydata())
 
 
-def test_diffusion_that_is_not_known_is_left_out():
-    config = Diffusion(shape_factors=[3.5, 3.7], speeds=[0.2])
+def test_nan_diffusion_is_not_drawn():
+    config = cell_diffusion.Config(shape_factors=[3.5, 3.7], speeds=[0.2])
     lags = np.arange(1.0, 5.0)
     squared = np.ones((1, 2, 4)) * lags
     squared[0, 1, 2:] = np.nan
     coefficients = np.array([[0.1, np.nan]])
-    figure = diffusion.diffusion(config, lags, squared, coefficients, coefficients)
+    figure = cell_diffusion.plot_diffusion(config, lags, squared, coefficients, coefficients)
     figure.canvas.draw()
     shown = np.asarray(figure.axes[1].lines[0].get_ydata(), float)
     np.testing.assert_array_equal(np.isnan(shown), [False, True])
@@ -41,9 +40,9 @@ def test_diffusion_that_is_not_known_is_left_out():
     assert free[-1] == pytest.approx(2 * 0.2**2 * (4 - 1 + np.exp(-4)))
 
 
-def test_transitions_of_all_lengths_of_steps_are_shown():
+def test_transitions_of_all_time_steps_are_drawn():
     steps = np.array([0.5, 0.25])
-    found = SimpleNamespace(
+    results = SimpleNamespace(
         decay_steps=steps,
         decay_errors=np.stack([steps, steps**2]),
         quench_times=[np.linspace(0, 1, n + 1) for n in (2, 4)],
@@ -57,18 +56,18 @@ def test_transitions_of_all_lengths_of_steps_are_shown():
         control_errors=np.full((2, 2), 1e-3),
         control_steps=np.full((2, 2), 7),
     )
-    figure = checks.checks(Checks(tolerances=[1e-2, 1e-3]), found)
+    figure = movement_checks.plot_checks(movement_checks.Config(tolerances=[1e-2, 1e-3]), results)
     figure.canvas.draw()
     events = figure.axes[2].lines
     points = sorted(tuple(xy) for line in events for xy in line.get_xydata().tolist())
     assert points == [(0.25, 0.25), (0.25, 0.75), (0.5, 0.5), (0.5, 1.0)]
 
 
-def test_a_course_is_shown_with_what_was_reached():
+def test_the_course_is_drawn_with_the_aspect_ratios():
     tissue = vx.initialise.free_voronoi(6, key=0, lloyd_steps=1)
     tensions = np.linspace(0.1, 0.2, tissue.n_edges)
     times = np.linspace(0, 1, 4)
-    figure = elongation.course(
+    figure = timed_elongation.plot_course(
         {"first": (tissue, tensions), "last": (tissue, tensions)},
         (0.04, 0.28),
         times,

@@ -50,11 +50,11 @@ def test_the_fitted_mesh_follows_the_membranes_better(picture, tmp_path, pytestc
     assert all(0 < float(row["x_pixels"]) < 160 for row in rows)
     # The correlation is that of the pictures of the saved tissues with the saved image.
     fitted = vx.load_tissue(tmp_path / "run" / "fitted.npz")
-    seen = np.load(tmp_path / "run" / "image.npy")
+    image = np.load(tmp_path / "run" / "image.npy")
     width = metrics["psf_width_pixels"] * metrics["pixel_size"]
-    whole = vx.costs.mirror(seen)
-    model = np.asarray(vx.costs.render(fitted, whole.shape, width, points_per_edge=48))
-    correlation = np.corrcoef(model.ravel(), whole.ravel())[0, 1]
+    mirrored = vx.costs.mirror(image)
+    model = np.asarray(vx.costs.render(fitted, mirrored.shape, width, points_per_edge=48))
+    correlation = np.corrcoef(model.ravel(), mirrored.ravel())[0, 1]
     assert correlation == pytest.approx(metrics["correlation_fitted"], abs=1e-6)
     for name in ("overlay", "convergence", "shape_factors"):
         assert (tmp_path / "run" / "figures" / f"{name}.png").stat().st_size > 5000

@@ -40,7 +40,7 @@ def tiny(tmp_path_factory):
     return run(base / "tiny.toml", base / "out")
 
 
-def test_a_run_leaves_everything(tiny):
+def test_a_run_writes_all_files(tiny):
     folder, _ = tiny
     files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert files == {
@@ -75,23 +75,23 @@ def test_metrics_agree_with_the_saved_tissues(tiny, source):
     force = eqx.filter_jit(jax.grad(lambda x: energy(fitted.with_configuration(x))))(
         fitted.configuration
     )
-    said = metrics[source]
-    assert np.abs(force).max() == pytest.approx(said["max_force"], abs=1e-12)
-    assert said["max_force"] < 1e-9
-    assert said["pearson"] == pytest.approx(np.corrcoef(true, inferred)[0, 1])
-    assert said["relative_error"] == pytest.approx(np.mean(np.abs(inferred - true) / true))
-    assert said["relative_error"] < said["relative_error_initial"]
-    assert said["cost_final"] < said["cost_initial"]
-    assert said["epochs"] == 4
-    assert said["seconds_per_epoch"] > 0
-    assert said["converged_fraction"] == 1
+    reported = metrics[source]
+    assert np.abs(force).max() == pytest.approx(reported["max_force"], abs=1e-12)
+    assert reported["max_force"] < 1e-9
+    assert reported["pearson"] == pytest.approx(np.corrcoef(true, inferred)[0, 1])
+    assert reported["relative_error"] == pytest.approx(np.mean(np.abs(inferred - true) / true))
+    assert reported["relative_error"] < reported["relative_error_initial"]
+    assert reported["cost_final"] < reported["cost_initial"]
+    assert reported["epochs"] == 4
+    assert reported["seconds_per_epoch"] > 0
+    assert reported["converged_fraction"] == 1
     if source == "vertices":
         cost = vx.costs.VertexDistance(vx.load_tissue(folder / "target.npz"))
-        assert float(cost(fitted, energy)) == pytest.approx(said["cost_final"])
+        assert float(cost(fitted, energy)) == pytest.approx(reported["cost_final"])
     else:
         width = 2.0 * np.sqrt(6) / 48
         cost = vx.costs.MeshImage(np.load(folder / "image.npy"), width)
-        assert float(eqx.filter_jit(cost)(fitted, energy)) == pytest.approx(said["cost_final"])
+        assert float(eqx.filter_jit(cost)(fitted, energy)) == pytest.approx(reported["cost_final"])
 
 
 def test_the_target_is_an_equilibrium_of_the_true_parameters(tiny):
@@ -100,9 +100,11 @@ def test_the_target_is_an_equilibrium_of_the_true_parameters(tiny):
     target = vx.load_tissue(folder / "target.npz")
     # The settings of the experiment: then nothing is compiled again.
     relaxation = load_config(folder / "config.toml")[1].relaxation.build()
-    found = relaxation(target, vx.energies.ShapeFactorEnergy(jax.numpy.asarray(true)), throw=False)
-    assert bool(found.converged)
-    assert int(found.num_steps) == 0
+    equilibrium = relaxation(
+        target, vx.energies.ShapeFactorEnergy(jax.numpy.asarray(true)), throw=False
+    )
+    assert bool(equilibrium.converged)
+    assert int(equilibrium.num_steps) == 0
 
 
 def test_history_has_a_row_for_each_epoch_of_each_fit(tiny):
@@ -139,7 +141,7 @@ def test_figures_are_pictures(tiny):
 # --- run folders
 
 
-def test_an_earlier_run_is_never_overwritten_unasked(tmp_path):
+def test_an_earlier_run_is_not_overwritten_by_default(tmp_path):
     claim = lambda **options: RunFolder.claim("demo", root=tmp_path, **options).path
     first = claim()
     assert first == tmp_path / "demo"

@@ -18,7 +18,7 @@ cluster = { n_cells = 9, pixels = 400 }
 
 
 @pytest.mark.slow  # compiles for half a minute
-def test_the_experiment_finds_what_it_drew(tmp_path):
+def test_tensions_of_a_synthetic_cluster_are_recovered(tmp_path):
     (tmp_path / "tiny.toml").write_text(TINY)
     folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out")
     assert metrics["pearson_tension"] > 0.8
@@ -32,7 +32,7 @@ def test_the_experiment_finds_what_it_drew(tmp_path):
 
 
 @pytest.mark.slow  # compiles for half a minute
-def test_a_mask_that_says_little_says_so(tmp_path):
+def test_few_determined_tensions_are_a_warning(tmp_path):
     (tmp_path / "tiny.toml").write_text(TINY)
     _, metrics = run(tmp_path / "tiny.toml", tmp_path / "out", "noise=20")
     assert any("are determined" in warning for warning in metrics["warnings"])

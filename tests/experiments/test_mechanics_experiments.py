@@ -7,9 +7,9 @@ from helpers import random_tissue
 from run_helpers import run, table
 
 import vertax as vx
+from experiments.double_optimisation import TunedCells
+from experiments.shear_stiffening import Config, branch, compare
 from vertax.costs import aspect_ratio
-from vertax.experiments.double_optimisation.experiment import TunedCells
-from vertax.experiments.tissue_moduli.stiffening import Stiffening, branch, compared
 
 pytestmark = pytest.mark.experiments
 
@@ -59,24 +59,24 @@ def test_the_factor_of_a_perimeter_that_grows_with_the_square_of_the_strain_is_t
     strains, centre, critical, k = np.linspace(0, 0.4, 401), 0.03, 0.1, 2.3
     off = np.stack([strains - centre, strains + centre])
     beyond = np.maximum(off**2 - critical**2, 0)
-    found = {
+    curves = {
         "stress": np.stack([1.0, -1.0])[:, None] * 2 * k * off * beyond,
         "modulus": np.where(beyond > 0, 2 * k * (3 * off**2 - critical**2), 0),
         "converged": np.ones_like(off, bool),
     }
-    right, left = (branch(strains, found, side, Stiffening(window=0.01)) for side in (0, 1))
+    right, left = (branch(strains, curves, side, Config(window=0.01)) for side in (0, 1))
     assert right is not None
     assert left is not None
     assert right.onset == pytest.approx(critical + centre, abs=1e-5)
-    told = compared(right, left)
-    assert told["critical_strain"] == pytest.approx(critical, abs=1e-5)
-    assert told["centre"] == pytest.approx(centre, abs=1e-5)
-    assert told["jump"] == pytest.approx(4 * k * critical**2, rel=1e-3)
-    assert told["factor"] == pytest.approx(3, rel=1e-3)
-    # Rigid from the beginning, or never: nothing is told.
-    rigid = found | {"stress": found["stress"] + 1.0}
-    assert branch(strains, rigid, 0, Stiffening()) is None
-    assert branch(strains, found | {"stress": 0 * off}, 0, Stiffening()) is None
+    factors = compare(right, left)
+    assert factors["critical_strain"] == pytest.approx(critical, abs=1e-5)
+    assert factors["centre"] == pytest.approx(centre, abs=1e-5)
+    assert factors["jump"] == pytest.approx(4 * k * critical**2, rel=1e-3)
+    assert factors["factor"] == pytest.approx(3, rel=1e-3)
+    # Solid at zero strain, or at no strain: there is no onset.
+    rigid = curves | {"stress": curves["stress"] + 1.0}
+    assert branch(strains, rigid, 0, Config()) is None
+    assert branch(strains, curves | {"stress": 0 * off}, 0, Config()) is None
 
 
 @pytest.mark.parametrize("tuned", ["stiffness", "perimeter", "area"])

@@ -12,7 +12,7 @@ cluster = { n_cells = 7, pieces = 4, frames = 3, interval = 0.01, noise = 1e-6 }
 """
 
 
-def test_it_finds_the_tensions_that_it_drew(tmp_path):
+def test_tensions_of_a_synthetic_movie_are_recovered(tmp_path):
     (tmp_path / "tiny.toml").write_text(TINY)
     folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out")
     assert metrics["n_frames"] == 3

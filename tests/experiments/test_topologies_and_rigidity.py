@@ -42,15 +42,15 @@ def test_guidance_crosses_topologies(tmp_path):
     (tmp_path / "tiny.toml").write_text(ACROSS)
     folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out")
     assert min(metrics["start"]["mismatched_neighbours"]) >= 2
-    found = metrics["guided"]
-    assert found["mismatched_neighbours"] == [0, 0]
-    assert found["relative_error_most"] < 1e-3
-    assert found["succeeded"] == 1
+    guided = metrics["guided"]
+    assert guided["mismatched_neighbours"] == [0, 0]
+    assert guided["relative_error_most"] < 1e-3
+    assert guided["succeeded"] == 1
     target, fitted = (vx.load_tissue(folder / f"{n}.npz") for n in ("target", "fitted_guided"))
     assert mismatched_neighbours(fitted, target) == 0
     rows = table(folder / "shape_factors.csv")
     error = np.abs(np.array(rows["guided"], float) / np.array(rows["true"], float) - 1)
-    assert np.mean(error.reshape(2, 8), axis=1) == pytest.approx(found["relative_error"])
+    assert np.mean(error.reshape(2, 8), axis=1) == pytest.approx(guided["relative_error"])
     assert len(table(folder / "history.csv")["cost"]) == 2 * 90
     assert json.loads((folder / "metrics.json").read_text()) == metrics
     for name in ("inference", "tissues"):

@@ -131,7 +131,7 @@ NUMBERS = [
 COUNTED = {
     "notebooks": len(list(ROOT.glob("notebooks/*.ipynb"))),
     "stories": len(list(ROOT.glob("notebooks/*.ipynb"))),
-    "experiments": len(list(ROOT.glob("vertax/experiments/*/__init__.py"))),
+    "experiments": len(list(ROOT.glob("experiments/[a-z]*.py"))),
     "configurations": len(list(ROOT.glob("configs/*.toml"))),
 }
 

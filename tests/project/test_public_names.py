@@ -85,7 +85,7 @@ def test_import_does_not_change_settings_of_jax():
     import sys
 
     code = (
-        "import jax; before = dict(jax.config.values); import vertax; import vertax.experiments; "
+        "import jax; before = dict(jax.config.values); import vertax; import vertax.jobs; "
         "assert dict(jax.config.values) == before"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

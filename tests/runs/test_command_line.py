@@ -58,7 +58,7 @@ def test_run_writes_results_and_says_where(tiny):
     assert "runs/tiny/figures/recovery.png" in outcome.output
 
 
-def test_a_second_run_gets_a_folder_of_its_own(tiny):
+def test_a_second_run_gets_a_new_folder(tiny):
     (tiny / "runs" / "tiny").mkdir(parents=True)
     (tiny / "runs" / "tiny" / "metrics.json").write_text("precious")
     outcome = vertax("run", "tiny.toml", "--quiet")
@@ -68,7 +68,7 @@ def test_a_second_run_gets_a_folder_of_its_own(tiny):
     assert (tiny / "runs/tiny-2/metrics.json").is_file()
 
 
-def test_a_chosen_folder_is_overwritten_only_if_told_to(tiny):
+def test_a_folder_is_overwritten_only_with_the_option(tiny):
     (tiny / "out").mkdir()
     (tiny / "out" / "config.toml").write_text("")
     (tiny / "out" / "metrics.json").write_text("precious")
@@ -81,7 +81,7 @@ def test_a_chosen_folder_is_overwritten_only_if_told_to(tiny):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["none.toml"], "There is no configuration file none.toml"),
         (["tiny.toml", "--set", "fit.epoch=3"], "did you mean `fit.epochs`"),
@@ -106,10 +106,10 @@ def test_a_chosen_folder_is_overwritten_only_if_told_to(tiny):
         (["tiny.toml", "--figures", "gif"], "Figures are written as png, pdf, svg"),
     ],
 )
-def test_a_wrong_configuration_is_a_message_and_exit_code_2(tiny, arguments, said):
+def test_a_wrong_configuration_is_a_message_and_exit_code_2(tiny, arguments, message):
     outcome = vertax("run", *arguments)
     assert outcome.exit_code == 2
-    assert said in outcome.stderr
+    assert message in outcome.stderr
     assert "Traceback" not in outcome.output
     assert not (tiny / "runs").exists()
 
@@ -119,9 +119,7 @@ def instead(monkeypatch):
     """Puts another function in the place of the experiment: nothing to compile."""
 
     def instead(run):
-        monkeypatch.setattr(
-            importlib.import_module("vertax.experiments.infer_shape_factors"), "run", run
-        )
+        monkeypatch.setattr(importlib.import_module("vertax.jobs.infer_shape_factors"), "run", run)
 
     return instead
 
@@ -140,7 +138,7 @@ def test_a_failed_run_is_a_message_and_exit_code_1(tiny, instead, error):
 
 
 @pytest.mark.parametrize("missing", [FileNotFoundError("no image"), ImportError("pip install it")])
-def test_a_run_that_could_not_begin_does_not_block_the_same_command(tiny, instead, missing):
+def test_a_run_that_fails_at_its_start_leaves_no_folder(tiny, instead, missing):
     def fail(config, folder, *, progress):
         (folder.path / "unfinished").mkdir()
         raise missing
@@ -264,7 +262,7 @@ def test_the_formats_of_the_figures_are_chosen(tiny, instead):
         RunFolder(tiny, figures=())
 
 
-def test_a_run_says_what_it_is_at_unless_it_is_to_be_quiet(tiny, instead):
+def test_a_run_prints_its_steps_unless_it_is_quiet(tiny, instead):
     def run(config, folder, *, progress):
         folder.say("counting")
         return {"n": folder.part("cells 1", lambda: {"n": np.arange(3)})["n"]}
@@ -274,7 +272,7 @@ def test_a_run_says_what_it_is_at_unless_it_is_to_be_quiet(tiny, instead):
     assert vertax("run", "tiny.toml", "--quiet").stderr == ""
 
 
-def test_a_fault_of_the_program_keeps_its_traceback(tiny, instead):
+def test_an_unexpected_error_keeps_its_traceback(tiny, instead):
     instead(lambda config, folder, *, progress: {}["missing"])
     assert isinstance(vertax("run", "tiny.toml").exception, KeyError)
 
@@ -331,7 +329,7 @@ def test_show_prints_the_metrics_and_lists_figures_and_files(done):
     )
 
 
-def test_show_shows_what_run_showed(tiny, instead):
+def test_show_prints_the_summary_of_the_run(tiny, instead):
     instead(lambda config, folder, *, progress: METRICS | {"note": "text"})
     ran = vertax("run", "tiny.toml")
     shown = vertax("show", "runs/tiny")
@@ -349,7 +347,7 @@ def test_show_of_an_unfinished_run_is_exit_code_1(done):
 
 
 @pytest.mark.parametrize(
-    ("broken", "said"),
+    ("broken", "message"),
     [
         (lambda run: (run / "config.toml").unlink(), "there is no config.toml in it"),
         (lambda run: (run / "metrics.json").write_text("{"), "metrics.json is no JSON"),
@@ -357,11 +355,11 @@ def test_show_of_an_unfinished_run_is_exit_code_1(done):
         (lambda run: (run / "metrics.json").write_text("[1]"), "holds no metrics by name"),
     ],
 )
-def test_show_of_a_folder_that_is_no_run_is_exit_code_2(done, broken, said):
+def test_show_of_a_folder_that_is_no_run_is_exit_code_2(done, broken, message):
     broken(done)
     outcome = vertax("show", str(done))
     assert outcome.exit_code == 2
-    assert said in outcome.stderr
+    assert message in outcome.stderr
     assert "Traceback" not in outcome.output
 
 
@@ -372,7 +370,7 @@ def test_show_of_no_folder_is_exit_code_2(done):
     assert vertax("show").exit_code == 2
 
 
-def test_help_tells_the_exit_codes():
+def test_help_lists_the_exit_codes():
     assert "Exit codes: 0 all went well, 1 the run failed" in vertax("--help").output
 
 
@@ -390,7 +388,7 @@ def test_the_program_runs_as_a_process():
 COMPILES = """
 import os, signal, sys
 import jax, jax.numpy as jnp
-import vertax.experiments.infer_shape_factors as experiment
+import vertax.jobs.infer_shape_factors as experiment
 from vertax.__main__ import main
 
 class Crash:

@@ -97,7 +97,7 @@ def test_a_key_inside_a_value_is_refused(write):
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("tissue.n_cell=3", ["`tissue.n_cell`", "`tissue.n_cells`", "an integer, at least 4"]),
         ("epochs=3", ["`epochs`", "`fit.epochs`", "an integer, at least 1"]),
@@ -107,14 +107,14 @@ def test_a_key_inside_a_value_is_refused(write):
         ("fit.xyz=1", ["`fit.xyz`", "`fit.optimiser`", "`fit.learning_rate`", "`fit.epochs`"]),
     ],
 )
-def test_an_unknown_key_is_refused_by_name_with_the_nearest_right_one(write, override, said):
+def test_an_unknown_key_is_refused_by_name_with_the_nearest_right_one(write, override, message):
     message = refusal(write(VALID), override)
-    for part in ["there is no key", *said]:
+    for part in ["there is no key", *message]:
         assert part in message
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("fit.epochs=many", '`fit.epochs` must be an integer, at least 1, but is "many"'),
         ("fit.epochs=2.5", "`fit.epochs` must be an integer, at least 1, but is 2.5"),
@@ -129,8 +129,8 @@ def test_an_unknown_key_is_refused_by_name_with_the_nearest_right_one(write, ove
         ("seed={a=1}", "`seed` must be an integer, at least 0, but is a table"),
     ],
 )
-def test_an_ill_typed_key_is_refused_by_name_with_what_is_allowed(write, override, said):
-    assert said in refusal(write(VALID), override)
+def test_an_ill_typed_key_is_refused_by_name_with_what_is_allowed(write, override, message):
+    assert message in refusal(write(VALID), override)
 
 
 def test_all_mistakes_are_reported_at_once_with_the_file(write):
@@ -166,7 +166,7 @@ def test_the_experiment_must_be_named_and_exist(write):
     assert "`experiment` is missing" in refusal(write("seed = 1"))
     message = refusal(write('experiment = "infer_shape_factor"'))
     assert "did you mean 'infer_shape_factors'?" in message
-    assert "there are: benchmark_adjoints" in refusal(write("experiment = 3"))
+    assert "there are: design_mechanics" in refusal(write("experiment = 3"))
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)

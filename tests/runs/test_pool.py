@@ -24,7 +24,7 @@ def test_results_come_in_order(tmp_path):
     assert side_by_side(late_first, 0, folder, progress=False) == []
 
 
-def test_after_an_error_nothing_else_begins(tmp_path, monkeypatch):
+def test_no_call_begins_after_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     begun = []
 
@@ -41,7 +41,7 @@ def test_after_an_error_nothing_else_begins(tmp_path, monkeypatch):
     assert not folder.interrupted
 
 
-def test_after_an_interrupt_nothing_else_begins(tmp_path, monkeypatch):
+def test_no_call_begins_after_an_interrupt(tmp_path, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     folder, begun = RunFolder(tmp_path), []
 
@@ -81,7 +81,7 @@ def outcome(problem, interrupted):
     return vx.Fit(problem.energy, problem.tissue, *best, history, interrupted=interrupted)
 
 
-def test_a_fit_that_ends_does_not_take_back_an_interrupt(tmp_path, monkeypatch):
+def test_a_finished_fit_keeps_the_interrupt_flag(tmp_path, monkeypatch):
     folder = RunFolder(tmp_path)
     long, short = problem(3.6), problem(3.7)
     long_goes, short_is_done = threading.Event(), threading.Event()
@@ -128,7 +128,7 @@ def test_an_interrupt_ends_fits_in_other_threads_after_their_epoch(tmp_path):
     assert {part.stem for part in folder.parts()} >= {"x_0"}
 
 
-def test_fits_side_by_side_are_those_of_one_after_the_other(tmp_path):
+def test_concurrent_fits_equal_sequential_fits(tmp_path):
     problems = [problem(3.6), problem(3.7)]
     notes = lambda problem, record: {"twice": 2 * record.cost}
     fitting = Fitting(epochs=4)

@@ -1,13 +1,14 @@
-"""An experiment is a folder: nothing else knows of it."""
+"""Jobs and experiments are found by the names of their modules."""
 
 import json
+import shutil
 import textwrap
 
 import pytest
 from typer.testing import CliRunner
 
-import vertax.experiments
-from vertax.runs import _registry, find_experiment
+import vertax.jobs
+from vertax.runs import _registry, _shipped, find_experiment
 from vertax.runs.command_line import app
 
 TOY = '''
@@ -31,18 +32,14 @@ def run(config, folder, *, progress=True):
 
 @pytest.fixture
 def toy(tmp_path, monkeypatch):
-    """A folder with the experiment `count`, next to all others."""
-    (tmp_path / "count").mkdir()
-    (tmp_path / "count/__init__.py").write_text(textwrap.dedent(TOY).lstrip())
-    monkeypatch.setattr(
-        vertax.experiments, "__path__", [*vertax.experiments.__path__, str(tmp_path)]
-    )
-    for name in set(_registry._found()) - set(_registry.EXPERIMENTS):
-        monkeypatch.setitem(_registry.EXPERIMENTS, name, _registry._found()[name])
+    """A folder with the job `count`, next to all others."""
+    (tmp_path / "count.py").write_text(textwrap.dedent(TOY).lstrip())
+    monkeypatch.setattr(vertax.jobs, "__path__", [*vertax.jobs.__path__, str(tmp_path)])
+    monkeypatch.setitem(_registry.EXPERIMENTS, "count", _registry._all_experiments()["count"])
     return tmp_path
 
 
-def test_a_folder_and_a_file_make_an_experiment(toy, monkeypatch):
+def test_a_module_and_a_configuration_make_a_job(toy, monkeypatch):
     monkeypatch.chdir(toy)
     command = lambda *arguments: CliRunner().invoke(app, list(arguments))
     assert "count" in command("list").output
@@ -64,3 +61,35 @@ def test_a_configuration_is_of_one_experiment():
     assert find_experiment("infer_shape_factors").config is config
     with pytest.raises(ValueError, match="infer_shape_factors"):
         config(experiment="salt_and_pepper")
+
+
+def test_modules_of_the_package_are_jobs_and_those_of_the_repository_are_experiments():
+    assert find_experiment("infer_shape_factors").is_job
+    assert not find_experiment("salt_and_pepper").is_job
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """The state of an installed wheel: its configurations are in the package, the experiments are missing."""
+    shutil.copytree(_shipped.REPOSITORY / "configs", tmp_path / "vertax" / "configs")
+    monkeypatch.setattr(_shipped, "_PACKAGE", tmp_path / "vertax")
+    monkeypatch.setattr(_registry, "REPOSITORY", None)
+    jobs = {name: each for name, each in _registry.EXPERIMENTS.items() if each.is_job}
+    assert _registry._all_experiments() == jobs
+    for name in set(_registry.EXPERIMENTS) - set(jobs):
+        monkeypatch.delitem(_registry.EXPERIMENTS, name)
+
+
+@pytest.mark.usefixtures("installed")
+def test_an_installed_package_runs_its_jobs_and_says_where_the_experiments_are():
+    command = lambda *arguments: CliRunner().invoke(app, list(arguments))
+    names = [line.split()[0] for line in command("list").output.splitlines() if line[:2] == "  "]
+    assert {"infer_tensions", "demo"} < set(names)
+    assert "salt_and_pepper" not in names
+    for arguments in (("run", "salt_and_pepper"), ("describe", "salt_and_pepper")):
+        outcome = command(*arguments)
+        assert outcome.exit_code == 2
+        assert "'salt_and_pepper' is not part of the installed package" in outcome.stderr
+        assert "`experiments/` of the repository" in outcome.stderr
+        assert "vertax run configs/salt_and_pepper.toml" in outcome.stderr
+    assert command("describe", "infer_tensions").exit_code == 0

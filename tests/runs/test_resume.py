@@ -28,7 +28,7 @@ def vertax(*arguments):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def finished(tmp_path_factory):
     """A folder with tiny.toml and a run of it that nothing disturbed."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "tiny.toml").write_text(TINY)
@@ -56,91 +56,102 @@ def interrupt(monkeypatch):
 
 def tables(run):
     """All tables of a run, without times; and its metrics."""
-    found = {}
+    tables_by_file = {}
     for file in sorted(Path(run).glob("*.csv")):
         rows = list(csv.DictReader(file.read_text().splitlines()))
-        found[file.name] = [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
+        tables_by_file[file.name] = [
+            {k: v for k, v in row.items() if k != "seconds"} for row in rows
+        ]
     metrics = json.loads((Path(run) / "metrics.json").read_text())
     for group in (metrics, metrics["vertices"], metrics["image"]):
         group.pop("seconds_per_epoch")
-    return found, metrics
+    return tables_by_file, metrics
 
 
 # In the first fit, and in the second one, when the first is kept.
 @pytest.mark.parametrize("epoch", [pytest.param(2, marks=pytest.mark.slow), 5])
 @pytest.mark.thorough
-def test_an_interrupted_run_goes_on_to_the_same_numbers(whole, interrupt, tmp_path, epoch):
+def test_a_resumed_run_has_the_same_numbers(finished, interrupt, tmp_path, epoch):
     run = tmp_path / "run"
     interrupt(epoch)
-    stopped = vertax("run", whole / "tiny.toml", "--output", run)
+    stopped = vertax("run", finished / "tiny.toml", "--output", run)
     assert stopped.exit_code == 130
-    assert f"To go on: vertax run {whole / 'tiny.toml'} --resume {run}" in stopped.stderr
+    assert f"To go on: vertax run {finished / 'tiny.toml'} --resume {run}" in stopped.stderr
     assert (run / "history.csv").is_file()
     assert RunFolder.existing(run).figures()
     assert not (run / "metrics.json").exists()
     shown = vertax("show", run)
     assert shown.exit_code == 1
     assert f"--resume {run}" in shown.stderr
-    resumed = vertax("run", whole / "tiny.toml", "--resume", run)
+    resumed = vertax("run", finished / "tiny.toml", "--resume", run)
     assert resumed.exit_code == 0, resumed.output
     assert "kept so far: " in resumed.output
-    assert tables(run) == tables(whole / "run")
-    fitted, expected = (np.load(f / "fitted_image.npz")["vertices"] for f in (run, whole / "run"))
+    assert tables(run) == tables(finished / "run")
+    fitted, expected = (
+        np.load(f / "fitted_image.npz")["vertices"] for f in (run, finished / "run")
+    )
     np.testing.assert_array_equal(fitted, expected)
     assert not (run / "unfinished").exists()
 
 
 @pytest.mark.thorough
-def test_an_interrupt_before_the_first_epoch_keeps_the_folder(whole, interrupt, tmp_path):
+def test_an_interrupt_before_the_first_epoch_keeps_the_folder(finished, interrupt, tmp_path):
     interrupt(0)
-    stopped = vertax("run", whole / "tiny.toml", "--output", tmp_path / "run", "--set", "seed=1")
+    stopped = vertax("run", finished / "tiny.toml", "--output", tmp_path / "run", "--set", "seed=1")
     assert stopped.exit_code == 130
     assert "--set seed=1 --resume" in stopped.stderr
     assert (tmp_path / "run/config.toml").is_file()
 
 
 @pytest.fixture
-def stopped(whole, tmp_path):
+def stopped(finished, tmp_path):
     """What an interrupt left."""
-    shutil.copytree(whole / "run", tmp_path / "run")
+    shutil.copytree(finished / "run", tmp_path / "run")
     (tmp_path / "run/metrics.json").unlink()
     return tmp_path / "run"
 
 
-def test_a_run_of_another_configuration_is_not_resumed(whole, stopped):
+def test_a_run_of_another_configuration_is_not_resumed(finished, stopped):
     outcome = vertax(
-        "run", whole / "tiny.toml", "--resume", stopped, "--set", "fit.epochs=9", "--set", "seed=1"
+        "run",
+        finished / "tiny.toml",
+        "--resume",
+        stopped,
+        "--set",
+        "fit.epochs=9",
+        "--set",
+        "seed=1",
     )
     assert outcome.exit_code == 2
     assert "has another configuration: `seed` was 0 and is 1; `fit.epochs` was 4 and is 9" in (
         outcome.stderr
     )
-    (whole / "other.toml").write_text('experiment = "salt_and_pepper"\n')
-    outcome = vertax("run", whole / "other.toml", "--resume", stopped)
+    (finished / "other.toml").write_text('experiment = "salt_and_pepper"\n')
+    outcome = vertax("run", finished / "other.toml", "--resume", stopped)
     assert outcome.exit_code == 2
     assert "is one of the experiment 'infer_shape_factors'. Give its own" in outcome.stderr
 
 
-def test_a_finished_run_is_not_resumed(whole):
-    outcome = vertax("run", whole / "tiny.toml", "--resume", whole / "run")
+def test_a_finished_run_is_not_resumed(finished):
+    outcome = vertax("run", finished / "tiny.toml", "--resume", finished / "run")
     assert outcome.exit_code == 2
     assert "is finished: there is nothing to resume" in outcome.stderr
 
 
-def test_resume_goes_with_no_other_folder(whole, stopped):
+def test_resume_goes_with_no_other_folder(finished, stopped):
     for other in (["--overwrite"], ["--output", "x"]):
-        outcome = vertax("run", whole / "tiny.toml", "--resume", stopped, *other)
+        outcome = vertax("run", finished / "tiny.toml", "--resume", stopped, *other)
         assert outcome.exit_code == 2
         assert "--resume goes with neither" in outcome.stderr
-    outcome = vertax("run", whole / "tiny.toml", "--resume", stopped / "none")
+    outcome = vertax("run", finished / "tiny.toml", "--resume", stopped / "none")
     assert outcome.exit_code == 2
     assert "is not the folder of a run" in outcome.stderr
 
 
-def test_a_broken_checkpoint_is_named(whole, stopped):
+def test_a_broken_checkpoint_is_named(finished, stopped):
     (stopped / "unfinished").mkdir()
     (stopped / "unfinished/vertices.npz").write_bytes(b"PK")
-    outcome = vertax("run", whole / "tiny.toml", "--resume", stopped)
+    outcome = vertax("run", finished / "tiny.toml", "--resume", stopped)
     assert outcome.exit_code == 1
     assert "vertices.npz is truncated or damaged" in outcome.stderr
     assert "Delete the file to start this fit anew" in outcome.stderr

@@ -43,13 +43,13 @@ def table(folder):
     ],
 )
 def test_values_of_a_grid(text, values):
-    (found,) = parse_grid([text]).values()
-    without_spaces = [value.replace(" ", "").replace(",]", "]") for value in found]
+    (parsed,) = parse_grid([text]).values()
+    without_spaces = [value.replace(" ", "").replace(",]", "]") for value in parsed]
     assert without_spaces == [value.replace(" ", "") for value in values]
 
 
 @pytest.mark.parametrize(
-    ("texts", "said"),
+    ("texts", "message"),
     [
         (["seed"], "must have the form key=value,value"),
         (["=3"], "must have the form"),
@@ -59,8 +59,8 @@ def test_values_of_a_grid(text, values):
         (["seed=1", "seed=2"], "`seed` has two grids"),
     ],
 )
-def test_a_grid_of_another_form_is_refused(texts, said):
-    with pytest.raises(ConfigError, match=said):
+def test_a_grid_of_another_form_is_refused(texts, message):
+    with pytest.raises(ConfigError, match=message):
         parse_grid(texts)
 
 
@@ -73,7 +73,7 @@ def test_runs_are_all_combinations(tiny):
     assert runs[-1].folder.name == "tiny-seed_1-tissue.n_cells_10"
 
 
-def test_what_cannot_be_run_is_refused_before_anything_is(tiny):
+def test_invalid_runs_are_rejected_before_the_sweep_begins(tiny):
     with pytest.raises(ConfigError, match=r"did you mean `tissue\.n_cells`"):
         sweep_runs(["tiny.toml"], {"tissue.n_cell": ["6"]}, "out")
     with pytest.raises(ConfigError, match="Two runs of the sweep are called tiny-seed_1"):
@@ -83,19 +83,19 @@ def test_what_cannot_be_run_is_refused_before_anything_is(tiny):
 
 def test_bad_folders_and_formats_are_refused(tiny):
     (tiny / "file").write_text("mine")
-    for options, said in (
+    for options, message in (
         (["--output", "file"], "file"),
         (["--figures", "jpg", "--output", "out"], "jpg"),
     ):
         outcome = CliRunner().invoke(app, ["sweep", "tiny.toml", *options])
         assert outcome.exit_code == 2, outcome.output
-        assert said in outcome.output
+        assert message in outcome.output
     assert (tiny / "file").read_text() == "mine"
     assert not (tiny / "out").exists()
 
 
 @pytest.mark.thorough
-def test_a_sweep_goes_on_past_what_fails_and_keeps_what_is_finished(tiny):
+def test_a_sweep_continues_after_failures_and_keeps_finished_runs(tiny):
     # In the folder of one run lies something else, which is not overwritten.
     (tiny / "out" / "tiny-seed_1").mkdir(parents=True)
     (tiny / "out" / "tiny-seed_1" / "notes.txt").write_text("mine")
@@ -123,7 +123,7 @@ def test_a_sweep_goes_on_past_what_fails_and_keeps_what_is_finished(tiny):
         sweep_runs(["tiny.toml"], {"seed": ["0"]}, "out", ["fit.epochs=5"])
 
 
-def test_a_scheduler_that_is_not_there_is_named(tiny, monkeypatch):
+def test_a_missing_scheduler_is_named(tiny, monkeypatch):
     outcome = CliRunner().invoke(
         app, ["sweep", "tiny.toml", "--scheduler", "nonsense://here", "--quiet"]
     )

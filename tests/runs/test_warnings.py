@@ -28,16 +28,16 @@ def problem(p0=3.6):
     )
 
 
-def test_a_run_with_a_fit_that_is_not_at_its_end_says_so(tmp_path):
+def test_a_fit_that_has_not_converged_is_a_warning(tmp_path):
     (tmp_path / "tiny.toml").write_text(TINY)
     arguments = ["run", str(tmp_path / "tiny.toml"), "--output", str(tmp_path / "run")]
     outcome = CliRunner().invoke(app, arguments)
     assert outcome.exit_code == 0, outcome.output
-    said = "vertices: the cost was still falling at the last epoch (raise the number of epochs)."
-    assert f"Warning: {said}" in outcome.stderr
+    message = "vertices: the cost was still falling at the last epoch (raise the number of epochs)."
+    assert f"Warning: {message}" in outcome.stderr
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
-    assert metrics["warnings"] == [said]
-    assert said in CliRunner().invoke(app, ["show", str(tmp_path / "run")]).stderr
+    assert metrics["warnings"] == [message]
+    assert message in CliRunner().invoke(app, ["show", str(tmp_path / "run")]).stderr
 
 
 def test_equal_warnings_are_joined(tmp_path):
@@ -56,7 +56,7 @@ def test_a_run_without_warnings_has_no_such_key(tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text()) == {"cost": 1.0}
 
 
-def test_a_least_squares_solver_that_was_cut_short_is_named(tmp_path, monkeypatch):
+def test_least_squares_without_convergence_are_a_warning(tmp_path, monkeypatch):
     # What counts is the number of epochs, and those of Adam compile much less.
     monkeypatch.setattr(_folder, "fit", lambda p, _, n, **options: vx.fit(p, ADAM, n, **options))
     folder = RunFolder(tmp_path)
@@ -76,7 +76,7 @@ def broken(monkeypatch):
 
 
 @pytest.mark.usefixtures("broken")
-def test_a_fit_that_cannot_go_on_leaves_what_there_is(tmp_path):
+def test_a_failed_fit_keeps_its_epochs(tmp_path):
     folder, optimiser = RunFolder(tmp_path), ADAM
     with pytest.raises(vx.FitError):
         folder.fit("a b", problem(), optimiser, 3, progress=False)

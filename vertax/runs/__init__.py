@@ -1,6 +1,6 @@
-"""What `vertax run` is made of: configuration, run folders, the registry and the command line.
+"""The command `vertax run`: configurations, folders, the registry and the command line.
 
-What is public is listed in `__init__.pyi`, and imported when it is first used.
+`__init__.pyi` lists the public names, which are imported at their first use.
 """
 
 import lazy_loader

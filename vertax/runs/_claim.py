@@ -1,4 +1,4 @@
-"""Which folder a run gets: a new one, or that of an earlier run to go on with."""
+"""Find or make the folder of a new or resumed run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vertax.runs._figures import FIGURE_FORMATS
 
 CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
 FIGURES = tuple(f"figures/*.{ending}" for ending in FIGURE_FORMATS)
-# What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
+# Files of a run. METRICS is removed first, so that a folder that has it is complete.
 _LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", *FIGURES, f"{PARTS}/*.npz")
 
 
@@ -93,13 +93,13 @@ def unfinished(path: str | os.PathLike[str], config: ExperimentConfig) -> Path:
 
 
 def changes(folder: Path, config: ExperimentConfig) -> list[str]:
-    """What differs between the configuration of the run in a folder and another one, in words."""
+    """Differences between the configuration of the run in a folder and another one, in words."""
     then = validate(type(config), read_toml(folder / CONFIG), str(folder / CONFIG))
     return _changes(then.model_dump(mode="json"), config.model_dump(mode="json"))
 
 
 def _numbered(path: Path) -> Path:
-    """The first of path, path-2, path-3, … that is free, made."""
+    """Make the first folder of path, path-2, path-3, … that does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     number = 1
     while True:
@@ -115,7 +115,7 @@ def _numbered(path: Path) -> Path:
 
 def _clear(folder: Path) -> None:
     """Remove the files of an earlier run, and nothing else."""
-    # Whoever points at the wrong folder must not lose it.
+    # A wrong folder must not be cleared.
     if not (folder / CONFIG).is_file():
         raise RunFolderError(
             f"The folder {folder} is not empty and holds no run (no {CONFIG}), so it is not "
@@ -127,7 +127,7 @@ def _clear(folder: Path) -> None:
 
 
 def _changes(then: Any, now: Any, name: str = "") -> list[str]:
-    """What differs between two configurations, in words."""
+    """Differences between two configurations, in words."""
     if isinstance(then, Mapping) and isinstance(now, Mapping):
         keys = dict.fromkeys([*then, *now])
         inside = lambda key: f"{name}.{key}" if name else key

@@ -1,4 +1,4 @@
-"""Typed configuration: what every experiment shares, how it is read, how mistakes are reported."""
+"""Typed configurations: common keys, reading, and error messages."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Section(pydantic.BaseModel):
         use_attribute_docstrings=True,
     )
 
-    # An experiment may give a shared table defaults of its own, `fit: Fitting = Fitting(epochs=150)`.
-    # They hold for each key of the table by itself, not only where the whole table is left out.
+    # An experiment may change the defaults of a shared table, `fit: Fitting = Fitting(epochs=150)`.
+    # They apply to each key of the table, also if the configuration sets another key of it.
     @pydantic.model_validator(mode="before")
     @classmethod
     def _complete(cls, data: Any) -> Any:
@@ -52,21 +52,18 @@ class Section(pydantic.BaseModel):
 
 
 class ExperimentConfig(Section):
-    """The keys that every experiment has.
-
-    Subclasses add their own.
-    """
+    """The keys of all jobs and experiments; subclasses add others."""
 
     experiment: str = ""
-    """Which experiment this is: the name of its folder."""
+    """The job or experiment to run: the name of its module."""
     seed: int = pydantic.Field(default=0, ge=0)
     """Seed of everything random."""
     precision: Literal["float64", "float32"] = "float64"
-    """Floating-point numbers of the whole run."""
+    """Precision of floating-point numbers."""
 
     @pydantic.model_validator(mode="after")
     def _seed_that_is_kept(self) -> Any:
-        # JAX takes the lower 32 bits and drops the others without a word.
+        # JAX silently drops all but the lower 32 bits.
         if self.precision == "float32" and self.seed >= 2**32:
             raise ValueError(
                 f"with precision float32, `seed` must be below 2**32, but is {self.seed}"
@@ -76,12 +73,12 @@ class ExperimentConfig(Section):
 
 @functools.cache
 def named(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
-    """The configuration of the experiment of a name, which takes no other for its key `experiment`.
+    """A configuration class with a key `experiment` that accepts one name only.
 
     **Arguments:**
 
-    - `config`: the class with the keys of the experiment.
-    - `name`: of the experiment.
+    - `config`: the class with the keys of the job or experiment.
+    - `name`: the name.
 
     **Returns:** a subclass.
     """
@@ -109,7 +106,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     - `ConfigError`, naming the file, if it cannot be read or is not valid TOML.
     """
     try:
-        # Editors on Windows put a mark before the text.
+        # Editors on Windows write a byte-order mark.
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise ConfigError(f"There is no configuration file {os.fspath(path)}.") from None
@@ -191,8 +188,8 @@ def validate(
     try:
         return model.model_validate(dict(data))
     except pydantic.ValidationError as error:
-        known = fields(model)
-        lines = [_explain(known, mistake) for mistake in error.errors(include_url=False)]
+        keys = fields(model)
+        lines = [_explain(keys, mistake) for mistake in error.errors(include_url=False)]
         listed = "\n  ".join(["", *lines]) if len(lines) > 1 else f" {lines[0]}"
         raise ConfigError(f"In {where}:{listed}") from None
 
@@ -207,12 +204,12 @@ def fields(model: type[Section], prefix: str = "") -> dict[str, FieldInfo]:
 
     **Returns:** the Pydantic field of each key.
     """
-    found: dict[str, FieldInfo] = {}
+    keys: dict[str, FieldInfo] = {}
     for name, field in model.model_fields.items():
-        found[prefix + name] = field
+        keys[prefix + name] = field
         if (section := _section(field)) is not None:
-            found |= fields(section, f"{prefix}{name}.")
-    return found
+            keys |= fields(section, f"{prefix}{name}.")
+    return keys
 
 
 def template(model: type[ExperimentConfig], name: str) -> str:
@@ -270,17 +267,17 @@ def _type_in_words(annotation: Any) -> str:
     return _TYPES.get(annotation, str(annotation))
 
 
-def _explain(known: Mapping[str, FieldInfo], mistake: Any) -> str:
+def _explain(keys: Mapping[str, FieldInfo], mistake: Any) -> str:
     """One mistake, as Pydantic reports it, in a sentence."""
     name = ".".join(str(part) for part in mistake["loc"])
     # An entry of a list is judged by the field that the list belongs to.
-    field = known.get(".".join(part for part in mistake["loc"] if isinstance(part, str)))
+    field = keys.get(".".join(part for part in mistake["loc"] if isinstance(part, str)))
     if mistake["type"] == "extra_forbidden":
-        near = _nearest(name, known)
+        near = _nearest(name, keys)
         if near is not None:
-            return f"there is no key `{name}`; did you mean `{near}` ({allowed(known[near])})?"
+            return f"there is no key `{name}`; did you mean `{near}` ({allowed(keys[near])})?"
         parent, _, _ = name.rpartition(".")
-        siblings = [key for key in known if key.rpartition(".")[0] == parent]
+        siblings = [key for key in keys if key.rpartition(".")[0] == parent]
         return f"there is no key `{name}`; allowed are: {', '.join(f'`{k}`' for k in siblings)}."
     if mistake["type"] == "missing" and field is not None:
         return f"`{name}` is missing; it must be {allowed(field)}."
@@ -290,12 +287,12 @@ def _explain(known: Mapping[str, FieldInfo], mistake: Any) -> str:
     return f"`{name}` must be {allowed(field)}, but is {_in_toml(mistake['input'])}."
 
 
-def _nearest(name: str, known: Iterable[str]) -> str | None:
-    """The key that was probably meant, also if it was written in the wrong table."""
+def _nearest(name: str, keys: Iterable[str]) -> str | None:
+    """The most similar key, also in another table."""
     alike = lambda a, b: difflib.SequenceMatcher(None, a, b).ratio()
     last = lambda key: key.rpartition(".")[2]
     score = lambda key: alike(last(key), last(name)) + 0.5 * alike(key, name)
-    best = max(known, key=score, default=None)
+    best = max(keys, key=score, default=None)
     return best if best is not None and alike(last(best), last(name)) > 0.65 else None
 
 

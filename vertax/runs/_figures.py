@@ -15,7 +15,7 @@ with requires_extra("run", "The folder of a run"):
     from matplotlib.figure import Figure
 
 FIGURE_FORMATS = ("png", "pdf", "svg")
-# Without these the same figure would be another file each time; and text in a PDF stays text.
+# Reproducible files, and text in a PDF as text.
 _UNDATED: dict[str, dict[str, None]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 _VECTOR_STYLE: Any = {"pdf.fonttype": 42, "svg.hashsalt": "vertax"}
 

@@ -1,4 +1,4 @@
-"""Run folders: where an experiment leaves its results."""
+"""Folders of runs and their results."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 class RunFolder:
     """A folder that holds the results of one run.
 
-    `config.toml` is written first and `metrics.json` last: a folder with metrics is complete. Every
-    file appears under its name only when it is complete.
+    `config.toml` is written first and `metrics.json` last: a folder with metrics is complete. Files are
+    written atomically.
 
     **Arguments:**
 
@@ -56,9 +56,9 @@ class RunFolder:
     path: Path
     figure_formats: tuple[str, ...]
     talkative: bool
-    """Whether `say` says it."""
+    """Whether `say` prints."""
     interrupted: bool
-    """Whether an interrupt from the keyboard ended a fit of this run: no other one begins."""
+    """Whether a keyboard interrupt ended a fit of this run; no other one begins."""
 
     def __init__(self, path: str | os.PathLike[str], *, figures: Sequence[str] = ("png",)):
         self.path = Path(path)
@@ -121,7 +121,7 @@ class RunFolder:
         *,
         figures: Sequence[str] = ("png",),
     ) -> RunFolder:
-        """The folder of an earlier run that did not come to its end, to go on with it.
+        """The folder of an earlier run, to resume it.
 
         **Arguments:**
 
@@ -139,11 +139,11 @@ class RunFolder:
         return cls(unfinished(path, config), figures=figures)
 
     def say(self, what: str) -> None:
-        """Tell on the terminal what the run is at, if it is to tell (`vertax run` without `--quiet`).
+        """Print the current step of the run (`vertax run` without `--quiet`).
 
         **Arguments:**
 
-        - `what`: a few words, said before what takes longer than a second or two.
+        - `what`: a few words, for a step that takes more than two seconds.
         """
         if self.talkative:
             tqdm.write(f"  {what} …", file=sys.stderr)  # above the bars
@@ -159,24 +159,23 @@ class RunFolder:
         callback: Callback | None = None,
         **options: Any,
     ) -> Fit[Any]:
-        """Solve an inverse problem, with a checkpoint in this folder that a resumed run goes on from.
+        """Solve an inverse problem, with a checkpoint in this folder for a resumed run.
 
-        A fit that is not at its end is one of `warnings`. One that cannot go on leaves the table of its
-        epochs and, if it is no batch, its best tissue, both named after it.
+        A fit that has not converged adds to `warnings`. A fit that fails leaves the table of its epochs and,
+        if it is not a batch, its best tissue, both named after it.
 
         **Arguments:**
 
-        - `name`: of this fit; no other one of the run has it.
+        - `name`: the name of this fit, unique in the run.
         - `problem`, `optimiser`, `epochs`, `callback`, `options`: as of [`fit`][vertax.fit].
-        - `partial`: take what there is of a fit that cannot go on, with a warning.
+        - `partial`: return the epochs of a fit that fails, with a warning.
 
-        **Returns:** the [`Fit`][vertax.Fit], also if it was interrupted; `interrupted` of the folder then
-        tells so.
+        **Returns:** the [`Fit`][vertax.Fit], also after an interrupt, which sets `interrupted` of the folder.
 
         **Raises:**
 
-        - `KeyboardInterrupt` if an earlier fit was interrupted, or this one before it had anything.
-        - `FitError` if it cannot go on and `partial` is not set, or if there is nothing of it.
+        - `KeyboardInterrupt` if an earlier fit was interrupted, or this one before its first epoch.
+        - `FitError` if it fails and `partial` is not set, or before its first epoch.
         - others as [`fit`][vertax.fit].
         """
 
@@ -187,7 +186,7 @@ class RunFolder:
 
         if self.interrupted:
             raise KeyboardInterrupt
-        if options.get("progress", True):  # fits side by side have a bar of their own
+        if options.get("progress", True):  # concurrent fits share one progress bar
             self.say(f"fit: {name}")
         checkpoint = Checkpoint(self._part(name))
         try:
@@ -202,14 +201,14 @@ class RunFolder:
                 raise
             self.warn(str(error).rstrip("."), name)
             return error.fit
-        # Several fits may go side by side: none takes back what another one says.
+        # With concurrent fits the flag is only ever set.
         self.interrupted |= outcome.interrupted
         if not outcome.interrupted:
             self._judge(name, optimiser, epochs, outcome)
         return outcome
 
     def _judge(self, name: str, optimiser: Any, epochs: int, outcome: Fit[Any]) -> None:
-        """Warn of a fit that is not at its end."""
+        """Warn of a fit that has not converged."""
         for doubt in doubts(outcome):
             self.warn(doubt, name)
         solver = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
@@ -228,30 +227,30 @@ class RunFolder:
             labels = [{"member": str(k)} for k in members]
             self.save_table(f"history_{ending}", histories(outcome, labels))
 
-    def warn(self, text: str, who: str | None = None) -> None:
-        """Note something that whoever reads the results must know: it is in the metrics and on the screen.
+    def warn(self, text: str, name: str | None = None) -> None:
+        """Add a warning, which is printed and part of the metrics.
 
         **Arguments:**
 
         - `text`: a sentence without a full stop.
-        - `who`: what it holds for, such as the name of a fit; equal texts are joined to one.
+        - `name`: its subject, such as the name of a fit; equal texts are joined.
         """
-        self._warnings.setdefault(text, []).extend([] if who is None else [who])
+        self._warnings.setdefault(text, []).extend([] if name is None else [name])
 
     @property
     def warnings(self) -> list[str]:
-        """What was noted by `warn`, one sentence each."""
-        return [sentence(text, sorted(whom)) for text, whom in self._warnings.items()]
+        """The warnings, one sentence each."""
+        return [sentence(text, sorted(names)) for text, names in self._warnings.items()]
 
     def part(
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
     ) -> dict[str, Shaped[np.ndarray, "..."]]:
-        """Arrays that a resumed run does not compute again.
+        """Arrays that are stored for a resumed run.
 
         **Arguments:**
 
-        - `name`: of this part; no other part or fit of the run has it.
-        - `compute`: makes the arrays, by name.
+        - `name`: the name of this part, unique in the run.
+        - `compute`: returns the arrays by name.
 
         **Returns:** the arrays.
         """
@@ -263,7 +262,7 @@ class RunFolder:
         return {key: array for key, array in arrays.items() if key not in ("format", "version")}
 
     def parts(self) -> list[Path]:
-        """The fits and other parts that a resumed run goes on from.
+        """The fits and other parts that a resumed run keeps.
 
         **Returns:** the paths of their files, sorted by name.
         """
@@ -273,7 +272,7 @@ class RunFolder:
         """Remove them: the run is finished."""
         for file in self.parts():
             file.unlink()
-        with contextlib.suppress(OSError):  # not there, or a file of somebody else in it
+        with contextlib.suppress(OSError):  # missing, or with other files
             (self.path / PARTS).rmdir()
 
     def _part(self, name: str) -> Path:
@@ -358,7 +357,7 @@ class RunFolder:
             file.write("\n")
 
     def finish(self, metrics: Mapping[str, Any]) -> None:
-        """End the run: write its metrics, and remove what only a resumed run needs.
+        """Finish the run: write its metrics and remove checkpoints.
 
         **Arguments:**
 
@@ -374,11 +373,7 @@ class RunFolder:
         self.forget_parts()
 
     def discard_if_empty(self) -> None:
-        """Remove the folder if the run has written nothing but its configuration.
-
-        For a run that failed when it began, because a file or an extra is missing: the same command may be
-        given again.
-        """
+        """Remove the folder if it has only the configuration, so that the same command can be repeated."""
         if any(file != self.path / CONFIG for file in self.files()):
             return
         (self.path / CONFIG).unlink(missing_ok=True)
@@ -390,11 +385,11 @@ class RunFolder:
     def metrics(self) -> dict[str, Any]:
         """The metrics of a finished run.
 
-        **Returns:** what was given to `save_metrics`.
+        **Returns:** the metrics.
 
         **Raises:**
 
-        - `UnfinishedRunError` if the run did not come to its end.
+        - `UnfinishedRunError` if the run is not finished.
         - `RunFolderError` if the metrics cannot be read.
         """
         file = self.path / METRICS
@@ -413,7 +408,7 @@ class RunFolder:
         return metrics
 
     def files(self) -> list[Path]:
-        """All files, those of other programs too.
+        """All files in the folder.
 
         **Returns:** their paths, sorted by name.
         """

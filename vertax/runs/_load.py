@@ -1,4 +1,4 @@
-"""From a configuration file to an experiment and its configuration."""
+"""Read a configuration file."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def load_config(
 
     **Arguments:**
 
-    - `path`: a TOML file; its key `experiment` says which experiment it configures. Or the name of a
+    - `path`: a TOML file with the name of a job or an experiment as its key `experiment`; or the name of a
         configuration that comes with vertax, such as `"demo"`; `vertax list` shows them.
     - `overrides`: texts `key=value` that set single keys, see
         `apply_overrides`.
 
-    **Returns:** the experiment and its configuration, an instance of `experiment.config`.
+    **Returns:** the job or experiment and its configuration, an instance of `experiment.config`.
 
     **Raises:**
 
@@ -38,8 +38,8 @@ def load_config(
     data = apply_overrides(read_toml(file), overrides)
     if "experiment" not in data:
         raise ConfigError(
-            f"In {os.fspath(path)}: `experiment` is missing; it names the experiment to run, one "
-            f"of {', '.join(EXPERIMENTS)}."
+            f"In {os.fspath(path)}: `experiment` is missing; it names the job or experiment to run, "
+            f"one of {', '.join(EXPERIMENTS)}."
         )
     experiment = find_experiment(data["experiment"])
     return experiment, validate(experiment.config, data, os.fspath(path))

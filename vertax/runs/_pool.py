@@ -1,4 +1,4 @@
-"""Independent runs side by side, one thread a core."""
+"""Independent runs in threads, one per core."""
 
 from __future__ import annotations
 
@@ -26,22 +26,21 @@ def side_by_side(
     progress: bool = True,
     unit: str = "run",
 ) -> list[Result]:
-    """Call a function for each of 0 … n - 1, one thread a core.
+    """Call a function for each of 0 … n - 1 in threads, one per core.
 
-    What JAX has compiled runs outside of Python's lock, so threads are enough. The first call goes alone,
-    because it compiles. An interrupt from the keyboard reaches one thread only: here it ends the others
-    too. Fits of the folder stop after their epoch and keep what they have, what is no fit is finished, and
-    nothing else begins.
+    Compiled functions of JAX release Python's lock, so threads are enough. The first call runs alone, because
+    it compiles. A keyboard interrupt reaches one thread only; here it ends all: fits of the folder stop after
+    their epoch and are kept, other calls run to their end, and no other call begins.
 
     **Arguments:**
 
-    - `function`: what to call, with results of its own.
-    - `n`: how often.
-    - `folder`: of the run, which knows of interrupts.
+    - `function`: the function; calls must not share state.
+    - `n`: number of calls.
+    - `folder`: the folder of the run, which records interrupts.
     - `progress`: show a progress bar (only on a terminal).
-    - `unit`: what is counted.
+    - `unit`: unit of the progress bar.
 
-    **Returns:** what was returned, in the order of the numbers.
+    **Returns:** the results, in the order of the numbers.
 
     **Raises:**
 
@@ -80,14 +79,14 @@ def scan(
     *,
     progress: bool = True,
 ) -> dict[str, Shaped[np.ndarray, "values ..."]]:
-    """Arrays at each of some values of a number, side by side; a resumed run computes none of them again.
+    """Arrays at each of several values of a parameter; a resumed run keeps those that are computed.
 
     **Arguments:**
 
-    - `name`: of the number, as parts of the run are called.
-    - `values`: its values, no two alike.
-    - `compute`: makes the arrays at one value, by name; their shapes are the same at each.
-    - `folder`: of the run.
+    - `name`: the name of the parameter, and of the parts of the run.
+    - `values`: its values, all different.
+    - `compute`: returns the arrays at one value by name; their shapes are the same at all values.
+    - `folder`: the folder of the run.
     - `progress`: show a progress bar (only on a terminal).
 
     **Returns:** the arrays by name, with a leading axis of the values.
@@ -110,26 +109,26 @@ def fit_side_by_side(
     notes: Callable[[InverseProblem[Any], Record], Mapping[str, ArrayLike]] | None = None,
     progress: bool = True,
 ) -> Fit[Any]:
-    """Fit problems of one shape side by side.
+    """Fit problems of one shape in threads.
 
-    As a batch they would all wait, in each epoch, for the one that takes the most steps to relax; with
-    T1 transitions that is many times as many as the others take.
+    In a batch each epoch takes as many steps as its slowest relaxation, which with T1 transitions is many
+    times the median.
 
     **Arguments:**
 
-    - `folder`: of the run.
-    - `name`: of these fits; they are numbered from 0.
+    - `folder`: the folder of the run.
+    - `name`: the name of these fits; they are numbered from 0.
     - `problems`: the inverse problems.
-    - `fitting`: how they are fitted.
-    - `notes`: what is kept of each epoch, from its problem and its [`Record`][vertax.Record].
+    - `fitting`: optimiser and epochs.
+    - `notes`: returns arrays to keep from each epoch, as a function of its problem and its
+        [`Record`][vertax.Record].
     - `progress`: show a progress bar (only on a terminal).
 
-    **Returns:** the fit of all as of a batch, with notes; seconds are those of all, over the number of
-    threads.
+    **Returns:** the fits as one batch, with notes; seconds are their sum over the number of threads.
 
     **Raises:**
 
-    - `FitError` if a fit cannot go on.
+    - `FitError` if a fit fails.
     """
 
     def one(index: int) -> Fit[Any]:
@@ -148,10 +147,10 @@ def fit_side_by_side(
 
 
 THREADS = "VERTAX_THREADS"
-"""The environment variable that says how many run at once."""
+"""The environment variable with the number of concurrent runs."""
 
 
 def n_threads() -> int:
-    """How many run at once: one a core, or what the environment says."""
-    said = os.environ.get(THREADS, "")
-    return max(int(said), 1) if said.isdecimal() else os.cpu_count() or 1
+    """The number of concurrent runs: the environment variable, or one per core."""
+    number = os.environ.get(THREADS, "")
+    return max(int(number), 1) if number.isdecimal() else os.cpu_count() or 1

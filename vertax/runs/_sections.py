@@ -1,4 +1,4 @@
-"""Tables that several experiments have in their configuration."""
+"""Tables that several configurations share."""
 
 from __future__ import annotations
 
@@ -37,30 +37,30 @@ from vertax.transitions import T1
 
 
 class Relaxation(Section):
-    """How the tissue is relaxed to mechanical equilibrium: the settings of `vertax.Relaxation`."""
+    """Relaxation to mechanical equilibrium: the settings of `vertax.Relaxation`."""
 
     solver: Literal["newton_cg", "lbfgs", "fire", "gradient_descent", "momentum"] = "newton_cg"
     """The minimiser; gradient_descent is the paper's, momentum the same with Nesterov momentum."""
     learning_rate: float = Field(default=1e-2, gt=0)
     """Step of gradient_descent and momentum; the others choose their own."""
     momentum: float = Field(default=0.95, ge=0, lt=1)
-    """How much of its last step momentum keeps."""
+    """Fraction of the last step that momentum keeps."""
     transitions: bool = True
     """Whether short edges may flip (T1 transitions)."""
     t1_threshold: float = Field(default=float(T1().threshold), gt=0)
     """Length below which an edge may flip, in units of the root of the mean cell area."""
     max_flips: int = Field(default=int(T1().max_flips), ge=1)
-    """How often one edge may flip in a relaxation."""
+    """Largest number of flips of one edge in a relaxation."""
     tolerance: float | None = Field(default=None, gt=0)
-    """Largest force that counts as equilibrium; left out, it is chosen by the precision."""
+    """Largest force at equilibrium; left out, it depends on the precision."""
     contacts: bool = True
-    """Whether cells keep out of one another; if not, they may overlap."""
+    """Whether contact forces prevent overlaps of cells."""
     contact_range: float = Field(default=float(Response().contact_range or 0), ge=0)
-    """How near a corner comes to a side before it is held off, in units of the root of the mean cell area."""
+    """Range of contact forces between corner and side, in units of the root of the mean cell area."""
     consecutive_steps: int = Field(default=int(Response().consecutive_steps), ge=1)
     """Number of consecutive steps for which the force must stay below the tolerance."""
     max_steps: int = Field(default=int(Response().max_steps), ge=1)
-    """Most steps of the minimiser."""
+    """Largest number of steps of the minimiser."""
 
     def build(self) -> Response:
         """The settings as an object.
@@ -86,7 +86,7 @@ class Relaxation(Section):
 
 
 class Fitting(Section):
-    """How the parameters are fitted."""
+    """Optimiser of the parameters."""
 
     optimiser: Literal["adam", "nadam"] = "adam"
     """The Optax optimiser; nadam is ADAM with Nesterov momentum, the paper's."""
@@ -104,7 +104,7 @@ class Fitting(Section):
 
 
 class Gradient(Section):
-    """How gradients through the equilibrium are taken."""
+    """Gradients through the equilibrium."""
 
     method: Literal["implicit", "sensitivity", "propagation", "unrolled"] = "implicit"
     """Implicit differentiation (adjoint state, or forward sensitivity), equilibrium propagation, or
@@ -112,9 +112,9 @@ class Gradient(Section):
     nudge: Literal["linear", "cost"] = "linear"
     """The nudge of equilibrium propagation; cost lets T1 transitions follow the cost."""
     beta: float | None = Field(default=None, gt=0)
-    """Its strength; left out, it is chosen by the precision."""
+    """Its strength; left out, it depends on the precision."""
     nudged_rtol: float | None = Field(default=None, gt=0)
-    """Tolerance of nudged relaxations relative to the nudge; left out, chosen by the precision."""
+    """Tolerance of nudged relaxations relative to the nudge; left out, it depends on the precision."""
     strict: bool = False
     """Whether a gradient that has not converged ends the fit; the history has its residual."""
 
@@ -168,10 +168,10 @@ class TensionRange(Section):
     """Line tensions of the edges and stiffness of the cells, where the mean rest area of a cell is 1."""
 
     low: float = Field(default=0.04, ge=0)
-    """Least tension."""
+    """Smallest tension."""
     high: float = Field(default=0.28, gt=0)
-    """Largest tension; above twice the least one, there are junctions of three edges without a balance,
-    which close to four-fold vertices."""
+    """Largest tension; above twice the smallest one, some junctions of three edges have no balance and become
+    four-fold vertices."""
     stiffness: float = Field(default=1.0, gt=0)
     """Stiffness of the areas of cells."""
 
@@ -249,7 +249,7 @@ class Preparation(Section):
 
 
 class Segmenter(Section):
-    """How the cells are found."""
+    """Segmentation of the cells."""
 
     method: Literal["watershed", "cellpose"] = "watershed"
     """Cellpose needs its own extra and downloads a model."""
@@ -274,14 +274,14 @@ class MicrographModel(Section):
     """First guess of the target shape factor of every cell."""
     border: Literal["mirrored", "pinned"] = "mirrored"
     """What holds the tissue at the border of the image: the image is mirrored, cells that the border cuts
-    included (as in the paper); or the outline of the cells that lie whole in it is pinned."""
+    included (as in the paper); or the outline of its complete cells is pinned."""
     pixel_size: float | None = Field(default=None, gt=0)
     """Length of a pixel of the file, where rest areas are 1 (of a pinned border only); left out, the mean
-    area of the cells that are seen whole is 1. In a rigid tissue all shape factors depend on it."""
+    area of the complete cells is 1. In a rigid tissue all shape factors depend on it."""
     rest_areas: Literal["fitted", "observed", "equal"] = "fitted"
     """Rest areas of the cells: fitted too, beginning with those of the segmented cells; as those are;
     or the mean area in all cells but those that the border cuts, which determines shape factors best
-    where it is true. A pinned border goes with equal ones, whatever is said here."""
+    where it is true. A pinned border always has equal ones."""
 
 
 class Microscope(Section):
@@ -315,11 +315,11 @@ class Microscope(Section):
 
 
 def file_name(path: str) -> str:
-    """The check of a key that names a file: in most cases an empty one comes from a variable that is unset.
+    """Check a key that names a file; an empty one usually comes from a shell variable that is not set.
 
     **Arguments:**
 
-    - `path`: what the key holds.
+    - `path`: the value of the key.
 
     **Returns:** the same.
 
@@ -344,7 +344,7 @@ def read_micrograph(
     **Arguments:**
 
     - `image`: the image, bright membranes on dark cells.
-    - `preparation`, `segmenter`, `model`, `relaxation`: how.
+    - `preparation`, `segmenter`, `model`, `relaxation`: the settings.
 
     **Returns:** the [`Micrograph`][vertax.inference.Micrograph].
 
@@ -360,7 +360,7 @@ def read_micrograph(
 
 
 def replicate_keys(seed: int, n: int) -> list[PRNGKeyArray]:
-    """Random keys of replicates: those of the first do not depend on how many there are.
+    """Random keys of replicates; each is independent of the number of replicates.
 
     **Arguments:**
 
@@ -385,8 +385,7 @@ def spread_of(values: Float[np.ndarray, " *values"]) -> dict[str, float]:
     return {"mean": float(values.mean()), "deviation": float(values.std())}
 
 
-# JAX knows an Optax optimiser by identity: a second fit in a process is not compiled again if it gets
-# the very same one.
+# JAX compares Optax optimisers by identity: the same object avoids a second compilation in one process.
 @functools.cache
 def _momentum(learning_rate: float, momentum: float) -> optax.GradientTransformation:
     return optax.sgd(learning_rate, momentum, nesterov=True)

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import difflib
 import os
+import tomllib
 from pathlib import Path
+from typing import Any
 
 _PACKAGE = Path(__file__).parents[1]
+REPOSITORY = _PACKAGE.parent if (_PACKAGE.parent / "pyproject.toml").is_file() else None
+"""The repository that this package is part of; None for an installed wheel."""
 
 
 def shipped_configurations() -> dict[str, Path]:
@@ -33,11 +37,11 @@ def configuration_file(name: str | os.PathLike[str]) -> Path:
 
 
 def nearest_configuration(name: str | os.PathLike[str]) -> str:
-    """A hint for a configuration that is not there: names that are.
+    """A hint for a configuration that does not exist.
 
     **Arguments:**
 
-    - `name`: what was asked for.
+    - `name`: its name.
 
     **Returns:** a sentence that begins with a space, or an empty text if no configurations are installed.
     """
@@ -50,8 +54,20 @@ def nearest_configuration(name: str | os.PathLike[str]) -> str:
     return " `vertax list` shows those that come with vertax."
 
 
+def configuration_of(file: Path) -> Any:
+    """The experiment that a shipped configuration names.
+
+    **Arguments:**
+
+    - `file`: the configuration.
+
+    **Returns:** the value of its key `experiment`; None if there is none.
+    """
+    return tomllib.loads(file.read_text(encoding="utf-8")).get("experiment")
+
+
 def configuration_summary(file: Path) -> str:
-    """What a configuration is for: the first sentence of the comment that it begins with."""
+    """The first sentence of the comment at the start of a configuration."""
     words: list[str] = []
     for line in file.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):

@@ -31,16 +31,16 @@ def summary(metrics: Mapping[str, Any]) -> str:
 
 
 def _alike(groups: Mapping[str, dict[str, Any]]) -> list[dict[str, dict[str, Any]]]:
-    """Groups that have names in common, which make one table each."""
+    """Groups by table; groups with common names share one."""
     tables: list[dict[str, dict[str, Any]]] = []
     for label, group in groups.items():
-        own = {label: {name: value for name, value in group.items() if _is_number(value)}}
+        group_table = {label: {name: value for name, value in group.items() if _is_number(value)}}
         for table in tables:
-            if any(own[label].keys() & other.keys() for other in table.values()):
-                table |= own
+            if any(group_table[label].keys() & other.keys() for other in table.values()):
+                table |= group_table
                 break
         else:
-            tables.append(own)
+            tables.append(group_table)
     return tables
 
 
@@ -73,10 +73,10 @@ def safe(name: str) -> str:
     return re.sub("[^0-9A-Za-z.-]+", "_", name)
 
 
-def sentence(text: str, whom: Sequence[str]) -> str:
-    """A warning, and the first of those whom it concerns."""
-    shown = ", ".join(whom[:3]) + (f" and {len(whom) - 3} more" if len(whom) > 3 else "")
-    return f"{shown}: {text}." if whom else f"{text[:1].upper()}{text[1:]}."
+def sentence(text: str, names: Sequence[str]) -> str:
+    """A warning after the first three names that it concerns."""
+    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return f"{shown}: {text}." if names else f"{text[:1].upper()}{text[1:]}."
 
 
 def _is_number(value: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Sweeps: runs of one configuration with different keys, side by side or on a cluster."""
+"""Sweeps: runs of one configuration with different keys, in processes or on a cluster."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ with requires_extra("run", "A sweep"):
     import tomli_w
 
 TABLE = "sweep"
-# A user can cause these; anything else is a fault of ours, which ends a sweep no more than they do.
+# Errors of the user; no error of a run ends the sweep.
 _EXPECTED = (FitError, ValueError, OSError, RuntimeError, MemoryError, OverflowError)
 
 
@@ -43,11 +43,11 @@ class SweepRun:
 
     **Arguments:**
 
-    - `folder`: where its results lie.
+    - `folder`: the folder of its results.
     - `keys`: the keys of the grid and their values, by dotted names.
-    - `config`: its whole configuration.
+    - `config`: its configuration.
     - `state`: `"new"`, `"finished"` or `"failed"`.
-    - `error`: why it failed; empty otherwise.
+    - `error`: the message of its failure, or empty.
     """
 
     folder: Path
@@ -57,7 +57,7 @@ class SweepRun:
     error: str = ""
 
     def ended(self, error: str | None) -> SweepRun:
-        """The same run, with how it ended."""
+        """A copy with state and error."""
         state = "finished" if error is None else "failed"
         return dataclasses.replace(self, state=state, error=error or "")
 
@@ -123,7 +123,7 @@ def sweep_runs(
 
     - `configs`: configuration files.
     - `grid`: values by dotted key, see `parse_grid`.
-    - `output`: the folder of all; each run has one of its own in it, named after its keys.
+    - `output`: the folder of all; each run has a subfolder named after its keys.
     - `overrides`: keys set in all runs, as of `apply_overrides`.
 
     **Returns:** the runs; one that was finished by an earlier sweep says so.
@@ -142,7 +142,7 @@ def sweep_runs(
             if name in runs:
                 raise ConfigError(f"Two runs of the sweep are called {name}: {', '.join(changes)}.")
             keys = {key: _value(config, key) for key in grid}
-            runs[name] = _known(SweepRun(Path(output) / name, keys, config))
+            runs[name] = _with_state(SweepRun(Path(output) / name, keys, config))
     return list(runs.values())
 
 
@@ -153,8 +153,8 @@ def _value(config: ExperimentConfig, key: str) -> Any:
     return value
 
 
-def _known(run: SweepRun) -> SweepRun:
-    """With what an earlier sweep left of it."""
+def _with_state(run: SweepRun) -> SweepRun:
+    """A copy with the state of its folder."""
     if not (run.folder / CONFIG).is_file():
         return run
     if changed := changes(run.folder, run.config):
@@ -174,23 +174,23 @@ def sweep(
     figures: Sequence[str] = ("png",),
     progress: bool = True,
 ) -> list[SweepRun]:
-    """Do the runs of a sweep that are not finished, and write one table of all.
+    """Execute the runs of a sweep that are not finished, and write one table of all.
 
-    A run that fails does not stop the others. After an interrupt, call it again: what is finished is
-    skipped, and what was begun goes on where it was. The table `sweep.csv` has a row for each run: its
-    folder, how it ended, its keys, and its metrics that are numbers or texts.
+    A run that fails does not stop the others. After an interrupt, call it again: finished runs are skipped
+    and interrupted ones resumed. The table `sweep.csv` has a row for each run: its folder, state and
+    keys, and its metrics that are numbers or texts.
 
     **Arguments:**
 
     - `runs`: see `sweep_runs`.
     - `output`: the folder of all.
-    - `scheduler`: address of a Dask scheduler, such as `"tcp://node:8786"`, whose workers see the same
-        folders; None for processes on this machine.
+    - `scheduler`: address of a Dask scheduler, such as `"tcp://node:8786"`, with workers on the same
+        file system; None for processes on this machine.
     - `workers`: number of those processes; by default one a core.
     - `figures`: formats of the pictures.
     - `progress`: show a progress bar (only on a terminal).
 
-    **Returns:** the runs, with how they ended.
+    **Returns:** the runs with their states.
 
     **Raises:**
 
@@ -240,7 +240,7 @@ def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
         import distributed
 
     if scheduler is None:
-        # Each run has the thread of its process for itself: the cores are taken by the other runs.
+        # One thread per process: the other cores belong to the other runs.
         cluster = distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -260,7 +260,7 @@ def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
 
 
 def _outcome(future: Any) -> str | None:
-    """Why a run failed, or None."""
+    """The error message of a failed run, or None."""
     error = future.exception()
     if error is None:
         return future.result()
@@ -270,20 +270,20 @@ def _outcome(future: Any) -> str | None:
 
 
 def _task(run: SweepRun) -> tuple[dict[str, Any], str]:
-    # Plain data: workers may be elsewhere, and know the classes by the name of the experiment.
+    # Plain data: workers on other machines import the classes by the name of the experiment.
     return run.config.model_dump(mode="json", exclude_none=True), str(run.folder.absolute())
 
 
 def perform(content: dict[str, Any], folder: str, figures: tuple[str, ...]) -> str | None:
-    """Do one run in this process, from its beginning or from where it was interrupted.
+    """Execute or resume one run in this process.
 
     **Arguments:**
 
     - `content`: the configuration.
-    - `folder`: of the run.
-    - `figures`: formats of the pictures.
+    - `folder`: the folder of the run.
+    - `figures`: formats of the figures.
 
-    **Returns:** why it failed, or None.
+    **Returns:** the error message of a failed run, or None.
     """
     import jax
     import matplotlib
@@ -310,7 +310,7 @@ def sweep_table(runs: Sequence[SweepRun]) -> dict[str, list[Any]]:
 
     **Arguments:**
 
-    - `runs`: with how they ended.
+    - `runs`: the runs with their states.
 
     **Returns:** columns by name, a row for each run.
     """

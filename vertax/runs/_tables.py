@@ -1,4 +1,4 @@
-"""What fits have to tell, as tables and metrics."""
+"""Tables and metrics of fits."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def history_columns(history: History, **labels: str) -> dict[str, Any]:
     **Arguments:**
 
     - `history`: a [`History`][vertax.History].
-    - `labels`: columns of one repeated text each, to tell fits apart in one table.
+    - `labels`: columns of one repeated text each, to distinguish fits in one table.
 
-    **Returns:** the labels, the number of the epoch and every known curve of the history.
+    **Returns:** the labels, the number of the epoch and every curve of the history.
     """
     n = len(history.cost)
     return {name: [text] * n for name, text in labels.items()} | {
@@ -34,7 +34,7 @@ def histories(outcome: Fit, labels: Sequence[dict[str, str]]) -> dict[str, Any]:
     **Arguments:**
 
     - `outcome`: the fit of the batch.
-    - `labels`: of each member, what tells it apart.
+    - `labels`: labels of each member.
 
     **Returns:** columns by name.
     """
@@ -45,7 +45,7 @@ def histories(outcome: Fit, labels: Sequence[dict[str, str]]) -> dict[str, Any]:
 
 
 def joined(tables: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Tables one below the other, with the columns that all of them have.
+    """Concatenate tables; the result has their common columns.
 
     **Arguments:**
 
@@ -58,7 +58,7 @@ def joined(tables: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def fit_metrics(outcome: Fit) -> dict[str, Any]:
-    """What every fit has to tell.
+    """The metrics of a fit.
 
     **Arguments:**
 

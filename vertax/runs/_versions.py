@@ -1,4 +1,4 @@
-"""Which programs are installed."""
+"""Versions of installed packages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def installed_version(name: str) -> str:
 
     **Arguments:**
 
-    - `name`: of the package.
+    - `name`: the name of the package.
 
     **Returns:** its version, or `"(not installed)"` for one that runs from its source folder.
     """

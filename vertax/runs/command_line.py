@@ -12,7 +12,7 @@ import typer
 if TYPE_CHECKING:
     from vertax.runs import RunFolder
 
-# JAX and the experiments are imported by the commands that need them, so that help comes quickly.
+# JAX, jobs and experiments are imported by the commands that use them, so that help is printed quickly.
 
 app = typer.Typer(
     help="A differentiable vertex model of epithelial tissue.",
@@ -49,15 +49,27 @@ def _options(
 
 @app.command("list")
 def list_experiments() -> None:
-    """List all experiments, and the configurations that come with vertax."""
+    """List the jobs, the experiments of the repository, and the configurations of both."""
     from vertax.runs import EXPERIMENTS
-    from vertax.runs._shipped import configuration_summary, shipped_configurations
+    from vertax.runs._shipped import (
+        configuration_of,
+        configuration_summary,
+        shipped_configurations,
+    )
 
-    shipped = shipped_configurations()
+    shipped = {
+        name: file
+        for name, file in shipped_configurations().items()
+        if configuration_of(file) in EXPERIMENTS
+    }
     width = max(map(len, [*EXPERIMENTS, *shipped]))
-    typer.echo("Experiments; vertax describe NAME prints all keys of one:")
-    for name, experiment in EXPERIMENTS.items():
-        typer.echo(f"  {name:{width}}  {experiment.summary}")
+    jobs = [each for each in EXPERIMENTS.values() if each.is_job]
+    experiments = [each for each in EXPERIMENTS.values() if not each.is_job]
+    for title, group in (("Jobs", jobs), ("Experiments of the repository", experiments)):
+        if group:
+            typer.echo(f"{title}; vertax describe NAME prints all keys of one:")
+        for each in group:
+            typer.echo(f"  {each.name:{width}}  {each.summary}")
     typer.echo("Configurations; vertax run NAME runs one:")
     for name, file in shipped.items():
         typer.echo(f"  {name:{width}}  {configuration_summary(file)}")
@@ -65,16 +77,18 @@ def list_experiments() -> None:
 
 @app.command()
 def describe(
-    experiment: Annotated[str, typer.Argument(help="Name of an experiment, see `vertax list`.")],
+    experiment: Annotated[
+        str, typer.Argument(help="Name of a job or an experiment, see `vertax list`.")
+    ],
 ) -> None:
-    """Print a configuration file with every key of an experiment, explained and at its default."""
+    """Print a configuration file with every key of a job or an experiment, explained and at its default."""
     from vertax.runs import ConfigError, find_experiment, template
 
     try:
-        found = find_experiment(experiment)
+        named = find_experiment(experiment)
     except ConfigError as error:
         _stop(error, USAGE)
-    typer.echo(template(found.config, experiment), nl=False)
+    typer.echo(template(named.config, experiment), nl=False)
 
 
 @app.command()
@@ -105,8 +119,8 @@ def run(
         Path | None,
         typer.Option(
             metavar="RUN",
-            help="Go on with the interrupted run in this folder: fits continue where they were, what is "
-            "no fit begins again.",
+            help="Resume the interrupted run in this folder: fits continue after their last epoch, "
+            "other steps begin again.",
         ),
     ] = None,
     figures: Annotated[
@@ -121,18 +135,16 @@ def run(
         bool,
         typer.Option(
             "--no-cache",
-            help="Compile everything anew, instead of keeping what was compiled in the user's cache folder "
-            "(the environment variable VERTAX_CACHE names another, or is off).",
+            help="Do not use the folder of compiled functions in the user's cache (the environment variable "
+            "VERTAX_CACHE names another folder, or is off).",
         ),
     ] = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", help="Show no progress bar and no summary.")
     ] = False,
-    debug: Annotated[
-        bool, typer.Option("--debug", help="Show where in the program an error occurred.")
-    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
-    """Run the experiment that a configuration file describes."""
+    """Run the job or the experiment that a configuration file describes."""
     import jax
 
     from vertax import FitError, enable_compilation_cache
@@ -154,7 +166,7 @@ def run(
     matplotlib.use("Agg")
     try:
         experiment, settings = load_config(config, overrides or ())
-        # The library leaves the precision of JAX to the user; here the configuration decides.
+        # The configuration sets the precision; the library does not.
         jax.config.update("jax_enable_x64", settings.precision == "float64")
         if not no_cache:
             enable_compilation_cache()
@@ -168,7 +180,7 @@ def run(
         else:
             folder = RunFolder.unfinished(resume, settings, figures=formats)
         if not quiet:
-            typer.echo(f"{experiment.name}: {config} → {folder.path}{_found(folder)}")
+            typer.echo(f"{experiment.name}: {config} → {folder.path}{_kept_parts(folder)}")
             announce_in_this_process(f"functions for {experiment.name}")
         folder.talkative = not quiet
         try:
@@ -181,7 +193,7 @@ def run(
     except KeyboardInterrupt:
         typer.echo(_interrupted(config, overrides or (), folder), err=True)
         raise typer.Exit(INTERRUPTED) from None
-    # What a user can cause and mend gets a message; anything else is our fault, with a traceback.
+    # Errors of the user are messages without a traceback; others are bugs.
     except (ConfigError, RunFolderError) as error:
         if debug:
             raise
@@ -215,8 +227,8 @@ def sweep(
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUES",
-            help="Values of one key, e.g. tissue.n_cells=50,100 or seed=0:20; of several grids all "
-            "combinations are run.",
+            help="Values of one key, e.g. tissue.n_cells=50,100 or seed=0:20; several grids give all "
+            "combinations.",
         ),
     ] = None,
     overrides: Annotated[
@@ -226,7 +238,7 @@ def sweep(
     output: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of all runs; by default runs/NAME-sweep. What is finished in it is kept.",
+            help="Folder of all runs; by default runs/NAME-sweep. Finished runs in it are kept.",
         ),
     ] = None,
     scheduler: Annotated[
@@ -237,7 +249,7 @@ def sweep(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Number of these processes; by default one a core.")
+        int | None, typer.Option(min=1, help="Number of these processes; by default one per core.")
     ] = None,
     figures: Annotated[
         list[str] | None,
@@ -311,13 +323,13 @@ def show(
 
 
 def _warn(warnings: Iterable[str]) -> None:
-    """What the numbers above do not tell."""
+    """Print warnings."""
     for warning in warnings:
         typer.secho(f"Warning: {warning}", err=True, fg=typer.colors.YELLOW)
 
 
-def _found(folder: RunFolder) -> str:
-    """What a resumed run begins with."""
+def _kept_parts(folder: RunFolder) -> str:
+    """The parts that a resumed run keeps."""
     parts = folder.parts()
     return f" (resumed; kept so far: {', '.join(part.stem for part in parts)})" if parts else ""
 

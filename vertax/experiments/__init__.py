@@ -1,1 +1,0 @@
-"""The experiments of `vertax run`: clients of the public packages, one folder each."""

@@ -1,4 +1,0 @@
-"""Compare automatic and implicit differentiation and equilibrium propagation."""
-
-from .experiment import run as run
-from .problems import Config as Config
