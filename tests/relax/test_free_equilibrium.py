@@ -321,7 +321,7 @@ def test_images_show_nothing_of_what_lies_outside():
     tissue = cluster(4, 1)
     far = tissue.with_vertices(tissue.vertices + jnp.array([60.0, 2.0]))
     assert jnp.abs(render(far, (40, 50), 0.2, pixel_size=0.1)).max() < 1e-9
-    with pytest.raises(ValueError, match="`pixel_size` is needed"):
+    with pytest.raises(ValueError, match="`pixel_size` must be given"):
         render(tissue, (40, 50), 0.2)
     with pytest.raises(ValueError, match="`pixel_size` must be positive"):
         MeshImage(np.eye(8), 0.2, pixel_size=0.0)
