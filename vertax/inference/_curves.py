@@ -187,6 +187,17 @@ def fit_curves(
     return Fitted(change, normal, noise, rest, csc_array(weighted), apart, bending)
 
 
+def arc_distances(
+    chord: Float[np.ndarray, "points 2"],
+    angle: Float[np.ndarray, " points"],
+    p: Float[np.ndarray, "points 2"],
+) -> Float[np.ndarray, " points"]:
+    """Distance of points from arcs to first order, see `fit_curves`; both begin at 0."""
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-300)
+    cross = chord[:, 0] * p[:, 1] - chord[:, 1] * p[:, 0]
+    return (cross * np.cos(angle) - np.sum(p * (p - chord), axis=1) * np.sin(angle)) / length
+
+
 def _modes(
     p: Float[np.ndarray, "points 2"],
     q: Float[np.ndarray, "points 2"],

@@ -12,6 +12,7 @@ from jaxtyping import Array, Int, Shaped
 
 from vertax._base.announce import announce_compilations
 from vertax._base.checks import check_number, check_whole, named
+from vertax._base.pixels import PixelSize, pixel_length
 from vertax.inference._balance import equations
 from vertax.inference._curves import Points, read_courses
 from vertax.inference._inferred import InferredTensions
@@ -20,8 +21,8 @@ from vertax.inference._outcome import outcome
 from vertax.inference._resampling import resampled_deviations
 from vertax.inference._seen import seen
 from vertax.inference._solve import solve, told
-from vertax.initialise import Segmentation, from_labels
-from vertax.io import Foam, read_surface_evolver
+from vertax.initialise import MaskReport, Segmentation, from_labels
+from vertax.io import Foam, pixel_aspect, read_surface_evolver
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
@@ -41,9 +42,11 @@ def infer_tensions(
     | os.PathLike[str],
     *,
     kind: str = "auto",
-    pixel_size: float | None = None,
+    plane: int | None = None,
+    pixel_size: PixelSize | None = None,
     background: int | None = None,
-    gap_width: float = 3.0,
+    gap_width: float | None = None,
+    holes: str = "keep",
     noise: float | None = None,
     prior: float | None = None,
     resamples: int = 0,
@@ -75,7 +78,10 @@ def infer_tensions(
         [`Segmentation`][vertax.initialise.Segmentation], [`Foam`][vertax.io.Foam] or
         [`Tissue`][vertax.Tissue] with arcs.
     - `kind`: of a mask, `"labels"`, `"outlines"` or `"auto"`.
-    - `pixel_size`, `background`, `gap_width`: of a mask, see [`from_labels`][vertax.initialise.from_labels].
+    - `plane`: of a stack, the plane to take, from 0.
+    - `pixel_size`, `background`, `gap_width`, `holes`: of a mask, see
+        [`from_labels`][vertax.initialise.from_labels]. Where a TIFF file has pixels that are not square, their
+        ratio is taken from it.
     - `noise`: standard deviation of the position of an edge, in units of length; left out, how far pixels
         (or the points of a foam) are from curves, and a five hundredth of a cell diameter for a tissue
         without either.
@@ -101,9 +107,16 @@ def infer_tensions(
     if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in _EVOLVER:
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
-        mask = read_mask(source, kind=kind, background=background)
+        mask = read_mask(source, kind=kind, background=background, plane=plane)
+        if pixel_size is None and isinstance(source, str | os.PathLike):
+            pixel_size = _pixels_of_file(Path(source), mask)
         source = from_labels(
-            mask, boundary="free", pixel_size=pixel_size, gap_width=gap_width, inner_arcs=True
+            mask,
+            boundary="free",
+            pixel_size=pixel_size,
+            gap_width=gap_width,
+            holes=holes,
+            inner_arcs=True,
         )
     if isinstance(source, Segmentation):
         course = _of_mask(source)
@@ -116,8 +129,9 @@ def infer_tensions(
             "Argument `segmentation_or_mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
             f"is {named(segmentation_or_mask)}."
         )
-    tissue = course.tissue
-    geometry = seen(tissue)
+    tissue, report = course.tissue, course.report
+    is_hole = course.labels == 0
+    geometry = seen(tissue, is_hole, None if report is None else report.closed)
     which = equations(geometry)
     if len(which.junctions) == 0:
         raise ValueError(
@@ -129,7 +143,8 @@ def infer_tensions(
     noise = course.noise if noise is None else noise
     curves = read_courses(geometry, points, course.grain, apart=course.apart, noise=noise)
     fitted = geometry.moved(curves.change)
-    shape = told(fitted, curves, which)
+    uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
+    shape = told(fitted, curves, which, uncertain)
     balance = solve(shape, which, exact=noise is not None, prior=prior)
     turned_over = None
     if resamples:
@@ -139,8 +154,8 @@ def infer_tensions(
         )
     # Corners of cells in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
-    source = course.labels, course.pixel_size, four_fold
-    return outcome(tissue, curves, which, balance, source, turned_over)
+    source = course.labels, course.pixel_size, four_fold, report
+    return outcome(tissue, course.points, curves, which, balance, source, turned_over)
 
 
 class _Course(NamedTuple):
@@ -154,7 +169,17 @@ class _Course(NamedTuple):
     apart: float | None
     """How far points lie apart that say something of their own; None if it is to be found."""
     noise: float | None
-    pixel_size: float | None
+    pixel_size: PixelSize | None
+    report: MaskReport | None = None
+
+
+def _pixels_of_file(file: Path, mask: Int[np.ndarray, "rows columns"]) -> PixelSize | None:
+    """Size of the pixels of a file that are not square, for a mean cell area of about 1."""
+    aspect = pixel_aspect(file)
+    if abs(aspect - 1) < 0.01:
+        return None
+    width = np.sqrt(len(np.unique(mask[mask > 0])) / (np.count_nonzero(mask > 0) * aspect))
+    return (float(aspect * width), float(width))
 
 
 def _of_mask(source: Segmentation) -> _Course:
@@ -171,11 +196,14 @@ def _of_mask(source: Segmentation) -> _Course:
         )
     _check_arcs(source.tissue)
     first = geometry_of(source.tissue).edge_vertices[:, 0]
-    edge = source.courses.edge
-    away = source.courses.points - np.asarray(source.tissue.vertices)[first][edge]
-    points = Points(edge, away)
-    pixel = source.pixel_size
-    return _Course(source.tissue, source.labels, points, pixel, None, None, pixel)
+    # Where a wide gap was closed, the mask does not show the edge.
+    edge = source.courses.edge[source.courses.shown]
+    course = source.courses.points[source.courses.shown]
+    points = Points(edge, course - np.asarray(source.tissue.vertices)[first][edge])
+    pixel = pixel_length(source.pixel_size)
+    return _Course(
+        source.tissue, source.labels, points, pixel, None, None, source.pixel_size, source.report
+    )
 
 
 def _of_foam(source: Foam, noise: float | None) -> _Course:

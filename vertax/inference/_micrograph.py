@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from vertax._base.checks import check_number
+from vertax._base.pixels import pixel_length
 from vertax.costs import MeshImage, mirror
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.fitting import Fit, InverseProblem, Uncertainty, uncertainty
@@ -76,7 +78,7 @@ class Micrograph(eqx.Module):
     def pixel_size(self) -> float:
         """Length of a pixel side of `image`, which may be coarser than the file, in units of the tissue."""
         found = self.segmentation
-        return found.pixel_size * found.image_shape[1] / self.image.shape[1]
+        return pixel_length(found.pixel_size) * found.image_shape[1] / self.image.shape[1]
 
     def parameters(
         self, energy: AbstractEnergy
@@ -211,6 +213,8 @@ def micrograph_problem(
             raise ValueError(
                 f"Argument `{name}` must be one of {', '.join(map(repr, known))}, but is {value!r}."
             )
+    if pixel_size is not None:
+        check_number("pixel_size", pixel_size, above=0)
     segmenter = Watershed() if segmenter is None else segmenter
     response = Relaxation() if response is None else response
     intensities = np.asarray(image, float)
@@ -226,7 +230,7 @@ def micrograph_problem(
     width = (
         best_psf_width(tissue, options, seen.shape)
         if psf_width is None
-        else psf_width * found.pixel_size
+        else psf_width * pixel_length(found.pixel_size)
     )
     first = response(tissue, guess, throw=False)
     # Mirror planes or pins hold the tissue in its place: there is no position to fit.
@@ -256,7 +260,7 @@ def _mirrored(
 ) -> _Read:
     """All cells, and their mirror images."""
     found = from_microscopy(image, segmenter=segmenter)
-    seen = prepare(found.pixel_size)
+    seen = prepare(pixel_length(found.pixel_size))
     areas, whole = found.tissue.areas, np.asarray(found.whole)
     if rest_areas == "equal":
         # Cells and their mirror images have one label; the mean area is the unit.
@@ -282,7 +286,7 @@ def _pinned(
     rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     check_zero("segmenter(image)", labels, None)
     labels = np.maximum(np.where(np.isin(labels, rim), 0, labels), 0)
-    found = from_labels(labels, boundary="free", pixel_size=pixel_size)
+    found = from_labels(labels, boundary="free", pixel_size=pixel_size, holes="close")
     cluster = found.tissue
     on_outline = np.asarray(cluster.topology.on_outline)
     outline = np.asarray(cluster.topology.edge_cells)[on_outline]
@@ -292,8 +296,8 @@ def _pinned(
     tissue = Tissue(
         cluster.vertices, cluster.topology, cluster.boundary, cluster.softening, pinned=pinned
     )
-    seen = prepare(found.pixel_size)
-    pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
+    seen = prepare(pixel_length(found.pixel_size))
+    pixel = pixel_length(found.pixel_size) * found.image_shape[1] / seen.shape[1]
     weight = away_from_outline(tissue, on_outline, labels > 0, pixel, seen.shape)
     # Straight edges cut off the corners of cells on the outline, of some nearly all of the cell.
     areas = jnp.log(jnp.maximum(tissue.areas, 0.2))

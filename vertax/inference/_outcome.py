@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from vertax._base.pixels import PixelSize, pixel_length
 from vertax.inference._balance import Equations
-from vertax.inference._curves import Fitted
+from vertax.inference._curves import Fitted, Points, arc_distances
 from vertax.inference._inferred import InferredTensions
 from vertax.inference._solve import Balance
+from vertax.initialise import MaskReport
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
@@ -62,10 +64,13 @@ def relative(balance: Balance, which: Equations) -> Relative:
 
 def outcome(
     tissue: Tissue,
+    points: Points,
     curves: Fitted,
     which: Equations,
     balance: Balance,
-    source: tuple[Int[np.ndarray, " cells"], float | None, Bool[np.ndarray, " edges"]],
+    source: tuple[
+        Int[np.ndarray, " cells"], PixelSize | None, Bool[np.ndarray, " edges"], MaskReport | None
+    ],
     resampled: Float[np.ndarray, " tensions"] | None,
 ) -> InferredTensions:
     """What is reported.
@@ -73,15 +78,16 @@ def outcome(
     **Arguments:**
 
     - `tissue`: as it was seen.
+    - `points`: the points of all edges.
     - `curves`: its edges, fitted.
     - `which`, `balance`: what balances forces.
-    - `source`: labels of the cells, length of a pixel side, and which edges have length 0.
+    - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
     - `resampled`: standard deviations of tensions by resampling.
 
     **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions].
     """
     tissue = _moved(tissue, curves.change)
-    labels, pixel_size, four_fold = source
+    labels, pixel_size, four_fold, report = source
     found = relative(balance, which)
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
@@ -111,8 +117,26 @@ def outcome(
         model_errors=(float(balance.errors.junction), float(balance.errors.arc)),
         pixel_size=pixel_size,
         four_fold=four_fold,
+        mask_report=report,
+        outline_errors=_outline_errors(tissue, points, curves.change)
+        / pixel_length(pixel_size or 1.0),
         resampled_deviations=None if resampled is None else spread(*edges, resampled, nan),
     )
+
+
+def _outline_errors(
+    tissue: Tissue, points: Points, change: Float[np.ndarray, " geometry"]
+) -> Float[np.ndarray, " cells"]:
+    """Root mean square distance of the points around each cell from its arcs."""
+    geometry, edge = geometry_of(tissue), points.edge
+    shift = change[: 2 * tissue.n_vertices].reshape(-1, 2)
+    p = points.away - shift[geometry.edge_vertices[edge, 0]]
+    distance = arc_distances(geometry.edge_vectors[edge], geometry.edge_angles[edge], p)
+    total, count = np.zeros((2, tissue.n_cells + 1))
+    for side in geometry.edge_cells.T:
+        np.add.at(total, side[edge], distance**2)
+        np.add.at(count, side[edge], 1)
+    return np.sqrt(total / np.maximum(count, 1))[:-1]
 
 
 def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:

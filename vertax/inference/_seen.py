@@ -56,10 +56,24 @@ class Seen(NamedTuple):
         return 2 * self.n_vertices + 3 * len(self.angle)
 
 
-def seen(tissue: Tissue) -> Seen:
-    """The geometry of a tissue."""
+def seen(
+    tissue: Tissue,
+    holes: Bool[np.ndarray, " cells"] | None = None,
+    closed: Bool[np.ndarray, " edges"] | None = None,
+) -> Seen:
+    """The geometry of a tissue.
+
+    **Arguments:**
+
+    - `tissue`: the tissue.
+    - `holes`: faces that are no cells: forces at their junctions are unknown, as at the outline.
+    - `closed`: edges that the mask does not show: forces at their ends are unknown too.
+    """
     m, geometry = tissue.topology, geometry_of(tissue)
-    inner = np.all(np.asarray(m.cell).reshape(-1, 3) < tissue.n_cells, axis=1)
+    is_cell = np.append(np.full(tissue.n_cells, True) if holes is None else ~holes, False)
+    inner = np.all(is_cell[np.asarray(m.cell)].reshape(-1, 3), axis=1)
+    if closed is not None:
+        inner &= ~np.any(closed[np.asarray(m.edge)].reshape(-1, 3), axis=1)
     return Seen(
         ends=geometry.edge_vertices,
         cells=geometry.edge_cells,
@@ -70,5 +84,5 @@ def seen(tissue: Tissue) -> Seen:
         bend=np.zeros((tissue.n_edges, 2)),
         n_cells=tissue.n_cells,
         inner=inner,
-        size=float(np.sqrt(np.mean(np.abs(geometry.areas)))),
+        size=float(np.sqrt(np.mean(np.abs(geometry.areas[: tissue.n_cells][is_cell[:-1]])))),
     )

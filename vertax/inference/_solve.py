@@ -78,13 +78,19 @@ class Balance(NamedTuple):
     """Edges so short that their direction is not known."""
 
 
-def told(fitted: Seen, curves: Fitted, which: Equations) -> Told:
-    """What a shape tells for the balance of forces."""
+def told(
+    fitted: Seen, curves: Fitted, which: Equations, uncertain: Bool[np.ndarray, " all_edges"]
+) -> Told:
+    """What a shape tells for the balance of forces.
+
+    `uncertain` marks edges that may be between other cells; they are treated as those without a direction.
+    """
     slope = angle_slopes(fitted, which)
     covariance = curves.noise**2 * (slope @ splu(curves.precision).solve(slope.T.toarray()))
     variance = np.zeros(len(which.edges))
     np.maximum.at(variance, which.half_edge.ravel(), np.diag(covariance)[: which.n_directions])
     loose = (variance > _LOOSE**2) | (which.chord < _SHORT * curves.noise)
+    loose |= uncertain[which.edges]
     unknown = pulls(fitted, which, loose)
     return Told(
         angle=angles(fitted, which),

@@ -7,6 +7,7 @@ from vertax.initialise._labels import (
     from_labels as from_labels,
 )
 from vertax.initialise._microscopy import from_microscopy as from_microscopy
+from vertax.initialise._report import MaskChange as MaskChange, MaskReport as MaskReport
 from vertax.initialise._segmenters import (
     AbstractSegmenter as AbstractSegmenter,
     Cellpose as Cellpose,

@@ -8,7 +8,7 @@ from vertax.io._data_tables import (
     write_csv as write_csv,
 )
 from vertax.io._geojson import write_geojson as write_geojson
-from vertax.io._image import read_image as read_image
+from vertax.io._image import pixel_aspect as pixel_aspect, read_image as read_image
 from vertax.io._module_file import (
     load_energy as load_energy,
     load_problem as load_problem,

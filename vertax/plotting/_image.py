@@ -5,19 +5,20 @@ from __future__ import annotations
 from typing import Any, SupportsFloat
 
 import numpy as np
-from jaxtyping import Array, Float, Real, Shaped
+from jaxtyping import Array, ArrayLike, Float, Real, Shaped
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from vertax._base.pixels import check_pixel_size, pixel_sides
 from vertax.plotting import _style
 
 
 def plot_image(
     image: Real[np.ndarray, " ..."],
     *,
-    pixel_size: SupportsFloat = 1.0,
+    pixel_size: ArrayLike = 1.0,
     ax: Axes | None = None,
     figure: Figure | None = None,
 ) -> Axes:
@@ -28,7 +29,7 @@ def plot_image(
     - `image`: a grey image, shown with robust contrast, or a colour image (red, green, blue; 8 bits, or
         floats in 0 … 1); labels are made one by [`label_colours`][vertax.plotting.label_colours]. The y
         axis points down.
-    - `pixel_size`: size of a pixel, in units of length.
+    - `pixel_size`: side of a pixel, in units of length, or (height, width).
     - `ax`: the axes to draw in; by default those of a new figure.
     - `figure`: an empty figure to draw in instead, which no window shows.
 
@@ -38,7 +39,7 @@ def plot_image(
 
     - `ValueError`, naming the argument, for an image that is not one, or a `pixel_size` out of range.
     """
-    image, pixel_size = np.asarray(image), float(pixel_size)
+    image = np.asarray(image)
     _style.one_of(ax, figure)
     width, height = extent_of(image, pixel_size)
     with _style.house_style():
@@ -52,7 +53,7 @@ def plot_image(
     return ax
 
 
-def draw_image(ax: Axes, image: np.ndarray, pixel_size: float) -> None:
+def draw_image(ax: Axes, image: np.ndarray, pixel_size: ArrayLike) -> None:
     """An image, its first row at the top, the y axis pointing down."""
     size = extent_of(image, pixel_size)
     grey: dict[str, Any] = {}
@@ -64,16 +65,15 @@ def draw_image(ax: Axes, image: np.ndarray, pixel_size: float) -> None:
     ax.imshow(image, origin="upper", extent=extent, zorder=0, **grey)
 
 
-def extent_of(image: np.ndarray, pixel_size: float) -> np.ndarray:
+def extent_of(image: np.ndarray, pixel_size: ArrayLike) -> np.ndarray:
     """Width and height of an image."""
     if image.size == 0 or image.ndim < 2 or image.shape[2:] not in ((), (3,)):
         raise ValueError(
             "Argument `image` must have shape (rows, columns) or (rows, columns, 3), but has "
             f"{image.shape}."
         )
-    if not (np.isfinite(pixel_size) and pixel_size > 0):
-        raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
-    return pixel_size * np.array(image.shape[1::-1])
+    check_pixel_size("pixel_size", pixel_size)
+    return pixel_sides(pixel_size) * image.shape[1::-1]
 
 
 def label_colours(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, SupportsFloat, TypeAlias
 
 import numpy as np
-from jaxtyping import Array, Bool, Real
+from jaxtyping import Array, ArrayLike, Bool, Real
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
@@ -44,7 +44,7 @@ def plot_tissues(
     colorbar: bool | str = True,
     linewidth: SupportsFloat | None = None,
     image: Real[np.ndarray, " ..."] | None = None,
-    pixel_size: SupportsFloat = 1.0,
+    pixel_size: ArrayLike = 1.0,
 ) -> list[Axes]:
     """Draw tissues side by side, to compare them: on one scale of colours and one scale of lengths.
 
@@ -98,12 +98,11 @@ def plot_tissues(
             checked("cells", own_cells, drawing.n_cells)
             checked("edges", own_edges, drawing.n_edges)
             checked("mask", mask, drawing.n_cells)
-    pixel = float(pixel_size)
     views = _views(drawings, mask) if image is None else [None] * len(drawings)
     with _style.house_style():
         if axes is None:
             view = views[0]
-            extent = view[1] - view[0] if view is not None else extent_of(np.asarray(image), pixel)
+            extent = view[1] - view[0] if view is not None else extent_of(np.asarray(image), pixel_size)
             height = 2.4 * float(np.clip(extent[1] / extent[0], 0.25, 2))
             room = 0.75 * len(bars)
             axes = _style.new_axes(
@@ -113,7 +112,7 @@ def plot_tissues(
             drawing = drawings[name]
             if drawing is None:
                 assert image is not None
-                plot_image(image, pixel_size=pixel, ax=ax)
+                plot_image(image, pixel_size=pixel_size, ax=ax)
             else:
                 draw(
                     drawing,
@@ -127,7 +126,7 @@ def plot_tissues(
                     colorbar=False,
                     linewidth=linewidth,
                     image=image,
-                    pixel_size=pixel,
+                    pixel_size=pixel_size,
                 )
             ax.set_title(name)
         # A later bar goes between the axes and an earlier one.

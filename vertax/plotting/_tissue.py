@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, SupportsFloat
 
 import numpy as np
-from jaxtyping import Array, Bool, Real
+from jaxtyping import Array, ArrayLike, Bool, Real
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
@@ -45,7 +45,7 @@ def plot_tissue(
     alpha: SupportsFloat | None = None,
     linewidth: SupportsFloat | None = None,
     image: Real[np.ndarray, " ..."] | None = None,
-    pixel_size: SupportsFloat = 1.0,
+    pixel_size: ArrayLike = 1.0,
 ) -> Axes:
     """Draw a tissue, its cells and edges coloured by values.
 
@@ -85,7 +85,7 @@ def plot_tissue(
     - `image`: a grey image, shown with robust contrast, or a colour image (red, green, blue; 8
         bits, or floats in 0 … 1). The pixel in row r and column c covers [c, c + 1] × [r, r + 1],
         in units of `pixel_size`.
-    - `pixel_size`: size of a pixel, in the tissue's units of length.
+    - `pixel_size`: side of a pixel, in the tissue's units of length, or (height, width).
 
     **Returns:** the axes.
 
@@ -108,7 +108,7 @@ def plot_tissue(
         alpha=alpha,
         linewidth=linewidth,
         image=image,
-        pixel_size=float(pixel_size),
+        pixel_size=pixel_size,
     )
 
 
@@ -141,7 +141,7 @@ def draw(
     alpha: SupportsFloat | None = None,
     linewidth: SupportsFloat | None = None,
     image: np.ndarray | None = None,
-    pixel_size: float = 1.0,
+    pixel_size: ArrayLike = 1.0,
 ) -> Axes:
     """Draw what `plot_tissue` draws, with cells placed as in `drawing`; `view` is what to show."""
     _style.one_of(ax, figure)

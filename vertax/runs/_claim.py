@@ -14,7 +14,7 @@ from vertax.runs._figures import FIGURE_FORMATS
 CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
 FIGURES = tuple(f"figures/*.{ending}" for ending in FIGURE_FORMATS)
 # What a run may have left behind; METRICS goes first, so that a folder which holds it is complete.
-_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", *FIGURES, f"{PARTS}/*.npz")
+_LEFTOVERS = (METRICS, "*.csv", "*.geojson", "*.npz", "*.npy", *FIGURES, f"{PARTS}/*.npz")
 
 
 def claimed(default: Path, output: str | os.PathLike[str] | None, overwrite: bool) -> Path:

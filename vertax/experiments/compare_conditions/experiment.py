@@ -18,6 +18,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from pydantic import Field
 from scipy.stats import mannwhitneyu
 
+from vertax._base.pixels import pixel_sides
 from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import Fit, FitError
 from vertax.inference import Micrograph, pearson
@@ -200,7 +201,7 @@ def _counterparts(
     """Whole cells of the segmented mesh, and the true cells whose centre is in the same place."""
     whole, found = np.flatnonzero(micrograph.whole), micrograph.segmentation
     pixel = float(np.sqrt(tissue.n_cells)) / config.microscope.pixels
-    ours = np.asarray(found.tissue.centroids)[whole] / found.pixel_size * pixel
+    ours = np.asarray(found.tissue.centroids)[whole] / pixel_sides(found.pixel_size) * pixel
     away = tissue.boundary.shortest(jnp.asarray(ours)[:, None] - tissue.centroids[None])
     distance = np.asarray(jnp.linalg.norm(away, axis=-1))
     nearest = distance.argmin(axis=1)

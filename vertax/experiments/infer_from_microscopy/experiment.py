@@ -114,7 +114,7 @@ def _metrics(micrograph: Micrograph, outcome: Fit) -> dict[str, Any]:
         "shape_factor_median": np.median(factors),
         "observed_shape_factor_mean": observed.mean(),
         "vertex_displacement_from_segmentation": float(jnp.mean(jnp.linalg.norm(corners, axis=-1))),
-        "psf_width_pixels": micrograph.psf_width / found.pixel_size,
+        "psf_width_pixels": micrograph.psf_width / pixel_length(found.pixel_size),
         "pixel_size": found.pixel_size,
         **fit_metrics(outcome),
         "num_t1_first_guess": first.num_t1,
@@ -132,8 +132,8 @@ def _cell_table(micrograph: Micrograph, outcome: Fit) -> dict[str, np.ndarray]:
         "shape_factor": tissue.shape_factors,
         "area": tissue.areas,
         "perimeter": tissue.perimeters,
-        "x_pixels": tissue.centroids[:, 0] / found.pixel_size,
-        "y_pixels": tissue.centroids[:, 1] / found.pixel_size,
+        "x_pixels": tissue.centroids[:, 0] / pixel_sides(found.pixel_size)[0],
+        "y_pixels": tissue.centroids[:, 1] / pixel_sides(found.pixel_size)[1],
     }
     return {name: np.asarray(column)[micrograph.whole] for name, column in columns.items()}
 

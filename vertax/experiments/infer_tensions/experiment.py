@@ -13,9 +13,10 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int, Shaped
 from pydantic import Field
 
+from vertax._base.pixels import pixel_length
 from vertax.energies import LocalSum
 from vertax.inference import (
     InferredTensions,
@@ -47,14 +48,31 @@ class ImageSection(ImageFile):
     an image of two values for outlines."""
     background: int | None = None
     """The label of what is no cell, if it is not 0 and does not lie around all others."""
-    gap_width: float = Field(default=3.0, ge=0)
-    """How wide lines between labels may be, in pixels."""
+    gap_width: float | None = Field(default=None, ge=0)
+    """Largest width of a line between two cells in contact, in pixels; left out, it is measured."""
+    holes: Literal["keep", "close"] = "keep"
+    """Whether holes stay faces without a cell, or are given to the cells next to them."""
+    pixel_size: list[float] | None = Field(default=None, min_length=2, max_length=2)
+    """Height and width of a pixel that is not square; left out, as the resolution of a TIFF file gives it."""
+
+    def source(self) -> str | Shaped[np.ndarray, "rows columns"]:
+        """The file, or the pixels of the channel that is chosen."""
+        return self.read() if self.channel is not None or self.path is None else self.path
 
     def labels(self) -> Int[np.ndarray, "rows columns"]:
         """A label for each pixel."""
-        chosen = self.channel is not None or self.plane is not None
-        image = self.read() if chosen or self.path is None else self.path
-        return read_mask(image, kind=self.kind, background=self.background)
+        return read_mask(self.source(), **self.reading())
+
+    def reading(self) -> dict[str, Any]:
+        """Arguments of `read_mask`."""
+        plane = self.plane if self.channel is None else None
+        return {"kind": self.kind, "background": self.background, "plane": plane}
+
+    def tensions(self, image: Any, **options: Any) -> InferredTensions:
+        """The tensions of an image, read as this section says."""
+        size = None if self.pixel_size is None else (self.pixel_size[0], self.pixel_size[1])
+        options |= {"gap_width": self.gap_width, "holes": self.holes, "pixel_size": size}
+        return infer_tensions(image, **options)
 
 
 class Cluster(Section):
@@ -104,13 +122,15 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
     truth = None
     if config.image.path != SYNTHETIC:
         labels = config.image.labels()
+        source, options = config.image.source(), config.image.reading()
     else:
         truth, labels = _synthetic(config)
-    options: dict[str, Any] = {"gap_width": config.image.gap_width, "prior": config.prior}
-    found = infer_tensions(labels, kind="labels", **options)
+        source, options = labels, {"kind": "labels"}
+    options["prior"] = config.prior
+    found = config.image.tensions(source, **options)
     if config.noise is not None and found.pixel_size is not None:
-        noise = config.noise * found.pixel_size
-        found = infer_tensions(labels, kind="labels", noise=noise, **options)
+        noise = config.noise * pixel_length(found.pixel_size)
+        found = config.image.tensions(source, noise=noise, **options)
     for doubt in found.doubts:
         folder.warn(doubt)
     folder.save_tissue("seen", found.tissue)
@@ -119,6 +139,8 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         _add_truth(found, truth, edges, cells)
     folder.save_table("edges", edges)
     folder.save_table("cells", cells)
+    if found.mask_report is not None:
+        folder.save_table("changes", found.mask_report.change_table())
     write_geojson(
         folder.path / "cells.geojson",
         found.tissue,
@@ -181,9 +203,11 @@ def _add_truth(
 def _metrics(
     found: InferredTensions, edges: dict[str, np.ndarray], cells: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    pixel = found.pixel_size or 1.0
+    pixel = pixel_length(found.pixel_size or 1.0)
+    cells_only = found.labels > 0
     metrics: dict[str, Any] = {
-        "n_cells": found.tissue.n_cells,
+        "n_cells": int(cells_only.sum()),
+        "n_holes": int(np.sum(~cells_only)),
         "n_edges": found.tissue.n_edges,
         "n_tensions_determined": int(found.determined.sum()),
         "n_pressures_determined": int(found.pressures_determined.sum()),
@@ -192,6 +216,8 @@ def _metrics(
         "noise_correlation_pixels": found.correlation / pixel,
         "bending_degrees": np.degrees(found.bending),
         "doubts": found.doubts,
+        "mask": None if found.mask_report is None else found.mask_report.summary(),
+        "area_error_max": float(np.max(np.abs(found.area_errors[cells_only]))),
         "out_of_balance_degrees_junctions": np.degrees(found.model_errors[0]),
         "out_of_balance_degrees_arcs": np.degrees(found.model_errors[1]),
     }
