@@ -45,8 +45,8 @@ def contacts(mask: np.ndarray) -> set[tuple[int, int]]:
     return {pair for pair in pairs if pair[0] > 0}
 
 
-def with_gaps(mask: np.ndarray, rng: np.random.Generator, widest: float) -> np.ndarray:
-    """Lines without label between all cells: of one width, or of a width for each pair of cells."""
+def with_gaps(mask: np.ndarray, widths: np.ndarray | float) -> np.ndarray:
+    """Lines without label between all cells, of one width or of a width for each pair of cells."""
     height, width = mask.shape
     # Sides between two cells lie between pixels: a grid of twice the resolution has a place for them.
     sides = np.zeros((2 * height - 1, 2 * width - 1), np.int64)
@@ -59,8 +59,8 @@ def with_gaps(mask: np.ndarray, rng: np.random.Generator, widest: float) -> np.n
         sides[place] = np.where(touch, np.minimum(one, other) * n + np.maximum(one, other), 0)
     distance, nearest = distance_transform_edt(sides == 0, return_indices=True)
     pair = sides[tuple(nearest)][::2, ::2]
-    widths = rng.uniform(0, widest, n * n) if rng.random() < 0.5 else np.full(n * n, widest)
-    return np.where(distance[::2, ::2] / 2 < widths[pair] / 2, 0, mask)
+    width_of_pair = np.broadcast_to(np.asarray(widths, float), n * n)[pair]
+    return np.where(distance[::2, ::2] / 2 < width_of_pair / 2, 0, mask)
 
 
 def damaged(clean: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tuple[float, float]]:
@@ -70,7 +70,8 @@ def damaged(clean: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tu
     if rng.random() < 0.5:
         mask = np.where(np.isin(mask, rng.choice(labels, int(rng.integers(1, 4)))), 0, mask)
     if rng.random() < 0.6:
-        mask = with_gaps(mask, rng, rng.uniform(1, 7))
+        widest, n_pairs = rng.uniform(1, 7), (int(mask.max()) + 1) ** 2
+        mask = with_gaps(mask, rng.uniform(0, widest, n_pairs) if rng.random() < 0.5 else widest)
     if rng.random() < 0.5:
         mask = wrapped(mask, clean, rng)
     if rng.random() < 0.5:

@@ -6,42 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from foam_helpers import against_truth
 from free_helpers import cluster
 
 import vertax as vx
-from vertax.energies import AreaElasticity, LineTension
 from vertax.inference import infer_tensions, label_image, pearson, read_mask
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(
     not DATA.exists(), reason="the data beside the repository, ../shared/data, are not there"
 )
-
-
-@pytest.fixture(scope="module")
-def foam():
-    """A cluster in equilibrium, its tensions and pressures."""
-    tissue = cluster(14, 3, lloyd_steps=3, inner_arcs=True)
-    tension = jax.random.uniform(jax.random.key(1), (tissue.n_edges,), minval=0.7, maxval=1.3)
-    area = AreaElasticity(
-        20.0, jax.random.uniform(jax.random.key(2), (14,), minval=0.9, maxval=1.3)
-    )
-    relax = vx.Relaxation(tolerance=1e-11, contact_range=None)
-    relaxed = relax(tissue, area + LineTension(tension)).tissue
-    return relaxed, np.asarray(tension), np.asarray(area.pressures(relaxed))
-
-
-def against_truth(found, foam):
-    """True and found tensions of what is determined, and deviations, each relative to its mean."""
-    tissue, tension, _ = foam
-    number = np.append(found.labels, 0)
-    pairs = np.sort(number[np.asarray(found.tissue.topology.edge_cells)], axis=1)
-    true = np.append(np.arange(1, tissue.n_cells + 1), 0)
-    known = np.sort(true[np.asarray(tissue.topology.edge_cells)], axis=1).tolist()
-    edge = np.array([known.index(pair) if pair in known else -1 for pair in pairs.tolist()])
-    use = found.determined & (edge >= 0)
-    wanted = tension[edge[use]]
-    return wanted / wanted.mean(), found.tensions[use], found.tension_deviations[use]
 
 
 def test_an_exact_shape_gives_tensions_and_pressures_back(foam):

@@ -33,10 +33,11 @@ FAMILIES = {
     "RecoveryWatch Scene Transition fit_onset fit_transition foam_energy foam_terms "
     "infer_tensions label_image micrograph_problem pearson read_mask relative_error "
     "same_neighbours shape_factor_scene",
-    "initialise": "AbstractSegmenter Cellpose Courses Segmentation Watershed free_voronoi "
+    "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport Segmentation Watershed "
+    "free_voronoi "
     "from_labels from_microscopy hexagonal labels_from_skeleton periodic_voronoi",
     "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_tables load_energy "
-    "load_problem load_tissue load_trajectory read_image read_surface_evolver save_energy "
+    "load_problem load_tissue load_trajectory pixel_aspect read_image read_surface_evolver save_energy "
     "save_problem save_tissue save_trajectory to_tables write_csv write_geojson write_vtk "
     "write_vtk_series",
     "mechanics": "BoxRelaxation Modes Ramp SelfStress bulk_modulus cell_stress compatibility "
