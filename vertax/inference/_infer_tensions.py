@@ -17,17 +17,17 @@ from vertax.inference._balance import equations
 from vertax.inference._curves import Points, read_courses
 from vertax.inference._inferred import InferredTensions
 from vertax.inference._mask import read_mask
+from vertax.inference._observed_geometry import observed_geometry
 from vertax.inference._outcome import outcome
 from vertax.inference._resampling import resampled_deviations
-from vertax.inference._seen import seen
-from vertax.inference._solve import solve, told
+from vertax.inference._solve import observability, solve
 from vertax.initialise import MaskReport, Segmentation, from_labels
 from vertax.io import Foam, pixel_aspect, read_surface_evolver
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
-# A tissue given as such is known to this share of a cell diameter, the points of a foam to that; and the
-# points that stand for an edge without any.
+# Noise of a tissue without an image, and of the points of a foam, relative to the cell diameter; and the
+# number of points of an edge without a course.
 _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 _EVOLVER = (".dmp", ".fe")
 
@@ -52,7 +52,7 @@ def infer_tensions(
     resamples: int = 0,
     seed: int = 0,
 ) -> InferredTensions:
-    r"""Tensions of edges and pressures of cells that keep a tissue in the shape in which it was seen.
+    r"""Tensions of edges and pressures of cells that balance in the observed shape of a tissue.
 
     ```python
     found = vx.inference.infer_tensions("NAME_cp_masks.tif")
@@ -64,12 +64,12 @@ def infer_tensions(
 
     $$\sum_e \gamma_e\, t_e = 0, \qquad \gamma_e\, \kappa_e = p_\mathrm{left} - p_\mathrm{right}.$$
 
-    Junctions on the outline, where cells beyond it may pull, do not count, so the tissue may have been cut
-    out of a larger one. Vertices and curves are fitted to the pixels: arcs, and how they bend towards their
-    ends, as far as pixels tell, because tensions pull along the ends. How far pixels are from curves is the
-    noise, which is carried through the balance with all its correlations, and the geometry is adjusted
-    within it (total least squares). What is left tells how far the tissue is from a balance at all, which
-    enters the standard deviations too.
+    Junctions on the outline and at holes, where forces from beyond are unknown, have no equation, so the
+    tissue may have been cut out of a larger one. Vertices and curves are fitted to the pixels: arcs, and
+    their bends towards the ends where the pixels resolve them, because tensions pull along the tangents at
+    the ends. The distances of pixels from curves are the noise, which is propagated to the balance with its
+    correlations, and the geometry is adjusted within the noise (total least squares). The residual is the
+    distance of the tissue from a balance, and enters the standard deviations too.
 
     **Arguments:**
 
@@ -80,24 +80,24 @@ def infer_tensions(
     - `kind`: of a mask, `"labels"`, `"outlines"` or `"auto"`.
     - `plane`: of a stack, the plane to take, from 0.
     - `pixel_size`, `background`, `gap_width`, `holes`: of a mask, see
-        [`from_labels`][vertax.initialise.from_labels]. Where a TIFF file has pixels that are not square, their
-        ratio is taken from it.
-    - `noise`: standard deviation of the position of an edge, in units of length; left out, how far pixels
-        (or the points of a foam) are from curves, and a five hundredth of a cell diameter for a tissue
+        [`from_labels`][vertax.initialise.from_labels]. Where a TIFF file has pixels that are not square,
+        their ratio is taken from it.
+    - `noise`: standard deviation of the position of an edge, in units of length; by default the root mean
+        square distance of pixels (or the points of a foam) from curves, and 0.002 cell diameters for a tissue
         without either.
-    - `prior`: standard deviation of relative tensions about 1 before the shape was seen; left out, twice
-        that of a first guess. A small one keeps tensions too much alike.
-    - `resamples`: how often to turn noise and errors of the model over by chance and infer anew, as a check
-        of the deviations (wild bootstrap: Wu 1986, doi:10.1214/aos/1176350142); a few dozen.
-    - `seed`: of that chance.
+    - `prior`: standard deviation of the prior of relative tensions about 1; by default twice the spread of a
+        first estimate. A small one makes tensions too uniform.
+    - `resamples`: number of resampled shapes, as a check of the standard deviations (wild bootstrap: Wu 1986,
+        doi:10.1214/aos/1176350142), such as 50.
+    - `seed`: seed of the random numbers of the resampling.
 
-    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; look at its `doubts`.
+    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; read its `doubts`.
 
     **Raises:**
 
-    - `TypeError` for something else.
-    - `ValueError` for a tissue without a place where three of its cells meet, one with straight inner edges,
-        one that was mirrored, a `noise` or `prior` that is not positive, and as the readers.
+    - `TypeError` for a source of another type.
+    - `ValueError` for a tissue without a junction of three cells, a tissue with straight inner edges, a
+        mirrored one, a `noise` or `prior` that is not positive, and as the readers.
     """
     for name, value in (("noise", noise), ("prior", prior)):
         if value is not None:
@@ -131,12 +131,12 @@ def infer_tensions(
         )
     tissue, report = course.tissue, course.report
     is_hole = course.labels == 0
-    geometry = seen(tissue, is_hole, None if report is None else report.closed)
+    geometry = observed_geometry(tissue, is_hole, None if report is None else report.closed)
     which = equations(geometry)
     if len(which.junctions) == 0:
         raise ValueError(
             "Argument `segmentation_or_mask` must have a place where three of its cells meet, but it has "
-            "none: what pulls at its outline is not known. Take a larger tissue."
+            "none: the forces at its outline are unknown. Take a larger tissue."
         )
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
@@ -144,30 +144,30 @@ def infer_tensions(
     curves = read_courses(geometry, points, course.grain, apart=course.apart, noise=noise)
     fitted = geometry.moved(curves.change)
     uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
-    shape = told(fitted, curves, which, uncertain)
+    shape = observability(fitted, curves, which, uncertain)
     balance = solve(shape, which, exact=noise is not None, prior=prior)
-    turned_over = None
+    resampled = None
     if resamples:
-        seen_as = fitted, curves, points, which, shape
-        turned_over = resampled_deviations(
-            *seen_as, balance, prior=prior, times=resamples, seed=seed
+        observed = fitted, curves, points, which, shape
+        resampled = resampled_deviations(
+            *observed, balance, prior=prior, times=resamples, seed=seed
         )
-    # Corners of cells in a mask are corners of pixels, so edges of length 0 differ from all others.
+    # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
     source = course.labels, course.pixel_size, four_fold, report
-    return outcome(tissue, course.points, curves, which, balance, source, turned_over)
+    return outcome(tissue, course.points, curves, which, balance, source, resampled)
 
 
 class _Course(NamedTuple):
-    """A tissue, and where its edges run."""
+    """A tissue, and the points of its edges."""
 
     tissue: Tissue
     labels: Int[np.ndarray, " cells"]
     points: Points
     grain: float
-    """How exactly a point can be known, a length."""
+    """Resolution of a point, a length."""
     apart: float | None
-    """How far points lie apart that say something of their own; None if it is to be found."""
+    """Distance along an edge at which the errors of two points are independent; None if it is estimated."""
     noise: float | None
     pixel_size: PixelSize | None
     report: MaskReport | None = None
@@ -185,8 +185,8 @@ def _pixels_of_file(file: Path, mask: Int[np.ndarray, "rows columns"]) -> PixelS
 def _of_mask(source: Segmentation) -> _Course:
     if source.courses is None:
         raise ValueError(
-            "Argument `segmentation_or_mask` must hold the courses of its edges, which "
-            "vx.initialise.from_labels finds. Pass its mask, or its tissue."
+            "Argument `segmentation_or_mask` must hold the courses of its edges, as "
+            "vx.initialise.from_labels returns them. Pass its mask, or its tissue."
         )
     copies = len(np.unique(source.labels)) < len(source.labels)
     if copies or (not source.whole.all() and source.tissue.topology.exterior is False):
@@ -212,7 +212,7 @@ def _of_foam(source: Foam, noise: float | None) -> _Course:
     away = np.concatenate([chain - chain[0] for chain in source.chains])
     same = edge[1:] == edge[:-1]
     apart = float(np.mean(np.linalg.norm(np.diff(away, axis=0), axis=1)[same]))
-    grain = _GRAIN * seen(tissue).size if noise is None else noise
+    grain = _GRAIN * observed_geometry(tissue).size if noise is None else noise
     return _Course(tissue, source.bodies, Points(edge, away), grain, apart, None, None)
 
 
@@ -222,7 +222,7 @@ def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:
     course = np.asarray(tissue.edge_points(jnp.append(0, fractions)), float)
     edge = np.repeat(np.arange(tissue.n_edges), _POINTS)
     points = Points(edge, (course[:, 1:] - course[:, :1]).reshape(-1, 2))
-    geometry = seen(tissue)
+    geometry = observed_geometry(tissue)
     noise = _EXACT * geometry.size if noise is None else noise
     apart = float(np.mean(np.linalg.norm(geometry.chord, axis=1))) / _POINTS
     labels = np.arange(1, tissue.n_cells + 1)  # 0 is the label of the exterior
@@ -233,5 +233,5 @@ def _check_arcs(tissue: Tissue) -> None:
     if not tissue.inner_arcs:
         raise ValueError(
             "Argument `segmentation_or_mask` must be a tissue whose inner edges are arcs, because their "
-            "curvature tells pressures; make it with `inner_arcs=True`."
+            "curvature determines pressures; make it with `inner_arcs=True`."
         )

@@ -1,4 +1,4 @@
-"""From what balances forces to what is reported: relative numbers, and which of them are determined."""
+"""From tensions and pressures in balance to the result: relative numbers, and which are determined."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from vertax.initialise import MaskReport
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
-# From this standard deviation on, relative to the mean, a tension is not determined.
+# A tension with a larger standard deviation, relative to the mean, is not determined.
 _UNKNOWN = 0.3
 
 
 class Relative(NamedTuple):
-    """Tensions relative to the mean of what is known, and pressures to theirs."""
+    """Tensions relative to their mean over determined edges, and pressures relative to theirs."""
 
     tension: Float[np.ndarray, " tensions"]
     pressure: Float[np.ndarray, " pressures"]
     tension_deviation: Float[np.ndarray, " tensions"]
     pressure_deviation: Float[np.ndarray, " pressures"]
     beside: Bool[np.ndarray, " pressures"]
-    """Whether a cell has an edge of known tension."""
+    """Whether a cell has an edge of determined tension."""
 
 
 def relative(balance: Balance, which: Equations) -> Relative:
-    """What balances forces, in units of its mean.
+    """Tensions and pressures in units of the mean tension.
 
     **Arguments:**
 
-    - `balance`: what balances forces.
-    - `which`: the balances.
+    - `balance`: the solution of the balance of forces.
+    - `which`: the equations.
 
     **Returns:** the [`Relative`][vertax.inference._outcome.Relative] numbers.
     """
@@ -73,14 +73,14 @@ def outcome(
     ],
     resampled: Float[np.ndarray, " tensions"] | None,
 ) -> InferredTensions:
-    """What is reported.
+    """The result as it is reported.
 
     **Arguments:**
 
-    - `tissue`: as it was seen.
+    - `tissue`: the observed tissue.
     - `points`: the points of all edges.
-    - `curves`: its edges, fitted.
-    - `which`, `balance`: what balances forces.
+    - `curves`: its fitted edges.
+    - `which`, `balance`: the equations and their solution.
     - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
     - `resampled`: standard deviations of tensions by resampling.
 
@@ -88,27 +88,27 @@ def outcome(
     """
     tissue = _moved(tissue, curves.change)
     labels, pixel_size, four_fold, report = source
-    found = relative(balance, which)
+    result = relative(balance, which)
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
-        everywhere = np.full(size, fill)
-        everywhere[place] = of
-        return everywhere
+        array = np.full(size, fill)
+        array[place] = of
+        return array
 
     nan, edges = float("nan"), (tissue.n_edges, which.edges)
-    tensions = spread(*edges, found.tension, nan)
-    sure = ~balance.loose & (found.tension_deviation < _UNKNOWN)
+    tensions = spread(*edges, result.tension, nan)
+    sure = ~balance.loose & (result.tension_deviation < _UNKNOWN)
     determined = spread(*edges, sure, False) & ~four_fold
     cells = (tissue.n_cells, which.cells)
-    pressures = spread(*cells, found.pressure, nan)
+    pressures = spread(*cells, result.pressure, nan)
     return InferredTensions(
         tissue=tissue,
         tensions=tensions,
-        tension_deviations=spread(*edges, found.tension_deviation, nan),
+        tension_deviations=spread(*edges, result.tension_deviation, nan),
         determined=determined,
         pressures=pressures,
-        pressure_deviations=spread(*cells, found.pressure_deviation, nan),
-        pressures_determined=spread(*cells, found.beside, False),
+        pressure_deviations=spread(*cells, result.pressure_deviation, nan),
+        pressures_determined=spread(*cells, result.beside, False),
         stresses=_stresses(tissue, tensions, pressures, determined),
         labels=np.asarray(labels),
         noise=float(curves.noise * balance.errors.noise),
@@ -143,7 +143,7 @@ def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
     """The tissue with the vertices and angles of the fit."""
     n = 2 * tissue.n_vertices
     dtype = tissue.vertices.dtype
-    # By NumPy: JAX would compile for each size.
+    # In NumPy: JAX would compile for each size.
     vertices = np.asarray(tissue.vertices) + change[:n].reshape(-1, 2)
     angles = geometry_of(tissue).edge_angles + change[n : n + tissue.n_edges]
     moved = tissue.with_vertices(jnp.asarray(vertices, dtype))
@@ -156,9 +156,10 @@ def _stresses(
     pressures: Float[np.ndarray, " cells"],
     determined: Bool[np.ndarray, " edges"],
 ) -> Float[np.ndarray, "cells 2 2"]:
-    """Half the tension of its edges, less the pressure, in each cell (Batchelor 1970,
+    """Stress of each cell, ½ Σ γ ∫ t t dl / A - p I over its edges (Batchelor 1970,
     doi:10.1017/S0022112070000745)."""
-    # Along an arc the tangent turns from -α to α: the integral of t t over its length, along and across.
+    # Along an arc the tangent t turns from -α to α; the mean of t t has an entry along the chord, `share`,
+    # and one across.
     geometry = geometry_of(tissue)
     chord, angle, length = geometry.edge_vectors, geometry.edge_angles, geometry.edge_lengths
     unit = chord / np.maximum(np.linalg.norm(chord, axis=1), 1e-300)[:, None]
@@ -166,8 +167,8 @@ def _stresses(
     share = 0.5 * (1 + np.sinc(2 * angle / np.pi))
     outer = lambda x: x[:, :, None] * x[:, None, :]
     fabric = share[:, None, None] * outer(unit) + (1 - share)[:, None, None] * outer(aside)
-    known = np.where(determined, tensions, np.nan)
-    pulled = 0.5 * (known * length)[:, None, None] * fabric
+    certain = np.where(determined, tensions, np.nan)
+    pulled = 0.5 * (certain * length)[:, None, None] * fabric
     total = np.zeros((tissue.n_cells + 1, 2, 2))
     for side in geometry.edge_cells.T:
         np.add.at(total, side, pulled)

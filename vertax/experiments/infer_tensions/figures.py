@@ -27,8 +27,8 @@ _PRESSURES = ListedColormap(colormaps["Blues"](np.linspace(0.15, 1, 256)), "pres
 def foam(image: Real[np.ndarray, "rows columns *colours"], found: InferredTensions) -> Figure:
     """The image with the arcs, and a map of tensions and pressures; values not determined are grey.
 
-    On the image holes are hatched, contacts that the mask does not show are dotted, and a ring marks each place
-    where the mask was changed.
+    On the image the sides of holes are dashed, contacts that the mask does not show are dotted, and a ring
+    marks each place where the mask was changed.
 
     **Arguments:**
 
