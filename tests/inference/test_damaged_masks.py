@@ -195,7 +195,7 @@ def test_labels_too_large_for_their_type_are_refused(mask, dtype, label, message
 
 
 def check_contacts(seed):
-    """Every contact whose tension is determined exists in the mask before it was damaged."""
+    """Every contact with a determined tension exists in the mask before it was damaged."""
     rng = np.random.default_rng(seed)
     clean = random_cells(rng)
     mask, pixel_size = damaged(clean, rng)

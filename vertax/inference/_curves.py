@@ -18,8 +18,8 @@ from vertax.inference._observed_geometry import ObservedGeometry
 _VERTEX, _ANGLE = 2.0, 0.5
 # Standard deviation of the bends, in radians: initial, smallest and largest.
 _BENDING, _BENDINGS = 0.1, (1e-4, 0.3)
-# Largest noise and correlation length, in grains, of edges whose only error is the grain of the pixels. (For
-# middles of the sides of pixels along a smooth curve: 0.24 and 1.45.)
+# Largest noise and correlation length, in grains, of edges with the grain of the pixels as their only error.
+# (For middles of the sides of pixels along a smooth curve: 0.24 and 1.45.)
 _CRISP = 0.26, 1.6
 # Edges shorter than this, in grains, have no weight; edges shorter than the second do not determine bends.
 _SHORT, _STRAIGHT = 3.0, 6.0

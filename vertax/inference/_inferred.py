@@ -221,13 +221,13 @@ class InferredTensions(eqx.Module):
         }
 
 
-def mask_doubts(report: MaskReport, found: InferredTensions) -> list[str]:
+def mask_doubts(report: MaskReport, result: InferredTensions) -> list[str]:
     """The changes of a mask as sentences, with places.
 
     **Arguments:**
 
     - `report`: the report on the mask.
-    - `found`: the tensions.
+    - `result`: the tensions.
 
     **Returns:** a sentence for each kind of change.
     """
@@ -260,20 +260,20 @@ def mask_doubts(report: MaskReport, found: InferredTensions) -> list[str]:
             places = "; ".join(map(str, changes[:_PLACES]))
             more = f"; and {len(changes) - _PLACES} more" if len(changes) > _PLACES else ""
             doubts.append(f"{text}: {places}{more}")
-    closed = report.closed & np.isfinite(report.shown) & ~found.four_fold
+    closed = report.closed & np.isfinite(report.shown) & ~result.four_fold
     closed &= np.all(
-        np.append(found.labels, 0)[np.asarray(found.tissue.topology.edge_cells)] > 0, axis=1
+        np.append(result.labels, 0)[np.asarray(result.tissue.topology.edge_cells)] > 0, axis=1
     )
     if closed.any():
         doubts.append(
             f"{closed.sum()} contacts are not shown by the mask, because gaps or holes wider than "
             f"{report.gap_width:g} pixels were closed; their tensions are not determined"
         )
-    off = np.flatnonzero((np.abs(found.area_errors) > _AREA_ERROR) & (found.labels > 0))
+    off = np.flatnonzero((np.abs(result.area_errors) > _AREA_ERROR) & (result.labels > 0))
     if len(off):
         cells = [
-            f"label {found.labels[k]} ({found.area_errors[k]:+.0%})"
-            for k in off[np.argsort(-np.abs(found.area_errors[off]))][:_PLACES]
+            f"label {result.labels[k]} ({result.area_errors[k]:+.0%})"
+            for k in off[np.argsort(-np.abs(result.area_errors[off]))][:_PLACES]
         ]
         more = f" and {len(off) - _PLACES} more" if len(off) > _PLACES else ""
         doubts.append(

@@ -1,4 +1,4 @@
-"""Label images from whatever a segmentation was saved as."""
+"""Label images from arrays and files of segmentations."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from vertax.initialise._pieces import connected_pieces
 from vertax.io import read_image
 
 _KINDS = ("auto", "labels", "outlines")
-# A region at the border of the image that is so many times as large as the median cell is none.
+# A region at the border of the image that is larger than this, relative to the median cell, is no cell.
 _OUTSIDE = 5.0
-# What is smaller than this share of it is none either.
+# A region smaller than this, relative to the median cell, is no cell either.
 _SPECK = 0.03
-# Lines are thinner than this share of the size of a cell, or they are no lines.
+# Largest width of lines, relative to the size of a cell.
 _THIN = 0.3
 
 
@@ -227,23 +227,23 @@ class _Outlined(NamedTuple):
 def _outlined(
     candidates: Sequence[Bool[np.ndarray, "rows columns"]], *, check_width: bool, may_fail: bool
 ) -> Int[np.ndarray, "rows columns"] | None:
-    """Labels of the cells between lines: the first of the candidates for the lines that has some.
+    """Labels of the cells between lines, for the first of the candidates for the lines that encloses cells.
 
-    None if there are none and the image may hold labels instead.
+    None if none does and `may_fail`.
 
     **Raises:**
 
     - `ValueError` if none has at least two regions; with `check_width` also if no lines are thinner than
         the cells.
     """
-    found = [_between(lines) for lines in candidates]
-    outlined = [each for each in found if isinstance(each, _Outlined)]
+    regions = [_between(lines) for lines in candidates]
+    outlined = [each for each in regions if isinstance(each, _Outlined)]
     if not outlined and may_fail:
         return None
     if not outlined:
         raise ValueError(
             "Argument `image` must show lines that enclose cells, but they enclose "
-            f"{'one region' if any(found) else 'nothing'}: are they closed?"
+            f"{'one region' if any(regions) else 'nothing'}: are they closed?"
         )
     thin = [each for each in outlined if each.line_width < _THIN * each.cell_size]
     if check_width and not thin:

@@ -31,7 +31,7 @@ class ObservedGeometry(NamedTuple):
     part of its two ends."""
     n_cells: int
     inner: Bool[np.ndarray, " vertices"]
-    """Vertices where three cells meet, whose forces balance."""
+    """Vertices where three cells meet and forces balance."""
     size: float
     """Root of the mean area of a cell."""
 

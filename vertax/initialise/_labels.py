@@ -66,7 +66,7 @@ class Segmentation(eqx.Module):
     absorbed: Int[np.ndarray, " absorbed"]
     """Labels without a cell, ascending; `report` says what became of each."""
     inflated: Int[np.ndarray, " inflated"]
-    """Labels of cells whose corners were moved, because their polygon had next to no area."""
+    """Labels of cells with corners that were moved, because their polygon had nearly no area."""
     pixel_size: PixelSize
     """Length of a pixel side, in the tissue's unit of length; (height, width) if pixels are not square."""
     image_shape: tuple[int, int] = eqx.field(static=True)
@@ -120,7 +120,7 @@ def from_labels(
     two junctions becomes an arc, which keeps the area of its cell; a cell on the outline may have two sides.
 
     A cell so concave that the polygon of its vertices has less than a hundredth of its area in the
-    image, or is inside out, is inflated a little by moving its vertices; `inflated` tells which.
+    image, or is inside out, is inflated a little by moving its vertices; `inflated` lists these cells.
 
     **Arguments:**
 
@@ -150,7 +150,7 @@ def from_labels(
 
     - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
         labels, or has a cell that reaches around the (mirrored) image or around all other cells;
-        for a mask whose label 0 may be that of a cell, because it has negative ones too; for an unknown
+        for a mask with a label 0 that may be that of a cell, because it has negative ones too; for an unknown
         `boundary` or `holes`, a `pixel_size` that is not positive, a `gap_width` that is negative or
         larger than the image, or a `background` that no pixel has.
     - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`.
@@ -244,10 +244,10 @@ def _closed(
     if options.inner_arcs:
         curved = np.full(len(mesh.cell), True)
         tissue = _with_arcs(tissue, mesh, curved, lengths, inner_arcs=True)
-    whole = np.ones(len(label), bool)
+    uncut = np.ones(len(label), bool)
     if not periodic:
         top_bottom, left_right = _touching(image, n)
-        whole = (mesh.cells < n) & ~(top_bottom | left_right)[label]
+        uncut = (mesh.cells < n) & ~(top_bottom | left_right)[label]
     parent = np.append(np.arange(len(values)), parents)
     depth = distance_within(parent[image] != given, spacing, periodic=periodic)
     repaired = Repaired(values, given, image, names, None, np.unique(label))
@@ -263,7 +263,7 @@ def _closed(
     return Segmentation(
         tissue=without_overlaps(tissue, bend_back=True),
         labels=names[label],
-        whole=whole,
+        whole=uncut,
         absorbed=np.setdiff1d(values, names[label]),
         inflated=np.unique(names[label[moved]]),
         pixel_size=as_pixel_size(lengths),

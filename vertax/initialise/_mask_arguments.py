@@ -123,6 +123,6 @@ def _background(mask: Integer[np.ndarray, "rows columns"], given: int | None) ->
         return int(given) if given > 0 else None
     # All others lie within a label that has the whole border, and a cell around all others is none.
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    around = int(border[0])
-    alone = around <= 0 or np.any(border != around) or np.all((mask == around) | (mask <= 0))
-    return None if alone else around
+    label = int(border[0])
+    alone = label <= 0 or np.any(border != label) or np.all((mask == label) | (mask <= 0))
+    return None if alone else label

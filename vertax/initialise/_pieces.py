@@ -75,7 +75,7 @@ def without_specks(
 def join_pieces(
     image: Int[np.ndarray, "rows columns"], n_labels: int, periodic: bool, *, keep_holes: bool
 ) -> tuple[Int[np.ndarray, "rows columns"], Int[np.ndarray, " new_labels"]]:
-    """An image whose labels are connected.
+    """An image of connected labels.
 
     Of each label the largest piece stays. A piece of at least 0.25 median cells becomes a new label.
     Of the others, those of at least 0.03 median cells become holes, if holes are kept, because whatever the

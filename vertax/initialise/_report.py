@@ -177,7 +177,7 @@ def changes_of(repaired: Repaired, gap_width: float, depth: np.ndarray) -> tuple
     first[flat[::-1]] = np.arange(final.size)[::-1]
     present = set(names[repaired.cells].tolist())
     new = set(np.setdiff1d(names, np.append(values, 0)).tolist())
-    found = []
+    changes = []
     for k in interesting.tolist():
         old, into = int(label.flat[first[k]]), int(now.flat[first[k]])
         if gaps[k]:
@@ -191,8 +191,8 @@ def changes_of(repaired: Repaired, gap_width: float, depth: np.ndarray) -> tuple
         else:
             kind = "piece" if old in present else "absorbed"
         size = int(pieces.size[k])
-        found.append(MaskChange(kind, old, into, size, float(row[k]), float(column[k])))
-    return tuple(sorted(found, key=lambda change: -change.pixels))
+        changes.append(MaskChange(kind, old, into, size, float(row[k]), float(column[k])))
+    return tuple(sorted(changes, key=lambda change: -change.pixels))
 
 
 def report_on(

@@ -128,8 +128,8 @@ def scale_bar(
     **Arguments:**
 
     - `ax`: the axes, after all is drawn.
-    - `unit`: what lengths are told in.
-    - `unit_length`: how long that is, in the tissue's units of length.
+    - `unit`: name of the unit of length.
+    - `unit_length`: length of the unit, in the tissue's units of length.
     - `length`: of the bar, in `unit`s; by default 1, 2 or 5 times a power of ten, and at most a quarter
         of the width.
 
