@@ -103,8 +103,8 @@ def from_labels(
         be a cell, because there are negative labels too, `background=0` states that it is none). One label
         all along the border of the image, which so surrounds all others, is the background;
     - of a label in several pieces the largest stays (pixels are connected by their sides, not by
-        their corners). Every other piece of at least a quarter of the median cell becomes a cell with a new
-        label; a smaller one goes to the neighbour with the longest common interface;
+        their corners). Every other piece of at least a quarter of the median cell (and 25 pixels) becomes a
+        cell with a new label; a smaller one goes to the neighbour with the longest common interface;
     - a label inside another (alone or in a group) goes to the one around it;
     - a label with only two sides goes to the neighbour with the longest common interface. In a
         mirrored image this happens to small cells at the border, which gain no side by being

@@ -13,6 +13,8 @@ from vertax.initialise._gaps import EXTERIOR, FIRST_HOLE, GAP, fill_gaps
 
 # Areas relative to the median cell: of the smallest piece that is a cell, and of the largest speck.
 _CELL, _SPECK = 0.25, 0.03
+# Smallest number of pixels of a piece that becomes a cell.
+_CELL_PIXELS = 25
 
 
 class Pieces(NamedTuple):
@@ -77,7 +79,8 @@ def join_pieces(
 ) -> tuple[Int[np.ndarray, "rows columns"], Int[np.ndarray, " new_labels"]]:
     """An image of connected labels.
 
-    Of each label the largest piece stays. A piece of at least 0.25 median cells becomes a new label.
+    Of each label the largest piece stays. A piece of at least 0.25 median cells (and 25 pixels) becomes a new
+    label.
     Of the others, those of at least 0.03 median cells become holes, if holes are kept, because whatever the
     neighbour that received them its contacts could be wrong; all others go to the neighbour with the longest
     common interface.
@@ -93,8 +96,9 @@ def join_pieces(
         return image, np.zeros(0, int)
     value = value.copy()
     is_label = value >= 0
-    median = float(np.median(size[kept & is_label]))
-    new = np.flatnonzero(~kept & is_label & (size >= _CELL * median))
+    labelled = np.bincount(value[is_label], size[is_label])
+    median = float(np.median(labelled[labelled > 0]))
+    new = np.flatnonzero(~kept & is_label & (size >= max(_CELL * median, _CELL_PIXELS)))
     parents = value[new]
     value[new] = n_labels + np.arange(len(new))
     kept[new] = True
