@@ -63,7 +63,7 @@ class MaskReport(eqx.Module):
     """Number of pixels of each."""
     became: Int[np.ndarray, " labels"]
     """Label of the cell that has most of these pixels: the label itself if it is a cell, 0 for none."""
-    changes: tuple[MaskChange, ...]
+    changes: tuple[MaskChange, ...] = eqx.field(static=True)
     """Regions with another label than in the mask, and holes; the largest first."""
     gap_width: float
     """Largest width of the gaps that were closed, in the shorter side of a pixel."""
