@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -16,12 +17,13 @@ from vertax._base.pixels import PixelSize, pixel_length
 from vertax.inference._balance import equations
 from vertax.inference._curves import Points, read_courses
 from vertax.inference._inferred import InferredTensions
-from vertax.inference._mask import read_mask
+from vertax.inference._mask import labels_and_lines
 from vertax.inference._observed_geometry import observed_geometry
 from vertax.inference._outcome import outcome
 from vertax.inference._resampling import resampled_deviations
 from vertax.inference._solve import observability, solve
 from vertax.initialise import MaskReport, Segmentation, from_labels
+from vertax.initialise._report import LEAST_LENGTH
 from vertax.io import Foam, pixel_aspect, read_surface_evolver
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
@@ -107,7 +109,7 @@ def infer_tensions(
     if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in _EVOLVER:
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
-        mask = read_mask(source, kind=kind, background=background, plane=plane)
+        mask, line_width = labels_and_lines(source, kind, background, plane)
         if pixel_size is None and isinstance(source, str | os.PathLike):
             pixel_size = _pixels_of_file(Path(source), mask)
         source = from_labels(
@@ -118,6 +120,7 @@ def infer_tensions(
             holes=holes,
             inner_arcs=True,
         )
+        source = _across_lines(source, line_width)
     if isinstance(source, Segmentation):
         course = _of_mask(source)
     elif isinstance(source, Foam):
@@ -180,6 +183,17 @@ def _pixels_of_file(file: Path, mask: Int[np.ndarray, "rows columns"]) -> PixelS
         return None
     width = np.sqrt(len(np.unique(mask[mask > 0])) / (np.count_nonzero(mask > 0) * aspect))
     return (float(aspect * width), float(width))
+
+
+def _across_lines(source: Segmentation, line_width: float) -> Segmentation:
+    """The segmentation, with contacts shorter than 1.5 times the width of the lines marked as uncertain."""
+    report = source.report
+    if report is None or line_width == 0:
+        return source
+    chord = np.linalg.norm(geometry_of(source.tissue).edge_vectors, axis=1)
+    short = chord < LEAST_LENGTH * line_width * pixel_length(source.pixel_size)
+    report = dataclasses.replace(report, uncertain=report.uncertain | short, line_width=line_width)
+    return dataclasses.replace(source, report=report)
 
 
 def _of_mask(source: Segmentation) -> _Course:

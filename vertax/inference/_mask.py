@@ -60,6 +60,16 @@ def read_mask(
         be that of a cell (0 and negative ones), outlines that enclose less than two cells, and two values of
         which neither is a line thinner than a third of a cell, unless `kind` is `"outlines"`.
     """
+    return labels_and_lines(image, kind, background, plane)[0]
+
+
+def labels_and_lines(
+    image: Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
+    kind: str,
+    background: int | None,
+    plane: int | None,
+) -> tuple[Int[np.ndarray, "rows columns"], float]:
+    """The labels of [`read_mask`][vertax.inference.read_mask], and the width of the lines in pixels, or 0."""
     if kind not in _KINDS:
         raise ValueError(
             f"Argument `kind` must be one of {', '.join(map(repr, _KINDS))}, but is {kind!r}."
@@ -89,10 +99,10 @@ def read_mask(
         labels_only = kind == "auto" and len(colours) == 2 and colours[0] > 0
         outlined = _outlined(lines, check_width=kind == "auto", may_fail=labels_only)
         if outlined is not None:
-            return outlined
+            return outlined.labels, outlined.line_width
     if pixels.ndim == 2 and pixels.dtype.kind in "iu":
         check_zero("image", pixels, background)
-    return np.maximum(values, 0)
+    return np.maximum(values, 0), 0.0
 
 
 def one_plane(pixels: np.ndarray, plane: int | None) -> np.ndarray:
@@ -226,7 +236,7 @@ class _Outlined(NamedTuple):
 
 def _outlined(
     candidates: Sequence[Bool[np.ndarray, "rows columns"]], *, check_width: bool, may_fail: bool
-) -> Int[np.ndarray, "rows columns"] | None:
+) -> _Outlined | None:
     """Labels of the cells between lines, for the first of the candidates for the lines that encloses cells.
 
     None if none does and `may_fail`.
@@ -247,13 +257,15 @@ def _outlined(
         )
     thin = [each for each in outlined if each.line_width < _THIN * each.cell_size]
     if check_width and not thin:
+        if may_fail:
+            return None
         first = outlined[0]
         raise ValueError(
             "Argument `image` must hold labels, or lines that are thinner than cells, but what may be a line "
             f"is {first.line_width:.0f} pixels wide between regions of {first.cell_size:.0f} pixels. Number "
             "the cells of a binary mask, e.g. by scipy.ndimage.label; pass kind='outlines' for thick lines."
         )
-    return (thin or outlined)[0].labels
+    return (thin or outlined)[0]
 
 
 def _between(lines: Bool[np.ndarray, "rows columns"]) -> _Outlined | int:

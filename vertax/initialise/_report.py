@@ -15,7 +15,7 @@ from vertax.initialise._pieces import connected_pieces
 # A contact is closed if less than this share of its length is shown by the mask.
 _LEAST_SHOWN = 0.5
 # A contact across a gap is uncertain if it is shorter than this times the width of the gap.
-_LEAST_LENGTH = 1.5
+LEAST_LENGTH = 1.5
 # Number of changes in a summary.
 _LISTED = 50
 
@@ -262,4 +262,4 @@ def contacts_of(
     shown = np.where(count > 0, np.bincount(edge, shows, n) / np.maximum(count, 1), 1.0)
     widest = np.zeros(n)
     np.maximum.at(widest, edge, np.where(shows, width, 0.0))
-    return shown, length < _LEAST_LENGTH * widest, shows
+    return shown, length < LEAST_LENGTH * widest, shows
