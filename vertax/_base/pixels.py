@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, SupportsFloat, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -10,6 +10,7 @@ from jaxtyping import Float
 from vertax._base.checks import check_number
 
 PixelSize: TypeAlias = float | tuple[float, float]
+PixelSizeLike: TypeAlias = SupportsFloat | tuple[SupportsFloat, SupportsFloat]
 
 
 def check_pixel_size(name: str, value: Any) -> None:

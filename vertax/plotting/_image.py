@@ -5,20 +5,20 @@ from __future__ import annotations
 from typing import Any, SupportsFloat
 
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Real, Shaped
+from jaxtyping import Array, Float, Real, Shaped
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from vertax._base.pixels import check_pixel_size, pixel_sides
+from vertax._base.pixels import PixelSizeLike, check_pixel_size, pixel_sides
 from vertax.plotting import _style
 
 
 def plot_image(
     image: Real[np.ndarray, " ..."],
     *,
-    pixel_size: ArrayLike = 1.0,
+    pixel_size: PixelSizeLike = 1.0,
     ax: Axes | None = None,
     figure: Figure | None = None,
 ) -> Axes:
@@ -53,7 +53,7 @@ def plot_image(
     return ax
 
 
-def draw_image(ax: Axes, image: np.ndarray, pixel_size: ArrayLike) -> None:
+def draw_image(ax: Axes, image: np.ndarray, pixel_size: PixelSizeLike) -> None:
     """An image, its first row at the top, the y axis pointing down."""
     size = extent_of(image, pixel_size)
     grey: dict[str, Any] = {}
@@ -65,7 +65,7 @@ def draw_image(ax: Axes, image: np.ndarray, pixel_size: ArrayLike) -> None:
     ax.imshow(image, origin="upper", extent=extent, zorder=0, **grey)
 
 
-def extent_of(image: np.ndarray, pixel_size: ArrayLike) -> np.ndarray:
+def extent_of(image: np.ndarray, pixel_size: PixelSizeLike) -> np.ndarray:
     """Width and height of an image."""
     if image.size == 0 or image.ndim < 2 or image.shape[2:] not in ((), (3,)):
         raise ValueError(

@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, SupportsFloat, TypeAlias
 
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Real
+from jaxtyping import Array, Bool, Real
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
+from vertax._base.pixels import PixelSizeLike
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
@@ -44,7 +45,7 @@ def plot_tissues(
     colorbar: bool | str = True,
     linewidth: SupportsFloat | None = None,
     image: Real[np.ndarray, " ..."] | None = None,
-    pixel_size: ArrayLike = 1.0,
+    pixel_size: PixelSizeLike = 1.0,
 ) -> list[Axes]:
     """Draw tissues side by side, to compare them: on one scale of colours and one scale of lengths.
 
@@ -102,7 +103,9 @@ def plot_tissues(
     with _style.house_style():
         if axes is None:
             view = views[0]
-            extent = view[1] - view[0] if view is not None else extent_of(np.asarray(image), pixel_size)
+            extent = (
+                view[1] - view[0] if view is not None else extent_of(np.asarray(image), pixel_size)
+            )
             height = 2.4 * float(np.clip(extent[1] / extent[0], 0.25, 2))
             room = 0.75 * len(bars)
             axes = _style.new_axes(

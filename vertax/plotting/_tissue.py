@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, SupportsFloat
 
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Real
+from jaxtyping import Array, Bool, Real
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
@@ -13,6 +13,7 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from vertax._base.pixels import PixelSizeLike
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
@@ -45,7 +46,7 @@ def plot_tissue(
     alpha: SupportsFloat | None = None,
     linewidth: SupportsFloat | None = None,
     image: Real[np.ndarray, " ..."] | None = None,
-    pixel_size: ArrayLike = 1.0,
+    pixel_size: PixelSizeLike = 1.0,
 ) -> Axes:
     """Draw a tissue, its cells and edges coloured by values.
 
@@ -141,7 +142,7 @@ def draw(
     alpha: SupportsFloat | None = None,
     linewidth: SupportsFloat | None = None,
     image: np.ndarray | None = None,
-    pixel_size: ArrayLike = 1.0,
+    pixel_size: PixelSizeLike = 1.0,
 ) -> Axes:
     """Draw what `plot_tissue` draws, with cells placed as in `drawing`; `view` is what to show."""
     _style.one_of(ax, figure)
