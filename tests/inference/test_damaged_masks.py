@@ -46,11 +46,13 @@ def test_a_missing_cell_is_a_hole_with_undetermined_sides(foam, mask, inner):
     assert invented(inferred, foam) == []
     assert agree(inferred, foam)
     (hole,) = inferred.mask_report.of_kind("hole")
-    assert hole.pixels == np.sum(mask == inner)
+    assert hole.pixels == pytest.approx(np.sum(mask == inner), rel=0.002)  # without its corners
     row, column = np.argwhere(mask == inner).mean(axis=0)
-    assert hole.row == pytest.approx(row)
-    assert hole.column == pytest.approx(column)
-    assert any(f"a hole of {hole.pixels} pixels at row {row:.0f}" in d for d in inferred.doubts)
+    assert hole.row == pytest.approx(row, abs=0.1)
+    assert hole.column == pytest.approx(column, abs=0.1)
+    assert any(
+        f"a hole of {hole.pixels} pixels at row {hole.row:.0f}" in d for d in inferred.doubts
+    )
     table = inferred.cell_table()
     np.testing.assert_array_equal(table["hole"], table["label"] == 0)
 
@@ -127,7 +129,7 @@ def test_pixels_that_are_not_square_have_a_height_and_a_width(foam, mask, tmp_pa
     assert narrow.pixel_size == (1.0, 2.0)
     assert agree(narrow, foam)
     areas = np.asarray(narrow.tissue.areas)[np.argsort(narrow.labels)]
-    np.testing.assert_allclose(areas, np.bincount(mask.ravel())[1:], rtol=0.03)
+    np.testing.assert_allclose(areas, np.bincount(mask.ravel())[1:], rtol=0.02)
     # From the resolution of a file: pixels per length along x and along y.
     file = tmp_path / "narrow.tif"
     tifffile.imwrite(file, mask[:, ::2].astype(np.uint16), resolution=(1.0, 2.0))
@@ -193,6 +195,17 @@ def test_labels_too_large_for_their_type_are_refused(mask, dtype, label, message
     large[mask == 3] = label
     with pytest.raises(ValueError, match=message):
         infer_tensions(large)
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_cells_have_the_areas_and_outlines_of_their_pixels(mask, step):
+    """Vertices on the outline move along the edges that end there; the arcs of the outline have to follow."""
+    result = infer_tensions(mask[:, ::step], pixel_size=(1.0, float(step)))
+    assert np.max(np.abs(result.area_errors)) < 0.02
+    assert np.max(result.outline_errors) < 2
+    table = result.cell_table()
+    np.testing.assert_array_equal(table["area_error"], result.area_errors)
+    np.testing.assert_array_equal(table["outline_error"], result.outline_errors)
 
 
 def check_contacts(seed):

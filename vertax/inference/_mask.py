@@ -96,7 +96,7 @@ def labels_and_lines(
         if len(colours) == 2:
             lines = [values == colour for colour in colours[np.argsort(counts, kind="stable")]]
         # Two labels without background that fill the image enclose nothing, and are two cells.
-        labels_only = kind == "auto" and len(colours) == 2 and colours[0] > 0
+        labels_only = kind == "auto" and len(colours) == 2 and bool(colours[0] > 0)
         outlined = _outlined(lines, check_width=kind == "auto", may_fail=labels_only)
         if outlined is not None:
             return outlined.labels, outlined.line_width

@@ -15,6 +15,7 @@ from vertax.inference._inferred import InferredTensions
 from vertax.inference._solve import Balance
 from vertax.initialise import MaskReport
 from vertax.mesh import Tissue
+from vertax.mesh._arcs import angle_of_area
 from vertax.mesh._geometry import geometry_of
 
 # A tension with a larger standard deviation, relative to the mean, is not determined.
@@ -86,8 +87,10 @@ def outcome(
 
     **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions].
     """
-    tissue = _moved(tissue, curves.change)
     labels, pixel_size, four_fold, report = source
+    tissue = _moved(tissue, curves.change)
+    if report is not None:
+        tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
     result = relative(balance, which)
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
@@ -129,14 +132,47 @@ def _outline_errors(
 ) -> Float[np.ndarray, " cells"]:
     """Root mean square distance of the points around each cell from its arcs."""
     geometry, edge = geometry_of(tissue), points.edge
-    shift = change[: 2 * tissue.n_vertices].reshape(-1, 2)
-    p = points.away - shift[geometry.edge_vertices[edge, 0]]
+    p = _from_moved_vertices(tissue, points, change)
     distance = arc_distances(geometry.edge_vectors[edge], geometry.edge_angles[edge], p)
     total, count = np.zeros((2, tissue.n_cells + 1))
     for side in geometry.edge_cells.T:
         np.add.at(total, side[edge], distance**2)
         np.add.at(count, side[edge], 1)
     return np.sqrt(total / np.maximum(count, 1))[:-1]
+
+
+def _from_moved_vertices(
+    tissue: Tissue, points: Points, change: Float[np.ndarray, " geometry"]
+) -> Float[np.ndarray, "points 2"]:
+    """The points relative to the first vertices of their edges after these moved."""
+    shift = change[: 2 * tissue.n_vertices].reshape(-1, 2)
+    return points.away - shift[geometry_of(tissue).edge_vertices[points.edge, 0]]
+
+
+def _with_outline_of_mask(
+    tissue: Tissue,
+    points: Points,
+    change: Float[np.ndarray, " geometry"],
+    fitted: Int[np.ndarray, " some"],
+) -> Tissue:
+    """The tissue with arcs of the areas in the mask in place of those that were not fitted.
+
+    The ends of an edge on the outline move along the edges that end there, and its angle has to follow.
+    """
+    geometry, edge = geometry_of(tissue), points.edge
+    p, chord = _from_moved_vertices(tissue, points, change), geometry.edge_vectors
+    # Area between the points and the chord, right of the chord.
+    same = edge[1:] == edge[:-1]
+    last = np.append(edge[1:] != edge[:-1], True)
+    area = np.zeros(tissue.n_edges)
+    np.add.at(area, edge[:-1][same], 0.5 * np.linalg.det(np.stack([p[:-1], p[1:]], 1)[same]))
+    np.add.at(area, edge[last], 0.5 * np.linalg.det(np.stack([p[last], chord[edge[last]]], 1)))
+    other = np.zeros(tissue.n_edges, bool)
+    other[edge] = True
+    other[fitted] = False
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
+    angles = np.where(other, angle_of_area(area, length), geometry.edge_angles)
+    return tissue.with_angles(jnp.asarray(angles, tissue.vertices.dtype))
 
 
 def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
