@@ -50,7 +50,7 @@ def test_correlation_and_contrast_fall_when_the_mesh_is_moved(pinned):
     assert pinned.correlation(tissue) > 0.6
     assert pinned.correlation(moved) < pinned.correlation(tissue) - 0.05
     assert pinned.membrane_contrast(moved) < pinned.membrane_contrast(tissue) - 0.1
-    value = float(jax.jit(lambda t: pinned.problem.cost(t, pinned.problem.energy))(seen))
+    value = float(jax.jit(lambda t: pinned.problem.cost(t, pinned.problem.energy))(tissue))
     assert pinned.correlation(tissue) == pytest.approx(np.sqrt(1 - 2 * value))
 
 

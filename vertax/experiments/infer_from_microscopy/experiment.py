@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from vertax._base.pixels import pixel_length, pixel_sides
 from vertax.fitting import Fit
 from vertax.inference import Micrograph
 from vertax.plotting import plot_history
