@@ -137,7 +137,9 @@ def match_cells(config: Config, micrograph: Any, tissue: vx.Tissue) -> tuple[np.
     """Complete cells of the segmented mesh, and the true cells with the nearest centroids."""
     cells, segmentation = np.flatnonzero(micrograph.whole), micrograph.segmentation
     pixel = float(np.sqrt(tissue.n_cells)) / config.microscope.pixels
-    centroids = np.asarray(segmentation.tissue.centroids)[cells] / segmentation.pixel_size * pixel
+    centroids = (
+        np.asarray(segmentation.tissue.centroids)[cells] / vx.io.pixel_sides(segmentation.pixel_size) * pixel
+    )
     vectors = tissue.boundary.shortest(jnp.asarray(centroids)[:, None] - tissue.centroids[None])
     distance = np.asarray(jnp.linalg.norm(vectors, axis=-1))
     nearest, close = distance.argmin(axis=1), distance.min(axis=1) < 0.25
@@ -219,7 +221,7 @@ def plot_images(pictures: dict[str, tuple[np.ndarray, Any, Any]]) -> Any:
         size: dict[str, Any] = {"pixel_size": segmentation.pixel_size}
         plotting.plot_image(pixels, ax=raw, **size)
         vx.plot_tissue(fit.tissue, ax=fitted, image=pixels, linewidth=0.9, **size)
-        plotting.scale_bar(raw, "pixels", unit_length=segmentation.pixel_size)
+        plotting.scale_bar(raw, "pixels", unit_length=vx.io.pixel_sides(segmentation.pixel_size)[0])
         raw.set_title(title)
         fitted.set_title("fitted mesh")
     return figure

@@ -18,7 +18,7 @@ def rasterise(seeds: np.ndarray, shape: tuple[int, int], periodic: bool = True) 
 
 
 def clear_seeds(n: int, shape: tuple[int, int], seed: int) -> np.ndarray:
-    """Seeds of cells whose edges are long compared to a pixel."""
+    """Seeds of cells with edges longer than 3 pixels."""
     box = np.diag(np.array(shape[::-1], float))
     rng = np.random.default_rng(seed)
     while True:
@@ -77,10 +77,10 @@ def polygon(segmentation: Segmentation, label: int) -> np.ndarray:
     m = segmentation.tissue.topology
     cell = int(np.flatnonzero(segmentation.labels == label)[0])
     h = int(np.flatnonzero(np.asarray(m.cell) == cell)[0])
-    around = [h]
-    while (h := int(m.next[h])) != around[0]:
-        around.append(h)
-    return np.asarray(segmentation.tissue.corners)[around] / segmentation.pixel_size
+    sides = [h]
+    while (h := int(m.next[h])) != sides[0]:
+        sides.append(h)
+    return np.asarray(segmentation.tissue.corners)[sides] / segmentation.pixel_size
 
 
 def honeycomb() -> np.ndarray:

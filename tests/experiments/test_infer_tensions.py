@@ -55,3 +55,27 @@ def test_a_colour_image_is_read_and_there_is_a_key_for_its_channel(tmp_path):
     assert len(np.unique(config.image.labels())) == len(np.unique(labels))
     chosen = config.image.model_copy(update={"channel": 1})
     np.testing.assert_array_equal(chosen.labels(), labels)
+
+
+@pytest.mark.slow  # compiles for half a minute
+def test_damage_of_a_mask_is_in_metrics_and_tables(tmp_path):
+    cluster = vx.initialise.free_voronoi(14, key=jax.random.key(3), lloyd_steps=3)
+    labels = vx.inference.label_image(cluster, 300)
+    centres = np.asarray(cluster.centroids)
+    inner = np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1)) + 1
+    np.save(tmp_path / "mask.npy", np.where(labels == inner, 0, labels))
+    (tmp_path / "mask.toml").write_text(
+        'experiment = "infer_tensions"\nimage = { path = "mask.npy" }'
+    )
+    folder, metrics = run(
+        tmp_path / "mask.toml", tmp_path / "out", f"image.path={tmp_path / 'mask.npy'}"
+    )
+    assert metrics["n_cells"] == 13
+    assert metrics["n_holes"] == 1
+    assert metrics["mask"]["n_changes"] == {"hole": 1}
+    (hole,) = metrics["mask"]["largest_changes"]
+    assert hole["pixels"] == np.sum(labels == inner)
+    assert table(folder / "changes.csv")["kind"] == ["hole"]
+    assert table(folder / "cells.csv")["hole"].count("True") == 1
+    assert "contact_closed" in table(folder / "edges.csv")
+    assert any("holes" in warning for warning in metrics["warnings"])

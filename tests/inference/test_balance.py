@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from foam_helpers import against_truth
 from free_helpers import cluster
 
 import vertax as vx
-from vertax.energies import AreaElasticity, LineTension
 from vertax.inference import infer_tensions, label_image, pearson, read_mask
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -18,46 +18,20 @@ needs_data = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(scope="module")
-def foam():
-    """A cluster in equilibrium, its tensions and pressures."""
-    tissue = cluster(14, 3, lloyd_steps=3, inner_arcs=True)
-    tension = jax.random.uniform(jax.random.key(1), (tissue.n_edges,), minval=0.7, maxval=1.3)
-    area = AreaElasticity(
-        20.0, jax.random.uniform(jax.random.key(2), (14,), minval=0.9, maxval=1.3)
-    )
-    relax = vx.Relaxation(tolerance=1e-11, contact_range=None)
-    relaxed = relax(tissue, area + LineTension(tension)).tissue
-    return relaxed, np.asarray(tension), np.asarray(area.pressures(relaxed))
-
-
-def against_truth(found, foam):
-    """True and found tensions of what is determined, and deviations, each relative to its mean."""
-    tissue, tension, _ = foam
-    number = np.append(found.labels, 0)
-    pairs = np.sort(number[np.asarray(found.tissue.topology.edge_cells)], axis=1)
-    true = np.append(np.arange(1, tissue.n_cells + 1), 0)
-    known = np.sort(true[np.asarray(tissue.topology.edge_cells)], axis=1).tolist()
-    edge = np.array([known.index(pair) if pair in known else -1 for pair in pairs.tolist()])
-    use = found.determined & (edge >= 0)
-    wanted = tension[edge[use]]
-    return wanted / wanted.mean(), found.tensions[use], found.tension_deviations[use]
-
-
-def test_an_exact_shape_gives_tensions_and_pressures_back(foam):
+def test_tensions_and_pressures_of_an_exact_shape(foam):
     tissue, tension, pressure = foam
-    found = infer_tensions(tissue)
-    sure = found.determined
+    result = infer_tensions(tissue)
+    sure = result.determined
     assert sure.sum() > 10
     np.testing.assert_allclose(
-        found.tensions[sure], tension[sure] / tension[sure].mean(), rtol=1e-2
+        result.tensions[sure], tension[sure] / tension[sure].mean(), rtol=1e-2
     )
-    cells = found.pressures_determined
+    cells = result.pressures_determined
     wanted = pressure[cells] / tension[sure].mean()
-    np.testing.assert_allclose(found.pressures[cells], wanted - wanted.mean(), atol=1e-2)
-    assert not found.determined[np.asarray(tissue.topology.on_outline)].any()
-    assert np.isnan(found.tensions[np.asarray(tissue.topology.on_outline)]).all()
-    assert found.doubts == []
+    np.testing.assert_allclose(result.pressures[cells], wanted - wanted.mean(), atol=1e-2)
+    assert not result.determined[np.asarray(tissue.topology.on_outline)].any()
+    assert np.isnan(result.tensions[np.asarray(tissue.topology.on_outline)]).all()
+    assert result.doubts == []
 
 
 # Three cells around the vertex 1; the outline of each has a vertex in its middle.
@@ -97,8 +71,8 @@ def test_labels_of_cells_differ_from_that_of_the_exterior(foam, tmp_path):
     from_dump, from_tissue = infer_tensions(tmp_path / "triplet.fe"), infer_tensions(foam[0])
     np.testing.assert_array_equal(from_dump.labels, [3, 7, 9])
     np.testing.assert_array_equal(from_tissue.labels, np.arange(1, 15))
-    for found in (from_dump, from_tissue):
-        edges, cells = found.edge_table(), found.cell_table()
+    for result in (from_dump, from_tissue):
+        edges, cells = result.edge_table(), result.cell_table()
         label = dict(zip(cells["cell"], cells["label"], strict=True)) | {-1: 0}
         for side in ("left", "right"):
             np.testing.assert_array_equal(
@@ -112,8 +86,8 @@ def test_edges_where_four_cells_meet_name_no_pair():
     """On a square lattice the numbers of the cells decide which two share an edge of length 0."""
     place, tables = np.kron(np.arange(36).reshape(6, 6), np.ones((20, 20), int)), []
     for numbers in (np.arange(36), np.random.default_rng(1).permutation(36)):
-        found = infer_tensions(np.pad(numbers[place] + 1, 10))
-        table = found.edge_table()
+        result = infer_tensions(np.pad(numbers[place] + 1, 10))
+        table = result.edge_table()
         assert table["four_fold"].sum() == 25
         assert not table["determined"][table["four_fold"]].any()
         position = {0: -1, -1: -2} | {int(label) + 1: k for k, label in enumerate(numbers)}
@@ -126,90 +100,91 @@ def test_edges_where_four_cells_meet_name_no_pair():
     assert tables[0].count((-2, -2)) == 25
 
 
-def test_turning_moving_and_scaling_a_tissue_changes_nothing(foam):
+def test_inference_is_invariant_under_rotation_translation_and_scaling(foam):
     tissue, *_ = foam
     turn = jnp.array([[0.6, -0.8], [0.8, 0.6]])
     moved = tissue.with_vertices(3.0 * tissue.vertices @ turn.T + 5.0)
-    found, again = infer_tensions(tissue), infer_tensions(moved)
-    np.testing.assert_allclose(found.tensions, again.tensions, atol=1e-6)
-    np.testing.assert_allclose(found.tension_deviations, again.tension_deviations, atol=1e-6)
-    np.testing.assert_allclose(found.pressures, 3 * again.pressures, atol=1e-6)
+    result, again = infer_tensions(tissue), infer_tensions(moved)
+    np.testing.assert_allclose(result.tensions, again.tensions, atol=1e-6)
+    np.testing.assert_allclose(result.tension_deviations, again.tension_deviations, atol=1e-6)
+    np.testing.assert_allclose(result.pressures, 3 * again.pressures, atol=1e-6)
     np.testing.assert_allclose(
-        found.stresses, 3 * np.einsum("ai,nij,bj->nab", turn.T, again.stresses, turn.T), atol=1e-5
+        result.stresses, 3 * np.einsum("ai,nij,bj->nab", turn.T, again.stresses, turn.T), atol=1e-5
     )
 
 
-def test_a_mask_gives_them_within_their_deviations(foam):
-    found = infer_tensions(label_image(foam[0], 500))
-    true, inferred, deviation = against_truth(found, foam)
+def test_tensions_of_a_mask_agree_within_their_deviations(foam):
+    result = infer_tensions(label_image(foam[0], 500))
+    true, inferred, deviation = against_truth(result, foam)
     assert pearson(true, inferred) > 0.9
     assert np.mean(np.abs(inferred - true) < 2 * deviation) > 0.85
     # Not by deviations that are too large.
     assert np.mean(np.abs(inferred - true) < 0.5 * deviation) < 0.7
     assert np.median(deviation) < 0.1
-    assert found.pixel_size is not None
-    assert found.noise < found.pixel_size
+    assert result.pixel_size is not None
+    assert result.noise < result.pixel_size
 
 
 def test_stresses_are_the_tensions_less_the_pressure(foam):
     tissue, *_ = foam
-    found = infer_tensions(tissue)
-    inside = np.isfinite(found.stresses).all(axis=(1, 2))
+    result = infer_tensions(tissue)
+    inside = np.isfinite(result.stresses).all(axis=(1, 2))
     assert inside.any()
-    half = 0.5 * np.where(np.isfinite(found.tensions), found.tensions, 0) * tissue.edge_lengths
+    half = 0.5 * np.where(np.isfinite(result.tensions), result.tensions, 0) * tissue.edge_lengths
     pull = np.zeros(tissue.n_cells + 1)
     for side in np.asarray(tissue.topology.edge_cells).T:
         np.add.at(pull, side, half)
-    trace = pull[:-1] / np.asarray(tissue.areas) - 2 * found.pressures
-    found_trace = np.trace(found.stresses, axis1=1, axis2=2)
+    trace = pull[:-1] / np.asarray(tissue.areas) - 2 * result.pressures
+    found_trace = np.trace(result.stresses, axis1=1, axis2=2)
     np.testing.assert_allclose(found_trace[inside], trace[inside], rtol=1e-3, atol=1e-4)
 
 
-def test_a_shape_out_of_balance_is_told_from_noise(foam):
+def test_imbalance_is_distinguished_from_noise(foam):
     tissue, *_ = foam
     noise = 0.06 * jax.random.normal(jax.random.key(5), tissue.vertices.shape)
-    found = infer_tensions(tissue.with_vertices(tissue.vertices + noise))
-    still = infer_tensions(tissue)
-    assert found.model_errors[0] > 5 * still.model_errors[0]
-    assert np.nanmedian(found.tension_deviations) > 3 * np.nanmedian(still.tension_deviations)
+    result = infer_tensions(tissue.with_vertices(tissue.vertices + noise))
+    at_rest = infer_tensions(tissue)
+    assert result.model_errors[0] > 5 * at_rest.model_errors[0]
+    assert np.nanmedian(result.tension_deviations) > 3 * np.nanmedian(at_rest.tension_deviations)
 
 
-def test_turning_the_noise_over_gives_deviations_like_those_of_laplace(foam):
-    found = infer_tensions(label_image(foam[0], 400), resamples=24)
-    sure = found.determined
-    assert found.resampled_deviations is not None
-    ratio = found.resampled_deviations[sure] / found.tension_deviations[sure]
+def test_bootstrap_agrees_with_laplace_approximation(foam):
+    result = infer_tensions(label_image(foam[0], 400), resamples=24)
+    sure = result.determined
+    assert result.resampled_deviations is not None
+    ratio = result.resampled_deviations[sure] / result.tension_deviations[sure]
     assert 0.4 < np.median(ratio) < 1.6
     again = infer_tensions(label_image(foam[0], 400), resamples=24)
     assert again.resampled_deviations is not None
     np.testing.assert_array_equal(
-        found.resampled_deviations[sure], again.resampled_deviations[sure]
+        result.resampled_deviations[sure], again.resampled_deviations[sure]
     )
 
 
-def test_polygons_are_no_foam_and_that_is_said():
+def test_polygons_raise_doubts():
     """Straight edges that meet at any angle: nothing is at rest in that shape."""
     tissue = vx.initialise.free_voronoi(30, key=jax.random.key(4), lloyd_steps=1)
-    found = infer_tensions(label_image(tissue, 900))
+    result = infer_tensions(label_image(tissue, 900))
     assert (
-        found.model_errors[0] > 0.05 or np.median(found.tension_deviations[found.determined]) > 0.1
+        result.model_errors[0] > 0.05
+        or np.median(result.tension_deviations[result.determined]) > 0.1
     )
-    assert found.doubts
+    assert result.doubts
 
 
 def test_results_are_written_as_tables_and_shapes(foam, tmp_path):
-    found = infer_tensions(foam[0])
+    result = infer_tensions(foam[0])
     for name in ("cells.csv", "cells.geojson", "cells.vtu"):
-        for path in found.write(tmp_path / name):
+        for path in result.write(tmp_path / name):
             assert path.stat().st_size > 500
     header = (tmp_path / "cells-edges.csv").read_text().splitlines()[0]
     assert {"tension", "tension_deviation", "determined"} <= set(header.split(","))
     with pytest.raises(ValueError, match=r"must end in \.csv"):
-        found.write(tmp_path / "cells.xlsx")
+        result.write(tmp_path / "cells.xlsx")
 
 
 def outlines(labels, width=1):
-    """The lines of a label image, so many pixels wide."""
+    """The lines of a label image, `width` pixels wide."""
     lines = np.zeros(labels.shape, bool)
     for shift in range(1, width + 1):
         lines[:, shift:] |= labels[:, shift:] != labels[:, :-shift]
@@ -225,20 +200,20 @@ def test_outlines_of_any_kind_give_the_cells(foam, width):
     grey = np.where(lines, 0, 200).astype(np.uint8)
     n = foam[0].n_cells
     for image in (lines, red, grey):
-        found = read_mask(image)
-        assert len(np.unique(found)) == n + 1
-        inside = (labels > 0) & (found > 0)
+        result = read_mask(image)
+        assert len(np.unique(result)) == n + 1
+        inside = (labels > 0) & (result > 0)
         # One label for one label.
-        assert len(np.unique(np.stack([labels, found])[:, inside & ~lines], axis=1).T) == n
+        assert len(np.unique(np.stack([labels, result])[:, inside & ~lines], axis=1).T) == n
 
 
 def test_cells_that_the_border_cuts_are_cells(foam):
     labels = label_image(foam[0], 300)
     cut = labels[90:210, 90:210]
     assert (cut > 0).all()
-    found = read_mask(outlines(cut))
-    assert (found > 0).all()
-    assert len(np.unique(found)) == len(np.unique(cut))
+    result = read_mask(outlines(cut))
+    assert (result > 0).all()
+    assert len(np.unique(result)) == len(np.unique(cut))
 
 
 def test_masks_of_cellpose_and_of_other_backgrounds_are_read(foam, tmp_path):
@@ -258,10 +233,10 @@ def test_a_boolean_mask_of_cells_apart_gives_the_cells(foam):
     n = foam[0].n_cells
     for mask in (labels, np.pad(labels, 80)):
         cells = (mask > 0) & ~outlines(mask, 2)
-        found = read_mask(cells)
-        assert len(np.unique(found)) == n + 1
+        result = read_mask(cells)
+        assert len(np.unique(result)) == n + 1
         # The surroundings are no cell, and lines go to both sides.
-        wrong = (found > 0) != (mask > 0)
+        wrong = (result > 0) != (mask > 0)
         assert wrong.mean() < 0.02
 
 
@@ -320,33 +295,33 @@ def test_what_cannot_be_used_is_refused(foam):
 )
 def test_foams_with_known_tensions(name, least, error):
     path = DATA / "surface_evolver" / name
-    found, foam = infer_tensions(path), vx.io.read_surface_evolver(path)
-    sure = found.determined
+    result, foam = infer_tensions(path), vx.io.read_surface_evolver(path)
+    sure = result.determined
     true = np.asarray(foam.tensions)[sure]
     true = true / true.mean()
-    assert pearson(true, found.tensions[sure]) > least
-    assert np.mean(np.abs(found.tensions[sure] - true) / true) < error
+    assert pearson(true, result.tensions[sure]) > least
+    assert np.mean(np.abs(result.tensions[sure] - true) / true) < error
 
 
 @needs_data
-def test_edges_that_bend_show_it_in_an_image():
-    """A foam in motion: the ends of edges tell tensions, and arcs through them far less."""
+def test_bends_are_inferred_from_an_image():
+    """A foam in motion: the ends of edges determine tensions, arcs through them do not."""
     foam = vx.io.read_surface_evolver(DATA / "surface_evolver" / "movie_6.dmp")
     errors = []
     for shape in (foam, foam.tissue):
-        found = infer_tensions(label_image(shape, 1000))
+        result = infer_tensions(label_image(shape, 1000))
         number = np.append(np.arange(1, foam.tissue.n_cells + 1), 0)
         pairs = np.sort(number[np.asarray(foam.tissue.topology.edge_cells)], axis=1).tolist()
-        table = found.edge_table()
+        table = result.edge_table()
         between = np.sort(np.stack([table["left_label"], table["right_label"]], 1), 1).tolist()
         edge = np.array([pairs.index(p) if p in pairs else -1 for p in between])
-        use = found.determined & (edge >= 0)
+        use = result.determined & (edge >= 0)
         true = np.asarray(foam.tensions)[edge[use]]
-        true, inferred = true / true.mean(), found.tensions[use] / found.tensions[use].mean()
+        true, inferred = true / true.mean(), result.tensions[use] / result.tensions[use].mean()
         errors.append(np.mean(np.abs(inferred - true) / true))
         if shape is foam:
             assert pearson(true, inferred) > 0.98
-            assert any("the tissue moves" in doubt for doubt in found.doubts)
+            assert any("the tissue moves" in doubt for doubt in result.doubts)
     assert errors[0] < 0.15 < errors[1]
 
 
@@ -363,7 +338,7 @@ def test_edges_that_bend_show_it_in_an_image():
     ],
     ids=["zeros", "four axes", "nan", "one", "two", "no image", "no dump"],
 )
-def test_masks_that_tell_nothing_are_refused(mask, message):
+def test_unusable_masks_are_refused(mask, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         infer_tensions(mask)
 
@@ -376,15 +351,15 @@ def test_a_label_in_two_pieces_keeps_the_largest_and_lone_pixels_are_absorbed(fo
         middle = np.rint(np.argwhere(labels == inside).mean(axis=0)).astype(int)
         assert labels[tuple(middle)] == inside
         changed[tuple(middle)] = new
-    found = infer_tensions(changed)
-    assert found.labels.tolist() == np.unique(labels)[1:].tolist()
+    result = infer_tensions(changed)
+    assert result.labels.tolist() == np.unique(labels)[1:].tolist()
 
 
 @needs_data
 @pytest.mark.slow
 def test_a_segmented_wing_cut_out_of_a_tissue():
-    found = infer_tensions(DATA / "segmentations" / "wing_t0.tif")
-    assert found.tissue.n_cells >= 45
+    result = infer_tensions(DATA / "segmentations" / "wing_t0.tif")
+    assert result.tissue.n_cells >= 45
     # Outlines are so rough that most are not determined.
-    assert 0 < found.determined.sum() < np.isfinite(found.tensions).sum()
-    assert found.doubts
+    assert 0 < result.determined.sum() < np.isfinite(result.tensions).sum()
+    assert result.doubts

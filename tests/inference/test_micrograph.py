@@ -45,13 +45,13 @@ def test_parameters_of_a_pinned_border(pinned):
 
 
 def test_correlation_and_contrast_fall_when_the_mesh_is_moved(pinned):
-    seen = pinned.segmentation.tissue
-    moved = seen.with_vertices(seen.vertices + jnp.array([0.15, 0.1]))
-    assert pinned.correlation(seen) > 0.6
-    assert pinned.correlation(moved) < pinned.correlation(seen) - 0.05
-    assert pinned.membrane_contrast(moved) < pinned.membrane_contrast(seen) - 0.1
-    value = float(jax.jit(lambda t: pinned.problem.cost(t, pinned.problem.energy))(seen))
-    assert pinned.correlation(seen) == pytest.approx(np.sqrt(1 - 2 * value))
+    tissue = pinned.segmentation.tissue
+    moved = tissue.with_vertices(tissue.vertices + jnp.array([0.15, 0.1]))
+    assert pinned.correlation(tissue) > 0.6
+    assert pinned.correlation(moved) < pinned.correlation(tissue) - 0.05
+    assert pinned.membrane_contrast(moved) < pinned.membrane_contrast(tissue) - 0.1
+    value = float(jax.jit(lambda t: pinned.problem.cost(t, pinned.problem.energy))(tissue))
+    assert pinned.correlation(tissue) == pytest.approx(np.sqrt(1 - 2 * value))
 
 
 def test_the_rest_area_of_an_inner_cell_is_one():

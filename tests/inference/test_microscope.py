@@ -24,13 +24,13 @@ def test_an_image_has_the_noise_and_background_asked_for():
     assert ratio.min() == pytest.approx(0.8, rel=1e-3)
 
 
-def test_it_is_darker_at_the_corners():
+def test_image_is_darker_at_the_corners():
     ratio = take(background=0.3, vignetting=0.4) / take(background=0.3)
     assert ratio[32, 32] == pytest.approx(1, abs=1e-3)
     assert ratio[0, 0] == pytest.approx(0.6, abs=0.02)
 
 
-def test_faint_stretches_are_on_membranes_and_nowhere_else():
+def test_faint_stretches_are_on_membranes_only():
     clean, faint = take(), take(faint=1.0)
     assert (np.abs(faint) <= np.abs(clean)).all()
     # Every edge has one in its middle.
@@ -56,9 +56,9 @@ def test_bad_settings_are_refused():
 def test_a_label_image_gives_the_cluster_back():
     tissue = cluster(7, lloyd_steps=3)
     labels = label_image(tissue, 400)
-    found = vx.initialise.from_labels(labels, boundary="free")
-    np.testing.assert_array_equal(found.labels, np.arange(1, 8))
-    assert vx.inference.same_neighbours(found.tissue, tissue)
+    result = vx.initialise.from_labels(labels, boundary="free")
+    np.testing.assert_array_equal(result.labels, np.arange(1, 8))
+    assert vx.inference.same_neighbours(result.tissue, tissue)
     counts = np.bincount(labels.ravel())[1:]
     areas = np.asarray(tissue.areas)
     np.testing.assert_allclose(counts / counts.sum(), areas / areas.sum(), rtol=5e-3)

@@ -16,7 +16,7 @@ DATA = Path(os.environ.get("VERTAX_DATA", Path(__file__).parents[3] / "shared/da
 
 @functools.cache
 def drawn():
-    """A cluster whose edges are chains, and tensions that make it move."""
+    """A cluster with chains as edges, and tensions out of balance."""
     cluster = vx.initialise.free_voronoi(7, key=3, lloyd_steps=2)
     chains = list(np.asarray(cluster.edge_points(jnp.linspace(0, 1, 6))))
     rng = np.random.default_rng(0)
@@ -50,7 +50,7 @@ def movie(substeps=20):
     return EdgeMotion([cluster] * 3, frames, [0, 0.02, 0.04], substeps=substeps), frames
 
 
-def test_areas_stay_and_points_go_downhill():
+def test_areas_are_constant_and_energy_decreases():
     cluster, chains, tension = drawn()
     length = lambda frame: sum(
         t * np.linalg.norm(np.diff(c, axis=0), axis=1).sum()
@@ -64,8 +64,8 @@ def test_areas_stay_and_points_go_downhill():
     assert lengths[0] > lengths[1] > lengths[2]
 
 
-def test_a_junction_sets_out_with_the_force_on_it():
-    # In so short a time a junction of straight edges goes along the sum of the tensions; pressures push
+def test_initial_velocity_of_a_junction_is_its_force():
+    # In a short time a junction of straight edges moves along the sum of the tensions; pressures push
     # across. Here all are equal and every edge is straight, so its neighbours on the way do not move.
     _, chains, tension = drawn()
     motion = held(0, 1e-6, substeps=1)
@@ -91,16 +91,16 @@ def test_its_sensitivities_match_finite_differences():
     np.testing.assert_allclose(slopes @ direction, difference.ravel() / 2e-5, atol=1e-8)
 
 
-def test_tensions_of_a_movie_are_found_with_their_errors():
+def test_tensions_of_a_movie_agree_within_their_errors():
     cluster, _, tension = drawn()
     motion, frames = movie()
     inner = motion.inner
     true = tension[inner] / tension[inner].mean()
-    found = motion.tensions()
-    np.testing.assert_allclose(found.tension[inner], true, rtol=1e-3)
-    assert np.isnan(found.tension[~inner]).all()
-    np.testing.assert_allclose(found.mobility, tension[inner].mean(), rtol=1e-3)
-    assert (found.misfit < 1e-3 * found.moved).all()
+    result = motion.tensions()
+    np.testing.assert_allclose(result.tension[inner], true, rtol=1e-3)
+    assert np.isnan(result.tension[~inner]).all()
+    np.testing.assert_allclose(result.mobility, tension[inner].mean(), rtol=1e-3)
+    assert (result.misfit < 1e-3 * result.moved).all()
     rng = np.random.default_rng(2)
     blurred = [[c + 1e-4 * rng.normal(size=c.shape) for c in frame] for frame in frames]
     noisy = EdgeMotion([cluster] * 3, blurred, [0, 0.02, 0.04], substeps=20).tensions()
@@ -140,10 +140,10 @@ def test_the_movie_of_surface_evolver():
     motion = EdgeMotion(
         [f.tissue for f in foams], [f.chains for f in foams], [f.time for f in foams]
     )
-    found = motion.tensions()
+    result = motion.tensions()
     true = np.asarray(foams[0].tensions)[motion.inner]
-    relative = found.tension[motion.inner] / (true / true.mean())
-    assert np.corrcoef(found.tension[motion.inner], true)[0, 1] > 0.9999
+    relative = result.tension[motion.inner] / (true / true.mean())
+    assert np.corrcoef(result.tension[motion.inner], true)[0, 1] > 0.9999
     assert np.mean(np.abs(relative - 1)) < 0.01
 
 

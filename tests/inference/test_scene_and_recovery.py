@@ -72,16 +72,16 @@ def test_the_watch_counts_what_differs():
     truth = vx.energies.ShapeFactorEnergy(3.7 + 0.1 * jnp.arange(16.0).reshape(2, 8))
     tissues = stack([targets[0], random_tissue(8, 2)])
     watch = RecoveryWatch(truth, stack(targets))
-    numbers, counts, yes = jnp.zeros(2), jnp.zeros(2, int), jnp.ones(2, bool)
+    numbers, counts, flags = jnp.zeros(2), jnp.zeros(2, int), jnp.ones(2, bool)
     names = ("cost", "max_force", "relative_error")
     slopes = ("gradient_norm", "gradient_residual", "gradient_steps")
     record = vx.Record(
         parameters=eqx.filter(truth, eqx.is_array),
         tissue=tissues,
-        converged=yes,
+        converged=flags,
         num_steps=counts,
         num_t1=counts,
-        sound=yes,
+        sound=flags,
         **dict.fromkeys((*names, *slopes), numbers),
     )
     notes = watch(0, record)
@@ -92,7 +92,7 @@ def test_the_watch_counts_what_differs():
     np.testing.assert_array_equal(watch(1, record)["mismatched"], notes["mismatched"])
 
 
-def test_neighbours_are_compared_whatever_the_edges_are_called():
+def test_neighbours_do_not_depend_on_edge_numbers():
     tissue = random_tissue(8, 0)
     assert same_neighbours(tissue, random_tissue(8, 0))
     assert not same_neighbours(tissue, random_tissue(8, 1))

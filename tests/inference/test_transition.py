@@ -9,9 +9,9 @@ from vertax.inference import fit_onset, fit_transition
 def test_the_curve_of_a_transition():
     p0 = np.linspace(3.6, 4.0, 21)
     share = 1 / (1 + np.exp(-(p0 - 3.83) / 0.03))
-    found = fit_transition(p0, 1e4 * share, 10_000)
-    assert found.centre == pytest.approx(3.83, abs=1e-4)
-    assert found.width == pytest.approx(0.03, rel=1e-2)
+    result = fit_transition(p0, 1e4 * share, 10_000)
+    assert result.centre == pytest.approx(3.83, abs=1e-4)
+    assert result.width == pytest.approx(0.03, rel=1e-2)
     # A step between two values lies between them.
     step = fit_transition(p0, 100.0 * (p0 > 3.81), 100)
     assert 3.80 <= step.centre <= 3.82

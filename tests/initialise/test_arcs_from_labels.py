@@ -13,12 +13,12 @@ def test_arcs_of_all_edges_hold_the_areas_of_the_pixels(boundary):
     if boundary == "free":
         rows, columns = np.indices(labels.shape)
         labels = np.where(np.hypot(rows - 60, columns - 80) < 55, labels, 0)
-    found = from_labels(labels, boundary=boundary, inner_arcs=True, softening=0.0)
-    assert found.tissue.inner_arcs
-    pixels = np.bincount(labels.ravel())[found.labels]
-    areas = np.asarray(found.tissue.areas) / found.pixel_size**2
-    assert found.inflated.size == 0
+    result = from_labels(labels, boundary=boundary, inner_arcs=True, softening=0.0)
+    assert result.tissue.inner_arcs
+    pixels = np.bincount(labels.ravel())[result.labels]
+    areas = np.asarray(result.tissue.areas) / result.pixel_size**2
+    assert result.inflated.size == 0
     if boundary == "mirrored":
-        areas, pixels = areas[found.whole], pixels[found.whole]
+        areas, pixels = areas[result.whole], pixels[result.whole]
     # Single pixels off their cell were given to a neighbour.
     np.testing.assert_allclose(areas, pixels, rtol=0, atol=3)

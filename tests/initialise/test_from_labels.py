@@ -50,7 +50,7 @@ def test_neighbours_are_those_of_the_pixels(seed):
     mask = rasterise(rng.random((15, 2)) * shape[::-1], shape)
     got = make(mask)
     assert np.all(areas_of(got.tissue) > 0)
-    alone = np.ones(shape, bool)  # pixels that are pieces of their own, which are given away
+    alone = np.ones(shape, bool)  # pixels that are separate pieces, which join other cells
     for step, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)):
         alone &= mask != np.roll(mask, step, axis)
     if got.absorbed.size == 0 and not alone.any():
@@ -102,10 +102,12 @@ def test_labels_may_be_any_positive_integers():
 @pytest.mark.parametrize("shift", [(0, 40), (33, 0), (50, 70)])
 def test_periodic_mask_may_start_anywhere(shift):
     mask = rasterise(clear_seeds(20, SHAPE, 2), SHAPE)
-    here = make(mask)
-    there = make(np.roll(mask, shift, (0, 1)))
-    assert neighbours(here.tissue, here.labels) == neighbours(there.tissue, there.labels)
-    np.testing.assert_allclose(areas_of(here.tissue), areas_of(there.tissue), rtol=1e-10)
+    original = make(mask)
+    shifted = make(np.roll(mask, shift, (0, 1)))
+    assert neighbours(original.tissue, original.labels) == neighbours(
+        shifted.tissue, shifted.labels
+    )
+    np.testing.assert_allclose(areas_of(original.tissue), areas_of(shifted.tissue), rtol=1e-10)
 
 
 def mirrored_cases() -> list[np.ndarray]:
@@ -149,9 +151,9 @@ def test_whole_cells_are_the_originals_away_from_the_border(mask):
         if a in got.absorbed
     }
     inside = set(mask.ravel().tolist()) - border - set(got.absorbed.tolist())
-    whole = got.labels[got.whole].tolist()
-    assert len(whole) == len(set(whole)) > 0
-    assert inside - beside <= set(whole) <= inside
+    labels = got.labels[got.whole].tolist()
+    assert len(labels) == len(set(labels)) > 0
+    assert inside - beside <= set(labels) <= inside
     first = len(np.unique(got.labels))
     assert np.all(np.diff(got.labels[:first]) > 0)  # originals first, in the order of their labels
     for cell in np.flatnonzero(got.whole):
@@ -287,7 +289,9 @@ def test_labels_beyond_63_bits_are_refused():
         ({"gap_width": "wide"}, TypeError, "`gap_width` must be one real number, but is 'wide'"),
         ({"gap_width": np.nan}, ValueError, "`gap_width` must be at least 0, but is nan"),
         ({"pixel_size": "0.5"}, TypeError, "`pixel_size` must be one real number, but is '0.5'"),
-        ({"pixel_size": [1.0, 2.0]}, ValueError, "`pixel_size` must be one number"),
+        ({"pixel_size": [1.0, 2.0, 3.0]}, ValueError, "`pixel_size` must be one number or"),
+        ({"pixel_size": (1.0, 0.0)}, ValueError, "`pixel_size` must be positive"),
+        ({"holes": "fill"}, ValueError, "`holes` must be one of 'keep', 'close'"),
         ({"pixel_size": 1j}, TypeError, "`pixel_size` must be one real number"),
     ],
 )
@@ -296,7 +300,7 @@ def test_wrong_sizes_are_named(options, error, message, without_type_checks):
         from_labels(honeycomb(), **options)
 
 
-def test_under_vmap_the_remedy_is_told():
+def test_error_under_vmap_names_the_remedy():
     with pytest.raises(TypeError, match=r"from_labels needs arrays.*Call it outside"):
         jax.vmap(lambda mask: from_labels(mask).tissue.areas)(honeycomb()[None])
 

@@ -126,7 +126,7 @@ def test_mirrored_by_default_and_options_are_passed_on(small):
 
 
 class Fixed(AbstractSegmenter):
-    """Returns what it is told."""
+    """Returns fixed labels."""
 
     labels: np.ndarray
 
@@ -134,7 +134,7 @@ class Fixed(AbstractSegmenter):
         return self.labels
 
 
-def test_a_segmenter_of_ones_own(small):
+def test_a_custom_segmenter(small):
     image, truth = small
     got = from_microscopy(image, segmenter=Fixed(truth), softening=0.0)
     want = from_labels(truth, softening=0.0)
@@ -150,7 +150,7 @@ def test_a_segmenter_must_return_integer_labels(small, labels):
         from_microscopy(small[0], segmenter=Fixed(labels))
 
 
-def test_labels_that_make_no_tissue_are_blamed_on_the_segmenter(small):
+def test_error_for_unusable_labels_names_the_segmenter(small):
     labels = np.repeat(np.arange(1, 5), 50)[:, None] + np.zeros((200, 200), int)
     message = r"The labels that Fixed found in `image` make no tissue\..* the labels 1, 2, 3, 4 do"
     with pytest.raises(ValueError, match=message):
@@ -346,10 +346,10 @@ def test_what_is_no_segmenter_is_refused(small, segmenter, without_type_checks):
 
 
 def test_the_smoothing_by_default_is_what_its_documentation_says(small):
-    said = re.search(r"by default `cell_size / (\d+)`.\n    - `depth`", Watershed.__doc__ or "")
-    assert said is not None
+    match = re.search(r"by default `cell_size / (\d+)`.\n    - `depth`", Watershed.__doc__ or "")
+    assert match is not None
     size = 20.0
-    explicit = Watershed(cell_size=size, smoothing=size / int(said[1]))
+    explicit = Watershed(cell_size=size, smoothing=size / int(match[1]))
     np.testing.assert_array_equal(Watershed(cell_size=size)(small[0]), explicit(small[0]))
 
 

@@ -123,6 +123,11 @@ class TestImage:
         assert list(image.get_extent()) == [0, 40, 30, 0]
         np.testing.assert_array_equal(image.get_array(), IMAGE)
 
+    def test_pixels_have_a_height_and_a_width(self):
+        ax = plot_image(IMAGE, pixel_size=(1.0, 0.5))
+        assert ax.get_xlim() == (0, 40)
+        assert ax.get_ylim() == (60, 0)
+
     def test_wrong_arguments(self):
         with pytest.raises(ValueError, match=r"`image` must have shape .* has \(4,\)"):
             plot_image(np.zeros(4))

@@ -163,7 +163,22 @@ def test_a_run_that_failed_later_keeps_what_it_wrote(tiny, instead):
     assert vertax("run", "tiny.toml").exit_code == 1
     # A folder without metrics is one of a run that did not end.
     files = sorted(path.name for path in (tiny / "runs/tiny").iterdir())
-    assert files == ["config.toml", "positions.npy"]
+    assert files == ["config.toml", "failed.txt", "positions.npy"]
+    assert (tiny / "runs/tiny/failed.txt").read_text() == "It broke.\n"
+
+
+def test_a_failed_run_does_not_block_the_same_command(tiny, instead):
+    def fail(config, folder, *, progress):
+        folder.save_array("positions", np.ones(3))
+        raise OSError("It broke.")
+
+    instead(fail)
+    for _ in range(2):
+        assert vertax("run", "tiny.toml", "--output", "out").exit_code == 1
+    instead(lambda config, folder, *, progress: {"cost": 1.0})
+    assert vertax("run", "tiny.toml", "--output", "out").exit_code == 0
+    assert sorted(path.name for path in (tiny / "out").iterdir()) == ["config.toml", "metrics.json"]
+    assert vertax("run", "tiny.toml", "--output", "out").exit_code == 2
 
 
 def test_a_resumed_run_that_fails_keeps_its_configuration(tiny, instead):

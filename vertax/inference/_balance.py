@@ -8,22 +8,22 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array
 
-from vertax.inference._seen import Seen
+from vertax.inference._observed_geometry import ObservedGeometry
 
 
 class Equations(NamedTuple):
-    """Which balances are written down, of what."""
+    """The equations of the balance of forces: their junctions, and the edges and cells that are unknowns."""
 
     junctions: Int[np.ndarray, " junctions"]
-    """Where three cells meet: two components of force at each."""
+    """Vertices where three cells meet: two components of force at each."""
     edges: Int[np.ndarray, " edges"]
-    """Those that end at one: their tensions are asked for, and each has its balance of pressures."""
+    """Edges that end at a junction: their tensions are unknowns, and each has an equation of pressures."""
     cells: Int[np.ndarray, " cells"]
-    """The cells beside them, whose pressures are asked for."""
+    """Cells next to these edges: their pressures are unknowns."""
     half_edge: Int[np.ndarray, "junctions 3"]
-    """The edges that meet at each junction, numbers among `edges`."""
+    """Edges that meet at each junction, as indices into `edges`."""
     sides: Int[np.ndarray, "edges 2"]
-    """The cells on the left and on the right of each edge, numbers among `cells`."""
+    """Cells on the left and on the right of each edge, as indices into `cells`."""
     chord: Float[np.ndarray, " edges"]
     """Distance between the ends of each edge."""
 
@@ -38,65 +38,68 @@ class Equations(NamedTuple):
         return 3 * len(self.junctions)
 
 
-def equations(seen: Seen) -> Equations:
-    """The balances that hold whatever is beyond the outline."""
-    junctions = np.flatnonzero(seen.inner)
-    edges = np.unique(seen.half_edge[junctions])
-    cells = np.unique(seen.cells[edges])
+def equations(geometry: ObservedGeometry) -> Equations:
+    """The equations of all junctions that do not touch the exterior."""
+    junctions = np.flatnonzero(geometry.inner)
+    edges = np.unique(geometry.half_edge[junctions])
+    cells = np.unique(geometry.cells[edges])
     return Equations(
         junctions=junctions,
         edges=edges,
         cells=cells,
-        half_edge=np.searchsorted(edges, seen.half_edge[junctions]),
-        sides=np.searchsorted(cells, seen.cells[edges]),
-        chord=np.maximum(np.linalg.norm(seen.chord[edges], axis=1), 1e-6 * seen.size),
+        half_edge=np.searchsorted(edges, geometry.half_edge[junctions]),
+        sides=np.searchsorted(cells, geometry.cells[edges]),
+        chord=np.maximum(np.linalg.norm(geometry.chord[edges], axis=1), 1e-6 * geometry.size),
     )
 
 
 # At a junction the sum of γ t is zero, with the tangents t of its edges. An arc with the angle α over the
 # chord c is in balance with the pressures on its two sides if 2 γ sin α = (p_left - p_right) |c|: the law of
-# Laplace, times the length of the chord. Both are forces, linear in tensions and pressures; and what they
-# depend on are angles: the directions of the tangents, away from their junctions, and the α.
-def angles(seen: Seen, which: Equations) -> Float[np.ndarray, " angles"]:
+# Laplace, times the length of the chord. Both are forces, linear in tensions and pressures, and functions of
+# angles: the directions of the tangents, away from their junctions, and the α.
+def angles(geometry: ObservedGeometry, which: Equations) -> Float[np.ndarray, " angles"]:
     """Directions of tangents, three for each junction, and angles of arcs."""
-    edge, forward = seen.half_edge[which.junctions], seen.forward[which.junctions]
-    chord = np.arctan2(seen.chord[:, 1], seen.chord[:, 0])[edge]
-    away = chord + seen.bend[edge, 0] + seen.bend[edge, 1] - seen.angle[edge]
-    back = chord + seen.bend[edge, 0] - seen.bend[edge, 1] + seen.angle[edge] + np.pi
-    return np.concatenate([np.where(forward, away, back).ravel(), seen.angle[which.edges]])
+    edge, forward = geometry.half_edge[which.junctions], geometry.forward[which.junctions]
+    chord = np.arctan2(geometry.chord[:, 1], geometry.chord[:, 0])[edge]
+    away = chord + geometry.bend[edge, 0] + geometry.bend[edge, 1] - geometry.angle[edge]
+    back = chord + geometry.bend[edge, 0] - geometry.bend[edge, 1] + geometry.angle[edge] + np.pi
+    return np.concatenate([np.where(forward, away, back).ravel(), geometry.angle[which.edges]])
 
 
-def angle_slopes(seen: Seen, which: Equations) -> csr_array:
-    """How these angles change with vertices, angles and bends."""
-    edge, forward = seen.half_edge[which.junctions].ravel(), seen.forward[which.junctions].ravel()
-    across = np.stack([-seen.chord[:, 1], seen.chord[:, 0]], axis=1)
-    across /= np.maximum(np.sum(seen.chord**2, axis=1), (1e-3 * seen.size) ** 2)[:, None]
-    first = 2 * seen.n_vertices
-    bends = first + len(seen.angle)
+def angle_slopes(geometry: ObservedGeometry, which: Equations) -> csr_array:
+    """Jacobian of these angles with respect to vertices, angles and bends."""
+    edge, forward = (
+        geometry.half_edge[which.junctions].ravel(),
+        geometry.forward[which.junctions].ravel(),
+    )
+    across = np.stack([-geometry.chord[:, 1], geometry.chord[:, 0]], axis=1)
+    across /= np.maximum(np.sum(geometry.chord**2, axis=1), (1e-3 * geometry.size) ** 2)[:, None]
+    first = 2 * geometry.n_vertices
+    bends = first + len(geometry.angle)
     row = np.arange(which.n_directions)
     way = np.where(forward, 1.0, -1.0)
     entries = [(row, first + edge, -way), (row, bends + 2 * edge, np.ones(len(row)))]
     entries.append((row, bends + 2 * edge + 1, way))
     for end, sign in ((0, -1.0), (1, 1.0)):
         for axis in range(2):
-            entries.append((row, 2 * seen.ends[edge, end] + axis, sign * across[edge, axis]))
+            entries.append((row, 2 * geometry.ends[edge, end] + axis, sign * across[edge, axis]))
     arcs = which.n_directions + np.arange(len(which.edges))
     entries.append((arcs, first + which.edges, np.ones(len(arcs))))
     rows, columns, values = (np.concatenate(x) for x in zip(*entries, strict=True))
-    shape = (which.n_directions + len(which.edges), seen.n_geometry)
+    shape = (which.n_directions + len(which.edges), geometry.n_geometry)
     return csr_array(coo_array((values, (rows, columns)), shape=shape))
 
 
 def forces(
     angle: Float[np.ndarray, " angles"], which: Equations, loose: Bool[np.ndarray, " edges"]
 ) -> Float[np.ndarray, "rows unknowns"]:
-    """The matrix that makes forces of tensions and pressures.
+    """The matrix of the forces, which are linear in tensions and pressures.
 
     **Arguments:**
 
     - `angle`: directions and angles of arcs.
-    - `which`: the balances.
-    - `loose`: edges whose direction is not known, and which pull with a force of any direction.
+    - `which`: the equations.
+    - `loose`: edges of unknown direction, which pull with a force of any direction.
 
     **Returns:** the matrix.
     """
@@ -117,7 +120,7 @@ def forces(
 def force_slopes(
     angle: Float[np.ndarray, " angles"], which: Equations, tension: Float[np.ndarray, " edges"]
 ) -> csr_array:
-    """How forces change with the angles, at some tensions."""
+    """Jacobian of the forces with respect to the angles, at given tensions."""
     n_junctions, n_edges = len(which.junctions), len(which.edges)
     direction, arc = angle[: which.n_directions], angle[which.n_directions :]
     pull = tension[which.half_edge].ravel()
@@ -131,16 +134,16 @@ def force_slopes(
 
 
 def pulls(
-    seen: Seen, which: Equations, chosen: Bool[np.ndarray, " edges"]
+    geometry: ObservedGeometry, which: Equations, chosen: Bool[np.ndarray, " edges"]
 ) -> Float[np.ndarray, "rows forces"]:
-    """How forces along some edges enter the equations, two components each."""
+    """Coefficients of forces of the chosen edges in the equations, two components each."""
     edges = np.flatnonzero(chosen)
     matrix = np.zeros((which.n_rows, len(edges), 2))
-    place = np.full(seen.n_vertices, -1)
+    place = np.full(geometry.n_vertices, -1)
     place[which.junctions] = np.arange(len(which.junctions))
     for end, sign in ((0, 1.0), (1, -1.0)):
-        at = place[seen.ends[which.edges[edges], end]]
-        here = np.flatnonzero(at >= 0)
+        at = place[geometry.ends[which.edges[edges], end]]
+        inner = np.flatnonzero(at >= 0)
         for axis in range(2):
-            matrix[2 * at[here] + axis, here, axis] = sign
+            matrix[2 * at[inner] + axis, inner, axis] = sign
     return matrix.reshape(which.n_rows, -1)

@@ -1,4 +1,4 @@
-"""Arcs that may bend, fitted to the points of edges, and how exactly they are known."""
+"""Arcs with bends, fitted to the points of edges, and the covariance of the fit."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from vertax.inference._seen import Seen
+from vertax.inference._observed_geometry import ObservedGeometry
 
-# Standard deviations of what no point tells, such as the angle of an edge of two pixels: of a vertex in
-# grains (it was seen in a corner of pixels) and of an angle in radians.
+# Prior standard deviations, for parameters that no point determines, such as the angle of an edge of two
+# pixels: of a vertex in grains (its initial position is the corner of a pixel) and of an angle in radians.
 _VERTEX, _ANGLE = 2.0, 0.5
-# How much edges may bend, in radians: to begin with, and at least and at most.
+# Standard deviation of the bends, in radians: initial, smallest and largest.
 _BENDING, _BENDINGS = 0.1, (1e-4, 0.3)
-# Middles of the sides of pixels are so far from a curve, and alike along so much of it, in grains, at most
-# where nothing else is wrong with them: 0.24 and 1.45.
+# Largest noise and correlation length, in grains, of edges with the grain of the pixels as their only error.
+# (For middles of the sides of pixels along a smooth curve: 0.24 and 1.45.)
 _CRISP = 0.26, 1.6
-# Shorter edges, in grains, have no course: their points say nothing, and a few more nothing about bends.
+# Edges shorter than this, in grains, have no weight; edges shorter than the second do not determine bends.
 _SHORT, _STRAIGHT = 3.0, 6.0
-# Mean length of edges, in grains, from which on bends are read.
+# Smallest mean length of edges, in grains, at which bends are fitted.
 _LONG = 25.0
 
 
 class Points(NamedTuple):
-    """Where edges run."""
+    """Points of edges."""
 
     edge: Int[np.ndarray, " points"]
     """The edge of each point, ascending; the points of each from its first vertex on."""
     away: Float[np.ndarray, "points 2"]
-    """The points, each seen from the first vertex of its edge."""
+    """The points, each relative to the first vertex of its edge."""
 
 
 class Fitted(NamedTuple):
-    """Curves fitted to points, and the covariance of the fit, but for the square of the noise."""
+    """Curves fitted to points, and the covariance of the fit over the square of the noise."""
 
     change: Float[np.ndarray, " geometry"]
-    """From the geometry of the tissue to that of the fit."""
+    """Geometry of the fit less that of the tissue."""
     precision: csc_array
     """The inverse covariance of vertices, angles and bends, where a point has the standard deviation 1."""
     noise: float
@@ -50,43 +50,43 @@ class Fitted(NamedTuple):
     weighted: csc_array
     """The slopes of the distances, transposed, times the weights of the points."""
     apart: float
-    """How far points lie apart that say something of their own, a length."""
+    """Distance along an edge at which the errors of two points are independent, a length."""
     bending: float
-    """How much edges bend, the standard deviation in radians."""
+    """Standard deviation of the bends, in radians."""
     crisp: bool = False
-    """Whether nothing but the grain is wrong with the points."""
+    """Whether the grain is the only error of the points."""
 
 
 def read_courses(
-    tissue: Seen,
+    tissue: ObservedGeometry,
     points: Points,
     grain: float,
     *,
     apart: float | None = None,
     noise: float | None = None,
 ) -> Fitted:
-    """Curves through the points, with the noise, its correlation and the bending that the points tell.
+    """Curves through the points, with estimates of the noise, its correlation length and the bends.
 
-    Edges that bend and noise that is alike along edges look the same. So bends are read only where nothing
-    but the grain of pixels is left of the points then; edges are arcs else, and all that is off is noise.
+    Bends and noise that is correlated along edges cannot be distinguished. So bends are fitted only if the
+    grain of the pixels is the only error left with them; otherwise edges are arcs, and all residuals are
+    noise.
 
     **Arguments:**
 
-    - `tissue`: the geometry to begin with.
-    - `points`: what was seen of its edges.
-    - `grain`: how exactly a point can be known: the side of a pixel.
-    - `apart`: how far points lie apart that are exact; left out, how far along edges they are off in the same
-        way.
-    - `noise`: standard deviation of a point; left out, that of the fit.
+    - `tissue`: the initial geometry.
+    - `points`: the points of its edges.
+    - `grain`: resolution of a point: the side of a pixel.
+    - `apart`: distance between points that are exact; by default the correlation length of the residuals.
+    - `noise`: standard deviation of a point; by default that of the fit.
 
     **Returns:** the [`Fitted`][vertax.inference._curves.Fitted] curves.
     """
     length = np.linalg.norm(tissue.chord, axis=1)
     used = np.unique(points.edge)
-    # What a fit leaves of an edge cannot be alike along all of it.
+    # The residuals of a fit cannot be correlated along a whole edge.
     longest = 0.25 * float(np.mean(length[used]))
     fit = partial(fit_curves, tissue, points, grain)
-    # A curve through a dozen pixels hides how rough they are.
+    # A curve through a dozen pixels follows their noise.
     short = apart is None and np.mean(length[used]) < _LONG * grain
     start, alike, crisp, first = _BENDING, 0.0, False, None
     for start in _BENDINGS[:1] if short else (_BENDING, _BENDINGS[0]):
@@ -105,7 +105,7 @@ def read_courses(
 
 
 def fit_curves(
-    tissue: Seen,
+    tissue: ObservedGeometry,
     points: Points,
     grain: float,
     *,
@@ -114,26 +114,26 @@ def fit_curves(
     noise: float,
     rounds: int = 6,
 ) -> Fitted:
-    r"""Vertices, angles and bends such that the curves run through points as well as they can.
+    r"""Vertices, angles and bends of the curves that fit the points best (weighted least squares).
 
-    An arc from 0 with the chord $c$ whose tangent there is turned by $\varphi$ from it has a distance from a
-    point $p$ of
+    An arc from 0 with the chord $c$ and a tangent at 0 turned by $\varphi$ from the chord has the distance
 
     $$d = \frac{p \cdot (p - c)\, \sin\varphi + (c \times p) \cos\varphi}{|c|}$$
 
-    to first order in $d$, for every angle. From there a curve of the length $L$ departs, at the share $u$ of
-    it, by $L\,(b_1\,u(1 - u)(1 - 2u) + b_2\,u(1 - u)(1 - \tfrac{14}{3} u(1 - u)))$: two shapes that turn its
-    ends and change neither chord nor, to first order, the arc that fits best.
+    from a point $p$, to first order in $d$, for every angle. A curve of the length $L$ departs from its arc,
+    at the fraction $u$ of its length, by
+    $L\,(b_1\,u(1 - u)(1 - 2u) + b_2\,u(1 - u)(1 - \tfrac{14}{3} u(1 - u)))$: two modes that turn its
+    ends and change neither the chord nor, to first order, the arc that fits best.
 
     **Arguments:**
 
-    - `tissue`: the geometry to begin with.
+    - `tissue`: the initial geometry.
     - `points`: the points.
-    - `grain`: their grain.
-    - `apart`: how far points must lie apart to say something of their own, a length.
-    - `bending`: standard deviation of the bends.
-    - `noise`: that of the points, by which it is weighed.
-    - `rounds`: steps of Gauss and Newton.
+    - `grain`: resolution of a point.
+    - `apart`: distance along an edge at which the errors of two points are independent.
+    - `bending`: prior standard deviation of the bends.
+    - `noise`: standard deviation of the points, relative to which the prior is weighted.
+    - `rounds`: largest number of Gauss–Newton steps.
 
     **Returns:** the [`Fitted`][vertax.inference._curves.Fitted] curves.
     """
@@ -143,10 +143,10 @@ def fit_curves(
     start, end = tissue.ends[edge].T
     n_points = np.bincount(edge, minlength=n_edges)
     length = np.linalg.norm(tissue.chord, axis=1)
-    # Each edge counts as so many points as are far enough apart.
+    # Each edge has the weight of length / apart independent points.
     weight = length / apart / np.maximum(n_points, 1)
     weight = np.where(length > _SHORT * grain, weight, 0.0)[edge]
-    # What the points leave open stays where it was seen.
+    # Prior: parameters that the points do not determine stay at their initial values.
     held = (
         noise / np.repeat([_VERTEX * grain, _ANGLE, bending], [angles, n_edges, 2 * n_edges])
     ) ** 2
@@ -159,9 +159,9 @@ def fit_curves(
     rest = np.zeros(len(edge))
     normal, weighted = csc_array(diags_array(held)), csc_array((n, len(edge)))
     for _ in range(rounds):
-        here = tissue.moved(change)
+        current = tissue.moved(change)
         p = away - change[:angles].reshape(-1, 2)[start]
-        c, angle = here.chord[edge], here.angle[edge]
+        c, angle = current.chord[edge], current.angle[edge]
         chord = np.maximum(np.linalg.norm(c, axis=1), 0.1 * grain)
         q, sine, cosine = p - c, -np.sin(angle), np.cos(angle)
         dot, cross = np.sum(p * q, axis=1), c[:, 0] * p[:, 1] - c[:, 1] * p[:, 0]
@@ -170,7 +170,7 @@ def fit_curves(
         slopes = (cosine[:, None] * turn - sine[:, None] * slide) / chord[:, None]
         bulge = (cross * sine - dot * cosine) / chord
         modes = _modes(p, q, chord, angle)
-        rest = (dot * sine + cross * cosine) / chord - np.sum(modes * here.bend[edge], axis=1)
+        rest = (dot * sine + cross * cosine) / chord - np.sum(modes * current.bend[edge], axis=1)
         values = np.column_stack([slopes, bulge, -modes])
         jacobian = csc_array(
             coo_array((values.ravel(), (rows, columns.ravel())), shape=(len(edge), n))
@@ -187,14 +187,25 @@ def fit_curves(
     return Fitted(change, normal, noise, rest, csc_array(weighted), apart, bending)
 
 
+def arc_distances(
+    chord: Float[np.ndarray, "points 2"],
+    angle: Float[np.ndarray, " points"],
+    p: Float[np.ndarray, "points 2"],
+) -> Float[np.ndarray, " points"]:
+    """Distance of points from arcs to first order, see `fit_curves`; both begin at 0."""
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-300)
+    cross = chord[:, 0] * p[:, 1] - chord[:, 1] * p[:, 0]
+    return (cross * np.cos(angle) - np.sum(p * (p - chord), axis=1) * np.sin(angle)) / length
+
+
 def _modes(
     p: Float[np.ndarray, "points 2"],
     q: Float[np.ndarray, "points 2"],
     chord: Float[np.ndarray, " points"],
     angle: Float[np.ndarray, " points"],
 ) -> Float[np.ndarray, "points 2"]:
-    """How far a point of an arc moves with the two bends; its ends are at -p and -q from it."""
-    # Seen from an end of an arc of the half angle α, a point at the share u is 2 R sin(u α) away.
+    """Displacement of a point of an arc by the two bends; the ends of the arc are at -p and -q from it."""
+    # A point at the fraction u of an arc of the half angle α is at the distance 2 R sin(u α) from its end.
     wide = np.clip(np.abs(angle), 1e-3, 1.5)
     scale = np.sin(wide) / chord
     first, last = (np.arcsin(np.minimum(np.linalg.norm(x, axis=1) * scale, 1.0)) for x in (p, q))
@@ -204,8 +215,10 @@ def _modes(
     return (wide / scale)[:, None] * shapes
 
 
-def _bending(tissue: Seen, flat: Fitted, edges: Int[np.ndarray, " some"], noise: float) -> float:
-    """How much edges bend, by maximum likelihood from bends that were left next to free."""
+def _bending(
+    tissue: ObservedGeometry, flat: Fitted, edges: Int[np.ndarray, " some"], noise: float
+) -> float:
+    """Standard deviation of the bends, by maximum likelihood from bends fitted with a wide prior."""
     if len(edges) < 3:
         return _BENDINGS[0]
     first = 2 * tissue.n_vertices + len(tissue.angle)
@@ -213,22 +226,22 @@ def _bending(tissue: Seen, flat: Fitted, edges: Int[np.ndarray, " some"], noise:
     unit = np.zeros((tissue.n_geometry, len(place)))
     unit[place, np.arange(len(place))] = 1.0
     variance = noise**2 * np.sum(unit * splu(flat.precision).solve(unit), axis=0)
-    # As if nothing had held them.
-    share = np.minimum(variance / _BENDINGS[1] ** 2, 0.95)
-    bend, variance = flat.change[place] / (1 - share), variance / (1 - share)
+    # The estimates without that prior.
+    fraction = np.minimum(variance / _BENDINGS[1] ** 2, 0.95)
+    bend, variance = flat.change[place] / (1 - fraction), variance / (1 - fraction)
 
     def loss(log: float) -> float:
         total = variance + np.exp(2 * log)
         return float(np.sum(np.log(total) + bend**2 / total))
 
-    found = minimize_scalar(loss, bounds=np.log(_BENDINGS).tolist(), method="bounded")
-    return float(np.exp(found.x))
+    optimum = minimize_scalar(loss, bounds=np.log(_BENDINGS).tolist(), method="bounded")
+    return float(np.exp(optimum.x))
 
 
 def correlation_length(points: Points, rest: Float[np.ndarray, " points"]) -> float:
-    """How far points must lie apart for their distances from curves to be independent.
+    """Distance along an edge at which the distances of two points from the curves are independent.
 
-    The integral of the correlation along edges, up to where it is first lost.
+    The integral of the correlation along edges, up to the first lag where it is below 0.05.
 
     **Arguments:**
 
@@ -245,9 +258,9 @@ def correlation_length(points: Points, rest: Float[np.ndarray, " points"]) -> fl
         pair = edge[lag:] == edge[:-lag]
         if np.sum(pair) < 20:
             break
-        here, there = rest[lag:][pair], rest[:-lag][pair]
-        share = np.sum(here * there) / np.sqrt(np.sum(here**2) * np.sum(there**2) + 1e-300)
-        if share <= 0.05:
+        one, other = rest[lag:][pair], rest[:-lag][pair]
+        correlation = np.sum(one * other) / np.sqrt(np.sum(one**2) * np.sum(other**2) + 1e-300)
+        if correlation <= 0.05:
             break
-        total, lag = total + 2 * share, lag + 1
+        total, lag = total + 2 * correlation, lag + 1
     return total * spacing

@@ -1,4 +1,4 @@
-"""How large the errors of noise and model are, as forces that are left tell."""
+"""Sizes of the errors of noise and model, estimated from the residual forces."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from jaxtyping import Float
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
 
-# No tissue is a foam better than that: a third of a degree, and an arc of 1 per cent of a cell.
+# Smallest errors of the model, in radians: of angles at junctions, and of arcs of the length of a cell;
+# largest.
 LEAST = (0.005, 0.02)
 _MOST = 1.5
 
 
 class Errors(NamedTuple):
-    """Sizes of errors; or the covariances of forces that each makes where it is 1."""
+    """Sizes of errors; or the covariance of the forces for each error of size 1."""
 
     junction: Float[np.ndarray, "*shape"] | float
     """Angles at junctions, radians."""
     arc: Float[np.ndarray, "*shape"] | float
     """Angles of arcs of the length of a cell, radians."""
     noise: Float[np.ndarray, "*shape"] | float
-    """Noise over that of the points."""
+    """Noise relative to that of the points."""
 
 
 def model_errors(
@@ -35,20 +36,20 @@ def model_errors(
 ) -> Errors:
     """The errors by restricted maximum likelihood (Patterson & Thompson 1971, doi:10.1093/biomet/58.3.545).
 
-    Combinations of the equations in which no unknown is left, N, have the covariance Nᵀ S N.
+    The combinations N of the equations without unknowns, Nᵀ A = 0, have the covariance Nᵀ S N.
 
     **Arguments:**
 
-    - `matrix`: forces of tensions and pressures.
+    - `matrix`: A, the forces of unit tensions and pressures.
     - `given`: forces without them.
-    - `parts`: the covariance of the forces that each error makes.
-    - `unknown`: that of forces which are not known.
-    - `guess`: errors to begin with.
-    - `shares`: least and largest noise over that of the points, logarithms.
+    - `parts`: covariance of the forces for each error of size 1.
+    - `unknown`: covariance of unknown forces.
+    - `guess`: initial errors.
+    - `shares`: logarithms of the smallest and largest noise relative to that of the points.
 
     **Returns:** the [`Errors`][vertax.inference._errors.Errors].
     """
-    factors: Any = qr(matrix, pivoting=True)  # (of SciPy's overloads none says so)
+    factors: Any = qr(matrix, pivoting=True)  # (the type is missing in SciPy's overloads)
     orthogonal, upper, _ = factors
     size = np.abs(np.diag(upper))
     free = orthogonal[:, int(np.sum(size > 1e-9 * size[0])) :]
@@ -64,5 +65,5 @@ def model_errors(
     bounds = [(np.log(least), np.log(_MOST)) for least in LEAST] + [shares]
     first = np.clip(np.log(np.array(guess)), *np.transpose(bounds))
     options = {"xatol": 0.05, "fatol": 0.02}
-    found = minimize(loss, first, method="Nelder-Mead", bounds=bounds, options=options)
-    return Errors(*np.exp(found.x).tolist())
+    optimum = minimize(loss, first, method="Nelder-Mead", bounds=bounds, options=options)
+    return Errors(*np.exp(optimum.x).tolist())

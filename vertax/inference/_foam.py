@@ -15,7 +15,7 @@ def foam_energy(
     low: float = 0.04,
     high: float = 0.28,
 ) -> LocalSum:
-    r"""The energy E2 with tensions that a fit cannot drive out of bounds.
+    r"""The energy E2 with tensions that stay within bounds during a fit.
 
     $$E = \tfrac12 K \sum_c (A_c - A^0_c)^2 + \sum_e \gamma_e \ell_e$$
 
@@ -24,8 +24,8 @@ def foam_energy(
     - `tension`: $\gamma$, scalar array or one an edge.
     - `target_area`: $A^0$, scalar or one a cell.
     - `stiffness`: $K$.
-    - `low`, `high`: bounds of the tensions. Above twice the least one there are junctions of three edges
-        without a balance, which close to four-fold vertices.
+    - `low`, `high`: bounds of the tensions. If the largest is more than twice the smallest, some junctions of
+        three edges cannot balance, and collapse to four-fold vertices.
 
     **Returns:** the sum of an [`AreaElasticity`][vertax.energies.AreaElasticity] and a
     [`BoundedTension`][vertax.energies.BoundedTension].
@@ -38,13 +38,14 @@ def foam_energy(
 
 
 def foam_terms(energy: AbstractEnergy) -> tuple[AreaElasticity, BoundedTension]:
-    """The two parts of an energy E2 whose tensions have bounds.
+    """The two parts of an energy E2 with bounded tensions.
 
     **Arguments:**
 
-    - `energy`: of [`foam_energy`][vertax.inference.foam_energy], or of a fit that began with it; or a batch.
+    - `energy`: from [`foam_energy`][vertax.inference.foam_energy], or the result of a fit that started from
+        it; or a batch.
 
-    **Returns:** the part of the areas, with its `pressures`, and that of the edges, with their `tension`.
+    **Returns:** the energy of the areas, with its `pressures`, and that of the edges, with their `tension`.
 
     **Raises:**
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -12,21 +13,23 @@ from jaxtyping import Array, Int, Shaped
 
 from vertax._base.announce import announce_compilations
 from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.pixels import PixelSize, pixel_length
 from vertax.inference._balance import equations
 from vertax.inference._curves import Points, read_courses
 from vertax.inference._inferred import InferredTensions
-from vertax.inference._mask import read_mask
+from vertax.inference._mask import labels_and_lines
+from vertax.inference._observed_geometry import observed_geometry
 from vertax.inference._outcome import outcome
 from vertax.inference._resampling import resampled_deviations
-from vertax.inference._seen import seen
-from vertax.inference._solve import solve, told
-from vertax.initialise import Segmentation, from_labels
-from vertax.io import Foam, read_surface_evolver
+from vertax.inference._solve import observability, solve
+from vertax.initialise import MaskReport, Segmentation, from_labels
+from vertax.initialise._report import LEAST_LENGTH
+from vertax.io import Foam, pixel_aspect, read_surface_evolver
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
-# A tissue given as such is known to this share of a cell diameter, the points of a foam to that; and the
-# points that stand for an edge without any.
+# Noise of a tissue without an image, and of the points of a foam, relative to the cell diameter; and the
+# number of points of an edge without a course.
 _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 _EVOLVER = (".dmp", ".fe")
 
@@ -41,15 +44,17 @@ def infer_tensions(
     | os.PathLike[str],
     *,
     kind: str = "auto",
-    pixel_size: float | None = None,
+    plane: int | None = None,
+    pixel_size: PixelSize | None = None,
     background: int | None = None,
-    gap_width: float = 3.0,
+    gap_width: float | None = None,
+    holes: str = "keep",
     noise: float | None = None,
     prior: float | None = None,
     resamples: int = 0,
     seed: int = 0,
 ) -> InferredTensions:
-    r"""Tensions of edges and pressures of cells that keep a tissue in the shape in which it was seen.
+    r"""Tensions of edges and pressures of cells that balance in the observed shape of a tissue.
 
     ```python
     found = vx.inference.infer_tensions("NAME_cp_masks.tif")
@@ -61,12 +66,12 @@ def infer_tensions(
 
     $$\sum_e \gamma_e\, t_e = 0, \qquad \gamma_e\, \kappa_e = p_\mathrm{left} - p_\mathrm{right}.$$
 
-    Junctions on the outline, where cells beyond it may pull, do not count, so the tissue may have been cut
-    out of a larger one. Vertices and curves are fitted to the pixels: arcs, and how they bend towards their
-    ends, as far as pixels tell, because tensions pull along the ends. How far pixels are from curves is the
-    noise, which is carried through the balance with all its correlations, and the geometry is adjusted
-    within it (total least squares). What is left tells how far the tissue is from a balance at all, which
-    enters the standard deviations too.
+    Junctions on the outline and at holes, where forces from beyond are unknown, have no equation, so the
+    tissue may have been cut out of a larger one. Vertices and curves are fitted to the pixels: arcs, and
+    their bends towards the ends where the pixels resolve them, because tensions pull along the tangents at
+    the ends. The distances of pixels from curves are the noise, which is propagated to the balance with its
+    correlations, and the geometry is adjusted within the noise (total least squares). The residual is the
+    distance of the tissue from a balance, and enters the standard deviations too.
 
     **Arguments:**
 
@@ -75,23 +80,26 @@ def infer_tensions(
         [`Segmentation`][vertax.initialise.Segmentation], [`Foam`][vertax.io.Foam] or
         [`Tissue`][vertax.Tissue] with arcs.
     - `kind`: of a mask, `"labels"`, `"outlines"` or `"auto"`.
-    - `pixel_size`, `background`, `gap_width`: of a mask, see [`from_labels`][vertax.initialise.from_labels].
-    - `noise`: standard deviation of the position of an edge, in units of length; left out, how far pixels
-        (or the points of a foam) are from curves, and a five hundredth of a cell diameter for a tissue
+    - `plane`: of a stack, the plane to take, from 0.
+    - `pixel_size`, `background`, `gap_width`, `holes`: of a mask, see
+        [`from_labels`][vertax.initialise.from_labels]. Where a TIFF file has pixels that are not square,
+        their ratio is taken from it.
+    - `noise`: standard deviation of the position of an edge, in units of length; by default the root mean
+        square distance of pixels (or the points of a foam) from curves, and 0.002 cell diameters for a tissue
         without either.
-    - `prior`: standard deviation of relative tensions about 1 before the shape was seen; left out, twice
-        that of a first guess. A small one keeps tensions too much alike.
-    - `resamples`: how often to turn noise and errors of the model over by chance and infer anew, as a check
-        of the deviations (wild bootstrap: Wu 1986, doi:10.1214/aos/1176350142); a few dozen.
-    - `seed`: of that chance.
+    - `prior`: standard deviation of the prior of relative tensions about 1; by default twice the spread of a
+        first estimate. A small one makes tensions too uniform.
+    - `resamples`: number of resampled shapes, as a check of the standard deviations (wild bootstrap: Wu 1986,
+        doi:10.1214/aos/1176350142), such as 50.
+    - `seed`: seed of the random numbers of the resampling.
 
-    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; look at its `doubts`.
+    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; read its `doubts`.
 
     **Raises:**
 
-    - `TypeError` for something else.
-    - `ValueError` for a tissue without a place where three of its cells meet, one with straight inner edges,
-        one that was mirrored, a `noise` or `prior` that is not positive, and as the readers.
+    - `TypeError` for a source of another type.
+    - `ValueError` for a tissue without a junction of three cells, a tissue with straight inner edges, a
+        mirrored one, a `noise` or `prior` that is not positive, and as the readers.
     """
     for name, value in (("noise", noise), ("prior", prior)):
         if value is not None:
@@ -101,10 +109,18 @@ def infer_tensions(
     if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in _EVOLVER:
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
-        mask = read_mask(source, kind=kind, background=background)
+        mask, line_width = labels_and_lines(source, kind, background, plane)
+        if pixel_size is None and isinstance(source, str | os.PathLike):
+            pixel_size = _pixels_of_file(Path(source), mask)
         source = from_labels(
-            mask, boundary="free", pixel_size=pixel_size, gap_width=gap_width, inner_arcs=True
+            mask,
+            boundary="free",
+            pixel_size=pixel_size,
+            gap_width=gap_width,
+            holes=holes,
+            inner_arcs=True,
         )
+        source = _across_lines(source, line_width)
     if isinstance(source, Segmentation):
         course = _of_mask(source)
     elif isinstance(source, Foam):
@@ -116,52 +132,75 @@ def infer_tensions(
             "Argument `segmentation_or_mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
             f"is {describe(segmentation_or_mask)}."
         )
-    tissue = course.tissue
-    geometry = seen(tissue)
+    tissue, report = course.tissue, course.report
+    is_hole = course.labels == 0
+    geometry = observed_geometry(tissue, is_hole, None if report is None else report.closed)
     which = equations(geometry)
     if len(which.junctions) == 0:
         raise ValueError(
             "Argument `segmentation_or_mask` must have a place where three of its cells meet, but it has "
-            "none: what pulls at its outline is not known. Take a larger tissue."
+            "none: the forces at its outline are unknown. Take a larger tissue."
         )
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
     noise = course.noise if noise is None else noise
     curves = read_courses(geometry, points, course.grain, apart=course.apart, noise=noise)
     fitted = geometry.moved(curves.change)
-    shape = told(fitted, curves, which)
+    uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
+    shape = observability(fitted, curves, which, uncertain)
     balance = solve(shape, which, exact=noise is not None, prior=prior)
-    turned_over = None
+    resampled = None
     if resamples:
-        seen_as = fitted, curves, points, which, shape
-        turned_over = resampled_deviations(
-            *seen_as, balance, prior=prior, times=resamples, seed=seed
+        observed = fitted, curves, points, which, shape
+        resampled = resampled_deviations(
+            *observed, balance, prior=prior, times=resamples, seed=seed
         )
-    # Corners of cells in a mask are corners of pixels, so edges of length 0 differ from all others.
+    # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
-    source = course.labels, course.pixel_size, four_fold
-    return outcome(tissue, curves, which, balance, source, turned_over)
+    source = course.labels, course.pixel_size, four_fold, report
+    return outcome(tissue, course.points, curves, which, balance, source, resampled)
 
 
 class _Course(NamedTuple):
-    """A tissue, and where its edges run."""
+    """A tissue, and the points of its edges."""
 
     tissue: Tissue
     labels: Int[np.ndarray, " cells"]
     points: Points
     grain: float
-    """How exactly a point can be known, a length."""
+    """Resolution of a point, a length."""
     apart: float | None
-    """How far points lie apart that say something of their own; None if it is to be found."""
+    """Distance along an edge at which the errors of two points are independent; None if it is estimated."""
     noise: float | None
-    pixel_size: float | None
+    pixel_size: PixelSize | None
+    report: MaskReport | None = None
+
+
+def _pixels_of_file(file: Path, mask: Int[np.ndarray, "rows columns"]) -> PixelSize | None:
+    """Size of the pixels of a file that are not square, for a mean cell area of about 1."""
+    aspect = pixel_aspect(file)
+    if abs(aspect - 1) < 0.01:
+        return None
+    width = np.sqrt(len(np.unique(mask[mask > 0])) / (np.count_nonzero(mask > 0) * aspect))
+    return (float(aspect * width), float(width))
+
+
+def _across_lines(source: Segmentation, line_width: float) -> Segmentation:
+    """The segmentation, with contacts shorter than 1.5 times the width of the lines marked as uncertain."""
+    report = source.report
+    if report is None or line_width == 0:
+        return source
+    chord = np.linalg.norm(geometry_of(source.tissue).edge_vectors, axis=1)
+    short = chord < LEAST_LENGTH * line_width * pixel_length(source.pixel_size)
+    report = dataclasses.replace(report, uncertain=report.uncertain | short, line_width=line_width)
+    return dataclasses.replace(source, report=report)
 
 
 def _of_mask(source: Segmentation) -> _Course:
     if source.courses is None:
         raise ValueError(
-            "Argument `segmentation_or_mask` must hold the courses of its edges, which "
-            "vx.initialise.from_labels finds. Pass its mask, or its tissue."
+            "Argument `segmentation_or_mask` must hold the courses of its edges, as "
+            "vx.initialise.from_labels returns them. Pass its mask, or its tissue."
         )
     copies = len(np.unique(source.labels)) < len(source.labels)
     if copies or (not source.whole.all() and source.tissue.topology.exterior is False):
@@ -171,11 +210,14 @@ def _of_mask(source: Segmentation) -> _Course:
         )
     _check_arcs(source.tissue)
     first = geometry_of(source.tissue).edge_vertices[:, 0]
-    edge = source.courses.edge
-    away = source.courses.points - np.asarray(source.tissue.vertices)[first][edge]
-    points = Points(edge, away)
-    pixel = source.pixel_size
-    return _Course(source.tissue, source.labels, points, pixel, None, None, pixel)
+    # Where a wide gap was closed, the mask does not show the edge.
+    edge = source.courses.edge[source.courses.shown]
+    course = source.courses.points[source.courses.shown]
+    points = Points(edge, course - np.asarray(source.tissue.vertices)[first][edge])
+    pixel = pixel_length(source.pixel_size)
+    return _Course(
+        source.tissue, source.labels, points, pixel, None, None, source.pixel_size, source.report
+    )
 
 
 def _of_foam(source: Foam, noise: float | None) -> _Course:
@@ -184,7 +226,7 @@ def _of_foam(source: Foam, noise: float | None) -> _Course:
     away = np.concatenate([chain - chain[0] for chain in source.chains])
     same = edge[1:] == edge[:-1]
     apart = float(np.mean(np.linalg.norm(np.diff(away, axis=0), axis=1)[same]))
-    grain = _GRAIN * seen(tissue).size if noise is None else noise
+    grain = _GRAIN * observed_geometry(tissue).size if noise is None else noise
     return _Course(tissue, source.bodies, Points(edge, away), grain, apart, None, None)
 
 
@@ -194,7 +236,7 @@ def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:
     course = np.asarray(tissue.edge_points(jnp.append(0, fractions)), float)
     edge = np.repeat(np.arange(tissue.n_edges), _POINTS)
     points = Points(edge, (course[:, 1:] - course[:, :1]).reshape(-1, 2))
-    geometry = seen(tissue)
+    geometry = observed_geometry(tissue)
     noise = _EXACT * geometry.size if noise is None else noise
     apart = float(np.mean(np.linalg.norm(geometry.chord, axis=1))) / _POINTS
     labels = np.arange(1, tissue.n_cells + 1)  # 0 is the label of the exterior
@@ -205,5 +247,5 @@ def _check_arcs(tissue: Tissue) -> None:
     if not tissue.inner_arcs:
         raise ValueError(
             "Argument `segmentation_or_mask` must be a tissue whose inner edges are arcs, because their "
-            "curvature tells pressures; make it with `inner_arcs=True`."
+            "curvature determines pressures; make it with `inner_arcs=True`."
         )

@@ -1,4 +1,4 @@
-"""What was inferred of a tissue from its shape, as arrays and tables."""
+"""Tensions and pressures inferred from the shape of a tissue, as arrays and tables."""
 
 from __future__ import annotations
 
@@ -10,108 +10,133 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from vertax._base.pixels import PixelSize, pixel_sides
+from vertax.initialise import MaskReport
 from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vtk
 from vertax.mesh import Tissue
+from vertax.mesh._geometry import geometry_of
+
+# Cells with a larger error of the area are named.
+_AREA_ERROR = 0.1
+# Number of places that a doubt names.
+_PLACES = 5
 
 
 class InferredTensions(eqx.Module):
     """Relative tensions and pressures of a tissue, with their standard deviations.
 
-    A shape tells them but for two numbers: tensions are relative to their mean, and pressures are differences
-    from their mean, in units of the mean tension over the unit of length of the tissue.
+    A shape determines them except for two numbers: tensions are relative to their mean, and pressures are
+    differences from their mean, in units of the mean tension over the unit of length of the tissue.
     """
 
     tissue: Tissue
-    """The tissue as it was seen, each edge an arc."""
+    """The observed tissue, each edge an arc."""
     tensions: Float[np.ndarray, " edges"]
-    """Tension of each edge; NaN where no balance tells it."""
+    """Tension of each edge; NaN where no equation contains it."""
     tension_deviations: Float[np.ndarray, " edges"]
     """Their standard deviations."""
     determined: Bool[np.ndarray, " edges"]
-    """Whether the tension is told by the shape. It is not for edges on the outline, for those without an end
-    where three cells meet, for edges so short that their direction is noise, and where the standard deviation
-    is above 0.3."""
+    """Whether the shape determines the tension. It does not for edges of the outline or of a hole, edges
+    without an end where three cells meet, edges too short for a direction, contacts that the mask does not
+    show, and where the standard deviation is above 0.3."""
     pressures: Float[np.ndarray, " cells"]
-    """Pressure of each cell less the mean; NaN where no balance tells it."""
+    """Pressure of each cell less the mean; NaN where no equation contains it."""
     pressure_deviations: Float[np.ndarray, " cells"]
     """Their standard deviations."""
     pressures_determined: Bool[np.ndarray, " cells"]
-    """Whether the pressure is told by the shape: it has a number, and an edge of known tension."""
+    """Whether the shape determines the pressure: the cell has an edge of determined tension."""
     stresses: Float[np.ndarray, "cells 2 2"]
     """Stress of each cell, tension positive: half the tension of its edges, less its pressure. NaN for cells
     with an edge that is not determined."""
     labels: Int[np.ndarray, " cells"]
-    """Label of each cell: in the mask, or the number of its body in a dump of Surface Evolver; of a tissue
-    without either, the number of the cell plus 1. The exterior has the label 0."""
+    """Label of each cell: in the mask (0 for a hole, which is no cell), or the number of its body in a dump
+    of Surface Evolver; of a tissue without either, the number of the cell plus 1. The exterior has the label
+    0."""
     noise: float
     """Standard deviation of the position of an edge, in units of length."""
     correlation: float
-    """How far along an edge this noise is alike, in units of length."""
+    """Correlation length of this noise along an edge, in units of length."""
     bending: float
-    """By how much edges bend beyond arcs, the standard deviation in radians: what a foam at rest does not."""
+    """Standard deviation of the bends of edges beyond arcs, in radians; 0 for a foam at rest."""
     model_errors: tuple[float, float]
-    """By how much, in radians, angles at junctions and angles of arcs of the length of a cell differ from
-    those of a balance, beyond the noise."""
-    pixel_size: float | None
-    """Length of a pixel side, if the tissue comes from an image."""
+    """Standard deviation, in radians, of the differences of angles at junctions, and of angles of arcs of the
+    length of a cell, from those of a balance, beyond the noise."""
+    pixel_size: PixelSize | None
+    """Length of a pixel side, if the tissue comes from an image; (height, width) if pixels are not square."""
     four_fold: Bool[np.ndarray, " edges"]
     """Whether the edge has length 0: it is shorter than half a pixel of the mask, or half the accuracy of the
     positions. Four cells meet in a point, and which two of them share the edge depends on their numbers."""
     resampled_deviations: Float[np.ndarray, " edges"] | None = None
-    """Standard deviations of the tensions by resampling, if that was asked for."""
+    """Standard deviations of the tensions by resampling, with `resamples`."""
+    mask_report: MaskReport | None = None
+    """What became of each label of the mask, and which contacts the mask shows."""
+
+    outline_errors: Float[np.ndarray, " cells"] | None = None
+    """Root mean square distance of the outline of each cell in the mask from its arcs, in pixels."""
+
+    @property
+    def area_errors(self) -> Float[np.ndarray, " cells"]:
+        """Area of each cell over the area of its pixels, less 1; NaN for a tissue without a mask."""
+        if self.mask_report is None or self.pixel_size is None:
+            return np.full(self.tissue.n_cells, np.nan)
+        pixels = self.mask_report.cell_pixels * np.prod(pixel_sides(self.pixel_size))
+        return geometry_of(self.tissue).areas / pixels - 1
 
     @property
     def doubts(self) -> list[str]:
-        """What speaks against believing the result; empty if nothing does."""
-        found = []
-        asked = np.isfinite(self.tensions)
-        share = np.mean(self.determined[asked]) if asked.any() else 0.0
+        """Reasons against the result, as sentences; empty if there are none."""
+        doubts = [] if self.mask_report is None else mask_doubts(self.mask_report, self)
+        unknowns = np.isfinite(self.tensions)
+        share = np.mean(self.determined[unknowns]) if unknowns.any() else 0.0
         if share < 0.5:
-            found.append(
-                f"of {asked.sum()} tensions only {share:.0%} are determined: edges are too short for their "
-                "pixels, or outlines too rough; take a finer image or a larger tissue"
+            doubts.append(
+                f"of {unknowns.sum()} tensions only {share:.0%} are determined: edges are too short for "
+                "their pixels, or outlines too rough; take a finer image or a larger tissue"
             )
         junction, arc = self.model_errors
         if share > 0 and np.nanmedian(self.tension_deviations[self.determined]) > 0.15:
-            found.append(
-                "half of the tensions that are determined have standard deviations above 0.15: strong edges "
-                "are told from weak ones, and no more"
+            doubts.append(
+                "half of the tensions that are determined have standard deviations above 0.15: only "
+                "strong and weak edges can be distinguished"
             )
         if junction > 0.1:
-            found.append(
+            doubts.append(
                 f"angles at junctions are {np.degrees(junction):.0f} degrees from those of a balance: the "
-                "tissue moves, or something else than tensions pulls on junctions; tensions that vary over "
+                "tissue moves, or other forces than tensions act on junctions; variations of tension over "
                 "many cells are then smoothed out"
             )
         if self.bending > 0.03:
-            found.append(
+            doubts.append(
                 f"edges bend by {np.degrees(self.bending):.1f} degrees beyond arcs: the tissue moves, and "
-                "its shape is in part that of older tensions; those of now differ more than these, "
-                "beyond their standard deviations"
+                "its shape is in part that of earlier tensions; the present ones differ more from each other "
+                "than the inferred ones, beyond their standard deviations"
             )
         if arc > 0.5:
-            found.append(
-                f"arcs are {np.degrees(arc):.0f} degrees from those that pressures make: pressures are not "
-                "to be trusted"
+            doubts.append(
+                f"arcs are {np.degrees(arc):.0f} degrees from those that pressures cause: pressures are not "
+                "reliable"
             )
         if share > 0 and np.mean(self.tensions[self.determined] < 0.2) > 0.03:
-            found.append(
+            doubts.append(
                 "many tensions are near 0: where outlines are rough and edges short, the error of each "
                 "junction adds up over many cells, and a part of the tissue loses its tension to the "
                 "others; take a finer image, or a smaller `prior`"
             )
-        none = int(np.sum(self.determined & (self.tensions < 1e-6)))
-        if none:
-            found.append(
-                f"{none} tensions are 0, the least there is: there the shape asks for a push"
+        zero = int(np.sum(self.determined & (self.tensions < 1e-6)))
+        if zero:
+            doubts.append(
+                f"{zero} tensions are 0, the smallest allowed: the shape requires a push there"
             )
-        return found
+        return doubts
 
     def edge_table(self) -> dict[str, np.ndarray]:
         """The edges as a table, see [`edge_table`][vertax.io.edge_table].
 
-        **Returns:** its columns, and `left_label`, `right_label` (0: the exterior; -1: no pair of cells, for
-        an edge that is four-fold), `four_fold`, `tension`, `tension_deviation` and `determined`.
+        **Returns:** its columns, and `left_label`, `right_label` (0: the exterior or a hole; -1: no pair of
+        cells, for an edge that is four-fold), `four_fold`, `tension`, `tension_deviation` and `determined`;
+        for a mask also `shown`, the share of the edge along which the mask shows the contact,
+        `contact_closed`, where that is less than a half, and `contact_uncertain`, for an edge across a gap so
+        wide that other cells may touch there.
         """
         return edge_table(self.tissue, **self._edge_columns)
 
@@ -119,7 +144,8 @@ class InferredTensions(eqx.Module):
         """The cells as a table, see [`cell_table`][vertax.io.cell_table].
 
         **Returns:** its columns, and `label`, `pressure`, `pressure_deviation`, `determined` and the stress
-        as `stress_xx`, `stress_xy` and `stress_yy`.
+        as `stress_xx`, `stress_xy` and `stress_yy`; for a mask also `hole`, `pixels`, `area_error` (the area
+        of the cell over that of its pixels, less 1) and `outline_error` (in pixels, see `outline_errors`).
         """
         return cell_table(self.tissue, **self._cell_columns)
 
@@ -155,6 +181,14 @@ class InferredTensions(eqx.Module):
     @property
     def _edge_columns(self) -> dict[str, Any]:
         left, right = np.append(self.labels, 0)[np.asarray(self.tissue.topology.edge_cells)].T
+        report = self.mask_report
+        contact = {}
+        if report is not None:
+            contact = {
+                "shown": report.shown,
+                "contact_closed": report.closed,
+                "contact_uncertain": report.uncertain,
+            }
         return {
             "left_label": np.where(self.four_fold, -1, left),
             "right_label": np.where(self.four_fold, -1, right),
@@ -162,10 +196,19 @@ class InferredTensions(eqx.Module):
             "tension": self.tensions,
             "tension_deviation": self.tension_deviations,
             "determined": self.determined,
+            **contact,
         }
 
     @property
     def _cell_columns(self) -> dict[str, Any]:
+        mask = {}
+        if self.mask_report is not None:
+            mask = {
+                "hole": self.labels == 0,
+                "pixels": self.mask_report.cell_pixels,
+                "area_error": self.area_errors,
+                "outline_error": self.outline_errors,
+            }
         return {
             "label": self.labels,
             "pressure": self.pressures,
@@ -174,4 +217,67 @@ class InferredTensions(eqx.Module):
             "stress_xx": self.stresses[:, 0, 0],
             "stress_xy": self.stresses[:, 0, 1],
             "stress_yy": self.stresses[:, 1, 1],
+            **mask,
         }
+
+
+def mask_doubts(report: MaskReport, result: InferredTensions) -> list[str]:
+    """The changes of a mask as sentences, with places.
+
+    **Arguments:**
+
+    - `report`: the report on the mask.
+    - `result`: the tensions.
+
+    **Returns:** a sentence for each kind of change.
+    """
+    groups = (
+        (
+            ("hole",),
+            "the mask has holes, which are no cells: the tensions at their sides are not determined",
+        ),
+        (
+            ("closed hole",),
+            "the mask has holes that were closed: contacts across them are not determined",
+        ),
+        (
+            ("new cell",),
+            "labels are in several pieces as large as cells, which became cells with new labels (do the "
+            "numbers start again after 255 or 65535?)",
+        ),
+        (("left out",), "labelled pixels belong to no cell"),
+        (("absorbed",), "labels are no cells"),
+    )
+    doubts = []
+    for kinds, text in groups:
+        changes = report.of_kind(*kinds)
+        # Single pixels off a cell are of no consequence.
+        if kinds == ("left out",):
+            changes = [
+                change for change in changes if change.pixels > 0.03 * np.median(report.pixels)
+            ]
+        if changes:
+            places = "; ".join(map(str, changes[:_PLACES]))
+            more = f"; and {len(changes) - _PLACES} more" if len(changes) > _PLACES else ""
+            doubts.append(f"{text}: {places}{more}")
+    closed = report.closed & np.isfinite(report.shown) & ~result.four_fold
+    closed &= np.all(
+        np.append(result.labels, 0)[np.asarray(result.tissue.topology.edge_cells)] > 0, axis=1
+    )
+    if closed.any():
+        doubts.append(
+            f"{closed.sum()} contacts are not shown by the mask, because gaps or holes wider than "
+            f"{report.gap_width:g} pixels were closed; their tensions are not determined"
+        )
+    off = np.flatnonzero((np.abs(result.area_errors) > _AREA_ERROR) & (result.labels > 0))
+    if len(off):
+        cells = [
+            f"label {result.labels[k]} ({result.area_errors[k]:+.0%})"
+            for k in off[np.argsort(-np.abs(result.area_errors[off]))][:_PLACES]
+        ]
+        more = f" and {len(off) - _PLACES} more" if len(off) > _PLACES else ""
+        doubts.append(
+            f"the areas of {len(off)} cells differ by more than {_AREA_ERROR:.0%} from those of their "
+            f"pixels, because arcs do not follow their outlines: {', '.join(cells)}{more}"
+        )
+    return doubts

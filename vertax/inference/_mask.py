@@ -1,4 +1,4 @@
-"""Label images from whatever a segmentation was saved as."""
+"""Label images from arrays and files of segmentations."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label
 
-from vertax.initialise._mask_arguments import check_bits, check_zero
+from vertax._base.checks import check_integer
+from vertax.initialise._mask_arguments import check_bits, check_zero, without_single_axes
+from vertax.initialise._pieces import connected_pieces
 from vertax.io import read_image
 
 _KINDS = ("auto", "labels", "outlines")
-# A region at the border of the image that is so many times as large as the median cell is none.
+# A region at the border of the image that is larger than this, relative to the median cell, is no cell.
 _OUTSIDE = 5.0
-# What is smaller than this share of it is none either.
+# A region smaller than this, relative to the median cell, is no cell either.
 _SPECK = 0.03
-# Lines are thinner than this share of the size of a cell, or they are no lines.
+# Largest width of lines, relative to the size of a cell.
 _THIN = 0.3
 
 
@@ -28,6 +30,7 @@ def read_mask(
     *,
     kind: str = "auto",
     background: int | None = None,
+    plane: int | None = None,
 ) -> Int[np.ndarray, "rows columns"]:
     """A label for each pixel, from a label image or an image of outlines.
 
@@ -41,25 +44,43 @@ def read_mask(
 
     **Arguments:**
 
-    - `image`: the pixels, shape (rows, columns) or (rows, columns, colours); or a file: TIFF, PNG, NPY.
+    - `image`: the pixels, shape (rows, columns) or (rows, columns, colours), with `plane` also (planes, rows,
+        columns); or a file: TIFF, PNG, NPY. Axes of length 1 are dropped. NaN is no cell.
     - `kind`: `"labels"`, `"outlines"`, or `"auto"`: outlines if there are two values or colours.
     - `background`: the label of what is no cell, if it is not 0. Labels of cells are positive.
+    - `plane`: of a stack, the plane (a frame, a depth) to take, from 0.
 
     **Returns:** the labels, 0 where there is no cell. See [`from_labels`][vertax.initialise.from_labels].
 
     **Raises:**
 
     - `FileNotFoundError` if there is no such file.
-    - `ValueError` for an unknown `kind`, pixels of another shape or that are not finite, a `background`
-        that no pixel has, labels of which 0 may be that of a cell (0 and negative ones), outlines that
-        enclose less than two cells, and two values of which neither is a line thinner than a third of a cell,
-        unless `kind` is `"outlines"`.
+    - `ValueError` for an unknown `kind`, pixels of another shape, labels that are not whole numbers or too
+        large for their type, a stack without `plane`, a `background` that no pixel has, labels of which 0 may
+        be that of a cell (0 and negative ones), outlines that enclose less than two cells, and two values of
+        which neither is a line thinner than a third of a cell, unless `kind` is `"outlines"`.
     """
+    return labels_and_lines(image, kind, background, plane)[0]
+
+
+def labels_and_lines(
+    image: Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
+    kind: str,
+    background: int | None,
+    plane: int | None,
+) -> tuple[Int[np.ndarray, "rows columns"], float]:
+    """The labels of [`read_mask`][vertax.inference.read_mask], and the width of the lines in pixels, or 0."""
     if kind not in _KINDS:
         raise ValueError(
             f"Argument `kind` must be one of {', '.join(map(repr, _KINDS))}, but is {kind!r}."
         )
-    pixels = _loaded(Path(image)) if isinstance(image, str | os.PathLike) else np.asarray(image)
+    if plane is not None:
+        check_integer("plane", plane, at_least=0)
+    if isinstance(image, str | os.PathLike):
+        pixels = _loaded(Path(image), plane)
+    else:
+        pixels = np.ma.filled(image, 0) if isinstance(image, np.ma.MaskedArray) else image
+        pixels = one_plane(np.asarray(pixels), plane)
     values = _numbered(pixels)
     if background is not None:
         if not np.any(values == background):
@@ -74,13 +95,51 @@ def read_mask(
         lines = [values != 0]
         if len(colours) == 2:
             lines = [values == colour for colour in colours[np.argsort(counts, kind="stable")]]
-        return _outlined(lines, check_width=kind == "auto")
+        # Two labels without background that fill the image enclose nothing, and are two cells.
+        labels_only = kind == "auto" and len(colours) == 2 and bool(colours[0] > 0)
+        outlined = _outlined(lines, check_width=kind == "auto", may_fail=labels_only)
+        if outlined is not None:
+            return outlined.labels, outlined.line_width
     if pixels.ndim == 2 and pixels.dtype.kind in "iu":
         check_zero("image", pixels, background)
-    return np.maximum(values, 0)
+    return np.maximum(values, 0), 0.0
 
 
-def _loaded(file: Path) -> np.ndarray:
+def one_plane(pixels: np.ndarray, plane: int | None) -> np.ndarray:
+    """The chosen plane of an array, without axes of length 1.
+
+    **Arguments:**
+
+    - `pixels`: shape (rows, columns), (rows, columns, colours) or (planes, rows, columns).
+    - `plane`: number of the plane.
+
+    **Returns:** the plane.
+
+    **Raises:**
+
+    - `ValueError` for a stack without a choice, and for a plane that it does not have.
+    """
+    pixels = without_single_axes(pixels)
+    colours = pixels.ndim == 3 and pixels.shape[2] in (3, 4)
+    if pixels.ndim > 3 or (pixels.ndim == 3 and not colours):
+        planes = pixels.reshape(-1, *pixels.shape[-2:])
+        if plane is None:
+            raise ValueError(
+                "Argument `image` must have shape (rows, columns), or a third axis of colours, but its shape "
+                f"is {pixels.shape}, a stack of {len(planes)} planes. Pass one plane of a stack, by the "
+                f"argument `plane`, 0 … {len(planes) - 1}."
+            )
+        if plane >= len(planes):
+            raise ValueError(f"Argument `plane` must lie in 0 … {len(planes) - 1}, but is {plane}.")
+        return planes[plane]
+    if plane:
+        raise ValueError(
+            f"Argument `plane` must be 0 or left out for an image of shape {pixels.shape}, but is {plane}."
+        )
+    return pixels
+
+
+def _loaded(file: Path, plane: int | None) -> np.ndarray:
     if file.suffix.lower() == ".npy":
         if not file.exists():
             raise FileNotFoundError(
@@ -88,46 +147,80 @@ def _loaded(file: Path) -> np.ndarray:
             )
         # Cellpose saves a dictionary, which only pickles hold; masks are plain arrays.
         if file.name.endswith("_seg.npy"):
-            held = np.load(file, allow_pickle=True)
-            held = held.item() if held.dtype == object and held.ndim == 0 else {}
-            if not isinstance(held, dict) or "masks" not in held:
+            content = np.load(file, allow_pickle=True)
+            content = content.item() if content.dtype == object and content.ndim == 0 else {}
+            if not isinstance(content, dict) or "masks" not in content:
                 raise ValueError(f"{file} must hold `masks`, as Cellpose saves them, but does not.")
-            return np.asarray(held["masks"])
-        return np.load(file, allow_pickle=False)
+            return one_plane(np.asarray(content["masks"]), plane)
+        return one_plane(np.load(file, allow_pickle=False), plane)
     try:
-        return read_image(file)
+        return read_image(file, plane=plane)
     except ValueError as error:
         if "`channel`" not in str(error):
             raise
-    return np.stack([read_image(file, channel=k) for k in range(3)], axis=-1)
+    return np.stack([read_image(file, channel=k, plane=plane) for k in range(3)], axis=-1)
 
 
 def _numbered(pixels: Shaped[np.ndarray, "..."]) -> Int[np.ndarray, "rows columns"]:
     """Integers, one for each colour; black is 0."""
-    if pixels.ndim == 3 and pixels.shape[2] in (3, 4):
+    if pixels.ndim == 3:
         pixels = pixels[..., :3]
-        flat = pixels.reshape(-1, 3)
-        colours, index = np.unique(flat, axis=0, return_inverse=True)
+        colours, index = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
+        if _are_frames(pixels, len(colours)):
+            raise ValueError(
+                "Argument `image` must have shape (rows, columns), or a third axis of colours, but its last "
+                f"axis holds {pixels.shape[2]} label images that differ. Label planes are not colours: pass "
+                "one, such as image[..., 0]."
+            )
         number = np.arange(1, len(colours) + 1)
         number[np.all(colours == 0, axis=1)] = 0
         return number[index.ravel()].reshape(pixels.shape[:2])
     if pixels.ndim != 2 or pixels.size == 0:
         raise ValueError(
             "Argument `image` must have shape (rows, columns), or a third axis of colours, but its shape is "
-            f"{pixels.shape}. Pass one plane of a stack."
+            f"{pixels.shape}."
         )
     if pixels.dtype.kind == "b":
         return pixels.astype(np.int64)
     if pixels.dtype.kind == "f":
-        if not np.isfinite(pixels).all() or np.any(pixels != np.rint(pixels)):
-            raise ValueError(
-                "Argument `image` must hold whole numbers, a label for each pixel, but holds "
-                f"{pixels[~(pixels == np.rint(pixels))].flat[0]}. A grey image must be segmented first."
-            )
-        return np.rint(pixels).astype(np.int64)
+        return _whole_numbers(pixels)
     if pixels.dtype.kind not in "iu":
         raise ValueError(f"Argument `image` must hold numbers, but its dtype is {pixels.dtype}.")
     check_bits("image", pixels)
+    return pixels.astype(np.int64)
+
+
+def _are_frames(pixels: Shaped[np.ndarray, "rows columns planes"], n_colours: int) -> bool:
+    """Whether each plane is a label image, and together they divide the image into many more regions."""
+    n_values = []
+    for plane in np.moveaxis(pixels, -1, 0):
+        values, index = np.unique(plane, return_inverse=True)
+        sizes = connected_pieces(index.reshape(plane.shape), periodic=False).size
+        # (Stray pixels are no regions.)
+        if len(values) < 3 or np.sum(sizes > _SPECK * np.median(sizes)) > 1.5 * len(values):
+            return False
+        n_values.append(len(values))
+    return n_colours > 1.5 * max(n_values)
+
+
+def _whole_numbers(pixels: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray, "rows columns"]:
+    """Labels that were stored as floats; NaN becomes 0."""
+    pixels = np.where(np.isnan(pixels), 0, pixels)
+    if not np.isfinite(pixels).all() or np.any(pixels != np.rint(pixels)):
+        raise ValueError(
+            "Argument `image` must hold whole numbers, a label for each pixel (or NaN), but holds "
+            f"{pixels[~(np.isfinite(pixels) & (pixels == np.rint(pixels)))].flat[0]}. A grey image must be "
+            "segmented first."
+        )
+    # Beyond, different labels may have been rounded to one.
+    bits = np.finfo(pixels.dtype).nmant + 1
+    largest = float(np.max(np.abs(pixels)))
+    if largest > 2.0**bits:
+        raise ValueError(
+            f"Argument `image` must hold labels of at most {bits} bits, as {pixels.dtype} holds exactly, but "
+            f"its largest is {largest:.0f}. Save the labels as integers, numbered anew: "
+            "numpy.unique(labels, return_inverse=True)[1]."
+        )
     return pixels.astype(np.int64)
 
 
@@ -142,31 +235,37 @@ class _Outlined(NamedTuple):
 
 
 def _outlined(
-    candidates: Sequence[Bool[np.ndarray, "rows columns"]], *, check_width: bool
-) -> Int[np.ndarray, "rows columns"]:
-    """Labels of the cells between lines: the first of the candidates for the lines that has some.
+    candidates: Sequence[Bool[np.ndarray, "rows columns"]], *, check_width: bool, may_fail: bool
+) -> _Outlined | None:
+    """Labels of the cells between lines, for the first of the candidates for the lines that encloses cells.
+
+    None if none does and `may_fail`.
 
     **Raises:**
 
     - `ValueError` if none has at least two regions; with `check_width` also if no lines are thinner than
         the cells.
     """
-    found = [_between(lines) for lines in candidates]
-    outlined = [each for each in found if isinstance(each, _Outlined)]
+    regions = [_between(lines) for lines in candidates]
+    outlined = [each for each in regions if isinstance(each, _Outlined)]
+    if not outlined and may_fail:
+        return None
     if not outlined:
         raise ValueError(
             "Argument `image` must show lines that enclose cells, but they enclose "
-            f"{'one region' if any(found) else 'nothing'}: are they closed?"
+            f"{'one region' if any(regions) else 'nothing'}: are they closed?"
         )
     thin = [each for each in outlined if each.line_width < _THIN * each.cell_size]
     if check_width and not thin:
+        if may_fail:
+            return None
         first = outlined[0]
         raise ValueError(
             "Argument `image` must hold labels, or lines that are thinner than cells, but what may be a line "
             f"is {first.line_width:.0f} pixels wide between regions of {first.cell_size:.0f} pixels. Number "
             "the cells of a binary mask, e.g. by scipy.ndimage.label; pass kind='outlines' for thick lines."
         )
-    return (thin or outlined)[0].labels
+    return (thin or outlined)[0]
 
 
 def _between(lines: Bool[np.ndarray, "rows columns"]) -> _Outlined | int:

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from vertax._base.checks import check_number
+from vertax._base.pixels import pixel_length
 from vertax.costs import MeshImage, mirror
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.fitting import Fit, InverseProblem, Uncertainty, uncertainty
@@ -31,17 +33,17 @@ _POINTS_PER_EDGE = 48
 
 
 class PinnedEnergy(AbstractEnergy):
-    """E1 of cells of rest area 1, but for those at the border of what is seen.
+    """E1 with rest area 1 for inner cells, and free rest areas for cells at the border of the image.
 
-    What a cell at the border feels from beyond it is not known, so its rest area is free.
+    The forces on a cell at the border from beyond it are unknown, so its rest area is a parameter.
     """
 
     target_shape_factor: Float[Array, " cells"]
     """Target shape factor of each cell."""
     log_border_area: Float[Array, " cells"]
-    """Logarithm of the rest area; it counts for cells that are not inner ones."""
+    """Logarithm of the rest area; ignored for inner cells."""
     inner: Bool[Array, " cells"]
-    """Which cells do not touch the border."""
+    """Cells that do not touch the border."""
 
     @property
     def mean_area(self) -> Float[Array, " cells"]:
@@ -64,7 +66,7 @@ class Micrograph(eqx.Module):
     segmentation: Segmentation
     """The segmented cells."""
     whole: Bool[np.ndarray, " cells"]
-    """Which of them are to be reported: no part of them, nor of what they touch, is out of sight."""
+    """Cells to report: all of them and of their neighbours is in the image."""
     image: Float[np.ndarray, "rows columns"]
     """The image in even light that the model is compared with."""
     psf_width: float
@@ -75,13 +77,13 @@ class Micrograph(eqx.Module):
     @property
     def pixel_size(self) -> float:
         """Length of a pixel side of `image`, which may be coarser than the file, in units of the tissue."""
-        found = self.segmentation
-        return found.pixel_size * found.image_shape[1] / self.image.shape[1]
+        columns = self.segmentation.image_shape[1]
+        return pixel_length(self.segmentation.pixel_size) * columns / self.image.shape[1]
 
     def parameters(
         self, energy: AbstractEnergy
     ) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
-        """What was fitted.
+        """The fitted parameters.
 
         **Arguments:**
 
@@ -134,12 +136,12 @@ class Micrograph(eqx.Module):
     def uncertainty(self, fit: Fit[Any], *, prior: float | None = None) -> Uncertainty:
         """How well the image determines the parameters.
 
-        What is left of the misfit is correlated over the blur, so all pixels within it say one thing.
+        The residual is correlated over the blur, so the pixels within it count as one observation.
 
         **Arguments:**
 
         - `fit`: of `problem`.
-        - `prior`: standard deviation of the parameters before the image was seen.
+        - `prior`: standard deviation of the prior of the parameters.
 
         **Returns:** the [`Uncertainty`][vertax.Uncertainty].
 
@@ -191,7 +193,7 @@ def micrograph_problem(
         `"observed"`; or `"equal"` to the mean area in all cells but those that the border cuts, which
         determines shape factors best where it is true. A pinned border goes with equal ones in any case.
     - `pixel_size`: length of a pixel, where rest areas are 1 (of a pinned border only); left out, the mean
-        area of the cells that are seen whole is 1. In a rigid tissue all shape factors depend on it.
+        area of the cells not cut by the border is 1. In a rigid tissue all shape factors depend on it.
     - `pixels`: longer side of the image that the model is compared with; finer ones are made coarser.
     - `background_width`: width of the filter that evens out the light, in mean cell diameters.
     - `psf_width`: standard deviation of the blur, in pixels of `image`; left out, the one that fits best.
@@ -203,14 +205,16 @@ def micrograph_problem(
 
     - `ValueError` for an image that cannot be used, and for an unknown `border` or `rest_areas`.
     """
-    for name, value, known in (
+    for name, value, options in (
         ("border", border, ("mirrored", "pinned")),
         ("rest_areas", rest_areas, ("fitted", "observed", "equal")),
     ):
-        if value not in known:
+        if value not in options:
             raise ValueError(
-                f"Argument `{name}` must be one of {', '.join(map(repr, known))}, but is {value!r}."
+                f"Argument `{name}` must be one of {', '.join(map(repr, options))}, but is {value!r}."
             )
+    if pixel_size is not None:
+        check_number("pixel_size", pixel_size, above=0)
     segmenter = Watershed() if segmenter is None else segmenter
     response = Relaxation() if response is None else response
     intensities = np.asarray(image, float)
@@ -221,28 +225,31 @@ def micrograph_problem(
         read = _mirrored(intensities, segmenter, target_shape_factor, rest_areas, prepare)
     else:
         read = _pinned(intensities, segmenter, target_shape_factor, pixel_size, prepare)
-    found, guess, trainable, whole, seen, options = read
-    tissue = found.tissue
+    tissue = read.segmentation.tissue
     width = (
-        best_psf_width(tissue, options, seen.shape)
+        best_psf_width(tissue, read.options, read.image.shape)
         if psf_width is None
-        else psf_width * found.pixel_size
+        else psf_width * pixel_length(read.segmentation.pixel_size)
     )
-    first = response(tissue, guess, throw=False)
+    first = response(tissue, read.guess, throw=False)
     # Mirror planes or pins hold the tissue in its place: there is no position to fit.
     problem = InverseProblem(
-        first.tissue, guess, MeshImage(psf_width=width, **options), trainable, response=response
+        first.tissue,
+        read.guess,
+        MeshImage(psf_width=width, **read.options),
+        read.trainable,
+        response=response,
     )
-    return Micrograph(problem, found, whole, seen, width, first)
+    return Micrograph(problem, read.segmentation, read.reported, read.image, width, first)
 
 
 class _Read(NamedTuple):
-    """What is compared with what."""
+    """The segmented cells, the initial energy and the image of a micrograph."""
 
-    found: Segmentation
+    segmentation: Segmentation
     guess: AbstractEnergy
     trainable: Any
-    whole: Bool[np.ndarray, " cells"]
+    reported: Bool[np.ndarray, " cells"]
     image: Float[np.ndarray, "rows columns"]
     options: dict[str, Any]
 
@@ -255,19 +262,19 @@ def _mirrored(
     prepare: Callable[[float], np.ndarray],
 ) -> _Read:
     """All cells, and their mirror images."""
-    found = from_microscopy(image, segmenter=segmenter)
-    seen = prepare(found.pixel_size)
-    areas, whole = found.tissue.areas, np.asarray(found.whole)
+    segmentation = from_microscopy(image, segmenter=segmenter)
+    even = prepare(pixel_length(segmentation.pixel_size))
+    areas, uncut = segmentation.tissue.areas, np.asarray(segmentation.whole)
     if rest_areas == "equal":
         # Cells and their mirror images have one label; the mean area is the unit.
-        labels = np.asarray(found.labels)
-        areas = jnp.where(np.isin(labels, labels[whole]), 1.0, areas)
-    guess = ShapeFactorEnergy(jnp.full(found.tissue.n_cells, target_shape_factor), areas)
+        labels = np.asarray(segmentation.labels)
+        areas = jnp.where(np.isin(labels, labels[uncut]), 1.0, areas)
+    guess = ShapeFactorEnergy(jnp.full(segmentation.tissue.n_cells, target_shape_factor), areas)
     trainable = eqx.tree_at(
         lambda e: (e.target_shape_factor, e.mean_area), guess, (True, rest_areas == "fitted")
     )
-    options = {"image": mirror(seen), "points_per_edge": _POINTS_PER_EDGE}
-    return _Read(found, guess, trainable, whole, seen, options)
+    options = {"image": mirror(even), "points_per_edge": _POINTS_PER_EDGE}
+    return _Read(segmentation, guess, trainable, uncut, even, options)
 
 
 def _pinned(
@@ -277,13 +284,13 @@ def _pinned(
     pixel_size: float | None,
     prepare: Callable[[float], np.ndarray],
 ) -> _Read:
-    """The cells that lie whole in the image, as a free tissue whose outline does not move."""
+    """The cells not cut by the border of the image, as a free tissue with a pinned outline."""
     labels = np.asarray(segmenter(image))
     rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     check_zero("segmenter(image)", labels, None)
     labels = np.maximum(np.where(np.isin(labels, rim), 0, labels), 0)
-    found = from_labels(labels, boundary="free", pixel_size=pixel_size)
-    cluster = found.tissue
+    segmentation = from_labels(labels, boundary="free", pixel_size=pixel_size, holes="close")
+    cluster = segmentation.tissue
     on_outline = np.asarray(cluster.topology.on_outline)
     outline = np.asarray(cluster.topology.edge_cells)[on_outline]
     inner = ~np.isin(np.arange(cluster.n_cells), outline)
@@ -292,17 +299,20 @@ def _pinned(
     tissue = Tissue(
         cluster.vertices, cluster.topology, cluster.boundary, cluster.softening, pinned=pinned
     )
-    seen = prepare(found.pixel_size)
-    pixel = found.pixel_size * found.image_shape[1] / seen.shape[1]
-    weight = away_from_outline(tissue, on_outline, labels > 0, pixel, seen.shape)
+    side = pixel_length(segmentation.pixel_size)
+    even = prepare(side)
+    pixel = side * segmentation.image_shape[1] / even.shape[1]
+    weight = away_from_outline(tissue, on_outline, labels > 0, pixel, even.shape)
     # Straight edges cut off the corners of cells on the outline, of some nearly all of the cell.
     areas = jnp.log(jnp.maximum(tissue.areas, 0.2))
     guess = PinnedEnergy(jnp.full(cluster.n_cells, target_shape_factor), areas, jnp.asarray(inner))
     options = {
-        "image": seen,
+        "image": even,
         "points_per_edge": _POINTS_PER_EDGE,
         "weight": weight,
         "pixel_size": pixel,
     }
-    found = eqx.tree_at(lambda f: f.tissue, found, tissue, is_leaf=lambda x: isinstance(x, Tissue))
-    return _Read(found, guess, eqx.is_inexact_array, inner, seen, options)
+    segmentation = eqx.tree_at(
+        lambda s: s.tissue, segmentation, tissue, is_leaf=lambda x: isinstance(x, Tissue)
+    )
+    return _Read(segmentation, guess, eqx.is_inexact_array, inner, even, options)

@@ -1,4 +1,4 @@
-"""Synthetic data: what a microscope sees of a tissue, and the label image of its cells."""
+"""Synthetic data: images of the membranes of a tissue, and the label image of its cells."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vertax.mesh._outlines import Drawing
 
 
 class Microscope(eqx.Module):
-    """Images of the membranes of a periodic tissue in a square box, as bad as wanted.
+    """Synthetic images of the membranes of a periodic tissue in a square box, with adjustable errors.
 
     ```python
     image = vx.inference.Microscope(pixels=256, noise=0.1)(tissue, key=jax.random.key(0))
@@ -83,13 +83,13 @@ class Microscope(eqx.Module):
         side = lattice[0, 0]
         if side <= 0 or not np.allclose(lattice, side * np.eye(2)):
             raise ValueError(
-                "Argument `tissue` must lie in a square periodic box, of which the microscope sees one "
+                "Argument `tissue` must lie in a square periodic box, of which the image shows one "
                 "period, but it does not. See vertax.costs.render for other boundaries."
             )
         return float(side) / self.pixels
 
     def __call__(self, tissue: Tissue, *, key: Key[Array, ""]) -> Float[np.ndarray, "rows columns"]:
-        """What it sees of one period of the tissue.
+        """The image of one period of the tissue.
 
         **Arguments:**
 
@@ -133,11 +133,11 @@ class Microscope(eqx.Module):
 
 
 def label_image(tissue: Tissue | Foam, pixels: int) -> Int[np.ndarray, "rows columns"]:
-    """The label image of a free cluster, with a margin: what a perfect segmentation of it would be.
+    """The label image of a free cluster, with a margin, as of a perfect segmentation.
 
     **Arguments:**
 
-    - `tissue`: a tissue with a [`Free`][vertax.Free] boundary; or a [`Foam`][vertax.io.Foam], whose edges run
+    - `tissue`: a tissue with a [`Free`][vertax.Free] boundary; or a [`Foam`][vertax.io.Foam], with edges
         along their chains of pieces and not along arcs.
     - `pixels`: longer side of the image.
 
@@ -148,16 +148,16 @@ def label_image(tissue: Tissue | Foam, pixels: int) -> Int[np.ndarray, "rows col
     - `ValueError` for another boundary, or fewer than 16 pixels.
     """
     foam = tissue if isinstance(tissue, Foam) else None
-    seen = tissue.tissue if isinstance(tissue, Foam) else tissue
-    if not isinstance(seen.boundary, Free):
+    drawn = tissue.tissue if isinstance(tissue, Foam) else tissue
+    if not isinstance(drawn.boundary, Free):
         raise ValueError(
             "Argument `tissue` must have a free boundary, but its boundary is "
-            f"{type(seen.boundary).__name__}."
+            f"{type(drawn.boundary).__name__}."
         )
     if pixels < 16:
         raise ValueError(f"Argument `pixels` must be at least 16, but is {pixels}.")
     if foam is None:
-        polygons, sizes = Drawing(seen, 60).polygons()
+        polygons, sizes = Drawing(drawn, 60).polygons()
         outlines = [polygon[:size] for polygon, size in zip(polygons, sizes, strict=True)]
     else:
         outlines = _outlines(foam)
@@ -178,13 +178,13 @@ def _outlines(foam: Foam) -> list[Float[np.ndarray, "_ 2"]]:
     following, cell, edge, forward = (np.asarray(x) for x in (m.next, m.cell, m.edge, m.forward))
     outlines = []
     for number in range(foam.tissue.n_cells):
-        first = here = int(np.flatnonzero(cell == number)[0])
-        around = []
-        while not around or here != first:
-            chain = foam.chains[edge[here]]
-            around.append((chain if forward[here] else chain[::-1])[:-1])
-            here = int(following[here])
-        outlines.append(np.concatenate(around))
+        first = current = int(np.flatnonzero(cell == number)[0])
+        sides = []
+        while not sides or current != first:
+            chain = foam.chains[edge[current]]
+            sides.append((chain if forward[current] else chain[::-1])[:-1])
+            current = int(following[current])
+        outlines.append(np.concatenate(sides))
     return outlines
 
 

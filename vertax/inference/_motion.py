@@ -1,4 +1,4 @@
-"""Relative tensions of a cluster on its way, from how the points of its edges move."""
+"""Relative tensions of a moving cluster, from the motion of the points of its edges."""
 
 from __future__ import annotations
 
@@ -17,34 +17,33 @@ Chain = Float[np.ndarray, "_ 2"]
 
 
 class MovingTensions(eqx.Module):
-    """What the motion of a cluster says of its tensions, relative to their mean."""
+    """Tensions inferred from the motion of a cluster, relative to their mean."""
 
     tension: Float[np.ndarray, " edges"]
-    """Tension of each edge of the first frame; those between two cells have the mean 1, and of those on the
-    outline nothing is said: NaN."""
+    """Tension of each edge of the first frame; those between two cells have the mean 1, those of edges on the
+    outline are NaN."""
     deviation: Float[np.ndarray, " edges"]
     """Their standard deviations."""
     mobility: float
-    """Velocity of a point over the force on it, where the mean tension is 1."""
+    """Velocity of a point over the force on it, in units of the mean tension."""
     misfit: Float[np.ndarray, " intervals"]
-    """How far points are at the end of each interval from where the tensions would have them, across their
-    edges: the root mean square."""
+    """Root mean square distance, across edges, of the points at the end of each interval from their predicted
+    positions."""
     moved: Float[np.ndarray, " intervals"]
-    """How far they went in it, likewise."""
+    """Root mean square displacement of the points in each interval, across edges."""
 
 
 class EdgeMotion:
-    r"""A cluster in motion whose edges are chains of points, each of which goes where the force on it points:
+    r"""A moving cluster of edges that are chains of points, each with a velocity proportional to its force:
 
     $$\zeta \dot x_i = - \frac{\partial}{\partial x_i} \sum_e \gamma_e \ell_e
       + \sum_c p_c \frac{\partial A_c}{\partial x_i}$$
 
-    The pressures $p_c$ are such that areas go evenly from those of one frame to those of the next, so they
-    stay if they are the same. Points on the outline are where they were seen, in between on a straight line:
-    what pulls there need not be tensions alone. In each interval the others begin where they were seen and
-    are followed up to the next frame, and how far they end from the curves that were seen there is what a
-    fit of the tensions minimises. That needs no velocities, which differences between frames tell badly
-    where junctions are fast.
+    The pressures $p_c$ change the areas at a constant rate from one frame to the next. Points on the outline
+    are interpolated linearly between their observed positions, because other forces than tensions may act
+    there. In each interval the others start at their observed positions and are integrated up to the next
+    frame; a fit of the tensions minimises their distances from the curves observed there. That needs no
+    velocities, which differences between frames approximate badly where junctions are fast.
 
     ```python
     foams = [vx.io.read_surface_evolver(path) for path in paths]
@@ -57,9 +56,9 @@ class EdgeMotion:
     **Arguments:**
 
     - `tissues`: a free cluster in two frames or more, with the same neighbours in all.
-    - `chains`: for each frame the points of each edge from one end to the other, as many in all frames. Each
-        has the friction $\zeta$. Where it is along its edge does not count.
-    - `times`: of the frames; they increase.
+    - `chains`: for each frame the points of each edge from one end to the other, equally many in all frames.
+        Each has the friction $\zeta$. Displacements along the edge are ignored.
+    - `times`: times of the frames, increasing.
     - `substeps`: steps from one frame to the next (Heun's method, of second order). They must be shorter than
         the distance of two points over twice a relative tension.
 
@@ -130,22 +129,23 @@ class EdgeMotion:
     def residuals(
         self, tension: Float[np.ndarray, " edges"]
     ) -> Float[np.ndarray, "intervals coordinates"]:
-        r"""How far points are at the end of each interval from what was seen.
+        r"""Distances of the predicted points at the end of each interval from the observed ones.
 
-        Junctions from where they were seen, points of edges across the edge; of points off the outline.
+        Both components for junctions, and the one across the edge for other points; without points on the
+        outline.
 
         **Arguments:**
 
-        - `tension`: $\gamma / \zeta$ of each edge; of those on the outline it does not matter.
+        - `tension`: $\gamma / \zeta$ of each edge; values of edges on the outline are ignored.
         """
         return self._left(np.asarray(tension, float), False)[0]
 
     def predicted(self, tension: Float[np.ndarray, " edges"]) -> list[list[Chain]]:
-        r"""The chains at the end of each interval, from what was seen where it begins.
+        r"""The chains at the end of each interval, integrated from the observed chains at its start.
 
         **Arguments:**
 
-        - `tension`: $\gamma / \zeta$ of each edge; of those on the outline it does not matter.
+        - `tension`: $\gamma / \zeta$ of each edge; values of edges on the outline are ignored.
 
         **Returns:** for each interval the points of each edge, in the order of the first tissue.
         """
@@ -158,20 +158,20 @@ class EdgeMotion:
     def tensions(self) -> MovingTensions:
         r"""The tensions that explain the motion best, by least squares.
 
-        Their standard deviations are those of the Laplace approximation, where what is left over is taken
-        for noise, independent for each coordinate of a junction and for each edge.
+        Their standard deviations are those of the Laplace approximation, with the residuals as noise,
+        independent for each coordinate of a junction and for each edge.
 
         **Raises:**
 
-        - `RuntimeError` if the fit comes to no end.
+        - `RuntimeError` if the fit does not converge.
         """
         which = np.flatnonzero(self.inner)
-        whole = lambda inner: np.bincount(which, inner, len(self.inner))
+        on_all_edges = lambda inner: np.bincount(which, inner, len(self.inner))
         pace = self._pace(self.inner.astype(float))
         fit = least_squares(
-            lambda relative: self._left(pace * whole(relative), False)[0].ravel(),
+            lambda relative: self._left(pace * on_all_edges(relative), False)[0].ravel(),
             np.ones(len(which)),
-            lambda relative: pace * self._left(pace * whole(relative), True)[1][:, which],  # pyright: ignore[reportArgumentType]
+            lambda relative: pace * self._left(pace * on_all_edges(relative), True)[1][:, which],  # pyright: ignore[reportArgumentType]
             ftol=1e-4,
             xtol=1e-5,
             max_nfev=50,
@@ -181,17 +181,17 @@ class EdgeMotion:
                 "The tensions could not be found: after 50 steps they still change. Are the points the same "
                 "in all frames, and the times right?"
             )
-        found, slopes = pace * fit.x, fit.jac / pace
+        estimate, slopes = pace * fit.x, fit.jac / pace
         # Points of one edge move together, and count as one.
         junctions = np.sum(self._free < 2 * self.n_vertices)
         n_independent = len(self._dt) * (junctions + len(which))
         variance = np.sum(fit.fun**2) / max(n_independent - len(which), 1)
         covariance = variance * np.linalg.pinv(slopes.T @ slopes, hermitian=True)
-        mean = found.mean()
-        # Slopes of relative tensions, γ over the mean.
-        relative = (np.eye(len(which)) - found[:, None] / mean / len(which)) / mean
+        mean = estimate.mean()
+        # Jacobian of the relative tensions, γ over the mean.
+        relative = (np.eye(len(which)) - estimate[:, None] / mean / len(which)) / mean
         tension, deviation = np.full((2, len(self.inner)), np.nan)
-        tension[which] = found / mean
+        tension[which] = estimate / mean
         deviation[which] = np.sqrt(np.diag(relative @ covariance @ relative.T))
         rms = lambda away: np.sqrt(2 * np.mean(np.square(away), axis=1))
         went = [
@@ -204,7 +204,7 @@ class EdgeMotion:
     def _left(
         self, tension: Float[np.ndarray, " edges"], sensitive: bool
     ) -> tuple[Float[np.ndarray, "intervals coordinates"], Float[np.ndarray, "all parameters"]]:
-        """The residuals, and how they depend on the tensions, if that is asked for."""
+        """The residuals and, if `sensitive`, their Jacobian with respect to the tensions."""
         left, slopes = [], []
         for number, end in enumerate(self._points[1:]):
             x, dx = self._followed(number, tension, sensitive)
@@ -216,10 +216,10 @@ class EdgeMotion:
     def _followed(
         self, number: int, tension: Float[np.ndarray, " edges"], sensitive: bool
     ) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, "free parameters"]]:
-        """Where points are at the end of an interval."""
+        """The predicted points at the end of an interval."""
         x = self._points[number].ravel()
         dx = np.zeros((len(self._free), len(tension) if sensitive else 0))
-        drive = self._seen(number)
+        drive = self._observed_rates(number)
         h = self._dt[number] / self.substeps
         for _ in range(self.substeps):  # Heun
             one, d_one = self._velocity(x, dx, tension, *drive)
@@ -227,10 +227,10 @@ class EdgeMotion:
             x, dx = x + 0.5 * h * (one + two), dx + 0.5 * h * (d_one + d_two)
         return x, dx
 
-    def _seen(
+    def _observed_rates(
         self, number: int
     ) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, " cells"]]:
-        """How fast points went in an interval, and how fast areas grew."""
+        """Observed velocities of points, and rates of the areas, in an interval."""
         start, end = self._points[number : number + 2].reshape(2, -1)
         dt = self._dt[number]
         return (end - start) / dt, (self._areas(end) - self._areas(start)) / dt
@@ -240,27 +240,27 @@ class EdgeMotion:
         x: Float[np.ndarray, " coordinates"],
         dx: Float[np.ndarray, "free parameters"],
         tension: Float[np.ndarray, " edges"],
-        as_seen: Float[np.ndarray, " coordinates"],
+        observed: Float[np.ndarray, " coordinates"],
         growth: Float[np.ndarray, " cells"],
     ) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, "free parameters"]]:
-        """How fast points go, and how that depends on tensions on which `x` depends as in `dx`."""
+        """Velocities of the points, and their derivatives by the tensions if those of `x` are `dx`."""
         free = self._free
         way = (self._difference @ x).reshape(-1, 2)
         length = np.linalg.norm(way, axis=1)
         along = way / length[:, None]
         pull = tension[self._edge]
-        v = as_seen.copy()
+        v = observed.copy()
         v[free] = -(self._difference.T @ (pull[:, None] * along).ravel())[free]
         area = self._area_slopes(x)
         loose = area[:, free]
         gram = (loose @ loose.T).toarray()
-        # One pressure for all moves nothing within a given outline: their sum is 0.
+        # A uniform pressure causes no motion within a given outline: the sum of the pressures is 0.
         inverse = np.linalg.inv(gram + np.trace(gram) / len(gram) ** 2)
         pressure = inverse @ (growth - area @ v)
         v[free] += loose.T @ pressure
         if dx.shape[1] == 0:
             return v, dx
-        # What a change of places does to pulls (across pieces alone) and to pressures, then both together.
+        # Derivatives of the pulls (only across pieces), of the pressures, and of the velocities.
         stretched = self._difference[:, free]
         ways = (stretched @ dx).reshape(len(way), 2, -1)
         turned = np.stack([-along[:, 1], along[:, 0]], axis=1)
@@ -269,29 +269,29 @@ class EdgeMotion:
         pulls = (turned[:, :, None] * swing[:, None]).reshape(2 * len(way), -1)
         dv = -(stretched.T @ pulls)
         each = np.arange(along.size)
-        own = sp.csr_array(
+        by_edge = sp.csr_array(
             (along.ravel(), (each, np.repeat(self._edge, 2))), (along.size, dx.shape[1])
         )
-        dv -= (stretched.T @ own).toarray()
+        dv -= (stretched.T @ by_edge).toarray()
         dv += self._area_curvature(pressure)[free][:, free] @ dx
         dv += loose.T @ -(inverse @ (self._area_slopes(v)[:, free] @ dx + loose @ dv))
         return v, dv
 
     def _pace(self, tension: Float[np.ndarray, " edges"]) -> float:
-        """The factor of tensions with which junctions set out as fast as they were seen to go."""
+        """The factor of the tensions that fits the observed velocities of the junctions best."""
         junctions = self._free[self._free < 2 * self.n_vertices]
-        none = np.zeros((len(self._free), 0))
+        no_slopes = np.zeros((len(self._free), 0))
         sums = np.zeros(2)
         for number, start in enumerate(self._points[:-1].reshape(len(self._dt), -1)):
-            seen, growth = self._seen(number)
-            rest, _ = self._velocity(start, none, 0 * tension, seen, growth)
-            pulled, _ = self._velocity(start, none, tension, seen, growth)
-            pulled, seen = (pulled - rest)[junctions], (seen - rest)[junctions]
-            sums += pulled @ seen, pulled @ pulled
+            observed, growth = self._observed_rates(number)
+            rest, _ = self._velocity(start, no_slopes, 0 * tension, observed, growth)
+            pulled, _ = self._velocity(start, no_slopes, tension, observed, growth)
+            pulled, observed = (pulled - rest)[junctions], (observed - rest)[junctions]
+            sums += pulled @ observed, pulled @ pulled
         return sums[0] / sums[1]
 
     def _ends(self, which: int) -> sp.csr_array:
-        """Takes the first or second point of each piece."""
+        """The matrix that selects the first or second point of each piece."""
         n = len(self._pieces)
         places = (np.arange(n), self._pieces[:, which])
         return sp.csr_array((np.ones(n), places), (n, self._points.shape[1]))
@@ -320,7 +320,7 @@ class EdgeMotion:
         return sp.csr_array((values, (rows, columns)), (n, n))
 
     def _across(self, end: Float[np.ndarray, "points 2"]) -> sp.csr_array:
-        """Displacements of free points without what is along an edge."""
+        """The matrix that removes the components along edges from displacements of free points."""
         n = len(end)
         # Each point within an edge is the second of one piece and the first of the next.
         before, after = np.arange(n), np.arange(n)
@@ -330,8 +330,8 @@ class EdgeMotion:
         across /= np.maximum(np.linalg.norm(across, axis=1), 1e-300)[:, None]
         blocks = across[:, :, None] * across[:, None]
         blocks[: self.n_vertices] = np.eye(2)
-        whole = sp.bsr_array((blocks, np.arange(n), np.arange(n + 1))).tocsr()
-        return whole[self._free][:, self._free]
+        matrix = sp.bsr_array((blocks, np.arange(n), np.arange(n + 1))).tocsr()
+        return matrix[self._free][:, self._free]
 
 
 def _numbered(tissue: Tissue, sizes: Sequence[int]) -> list[list[int]]:

@@ -1,4 +1,4 @@
-"""From what balances forces to what is reported: relative numbers, and which of them are determined."""
+"""From tensions and pressures in balance to the result: relative numbers, and which are determined."""
 
 from __future__ import annotations
 
@@ -8,35 +8,38 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from vertax._base.pixels import PixelSize, pixel_length
 from vertax.inference._balance import Equations
-from vertax.inference._curves import Fitted
+from vertax.inference._curves import Fitted, Points, arc_distances
 from vertax.inference._inferred import InferredTensions
 from vertax.inference._solve import Balance
+from vertax.initialise import MaskReport
 from vertax.mesh import Tissue
+from vertax.mesh._arcs import angle_of_area
 from vertax.mesh._geometry import geometry_of
 
-# From this standard deviation on, relative to the mean, a tension is not determined.
+# A tension with a larger standard deviation, relative to the mean, is not determined.
 _UNKNOWN = 0.3
 
 
 class Relative(NamedTuple):
-    """Tensions relative to the mean of what is known, and pressures to theirs."""
+    """Tensions relative to their mean over determined edges, and pressures relative to theirs."""
 
     tension: Float[np.ndarray, " tensions"]
     pressure: Float[np.ndarray, " pressures"]
     tension_deviation: Float[np.ndarray, " tensions"]
     pressure_deviation: Float[np.ndarray, " pressures"]
     beside: Bool[np.ndarray, " pressures"]
-    """Whether a cell has an edge of known tension."""
+    """Whether a cell has an edge of determined tension."""
 
 
 def relative(balance: Balance, which: Equations) -> Relative:
-    """What balances forces, in units of its mean.
+    """Tensions and pressures in units of the mean tension.
 
     **Arguments:**
 
-    - `balance`: what balances forces.
-    - `which`: the balances.
+    - `balance`: the solution of the balance of forces.
+    - `which`: the equations.
 
     **Returns:** the [`Relative`][vertax.inference._outcome.Relative] numbers.
     """
@@ -62,47 +65,53 @@ def relative(balance: Balance, which: Equations) -> Relative:
 
 def outcome(
     tissue: Tissue,
+    points: Points,
     curves: Fitted,
     which: Equations,
     balance: Balance,
-    source: tuple[Int[np.ndarray, " cells"], float | None, Bool[np.ndarray, " edges"]],
+    source: tuple[
+        Int[np.ndarray, " cells"], PixelSize | None, Bool[np.ndarray, " edges"], MaskReport | None
+    ],
     resampled: Float[np.ndarray, " tensions"] | None,
 ) -> InferredTensions:
-    """What is reported.
+    """The result as it is reported.
 
     **Arguments:**
 
-    - `tissue`: as it was seen.
-    - `curves`: its edges, fitted.
-    - `which`, `balance`: what balances forces.
-    - `source`: labels of the cells, length of a pixel side, and which edges have length 0.
+    - `tissue`: the observed tissue.
+    - `points`: the points of all edges.
+    - `curves`: its fitted edges.
+    - `which`, `balance`: the equations and their solution.
+    - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
     - `resampled`: standard deviations of tensions by resampling.
 
     **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions].
     """
+    labels, pixel_size, four_fold, report = source
     tissue = _moved(tissue, curves.change)
-    labels, pixel_size, four_fold = source
-    found = relative(balance, which)
+    if report is not None:
+        tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
+    result = relative(balance, which)
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
-        everywhere = np.full(size, fill)
-        everywhere[place] = of
-        return everywhere
+        array = np.full(size, fill)
+        array[place] = of
+        return array
 
     nan, edges = float("nan"), (tissue.n_edges, which.edges)
-    tensions = spread(*edges, found.tension, nan)
-    sure = ~balance.loose & (found.tension_deviation < _UNKNOWN)
+    tensions = spread(*edges, result.tension, nan)
+    sure = ~balance.loose & (result.tension_deviation < _UNKNOWN)
     determined = spread(*edges, sure, False) & ~four_fold
     cells = (tissue.n_cells, which.cells)
-    pressures = spread(*cells, found.pressure, nan)
+    pressures = spread(*cells, result.pressure, nan)
     return InferredTensions(
         tissue=tissue,
         tensions=tensions,
-        tension_deviations=spread(*edges, found.tension_deviation, nan),
+        tension_deviations=spread(*edges, result.tension_deviation, nan),
         determined=determined,
         pressures=pressures,
-        pressure_deviations=spread(*cells, found.pressure_deviation, nan),
-        pressures_determined=spread(*cells, found.beside, False),
+        pressure_deviations=spread(*cells, result.pressure_deviation, nan),
+        pressures_determined=spread(*cells, result.beside, False),
         stresses=_stresses(tissue, tensions, pressures, determined),
         labels=np.asarray(labels),
         noise=float(curves.noise * balance.errors.noise),
@@ -111,15 +120,66 @@ def outcome(
         model_errors=(float(balance.errors.junction), float(balance.errors.arc)),
         pixel_size=pixel_size,
         four_fold=four_fold,
+        mask_report=report,
+        outline_errors=_outline_errors(tissue, points, curves.change)
+        / pixel_length(pixel_size or 1.0),
         resampled_deviations=None if resampled is None else spread(*edges, resampled, nan),
     )
+
+
+def _outline_errors(
+    tissue: Tissue, points: Points, change: Float[np.ndarray, " geometry"]
+) -> Float[np.ndarray, " cells"]:
+    """Root mean square distance of the points around each cell from its arcs."""
+    geometry, edge = geometry_of(tissue), points.edge
+    p = _from_moved_vertices(tissue, points, change)
+    distance = arc_distances(geometry.edge_vectors[edge], geometry.edge_angles[edge], p)
+    total, count = np.zeros((2, tissue.n_cells + 1))
+    for side in geometry.edge_cells.T:
+        np.add.at(total, side[edge], distance**2)
+        np.add.at(count, side[edge], 1)
+    return np.sqrt(total / np.maximum(count, 1))[:-1]
+
+
+def _from_moved_vertices(
+    tissue: Tissue, points: Points, change: Float[np.ndarray, " geometry"]
+) -> Float[np.ndarray, "points 2"]:
+    """The points relative to the first vertices of their edges after these moved."""
+    shift = change[: 2 * tissue.n_vertices].reshape(-1, 2)
+    return points.away - shift[geometry_of(tissue).edge_vertices[points.edge, 0]]
+
+
+def _with_outline_of_mask(
+    tissue: Tissue,
+    points: Points,
+    change: Float[np.ndarray, " geometry"],
+    fitted: Int[np.ndarray, " some"],
+) -> Tissue:
+    """The tissue with arcs of the areas in the mask in place of those that were not fitted.
+
+    The ends of an edge on the outline move along the edges that end there, and its angle has to follow.
+    """
+    geometry, edge = geometry_of(tissue), points.edge
+    p, chord = _from_moved_vertices(tissue, points, change), geometry.edge_vectors
+    # Area between the points and the chord, right of the chord.
+    same = edge[1:] == edge[:-1]
+    last = np.append(edge[1:] != edge[:-1], True)
+    area = np.zeros(tissue.n_edges)
+    np.add.at(area, edge[:-1][same], 0.5 * np.linalg.det(np.stack([p[:-1], p[1:]], 1)[same]))
+    np.add.at(area, edge[last], 0.5 * np.linalg.det(np.stack([p[last], chord[edge[last]]], 1)))
+    other = np.zeros(tissue.n_edges, bool)
+    other[edge] = True
+    other[fitted] = False
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
+    angles = np.where(other, angle_of_area(area, length), geometry.edge_angles)
+    return tissue.with_angles(jnp.asarray(angles, tissue.vertices.dtype))
 
 
 def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
     """The tissue with the vertices and angles of the fit."""
     n = 2 * tissue.n_vertices
     dtype = tissue.vertices.dtype
-    # By NumPy: JAX would compile for each size.
+    # In NumPy: JAX would compile for each size.
     vertices = np.asarray(tissue.vertices) + change[:n].reshape(-1, 2)
     angles = geometry_of(tissue).edge_angles + change[n : n + tissue.n_edges]
     moved = tissue.with_vertices(jnp.asarray(vertices, dtype))
@@ -132,9 +192,10 @@ def _stresses(
     pressures: Float[np.ndarray, " cells"],
     determined: Bool[np.ndarray, " edges"],
 ) -> Float[np.ndarray, "cells 2 2"]:
-    """Half the tension of its edges, less the pressure, in each cell (Batchelor 1970,
+    """Stress of each cell, ½ Σ γ ∫ t t dl / A - p I over its edges (Batchelor 1970,
     doi:10.1017/S0022112070000745)."""
-    # Along an arc the tangent turns from -α to α: the integral of t t over its length, along and across.
+    # Along an arc the tangent t turns from -α to α; the mean of t t has an entry along the chord, `share`,
+    # and one across.
     geometry = geometry_of(tissue)
     chord, angle, length = geometry.edge_vectors, geometry.edge_angles, geometry.edge_lengths
     unit = chord / np.maximum(np.linalg.norm(chord, axis=1), 1e-300)[:, None]
@@ -142,8 +203,8 @@ def _stresses(
     share = 0.5 * (1 + np.sinc(2 * angle / np.pi))
     outer = lambda x: x[:, :, None] * x[:, None, :]
     fabric = share[:, None, None] * outer(unit) + (1 - share)[:, None, None] * outer(aside)
-    known = np.where(determined, tensions, np.nan)
-    pulled = 0.5 * (known * length)[:, None, None] * fabric
+    certain = np.where(determined, tensions, np.nan)
+    pulled = 0.5 * (certain * length)[:, None, None] * fabric
     total = np.zeros((tissue.n_cells + 1, 2, 2))
     for side in geometry.edge_cells.T:
         np.add.at(total, side, pulled)

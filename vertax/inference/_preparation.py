@@ -1,4 +1,4 @@
-"""Images made ready for the comparison with a mesh."""
+"""Preparation of images for the comparison with a mesh."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def in_even_light(
     background_width: float,
     longest_side: int,
 ) -> Float[np.ndarray, "coarse_rows coarse_columns"]:
-    """The image in even light, and no finer than it need be."""
-    # The logarithm brings bright junctions and faint membranes together, as the segmentation does.
+    """The image with a uniform background, and at most `longest_side` pixels wide and high."""
+    # The logarithm reduces the contrast of bright junctions with faint membranes, as the segmentation does.
     bright = pixels - pixels.min()
     bright = np.log1p(bright / bright.mean())
     diameter = 1 / pixel_size  # the mean cell area is 1
@@ -44,8 +44,9 @@ def away_from_outline(
     pixel: float,
     shape: tuple[int, ...],
 ) -> Float[np.ndarray, "coarse_rows coarse_columns"]:
-    """1 where pixels count: inside of the outline, in the image and in the mesh, and not close to it."""
-    # The outline is no interface of two cells, and the mesh cuts its corners: it is not compared.
+    """Weights of pixels: 1 inside the outline, in the image and in the mesh, and not close to it; 0
+    elsewhere."""
+    # The outline is not an interface of two cells, and the mesh cuts its corners: it has no weight.
     inside = binary_closing(np.pad(cells, 8), iterations=6)[8:-8, 8:-8]
     margin = 0.15 / pixel * cells.shape[1] / shape[1]
     inside = distance_transform_edt(inside) > margin
@@ -60,12 +61,12 @@ def away_from_outline(
 
 
 def best_psf_width(tissue: Tissue, options: dict[str, Any], shape: tuple[int, ...]) -> float:
-    """The width of the blur, in units of length, that makes a mesh most like the image.
+    """The width of the blur, in units of length, at which the rendered mesh fits the image best.
 
     `options` are those of `MeshImage`, and `shape` is that of the image, which in a mirrored tissue is a
     quarter of the whole.
     """
-    no_energy = ShapeFactorEnergy(0.0)  # the image cost does not look at the energy
+    no_energy = ShapeFactorEnergy(0.0)  # the image cost does not depend on the energy
 
     @eqx.filter_jit
     def misfit(width: Float[Array, ""]) -> Float[Array, ""]:

@@ -1,4 +1,4 @@
-"""How well hidden parameters and neighbours were found."""
+"""Accuracy of inferred parameters and neighbours."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def same_neighbours(tissue: Tissue, other: Tissue) -> bool:
 
     - `tissue`, `other`: the tissues; cells are compared by number.
 
-    **Returns:** whether they do. How many neighbourships differ, whatever the numbers of the cells, tells
-    [`mismatched_neighbours`][vertax.costs.mismatched_neighbours].
+    **Returns:** whether they do. [`mismatched_neighbours`][vertax.costs.mismatched_neighbours] counts the
+    neighbourships that differ, for any numbering of the cells.
     """
 
     def pairs(t: Tissue) -> list[list[int]]:
@@ -69,10 +69,10 @@ def same_neighbours(tissue: Tissue, other: Tissue) -> bool:
 
 
 class RecoveryWatch:
-    """A callback of [`fit`][vertax.fit] that notes, in each epoch, how much was recovered.
+    """A callback of [`fit`][vertax.fit] that records the accuracy in each epoch.
 
-    For batches of problems whose energy is a [`ShapeFactorEnergy`][vertax.energies.ShapeFactorEnergy]: the
-    notes are `pearson`, the correlation of the inferred with the true shape factors, and `mismatched`, the
+    For batches of problems with a [`ShapeFactorEnergy`][vertax.energies.ShapeFactorEnergy]: the
+    records are `pearson`, the correlation of the inferred with the true shape factors, and `mismatched`, the
     number of neighbourships that differ from those of the target.
 
     **Arguments:**
@@ -84,12 +84,12 @@ class RecoveryWatch:
     def __init__(self, truth: ShapeFactorEnergy, targets: Tissue):
         self._true = np.asarray(truth.target_shape_factor)
         self._targets = [member(targets, k) for k in range(len(self._true))]
-        self._known: list[tuple[Int[np.ndarray, " halfedges"], int] | None] = [None] * len(
+        self._counts: list[tuple[Int[np.ndarray, " halfedges"], int] | None] = [None] * len(
             self._true
         )
 
     def __call__(self, epoch: int, record: Record) -> dict[str, np.ndarray]:
-        """The notes of an epoch."""
+        """The records of an epoch."""
         inferred = np.asarray(record.parameters.target_shape_factor)
         cells = np.asarray(record.tissue.topology.cell)
         mismatched = [self._count(k, record, row) for k, row in enumerate(cells)]
@@ -97,11 +97,11 @@ class RecoveryWatch:
 
     def _count(self, k: int, record: Record, cells: Int[np.ndarray, " halfedges"]) -> int:
         # Most epochs have no T1 transition, and the assignment of cells takes a while.
-        known = self._known[k]
-        if known is None or not np.array_equal(known[0], cells):
+        latest = self._counts[k]
+        if latest is None or not np.array_equal(latest[0], cells):
             count = mismatched_neighbours(member(record.tissue, k), self._targets[k])
-            self._known[k] = known = (cells, count)
-        return known[1]
+            self._counts[k] = latest = (cells, count)
+        return latest[1]
 
 
 def _alike(true: Values, inferred: Values) -> tuple[np.ndarray, np.ndarray]:

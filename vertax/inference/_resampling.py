@@ -1,4 +1,4 @@
-"""Deviations by turning noise over: what Laplace's approximation is checked against."""
+"""Standard deviations by resampling (wild bootstrap), a check of Laplace's approximation."""
 
 from __future__ import annotations
 
@@ -8,42 +8,41 @@ from scipy.sparse.linalg import splu
 
 from vertax.inference._balance import Equations, angle_slopes
 from vertax.inference._curves import Fitted, Points
+from vertax.inference._observed_geometry import ObservedGeometry
 from vertax.inference._outcome import relative
-from vertax.inference._seen import Seen
-from vertax.inference._solve import Balance, Told, solve
+from vertax.inference._solve import Balance, Observability, solve
 
 
-# The angles with which all forces balance, with the tensions found, are taken for the truth. To them comes
-# what the distances of points from curves do, as they were seen, but each stretch along which they are alike
-# with a sign by chance (wild bootstrap: Wu 1986, doi:10.1214/aos/1176350142); and errors of the model by
-# chance.
+# The truth of the bootstrap are the angles with which all forces balance at the inferred tensions. Added are
+# the effect of the observed distances of points from curves, where each stretch of correlated distances gets
+# a random sign (wild bootstrap: Wu 1986, doi:10.1214/aos/1176350142), and random errors of the model.
 def resampled_deviations(
-    fitted: Seen,
+    fitted: ObservedGeometry,
     curves: Fitted,
     points: Points,
     which: Equations,
-    shape: Told,
+    shape: Observability,
     balance: Balance,
     *,
     prior: float | None,
     times: int,
     seed: int,
 ) -> Float[np.ndarray, " tensions"]:
-    """Standard deviations of tensions, from shapes with other noise.
+    """Standard deviations of tensions inferred from resampled shapes.
 
     **Arguments:**
 
-    - `fitted`, `curves`, `points`, `which`, `shape`: what was seen.
-    - `balance`: what was found.
-    - `prior`: of tensions.
-    - `times`: number of shapes.
-    - `seed`: of their chance.
+    - `fitted`, `curves`, `points`, `which`, `shape`: the observed geometry and its equations.
+    - `balance`: the inferred tensions and pressures.
+    - `prior`: standard deviation of the prior of tensions.
+    - `times`: number of resampled shapes.
+    - `seed`: seed of the random numbers.
 
     **Returns:** the standard deviations.
     """
     random = np.random.default_rng(seed)
     stretch = _stretches(points, 2 * curves.apart)
-    # What the distance of each stretch does to the angles.
+    # Effect of the distances of each stretch on the angles.
     by_point = angle_slopes(fitted, which) @ splu(curves.precision).solve(
         (curves.weighted * curves.rest).toarray()
     )
@@ -52,19 +51,19 @@ def resampled_deviations(
     model = np.concatenate(
         [np.full(which.n_directions, errors.junction), errors.arc * shape.length]
     )
-    found = []
+    samples = []
     for _ in range(times):
         sign = random.choice([-1.0, 1.0], size=by_stretch.shape[1])
         chance = by_stretch @ sign + model * random.normal(size=len(model))
         again = shape._replace(angle=balance.angle + chance)
-        found.append(
+        samples.append(
             relative(solve(again, which, exact=True, prior=prior, errors=errors), which).tension
         )
-    return np.std(found, axis=0, ddof=1)
+    return np.std(samples, axis=0, ddof=1)
 
 
 def _stretches(points: Points, length: float) -> Int[np.ndarray, " points"]:
-    """Numbers of stretches of edges that are so long, in order."""
+    """Index of the stretch of given length of each point, in order along the edges."""
     same = np.append(False, points.edge[1:] == points.edge[:-1])
     spacing = np.linalg.norm(np.diff(points.away, axis=0, prepend=points.away[:1]), axis=1)
     course = np.cumsum(np.where(same, spacing, 0.0))

@@ -1,4 +1,4 @@
-"""Synthetic inverse problems: a tissue with hidden parameters, and where a fit starts."""
+"""Synthetic inverse problems: a tissue with hidden parameters, and the start of a fit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vertax.relax import Relaxation
 
 
 class Scene(eqx.Module):
-    """What is hidden, what is to be matched, and where the fit starts."""
+    """Hidden parameters, the target that they produce, and the start of the fit."""
 
     truth: ShapeFactorEnergy
     """The hidden parameters."""
@@ -25,7 +25,7 @@ class Scene(eqx.Module):
     initial: Tissue
     """Their equilibrium."""
     converged: Bool[Array, ""]
-    """Whether that was reached: a coarse relaxation need not."""
+    """Whether the initial tissue is in equilibrium; after a coarse relaxation it may not be."""
 
 
 def shape_factor_scene(
@@ -66,13 +66,13 @@ def shape_factor_scene(
 
     - `ValueError` for an unknown `guess` or `start`, or if the hidden tissue does not reach equilibrium.
     """
-    for name, value, known in (
+    for name, value, options in (
         ("guess", guess, ("redrawn", "mean")),
         ("start", start, ("target", "first")),
     ):
-        if value not in known:
+        if value not in options:
             raise ValueError(
-                f"Argument `{name}` must be {known[0]!r} or {known[1]!r}, but is {value!r}."
+                f"Argument `{name}` must be {options[0]!r} or {options[1]!r}, but is {value!r}."
             )
     response = Relaxation() if response is None else response
     if target_response is None:

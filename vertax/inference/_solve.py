@@ -1,4 +1,4 @@
-"""Tensions and pressures in balance, and the angles nearest to those seen."""
+"""Tensions and pressures in balance, and the angles nearest to those observed."""
 
 from __future__ import annotations
 
@@ -20,73 +20,83 @@ from vertax.inference._balance import (
 )
 from vertax.inference._curves import Fitted
 from vertax.inference._errors import Errors, model_errors
-from vertax.inference._seen import Seen
+from vertax.inference._observed_geometry import ObservedGeometry
 
-# From this deviation of its direction on, in radians, an edge says nothing, nor if it is no longer than so
-# many times the noise; how large forces may be there.
+# An edge is loose if the standard deviation of its direction, in radians, is larger than the first, or if it
+# is shorter than the second times the noise. Its force has the third as standard deviation, in mean tensions.
 _LOOSE, _SHORT, _UNKNOWN = 0.2, 8.0, 10.0
-# How much pressures may differ, mean tensions over a cell diameter.
+# Prior standard deviation of pressures, in mean tensions over a cell diameter.
 _PRESSURE = 10.0
-# How many times the spread of tensions their prior is wide; at least and at most.
+# Width of the prior of tensions over their spread; smallest and largest width; initial width.
 _TIMES, _WIDTHS, _START = 2.0, (0.3, 3.0), 0.5
-# Least tension by which noise is judged.
+# Smallest tension in the covariance of the forces.
 _SMALL = 0.2
 _FIRST = Errors(0.05, 0.5, 1.0)
-# How much less or more noise than points tell may be found, logarithms: pixels on a straight line depart from
-# it by a pattern that averages out, which what is rough does not.
+# Logarithms of the smallest noise relative to that of the points, of smooth and of rough outlines, and of the
+# largest: pixels along a straight line deviate from it by a pattern that averages out, rough outlines do not.
 _LESS, _ROUGH_LESS, _MORE = -2.3, -0.35, 0.7
-# From this error on, in radians, arcs say little of tensions.
+# Error of arcs, in radians, above which their weight decreases.
 _ARCS = 0.02
-# By how much angles may be adjusted, in radians.
+# Largest adjustment of an angle, in radians.
 _REACH = 0.5
 
 
-class Told(NamedTuple):
-    """What a shape tells for the balance of forces."""
+class Observability(NamedTuple):
+    """The observed angles of a shape, their covariance, and which forces they determine."""
 
     angle: Float[np.ndarray, " angles"]
     """Directions at junctions, and angles of arcs."""
     covariance: Float[np.ndarray, "angles angles"]
-    """Of the angles, as the noise of points makes it."""
+    """Covariance of the angles due to the noise of points."""
     length: Float[np.ndarray, " edges"]
-    """Of chords, in cell diameters."""
+    """Lengths of chords, in cell diameters."""
     loose: Bool[np.ndarray, " edges"]
-    """Edges so short that their direction is not known."""
+    """Edges too short for a direction."""
     unknown: Float[np.ndarray, "rows rows"]
-    """Covariance of the forces along these: what an edge pulls at one end it pulls back at the other, so that
-    the balance of both ends together is left."""
+    """Covariance of the unknown forces of loose edges. The force at one end is opposite to that at the
+    other, so that the balance of both ends together remains."""
     size: float
     """Root of the mean area of a cell."""
     least_noise: float
-    """That may be found over that of points, a logarithm."""
+    """Logarithm of the smallest noise relative to that of the points."""
 
 
 class Balance(NamedTuple):
-    """What balances forces best."""
+    """The solution of the balance of forces."""
 
     tension: Float[np.ndarray, " edges"]
     pressure: Float[np.ndarray, " cells"]
     covariance: Float[np.ndarray, "unknowns unknowns"]
-    """Of tensions and pressures."""
+    """Covariance of tensions and pressures."""
     angle: Float[np.ndarray, " angles"]
     """The angles with which all forces balance."""
     errors: Errors
-    """Of the model, which no noise explains, and the noise, as forces tell it, over that of the points."""
+    """Errors of the model, beyond noise, and the noise estimated from forces, relative to that of the
+    points."""
     residual: Float[np.ndarray, " rows"]
-    """Forces that are left with the angles as they were seen, over their standard deviations."""
+    """Residual forces with the observed angles, over their standard deviations."""
     loose: Bool[np.ndarray, " edges"]
-    """Edges so short that their direction is not known."""
+    """Edges too short for a direction."""
 
 
-def told(fitted: Seen, curves: Fitted, which: Equations) -> Told:
-    """What a shape tells for the balance of forces."""
+def observability(
+    fitted: ObservedGeometry,
+    curves: Fitted,
+    which: Equations,
+    uncertain: Bool[np.ndarray, " all_edges"],
+) -> Observability:
+    """The observed angles of a shape, and their covariance.
+
+    `uncertain` marks edges that may be between other cells; they are loose, as those without a direction.
+    """
     slope = angle_slopes(fitted, which)
     covariance = curves.noise**2 * (slope @ splu(curves.precision).solve(slope.T.toarray()))
     variance = np.zeros(len(which.edges))
     np.maximum.at(variance, which.half_edge.ravel(), np.diag(covariance)[: which.n_directions])
     loose = (variance > _LOOSE**2) | (which.chord < _SHORT * curves.noise)
+    loose |= uncertain[which.edges]
     unknown = pulls(fitted, which, loose)
-    return Told(
+    return Observability(
         angle=angles(fitted, which),
         covariance=covariance,
         length=np.maximum(which.chord / fitted.size, 0.05),
@@ -97,18 +107,18 @@ def told(fitted: Seen, curves: Fitted, which: Equations) -> Told:
     )
 
 
-# What was seen are angles a with the covariance C, from the noise of points. Where the tissue is not in
-# balance, angles differ from those of a balance as well, and count as a part of a with the covariance τ².
+# Observed are angles a with the covariance C, from the noise of points. Where the tissue is not in balance,
+# angles differ from those of a balance as well, which adds τ² to their covariance.
 # Forces r(x, a) = A(a) x are linear in the unknowns x. To first order their covariance is S = J C Jᵀ with
-# J = ∂r/∂a. Weighted least squares with fixed a would shrink what is noisy, because noise of A and of r is
-# the same noise. So a is adjusted as well (total least squares: Britt & Luecke 1973,
+# J = ∂r/∂a. Weighted least squares with fixed a would shrink the unknowns, because the noise of A and of r is
+# the same. So a is adjusted as well (total least squares: Britt & Luecke 1973,
 # doi:10.1080/00401706.1973.10489060): linearised at (x, a),
 #
 #     x' minimises (A x' - J d)ᵀ S⁻¹ (A x' - J d) + prior,      d' = - C Jᵀ S⁻¹ (A x' - J d),
 #
-# where d = a - a_seen. At its end all forces balance with the adjusted angles.
+# where d = a - a_observed. When it has converged, all forces balance with the adjusted angles.
 def solve(
-    shape: Told,
+    shape: Observability,
     which: Equations,
     *,
     exact: bool,
@@ -120,33 +130,33 @@ def solve(
 
     **Arguments:**
 
-    - `shape`: what was seen.
-    - `which`: the balances that count.
-    - `exact`: whether there cannot be more noise than points tell.
-    - `prior`: standard deviation of tensions about 1; left out, some times that of those which are known.
-    - `errors`: of model and noise; left out, as large as forces tell.
-    - `rounds`: of adjusting the angles.
+    - `shape`: the observed angles.
+    - `which`: the equations.
+    - `exact`: whether the noise is at most that of the points.
+    - `prior`: standard deviation of tensions about 1; by default twice the spread of those determined.
+    - `errors`: errors of model and noise; by default estimated from the forces.
+    - `rounds`: largest number of adjustments of the angles.
 
     **Returns:** the [`Balance`][vertax.inference._solve.Balance].
     """
     n_edges, n_cells, loose = len(which.edges), len(which.cells), shape.loose
     x = np.concatenate([np.ones(n_edges), np.zeros(n_cells)])
     change = np.zeros(len(shape.angle))
-    # Before anything was seen: tensions about 1, and pressures of that order in a cell.
+    # Prior means: tensions of 1, and pressures of 0.
     expected = x.copy()
     width = prior or _START
     mean = np.append(~loose, np.zeros(n_cells, bool)) / max(1, np.sum(~loose))
     at_junctions, along = np.zeros_like(change), np.zeros_like(change)
     at_junctions[: which.n_directions] = 1.0
     along[which.n_directions :] = shape.length**2
-    known, shares = errors is not None, (shape.least_noise, 0.0 if exact else _MORE)
+    has_errors, shares = errors is not None, (shape.least_noise, 0.0 if exact else _MORE)
     errors = _FIRST if errors is None else errors
     covariance = residual = np.zeros(0)
     for attempt in range(rounds):
         matrix = forces(shape.angle + change, which, loose)
         slope = force_slopes(shape.angle + change, which, np.maximum(x[:n_edges], _SMALL))
         offset = -slope @ change
-        if attempt in (2, 4) and not known:
+        if attempt in (2, 4) and not has_errors:
             parts = Errors(
                 (slope * at_junctions @ slope.T).toarray(),
                 (slope * along @ slope.T).toarray(),
@@ -155,8 +165,8 @@ def solve(
             basis = np.linalg.svd(mean[None])[2][1:].T
             left_over = matrix @ expected + offset
             errors = model_errors(matrix @ basis, left_over, parts, shape.unknown, errors, shares)
-        # Where arcs are not in balance, that is not chance: friction holds weak edges and strong ones in
-        # another way, which would bias tensions long before it shows. So they have less to say.
+        # Arcs out of balance are not random errors: friction acts on weak edges otherwise than on strong
+        # ones, which biases tensions before it shows in the residuals. So their weight is reduced.
         arc = errors.arc * np.sqrt(1 + (errors.arc / _ARCS) ** 2)
         spread = errors.noise**2 * shape.covariance + np.diag(
             errors.junction**2 * at_junctions + arc**2 * along
@@ -178,10 +188,10 @@ def solve(
         change = -answer @ solve_triangular(factor, residual, lower=True, trans=1)
         change *= min(1.0, _REACH / max(float(np.max(np.abs(change))), 1e-300))
         covariance = cho_solve(root, np.eye(len(x)))
-        # Before angles are adjusted by much: where noise is large, tensions could drift with the prior.
+        # Only in the first rounds: where noise is large, tensions could drift with the prior.
         if prior is None and attempt < 2:
             width = _varied(x[:n_edges][~loose], np.diag(covariance)[:n_edges][~loose])
-        if attempt > (1 if known else 4) and np.max(np.abs(x - before)[:n_edges]) < 1e-3:
+        if attempt > (1 if has_errors else 4) and np.max(np.abs(x - before)[:n_edges]) < 1e-3:
             break
     return Balance(
         tension=x[:n_edges],
@@ -195,8 +205,8 @@ def solve(
 
 
 def _varied(tension: Float[np.ndarray, " edges"], variance: Float[np.ndarray, " edges"]) -> float:
-    """How much tensions may differ: some times as much as those do that are known, because they may be alike
-    over many cells, and the prior takes each by itself."""
+    """Width of the prior of tensions: twice their spread, because tensions may be correlated over many
+    cells, and the prior treats them as independent."""
     weight = 1 / (variance + 0.05)
     spread = np.sum(weight * ((tension - 1) ** 2 - variance)) / max(np.sum(weight), 1e-300)
     return float(np.clip(_TIMES * np.sqrt(max(spread, 0.0)), *_WIDTHS))
@@ -205,8 +215,8 @@ def _varied(tension: Float[np.ndarray, " edges"], variance: Float[np.ndarray, " 
 def _not_negative(
     normal: Float[np.ndarray, "n n"], right: Float[np.ndarray, " n"], n: int
 ) -> Float[np.ndarray, " n"]:
-    """The solution of normal equations whose first `n` entries are not negative."""
-    # Without the others, which follow.
+    """The solution of normal equations with the constraint that the first `n` entries are not negative."""
+    # The others are eliminated.
     other = cho_factor(normal[n:, n:])
     through = cho_solve(other, np.column_stack([normal[n:, :n], right[n:]]))
     reduced = normal[:n, :n] - normal[:n, n:] @ through[:, :-1]

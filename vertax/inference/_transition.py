@@ -1,4 +1,4 @@
-"""Where a tissue turns from solid to fluid: the transition in counts, and the onset in energies."""
+"""The transition of a tissue from solid to fluid: from counts, and from the onset of energies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 
 class Transition(NamedTuple):
-    """Where something sets in, and over what range."""
+    """Position and width of a transition."""
 
     centre: float
     """The value of the parameter."""
@@ -33,7 +33,7 @@ def fit_transition(
     - `trials`: number of trials at each.
 
     **Returns:** the [`Transition`][vertax.inference.Transition]; NaN if all trials succeeded, or none. It is
-    no steeper than the spacing of the values can tell.
+    no steeper than the spacing of the values resolves.
 
     **Raises:**
 
@@ -69,9 +69,9 @@ def fit_onset(
 ) -> Transition | None:
     r"""Where rigid tissues would lose their energy: $\sqrt{E} \propto p^* - p^0$, extrapolated.
 
-    A rigid tissue keeps the perimeters that it can get, so its energy grows like the square of what is
-    missing. Unlike the count of tissues at zero energy this does not ask that the last cell of a tissue
-    be content.
+    In a rigid tissue the perimeters are limited, so its energy grows like the square of the difference from
+    the target. Unlike the count of tissues at zero energy, this does not depend on the last cell that reaches
+    its target.
 
     **Arguments:**
 

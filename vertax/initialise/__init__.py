@@ -11,6 +11,7 @@ from vertax.initialise._polygons import (
     PolygonTissue as PolygonTissue,
     from_polygons as from_polygons,
 )
+from vertax.initialise._report import MaskChange as MaskChange, MaskReport as MaskReport
 from vertax.initialise._segmenters import (
     AbstractSegmenter as AbstractSegmenter,
     Cellpose as Cellpose,

@@ -25,7 +25,7 @@ from vertax.initialise._spatial_order import spatial_order
 # pixels of one cell are not joined through their corner, so faces are the 4-connected regions.
 _STEP = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 
-# _TURN[p, e]: first occupied slot clockwise of slot e at a corner whose occupied slots are the bits
+# _TURN[p, e]: first occupied slot clockwise of slot e at a corner with the occupied slots in the bits
 # of p.
 _OCCUPIED = (np.arange(16)[:, None] >> np.arange(4)) & 1
 _CANDIDATES = (np.arange(4)[:, None] - np.arange(1, 5)) % 4
@@ -142,7 +142,7 @@ def enclosed_cells(graph: CrackGraph, exterior: int | None = None) -> dict[int, 
     if not np.any(is_tissue):
         # The outline of a disk makes four left turns in all, that of a hole four right turns, and
         # an outline that goes around the torus none: cells without an outline of the first kind are
-        # to blame.
+        # not disks.
         turn = (graph.following[cracks] % 4 - cracks % 4 + 1) % 4 - 1
         turns = np.bincount(face, turn, minlength=n_faces)
         raise NotADiskError(np.setdiff1d(left, left[turns[face] == 4]))
@@ -169,7 +169,7 @@ class NotADiskError(Exception):
 
 
 def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mesh:
-    """The trivalent mesh of an image whose cells are disks.
+    """The trivalent mesh of an image of cells that are disks.
 
     `priority` ranks the cell on the left of each slot: where four different cells meet, the one of
     the lowest rank gets to touch its opposite.
@@ -189,17 +189,15 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     p, rank = graph.left[fourfold], priority[fourfold]
     s = np.where(np.minimum(rank[:, 0], rank[:, 2]) < np.minimum(rank[:, 1], rank[:, 3]), 0, 1)
     s = np.where(p[:, 0] == p[:, 2], 1, np.where(p[:, 1] == p[:, 3], 0, s))[:, None]
-    around = (s + np.array([[1, 2, 3, 0]])) % 4
-    p_around = np.take_along_axis(p, around, axis=1)
-    cell_u, cell_w = p_around[:, [0, 1, 3]], p_around[:, [2, 3, 1]]
+    slot = (s + np.array([[1, 2, 3, 0]])) % 4
+    p_slot = np.take_along_axis(p, slot, axis=1)
+    cell_u, cell_w = p_slot[:, [0, 1, 3]], p_slot[:, [2, 3, 1]]
 
     at = np.concatenate([triple, fourfold, fourfold])
     cell = np.concatenate([cell3, cell_u, cell_w])
     crack = np.full((len(at), 3), -1)
     crack[: len(triple)] = 4 * triple[:, None] + slot3
-    crack[len(triple) :, :2] = 4 * at[len(triple) :, None] + np.vstack(
-        [around[:, :2], around[:, 2:]]
-    )
+    crack[len(triple) :, :2] = 4 * at[len(triple) :, None] + np.vstack([slot[:, :2], slot[:, 2:]])
     partner = np.arange(len(at))
     u = np.arange(len(triple), len(triple) + len(fourfold))
     partner[u], partner[u + len(u)] = u + len(u), u

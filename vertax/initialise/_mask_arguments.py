@@ -5,20 +5,21 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Array, Int, Integer, Shaped
 
-from vertax._base.checks import check_integer, check_number
+from vertax._base.checks import check_integer
+from vertax._base.pixels import PixelSize, check_pixel_size
 
 _BOUNDARIES = ("mirrored", "periodic", "free")
 
 
-def check_options(boundary: str, pixel_size: float | None) -> None:
-    """Refuse an unknown boundary or an impossible pixel size with a `ValueError`."""
+def check_options(boundary: str, pixel_size: PixelSize | None) -> None:
+    """Raise a `ValueError` for an unknown boundary or an impossible pixel size."""
     if boundary not in _BOUNDARIES:
         raise ValueError(
             f"Argument `boundary` must be one of {', '.join(map(repr, _BOUNDARIES))}, but is "
             f"{boundary!r}."
         )
     if pixel_size is not None:
-        check_number("pixel_size", pixel_size, above=0)
+        check_pixel_size("pixel_size", pixel_size)
 
 
 def checked_mask(
@@ -30,16 +31,20 @@ def checked_mask(
     """
     # Of a masked array, what is masked is no cell.
     mask = np.ma.filled(mask, 0) if isinstance(mask, np.ma.MaskedArray) else np.asarray(mask)
+    mask = without_single_axes(mask)
     if mask.ndim != 2 or mask.size == 0:
         raise ValueError(
             "Argument `mask` must have shape (rows, columns), one label a pixel, but its shape is "
-            f"{mask.shape}. Pass one plane of a stack, without a channel axis."
+            f"{mask.shape}. Pass one plane of a stack, such as mask[0], without a channel axis."
         )
     if mask.dtype.kind not in "iu":
+        convert = "mask.astype(int)"
+        if mask.dtype.kind == "f" and np.isnan(mask).any():
+            convert = "numpy.nan_to_num(mask, nan=0), where NaN is no cell, and mask.astype(int)"
         raise ValueError(
             f"Argument `mask` must hold integer labels, but its dtype is {mask.dtype}. Number the "
             "cells (scipy.ndimage.label does it for a binary mask) or convert the labels with "
-            "mask.astype(int)."
+            f"{convert}."
         )
     check_bits("mask", mask)
     check_zero("mask", mask, background)
@@ -59,6 +64,13 @@ def checked_mask(
         )
     image = image.reshape(mask.shape).astype(np.int32) - n_gaps
     return values.astype(np.int64), np.maximum(image, -1), background
+
+
+def without_single_axes(image: np.ndarray) -> np.ndarray:
+    """An image without the axes of length 1 that a third and further axes are."""
+    while image.ndim > 2 and 1 in image.shape:
+        image = np.squeeze(image, axis=image.shape.index(1))
+    return image
 
 
 def check_bits(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:
@@ -111,6 +123,6 @@ def _background(mask: Integer[np.ndarray, "rows columns"], given: int | None) ->
         return int(given) if given > 0 else None
     # All others lie within a label that has the whole border, and a cell around all others is none.
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    around = int(border[0])
-    alone = around <= 0 or np.any(border != around) or np.all((mask == around) | (mask <= 0))
-    return None if alone else around
+    label = int(border[0])
+    alone = label <= 0 or np.any(border != label) or np.all((mask == label) | (mask <= 0))
+    return None if alone else label

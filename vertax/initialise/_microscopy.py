@@ -37,7 +37,7 @@ def from_microscopy(
     - `image`: intensities of shape (rows, columns), e.g. from
         [`vertax.io.read_image`][vertax.io.read_image].
     - `segmenter`: [`Watershed`][vertax.initialise.Watershed] by default, or
-        [`Cellpose`][vertax.initialise.Cellpose], or one of your own: a function from pixels to labels.
+        [`Cellpose`][vertax.initialise.Cellpose], or a custom one: a function from pixels to labels.
     - `boundary`, `pixel_size`, `softening`: as for `from_labels`. With `boundary="periodic"` cells
         are found across the border of the image.
 
@@ -77,7 +77,7 @@ def from_microscopy(
 
 
 def _name(segmenter: Segmenter) -> str:
-    """What messages call it; a segmenter of one's own may be a function."""
+    """Its name in messages; a custom segmenter may be a function."""
     return getattr(segmenter, "__name__", type(segmenter).__name__)
 
 
@@ -96,7 +96,7 @@ def _segment_periodic(image: np.ndarray, segmenter: Segmenter) -> Int[np.ndarray
     """Labels of a periodic image, with cells that cross its border whole.
 
     Every cell lies whole somewhere in the image continued by half of itself on all sides. There it
-    has several copies; the one whose centre is in the original is taken.
+    has several copies; the one with its centre in the original is taken.
     """
     rows, columns = image.shape
     top, left = rows // 2, columns // 2

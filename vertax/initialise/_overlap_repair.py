@@ -11,27 +11,30 @@ from vertax.mesh import Periodic, Tissue
 from vertax.mesh._geometry import geometry_of
 from vertax.mesh._overlaps import crossed_sides
 
-_MAX_ITERATIONS = 60
+# Largest number of rounds of flattening, and of bending back.
+_ROUNDS = 60
 
 
-def repair_overlaps(tissue: Tissue) -> Tissue:
-    """Remove overlaps of cells; only cells that overlap change.
+def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
+    """The same tissue, repaired where its cells overlap, and only there.
 
-    Angles of arcs decrease; then corners move towards their neighbours. A tissue without overlaps is returned
-    as the same object.
+    Arcs are flattened; where straight edges cross, vertices move towards their neighbours. With
+    `bend_back` each arc is then bent back as far as no overlap returns, which keeps the areas of cells.
 
     **Raises:**
 
-    - `ValueError` if overlaps remain.
+    - `ValueError` if cells still overlap after 60 rounds.
     """
+    angles = None if tissue.arcs is None else np.asarray(tissue.arcs.angles)
     m = tissue.topology
     cell, twin = np.asarray(m.cell), np.asarray(m.twin)
     following = np.where(twin % 3 == 0, twin + 2, twin - 1)
     for attempt in range(_MAX_ITERATIONS):
-        crossed = _crossing_sides(tissue, following, cell)
+        crossed = _crossed(tissue, following, cell)
         bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
         if not crossed.any():
-            return tissue
+            bends = bend_back and attempt > 0 and angles is not None
+            return _bent_back(tissue, angles) if bends else tissue
         geometry = geometry_of(tissue)
         ends, faces = geometry.edge_vertices, geometry.edge_cells
         touched = np.any(np.append(bad, False)[faces], axis=1)
@@ -54,7 +57,31 @@ def repair_overlaps(tissue: Tissue) -> Tissue:
     )
 
 
-def _crossing_sides(
+def _bent_back(tissue: Tissue, angles: Float[np.ndarray, " edges"]) -> Tissue:
+    """The tissue with each arc as near to an angle as possible without overlaps."""
+    m = tissue.topology
+    cell, twin, edge = np.asarray(m.cell), np.asarray(m.twin), np.asarray(m.edge)
+    following = np.where(twin % 3 == 0, twin + 2, twin - 1)
+    assert tissue.arcs is not None
+    flat = np.asarray(tissue.arcs.angles)
+    faces = geometry_of(tissue).edge_cells
+    fraction = np.ones(len(flat))
+    for attempt in range(_ROUNDS):
+        trial = tissue.with_angles(jnp.asarray(flat + fraction * (angles - flat), flat.dtype))
+        crossed = _crossed(trial, following, cell)
+        if not crossed.any():
+            return trial
+        # First the arcs that cross another side, then all arcs of these cells.
+        touched = np.zeros(len(flat), bool)
+        touched[edge[crossed]] = True
+        if attempt >= _ROUNDS // 3:
+            bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
+            touched |= np.any(np.append(bad, False)[faces], axis=1)
+        fraction = np.where(touched, np.where(fraction > 0.05, 0.6 * fraction, 0.0), fraction)
+    return tissue
+
+
+def _crossed(
     tissue: Tissue, following: Int[np.ndarray, " halfedges"], cell: Int[np.ndarray, " halfedges"]
 ) -> Bool[np.ndarray, " halfedges"]:
     """Which half-edges cross another side of their face."""

@@ -123,9 +123,8 @@ class Cellpose(AbstractSegmenter):
 
     **Arguments:**
 
-    - `model`: name of a model that cellpose knows, or path of one you trained.
-    - `diameter`: typical diameter of a cell in pixels, for images whose cells are far from 30
-        pixels.
+    - `model`: name of a model of cellpose, or path of one you trained.
+    - `diameter`: typical diameter of a cell in pixels, for images of cells far from 30 pixels.
     - `flow_threshold`: largest error of the flow field of a cell; higher finds more cells.
     - `cellprob_threshold`: lowest score of a pixel of a cell; lower finds more and larger cells.
     - `gpu`: use a GPU if there is one.

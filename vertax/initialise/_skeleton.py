@@ -25,7 +25,7 @@ def labels_from_skeleton(
     **Raises:**
 
     - `ValueError` for an image that is not two-dimensional or too small, holds no finite real numbers, or
-        whose lines enclose nothing.
+        has lines that enclose nothing.
     """
     pixels = np.asarray(image)
     if pixels.dtype.kind not in "buif":
@@ -40,7 +40,7 @@ def labels_from_skeleton(
             "Argument `image` must have shape (rows, columns), at least 3 × 3, but its shape is "
             f"{lines.shape}."
         )
-    # Around the image there is nothing but outside, so a frame of lines encloses nothing.
+    # The image is surrounded by outside, so a frame of lines encloses nothing.
     lines = np.pad(lines[1:-1, 1:-1], 1)
     regions = np.zeros(lines.shape, np.int32)
     label(~lines, output=regions)

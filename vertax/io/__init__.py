@@ -1,6 +1,7 @@
 """Files: tissues, energies, problems, trajectories; tables and formats of other programs."""
 
 from vertax._base.atomic import atomic_write as atomic_write
+from vertax._base.pixels import pixel_sides as pixel_sides
 from vertax.io._bounded_tables import BoundedTables as BoundedTables
 from vertax.io._data_tables import (
     cell_table as cell_table,
@@ -10,7 +11,7 @@ from vertax.io._data_tables import (
 from vertax.io._edge_table import from_edge_table as from_edge_table
 from vertax.io._force_inference import read_force_inference as read_force_inference
 from vertax.io._geojson import write_geojson as write_geojson
-from vertax.io._image import read_image as read_image
+from vertax.io._image import pixel_aspect as pixel_aspect, read_image as read_image
 from vertax.io._module_file import (
     load_energy as load_energy,
     load_problem as load_problem,

@@ -67,6 +67,28 @@ def read_image(
     return planes_read[_choose("channel", channel, len(planes_read), file)]
 
 
+def pixel_aspect(path: str | os.PathLike[str]) -> float:
+    """Height over width of the pixels of a TIFF file, from its resolution; 1 where the file has none.
+
+    **Arguments:**
+
+    - `path`: the file; of another format the ratio is 1.
+
+    **Returns:** the ratio.
+    """
+    file = Path(path)
+    if file.suffix.lower() not in _TIFF:
+        return 1.0
+    with requires_extra("image", "Reading TIFF files"):
+        import tifffile
+    with tifffile.TiffFile(file) as tiff:
+        tags = tiff.pages.first.tags
+        # Pixels per unit of length along x and y, as fractions.
+        found = [tags.get(name) for name in ("XResolution", "YResolution")]
+    (a, b), (c, d) = ((0, 1) if tag is None else tag.value for tag in found)
+    return float(a * d / (b * c)) if a * b * c * d else 1.0
+
+
 def _read(file: Path) -> tuple[np.ndarray, str]:
     """All pixels of the file, and a letter for each axis."""
     try:

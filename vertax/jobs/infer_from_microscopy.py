@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from vertax import runs
 from vertax.fitting import Fit
 from vertax.inference import Micrograph
+from vertax.io import pixel_sides
 from vertax.mesh import Tissue
 from vertax.plotting import plot_history, plot_tissue, plot_tissues, scale_bar
 
@@ -92,7 +93,8 @@ def measure(micrograph: Micrograph, fit: Fit) -> dict[str, Any]:
         "shape_factor_median": np.median(factors),
         "observed_shape_factor_mean": np.asarray(fit.tissue.shape_factors)[complete].mean(),
         "vertex_displacement_from_segmentation": distance,
-        "psf_width_pixels": micrograph.psf_width / segmentation.pixel_size,
+        "psf_width_pixels": micrograph.psf_width
+        / np.sqrt(np.prod(pixel_sides(segmentation.pixel_size))),
         "pixel_size": segmentation.pixel_size,
         **runs.fit_metrics(fit),
         "num_t1_first_guess": first.num_t1,
@@ -103,6 +105,7 @@ def cell_table(micrograph: Micrograph, fit: Fit) -> dict[str, np.ndarray]:
     """One row per complete cell of the original image."""
     tissue, segmentation = fit.tissue, micrograph.segmentation
     shape_factors, rest_areas = micrograph.parameters(fit.energy)
+    sides = pixel_sides(segmentation.pixel_size)
     columns = {
         "label": segmentation.labels,
         "target_shape_factor": shape_factors,
@@ -110,8 +113,8 @@ def cell_table(micrograph: Micrograph, fit: Fit) -> dict[str, np.ndarray]:
         "shape_factor": tissue.shape_factors,
         "area": tissue.areas,
         "perimeter": tissue.perimeters,
-        "x_pixels": tissue.centroids[:, 0] / segmentation.pixel_size,
-        "y_pixels": tissue.centroids[:, 1] / segmentation.pixel_size,
+        "x_pixels": tissue.centroids[:, 0] / sides[0],
+        "y_pixels": tissue.centroids[:, 1] / sides[1],
     }
     return {name: np.asarray(column)[micrograph.whole] for name, column in columns.items()}
 
@@ -129,20 +132,20 @@ def draw(micrograph: Micrograph, pixels: np.ndarray, fit: Fit, folder: runs.RunF
     folder.save_figure("shape_factors", plot_cells(pixels, fit.tissue, values, complete, size))
 
 
-def plot_overlays(image: np.ndarray, panels: dict[str, Tissue], *, pixel_size: float) -> Figure:
+def plot_overlays(image: np.ndarray, panels: dict[str, Tissue], *, pixel_size: Any) -> Figure:
     """Meshes over the image; its first row and column begin at y = 0 and x = 0."""
     figure = Figure()
     axes = plot_tissues(panels, figure=figure, image=image, pixel_size=pixel_size, linewidth=0.9)
-    scale_bar(axes[0], "pixels", unit_length=pixel_size)
+    scale_bar(axes[0], "pixels", unit_length=pixel_sides(pixel_size)[0])
     return figure
 
 
 def plot_cells(
-    image: np.ndarray, tissue: Tissue, values: Any, mask: Any, pixel_size: float
+    image: np.ndarray, tissue: Tissue, values: Any, mask: Any, pixel_size: Any
 ) -> Figure:
     """The cells of a mask over the image, coloured by their target shape factors."""
     figure = Figure()
     options: Any = {"mask": mask, "label": "target shape factor $p_0$", "pixel_size": pixel_size}
     ax = plot_tissue(tissue, values, figure=figure, image=image, **options)
-    scale_bar(ax, "pixels", unit_length=pixel_size)
+    scale_bar(ax, "pixels", unit_length=pixel_sides(pixel_size)[0])
     return figure

@@ -12,13 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from pydantic import Field
 
 from vertax import inference, plotting, runs
-from vertax.initialise import free_voronoi
-from vertax.io import write_geojson
+from vertax.initialise import MaskReport, free_voronoi
+from vertax.io import pixel_sides, write_geojson
 
 SYNTHETIC = "synthetic"
 # Without the palest end, which looks like no colour.
@@ -37,14 +39,27 @@ class ImageSection(runs.ImageFile):
     for outlines."""
     background: int | None = None
     """The label of the background, if it is not 0 and not the region around all others."""
-    gap_width: float = Field(default=3.0, ge=0)
-    """Largest width of lines between labels, in pixels."""
+    gap_width: float | None = Field(default=None, ge=0)
+    """Largest width of a line between two cells in contact, in pixels; left out, it is measured."""
+    holes: Literal["keep", "close"] = "keep"
+    """Whether holes stay faces without a cell, or are given to the cells next to them."""
+    pixel_size: list[float] | None = Field(default=None, min_length=2, max_length=2)
+    """Height and width of a pixel that is not square; left out, from the resolution of a TIFF file."""
 
-    def labels(self) -> np.ndarray:
-        """A label for each pixel."""
-        chosen = self.channel is not None or self.plane is not None
-        image = self.read() if chosen or self.path is None else self.path
-        return inference.read_mask(image, kind=self.kind, background=self.background)
+    def source(self) -> Any:
+        """The file, or the pixels of the channel that is chosen."""
+        return self.read() if self.channel is not None or self.path is None else self.path
+
+    def reading(self) -> dict[str, Any]:
+        """Arguments of `read_mask`."""
+        plane = self.plane if self.channel is None else None
+        return {"kind": self.kind, "background": self.background, "plane": plane}
+
+    def tensions(self, image: Any, **options: Any) -> inference.InferredTensions:
+        """The tensions of an image, read as this section specifies."""
+        size = None if self.pixel_size is None else (self.pixel_size[0], self.pixel_size[1])
+        options |= {"gap_width": self.gap_width, "holes": self.holes, "pixel_size": size}
+        return inference.infer_tensions(image, **options)
 
 
 class Cluster(runs.Section):
@@ -82,14 +97,16 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     del progress
     truth = None
     if config.image.path != SYNTHETIC:
-        labels = config.image.labels()
+        source, options = config.image.source(), config.image.reading()
+        labels = inference.read_mask(source, **options)
     else:
         *truth, labels = draw_cluster(config)
-    options: dict[str, Any] = {"gap_width": config.image.gap_width, "prior": config.prior}
-    result = inference.infer_tensions(labels, kind="labels", **options)
+        source, options = labels, {"kind": "labels"}
+    options["prior"] = config.prior
+    result = config.image.tensions(source, **options)
     if config.noise is not None and result.pixel_size is not None:
-        options["noise"] = config.noise * result.pixel_size
-        result = inference.infer_tensions(labels, kind="labels", **options)
+        options["noise"] = config.noise * np.sqrt(np.prod(pixel_sides(result.pixel_size)))
+        result = config.image.tensions(source, **options)
     for doubt in result.doubts:
         folder.warn(doubt)
     folder.save_tissue("seen", result.tissue)
@@ -98,6 +115,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         add_truth(result, *truth, edges, cells)
     folder.save_table("edges", edges)
     folder.save_table("cells", cells)
+    if result.mask_report is not None:
+        folder.save_table("changes", result.mask_report.change_table())
     write_geojson(
         folder.path / "cells.geojson",
         result.tissue,
@@ -153,9 +172,11 @@ def add_truth(
 
 def measure(result: inference.InferredTensions, edges: Any, cells: Any) -> dict[str, Any]:
     """The metrics."""
-    pixel = result.pixel_size or 1.0
+    pixel = float(np.sqrt(np.prod(pixel_sides(result.pixel_size or 1.0))))
+    is_cell = result.labels > 0
     metrics: dict[str, Any] = {
-        "n_cells": result.tissue.n_cells,
+        "n_cells": int(is_cell.sum()),
+        "n_holes": int(np.sum(~is_cell)),
         "n_edges": result.tissue.n_edges,
         "n_tensions_determined": int(result.determined.sum()),
         "n_pressures_determined": int(result.pressures_determined.sum()),
@@ -164,6 +185,8 @@ def measure(result: inference.InferredTensions, edges: Any, cells: Any) -> dict[
         "noise_correlation_pixels": result.correlation / pixel,
         "bending_degrees": np.degrees(result.bending),
         "doubts": result.doubts,
+        "mask": None if result.mask_report is None else result.mask_report.summary(),
+        "area_error_max": float(np.max(np.abs(result.area_errors[is_cell]))),
         "out_of_balance_degrees_junctions": np.degrees(result.model_errors[0]),
         "out_of_balance_degrees_arcs": np.degrees(result.model_errors[1]),
     }
@@ -190,13 +213,19 @@ def measure(result: inference.InferredTensions, edges: Any, cells: Any) -> dict[
 
 @plotting.house_style()
 def plot_foam(image: np.ndarray, result: inference.InferredTensions) -> Figure:
-    """The image with the arcs, and a map of tensions and pressures; grey where they are not determined."""
+    """The image with the arcs, and a map of tensions and pressures; grey where they are not determined.
+
+    On the image the sides of holes are dashed, contacts that the mask does not show are dotted, and a ring
+    marks each place where the mask was changed.
+    """
     rows, columns = image.shape[:2]
-    height, pixel = max(3.4 * rows / columns + 0.5, 2.4), result.pixel_size or 1.0
+    height, size = max(3.4 * rows / columns + 0.5, 2.4), result.pixel_size or 1.0
     figure, ((left, right),) = plotting.new_figure(1, 2, width=3.6, height=height, room=1.2)
-    plotting.plot_tissue(result.tissue, ax=left, image=image, pixel_size=pixel)
+    plotting.plot_tissue(result.tissue, ax=left, image=image, pixel_size=size)
     left.set_title("arcs over the image")
-    plotting.scale_bar(left, "pixels", unit_length=pixel)
+    plotting.scale_bar(left, "pixels", unit_length=pixel_sides(size)[0])
+    if result.mask_report is not None:
+        draw_report(left, result, result.mask_report)
     pressures = np.where(result.pressures_determined, result.pressures, np.nan)
     tensions = np.where(result.determined, result.tensions, np.nan)
     style: Any = {"cmap": PRESSURES, "label": PRESSURE, "edge_label": TENSION}
@@ -205,6 +234,26 @@ def plot_foam(image: np.ndarray, result: inference.InferredTensions) -> Figure:
     right.set(xlim=left.get_xlim(), ylim=left.get_ylim())
     right.set_title("tensions and pressures")
     return figure
+
+
+def draw_report(ax: Any, result: inference.InferredTensions, report: MaskReport) -> None:
+    """Mark holes, contacts that the mask does not show, and places where the mask was changed."""
+    sides = pixel_sides(result.pixel_size or 1.0)
+    points = np.asarray(result.tissue.edge_points(jnp.linspace(0.0, 1.0, 13)), float)
+    edge_cells = np.asarray(result.tissue.topology.edge_cells)
+    between = np.append(result.labels, 0)[edge_cells]
+    hole = np.append(result.labels == 0, False)[edge_cells].any(1)
+    hidden = report.closed & np.all(between > 0, axis=1)
+    for which, style in ((hidden, ":"), (hole, "--")):
+        if which.any():
+            lines = LineCollection(list(points[which]), colors="w", linestyles=style, lw=1.5)
+            ax.add_collection(lines)
+    median = np.median(report.pixels)
+    for change in report.changes:
+        area = max(change.pixels, 0.01 * median) * sides.prod()
+        radius = max(3.0 * sides.min(), np.sqrt(area / np.pi))
+        place = (sides[0] * change.column, sides[1] * change.row)
+        ax.add_patch(Circle(place, radius, fill=False, ec="r", lw=1.0))
 
 
 @plotting.house_style()

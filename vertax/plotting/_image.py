@@ -11,13 +11,14 @@ from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from vertax._base.pixels import PixelSizeLike, check_pixel_size, pixel_sides
 from vertax.plotting import _style
 
 
 def plot_image(
     image: Real[np.ndarray, " ..."],
     *,
-    pixel_size: SupportsFloat = 1.0,
+    pixel_size: PixelSizeLike = 1.0,
     ax: Axes | None = None,
     figure: Figure | None = None,
 ) -> Axes:
@@ -26,9 +27,9 @@ def plot_image(
     **Arguments:**
 
     - `image`: a grey image, shown with robust contrast, or a colour image (red, green, blue; 8 bits, or
-        floats in 0 … 1); [`label_colours`][vertax.plotting.label_colours] makes one of labels. The y axis
-        points down.
-    - `pixel_size`: size of a pixel, in units of length.
+        floats in 0 … 1); labels are made one by [`label_colours`][vertax.plotting.label_colours]. The y
+        axis points down.
+    - `pixel_size`: side of a pixel, in units of length, or (height, width).
     - `ax`: the axes to draw in; by default those of a new figure.
     - `figure`: an empty figure to draw in instead; no window is opened.
 
@@ -39,7 +40,7 @@ def plot_image(
     - `ValueError`, naming the argument, for an image of the wrong shape, or a `pixel_size` that is not
         positive.
     """
-    image, pixel_size = np.asarray(image), float(pixel_size)
+    image = np.asarray(image)
     _style.one_of(ax, figure)
     width, height = extent_of(image, pixel_size)
     with _style.house_style():
@@ -53,8 +54,8 @@ def plot_image(
     return ax
 
 
-def draw_image(ax: Axes, image: np.ndarray, pixel_size: float) -> None:
-    """Draw an image with its first row at the top and the y axis pointing down."""
+def draw_image(ax: Axes, image: np.ndarray, pixel_size: PixelSizeLike) -> None:
+    """An image, its first row at the top, the y axis pointing down."""
     size = extent_of(image, pixel_size)
     grey: dict[str, Any] = {}
     if image.ndim == 2:
@@ -65,16 +66,15 @@ def draw_image(ax: Axes, image: np.ndarray, pixel_size: float) -> None:
     ax.imshow(image, origin="upper", extent=extent, zorder=0, **grey)
 
 
-def extent_of(image: np.ndarray, pixel_size: float) -> np.ndarray:
+def extent_of(image: np.ndarray, pixel_size: PixelSizeLike) -> np.ndarray:
     """Width and height of an image."""
     if image.size == 0 or image.ndim < 2 or image.shape[2:] not in ((), (3,)):
         raise ValueError(
             "Argument `image` must have shape (rows, columns) or (rows, columns, 3), but has "
             f"{image.shape}."
         )
-    if not (np.isfinite(pixel_size) and pixel_size > 0):
-        raise ValueError(f"Argument `pixel_size` must be positive, but is {pixel_size}.")
-    return pixel_size * np.array(image.shape[1::-1])
+    check_pixel_size("pixel_size", pixel_size)
+    return pixel_sides(pixel_size) * image.shape[1::-1]
 
 
 def label_colours(
@@ -128,10 +128,10 @@ def scale_bar(
 
     **Arguments:**
 
-    - `ax`: the axes; call this after drawing everything else.
-    - `unit`: name of the unit of the label.
-    - `unit_length`: length of that unit, in the tissue's units of length.
-    - `length`: of the bar, in that unit; by default 1, 2 or 5 times a power of ten, and at most a quarter
+    - `ax`: the axes, after all is drawn.
+    - `unit`: name of the unit of length.
+    - `unit_length`: length of the unit, in the tissue's units of length.
+    - `length`: of the bar, in `unit`s; by default 1, 2 or 5 times a power of ten, and at most a quarter
         of the width.
 
     **Raises:**

@@ -10,6 +10,7 @@ from matplotlib import colormaps
 from matplotlib.colors import Normalize
 
 from vertax._base.compilation_cache import enable_compilation_cache
+from vertax._base.pixels import pixel_sides
 from vertax.inference import InferredTensions, infer_tensions
 
 _POINTS = 13
@@ -41,13 +42,13 @@ def tension_layer(inferred: InferredTensions, *, colours: str = "viridis") -> tu
             "Argument `inferred` must come from an image, but has no pixels. "
             "vx.plot_tissue draws it."
         )
-    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=inferred.tissue.vertices.dtype)
-    course = np.asarray(inferred.tissue.edge_points(fractions), float) / inferred.pixel_size
-    determined = inferred.tensions[inferred.determined]
-    scale = Normalize(*(determined.min(), determined.max()) if determined.size else (0.0, 1.0))
-    colour = colormaps[colours](scale(np.where(inferred.determined, inferred.tensions, 0.0)))
-    colour[~inferred.determined] = _UNKNOWN
-    # In napari the middle of a pixel has integer coordinates, in vertax its corner; and rows come first.
+    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=found.tissue.vertices.dtype)
+    course = np.asarray(found.tissue.edge_points(fractions), float) / pixel_sides(found.pixel_size)
+    known = found.tensions[found.determined]
+    scale = Normalize(*(known.min(), known.max()) if known.size else (0.0, 1.0))
+    colour = colormaps[colours](scale(np.where(found.determined, found.tensions, 0.0)))
+    colour[~found.determined] = _UNKNOWN
+    # To napari the middle of a pixel is a whole number, to us its corner; and rows come first.
     options = {
         "name": "tensions",
         "shape_type": "path",
@@ -75,20 +76,29 @@ def napari_tensions(
     from napari.utils import progress  # pyright: ignore[reportMissingImports]
 
     enable_compilation_cache()
-    mask = np.asarray(cells.data)
+    # A stack of one plane is an image: the last two axes are rows and columns.
+    mask, plane = np.asarray(cells.data), tuple(cells.scale[-2:])
+    # The size of a pixel matters only where it is not square: tensions are relative.
+    pixels: dict[str, Any] = {}
+    if not np.isclose(*plane):
+        n_labels = np.count_nonzero(np.unique(mask) > 0)
+        side = np.sqrt(n_labels / np.count_nonzero(mask > 0) / np.prod(plane))
+        pixels["pixel_size"] = tuple((side * np.array(plane)).tolist())
     # The activity dock is drawn before the computation, which blocks the window.
     with progress(total=1, desc="vertax: tensions (first compiles for this size)"):
-        inferred = infer_tensions(mask, kind="labels")
-    for doubt in inferred.doubts:
+        found = infer_tensions(mask, kind="labels", **pixels)
+    for doubt in found.doubts:
         notifications.show_warning(doubt)
     placed = {"scale": cells.scale, "translate": cells.translate}
-    edges, options, kind = tension_layer(inferred)
+    in_plane = {"scale": cells.scale[-2:], "translate": cells.translate[-2:]}
+    edges, options, kind = tension_layer(found)
     # Row 0 of the table of a layer of labels is the background.
-    table = inferred.cell_table()
-    column = {"index": np.append(0, inferred.labels)}
+    table = found.cell_table()
+    cells_only = found.labels > 0  # holes are background
+    column = {"index": np.append(0, found.labels[cells_only])}
     column |= {
-        name: np.concatenate([[np.nan], np.asarray(table[name], float)])
+        name: np.concatenate([[np.nan], np.asarray(table[name], float)[cells_only]])
         for name in ("pressure", "pressure_deviation", "area")
     }
     pressures = {"name": "pressures", "features": column, "opacity": 0.3, "visible": False}
-    return [(mask, pressures | placed, "labels"), (edges, options | placed, kind)]
+    return [(mask, pressures | placed, "labels"), (edges, options | in_plane, kind)]

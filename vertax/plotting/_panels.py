@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
+from vertax._base.pixels import PixelSizeLike
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
@@ -44,7 +45,7 @@ def plot_tissues(
     colorbar: bool | str = True,
     linewidth: SupportsFloat | None = None,
     image: Real[np.ndarray, " ..."] | None = None,
-    pixel_size: SupportsFloat = 1.0,
+    pixel_size: PixelSizeLike = 1.0,
 ) -> list[Axes]:
     """Draw tissues side by side with one colour scale and one length scale.
 
@@ -100,12 +101,13 @@ def plot_tissues(
             checked("cells", panel_cells, drawing.n_cells)
             checked("edges", panel_edges, drawing.n_edges)
             checked("mask", mask, drawing.n_cells)
-    pixel = float(pixel_size)
     views = _views(drawings, mask) if image is None else [None] * len(drawings)
     with _style.house_style():
         if axes is None:
             view = views[0]
-            extent = view[1] - view[0] if view is not None else extent_of(np.asarray(image), pixel)
+            extent = (
+                view[1] - view[0] if view is not None else extent_of(np.asarray(image), pixel_size)
+            )
             height = 2.4 * float(np.clip(extent[1] / extent[0], 0.25, 2))
             room = 0.75 * len(bars)
             axes = _style.new_axes(
@@ -115,7 +117,7 @@ def plot_tissues(
             drawing = drawings[name]
             if drawing is None:
                 assert image is not None
-                plot_image(image, pixel_size=pixel, ax=ax)
+                plot_image(image, pixel_size=pixel_size, ax=ax)
             else:
                 draw(
                     drawing,
@@ -129,7 +131,7 @@ def plot_tissues(
                     colorbar=False,
                     linewidth=linewidth,
                     image=image,
-                    pixel_size=pixel,
+                    pixel_size=pixel_size,
                 )
             ax.set_title(name)
         # Matplotlib puts each new bar between the axes and the previous bar.

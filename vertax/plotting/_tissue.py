@@ -13,6 +13,7 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from vertax._base.pixels import PixelSizeLike
 from vertax.mesh import Tissue
 from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
@@ -45,7 +46,7 @@ def plot_tissue(
     alpha: SupportsFloat | None = None,
     linewidth: SupportsFloat | None = None,
     image: Real[np.ndarray, " ..."] | None = None,
-    pixel_size: SupportsFloat = 1.0,
+    pixel_size: PixelSizeLike = 1.0,
 ) -> Axes:
     """Draw a tissue, its cells and edges coloured by values.
 
@@ -84,7 +85,7 @@ def plot_tissue(
     - `image`: a grey image, shown with robust contrast, or a colour image (red, green, blue; 8
         bits, or floats in 0 … 1). The pixel in row r and column c covers [c, c + 1] × [r, r + 1],
         in units of `pixel_size`.
-    - `pixel_size`: size of a pixel, in the tissue's units of length.
+    - `pixel_size`: side of a pixel, in the tissue's units of length, or (height, width).
 
     **Returns:** the axes.
 
@@ -107,7 +108,7 @@ def plot_tissue(
         alpha=alpha,
         linewidth=linewidth,
         image=image,
-        pixel_size=float(pixel_size),
+        pixel_size=pixel_size,
     )
 
 
@@ -140,7 +141,7 @@ def draw(
     alpha: SupportsFloat | None = None,
     linewidth: SupportsFloat | None = None,
     image: np.ndarray | None = None,
-    pixel_size: float = 1.0,
+    pixel_size: PixelSizeLike = 1.0,
 ) -> Axes:
     """Like `plot_tissue`, with cells placed as in `drawing`; `view` is the part of the plane to show."""
     _style.one_of(ax, figure)

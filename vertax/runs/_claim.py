@@ -12,9 +12,11 @@ from vertax.runs._errors import RunFolderError
 from vertax.runs._figures import FIGURE_FORMATS
 
 CONFIG, METRICS, PARTS = "config.toml", "metrics.json", "unfinished"
+# The error message of a run that failed and cannot be resumed: its folder may be used again.
+FAILED = "failed.txt"
 FIGURES = tuple(f"figures/*.{ending}" for ending in FIGURE_FORMATS)
 # Files of a run. METRICS is removed first, so that a folder that has it is complete.
-_LEFTOVERS = (METRICS, "*.csv", "*.npz", "*.npy", *FIGURES, f"{PARTS}/*.npz")
+_LEFTOVERS = (METRICS, FAILED, "*.csv", "*.geojson", "*.npz", "*.npy", *FIGURES, f"{PARTS}/*.npz")
 
 
 def claimed(default: Path, output: str | os.PathLike[str] | None, overwrite: bool) -> Path:
@@ -30,7 +32,7 @@ def claimed(default: Path, output: str | os.PathLike[str] | None, overwrite: boo
             return _numbered(default)
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            if not overwrite:
+            if not overwrite and not (folder / FAILED).is_file():
                 raise RunFolderError(
                     f"The folder {folder} is not empty. Choose another with --output, or pass "
                     "--overwrite to replace the run in it."

@@ -21,7 +21,16 @@ from vertax._base.extras import requires_extra
 from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
 from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
-from vertax.runs._claim import CONFIG, FIGURES, METRICS, PARTS, claimed, existing, unfinished
+from vertax.runs._claim import (
+    CONFIG,
+    FAILED,
+    FIGURES,
+    METRICS,
+    PARTS,
+    claimed,
+    existing,
+    unfinished,
+)
 from vertax.runs._config import ExperimentConfig
 from vertax.runs._errors import RunFolderError, UnfinishedRunError
 from vertax.runs._figures import checked_formats, write_figure
@@ -381,6 +390,19 @@ class RunFolder:
             for folder in (self.path / PARTS, self.path / "figures", self.path):
                 if folder.is_dir():
                     folder.rmdir()
+
+    def mark_failed(self, error: Exception) -> None:
+        """Write the message of the error to `failed.txt`, unless the run can be resumed or left no files.
+
+        The same command may then use the folder again.
+
+        **Arguments:**
+
+        - `error`: the error that ended the run.
+        """
+        if self.path.is_dir() and not self.parts():
+            with atomic_write(self.path / FAILED) as file:
+                file.write(f"{error}\n")
 
     def metrics(self) -> dict[str, Any]:
         """The metrics of a finished run.

@@ -185,9 +185,10 @@ def run(
         folder.talkative = not quiet
         try:
             metrics = experiment.run(settings, folder, progress=not quiet)
-        except Exception:
+        except Exception as error:
             if resume is None:
                 folder.discard_if_empty()
+                folder.mark_failed(error)
             raise
         folder.finish(metrics)
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""The geometry of a tissue on the host, as it was seen: vertices, arcs, and how these bend."""
+"""The observed geometry of a tissue as NumPy arrays: vertices, arcs and bends."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
 
-class Seen(NamedTuple):
-    """The geometry of a tissue on the host: numbers, and arcs in terms of chords and angles.
+class ObservedGeometry(NamedTuple):
+    """The geometry of a tissue as NumPy arrays, arcs in terms of chords and angles.
 
-    What is known of it are displacements of the vertices and changes of the angles, in one vector.
+    Its unknowns are displacements of the vertices, and changes of angles and bends, in one vector.
     """
 
     ends: Int[np.ndarray, "edges 2"]
     cells: Int[np.ndarray, "edges 2"]
     """On the left and on the right; the exterior is the number of cells."""
     half_edge: Int[np.ndarray, "vertices 3"]
-    """The edge of each half-edge that leaves a vertex."""
+    """Edge of each of the three half-edges that leave a vertex."""
     forward: Bool[np.ndarray, "vertices 3"]
-    """Whether it runs in the direction of its edge."""
+    """Whether the half-edge has the direction of its edge."""
     chord: Float[np.ndarray, "edges 2"]
     angle: Float[np.ndarray, " edges"]
     bend: Float[np.ndarray, "edges 2"]
-    """By how much the curve is turned from its arc: at both ends alike, and at its first end and back at its
-    last."""
+    """Angles by which the tangents of the curve are turned from those of its arc: symmetric and antisymmetric
+    part of its two ends."""
     n_cells: int
     inner: Bool[np.ndarray, " vertices"]
-    """Where three cells meet, and not the exterior."""
+    """Vertices where three cells meet and forces balance."""
     size: float
     """Root of the mean area of a cell."""
 
@@ -40,8 +40,8 @@ class Seen(NamedTuple):
         """Number of vertices."""
         return len(self.inner)
 
-    def moved(self, change: Float[np.ndarray, " geometry"]) -> Seen:
-        """With vertices and angles elsewhere."""
+    def moved(self, change: Float[np.ndarray, " geometry"]) -> ObservedGeometry:
+        """The geometry after a change of vertices, angles and bends."""
         angles, bends = 2 * self.n_vertices, 2 * self.n_vertices + len(self.angle)
         shift = change[:angles].reshape(-1, 2)
         return self._replace(
@@ -56,11 +56,25 @@ class Seen(NamedTuple):
         return 2 * self.n_vertices + 3 * len(self.angle)
 
 
-def seen(tissue: Tissue) -> Seen:
-    """The geometry of a tissue."""
+def observed_geometry(
+    tissue: Tissue,
+    holes: Bool[np.ndarray, " cells"] | None = None,
+    closed: Bool[np.ndarray, " edges"] | None = None,
+) -> ObservedGeometry:
+    """The geometry of a tissue.
+
+    **Arguments:**
+
+    - `tissue`: the tissue.
+    - `holes`: faces that are no cells: forces at their junctions are unknown, as at the outline.
+    - `closed`: edges that the mask does not show: forces at their ends are unknown too.
+    """
     m, geometry = tissue.topology, geometry_of(tissue)
-    inner = np.all(np.asarray(m.cell).reshape(-1, 3) < tissue.n_cells, axis=1)
-    return Seen(
+    is_cell = np.append(np.full(tissue.n_cells, True) if holes is None else ~holes, False)
+    inner = np.all(is_cell[np.asarray(m.cell)].reshape(-1, 3), axis=1)
+    if closed is not None:
+        inner &= ~np.any(closed[np.asarray(m.edge)].reshape(-1, 3), axis=1)
+    return ObservedGeometry(
         ends=geometry.edge_vertices,
         cells=geometry.edge_cells,
         half_edge=np.asarray(m.edge).reshape(-1, 3),
@@ -70,5 +84,5 @@ def seen(tissue: Tissue) -> Seen:
         bend=np.zeros((tissue.n_edges, 2)),
         n_cells=tissue.n_cells,
         inner=inner,
-        size=float(np.sqrt(np.mean(np.abs(geometry.areas)))),
+        size=float(np.sqrt(np.mean(np.abs(geometry.areas[: tissue.n_cells][is_cell[:-1]])))),
     )
