@@ -85,7 +85,8 @@ def main() -> None:
             times.append(time.perf_counter())
             lowered = traced.lower()
             times.append(time.perf_counter())
-            program = lowered.compile(compiler_options=OPTIONS if chosen.fast else None)
+            options: Any = OPTIONS if chosen.fast else None
+            program = lowered.compile(compiler_options=options)
             times.append(time.perf_counter())
             trace, lower, xla = (b - a for a, b in pairwise(times))
             kernels = (program.as_text() or "").count(" fusion(")

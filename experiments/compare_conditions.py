@@ -135,11 +135,10 @@ def infer(config: Config, pixels: Any, folder: runs.RunFolder, name: str, progre
 
 def match_cells(config: Config, micrograph: Any, tissue: vx.Tissue) -> tuple[np.ndarray, np.ndarray]:
     """Complete cells of the segmented mesh, and the true cells with the nearest centroids."""
-    cells, segmentation = np.flatnonzero(micrograph.whole), micrograph.segmentation
+    cells, segmentation = np.flatnonzero(micrograph.complete), micrograph.segmentation
     pixel = float(np.sqrt(tissue.n_cells)) / config.microscope.pixels
-    centroids = (
-        np.asarray(segmentation.tissue.centroids)[cells] / vx.io.pixel_sides(segmentation.pixel_size) * pixel
-    )
+    scale = pixel / vx.io.pixel_sides(segmentation.pixel_size)
+    centroids = np.asarray(segmentation.tissue.centroids)[cells] * scale
     vectors = tissue.boundary.shortest(jnp.asarray(centroids)[:, None] - tissue.centroids[None])
     distance = np.asarray(jnp.linalg.norm(vectors, axis=-1))
     nearest, close = distance.argmin(axis=1), distance.min(axis=1) < 0.25

@@ -57,7 +57,7 @@ def with_gaps(mask: np.ndarray, widths: np.ndarray | float) -> np.ndarray:
     ):
         touch = (one != other) & (one > 0) & (other > 0)
         sides[place] = np.where(touch, np.minimum(one, other) * n + np.maximum(one, other), 0)
-    distance, nearest = distance_transform_edt(sides == 0, return_indices=True)
+    distance, nearest = distance_transform_edt(sides == 0, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
     pair = sides[tuple(nearest)][::2, ::2]
     width_of_pair = np.broadcast_to(np.asarray(widths, float), n * n)[pair]
     return np.where(distance[::2, ::2] / 2 < width_of_pair / 2, 0, mask)

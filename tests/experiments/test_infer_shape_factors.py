@@ -123,7 +123,7 @@ def test_the_resolved_configuration_repeats_the_run(tiny):
     # Four epochs are too few, which is said of the run and not of a fit.
     left_out = ("seconds_per_epoch", "warnings")
     timeless = lambda numbers: {k: v for k, v in numbers.items() if k not in left_out}
-    # One kind of data: its metrics are at the top, and its files need no name to tell them apart.
+    # One kind of data: its metrics are at the top, and its files need no name to distinguish them.
     assert timeless(repeated) == timeless(metrics["vertices"])
     assert (again / "fitted.npz").is_file()
     assert not (again / "image.npy").exists()

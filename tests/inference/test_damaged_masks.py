@@ -1,5 +1,9 @@
 """Masks as segmentation programs leave them: holes, repeated labels, lines between cells, other pixels."""
 
+# The report of a mask is optional, and each test has one.
+# pyright: reportOptionalMemberAccess=false, reportGeneralTypeIssues=false, reportOptionalIterable=false
+# pyright: reportArgumentType=false, reportCallIssue=false
+
 import numpy as np
 import pytest
 from damage_helpers import contacts, damaged, random_cells, with_gaps

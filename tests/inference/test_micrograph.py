@@ -30,7 +30,7 @@ def test_a_pinned_border_does_not_move(pinned):
     ends = np.unique(np.asarray(problem.tissue.topology.edge_vertices)[on_outline])
     before = np.asarray(pinned.segmentation.tissue.vertices)[ends]
     np.testing.assert_array_equal(np.asarray(pinned.first.tissue.vertices)[ends], before)
-    assert 1 <= pinned.whole.sum() < problem.tissue.n_cells
+    assert 1 <= pinned.complete.sum() < problem.tissue.n_cells
     assert pinned.image.shape == (96, 96)
     assert pinned.pixel_size == pytest.approx(pinned.segmentation.pixel_size * 160 / 96)
 
@@ -39,7 +39,7 @@ def test_a_pinned_border_does_not_move(pinned):
 def test_parameters_of_a_pinned_border(pinned):
     shape_factors, areas = pinned.parameters(pinned.problem.energy)
     np.testing.assert_allclose(shape_factors, 3.7)
-    np.testing.assert_allclose(areas[pinned.whole], 1)
+    np.testing.assert_allclose(areas[pinned.complete], 1)
     with pytest.raises(TypeError, match="that of a fit of `problem`"):
         pinned.parameters(vx.energies.LineTension(1.0))
 

@@ -38,7 +38,7 @@ def test_periodic_mask_gives_back_the_voronoi_tissue(seed):
     shift = np.array(got.tissue.centroids - voronoi.centroids)
     shift -= np.round(shift / [160, 120]) * [160, 120]
     assert np.abs(shift).max() < 1
-    assert got.whole.all()
+    assert got.complete.all()
     assert got.absorbed.size == 0
     assert got.inflated.size == 0
 
@@ -151,12 +151,12 @@ def test_whole_cells_are_the_originals_away_from_the_border(mask):
         if a in got.absorbed
     }
     inside = set(mask.ravel().tolist()) - border - set(got.absorbed.tolist())
-    labels = got.labels[got.whole].tolist()
+    labels = got.labels[got.complete].tolist()
     assert len(labels) == len(set(labels)) > 0
     assert inside - beside <= set(labels) <= inside
     first = len(np.unique(got.labels))
     assert np.all(np.diff(got.labels[:first]) > 0)  # originals first, in the order of their labels
-    for cell in np.flatnonzero(got.whole):
+    for cell in np.flatnonzero(got.complete):
         corners = np.asarray(got.tissue.corners)[np.asarray(got.tissue.topology.cell) == cell]
         assert np.all(corners >= 0)
         assert np.all(corners <= mask.shape[::-1])

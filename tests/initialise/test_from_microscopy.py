@@ -122,7 +122,7 @@ def test_mirrored_by_default_and_options_are_passed_on(small):
     np.testing.assert_array_equal(got.tissue.boundary.lattice, np.diag([200.0, 200.0]))
     assert float(got.tissue.softening) == 0.01
     assert got.image_shape == (200, 200)
-    assert 5 < got.whole.sum() < 25
+    assert 5 < got.complete.sum() < 25
 
 
 class Fixed(AbstractSegmenter):
@@ -379,19 +379,19 @@ def real():
 def test_real_image_shows_as_many_cells_as_the_eye_counts(real):
     # By eye: 75 cells, of which 45 do not touch the border.
     assert 72 <= len(np.unique(real.labels)) <= 78
-    assert 42 <= real.whole.sum() <= 48
+    assert 42 <= real.complete.sum() <= 48
     assert real.absorbed.size <= 3
 
 
 def test_real_image_makes_a_sound_tissue(real):
     areas = np.asarray(real.tissue.areas)
     assert areas.min() > 0.05
-    assert areas[real.whole].max() < 3 * np.median(areas[real.whole])
+    assert areas[real.complete].max() < 3 * np.median(areas[real.complete])
     np.testing.assert_allclose(areas.mean(), 1.0, rtol=1e-12)
     counts = np.asarray(real.tissue.neighbour_counts)
     assert counts.mean() == 6
-    assert counts[real.whole].min() >= 4
-    assert counts[real.whole].max() <= 9
+    assert counts[real.complete].min() >= 4
+    assert counts[real.complete].max() <= 9
     assert real.inflated.size == 0
 
 
@@ -400,7 +400,7 @@ def test_real_image_edges_lie_on_membranes(real):
     image = gaussian_filter(read_image(REAL_IMAGE).astype(float), 2)
     m = real.tissue.topology
     corners, cell = np.asarray(real.tissue.corners), np.asarray(m.cell)
-    inside = real.whole[cell]
+    inside = real.complete[cell]
     middles = 0.5 * (corners + corners[np.asarray(m.next)])[inside] / real.pixel_size
     centres = np.asarray(real.tissue.centroids)[cell][inside] / real.pixel_size
     at = lambda points: image[tuple(points[:, ::-1].astype(int).T)]

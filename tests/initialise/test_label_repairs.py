@@ -115,7 +115,7 @@ def test_border_cells_with_two_sides_are_absorbed_when_mirrored():
     mask[:3, 9:12] = 52  # on the line between 1 and 2: mirrored it is a lens
     got = make(mask, "mirrored")
     assert got.absorbed.tolist() == [50, 51, 52]
-    assert got.labels[got.whole].tolist() == [5]
+    assert got.labels[got.complete].tolist() == [5]
 
 
 @pytest.mark.parametrize("flip", [False, True])
@@ -204,6 +204,7 @@ def test_noisy_masks_are_repaired(seed, boundary):
     np.testing.assert_allclose(areas.sum(), copies * mask.size, rtol=1e-12)
     # Large pieces that noise cuts off are cells with new labels.
     given = got.labels[got.labels <= mask.max()]
+    assert got.report is not None
     new = {change.into for change in got.report.of_kind("new cell")}
     assert set(got.labels.tolist()) - set(given.tolist()) <= new
     assert np.array_equal(np.union1d(given, got.absorbed), np.unique(mask[mask > 0]))

@@ -203,7 +203,7 @@ def _of_mask(source: Segmentation) -> _Course:
             "vx.initialise.from_labels returns them. Pass its mask, or its tissue."
         )
     copies = len(np.unique(source.labels)) < len(source.labels)
-    if copies or (not source.whole.all() and source.tissue.topology.exterior is False):
+    if copies or (not source.complete.all() and source.tissue.topology.exterior is False):
         raise ValueError(
             "Argument `segmentation_or_mask` must not be mirrored at its border, where no forces "
             "balance. Use vx.initialise.from_labels(mask, boundary='free')."

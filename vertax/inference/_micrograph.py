@@ -65,7 +65,7 @@ class Micrograph(eqx.Module):
     """The inverse problem; it starts from the relaxed tissue of the first guess."""
     segmentation: Segmentation
     """The segmented cells."""
-    whole: Bool[np.ndarray, " cells"]
+    complete: Bool[np.ndarray, " cells"]
     """Cells to report: all of them and of their neighbours is in the image."""
     image: Float[np.ndarray, "rows columns"]
     """The image in even light that the model is compared with."""
@@ -175,7 +175,7 @@ def micrograph_problem(
     micrograph = vx.inference.micrograph_problem(image)
     fit = vx.fit(micrograph.problem, optax.adam(2e-2), 150)
     shape_factors, rest_areas = micrograph.parameters(fit.energy)
-    shape_factors[micrograph.whole]
+    shape_factors[micrograph.complete]
     ```
 
     The energy is E1 with a rest area for each cell, the cost that of
@@ -264,7 +264,7 @@ def _mirrored(
     """All cells, and their mirror images."""
     segmentation = from_microscopy(image, segmenter=segmenter)
     even = prepare(pixel_length(segmentation.pixel_size))
-    areas, uncut = segmentation.tissue.areas, np.asarray(segmentation.whole)
+    areas, uncut = segmentation.tissue.areas, np.asarray(segmentation.complete)
     if rest_areas == "equal":
         # Cells and their mirror images have one label; the mean area is the unit.
         labels = np.asarray(segmentation.labels)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -136,7 +136,7 @@ def with_exterior(
     gap = image == GAP
     distance = np.asarray(distance_transform_edt(gap, spacing))
     regions = np.zeros(image.shape, np.int32)
-    n_regions = connected_regions(distance > reach, output=regions)
+    n_regions: Any = connected_regions(distance > reach, output=regions)
     code = np.full(n_regions + 1, GAP, image.dtype)
     if keep_holes:
         deep = np.asarray(maximum(distance, regions, np.arange(n_regions + 1)))

@@ -58,7 +58,7 @@ class Segmentation(eqx.Module):
     labels: Int[np.ndarray, " cells"]
     """Label of each cell: its label in the mask, where a mirrored cell carries the label of its original; a
     new one for a second piece of a label; 0 for a hole, which is a face of the tissue without a cell."""
-    whole: Bool[np.ndarray, " cells"]
+    complete: Bool[np.ndarray, " cells"]
     """True for the one copy of each label in the original image, if it does not touch its border.
 
     A periodic mask has no border: all its cells are whole. Holes are not.
@@ -263,7 +263,7 @@ def _closed(
     return Segmentation(
         tissue=repair_overlaps(tissue, bend_back=True),
         labels=names[label],
-        whole=uncut,
+        complete=uncut,
         absorbed=np.setdiff1d(values, names[label]),
         inflated=np.unique(names[label[moved]]),
         pixel_size=as_pixel_size(lengths),
@@ -350,7 +350,7 @@ def _free(
     return Segmentation(
         tissue=repair_overlaps(tissue, bend_back=True),
         labels=names[label],
-        whole=~(top_bottom | left_right)[label] & (names[label] > 0),
+        complete=~(top_bottom | left_right)[label] & (names[label] > 0),
         absorbed=np.setdiff1d(values, names[label]),
         inflated=np.unique(names[label[moved]]),
         pixel_size=as_pixel_size(lengths),

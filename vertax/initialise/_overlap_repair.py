@@ -29,19 +29,20 @@ def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
     m = tissue.topology
     cell, twin = np.asarray(m.cell), np.asarray(m.twin)
     following = np.where(twin % 3 == 0, twin + 2, twin - 1)
-    for attempt in range(_MAX_ITERATIONS):
+    for attempt in range(_ROUNDS):
         crossed = _crossed(tissue, following, cell)
         bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
         if not crossed.any():
-            bends = bend_back and attempt > 0 and angles is not None
-            return _bent_back(tissue, angles) if bends else tissue
+            if angles is None or not bend_back or attempt == 0:
+                return tissue
+            return _bent_back(tissue, angles)
         geometry = geometry_of(tissue)
         ends, faces = geometry.edge_vertices, geometry.edge_cells
         touched = np.any(np.append(bad, False)[faces], axis=1)
         touched[np.asarray(m.edge)[crossed]] = True
         if tissue.arcs is not None:
             tissue = tissue.with_angles(jnp.where(touched, 0.7, 1) * tissue.arcs.angles)
-        if tissue.arcs is None or attempt >= _MAX_ITERATIONS // 4:
+        if tissue.arcs is None or attempt >= _ROUNDS // 4:
             moving = np.zeros(m.n_vertices, bool)
             moving[ends[touched]] = True
             step = np.zeros((m.n_vertices, 2))

@@ -84,8 +84,8 @@ def pixel_aspect(path: str | os.PathLike[str]) -> float:
     with tifffile.TiffFile(file) as tiff:
         tags = tiff.pages.first.tags
         # Pixels per unit of length along x and y, as fractions.
-        found = [tags.get(name) for name in ("XResolution", "YResolution")]
-    (a, b), (c, d) = ((0, 1) if tag is None else tag.value for tag in found)
+        entries = [tags.get(name) for name in ("XResolution", "YResolution")]
+    (a, b), (c, d) = ((0, 1) if tag is None else tag.value for tag in entries)
     return float(a * d / (b * c)) if a * b * c * d else 1.0
 
 

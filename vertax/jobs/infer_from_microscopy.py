@@ -76,7 +76,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
 def measure(micrograph: Micrograph, fit: Fit) -> dict[str, Any]:
     """The metrics."""
-    segmentation, first, complete = micrograph.segmentation, micrograph.first, micrograph.whole
+    segmentation, first, complete = micrograph.segmentation, micrograph.first, micrograph.complete
     meshes = {"segmented": segmentation.tissue, "initial": first.tissue, "fitted": fit.tissue}
     factors = micrograph.parameters(fit.energy)[0][complete]
     metrics: dict[str, Any] = {}
@@ -116,7 +116,7 @@ def cell_table(micrograph: Micrograph, fit: Fit) -> dict[str, np.ndarray]:
         "x_pixels": tissue.centroids[:, 0] / sides[0],
         "y_pixels": tissue.centroids[:, 1] / sides[1],
     }
-    return {name: np.asarray(column)[micrograph.whole] for name, column in columns.items()}
+    return {name: np.asarray(column)[micrograph.complete] for name, column in columns.items()}
 
 
 def draw(micrograph: Micrograph, pixels: np.ndarray, fit: Fit, folder: runs.RunFolder) -> None:
@@ -128,7 +128,7 @@ def draw(micrograph: Micrograph, pixels: np.ndarray, fit: Fit, folder: runs.RunF
     folder.save_figure("overlay", overlays)
     plot_history(fit.history, figure=(convergence := Figure()))
     folder.save_figure("convergence", convergence)
-    values, complete = micrograph.parameters(fit.energy)[0], micrograph.whole
+    values, complete = micrograph.parameters(fit.energy)[0], micrograph.complete
     folder.save_figure("shape_factors", plot_cells(pixels, fit.tissue, values, complete, size))
 
 

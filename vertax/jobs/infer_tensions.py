@@ -95,7 +95,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     noise of the image and distance from balance; for a synthetic cluster also the errors.
     """
     del progress
-    truth = None
+    truth: Any = None
+    options: dict[str, Any]
     if config.image.path != SYNTHETIC:
         source, options = config.image.source(), config.image.reading()
         labels = inference.read_mask(source, **options)

@@ -42,13 +42,15 @@ def tension_layer(inferred: InferredTensions, *, colours: str = "viridis") -> tu
             "Argument `inferred` must come from an image, but has no pixels. "
             "vx.plot_tissue draws it."
         )
-    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=found.tissue.vertices.dtype)
-    course = np.asarray(found.tissue.edge_points(fractions), float) / pixel_sides(found.pixel_size)
-    known = found.tensions[found.determined]
-    scale = Normalize(*(known.min(), known.max()) if known.size else (0.0, 1.0))
-    colour = colormaps[colours](scale(np.where(found.determined, found.tensions, 0.0)))
-    colour[~found.determined] = _UNKNOWN
-    # To napari the middle of a pixel is a whole number, to us its corner; and rows come first.
+    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=inferred.tissue.vertices.dtype)
+    course = np.asarray(inferred.tissue.edge_points(fractions), float) / pixel_sides(
+        inferred.pixel_size
+    )
+    determined = inferred.tensions[inferred.determined]
+    scale = Normalize(*(determined.min(), determined.max()) if determined.size else (0.0, 1.0))
+    colour = colormaps[colours](scale(np.where(inferred.determined, inferred.tensions, 0.0)))
+    colour[~inferred.determined] = _UNKNOWN
+    # In napari the middle of a pixel has integer coordinates, in vertax its corner; and rows come first.
     options = {
         "name": "tensions",
         "shape_type": "path",
@@ -86,16 +88,16 @@ def napari_tensions(
         pixels["pixel_size"] = tuple((side * np.array(plane)).tolist())
     # The activity dock is drawn before the computation, which blocks the window.
     with progress(total=1, desc="vertax: tensions (first compiles for this size)"):
-        found = infer_tensions(mask, kind="labels", **pixels)
-    for doubt in found.doubts:
+        inferred = infer_tensions(mask, kind="labels", **pixels)
+    for doubt in inferred.doubts:
         notifications.show_warning(doubt)
     placed = {"scale": cells.scale, "translate": cells.translate}
     in_plane = {"scale": cells.scale[-2:], "translate": cells.translate[-2:]}
-    edges, options, kind = tension_layer(found)
+    edges, options, kind = tension_layer(inferred)
     # Row 0 of the table of a layer of labels is the background.
-    table = found.cell_table()
-    cells_only = found.labels > 0  # holes are background
-    column = {"index": np.append(0, found.labels[cells_only])}
+    table = inferred.cell_table()
+    cells_only = inferred.labels > 0  # holes are background
+    column = {"index": np.append(0, inferred.labels[cells_only])}
     column |= {
         name: np.concatenate([[np.nan], np.asarray(table[name], float)[cells_only]])
         for name in ("pressure", "pressure_deviation", "area")

@@ -44,7 +44,7 @@ class Relaxation(AbstractResponse):
     Call it with a tissue and an energy, or give it to an
     [`InverseProblem`][vertax.InverseProblem]; [`equilibrate`][vertax.equilibrate] does both in one line.
 
-    Defaults know the units of the tissue, so it relaxes alike in micrometres, in pixels and in cells of
+    Defaults are in units of the tissue, so results are the same in micrometres, in pixels and in cells of
     area 1: lengths are measured in the root mean cell area $\ell$, forces in $k \ell$ with $k$ the mean
     eigenvalue of the Hessian where the relaxation starts.
 
@@ -296,7 +296,7 @@ def equilibrate(
     - `adjoint`: how to differentiate, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
         default.
     - `solver`, `transitions`, `tolerance`, `consecutive_steps`, `max_steps`, `contact_range`: see
-        [`Relaxation`][vertax.Relaxation], whose convenient form this is.
+        [`Relaxation`][vertax.Relaxation]; this function is its short form.
     - `throw`: raise an error if no equilibrium is reached. If False, look at `converged`.
 
     **Returns:** an [`Equilibrium`][vertax.Equilibrium].
@@ -362,8 +362,8 @@ def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
 
 
 def _check_sharding(tree: PyTree) -> None:
-    # Within `shard_map` JAX tells apart what differs from device to device and what does not, and a loop
-    # that begins with a plain 0 and counts is refused. The loops of Optimistix and Equinox do.
+    # Within `shard_map` JAX distinguishes values that differ between devices, and refuses a loop that starts
+    # at a constant 0, as the loops of Optimistix and Equinox do.
     if any(differs_between_devices(x) for x in jax.tree.leaves(tree) if eqx.is_array(x)):
         raise ValueError(
             "A relaxation within jax.shard_map needs jax.shard_map(..., check_vma=False): its loops begin "
