@@ -101,8 +101,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         source, options = config.image.source(), config.image.reading()
         labels = inference.read_mask(source, **options)
     else:
-        *truth, labels = draw_cluster(config)
-        source, options = labels, {"kind": "labels"}
+        energy, relaxed, labels = draw_cluster(config)
+        truth, source, options = (energy, relaxed), labels, {"kind": "labels"}
     options["prior"] = config.prior
     result = config.image.tensions(source, **options)
     if config.noise is not None and result.pixel_size is not None:
@@ -113,7 +113,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     folder.save_tissue("seen", result.tissue)
     edges, cells = result.edge_table(), result.cell_table()
     if truth is not None:
-        add_truth(result, *truth, edges, cells)
+        add_truth(result, truth[0], truth[1], edges, cells)
     folder.save_table("edges", edges)
     folder.save_table("cells", cells)
     if result.mask_report is not None:
