@@ -71,6 +71,7 @@ def test_modules_of_the_package_are_jobs_and_those_of_the_repository_are_experim
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
     """The state of an installed wheel: its configurations are in the package, the experiments are missing."""
+    assert _shipped.REPOSITORY is not None
     shutil.copytree(_shipped.REPOSITORY / "configs", tmp_path / "vertax" / "configs")
     monkeypatch.setattr(_shipped, "_PACKAGE", tmp_path / "vertax")
     monkeypatch.setattr(_registry, "REPOSITORY", None)

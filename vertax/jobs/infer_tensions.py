@@ -80,11 +80,11 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     noise of the image and distance from balance; for a synthetic cluster also the errors.
     """
     del progress
-    truth = None
+    truth: tuple[Any, Any] | None = None
     if config.image.path != SYNTHETIC:
         labels = config.image.labels()
     else:
-        *truth, labels = draw_cluster(config)
+        truth, labels = draw_cluster(config)
     options: dict[str, Any] = {"gap_width": config.image.gap_width, "prior": config.prior}
     result = inference.infer_tensions(labels, kind="labels", **options)
     if config.noise is not None and result.pixel_size is not None:
@@ -110,8 +110,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     return measure(result, edges, cells)
 
 
-def draw_cluster(config: Config) -> tuple[Any, Any, np.ndarray]:
-    """The energy of a cluster, the cluster at equilibrium, and its label image."""
+def draw_cluster(config: Config) -> tuple[tuple[Any, Any], np.ndarray]:
+    """The energy of a cluster and the cluster at equilibrium, and its label image."""
     options = config.cluster
     shape_key, tension_key, area_key = jax.random.split(jax.random.key(config.seed), 3)
     cluster = free_voronoi(options.n_cells, key=shape_key, lloyd_steps=3, inner_arcs=True)
@@ -123,7 +123,7 @@ def draw_cluster(config: Config) -> tuple[Any, Any, np.ndarray]:
     bounds: dict[str, Any] = {"stiffness": options.stiffness, "low": 0.05, "high": 4.0}
     energy = inference.foam_energy(tension / jnp.mean(tension), areas, **bounds)
     relaxed = runs.Relaxation().build()(cluster, energy).tissue
-    return energy, relaxed, inference.label_image(relaxed, options.pixels)
+    return (energy, relaxed), inference.label_image(relaxed, options.pixels)
 
 
 def add_truth(
