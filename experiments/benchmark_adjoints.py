@@ -17,7 +17,7 @@ import vertax as vx
 from vertax import inference, plotting, runs
 
 Method = Literal["AD", "Adj-ID", "Sen-ID", "EP"]
-GRADIENTS: dict[Method, str] = {
+GRADIENTS: dict[str, str] = {
     "AD": "unrolled",
     "Adj-ID": "implicit",
     "Sen-ID": "sensitivity",
@@ -119,7 +119,7 @@ def make_scenes(config: Scenes, relaxation: runs.Relaxation, n_cells: int | None
     )
 
 
-def make_problem(scene: inference.Scene, protocol: Protocol, method: Method) -> vx.InverseProblem:
+def make_problem(scene: inference.Scene, protocol: Protocol, method: str) -> vx.InverseProblem:
     """The inverse problem of a scene, or of a batch of scenes."""
     relaxation = protocol.unrolled if method == "AD" else protocol.relaxation
     gradient = protocol.gradient.model_copy(update={"method": GRADIENTS[method]})

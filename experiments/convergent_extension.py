@@ -96,10 +96,11 @@ def design(config: Config, n_cells: int, folder: runs.RunFolder, progress: bool)
         make = vx.initialise.periodic_voronoi
     problems = []
     for key in runs.replicate_keys(config.seed, config.replicates):
-        cluster, levels = make(n_cells, key=key, lloyd_steps=2), {"adjoint": config.gradient.build()}
+        cluster = make(n_cells, key=key, lloyd_steps=2)
         energy = config.tensions.draw(cluster, config.spread, key)
         cost = AspectRatio(jnp.array(config.start_ratio), config.measure)
-        problems.append(vx.InverseProblem(cluster, energy, cost, response=response, **levels))
+        levels: Any = {"adjoint": config.gradient.build(), "response": response}
+        problems.append(vx.InverseProblem(cluster, energy, cost, **levels))
     name, options = f"{n_cells} cells", {"notes": note_ratio, "progress": progress}
     start = runs.fit_side_by_side(folder, f"{name} first", problems, config.start, **options)
     designs = []

@@ -114,10 +114,11 @@ def scan_betas(config: Config, cases: list[Case], folder: runs.RunFolder, progre
     errors: dict[str, np.ndarray] = {}
     rows: list[dict[str, Any]] = []
     for nudge, estimator in ((n, e) for n in ("linear", "cost") for e in ("centred", "one-sided")):
-        error, options = gradient_error(vx.Relaxation()), {"centred": estimator == "centred", "throw": False}
+        error = gradient_error(vx.Relaxation())
+        options: Any = {"nudge": nudge, "centred": estimator == "centred", "throw": False}
         values = np.zeros((len(betas[nudge]), len(cases)))
         for k, beta in enumerate(betas[nudge]):
-            adjoint = vx.EquilibriumPropagation(jnp.asarray(beta), nudge, **options)
+            adjoint = vx.EquilibriumPropagation(jnp.asarray(beta), **options)
             values[k] = [float(error(c, adjoint, c.settled, jnp.asarray(1e-11))) for c in cases]
             mean = geometric_mean(values[k])
             rows.append({"nudge": nudge, "estimator": estimator, "beta": beta, "error": mean})

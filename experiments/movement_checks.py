@@ -79,7 +79,9 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     results = Results(
         decay["steps"],
         decay["errors"],
-        *([each[name] for each in quenches] for name in ("times", "energies", "events")),
+        [each["times"] for each in quenches],
+        [each["energies"] for each in quenches],
+        [each["events"] for each in quenches],
         **folder.part("noise", lambda: measure_noise(config, solid, energy)),
         **folder.part("gradients", lambda: measure_gradients(config, solid, energy)),
         **folder.part("control", lambda: measure_control(config, solid, energy)),

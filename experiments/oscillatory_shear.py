@@ -23,7 +23,7 @@ from vertax import mechanics, plotting, runs
 from vertax.dissipations import SubstrateFriction
 from vertax.energies import AreaElasticity, PerimeterElasticity
 
-Sample = tuple[vx.Tissue, vx.AbstractEnergy, np.ndarray]
+Sample = tuple[vx.Tissue, vx.AbstractEnergy, Any]
 """A tissue at equilibrium, its energy, and the expected complex moduli."""
 
 
@@ -82,7 +82,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     """The largest errors of G' and G'' of each tissue, relative to themselves and to |G*|."""
     began, frequencies = time.perf_counter(), np.asarray(config.frequencies)
     samples = make_samples(config, frequencies)
-    measured: dict[str, np.ndarray] = {}
+    measured: dict[str, Any] = {}
     table: dict[str, Any] = {"frequency": frequencies}
     metrics: dict[str, Any] = {}
     for name, (tissue, energy, expected) in samples.items():
@@ -92,7 +92,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             return folder.part(f"{name} {frequencies[index]:g}", compute)["modulus"]
 
         parts = runs.side_by_side(one, len(frequencies), folder, progress=progress, unit="frequency")
-        measured[name] = values = np.stack(parts)
+        values: Any = np.stack(parts)
+        measured[name] = values
         for label, moduli in (("measured", values), ("expected", expected)):
             table |= {f"{name}_storage_{label}": moduli.real, f"{name}_loss_{label}": moduli.imag}
         metrics[name] = {

@@ -180,7 +180,7 @@ def plot_classes(counts: np.ndarray, n_cells: np.ndarray, chain: np.ndarray) -> 
     left.legend(loc="upper right")
     enough = inner >= 10
     for k, (n, expected) in enumerate(EPITHELIA.items()):
-        curve = counts[enough, list(SIDES).index(n)] / inner[enough]
+        curve = counts[enough, n - SIDES[0]] / inner[enough]
         right.plot(n_cells[enough], curve, color=SERIES[k], label=f"{n} sides")
         right.axhline(expected, color=SERIES[k], lw=0.7, ls=":")
     right.set_xlim(n_cells[0], n_cells[-1] + 1)  # a short run has no curve

@@ -74,7 +74,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     return metrics
 
 
-def make_problems(config: Config, boundary: Boundary, n_types: int) -> list[vx.InverseProblem]:
+def make_problems(config: Config, boundary: str, n_types: int) -> list[vx.InverseProblem]:
     """One problem per replicate; those of one replicate differ in the types only."""
     make, n_cells = vx.initialise.free_voronoi, config.tissue.n_cells
     make = make if boundary == "free" else vx.initialise.periodic_voronoi

@@ -117,8 +117,8 @@ def compare(inferred: Any, true: np.ndarray, inner: np.ndarray) -> dict[str, flo
 def read_frames(paths: list[str]) -> Frames:
     """The frames of dumps of Surface Evolver."""
     foams = [vx.io.read_surface_evolver(path) for path in paths]
-    parts = ([getattr(foam, name) for foam in foams] for name in ("tissue", "chains", "time"))
-    return Frames(*parts, np.asarray(foams[0].tensions))
+    tissues, times = [foam.tissue for foam in foams], [foam.time for foam in foams]
+    return Frames(tissues, [foam.chains for foam in foams], times, np.asarray(foams[0].tensions))
 
 
 def synthetic_frames(config: Config) -> Frames:

@@ -175,6 +175,7 @@ def gradient_step(problem: vx.InverseProblem, energy: Any, tissue: vx.Tissue) ->
 def coupled_step(problem: vx.InverseProblem, energy: Any, tissue: vx.Tissue, clamp: Any) -> tuple:
     """The same with the difference between clamped and free state in place of the gradient."""
     (stiffness, share), cost = clamp, problem.cost
+    assert isinstance(cost, CellStress)
     free = problem.response(tissue, energy, throw=False)
     stress = cell_stress(free.tissue, energy)[cost.cells]
     target = CellStress(stress + share * (cost.target - stress), cost.cells)

@@ -130,8 +130,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     return measure(result, edges, cells)
 
 
-def draw_cluster(config: Config) -> tuple[Any, Any, np.ndarray]:
-    """The energy of a cluster, the cluster at equilibrium, and its label image."""
+def draw_cluster(config: Config) -> tuple[tuple[Any, Any], np.ndarray]:
+    """The energy of a cluster and the cluster at equilibrium, and its label image."""
     options = config.cluster
     shape_key, tension_key, area_key = jax.random.split(jax.random.key(config.seed), 3)
     cluster = free_voronoi(options.n_cells, key=shape_key, lloyd_steps=3, inner_arcs=True)
@@ -143,7 +143,7 @@ def draw_cluster(config: Config) -> tuple[Any, Any, np.ndarray]:
     bounds: dict[str, Any] = {"stiffness": options.stiffness, "low": 0.05, "high": 4.0}
     energy = inference.foam_energy(tension / jnp.mean(tension), areas, **bounds)
     relaxed = runs.Relaxation().build()(cluster, energy).tissue
-    return energy, relaxed, inference.label_image(relaxed, options.pixels)
+    return (energy, relaxed), inference.label_image(relaxed, options.pixels)
 
 
 def add_truth(
