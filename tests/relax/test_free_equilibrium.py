@@ -326,5 +326,5 @@ def test_images_show_nothing_of_what_lies_outside():
     with pytest.raises(ValueError, match="`pixel_size` must be positive"):
         MeshImage(np.eye(8), 0.2, pixel_size=0.0)
     periodic = vx.initialise.hexagonal(2, 2)
-    with pytest.raises(ValueError, match="follows from the box"):
+    with pytest.raises(ValueError, match="None for a periodic one"):
         render(periodic, (40, 50), 0.2, pixel_size=0.1)

@@ -101,8 +101,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         source, options = config.image.source(), config.image.reading()
         labels = inference.read_mask(source, **options)
     else:
-        energy, relaxed, labels = draw_cluster(config)
-        truth, source, options = (energy, relaxed), labels, {"kind": "labels"}
+        truth, labels = draw_cluster(config)
+        source, options = labels, {"kind": "labels"}
     options["prior"] = config.prior
     result = config.image.tensions(source, **options)
     if config.noise is not None and result.pixel_size is not None:
