@@ -79,7 +79,7 @@ def gradient_error(response: vx.Relaxation) -> Any:
     return error
 
 
-def geometric_mean(values: Any) -> np.ndarray:
+def geometric_mean(values: Any) -> Any:
     """The geometric mean over the last axis."""
     return np.exp(np.mean(np.log(np.maximum(values, 1e-300)), axis=-1))
 
