@@ -136,7 +136,8 @@ def with_exterior(
     gap = image == GAP
     distance = np.asarray(distance_transform_edt(gap, spacing))
     regions = np.zeros(image.shape, np.int32)
-    n_regions = connected_regions(distance > reach, output=regions)
+    connected_regions(distance > reach, output=regions)
+    n_regions = int(regions.max())
     code = np.full(n_regions + 1, GAP, image.dtype)
     if keep_holes:
         deep = np.asarray(maximum(distance, regions, np.arange(n_regions + 1)))

@@ -33,8 +33,9 @@ def without_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
         crossed = _crossed(tissue, following, cell)
         bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
         if not crossed.any():
-            bends = bend_back and attempt > 0 and angles is not None
-            return _bent_back(tissue, angles) if bends else tissue
+            if angles is None or attempt == 0 or not bend_back:
+                return tissue
+            return _bent_back(tissue, angles)
         geometry = geometry_of(tissue)
         ends, faces = geometry.edge_vertices, geometry.edge_cells
         touched = np.any(np.append(bad, False)[faces], axis=1)

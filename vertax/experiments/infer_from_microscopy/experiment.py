@@ -147,7 +147,9 @@ def _draw(
 ) -> None:
     found, initial = micrograph.segmentation, micrograph.first.tissue
     overlays = {"segmented": found.tissue, "relaxed first guess": initial, "fitted": outcome.tissue}
-    folder.save_figure("overlay", figures.overlays(pixels, overlays, pixel_size=found.pixel_size))
+    folder.save_figure(
+        "overlay", figures.overlays(pixels, overlays, pixel_size=pixel_length(found.pixel_size))
+    )
     convergence = Figure()
     plot_history(outcome.history, figure=convergence)
     folder.save_figure("convergence", convergence)
@@ -156,7 +158,7 @@ def _draw(
         outcome.tissue,
         micrograph.parameters(outcome.energy)[0],
         micrograph.whole,
-        pixel_size=found.pixel_size,
+        pixel_size=pixel_length(found.pixel_size),
         label="target shape factor $p_0$",
     )
     folder.save_figure("shape_factors", figure)

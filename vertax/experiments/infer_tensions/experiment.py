@@ -125,7 +125,7 @@ def run(config: Config, folder: RunFolder, *, progress: bool = True) -> dict[str
         source, options = config.image.source(), config.image.reading()
     else:
         truth, labels = _synthetic(config)
-        source, options = labels, {"kind": "labels"}
+        source, options = labels, dict[str, Any](kind="labels")
     options["prior"] = config.prior
     found = config.image.tensions(source, **options)
     if config.noise is not None and found.pixel_size is not None:
