@@ -336,7 +336,7 @@ def test_bends_are_inferred_from_an_image():
         ("nowhere.tif", "nowhere.tif does not exist"),
         ("nowhere.dmp", "nowhere.dmp"),
     ],
-    ids=["zeros", "four axes", "nan", "one", "two", "no image", "no dump"],
+    ids=["zeros", "four axes", "nan", "infinite", "one", "two", "no image", "no dump"],
 )
 def test_unusable_masks_are_refused(mask, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
