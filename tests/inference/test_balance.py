@@ -331,6 +331,7 @@ def test_bends_are_inferred_from_an_image():
         (np.zeros((20, 20), int), "at least two cells"),
         (np.zeros((2, 2, 2, 2), int), "Pass one plane of a stack"),
         (np.full((9, 9), np.nan), "at least two cells"),
+        (np.full((9, 9), np.inf), "whole numbers"),
         (np.pad(np.ones((9, 9), int), 5), "one region"),
         (np.pad(np.repeat([[1, 2]], 9, 0).repeat(9, 1), 5), "three of its cells meet"),
         ("nowhere.tif", "nowhere.tif does not exist"),

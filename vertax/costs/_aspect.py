@@ -88,7 +88,7 @@ class AspectRatio(AbstractLeastSquaresCost):
 
     def __check_init__(self):
         _check_measure(self.measure)
-        limit = {"above": 0} if self.measure == "box" else {"least": 1}
+        limit = {"above": 0} if self.measure == "box" else {"at_least": 1}
         check_number("target", self.target, **limit, many=True)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
