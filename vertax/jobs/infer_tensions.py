@@ -50,6 +50,10 @@ class ImageSection(runs.ImageFile):
         """The file, or the pixels of the channel that is chosen."""
         return self.read() if self.channel is not None or self.path is None else self.path
 
+    def labels(self) -> np.ndarray:
+        """A label for each pixel."""
+        return inference.read_mask(self.source(), **self.reading())
+
     def reading(self) -> dict[str, Any]:
         """Arguments of `read_mask`."""
         plane = self.plane if self.channel is None else None
@@ -99,7 +103,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     options: dict[str, Any]
     if config.image.path != SYNTHETIC:
         source, options = config.image.source(), config.image.reading()
-        labels = inference.read_mask(source, **options)
+        labels = config.image.labels()
     else:
         truth, labels = draw_cluster(config)
         source, options = labels, {"kind": "labels"}
