@@ -169,7 +169,7 @@ WRONG = {
     "cost": (lambda: costs.Stress(skewed), "`target` must be symmetric"),
     "cell out of range": (
         lambda: costs.CellStress(jnp.zeros((2, 2)), jnp.array([3, 99]))(tissue, energy),
-        "`cells` must hold numbers of cells, from 0 to 8, but holds 99",
+        "`cells` must hold indices of cells, from 0 to 8, but holds 99",
     ),
     "cell not an integer": (
         lambda: costs.CellStress(jnp.zeros((2, 2)), jnp.array([0.5])),
