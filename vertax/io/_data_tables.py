@@ -142,17 +142,20 @@ def edge_columns(
     m = tissue.topology
     cells, vertices = np.asarray(m.edge_cells), np.asarray(m.edge_vertices)
     cells = np.where(cells == tissue.n_cells, -1, cells)
-    lines = drawing.lines[drawing.half_edge]
+    # The end of an edge is the start of the next half-edge of the cell, exactly; the end of the line that
+    # draws an arc is rounded.
+    start = drawing.lines[drawing.half_edge, 0]
+    end = drawing.lines[drawing.following[drawing.half_edge], 0]
     table = {
         "edge": np.arange(tissue.n_edges),
         "left_cell": cells[:, 0],
         "right_cell": cells[:, 1],
         "start_vertex": vertices[:, 0],
         "end_vertex": vertices[:, 1],
-        "start_x": lines[:, 0, 0],
-        "start_y": lines[:, 0, 1],
-        "end_x": lines[:, -1, 0],
-        "end_y": lines[:, -1, 1],
+        "start_x": start[:, 0],
+        "start_y": start[:, 1],
+        "end_x": end[:, 0],
+        "end_y": end[:, 1],
         "length": tissue.edge_lengths,
         "angle": tissue.edge_angles,
         "on_outline": m.on_outline,

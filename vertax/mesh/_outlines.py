@@ -75,7 +75,13 @@ class Drawing(eqx.Module):
             first, second = lattice
             self.box = np.stack([0 * first, first, first + second, second, 0 * first])
         self.cell = np.asarray(m.cell)
-        self.lines = lines.astype(float) + shift[self.cell][:, None]
+        lines = lines.astype(float)
+        # (Points of arcs are rounded; files keep the vertices exactly.)
+        corners = np.repeat(np.asarray(tissue.vertices, float), 3, axis=0)
+        if self.lattice is not None:
+            corners = corners + np.asarray(m.frame) @ self.lattice
+        lines[:, 0], lines[:, -1] = corners, corners[following]
+        self.lines = lines + shift[self.cell][:, None]
         self.image = np.asarray(m.frame) + image[self.cell]
         self.n_cells = tissue.n_cells
         self.n_edges = tissue.n_edges
