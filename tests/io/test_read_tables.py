@@ -49,7 +49,8 @@ def test_edges_of_a_free_tissue_are_read_exactly(tmp_path, tissue, suffix):
     again = vx.io.from_edge_table(table)
     assert_same(again, tissue)
     for name, column in vx.io.edge_table(again).items():
-        np.testing.assert_array_equal(table[name], column)
+        # (Lengths depend on the softening, which a table does not hold.)
+        np.testing.assert_allclose(table[name], column, rtol=1e-5 if name == "length" else 0)
 
 
 @pytest.mark.parametrize("n_cells", [1, 2, 9])
