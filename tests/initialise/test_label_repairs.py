@@ -204,6 +204,7 @@ def test_noisy_masks_are_repaired(seed, boundary):
     np.testing.assert_allclose(areas.sum(), copies * mask.size, rtol=1e-12)
     # Large pieces that noise cuts off are cells with new labels.
     given = got.labels[got.labels <= mask.max()]
+    assert got.report is not None
     new = {change.into for change in got.report.of_kind("new cell")}
     assert set(got.labels.tolist()) - set(given.tolist()) <= new
     assert np.array_equal(np.union1d(given, got.absorbed), np.unique(mask[mask > 0]))

@@ -216,11 +216,12 @@ def _metrics(
         "noise_correlation_pixels": found.correlation / pixel,
         "bending_degrees": np.degrees(found.bending),
         "doubts": found.doubts,
-        "mask": None if found.mask_report is None else found.mask_report.summary(),
         "area_error_max": float(np.max(np.abs(found.area_errors[cells_only]))),
         "out_of_balance_degrees_junctions": np.degrees(found.model_errors[0]),
         "out_of_balance_degrees_arcs": np.degrees(found.model_errors[1]),
     }
+    if found.mask_report is not None:
+        metrics |= {f"mask_{name}": value for name, value in found.mask_report.summary().items()}
     for name, values, sure in (
         ("tension", edges, found.determined),
         ("pressure", cells, found.pressures_determined),
