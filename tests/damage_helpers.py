@@ -1,5 +1,7 @@
 """Label images of random cells, and the damage that masks have in practice."""
 
+from typing import Any
+
 import numpy as np
 from label_helpers import rasterise
 from scipy.ndimage import distance_transform_edt
@@ -57,7 +59,8 @@ def with_gaps(mask: np.ndarray, widths: np.ndarray | float) -> np.ndarray:
     ):
         touch = (one != other) & (one > 0) & (other > 0)
         sides[place] = np.where(touch, np.minimum(one, other) * n + np.maximum(one, other), 0)
-    distance, nearest = distance_transform_edt(sides == 0, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    transform: Any = distance_transform_edt(sides == 0, return_indices=True)
+    distance, nearest = transform
     pair = sides[tuple(nearest)][::2, ::2]
     width_of_pair = np.broadcast_to(np.asarray(widths, float), n * n)[pair]
     return np.where(distance[::2, ::2] / 2 < width_of_pair / 2, 0, mask)

@@ -72,9 +72,10 @@ def test_damage_of_a_mask_is_in_metrics_and_tables(tmp_path):
     )
     assert metrics["n_cells"] == 13
     assert metrics["n_holes"] == 1
-    assert metrics["mask"]["n_changes"] == {"hole": 1}
-    (hole,) = metrics["mask"]["largest_changes"]
-    assert hole["pixels"] == np.sum(labels == inner)
+    assert metrics["mask_n_hole"] == 1
+    assert metrics["mask_n_new_cell"] == 0
+    (hole,) = metrics["mask_largest_changes"]
+    assert hole["pixels"] == pytest.approx(np.sum(labels == inner), rel=0.002)
     assert table(folder / "changes.csv")["kind"] == ["hole"]
     assert table(folder / "cells.csv")["hole"].count("True") == 1
     assert "contact_closed" in table(folder / "edges.csv")

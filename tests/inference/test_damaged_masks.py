@@ -1,8 +1,6 @@
 """Masks as segmentation programs leave them: holes, repeated labels, lines between cells, other pixels."""
 
-# The report of a mask is optional, and each test has one.
-# pyright: reportOptionalMemberAccess=false, reportGeneralTypeIssues=false, reportOptionalIterable=false
-# pyright: reportArgumentType=false, reportCallIssue=false
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +24,15 @@ def inner(foam, mask):
     return int(np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))) + 1
 
 
+def infer(mask, **options) -> Any:
+    """Tensions, with the report that they have for a mask."""
+    return infer_tensions(mask, **options)
+
+
+def segment(mask, **options) -> Any:
+    return from_labels(mask, **options)
+
+
 def edges_of(inferred, label):
     """Edges beside the cells of a label."""
     labels = np.append(inferred.labels, -1)
@@ -42,7 +49,7 @@ def agree(inferred, foam):
 
 
 def test_a_missing_cell_is_a_hole_with_undetermined_sides(foam, mask, inner):
-    inferred = infer_tensions(np.where(mask == inner, 0, mask))
+    inferred = infer(np.where(mask == inner, 0, mask))
     assert np.sum(inferred.labels == 0) == 1
     assert inferred.tissue.n_cells == foam[0].n_cells
     assert not inferred.determined[edges_of(inferred, 0)].any()
@@ -62,7 +69,7 @@ def test_a_missing_cell_is_a_hole_with_undetermined_sides(foam, mask, inner):
 
 
 def test_contacts_across_a_closed_hole_are_not_determined(foam, mask, inner):
-    inferred = infer_tensions(np.where(mask == inner, 0, mask), holes="close")
+    inferred = infer(np.where(mask == inner, 0, mask), holes="close")
     assert inferred.tissue.n_cells == foam[0].n_cells - 1
     assert inferred.mask_report.closed.any()
     assert inferred.edge_table()["contact_closed"].any()
@@ -75,11 +82,11 @@ def test_contacts_across_a_closed_hole_are_not_determined(foam, mask, inner):
 def test_a_hole_closed_in_a_periodic_mask_is_reported(boundary):
     mask = honeycomb()
     hole = np.where(mask == 13, 0, mask)
-    report = from_labels(np.kron(hole, np.ones((2, 2), int)), boundary=boundary).report
+    report = segment(np.kron(hole, np.ones((2, 2), int)), boundary=boundary).report
     (change,) = report.of_kind("closed hole")
     assert change.pixels == 400
     assert report.closed.any()
-    clean = from_labels(mask, boundary=boundary).report
+    clean = segment(mask, boundary=boundary).report
     assert not clean.closed.any()
     assert not clean.of_kind("closed hole")
     if boundary == "periodic":
@@ -89,7 +96,7 @@ def test_a_hole_closed_in_a_periodic_mask_is_reported(boundary):
 def test_distant_cells_with_one_label_are_two_cells(foam, mask, inner):
     centres = np.asarray(foam[0].centroids)
     far = int(np.argmax(np.linalg.norm(centres - centres[inner - 1], axis=1))) + 1
-    inferred = infer_tensions(np.where(mask == far, inner, mask))
+    inferred = infer(np.where(mask == far, inner, mask))
     assert inferred.tissue.n_cells == foam[0].n_cells
     (change,) = inferred.mask_report.of_kind("new cell")
     assert change.label == inner
@@ -106,7 +113,7 @@ def test_stray_pixels_join_their_surroundings_and_are_listed(mask, inner):
     other = 1 if inner != 1 else 2
     changed[row, column] = other
     changed[row + 5 : row + 7, column] = 99
-    report = from_labels(changed, boundary="free", inner_arcs=True).report
+    report = segment(changed, boundary="free", inner_arcs=True).report
     kinds = {change.kind: change for change in report.changes}
     assert kinds["piece"][1:4] == (other, inner, 1)
     assert kinds["absorbed"][1:4] == (99, inner, 2)
@@ -117,19 +124,19 @@ def test_stray_pixels_join_their_surroundings_and_are_listed(mask, inner):
 @pytest.mark.parametrize("width", [4, 6, 8])
 def test_the_width_of_lines_between_cells_is_measured(foam, mask, width):
     lines = with_gaps(mask, width)
-    inferred = infer_tensions(lines)
+    inferred = infer(lines)
     assert inferred.tissue.n_cells == foam[0].n_cells
     assert inferred.mask_report.line_width == pytest.approx(width, abs=1)
     assert inferred.mask_report.gap_width > width
     assert invented(inferred, foam) == []
     assert agree(inferred, foam)
     with pytest.raises(ValueError, match=r"pixels apart .*pass gap_width="):
-        infer_tensions(lines, gap_width=1.0)
+        infer(lines, gap_width=1.0)
 
 
 def test_pixels_that_are_not_square_have_a_height_and_a_width(foam, mask, tmp_path):
     tifffile = pytest.importorskip("tifffile")
-    narrow = infer_tensions(mask[:, ::2], pixel_size=(1.0, 2.0))
+    narrow = infer(mask[:, ::2], pixel_size=(1.0, 2.0))
     assert narrow.pixel_size == (1.0, 2.0)
     assert agree(narrow, foam)
     areas = np.asarray(narrow.tissue.areas)[np.argsort(narrow.labels)]
@@ -137,7 +144,7 @@ def test_pixels_that_are_not_square_have_a_height_and_a_width(foam, mask, tmp_pa
     # From the resolution of a file: pixels per length along x and along y.
     file = tmp_path / "narrow.tif"
     tifffile.imwrite(file, mask[:, ::2].astype(np.uint16), resolution=(1.0, 2.0))
-    read = infer_tensions(file)
+    read = infer(file)
     height, width = read.pixel_size
     assert width == pytest.approx(2 * height)
     np.testing.assert_allclose(read.tensions, narrow.tensions, rtol=1e-3)
@@ -152,13 +159,13 @@ def test_a_stack_needs_the_choice_of_a_plane(mask, tmp_path):
     np.testing.assert_array_equal(read_mask(mask[..., None]), mask)
     np.testing.assert_array_equal(read_mask(frames, plane=1), moved)
     with pytest.raises(ValueError, match=r"argument `plane`, 0 … 1"):
-        infer_tensions(frames)
+        infer(frames)
     with pytest.raises(ValueError, match=r"`plane` must lie in 0 … 1"):
-        infer_tensions(frames, plane=2)
+        infer(frames, plane=2)
     file = tmp_path / "movie.tif"
     tifffile.imwrite(file, frames, metadata={"axes": "TYX"}, imagej=True)
     with pytest.raises(ValueError, match=r"argument `plane`, 0 … 1"):
-        infer_tensions(file)
+        infer(file)
     np.testing.assert_array_equal(read_mask(file, plane=1), moved)
 
 
@@ -166,7 +173,7 @@ def test_a_stack_needs_the_choice_of_a_plane(mask, tmp_path):
 def test_label_planes_are_not_colours(mask, dtype):
     frames = np.stack([mask, np.roll(mask, 5, 0), np.roll(mask, 5, 1)], axis=-1).astype(dtype)
     with pytest.raises(ValueError, match=r"Label planes are not colours: pass one"):
-        infer_tensions(frames)
+        infer(frames)
     colours = np.random.default_rng(0).integers(1, 255, (15, 3)).astype(dtype)
     colours[0] = 0
     assert len(np.unique(read_mask(colours[mask]))) == 15
@@ -176,13 +183,13 @@ def test_two_labels_that_fill_the_image_are_two_cells():
     halves = np.ones((40, 60), int)
     halves[:, 30:] = 2
     np.testing.assert_array_equal(read_mask(halves), halves)
-    assert from_labels(halves, boundary="free").tissue.n_cells == 2
+    assert segment(halves, boundary="free").tissue.n_cells == 2
 
 
 def test_nan_is_no_cell(mask):
     np.testing.assert_array_equal(read_mask(np.where(mask == 0, np.nan, mask)), mask)
     with pytest.raises(ValueError, match=r"numpy\.nan_to_num\(mask, nan=0\)"):
-        from_labels(np.where(mask == 0, np.nan, mask))
+        segment(np.where(mask == 0, np.nan, mask))
 
 
 @pytest.mark.parametrize(
@@ -198,13 +205,13 @@ def test_labels_too_large_for_their_type_are_refused(mask, dtype, label, message
     large = mask.astype(dtype)
     large[mask == 3] = label
     with pytest.raises(ValueError, match=message):
-        infer_tensions(large)
+        infer(large)
 
 
 @pytest.mark.parametrize("step", [1, 2])
 def test_cells_have_the_areas_and_outlines_of_their_pixels(mask, step):
     """Vertices on the outline move along the edges that end there; the arcs of the outline have to follow."""
-    result = infer_tensions(mask[:, ::step], pixel_size=(1.0, float(step)))
+    result = infer(mask[:, ::step], pixel_size=(1.0, float(step)))
     assert np.max(np.abs(result.area_errors)) < 0.02
     assert np.max(result.outline_errors) < 2
     table = result.cell_table()
@@ -217,7 +224,7 @@ def check_contacts(seed):
     rng = np.random.default_rng(seed)
     clean = random_cells(rng)
     mask, pixel_size = damaged(clean, rng)
-    inferred = infer_tensions(mask, kind="labels", pixel_size=pixel_size)
+    inferred = infer(mask, kind="labels", pixel_size=pixel_size)
     column, row = np.floor(np.asarray(inferred.tissue.centroids)).astype(int).T
     rows, columns = clean.shape
     true = np.append(clean[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)], 0)

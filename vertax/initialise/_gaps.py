@@ -63,8 +63,8 @@ def line_width(
     """
     if not np.any(image == GAP):
         return 0.0, 0.0
-    distance = np.asarray(distance_transform_edt(image == GAP, spacing))
-    filled = fill_gaps(image, spacing=spacing)
+    distance, nearest = _nearest_outside(image == GAP, spacing)
+    filled = image[nearest]
     first, second, width = [], [], []
     for one, other in _PAIRS:
         differ = filled[one] != filled[other]
@@ -81,6 +81,15 @@ def line_width(
     every = _medians(pair, width)
     close = _medians(pair[near], width[near])
     return (float(np.quantile(close, _QUANTILE)) if len(close) else 0.0), float(np.median(every))
+
+
+def _nearest_outside(
+    region: Bool[np.ndarray, "rows columns"], spacing: tuple[float, float]
+) -> tuple[Float[np.ndarray, "rows columns"], tuple[np.ndarray, np.ndarray]]:
+    """Distance of each pixel from the nearest one outside a region, and the index of that pixel."""
+    transform: Any = distance_transform_edt(region, spacing, return_indices=True)
+    distance, (y, x) = transform
+    return distance, (y, x)
 
 
 _PAIRS = (
@@ -146,9 +155,11 @@ def with_exterior(
     code[regions[0, 0]] = EXTERIOR
     code[0] = GAP
     open_region = code[regions]
-    away, (y, x) = distance_transform_edt(open_region == GAP, spacing, return_indices=True)  # pyright: ignore
+    away, nearest = _nearest_outside(open_region == GAP, spacing)
     near = gap & (away <= reach)
-    return FilledGaps(fill_gaps(np.where(near, open_region[y, x], image), spacing=spacing), margin)
+    return FilledGaps(
+        fill_gaps(np.where(near, open_region[nearest], image), spacing=spacing), margin
+    )
 
 
 def largest_cluster(

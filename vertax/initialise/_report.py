@@ -20,6 +20,9 @@ LEAST_LENGTH = 1.5
 _LISTED = 50
 
 
+KINDS = ("new cell", "piece", "absorbed", "left out", "hole", "closed hole")
+
+
 class MaskChange(NamedTuple):
     """A connected region of a mask that is not what its label says, or a hole."""
 
@@ -99,6 +102,7 @@ class MaskReport(eqx.Module):
         **Returns:** numbers of labels, contacts and changes by kind; and the 50 largest changes.
         """
         kinds = [change.kind for change in self.changes]
+        counts = {f"n_{kind.replace(' ', '_')}": kinds.count(kind) for kind in KINDS}
         return {
             "n_labels": len(self.labels),
             "n_labels_without_cell": int(np.sum(self.became != self.labels)),
@@ -106,7 +110,7 @@ class MaskReport(eqx.Module):
             "line_width": self.line_width,
             "n_contacts_closed": int(self.closed.sum()),
             "n_contacts_uncertain": int(np.sum(self.uncertain & ~self.closed)),
-            "n_changes": {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)},
+            **counts,
             "largest_changes": [change._asdict() for change in self.changes[:_LISTED]],
         }
 

@@ -190,11 +190,13 @@ def measure(result: inference.InferredTensions, edges: Any, cells: Any) -> dict[
         "noise_correlation_pixels": result.correlation / pixel,
         "bending_degrees": np.degrees(result.bending),
         "doubts": result.doubts,
-        "mask": None if result.mask_report is None else result.mask_report.summary(),
         "area_error_max": float(np.max(np.abs(result.area_errors[is_cell]))),
         "out_of_balance_degrees_junctions": np.degrees(result.model_errors[0]),
         "out_of_balance_degrees_arcs": np.degrees(result.model_errors[1]),
     }
+    if result.mask_report is not None:
+        summary = result.mask_report.summary()
+        metrics |= {f"mask_{name}": value for name, value in summary.items()}
     for name, table, determined in (
         ("tension", edges, result.determined),
         ("pressure", cells, result.pressures_determined),
