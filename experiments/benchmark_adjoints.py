@@ -48,7 +48,7 @@ class Scenes(runs.ExperimentConfig):
 
     replicates: int = Field(default=5, ge=2)
     """Independent tissues, fitted as one batch."""
-    methods: list[Method] = Field(default=list(GRADIENTS))
+    methods: list[Method] = Field(default=["AD", "Adj-ID", "Sen-ID", "EP"])
     """Ways to differentiate."""
     tissue: runs.TissueSection = runs.TissueSection()
     """The tissues."""
