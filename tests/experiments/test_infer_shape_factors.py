@@ -120,7 +120,7 @@ def test_history_has_a_row_for_each_epoch_of_each_fit(tiny):
 def test_the_resolved_configuration_repeats_the_run(tiny):
     folder, metrics = tiny
     again, repeated = run(folder / "config.toml", folder.parent / "again", "data=vertices")
-    # Four epochs are too few, which is said of the run and not of a fit.
+    # The warning that four epochs are too few has no name of a fit.
     left_out = ("seconds_per_epoch", "warnings")
     timeless = lambda numbers: {k: v for k, v in numbers.items() if k not in left_out}
     # One kind of data: its metrics are at the top, and its files need no name to distinguish them.
