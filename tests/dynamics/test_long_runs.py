@@ -50,14 +50,14 @@ class Interrupt:
 
     def __init__(self, monkeypatch, after):
         calls = itertools.count(1)
-        write = vx._base.checkpoints.CheckpointFile.note
+        write = vx._base.checkpoints.CheckpointFile.save_if_due
 
         def note(file, progress):
             write(file, progress)
             if next(calls) == after:
                 raise KeyboardInterrupt
 
-        monkeypatch.setattr(vx._base.checkpoints.CheckpointFile, "note", note)
+        monkeypatch.setattr(vx._base.checkpoints.CheckpointFile, "save_if_due", note)
 
 
 @pytest.mark.thorough
