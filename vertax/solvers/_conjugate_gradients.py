@@ -162,7 +162,7 @@ class TruncatedCG(eqx.Module):
             far = furthest > jnp.where(small, self.overshoot_solved, self.overshoot)
             wants = concave | (~clips & far)
             again = wants & more
-            curvature = jnp.where(small, s.curvature, curvature)
+            curvature = jnp.where(small | clips, s.curvature, curvature)
 
             def damp() -> tuple[Table, Float[Array, " rows"]]:
                 last = jnp.where(small, s.direction, d)
