@@ -175,6 +175,13 @@ def test_an_edge_that_vanishes_along_another_side_has_a_moderate_curvature(offse
     assert np.abs(curvature).max() < 1e5 * contacts.pairs.strength
 
 
+def test_room_for_contacts_is_a_positive_integer(without_type_checks):
+    with pytest.raises(ValueError, match="`max_contacts` must be at least 1, but is 0"):
+        vx.Relaxation(max_contacts=0)
+    with pytest.raises(TypeError, match=r"`max_contacts` must be at least 1 \(a Python integer\)"):
+        vx.Relaxation(max_contacts=2.5)  # pyright: ignore[reportArgumentType]
+
+
 def test_a_negative_range_is_refused():
     with pytest.raises(ValueError, match="contact_range"):
         vx.Relaxation(contact_range=-0.1)

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import check_number, describe
+from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import differs_between_devices, is_concrete, traced
@@ -60,9 +60,10 @@ class Relaxation(AbstractResponse):
     - `contact_range`: how near a corner comes to a side of the same cell (or of the outline) before a
         barrier holds it off, in units of the size of a cell; see [Contact](../concepts.md#contact). 0 leaves
         the barrier out, and steps that would make cells overlap are still refused; None lets them overlap.
-    - `max_contacts`: most corners that may be near a side of the same cell at once; by default as many as
-        there are vertices (a quarter of them above 8000). Where there are more, a call outside of `jax.jit`
-        repeats the relaxation with more room, and otherwise the `result` says so.
+    - `max_contacts`: most corners that may be near a side of the same cell at once (an integer); by default
+        the number of vertices, but at least 64, and above 2000 vertices 2000 or a quarter of their number.
+        Where there are more, a call outside of `jax.jit` repeats the relaxation with more room, and otherwise
+        the `result` says so.
     - `preconditioner`: the Hessian of a nearby equilibrium, see `with_preconditioner`. It changes the time of
         a relaxation, not its result.
 
@@ -71,8 +72,9 @@ class Relaxation(AbstractResponse):
 
     **Raises:**
 
-    - `TypeError` for a solver that is no minimiser, or transitions that are no rule.
-    - `ValueError` for a tolerance or number of steps that is not positive, or a negative
+    - `TypeError` for a solver that is no minimiser, transitions that are no rule, or a `max_contacts` that is
+        no integer.
+    - `ValueError` for a tolerance, number of steps or of contacts that is not positive, or a negative
         contact range.
     """
 
@@ -92,9 +94,11 @@ class Relaxation(AbstractResponse):
                 "Argument `transitions` must be a rule for topology changes, e.g. vertax.T1(), or None, "
                 f"but is {self.transitions!r}."
             )
-        for name in ("tolerance", "consecutive_steps", "max_steps", "max_contacts"):
+        for name in ("tolerance", "consecutive_steps", "max_steps"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0, many=True)
+        if self.max_contacts is not None:
+            check_integer("max_contacts", self.max_contacts, at_least=1)
         if self.contact_range is not None:
             check_number("contact_range", self.contact_range, at_least=0, many=True)
         if not isinstance(self.preconditioner, RecycledHessian | None):
