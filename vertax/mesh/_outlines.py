@@ -75,13 +75,7 @@ class Drawing(eqx.Module):
             first, second = lattice
             self.box = np.stack([0 * first, first, first + second, second, 0 * first])
         self.cell = np.asarray(m.cell)
-        lines = lines.astype(float)
-        # (Points of arcs are rounded; files keep the vertices exactly.)
-        corners = np.repeat(np.asarray(tissue.vertices, float), 3, axis=0)
-        if self.lattice is not None:
-            corners = corners + np.asarray(m.frame) @ self.lattice
-        lines[:, 0], lines[:, -1] = corners, corners[following]
-        self.lines = lines + shift[self.cell][:, None]
+        self.lines = lines.astype(float) + shift[self.cell][:, None]
         self.image = np.asarray(m.frame) + image[self.cell]
         self.n_cells = tissue.n_cells
         self.n_edges = tissue.n_edges
@@ -161,5 +155,6 @@ def _geometry(tissue: Tissue, points_per_arc: int) -> tuple[Array, Array, Array,
     fractions = jnp.linspace(0, 1, 2 if tissue.angles is None else points_per_arc + 1)
     points = take(tissue.edge_points(fractions.astype(tissue.vertices.dtype)), m.edge)
     points = jnp.where(m.forward[:, None, None], points, points[:, ::-1])
-    lines = tissue.corners[:, None] + points - points[:, :1]
+    # (In this order a line starts exactly at its corner: files keep vertices to the last bit.)
+    lines = tissue.corners[:, None] + (points - points[:, :1])
     return lines, tissue.centroids, tissue.areas, m.next
