@@ -251,26 +251,18 @@ def _closed(
     parent = np.append(np.arange(len(values)), parents)
     depth = distance_within(parent[image] != given, spacing, periodic=periodic)
     repaired = Repaired(values, given, image, names, None, np.unique(label))
-    courses, report = _checked(
+    return _segmentation(
         tissue,
         mesh,
         repaired,
         depth if periodic else _reflected(depth),
         (gap_width, measured),
         lengths,
-        pixels=pixels,
-    )
-    return Segmentation(
-        tissue=repair_overlaps(tissue, bend_back=True),
-        labels=names[label],
+        label=label,
         complete=uncut,
-        absorbed=np.setdiff1d(values, names[label]),
-        inflated=np.unique(names[label[moved]]),
-        pixel_size=as_pixel_size(lengths),
-        image_shape=_shape(given),
+        moved=moved,
+        pixels=pixels,
         background=options.background,
-        courses=courses,
-        report=report,
     )
 
 
@@ -337,27 +329,19 @@ def _free(
     )
     depth = distance_within(parent[home] != given, spacing, periodic=False)
     repaired = Repaired(values, given, home, names, exterior, label)
-    courses, report = _checked(
+    return _segmentation(
         tissue,
         mesh,
         repaired,
         depth,
         (gap_width, measured),
         lengths,
-        margin=margin,
-        pixels=pixels,
-    )
-    return Segmentation(
-        tissue=repair_overlaps(tissue, bend_back=True),
-        labels=names[label],
+        label=label,
         complete=~(top_bottom | left_right)[label] & (names[label] > 0),
-        absorbed=np.setdiff1d(values, names[label]),
-        inflated=np.unique(names[label[moved]]),
-        pixel_size=as_pixel_size(lengths),
-        image_shape=_shape(given),
+        moved=moved,
+        pixels=pixels,
         background=options.background,
-        courses=courses,
-        report=report,
+        margin=margin,
     )
 
 
@@ -372,7 +356,7 @@ def _shape(image: Int[np.ndarray, "rows columns"]) -> tuple[int, int]:
     return int(image.shape[0]), int(image.shape[1])
 
 
-def _checked(
+def _segmentation(
     tissue: Tissue,
     mesh: Mesh,
     repaired: Repaired,
@@ -380,10 +364,14 @@ def _checked(
     widths: tuple[float, float],
     lengths: Float[np.ndarray, " xy"],
     *,
+    label: Int[np.ndarray, " cells"],
+    complete: Bool[np.ndarray, " cells"],
+    moved: np.ndarray,
     pixels: Int[np.ndarray, " cells"],
+    background: int | None,
     margin: int = 0,
-) -> tuple[Courses, MaskReport]:
-    """The points of the edges, and the report on the mask."""
+) -> Segmentation:
+    """The tissue without overlaps, the points of its edges, and the report on the mask."""
     edge, points = _courses(tissue.topology, mesh, margin)
     # A free tissue has a margin of unchanged pixels; the box of the others repeats itself.
     room = 2 * margin
@@ -395,7 +383,19 @@ def _checked(
     shown, uncertain, point_shown = contacts_of(edge, points, chord, depth_at, widths[0])
     rows, columns = repaired.given.shape
     report = report_on(repaired, (shown, uncertain), depth[:rows, :columns], widths, pixels)
-    return Courses(edge, points * lengths, point_shown), report
+    names = repaired.names
+    return Segmentation(
+        tissue=repair_overlaps(tissue, bend_back=True),
+        labels=names[label],
+        complete=complete,
+        absorbed=np.setdiff1d(repaired.values, names[label]),
+        inflated=np.unique(names[label[moved]]),
+        pixel_size=as_pixel_size(lengths),
+        image_shape=_shape(repaired.given),
+        background=background,
+        courses=Courses(edge, points * lengths, point_shown),
+        report=report,
+    )
 
 
 def _courses(

@@ -35,7 +35,7 @@ def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
         if not crossed.any():
             if angles is None or not bend_back or attempt == 0:
                 return tissue
-            return _bent_back(tissue, angles)
+            return _bent_back(tissue, angles, following, cell)
         geometry = geometry_of(tissue)
         ends, faces = geometry.edge_vertices, geometry.edge_cells
         touched = np.any(np.append(bad, False)[faces], axis=1)
@@ -58,11 +58,15 @@ def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
     )
 
 
-def _bent_back(tissue: Tissue, angles: Float[np.ndarray, " edges"]) -> Tissue:
+def _bent_back(
+    tissue: Tissue,
+    angles: Float[np.ndarray, " edges"],
+    following: Int[np.ndarray, " halfedges"],
+    cell: Int[np.ndarray, " halfedges"],
+) -> Tissue:
     """The tissue with each arc as near to an angle as possible without overlaps."""
     m = tissue.topology
-    cell, twin, edge = np.asarray(m.cell), np.asarray(m.twin), np.asarray(m.edge)
-    following = np.where(twin % 3 == 0, twin + 2, twin - 1)
+    edge = np.asarray(m.edge)
     assert tissue.arcs is not None
     flat = np.asarray(tissue.arcs.angles)
     faces = geometry_of(tissue).edge_cells
