@@ -66,7 +66,7 @@ def test_within_wide_bounds_it_is_the_newton_step(forcing):
 
 
 def test_only_rows_beyond_their_bounds_are_clipped():
-    """Independent rows, of which one may go less far."""
+    """Independent rows, one of them with a smaller bound."""
     g, bounds = -jnp.ones((N, 2)), jnp.full(N, 10.0).at[3].set(0.05)
     proposal, product = step(g, jnp.eye(2 * N), bounds, 1e-8, damped=False, max_rounds=0)
     lengths = jnp.linalg.norm(proposal.step, axis=-1)

@@ -42,6 +42,12 @@ def differs_between_devices(array: jax.typing.ArrayLike) -> bool:
     return bool(newer or getattr(kind, "vma", None))
 
 
+def zeros_of(shapes: Any) -> Any:
+    """A pytree with zeros for the arrays of which only shapes are given, as by `jax.eval_shape`."""
+    is_shape = lambda x: isinstance(x, jax.ShapeDtypeStruct)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_shape(x) else x, shapes)
+
+
 def tree_where(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
     """`jnp.where` for pytrees, with the dtypes of `old`; leaves that are not arrays are those of `new`."""
     pick = lambda x, y: jnp.where(condition, x, y).astype(y.dtype) if eqx.is_array(x) else x

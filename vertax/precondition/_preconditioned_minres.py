@@ -10,6 +10,7 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
+from vertax._base.tracing import zeros_of
 from vertax.precondition._sum import Preconditioner, TissueInverse
 from vertax.solvers._minres import MINRES
 from vertax.solvers._rows import point_of, table_of
@@ -46,7 +47,7 @@ class PreconditionedMINRES(lx.AbstractLinearSolver[_State]):
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> _State:
         linear = self.plain.init(operator, options)
-        like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), operator.in_structure())
+        like = zeros_of(operator.in_structure())
         inverse = self.preconditioner.inverse(linear.mv, like, self.stiffness, jnp.array(True))
         n_rows = sum(x.shape[0] if x.ndim else 1 for x in jax.tree.leaves(like))
         return _State(linear, inverse, inverse.factors(jnp.zeros(n_rows, self.stiffness.dtype)))
@@ -92,7 +93,7 @@ def _solve(
         return _Attempt(solution, result, jax.tree.map(jnp.asarray, stats), ~again, again)
 
     outcome = jax.eval_shape(lambda: solver.plain.compute(linear, vector, options))
-    solution, result, stats = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), outcome)
+    solution, result, stats = zeros_of(outcome)
     start = _Attempt(solution, result, stats, inverse.coarse, jnp.array(True))
     end = jax.lax.while_loop(lambda last: last.again, attempt, start)
     return end.solution, end.result, end.stats

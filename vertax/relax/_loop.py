@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.probe_vector import probe_vector
 from vertax._base.reductions import any_of
-from vertax._base.tracing import tree_where
+from vertax._base.tracing import tree_where, zeros_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.precondition._recycled_hessian import RecycledHessian
@@ -103,7 +103,7 @@ class Search(eqx.Module):
             origin=tissue.configuration,
             iteration=self.iteration.unevaluated(objective, tissue.configuration, args, sizes),
             contacts=contacts,
-            preconditioner=_zeros(eqx.filter_eval_shape(self._preconditioner, *args)),
+            preconditioner=zeros_of(eqx.filter_eval_shape(self._preconditioner, *args)),
             overlaps=false,
             counts=counts,
             force=jnp.full((), jnp.inf, tissue.vertices.dtype),
@@ -252,9 +252,3 @@ def _moved(one: Tissue, other: Tissue) -> Bool[Array, ""]:
     differ = lambda a, b: any_of((a != b) & ~(jnp.isnan(a) & jnp.isnan(b)))
     parts = jax.tree.map(differ, one.configuration, other.configuration)
     return functools.reduce(jnp.logical_or, jax.tree.leaves(parts))
-
-
-def _zeros(tree: PyTree) -> PyTree:
-    """Zeros for the arrays of a pytree of which only their shapes are known."""
-    is_shape = lambda x: isinstance(x, jax.ShapeDtypeStruct)
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_shape(x) else x, tree)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.reductions import max_of
+from vertax._base.tracing import zeros_of
 from vertax.solvers._rows import Table, inner, row_inner, sizes
 
 # The phases of the loop: conjugate gradients, a last pass that clips the step, and the end.
@@ -196,8 +197,7 @@ class TruncatedCG(eqx.Module):
 
         zero, number, scalar = jnp.zeros_like(gradient), jnp.array(0), jnp.zeros((), gradient.dtype)
         phase = jnp.where(active & (inner(gradient, gradient) > 0), _SOLVE, _END)
-        shapes = jax.eval_shape(inverse.factors, damping)
-        factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        factors = zeros_of(jax.eval_shape(inverse.factors, damping))
         begin = _State(
             zero,
             gradient,

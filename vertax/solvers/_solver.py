@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
-from vertax._base.tracing import tree_where
+from vertax._base.tracing import tree_where, zeros_of
 from vertax.solvers._rows import Rows
 
 State = TypeVar("State")
@@ -171,7 +171,7 @@ class Stepwise(AbstractIteration[_StepwiseState]):
     def unevaluated(self, fn: Any, y: Any, args: Any, options: Any) -> _StepwiseState:
         value, aux = eqx.filter_eval_shape(fn, y, args)
         init = lambda y, args: self.solver.init(fn, y, args, options, value, aux, frozenset())
-        inner = _zeros(eqx.filter_eval_shape(init, y, args))
+        inner = zeros_of(eqx.filter_eval_shape(init, y, args))
         progress = Progress.initial(jnp.full(value.shape, jnp.inf, value.dtype))
         return _StepwiseState(inner, jnp.array(_FRESH), progress)
 
@@ -226,9 +226,3 @@ class Stepwise(AbstractIteration[_StepwiseState]):
 
 # Whether the next evaluation restarts the solver at the iterate: not, with its old memory, or without.
 _NO, _OLD, _FRESH = range(3)
-
-
-def _zeros(tree: PyTree) -> PyTree:
-    """Zeros for the arrays of a pytree of shapes."""
-    is_shape = lambda x: isinstance(x, jax.ShapeDtypeStruct)
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if is_shape(x) else x, tree)

@@ -94,7 +94,6 @@ class VertexTrustRegion(eqx.Module):
     def cut(
         self,
         radii: Float[Array, " rows"],
-        step: Table,
         fraction: Float[Array, " rows"],
         largest: Float[Array, ""] | float,
     ) -> Float[Array, " rows"]:
