@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 from tqdm import tqdm
 
-from vertax._base.fast_compilation import available_options, compiles_fast
+from vertax._base.fast_compilation import OPTIONS, compiles_fast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -44,14 +44,11 @@ def announced_jit(function: Function, *, inline: bool = False) -> Function:
 
     jit: Any = eqx.filter_jit
     optimised = jit(traced, inline=inline)
-
-    @functools.cache
-    def fast() -> Any:
-        return jit(traced, inline=inline, compiler_options=available_options())
+    fast = jit(traced, inline=inline, compiler_options=OPTIONS)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        compiled = fast() if compiles_fast((args, kwargs)) else optimised
+        compiled = fast if compiles_fast((args, kwargs)) else optimised
         label = _thread.label or next(iter(_label_of_process), None)
         if label is None or _thread.timer is not None:
             return compiled(*args, **kwargs)
