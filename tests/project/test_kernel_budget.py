@@ -58,7 +58,7 @@ def step(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.dynamics.Evolved:
             slope, lambda: periodic(100), 950, id="gradient 100", marks=pytest.mark.thorough
         ),
         pytest.param(step, lambda: periodic(100), 680, id="evolve 100", marks=pytest.mark.thorough),
-        pytest.param(relaxed, lambda: cluster(30), 1500, id="arcs 30", marks=pytest.mark.thorough),
+        pytest.param(relaxed, lambda: cluster(30), 940, id="arcs 30", marks=pytest.mark.thorough),
         pytest.param(
             relaxed, lambda: periodic(400), 860, id="equilibrate 400", marks=pytest.mark.thorough
         ),

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vertax._base.minimum_maximum import maximum, minimum
+from vertax._base.reciprocal import inverse_square_root
 
 # A side is a row of an array: its start, its chord and, in tissues with arcs, its angle α, positive if it
 # bulges to the right (out of the face). With the unit vector e along the chord of length c and the unit
@@ -57,7 +58,7 @@ def _segments_cross(one: Sides, other: Sides) -> Bool[Array, " sides"]:
 
 def _arcs_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array, " sides"]:
     """`sides_cross` for arcs: two circles intersect on the line κ' F = κ F'."""
-    circles = jnp.column_stack(circle_of(one)), jnp.column_stack(circle_of(other))
+    circles = [jnp.column_stack(circle_of(side[:, 2:4], side[:, 4])) for side in (one, other)]
     first = (jnp.abs(circles[0][:, 0]) >= jnp.abs(circles[1][:, 0]))[:, None]
     a, b = jnp.where(first, one, other), jnp.where(first, other, one)
     (k1, g1), (k2, g2) = (
@@ -81,13 +82,14 @@ def _arcs_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array
     for position in (root / nonzero(k1), 2 * rest / nonzero(root)):
         x = foot + position[:, None] * along
         away = ~joined | (jnp.sqrt(dot(x - joint, x - joint)) > nearby)
-        crosses |= away & _on_arc(a, x) & _on_arc(b, x - w)
+        crosses |= away & on_arc(a[:, 2:4], a[:, 4], x) & on_arc(b[:, 2:4], b[:, 4], x - w)
     return crosses & (squared > 0)
 
 
-def _on_arc(side: Sides, x: Float[Array, "sides 2"]) -> Bool[Array, " sides"]:
+def on_arc(
+    chord: Float[Array, "*n 2"], angle: Float[Array, "*n"], x: Float[Array, "*n 2"]
+) -> Bool[Array, "*n"]:
     """Whether a point of the circle, relative to the start of the side, is on the arc."""
-    chord, angle = side[:, 2:4], side[:, 4]
     squared, along, aside = dot(chord, chord), dot(chord, x), cross(chord, x)
     # The arc is the part of its circle on one side of the chord. A flat arc is close to the chord.
     flat = (along > 0) & (along < squared) & (jnp.abs(aside) < squared)
@@ -97,19 +99,18 @@ def _on_arc(side: Sides, x: Float[Array, "sides 2"]) -> Bool[Array, " sides"]:
 class Circle(NamedTuple):
     """Curvature κ and vector g of the circle of each side."""
 
-    curvature: Float[Array, " sides"]
-    normal: Float[Array, "sides 2"]
+    curvature: Float[Array, "*n"]
+    normal: Float[Array, "*n 2"]
 
 
-def circle_of(side: Sides) -> Circle:
+def circle_of(chord: Float[Array, "*n 2"], angle: Float[Array, "*n"]) -> Circle:
     """The circles of sides that may be arcs; κ = 0 for straight sides."""
-    chord, angle = side[:, 2:4], side[:, 4:]
-    squared = jnp.sum(chord**2, axis=-1, keepdims=True)
-    unit = chord / jnp.sqrt(jnp.where(squared > 0, squared, 1))
+    squared = dot(chord, chord)
+    inverse = inverse_square_root(jnp.where(squared > 0, squared, 1))
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
-    left = jnp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
-    curvature = 2 * sine / jnp.sqrt(jnp.where(squared > 0, squared, 1))
-    return Circle(curvature[:, 0], sine * unit + cosine * left)
+    along = chord * inverse[..., None]
+    left = jnp.stack([-along[..., 1], along[..., 0]], axis=-1)
+    return Circle(2 * sine * inverse, sine[..., None] * along + cosine[..., None] * left)
 
 
 @jax.custom_jvp
@@ -137,81 +138,3 @@ def _offset_from_segment(
     squared = dot(chord, chord)
     fraction = minimum(maximum(dot(first, chord) / jnp.where(squared > 0, squared, 1), 0), 1)
     return first - fraction[:, None] * chord, fraction
-
-
-def squared_distance_to_arc(
-    point: Float[Array, "sides 2"], side: Sides, circle: Circle
-) -> Float[Array, " sides"]:
-    """Squared distance of a point from each arc."""
-    curvature, g = circle
-    first, chord = point - side[:, :2], side[:, 2:4]
-    last = first - chord
-    value = 0.5 * curvature * dot(first, first) - dot(g, first)
-    # 0 at the centre of the circle, where the distance to all points of the arc is the same.
-    squared = 1 + 2 * curvature * value
-    distance = 2 * value / (1 + jnp.sqrt(jnp.where(squared > 0, squared, 1)))
-    past_start = -cross(g, first) >= 0
-    before_end = curvature * cross(first, chord) + cross(g, last) >= 0
-    wide = jnp.abs(side[:, 4]) > 0.5 * jnp.pi
-    faces = jnp.where(wide, past_start | before_end, past_start & before_end) & (squared > 0)
-    ends = minimum(dot(first, first), dot(last, last))
-    return jnp.where(faces, distance**2, ends)
-
-
-def bulge_gap(
-    one: Sides, other: Sides, circles: tuple[Circle, Circle], reach: Float[Array, ""]
-) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
-    """Distance from an arc that bulges into the face to another side, and a weight from 0 to 1.
-
-    The gap is the least distance between the circle of the arc and that of the other side (or its line). If
-    the nearest point is within `reach` of the end of a side, or the arc is flat, then its corners are as
-    near, and the weight decreases smoothly to 0. (For weight 0 the gap is infinite.)
-    """
-    bulge = -one[:, 4]
-    bulging = bulge > _FLAT
-    radius = -1 / jnp.where(bulging, circles[0].curvature, -1)
-    to_centre = -radius[:, None] * circles[0].normal
-    curvature, g = circles[1]
-    centre = one[:, :2] + to_centre - other[:, :2]
-    value = 0.5 * curvature * dot(centre, centre) - dot(g, centre)
-    squared = 1 + 2 * curvature * value
-    root = jnp.sqrt(jnp.where(squared > 0, squared, 1))
-    # Distance of the centre from the other circle, positive on its inner side, and the direction to it.
-    distance = -2 * value / (1 + root)
-    unit = (curvature[:, None] * centre - g) / root[:, None]
-    x = to_centre + radius[:, None] * unit
-    y = centre + distance[:, None] * unit
-    gap = distance - radius
-    x, y, gap = jax.lax.optimization_barrier((x, y, gap))
-    facing = bulging & (squared > 0) & (gap > 0) & _on_arc(one, x) & _on_arc(other, y)
-    inner = _inner(one, x, facing, reach) * _inner(other, y, facing, reach)
-    weight = _smooth_step(bulge / _FLAT - 1) * inner
-    return jnp.where(facing, gap, jnp.inf), jnp.where(facing, weight, 0)
-
-
-_FLAT = 0.01  # radians
-
-
-def _inner(
-    side: Sides, x: Float[Array, "sides 2"], where: Bool[Array, " sides"], reach: Float[Array, ""]
-) -> Float[Array, " sides"]:
-    """Weight of a point on an arc: 1 in its inner part, decreasing to 0 at its ends."""
-    x, chord = jnp.where(where[:, None], x, 1), jnp.where(where[:, None], side[:, 2:4], 3)
-    last, squared = x - chord, dot(chord, chord)
-    near = minimum(0.1 * jnp.sqrt(squared), reach)
-    return _smooth_step(jnp.sqrt(dot(x, x) * dot(last, last) / squared) / near)
-
-
-def _smooth_step(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """6x⁵ - 15x⁴ + 10x³ between 0 and 1; constant outside; twice differentiable."""
-    x = minimum(maximum(x, 0), 1)
-    return (10 + (6 * x - 15) * x) * x**3
-
-
-def wedge(
-    one: Sides, circles: tuple[Circle, Circle]
-) -> tuple[Float[Array, " sides"], Float[Array, " sides"]]:
-    """Sine and cosine of the interior angle of the face between a side and the next one."""
-    (curvature, g), (_, leaving) = circles
-    arriving = g - curvature[:, None] * one[:, 2:4]  # normals to the two tangents there
-    return -cross(leaving, arriving), -dot(leaving, arriving)

@@ -1,7 +1,7 @@
-r"""Barriers: sums of functions of four numbers each, with derivatives in closed form.
+r"""Barriers: sums of energies of rows of a few numbers, with one Hessian block for each row.
 
-Each row of a barrier is an energy $\varphi(s_1, s_2)$ of two scalars, which are functions of the four numbers
-$z$ of the row (two vectors). With $g_i = \nabla_z s_i$ and $G_i = \nabla^2_z s_i$,
+Each row of a barrier of straight edges is an energy $\varphi(s_1, s_2)$ of two scalars, which are functions
+of the four numbers $z$ of the row (two vectors). With $g_i = \nabla_z s_i$ and $G_i = \nabla^2_z s_i$,
 
 $$\nabla_z \varphi = \sum_i \varphi_i\, g_i, \qquad
 \nabla^2_z \varphi = \sum_{ij} \varphi_{ij}\, g_i g_j^T + \sum_i \varphi_i\, G_i.$$
@@ -12,6 +12,7 @@ Automatic differentiation through the same expressions compiles to several times
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -48,18 +49,33 @@ def profile(x: Float[Array, "*shape"]) -> Profile:
     return Profile(zero(gap**2 * log), zero(first), zero(second))
 
 
+@jax.custom_jvp
 def barrier(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The barrier alone, to be differentiated by JAX."""
-    x = jnp.where(x < 1, x, 1)
-    return (1 - x) ** 2 * (np.log1p(FLOOR) - jnp.log(x + FLOOR))
+    """The barrier, with the derivatives of `profile`."""
+    return profile(x).value
+
+
+@barrier.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return barrier(*primals), _slope(*primals) * tangents[0]
+
+
+@jax.custom_jvp
+def _slope(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    return profile(x).first
+
+
+@_slope.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    return _slope(*primals), profile(*primals).second * tangents[0]
 
 
 class Expansion(NamedTuple):
     """Energies of rows, with their first and second derivatives."""
 
     energy: Float[Array, " rows"]
-    slope: Float[Array, "4 rows"]
-    block: Float[Array, "4 4 rows"]
+    slope: Float[Array, "numbers rows"]
+    block: Float[Array, "numbers numbers rows"]
 
 
 def outer(a: Float[Array, "i rows"], b: Float[Array, "j rows"]) -> Float[Array, "i j rows"]:
@@ -80,6 +96,25 @@ def composed(
     cross = outer(g1, g2)
     block = f11 * outer(g1, g1) + f12 * (cross + jnp.swapaxes(cross, 0, 1)) + f22 * outer(g2, g2)
     return Expansion(value, f1 * g1 + f2 * g2, block + f1 * h1 + f2 * h2)
+
+
+def differentiated(
+    energies: Callable[[Float[Array, "numbers rows"]], Float[Array, " rows"]],
+    vectors: Float[Array, "numbers rows"],
+) -> Expansion:
+    """The expansion of energies of rows, each a function of the numbers of its row.
+
+    By forward differentiation twice: that compiles to fewer kernels than reverse differentiation.
+    """
+    n, rows = vectors.shape
+    directions = jnp.broadcast_to(jnp.eye(n, dtype=vectors.dtype)[:, :, None], (n, n, rows))
+
+    def with_slopes(f: Callable, z: Array) -> tuple:
+        return jax.vmap(lambda d: jax.jvp(f, (z,), (d,)), out_axes=(None, 0))(directions)
+
+    first = lambda z: with_slopes(energies, z)
+    (energy, slope), (_, block) = with_slopes(first, vectors)
+    return Expansion(energy, slope, block)
 
 
 class GatherPlan(eqx.Module):
@@ -106,24 +141,24 @@ class GatherPlan(eqx.Module):
 
 
 class AbstractBarrier(eqx.Module):
-    """A sum of energies of rows of two vectors, which are linear in the positions of some points."""
+    """A sum of energies of rows of numbers, which are linear in the positions of some points (or sides)."""
 
     @abc.abstractmethod
-    def expansion(self, vectors: Float[Array, "4 rows"]) -> Expansion:
+    def expansion(self, vectors: Float[Array, "numbers rows"]) -> Expansion:
         """The energies of rows and their derivatives."""
 
     @abc.abstractmethod
-    def vectors(self, positions: Float[Array, "points rows 2"]) -> Float[Array, "4 rows"]:
-        """The two vectors of each row."""
+    def vectors(self, positions: Float[Array, "points rows parts"]) -> Float[Array, "numbers rows"]:
+        """The numbers of each row: two vectors, or the shape of two arcs."""
 
     @abc.abstractmethod
-    def forces(self, slopes: Float[Array, "4 rows"]) -> Float[Array, "points rows 2"]:
+    def forces(self, slopes: Float[Array, "numbers rows"]) -> Float[Array, "points rows parts"]:
         """The transpose of `vectors`."""
 
 
 @jax.custom_jvp
 def barrier_energy(
-    barrier: AbstractBarrier, positions: Float[Array, "points rows 2"]
+    barrier: AbstractBarrier, positions: Float[Array, "points rows parts"]
 ) -> Float[Array, ""]:
     """The energy of a barrier; derivatives by `barrier` are zero."""
     energies = barrier.expansion(barrier.vectors(positions)).energy
@@ -137,8 +172,8 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 @jax.custom_jvp
 def _gradient(
-    barrier: AbstractBarrier, positions: Float[Array, "points rows 2"]
-) -> Float[Array, "points rows 2"]:
+    barrier: AbstractBarrier, positions: Float[Array, "points rows parts"]
+) -> Float[Array, "points rows parts"]:
     return barrier.forces(barrier.expansion(barrier.vectors(positions)).slope)
 
 

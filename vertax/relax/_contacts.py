@@ -10,12 +10,13 @@ from jaxtyping import Array, Bool, Float, Int
 from vertax._base.reductions import any_of, count_true, indices_of_true
 from vertax.mesh import Tissue
 from vertax.mesh._overlaps import overlaps_and_nearest
-from vertax.mesh._sides import Sides, dot
+from vertax.mesh._sides import dot
 from vertax.mesh._topology import Topology, take
 from vertax.precondition._edge_blocks import Symmetric
+from vertax.relax._arc_barrier import ArcBarrier
 from vertax.relax._barrier import GatherPlan, barrier_energy
 from vertax.relax._inversion_barrier import REACH, InversionBarrier
-from vertax.relax._pair_barrier import PairBarrier
+from vertax.relax._pair_barrier import AbstractPairBarrier, SegmentBarrier
 
 
 class Contacts(eqx.Module):
@@ -31,7 +32,7 @@ class Contacts(eqx.Module):
     - `overflow`: whether more pairs are near than there are rows.
     """
 
-    pairs: PairBarrier
+    pairs: AbstractPairBarrier
     sides: Int[Array, "2 pairs"]
     plan: GatherPlan
     inversion: InversionBarrier
@@ -42,12 +43,10 @@ class Contacts(eqx.Module):
         """The energy of the barriers."""
 
         def energy() -> Float[Array, ""]:
-            if tissue.arcs is None:
-                of_pairs = barrier_energy(self.pairs, self.plan.positions(tissue))
-            else:
-                one, other = map(tissue.sides_of, self.sides)
-                of_pairs = jnp.sum(self.pairs.heights(one, other))
-            return of_pairs + self._inversion_energy(tissue)
+            straight = tissue.arcs is None
+            of_sides = lambda: jnp.stack([tissue.sides_of(sides) for sides in self.sides])
+            positions = self.plan.positions(tissue) if straight else of_sides()
+            return barrier_energy(self.pairs, positions) + self._inversion_energy(tissue)
 
         # (Most of the time there are no contacts, and the barriers take longer than the energy.)
         return jax.lax.cond(self.some, energy, lambda: jnp.zeros((), tissue.vertices.dtype))
@@ -137,12 +136,7 @@ class Contacts(eqx.Module):
 
     def updated_pairs(self, tissue: Tissue) -> tuple[Contacts, Bool[Array, " vertices"]]:
         """The contacts with the pairs of a tissue, and the vertices of cells that overlap."""
-
-        def measure(one: Sides, other: Sides, after: Array, before: Array) -> Array:
-            near = [near for near, _ in self.pairs.nearness(one, other, after, before)]
-            return near[0] if len(near) == 1 else jnp.minimum(*near)
-
-        m, size = tissue.topology, self.capacity
+        m, size, measure = tissue.topology, self.capacity, self.pairs.nearness
         overlapping, nearest, gaps = overlaps_and_nearest(m, tissue.sides, tissue.areas, measure)
         near = (gaps < _MARGIN**2).reshape(-1)
         # (A slice of its results would make XLA sort instead.)
@@ -196,8 +190,9 @@ def no_contacts(
     )
     topology = tissue.topology
     false, sides = jnp.zeros(n, bool), jnp.zeros((2, n), topology.twin.dtype)
+    barrier = SegmentBarrier if tissue.arcs is None else ArcBarrier
     contacts = Contacts(
-        PairBarrier(reach * length, slope, strength, false, false, false),
+        barrier(reach * length, slope, strength, false, false, false),
         sides,
         GatherPlan.empty(topology, (3, n)),
         inversion,

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
+import abc
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vertax._base.minimum_maximum import minimum
 from vertax._base.reciprocal import reciprocal
 from vertax._base.sums import total
-from vertax.mesh._sides import (
-    Sides,
-    bulge_gap,
-    circle_of,
-    dot,
-    squared_distance_to_arc,
-    squared_distance_to_segment,
-    wedge,
-)
+from vertax.mesh._sides import Sides, dot, squared_distance_to_segment
 from vertax.relax._barrier import (
     AbstractBarrier,
     Expansion,
-    barrier,
     composed,
     outer,
     profile,
 )
 
 
-class PairBarrier(AbstractBarrier):
+class AbstractPairBarrier(AbstractBarrier):
     r"""The barrier between corners and sides that are near.
 
     A face overlaps itself where a corner reaches a side that it does not end. The energy of a corner at the
@@ -59,6 +52,24 @@ class PairBarrier(AbstractBarrier):
     after: Bool[Array, " pairs"]
     before: Bool[Array, " pairs"]
     valid: Bool[Array, " pairs"]
+
+    @abc.abstractmethod
+    def nearness(
+        self, one: Sides, other: Sides, after: Bool[Array, " n"], before: Bool[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """Squared distance of the start of one side from another side over the squared range."""
+
+    def inverse_squared_range(
+        self, arm: Float[Array, "*shape"], joined: Bool[Array, "*shape"]
+    ) -> Float[Array, "*shape"]:
+        """$1 / d^2$, with the squared distance from a common end where two sides are joined."""
+        joined &= arm > 0
+        near_end = reciprocal(self.slope**2 * jnp.where(joined, arm, 1))
+        return reciprocal(self.distance**2) + jnp.where(joined, near_end, 0)
+
+
+class SegmentBarrier(AbstractPairBarrier):
+    """The barrier between corners and straight sides, with derivatives in closed form."""
 
     def vectors(self, positions: Float[Array, "3 pairs 2"]) -> Float[Array, "4 pairs"]:
         """The corner from the start of the side, and the chord."""
@@ -121,47 +132,11 @@ class PairBarrier(AbstractBarrier):
             (quadratic(t) - 0.5 * inverse_squared * outer(turn, turn), quadratic(e)),
         )
 
-    def heights(self, one: Sides, other: Sides) -> Float[Array, " pairs"]:
-        """The energies of pairs of sides that may be arcs."""
-        heights = jnp.zeros(len(one), one.dtype)
-        for near, squared in self.nearness(one, other, self.after, self.before):
-            # (A side that is far away may be at an infinite distance.)
-            valid = self.valid & (near < 1)
-            heights += squared * barrier(jnp.where(valid, near, 1))
-        return self.strength * heights
-
     def nearness(
         self, one: Sides, other: Sides, after: Bool[Array, " n"], before: Bool[Array, " n"]
-    ) -> list[tuple[Float[Array, " n"], Float[Array, " n"]]]:
-        """Squared distance over squared range, and the squared range times a weight.
-
-        The distance is that of the start of one side from the other; of arcs also that between the two, or
-        the angle if one follows on the other.
-        """
-        apart = jnp.broadcast_to(reciprocal(self.distance**2), after.shape)
-
-        def inverse_square(arm: Float[Array, " n"], where: Bool[Array, " n"]) -> Float[Array, " n"]:
-            """Of the range, where a side is next to another one with a squared distance to its end."""
-            where &= arm > 0
-            return apart + jnp.where(where, reciprocal(self.slope**2 * jnp.where(where, arm, 1)), 0)
-
+    ) -> Float[Array, " n"]:
         first = one[:, :2] - other[:, :2]
         last = first - other[:, 2:4]
-        inverse = inverse_square(minimum(dot(first, first), dot(last, last)), after | before)
-        squared = reciprocal(inverse)
-        if one.shape[-1] == 4:
-            return [(squared_distance_to_segment(one[:, :2], other) * inverse, squared)]
-        circles = circle_of(one), circle_of(other)
-        near = [(squared_distance_to_arc(one[:, :2], other, circles[1]) * inverse, squared)]
-        sine, cosine = wedge(one, circles)
-        acute = after & (cosine > 0) & (sine > 0)
-        arms = dot(one[:, 2:4], one[:, 2:4]), dot(other[:, 2:4], other[:, 2:4])
-        # (The corner's other side is next to the one before. This one is not, and may come near anywhere.)
-        inverse = inverse_square(minimum(*arms), after)
-        angle = jnp.where(acute, (sine / self.slope) ** 2, jnp.inf)
-        gap, weight = bulge_gap(one, other, circles, self.distance)
-        far = jnp.isinf(gap)
-        gap = jnp.where(far, jnp.inf, jnp.where(far, 1, gap) ** 2 * inverse)
-        weight = reciprocal(inverse) * jnp.where(after, 1, weight)
-        near.append((jnp.where(after, angle, gap), weight))
-        return near
+        arm = minimum(dot(first, first), dot(last, last))
+        squared = squared_distance_to_segment(one[:, :2], other)
+        return squared * self.inverse_squared_range(arm, after | before)
