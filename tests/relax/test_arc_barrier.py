@@ -49,7 +49,7 @@ def test_nearness_is_the_minimum_distance(bulge, angle, middle, half):
     distances = cdist(points, others)
     distance, nearest = distance_between(one, other), distances.min()
     assert distance > nearest - 1e-2 * nearest - 2e-3  # (the points are 0.003 apart)
-    # (Otherwise the bulge is on the other side, or corners of the other side are nearest: a pair of its own.)
+    # (Otherwise the bulge is on the other side, or corners of the other side are nearest: another pair.)
     bulge_counts = distance < distances[0].min() * (1 - 1e-3) - 1e-4
     apart = nearest > 5e-3
     if bulge_counts and apart and nearest < distances[:, [0, -1]].min() * (1 - 1e-3) - 1e-4:
