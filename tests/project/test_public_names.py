@@ -27,7 +27,7 @@ PACKAGES = {
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity "
     "PerimeterViscosity SubstrateFriction Sum ViscositySum",
     "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
-    "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum",
+    "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum TypeTension by_type",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts "
     "fit limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
