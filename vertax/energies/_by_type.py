@@ -71,7 +71,12 @@ class TypeTension(AbstractLocalEnergy):
         return self.edge_tensions(tissue) * tissue.edge_lengths
 
 
-def by_type(table: ArrayLike, types: ArrayLike, *, outline: ArrayLike | None = None) -> TypeTension:
+def by_type(
+    table: ArrayLike | Sequence[Any],
+    types: ArrayLike | Sequence[Any],
+    *,
+    outline: ArrayLike | Sequence[Any] | None = None,
+) -> TypeTension:
     r"""Line tension that depends on the types of the two cells of an edge: $\sum_e \gamma_{st}\,\ell_e$.
 
     ```python
