@@ -57,10 +57,10 @@ def test_cells_are_matched_by_number_in_any_order():
 
 
 def test_t1_transition_is_recognised():
-    tissue = vx.initialise.periodic_voronoi(16, key=jax.random.key(2))
-    end = vx.equilibrate(tissue, vx.energies.ShapeFactorEnergy(3.7)).tissue
+    tissue = vx.initialise.periodic_voronoi(36, key=jax.random.key(2))
+    end = vx.equilibrate(tissue, vx.energies.ShapeFactorEnergy(3.8)).tissue
     assert not np.array_equal(tissue.topology.edge_cells, end.topology.edge_cells)
-    movie = Movie([tissue, end], [0, 1])
+    movie = Movie([tissue, end], [0, 1], largest_jump=2.0)
     contacts = lambda t: {frozenset(p) for p in np.asarray(t.topology.edge_cells).tolist()}
     lost, gained = contacts(tissue) - contacts(end), contacts(end) - contacts(tissue)
     listed = [frozenset(e.cells[:2]) for e in movie.events if e.kind in ("T1", "contact lost")]

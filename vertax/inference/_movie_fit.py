@@ -102,7 +102,7 @@ def fit_movie(
 
     | symbol | argument | choose |
     |---|---|---|
-    | $\alpha$ | `implicitness` | 1 if tissues relax between frames; 0.5, of second order, if frames are closer |
+    | $\alpha$ | `implicitness` | 1 if tissues relax between frames; 0.5 if frames are closer |
     | $\zeta$ | `friction` | a known value; with another one all parameters scale, unless some are constants |
     | $\sigma$ | `noise` | standard deviation of the coordinates of vertices |
 
@@ -140,7 +140,8 @@ def fit_movie(
     check_energy(energy)
     check_number("friction", friction, above=0)
     check_number("noise", noise, at_least=0)
-    check_number("implicitness", implicitness, at_least=0.5, at_most=1)
+    if not 0.5 <= implicitness <= 1:
+        raise ValueError(f"Argument `implicitness` must be from 0.5 to 1, but is {implicitness}.")
     check_integer("max_steps", max_steps, at_least=1)
     n_steps = movie.n_frames - 2
     if n_steps < 1:
@@ -196,10 +197,8 @@ def _fit_windows(
         """The equations of each step, see `_equations`."""
 
         def one(item: tuple[Array, Array]) -> tuple[Array, ...]:
-            triple = [
-                eqx.combine(jax.tree.map(lambda x: x[item[0] + j], arrays), static)
-                for j in range(3)
-            ]
+            pick = lambda k: eqx.combine(jax.tree.map(lambda x: x[k], arrays), static)
+            triple = [pick(item[0] + j) for j in range(3)]
             dt = times[item[0] + 2] - times[item[0] + 1]
             return _equations(settings, theta, floor, triple, dt, item[1])
 
