@@ -177,7 +177,8 @@ def fit_movie(
             "Argument `movie` must have vertices that join the same three cells in three successive frames, "
             "but has none. Take frames in shorter intervals."
         )
-    return fits if windows is not None else jax.tree.map(lambda x: x[0], fits)
+    first = lambda x: x[0] if eqx.is_array(x) else x
+    return fits if windows is not None else jax.tree.map(first, fits)
 
 
 @eqx.filter_jit
