@@ -78,7 +78,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
 
 def with_noise(tissue: vx.Tissue, noise: float, rng: np.random.Generator) -> vx.Tissue:
-    """A tissue with displaced vertices, by at most a fifth of their shortest edge so that cells stay valid."""
+    """A tissue with displaced vertices, by at most a fifth of their shortest edge: cells stay valid."""
     shortest = np.full(tissue.n_vertices, np.inf)
     ends = np.asarray(tissue.topology.edge_vertices)
     np.minimum.at(shortest, ends.ravel(), np.repeat(np.asarray(tissue.edge_lengths), 2))
