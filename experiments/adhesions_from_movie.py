@@ -41,9 +41,9 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     types = model.types("sorting")
     times = np.arange(round(config.duration + config.forecast) + 1.0)
     energy = model.energy("sorting")
-    whole = model.evolution(times, key=config.seed)(honeycomb(model.across), energy)
+    simulated = model.evolution(times, key=config.seed)(honeycomb(model.across), energy)
     used = np.arange(0, round(config.duration) + 1, config.every)
-    frames = list(whole.trajectory)
+    frames = list(simulated.trajectory)
     noisy = [with_noise(frames[k], config.noise, rng) for k in used]
     movie = Movie(noisy, times[used], types=dict(enumerate(types.tolist())), largest_jump=3.0)
     guess = by_type(0.1 * jnp.ones((2, 2)), movie.types, outline=jnp.array(0.1))
@@ -60,7 +60,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     forecast = lambda seed: evolution(seed)(start, fit.energy, throw=False)
     part = lambda seed: lambda: {"unlike": np.asarray(unlike_length(forecast(seed).frames, types))}
     series = np.stack([folder.part(f"seed {seed}", part(seed))["unlike"] for seed in range(config.seeds)])
-    course = np.asarray(unlike_length(whole.frames, types))
+    course = np.asarray(unlike_length(simulated.frames, types))
     folder.save_table("forecast", {"time": later, "true": course[used[-1] :], "mean": series.mean(axis=0)})
     figure = plot_recovery(true, values, deviations, times, course, later, series)
     folder.save_figure("adhesions", figure)

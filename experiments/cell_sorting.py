@@ -1,7 +1,7 @@
 r"""Sorting, engulfment and mixing of two types of cells, the benchmark of the OpenVT workshop 2026.
 
-A free honeycomb with the energy $\tfrac12 \sum_c (A_c - 1)^2 + \sum_e \gamma_e \ell_e$, whose adhesions
-depend on the types of the two cells, relaxes against friction and noise. The length of contacts between
+A free honeycomb with the energy $\tfrac12 \sum_c (A_c - 1)^2 + \sum_e \gamma_e \ell_e$ and adhesions
+that depend on the types of the two cells relaxes against friction and noise. The length of contacts between
 unlike cells is compared with the series of Chaste, and the time per step is measured against the number of
 cells.
 """
@@ -32,7 +32,7 @@ class Config(runs.ExperimentConfig):
     replicates: int = Field(default=10, ge=1)
     """Runs of each test with other noise."""
     sizes: list[int] = Field(default=[5, 10, 20], min_length=1)
-    """Cells across of the tissues whose time per step is measured."""
+    """Cells across of the tissues for the time per step."""
     timed_steps: int = Field(default=200, ge=1)
     """Steps that are timed."""
     model: Model = Model()

@@ -18,7 +18,7 @@ FRICTION = 0.7
 
 @pytest.fixture(scope="module")
 def evolved():
-    """A movie whose frames are the steps of the implicit Euler method, with T1 transitions."""
+    """A movie with frames that are the steps of the implicit Euler method, with T1 transitions."""
     tissue = vx.initialise.periodic_voronoi(16, key=jax.random.key(0))
     times = jnp.linspace(0, 6, 41)
     return vx.evolve(tissue, TRUTH, vx.dissipations.SubstrateFriction(FRICTION), times)

@@ -194,14 +194,14 @@ def _events(frames: list[_Frame]) -> list[Event]:
     """The events between all pairs of consecutive frames."""
     present = [set(frame.places) for frame in frames]
     last = {cell: k for k, cells in enumerate(present) for cell in cells}
-    seen: set[int] = set(present[0])
+    known_cells: set[int] = set(present[0])
     events: list[Event] = []
     for now in range(1, len(frames)):
         before, after = frames[now - 1], frames[now]
         gone, new = present[now - 1] - present[now], present[now] - present[now - 1]
         events += [Event("gap", now, (cell,)) for cell in sorted(gone) if last[cell] > now]
         gone = {cell for cell in gone if last[cell] < now}
-        new, seen = new - seen, seen | new
+        new, known_cells = new - known_cells, known_cells | new
         for mother, daughters in _divisions(before, after, gone, new):
             events.append(Event("division", now, (mother, *daughters)))
             gone, new = gone - {mother}, new - set(daughters)
@@ -217,7 +217,7 @@ def _divisions(
     before: _Frame, after: _Frame, gone: set[int], new: set[int]
 ) -> list[tuple[int, tuple[int, ...]]]:
     """Mothers and daughters: two neighbours at the place of one cell, whose number one of them may keep."""
-    found, free = [], set(new)
+    divisions, free = [], set(new)
     for first in sorted(new):
         if first not in free:
             continue
@@ -240,10 +240,10 @@ def _divisions(
                 if change < 0.5 and away < 1 / 3 and (best is None or away < best[0]):
                     best = (away, mother, daughters)
         if best is not None:
-            found.append(best[1:])
+            divisions.append(best[1:])
             free -= set(best[2])
             gone = gone - {best[1]}
-    return found
+    return divisions
 
 
 def _relative(frame: _Frame, places: np.ndarray) -> np.ndarray:
