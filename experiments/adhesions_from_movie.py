@@ -26,7 +26,7 @@ class Config(runs.ExperimentConfig):
     forecast: float = Field(default=100.0, gt=0)
     """Duration of the forecast."""
     every: int = Field(default=10, ge=1)
-    """The run has a frame per unit of time; each of so many is used."""
+    """The run has a frame per unit of time; the fit uses one in `every`."""
     noise: float = Field(default=0.02, ge=0)
     """Standard deviation of positions; at most a fifth of the shortest edge of the vertex."""
     seeds: int = Field(default=5, ge=2)

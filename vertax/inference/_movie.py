@@ -216,7 +216,7 @@ def _events(frames: list[_Frame]) -> list[Event]:
 def _divisions(
     before: _Frame, after: _Frame, gone: set[int], new: set[int]
 ) -> list[tuple[int, tuple[int, ...]]]:
-    """Mothers and daughters: two neighbours at the place of one cell, whose number one of them may keep."""
+    """Mothers and daughters: two neighbours at the place of one cell; one may keep its number."""
     divisions, free = [], set(new)
     for first in sorted(new):
         if first not in free:
