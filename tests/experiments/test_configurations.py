@@ -15,6 +15,13 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 ONE_METHOD = '[{name = "guided", distance = "centroids", guided = true}]'
 
 SHORT = {
+    "adhesions_from_movie": [
+        "model.across=4",
+        "duration=12",
+        "forecast=1",
+        "every=2",
+        "seeds=2",
+    ],
     "adjoint_scaling": ["methods=['Adj-ID', 'EP']", "sizes=[8]", "epochs=1"],
     "benchmark_adjoints": [
         "replicates=2",
@@ -29,6 +36,15 @@ SHORT = {
         "speeds=[0.5]",
         "tissue.n_cells=9",
         "duration=5",
+    ],
+    "cell_sorting": [
+        "tests=['sorting']",
+        "duration=2",
+        "interval=1",
+        "replicates=2",
+        "sizes=[4]",
+        "timed_steps=4",
+        "model.across=4",
     ],
     "compare_conditions": [
         "images=1",

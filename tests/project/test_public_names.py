@@ -27,13 +27,14 @@ PACKAGES = {
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity "
     "PerimeterViscosity SubstrateFriction Sum ViscositySum",
     "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
-    "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum",
+    "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum TypeTension by_type",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts "
     "fit limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
-    "inference": "EdgeMotion InferredTensions Micrograph Microscope MovingTensions PinnedEnergy "
-    "RecoveryWatch Scene Transition fit_onset fit_transition foam_energy foam_terms "
-    "infer_tensions label_image micrograph_problem pearson read_mask relative_error "
+    "inference": "EdgeMotion Event InferredTensions Micrograph Microscope Movie MovieFit MovingTensions "
+    "PinnedEnergy RecoveryWatch Scene Transition fit_movie fit_onset fit_transition foam_energy "
+    "foam_terms infer_tensions label_image micrograph_problem movie_from_table pearson read_mask "
+    "relative_error "
     "same_neighbours shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport PolygonTissue "
     "Segmentation Watershed "

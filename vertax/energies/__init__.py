@@ -1,6 +1,7 @@
 """Mechanical energies of a tissue."""
 
 from vertax.energies._ablation import Ablated as Ablated
+from vertax.energies._by_type import TypeTension as TypeTension, by_type as by_type
 from vertax.energies._elasticity import (
     AreaElasticity as AreaElasticity,
     PerimeterElasticity as PerimeterElasticity,

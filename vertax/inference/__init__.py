@@ -17,6 +17,9 @@ from vertax.inference._motion import (
     EdgeMotion as EdgeMotion,
     MovingTensions as MovingTensions,
 )
+from vertax.inference._movie import Event as Event, Movie as Movie
+from vertax.inference._movie_fit import MovieFit as MovieFit, fit_movie as fit_movie
+from vertax.inference._movie_table import movie_from_table as movie_from_table
 from vertax.inference._recovery import (
     RecoveryWatch as RecoveryWatch,
     pearson as pearson,

@@ -1,0 +1,181 @@
+"""Movies of tracked cells, and the events between their frames."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vertax as vx
+from vertax.inference import Event, Movie, movie_from_table
+from vertax.mesh import cell_polygons
+
+
+def rows_of(tissue, frame, numbers=None, leave_out=(), **columns):
+    """The rows of the corners of a tissue with straight edges."""
+    numbers = np.arange(tissue.n_cells) if numbers is None else numbers
+    polygons, sizes = cell_polygons(tissue, 1)
+    return [
+        {"frame": frame, "cell": int(number), "x": x, "y": y}
+        | {name: values[k] for name, values in columns.items()}
+        for k, (number, polygon, size) in enumerate(zip(numbers, polygons, sizes, strict=True))
+        if number not in leave_out
+        for x, y in polygon[:size]
+    ]
+
+
+def table_of(rows):
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+CLUSTER = vx.initialise.free_voronoi(20, key=jax.random.key(4), lloyd_steps=20)
+STRAIGHT = CLUSTER.with_angles(0 * CLUSTER.angles)
+_outline = np.asarray(STRAIGHT.topology.edge_cells)[np.asarray(STRAIGHT.topology.on_outline), 0]
+INNER = [cell for cell in range(20) if cell not in _outline]
+
+
+def test_cells_without_events_keep_their_places():
+    moved = STRAIGHT.with_vertices(STRAIGHT.vertices + 0.1)
+    types = {"type": np.arange(20) % 2}
+    movie = movie_from_table(table_of(rows_of(STRAIGHT, 3, **types) + rows_of(moved, 7, **types)))
+    assert movie.events == ()
+    np.testing.assert_array_equal(movie.times, [3, 7])
+    np.testing.assert_array_equal(movie.types, np.arange(20) % 2)
+    np.testing.assert_allclose(movie.frame(0).areas, STRAIGHT.areas, rtol=1e-12)
+    np.testing.assert_allclose(movie.frame(1).centroids, moved.centroids, rtol=1e-12)
+
+
+def test_cells_are_matched_by_number_in_any_order():
+    numbers = 5 + 3 * np.random.default_rng(0).permutation(20)
+    order = rows_of(STRAIGHT, 0, numbers)
+    movie = movie_from_table(table_of(order + rows_of(STRAIGHT, 1, numbers)[::-1]))
+    np.testing.assert_array_equal(movie.cells, np.sort(numbers))
+    by_number = np.asarray(STRAIGHT.areas)[np.argsort(numbers)]
+    for frame in range(2):
+        movie.frame(frame).topology.validate()
+        np.testing.assert_allclose(movie.frame(frame).areas, by_number, rtol=1e-12)
+    assert movie.events == ()
+
+
+def test_t1_transition_is_recognised():
+    tissue = vx.initialise.periodic_voronoi(36, key=jax.random.key(2))
+    end = vx.equilibrate(tissue, vx.energies.ShapeFactorEnergy(3.8)).tissue
+    assert not np.array_equal(tissue.topology.edge_cells, end.topology.edge_cells)
+    movie = Movie([tissue, end], [0, 1], largest_jump=2.0)
+    contacts = lambda t: {frozenset(p) for p in np.asarray(t.topology.edge_cells).tolist()}
+    lost, gained = contacts(tissue) - contacts(end), contacts(end) - contacts(tissue)
+    listed = [frozenset(e.cells[:2]) for e in movie.events if e.kind in ("T1", "contact lost")]
+    assert lost
+    assert sorted(map(sorted, listed)) == sorted(map(sorted, lost))
+    new = [frozenset(e.cells[2:]) for e in movie.events if e.kind == "T1"]
+    new += [frozenset(e.cells) for e in movie.events if e.kind == "contact gained"]
+    assert sorted(map(sorted, new)) == sorted(map(sorted, gained))
+
+
+@pytest.mark.parametrize("keeps_number", [True, False])
+def test_division_is_recognised(keeps_number):
+    mother, start = INNER[0], STRAIGHT.with_capacity(21)
+    divided = vx.transitions.divide(start, mother).tissue.without_spare()
+    numbers = np.arange(21)
+    if not keeps_number:
+        numbers[mother] = 40
+    movie = Movie([STRAIGHT, divided], [0, 1], cells=[np.arange(20), numbers])
+    daughters = {int(numbers[mother]), 20}
+    (event,) = [e for e in movie.events if e.kind == "division"]
+    assert (event.frame, event.cells[0]) == (1, mother)
+    assert set(event.cells[1:]) == daughters
+    assert not any(e.kind in ("death", "entry") for e in movie.events)
+    n_alive = [int(movie.frame(k).alive.sum()) for k in range(2)]
+    assert n_alive == [20, 21]
+    np.testing.assert_allclose(movie.frame(0).areas.sum(), STRAIGHT.areas.sum(), rtol=1e-12)
+
+
+def test_death_is_recognised():
+    dead = INNER[0]
+    removed = vx.transitions.remove(STRAIGHT.with_capacity(20), dead).tissue.without_spare()
+    rest = np.delete(np.arange(20), dead)
+    movie = Movie([STRAIGHT, removed], [0, 1], cells=[np.arange(20), rest], largest_jump=2.0)
+    assert Event("death", 1, (dead,)) in movie.events
+    assert not movie.frame(1).alive[dead]
+
+
+def test_a_cell_that_is_missing_for_a_frame_fills_the_hole():
+    missing = INNER[0]
+    frames = rows_of(STRAIGHT, 0) + rows_of(STRAIGHT, 1, leave_out=[missing]) + rows_of(STRAIGHT, 2)
+    movie = movie_from_table(table_of(frames))
+    assert movie.events == (Event("gap", 1, (missing,)),)
+    np.testing.assert_allclose(movie.frame(1).areas, STRAIGHT.areas, rtol=1e-12)
+
+
+def test_a_cell_at_the_border_may_be_missing():
+    missing = int(_outline[0])
+    gap = rows_of(STRAIGHT, 1, leave_out=[missing])
+    movie = movie_from_table(table_of(rows_of(STRAIGHT, 0) + gap + rows_of(STRAIGHT, 2)))
+    assert Event("gap", 1, (missing,)) in movie.events
+    assert not any(event.kind in ("exit", "death", "entry") for event in movie.events)
+
+
+def test_cells_that_jump_are_named():
+    numbers = np.arange(20)
+    numbers[[0, 19]] = [19, 0]
+    with pytest.raises(
+        ValueError, match=r"must not jump, but in frame 1 cell (0|19) is .* cell sizes"
+    ):
+        Movie([STRAIGHT, STRAIGHT], [0, 1], cells=[np.arange(20), numbers])
+
+
+def test_numbers_that_are_used_again_are_named():
+    far = np.asarray(STRAIGHT.centroids)
+    first = int(_outline[0])
+    away = np.linalg.norm(far - far[first], axis=1)
+    other = max((int(c) for c in _outline), key=lambda c: away[c])
+    again = np.arange(20)
+    again[other], again[first] = first, 50
+    frames = rows_of(STRAIGHT, 0) + rows_of(STRAIGHT, 1, leave_out=[first])
+    with pytest.raises(ValueError, match=f"lost cell again, but in frame 2 cell {first} "):
+        movie_from_table(table_of(frames + rows_of(STRAIGHT, 2, again)))
+
+
+def test_bad_tables_are_named():
+    first, second = rows_of(STRAIGHT, 0), rows_of(STRAIGHT, 1)
+    with pytest.raises(
+        ValueError, match="`frame` of argument `table` must ascend, but frame 0 follows"
+    ):
+        movie_from_table(table_of(second + first))
+    with pytest.raises(ValueError, match="cell 3 appears twice in frame 1"):
+        movie_from_table(
+            table_of(first + second + [{**row, "frame": 1} for row in first if row["cell"] == 3])
+        )
+    with pytest.raises(ValueError, match="must have a column `cell`"):
+        movie_from_table({"frame": [0, 1]})
+    mixed = [{**row, "type": int(k == 0)} for k, row in enumerate(first + second)]
+    with pytest.raises(ValueError, match="one type per cell, but cell 0 has several"):
+        movie_from_table(table_of(mixed))
+
+
+def test_polygons_that_overlap_are_named():
+    squares = [[0, 0, 1, 0, 1, 1, 0, 1], [0.5, 0.2, 2, 0, 2, 1, 0.5, 0.8]]
+    rows = [
+        {"frame": f, "cell": c, "x": x, "y": y}
+        for f in range(2)
+        for c, square in enumerate(squares)
+        for x, y in np.reshape(square, (-1, 2))
+    ]
+    with pytest.raises(ValueError, match="Frame 0 of argument `table` must"):
+        movie_from_table(table_of(rows))
+
+
+def test_wrong_times_and_numbers_are_named():
+    with pytest.raises(ValueError, match="`times` must"):
+        Movie([STRAIGHT, STRAIGHT], [1, 0])
+    with pytest.raises(ValueError, match="one entry per frame"):
+        Movie([STRAIGHT, STRAIGHT], [0, 1, 2])
+    with pytest.raises(ValueError, match="frame 1 has two cells 7"):
+        Movie([STRAIGHT] * 2, [0, 1], cells=[np.arange(20), np.append(np.arange(19), 7)])
+    with pytest.raises(ValueError, match=r"has none for \[19\]"):
+        Movie([STRAIGHT] * 2, [0, 1], types=dict.fromkeys(range(19), 0))
+
+
+def test_types_of_a_movie_are_those_of_an_energy():
+    movie = Movie([STRAIGHT] * 2, [0, 1], types={k: k % 2 for k in range(20)})
+    energy = vx.energies.by_type(jnp.eye(2), movie.types, outline=0.0)
+    assert float(energy(movie.frame(0))) > 0

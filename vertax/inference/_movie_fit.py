@@ -1,0 +1,330 @@
+"""Parameters of an energy from the motion in a movie, across changes of neighbours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from vertax._base.checks import check_integer, check_number
+from vertax.costs._positions import matching_vertices
+from vertax.energies import AbstractEnergy
+from vertax.energies._energy import check_energy
+from vertax.inference._movie import Movie
+from vertax.mesh import Tissue
+from vertax.mesh._topology import take
+
+
+class MovieFit(eqx.Module):
+    """Parameters that explain the motion in a movie; with windows all arrays have a leading axis."""
+
+    energy: AbstractEnergy
+    """The energy with the fitted parameters."""
+    deviation: AbstractEnergy
+    """Standard errors in the place of the parameters; NaN for those that the movie does not determine."""
+    friction: Float[Array, "*windows"]
+    """The friction of a vertex, fitted or given."""
+    friction_deviation: Float[Array, "*windows"]
+    """Its standard error; 0 if it was given."""
+    covariance: Float[Array, "*windows parameters parameters"]
+    """Covariance of the parameters, the friction last if it was fitted."""
+    misfit: Float[Array, "*windows"]
+    """Root mean square of a component of the residual force."""
+    num_equations: Int[Array, "*windows"]
+    """Number of force components that were used."""
+    converged: Bool[Array, "*windows"]
+    """Whether the parameters no longer changed in the last step."""
+
+
+class _Settings(eqx.Module):
+    """The arguments of `fit_movie` that do not depend on the frames."""
+
+    static: Any
+    unravel: Any = eqx.field(static=True)
+    friction: Float[Array, ""]
+    noise: Float[Array, ""]
+    implicitness: Float[Array, ""]
+    fit_friction: bool = eqx.field(static=True)
+    outline: bool = eqx.field(static=True)
+
+    def energy(self, theta: Float[Array, " parameters"]) -> AbstractEnergy:
+        parameters = theta[:-1] if self.fit_friction else theta
+        return eqx.combine(self.unravel(parameters), self.static)
+
+    def zeta(self, theta: Float[Array, " parameters"]) -> Float[Array, ""]:
+        return theta[-1] if self.fit_friction else self.friction
+
+    def slope(
+        self, theta: Float[Array, " parameters"], tissue: Tissue
+    ) -> Float[Array, "vertices 2"]:
+        energy = self.energy(theta)
+        return jax.grad(lambda x: energy(tissue.with_vertices(x)))(tissue.vertices)
+
+
+def fit_movie(
+    movie: Movie,
+    energy: AbstractEnergy,
+    *,
+    friction: float | Float[Array, ""] = 1.0,
+    fit_friction: bool = False,
+    noise: float = 0.0,
+    implicitness: float = 1.0,
+    outline: bool = True,
+    windows: int | None = None,
+    max_steps: int = 30,
+) -> MovieFit:
+    r"""Parameters of an energy from the motion in a movie in which neighbours change.
+
+    A vertex obeys $\zeta\dot x = -\nabla E(x;\theta)$. Its residual in the step from frame $n$ to $n + 1$ is
+
+    $$r = \zeta\,\frac{x_{n+1} - x_n}{\Delta t}
+      + \alpha \nabla E(x_{n+1};\theta) + (1 - \alpha) \nabla E(x_n;\theta),$$
+
+    for each vertex that joins the same three cells in frames $n - 1$, $n$ and $n + 1$: in a step with a T1
+    transition, a division or a death all other vertices count. The parameters solve
+    $\sum Z^\mathsf T w\, r = 0$ with the instruments $Z = \partial_\theta \nabla E(x_{n-1};\theta)$ of the
+    frame before. Least squares, with $Z$ from the frames of $r$, are biased, because an error of the position
+    of a vertex changes $r$ and $Z$ together; errors of different frames are independent, and so is the noise
+    of a later step (instrumental variables: Sargan 1958, doi:10.2307/1907619; noise in stochastic
+    trajectories: Frishman and Ronceray 2020, doi:10.1103/PhysRevX.10.021009). The weight of a vertex is
+
+    $$1/w = \sigma^2 \left(\tfrac12 \|\nabla\nabla E_v\|^2 + 2 \zeta^2/\Delta t^2\right) + s^2$$
+
+    with the tracking noise $\sigma$, the rows $\nabla\nabla E_v$ of its Hessian (estimated by random
+    vectors), and a variance $s^2$ that explains the remaining residuals. Standard errors are those of the
+    sandwich formula over steps, with the correlation of successive steps (Newey and West 1987,
+    doi:10.2307/1913610); they require more steps than parameters.
+
+    | symbol | argument | choose |
+    |---|---|---|
+    | $\alpha$ | `implicitness` | 1 if tissues relax between frames; 0.5 if frames are closer |
+    | $\zeta$ | `friction` | a known value; with another one all parameters scale, unless some are constants |
+    | $\sigma$ | `noise` | standard deviation of the coordinates of vertices |
+
+    All arrays of the energy are parameters, and numbers are constants. Parameters for each cell are in the
+    order of `movie.cells`; [`by_type`][vertax.energies.by_type] gives one for each pair of types, and
+    with `types=jnp.arange(n_cells)` one for each pair of cells, which is one for each edge.
+
+    ```python
+    guess = vx.energies.AreaElasticity(1.0, 1.0) + vx.energies.by_type(0.1 * jnp.ones((2, 2)), movie.types)
+    fit = vx.inference.fit_movie(movie, guess, noise=0.02)
+    fit.energy, fit.deviation
+    ```
+
+    **Arguments:**
+
+    - `movie`: the [`Movie`][vertax.inference.Movie], three frames at least.
+    - `energy`: the energy with a first guess of the parameters.
+    - `friction`: friction $\zeta$ of a vertex, force over velocity; a first guess with `fit_friction`.
+    - `fit_friction`: fit the friction too. That requires a constant in the energy that sets the scale of
+        forces, such as a known stiffness.
+    - `noise`: standard deviation $\sigma$ of tracked positions, in units of length.
+    - `implicitness`: $\alpha$, from 0.5 to 1.
+    - `outline`: whether to use vertices on the outline; False for a part of a tissue.
+    - `windows`: split the steps into this number of parts and fit each, in parallel.
+    - `max_steps`: largest number of Newton steps; one is enough for parameters of which forces are linear
+        functions, but weights change.
+
+    **Returns:** a [`MovieFit`][vertax.inference.MovieFit].
+
+    **Raises:**
+
+    - `ValueError` for numbers out of range, fewer than three frames, an energy without arrays, more windows
+        than steps, and if no vertex survives three frames.
+    """
+    check_energy(energy)
+    check_number("friction", friction, above=0)
+    check_number("noise", noise, at_least=0)
+    if not 0.5 <= implicitness <= 1:
+        raise ValueError(f"Argument `implicitness` must be from 0.5 to 1, but is {implicitness}.")
+    check_integer("max_steps", max_steps, at_least=1)
+    n_steps = movie.n_frames - 2
+    if n_steps < 1:
+        raise ValueError(
+            f"Argument `movie` must have three frames or more, but has {movie.n_frames}."
+        )
+    n_windows = 1 if windows is None else windows
+    check_integer("windows", n_windows, at_least=1)
+    if n_windows > n_steps:
+        raise ValueError(
+            f"Argument `windows` must be at most the number of steps, {n_steps}, but is {n_windows}."
+        )
+    parameters, static = eqx.partition(energy, eqx.is_inexact_array)
+    theta, unravel = ravel_pytree(parameters)
+    if not theta.size:
+        raise ValueError(
+            "Argument `energy` must have arrays, which are parameters, but has none. Give a parameter as "
+            "jnp.array(0.1)."
+        )
+    dtype = movie.tissue.vertices.dtype
+    zeta = jnp.asarray(friction, dtype)
+    theta = jnp.append(theta, zeta) if fit_friction else theta
+    numbers = (zeta, jnp.asarray(noise, dtype), jnp.asarray(implicitness, dtype))
+    settings = _Settings(static, unravel, *numbers, fit_friction, outline)
+    parts = np.array_split(np.arange(n_steps), n_windows)
+    steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
+    used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
+    fits = _fit_windows(
+        movie.tissue, movie.times.astype(dtype), settings, theta, steps, used, max_steps
+    )
+    if not np.all(fits.num_equations > 0):
+        raise ValueError(
+            "Argument `movie` must have vertices that join the same three cells in three successive frames, "
+            "but has none. Take frames in shorter intervals."
+        )
+    first = lambda x: x[0] if eqx.is_array(x) else x
+    return fits if windows is not None else jax.tree.map(first, fits)
+
+
+@eqx.filter_jit
+def _fit_windows(
+    frames: Tissue,
+    times: Float[Array, " frames"],
+    settings: _Settings,
+    theta: Float[Array, " parameters"],
+    steps: Int[Array, "windows steps"],
+    used: Bool[Array, "windows steps"],
+    max_steps: int,
+) -> MovieFit:
+    """The fit of each window."""
+    arrays, static = eqx.partition(frames, eqx.is_array)
+
+    def sums(theta: Array, floor: Array, steps: Array, used: Array) -> tuple[Array, ...]:
+        """The equations of each step, see `_equations`."""
+
+        def one(item: tuple[Array, Array]) -> tuple[Array, ...]:
+            pick = lambda k: eqx.combine(jax.tree.map(lambda x: x[k], arrays), static)
+            triple = [pick(item[0] + j) for j in range(3)]
+            dt = times[item[0] + 2] - times[item[0] + 1]
+            return _equations(settings, theta, floor, triple, dt, item[1])
+
+        return jax.lax.map(one, (steps, used))
+
+    def fit(steps: Array, used: Array) -> MovieFit:
+        def newton(carry: tuple) -> tuple:
+            theta, floor, _, count = carry
+            moments, slopes, scales, squares = (
+                x.sum(axis=0) for x in sums(theta, floor, steps, used)
+            )
+            step = _inverse(slopes, scales)[0] @ moments
+            squared, tracking, n = squares
+            mean = squared / jnp.maximum(n, 1)
+            excess = jnp.maximum((squared - tracking) / jnp.maximum(n, 1), 1e-3 * mean)
+            change = jnp.max(jnp.abs(step) / (1e-3 + jnp.abs(theta)))
+            change = jnp.maximum(change, jnp.abs(excess - floor) / (excess + 1e-6))
+            return theta - step, excess + jnp.finfo(theta.dtype).tiny, change, count + 1
+
+        going = lambda carry: (carry[2] > 1e-6) & (carry[3] < max_steps)
+        # First with equal weights.
+        start = newton((theta, jnp.ones((), theta.dtype), jnp.ones((), theta.dtype), 0))
+        best, floor, change, _ = jax.lax.while_loop(going, newton, start)
+        moments, slopes, scales, squares = sums(best, floor, steps, used)
+        covariance = _covariance(moments, slopes.sum(axis=0), scales.sum(axis=0), used)
+        deviations = jnp.sqrt(jnp.diag(covariance))
+        n = jnp.maximum(squares[:, 2].sum(), 1)
+        parameters = deviations[:-1] if settings.fit_friction else deviations
+        zeta_deviation = deviations[-1] if settings.fit_friction else jnp.zeros(())
+        return MovieFit(
+            energy=settings.energy(best),
+            deviation=eqx.combine(settings.unravel(parameters), settings.static),
+            friction=settings.zeta(best),
+            friction_deviation=zeta_deviation,
+            covariance=covariance,
+            misfit=jnp.sqrt(squares[:, 0].sum() / n),
+            num_equations=2 * squares[:, 2].sum().astype(int),
+            converged=change <= 1e-6,
+        )
+
+    return eqx.filter_vmap(fit, out_axes=eqx.if_array(0))(steps, used)
+
+
+def _equations(
+    settings: _Settings,
+    theta: Float[Array, " parameters"],
+    floor: Float[Array, ""],
+    triple: list[Tissue],
+    dt: Float[Array, ""],
+    used: Bool[Array, ""],
+) -> tuple[Array, ...]:
+    """Of one step: ZᵀWr, ZᵀWG, the diagonals of ZᵀWZ and GᵀWG, and sums of squares.
+
+    The sums are those of squared residuals and of variances by tracking, per component, and the number of
+    vertices.
+    """
+    before, start, end = triple
+    to_before, in_before = matching_vertices(end, before)
+    to_start, in_start = matching_vertices(end, start)
+    use = in_before & in_start & used
+    cells = end.topology.cell.reshape(-1, 3)
+    use &= jnp.all(cells != end.n_cells + 1, axis=1)
+    if not settings.outline:
+        use &= jnp.all(cells != end.n_cells, axis=1)
+    velocity = end.boundary.shortest(end.vertices - take(start.vertices, to_start)) / dt
+    alpha = settings.implicitness
+
+    def residual(theta: Array) -> Array:
+        force = alpha * settings.slope(theta, end)
+        force += (1 - alpha) * take(settings.slope(theta, start), to_start)
+        return settings.zeta(theta) * velocity + force
+
+    def instrument(theta: Array) -> Array:
+        return settings.slope(theta, before)
+
+    r, g = residual(theta), jax.jacfwd(residual)(theta)
+    z = take(jax.jacfwd(instrument)(theta), to_before)
+    zeta = settings.zeta(theta)
+    if settings.fit_friction:
+        # The velocity that the forces of the frame before predict.
+        z = z.at[..., -1].set(-take(instrument(theta), to_before) / zeta)
+    slope_at = lambda x: settings.slope(theta, before.with_vertices(x))
+    probes = jax.random.normal(jax.random.key(0), (_N_PROBES, *before.vertices.shape), r.dtype)
+    product = lambda v: jax.jvp(slope_at, (before.vertices,), (v,))[1]
+    spread = jnp.mean(jnp.sum(jax.vmap(product)(probes) ** 2, axis=-1), axis=0) / 2
+    tracking = settings.noise**2 * (take(spread, to_before) + 2 * (zeta / dt) ** 2)
+    clean = lambda x: jnp.where(use.reshape(-1, *[1] * (x.ndim - 1)), x, 0)
+    r, g, z, tracking = clean(r), clean(g), clean(z), clean(tracking)
+    w = use / (tracking + floor)
+    moments = jnp.einsum("vip,v,vi->p", z, w, r)
+    slopes = jnp.einsum("vip,v,viq->pq", z, w, g)
+    scales = jnp.stack([jnp.einsum("vip,v,vip->p", x, w, x) for x in (z, g)])
+    squares = jnp.stack([jnp.sum(r**2) / 2, jnp.sum(tracking), jnp.sum(use).astype(r.dtype)])
+    return moments, slopes, scales, squares
+
+
+_N_PROBES = 16
+"""Random vectors that estimate the rows of a Hessian: weights within about 20 %."""
+
+
+def _inverse(
+    slopes: Float[Array, "parameters parameters"], scales: Float[Array, "2 parameters"]
+) -> tuple[Float[Array, "parameters parameters"], Bool[Array, " parameters"]]:
+    """The pseudoinverse of ZᵀWG, scaled, and which parameters are determined."""
+    size = jnp.sqrt(jnp.where(scales > 0, scales, 1))
+    scaled = slopes / size[0][:, None] / size[1]
+    inverse = jnp.linalg.pinv(scaled, rtol=1e-8)
+    determined = jnp.diag(inverse @ scaled) > 0.99
+    return inverse / size[1][:, None] / size[0], determined
+
+
+def _covariance(
+    moments: Float[Array, "steps parameters"],
+    slopes: Float[Array, "parameters parameters"],
+    scales: Float[Array, "2 parameters"],
+    used: Bool[Array, " steps"],
+) -> Float[Array, "parameters parameters"]:
+    """Sandwich formula over steps, with a correlation of successive steps of weight 1/2."""
+    following = moments[:-1].T @ moments[1:]
+    middle = moments.T @ moments + 0.5 * (following + following.T)
+    inverse, determined = _inverse(slopes, scales)
+    n_steps, n_parameters = used.sum(), len(slopes)
+    factor = jnp.where(
+        n_steps > n_parameters, n_steps / jnp.maximum(n_steps - n_parameters, 1), jnp.nan
+    )
+    covariance = factor * inverse @ middle @ inverse.T
+    both = determined[:, None] & determined
+    return jnp.where(both, covariance, jnp.nan)

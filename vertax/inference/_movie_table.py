@@ -1,0 +1,147 @@
+"""Movies from tables of tracked polygons."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike, Float, Int
+
+from vertax._base.checks import as_float64
+from vertax.inference._movie import Movie
+from vertax.initialise._polygons import tissue_from_corners
+from vertax.io._read_table import column, whole_numbers
+from vertax.mesh import Tissue
+from vertax.mesh._faces import Names
+
+
+def movie_from_table(
+    table: Any, *, box: ArrayLike | None = None, largest_jump: float = 1.0
+) -> Movie:
+    """A movie from a table of the corners of tracked cells.
+
+    ```python
+    movie = vx.inference.movie_from_table(vx.io.read_table("tracked.csv"))
+    movie.events
+    ```
+
+    Cells that touch must have the same coordinates at common corners. A frame may lack cells: a hole between
+    cells becomes the missing cell that was last seen closest to it, if there is one, so that its neighbours
+    keep their places. Frames may be missing altogether.
+
+    **Arguments:**
+
+    - `table`: a mapping or a data frame with a row for each corner of each cell in each frame: `frame`, an
+        integer, ascending; `cell`, its number, from 0; `x` and `y`, the corner; corners of a cell follow one
+        another in order. Optional: `time` of the frame, by default its number; `type` of the cell, an
+        integer.
+    - `box`: of a periodic tissue, as in [`from_polygons`][vertax.initialise.from_polygons].
+    - `largest_jump`: as in [`Movie`][vertax.inference.Movie].
+
+    **Returns:** a [`Movie`][vertax.inference.Movie].
+
+    **Raises:**
+
+    - `ValueError`, naming frame and cell, for columns that are missing, frames out of order, a cell that
+        appears twice in a frame or has two types, polygons that overlap, and as
+        [`Movie`][vertax.inference.Movie] and [`from_polygons`][vertax.initialise.from_polygons].
+    """
+    frame, cell = (whole_numbers(table, name, "table") for name in ("frame", "cell"))
+    places = np.stack([as_float64("table", column(table, name, "table")) for name in "xy"], axis=1)
+    if (np.diff(frame) < 0).any():
+        row = int(np.flatnonzero(np.diff(frame) < 0)[0]) + 1
+        raise ValueError(
+            f"Column `frame` of argument `table` must ascend, but frame {frame[row]} follows frame "
+            f"{frame[row - 1]} in row {row}. Sort the rows by frame."
+        )
+    names = set(table) if hasattr(table, "__iter__") else set()
+    times = as_float64("table", column(table, "time", "table")) if "time" in names else frame
+    tissues, numbers, moments, filled = [], [], [], []
+    last_seen: dict[int, np.ndarray] = {}
+    for number in np.unique(frame):
+        rows = np.flatnonzero(frame == number)
+        if np.ptp(times[rows]) > 0:
+            raise ValueError(
+                f"Argument `table` must have one time per frame, but frame {number} has several."
+            )
+        tissue, cells, added = _one_frame(int(number), cell[rows], places[rows], box, last_seen)
+        filled.append(added)
+        tissues.append(tissue)
+        numbers.append(cells)
+        moments.append(float(times[rows[0]]))
+    types = _types(cell, whole_numbers(table, "type", "table")) if "type" in names else None
+    options: Any = {"cells": numbers, "types": types, "filled": filled}
+    return Movie(tissues, moments, largest_jump=largest_jump, **options)
+
+
+def _one_frame(
+    number: int,
+    cell: Int[np.ndarray, " rows"],
+    places: Float[np.ndarray, "rows 2"],
+    box: ArrayLike | None,
+    last_seen: dict[int, np.ndarray],
+) -> tuple[Tissue, Int[np.ndarray, " cells"], list[int]]:
+    """The tissue of a frame, the numbers of its cells, and those of cells that fill holes."""
+    starts = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
+    numbers = cell[starts]
+    unique, counts = np.unique(numbers, return_counts=True)
+    if (counts > 1).any():
+        raise ValueError(
+            f"Argument `table` must have each cell once per frame, but cell {unique[counts > 1][0]} appears "
+            f"twice in frame {number}. Give the other one another number, or put its corners together."
+        )
+    # Equal coordinates are one point.
+    extent = np.ptp(places, axis=0).max()
+    grid = np.rint((places - places.min(axis=0)) / (1e-9 * extent)).astype(np.int64)
+    _, first, point = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    corners = [part.tolist() for part in np.split(point.ravel(), starts[1:])]
+    points, added = places[first], []
+    if box is None:
+        for hole in _holes(corners, points):
+            middle = points[hole].mean(axis=0)
+            lost = {c: np.linalg.norm(p - middle) for c, p in last_seen.items() if c not in numbers}
+            lost = {c: away for c, away in lost.items() if c not in added}
+            if lost:
+                added.append(min(lost, key=lambda c: lost[c]))
+                corners.append(hole)
+    numbers = np.append(numbers, np.array(added, int))
+    named = Names(
+        f"Frame {number} of argument `table`",
+        lambda k: f"the point ({points[k, 0]:.4g}, {points[k, 1]:.4g})",
+        lambda k: f"cell {numbers[k]}",
+    )
+    result = tissue_from_corners(points, corners, named, box=box)
+    last_seen.update(zip(numbers.tolist(), np.asarray(result.tissue.centroids), strict=True))
+    return result.tissue, numbers, added
+
+
+def _holes(corners: list[list[int]], points: Float[np.ndarray, "points 2"]) -> list[list[int]]:
+    """Polygons that are surrounded by cells, as corner numbers."""
+    sides = set()
+    for polygon in corners:
+        x, y = points[polygon].T
+        order = polygon if x @ np.roll(y, -1) - y @ np.roll(x, -1) > 0 else polygon[::-1]
+        sides |= set(zip(order, order[1:] + order[:1], strict=True))
+    # Sides without a partner, reversed, lead around holes counter-clockwise and around the outline clockwise.
+    border = {b: a for a, b in sides if (b, a) not in sides}
+    holes = []
+    while border:
+        loop = [next(iter(border))]
+        while border.get(loop[-1], loop[0]) != loop[0]:
+            loop.append(border.pop(loop[-1]))
+        border.pop(loop[-1], None)
+        x, y = points[loop].T
+        if len(loop) > 2 and x @ np.roll(y, -1) - y @ np.roll(x, -1) > 0:
+            holes.append(loop)
+    return holes
+
+
+def _types(cell: Int[np.ndarray, " rows"], kind: Int[np.ndarray, " rows"]) -> dict[int, int]:
+    pairs = np.unique(np.stack([cell, kind], axis=1), axis=0)
+    twice = pairs[1:][np.diff(pairs[:, 0]) == 0]
+    if len(twice):
+        raise ValueError(
+            f"Argument `table` must have one type per cell, but cell {twice[0, 0]} has several. Correct the "
+            "column `type`."
+        )
+    return dict(pairs.tolist())
