@@ -43,16 +43,17 @@ def test_nearness_is_the_minimum_distance(bulge, angle, middle, half):
     start, end = np.subtract(middle, half), np.add(middle, half)
     one, other = side([0.0, 0.0], [1.0, 0.0], -bulge), side(start, end, angle)
     points = side_points(np.zeros(2), np.array([1.0, 0.0]), -bulge, 800)
-    others = (
-        np.linspace(start, end, 800) if abs(angle) < 1e-9 else side_points(start, end, angle, 800)
-    )
+    straight = abs(angle) < 1e-9
+    inner = np.linspace(start, end, 800) if straight else side_points(start, end, angle, 800)
+    others = np.vstack([inner, end])
     distances = cdist(points, others)
     distance, nearest = distance_between(one, other), distances.min()
     assert distance > nearest - 1e-2 * nearest - 2e-3  # (the points are 0.003 apart)
     # (Otherwise the bulge is on the other side, or corners of the other side are nearest: another pair.)
-    bulge_counts = distance < distances[0].min() * (1 - 1e-3) - 1e-4
+    clearly_below = lambda other: other > 1.01 * distance + 1e-3
+    bulge_counts = clearly_below(distances[0].min())
     apart = nearest > 5e-3
-    if bulge_counts and apart and nearest < distances[:, [0, -1]].min() * (1 - 1e-3) - 1e-4:
+    if bulge_counts and apart and clearly_below(distances[:, [0, -1]].min()):
         np.testing.assert_allclose(distance, nearest, rtol=1e-2, atol=1e-4)
 
 
