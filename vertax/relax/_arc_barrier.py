@@ -9,7 +9,7 @@ from vertax._base.minimum_maximum import maximum, minimum
 from vertax._base.reciprocal import inverse_square_root, reciprocal
 from vertax._base.sums import total
 from vertax.mesh._sides import Circle, Sides, circle_of, cross, dot, on_arc
-from vertax.relax._barrier import Expansion, barrier, differentiated
+from vertax.relax._barrier import Expansion, differentiated, profile
 from vertax.relax._pair_barrier import AbstractPairBarrier
 
 _FLAT = 0.01
@@ -19,11 +19,11 @@ _ENDS = 0.1
 
 
 class ArcBarrier(AbstractPairBarrier):
-    """The barrier between sides that may be arcs: the sum of two terms for each pair.
+    r"""The barrier between sides that may be arcs: the sum of two terms for each pair.
 
     1. The start of one side against the other side, as for straight sides.
-    2. The first side against the second one. If the second follows on the first, $s = (\\sin\\theta / m)^2$
-        with the angle $\\theta$ of the face between them. Otherwise $s = D^2 / d_0^2$ with the distance $D$
+    2. The first side against the second one. If the second follows on the first, $s = (\sin\theta / m)^2$
+        with the angle $\theta$ of the face between them. Otherwise $s = D^2 / d_0^2$ with the distance $D$
         between the circles, for an arc that bulges into the face. Where the nearest points are at ends of
         sides, corners are as near, and the weight of this term decreases smoothly to 0.
 
@@ -47,7 +47,7 @@ class ArcBarrier(AbstractPairBarrier):
             near, weight = self._terms(vectors, self.after, self.before)
             # (A side that is far away may be at an infinite distance.)
             near = jnp.where(self.valid & (near < 1), near, 1)
-            return self.strength * total(weight * barrier(near))
+            return self.strength * total(weight * profile(near).value)
 
         return differentiated(energies, vectors)
 

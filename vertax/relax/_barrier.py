@@ -49,27 +49,6 @@ def profile(x: Float[Array, "*shape"]) -> Profile:
     return Profile(zero(gap**2 * log), zero(first), zero(second))
 
 
-@jax.custom_jvp
-def barrier(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The barrier, with the derivatives of `profile`."""
-    return profile(x).value
-
-
-@barrier.defjvp
-def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    return barrier(*primals), _slope(*primals) * tangents[0]
-
-
-@jax.custom_jvp
-def _slope(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    return profile(x).first
-
-
-@_slope.defjvp
-def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    return _slope(*primals), profile(*primals).second * tangents[0]
-
-
 class Expansion(NamedTuple):
     """Energies of rows, with their first and second derivatives."""
 
