@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
 
 import vertax as vx
 from vertax import runs
@@ -27,13 +28,13 @@ PUBLISHED = {
 class Model(runs.Section):
     """The vertex model of the benchmark."""
 
-    across: int = 10
+    across: int = Field(default=10, ge=2)
     """Cells in each row and column of the honeycomb."""
-    inner_factor: float = 2.0
+    inner_factor: float = Field(default=2.0, gt=0)
     """Factor of the adhesions between cells: Chaste sums over cells, so it counts these edges twice."""
-    dt: float = 0.05
+    dt: float = Field(default=0.05, gt=0)
     """Time step, in units of friction over stiffness."""
-    temperature: float = 1e-4
+    temperature: float = Field(default=1e-4, ge=0)
     """Diffusion constant of a free vertex."""
     relaxation: runs.Relaxation = runs.Relaxation(t1_threshold=0.1, tolerance=1e-5)
     """Relaxation of each step."""

@@ -175,6 +175,12 @@ def test_wrong_times_and_numbers_are_named():
         Movie([STRAIGHT] * 2, [0, 1], types=dict.fromkeys(range(19), 0))
 
 
+def test_a_frame_that_does_not_exist_is_refused():
+    movie = Movie([STRAIGHT] * 2, [0, 1])
+    with pytest.raises(IndexError):
+        movie.frame(2)
+
+
 def test_types_of_a_movie_are_those_of_an_energy():
     movie = Movie([STRAIGHT] * 2, [0, 1], types={k: k % 2 for k in range(20)})
     assert movie.types is not None

@@ -30,12 +30,20 @@ class TypeTension(AbstractLocalEnergy):
     """Type of each cell."""
 
     @property
+    def n_types(self) -> int:
+        """Number of types."""
+        return round((np.sqrt(8 * self.tension.size + 1) - 1) / 2)
+
+    @property
     def table(self) -> Float[Array, "types types"]:
         """Tension by the types of both cells, a symmetric matrix."""
-        n_types = round((np.sqrt(8 * self.tension.size + 1) - 1) / 2)
-        low, high = jnp.triu_indices(n_types)
-        table = jnp.zeros((n_types, n_types), self.tension.dtype)
-        return table.at[low, high].set(self.tension).at[high, low].set(self.tension)
+        types = jnp.arange(self.n_types)
+        return self._between(types[:, None], types)
+
+    def _between(self, one: Int[Array, "*n"], other: Int[Array, "*m"]) -> Float[Array, "..."]:
+        """Tension between types, from their place in the upper triangle."""
+        low, high = jnp.minimum(one, other), jnp.maximum(one, other)
+        return self.tension[low * (2 * self.n_types - low - 1) // 2 + high]
 
     def edge_tensions(self, tissue: Tissue) -> Float[Array, " edges"]:
         """Tension of each edge, energy per length; 0 for spare slots.
@@ -58,12 +66,13 @@ class TypeTension(AbstractLocalEnergy):
             )
         first, second = tissue.topology.edge_cells.T
         inside = (first < n_cells) & (second < n_cells)
-        of_first, of_second = (jnp.take(self.types, c, mode="clip") for c in (first, second))
-        tension = jnp.where(inside, self.table[of_first, of_second], 0)
+        types = self.types.astype(jnp.int32)
+        of_first, of_second = (jnp.take(types, c, mode="clip") for c in (first, second))
+        tension = jnp.where(inside, self._between(of_first, of_second), 0)
         if self.outline is None:
             return tension
         # (The cell of an edge on the outline is its first.)
-        outline = jnp.broadcast_to(self.outline, len(self.table))[of_first]
+        outline = jnp.broadcast_to(self.outline, self.n_types)[of_first]
         return jnp.where(tissue.topology.on_outline, outline, tension)
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:

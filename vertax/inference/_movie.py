@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from vertax._base.batch import member, stack
 from vertax._base.checks import as_times, check_number
-from vertax.fitting import stack
 from vertax.mesh import Periodic, Tissue, Topology
 
 Cells = frozenset[int]
@@ -91,7 +90,7 @@ class Movie(eqx.Module):
         ]
         self.cells = np.unique(np.concatenate(numbers))
         frames = [_Frame(n, t) for n, t in zip(numbers, tissues, strict=True)]
-        _check_jumps(frames, tissues, largest_jump)
+        _check_jumps(frames, largest_jump)
         gaps = [Event("gap", k, (c,)) for k, holes in enumerate(filled or ()) for c in holes]
         events = sorted([*_events(frames), *gaps], key=lambda event: event.frame)
         self.events = tuple(events)
@@ -116,9 +115,13 @@ class Movie(eqx.Module):
         return len(self.times)
 
     def frame(self, number: int) -> Tissue:
-        """The tissue of a frame; cells that it lacks are spare slots."""
-        arrays, static = eqx.partition(self.tissue, eqx.is_array)
-        return eqx.combine(jax.tree.map(lambda x: x[number], arrays), static)
+        """The tissue of a frame; cells that it lacks are spare slots.
+
+        **Raises:**
+
+        - `IndexError` if there is no such frame.
+        """
+        return member(self.tissue, number)
 
 
 class _Frame:
@@ -142,12 +145,16 @@ class _Frame:
             self.neighbours.setdefault(a, set()).add(b)
             self.neighbours.setdefault(b, set()).add(a)
 
+    def displacement(self, places: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """Vector from a point to others, across a periodic boundary."""
+        away = places - origin
+        if isinstance(self.boundary, Periodic):
+            return np.asarray(self.boundary.shortest(jnp.asarray(away)))
+        return away
+
     def distance(self, place: np.ndarray, other: np.ndarray) -> float:
         """Distance of two points, across a periodic boundary."""
-        away = place - other
-        if isinstance(self.boundary, Periodic):
-            away = np.asarray(self.boundary.shortest(jnp.asarray(away)))
-        return float(np.linalg.norm(away))
+        return float(np.linalg.norm(self.displacement(place, other)))
 
 
 def _checked_numbers(frame: int, numbers: Any, tissue: Tissue) -> Int[np.ndarray, " cells"]:
@@ -166,7 +173,7 @@ def _checked_numbers(frame: int, numbers: Any, tissue: Tissue) -> Int[np.ndarray
     return array.astype(int)
 
 
-def _check_jumps(frames: list[_Frame], tissues: Sequence[Tissue], largest: float) -> None:
+def _check_jumps(frames: list[_Frame], largest: float) -> None:
     """Raise an error for cells that move too far from one of their frames to the next."""
     last: dict[int, int] = {}
     for now, frame in enumerate(frames):
@@ -231,7 +238,7 @@ def _divisions(
                 continue
             areas = np.array([after.areas[d] for d in daughters])
             places = np.stack([after.places[d] for d in daughters])
-            places = places[0] + _relative(after, places)
+            places = places[0] + after.displacement(places, places[0])
             middle = areas @ places / areas.sum()
             for mother in mothers:
                 # The daughters cover the mother: the same centroid within a third of its size.
@@ -244,13 +251,6 @@ def _divisions(
             free -= set(best[2])
             gone = gone - {best[1]}
     return divisions
-
-
-def _relative(frame: _Frame, places: np.ndarray) -> np.ndarray:
-    away = places - places[0]
-    if isinstance(frame.boundary, Periodic):
-        away = np.asarray(frame.boundary.shortest(jnp.asarray(away)))
-    return away
 
 
 def _changes_of_contact(before: _Frame, after: _Frame, now: int) -> list[Event]:

@@ -70,8 +70,9 @@ def movie_from_table(
         numbers.append(cells)
         moments.append(float(times[rows[0]]))
     types = _types(cell, whole_numbers(table, "type", "table")) if "type" in names else None
-    options: Any = {"cells": numbers, "types": types, "filled": filled}
-    return Movie(tissues, moments, largest_jump=largest_jump, **options)
+    return Movie(
+        tissues, moments, cells=numbers, types=types, filled=filled, largest_jump=largest_jump
+    )
 
 
 def _one_frame(
