@@ -94,7 +94,7 @@ def plot_recovery(true: Any, values: Any, deviations: Any, *curves: Any) -> Any:
     figure, ((left, right),) = plotting.new_figure(1, 2, width=2.8)
     left.plot([0, true.max()], [0, true.max()], color=plotting.INK, ls=":", lw=0.8)
     left.errorbar(true, values, 2 * deviations, fmt="o", ms=4, color=plotting.SERIES[0], capsize=2)
-    left.set(xlabel="true adhesion", ylabel="fitted adhesion, ± 2 standard errors")
+    left.set(xlabel="true adhesion", ylabel="fitted, ± 2 standard errors")
     right.plot(times, course, color=plotting.INK, lw=0.9, label="run")
     right.plot(later, series.T, color=plotting.SERIES[1], lw=0.5)
     right.plot(later, series.mean(axis=0), color=plotting.SERIES[1], label="forecast, mean")

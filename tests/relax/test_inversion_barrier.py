@@ -10,7 +10,7 @@ from helpers import fine_difference, random_tissue
 
 import vertax as vx
 from vertax.mesh._topology import edge_neighbourhood, take
-from vertax.relax._barrier import barrier
+from vertax.relax._barrier import profile
 from vertax.relax._contacts import Contacts, no_contacts
 from vertax.relax._inversion_barrier import _FADE, _LONG, _OFTEN, REACH, InversionBarrier
 from vertax.transitions._edge_frames import EdgeFrames, edge_axis
@@ -103,7 +103,7 @@ def test_derivatives_agree_with_finite_differences(across, arcs):
         length = jnp.sqrt(squared + (1e-4 * REACH) ** 2)
         upright = (length + edge @ axis / jnp.linalg.norm(axis)) / (2 * REACH)
         fade = (1 - squared / (_FADE * REACH) ** 2) ** 3
-        return 2.0 * REACH * fade * barrier(upright)
+        return 2.0 * REACH * fade * profile(upright).value
 
     contacts = holding(nearly, inversion)
     energy = lambda x: contacts(nearly.with_vertices(x))
