@@ -147,8 +147,10 @@ def infer_tensions(
     curves = read_courses(geometry, points, course.grain, apart=course.apart, noise=noise)
     fitted = geometry.moved(curves.change)
     uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
-    shape = observability(fitted, curves, which, uncertain)
-    balance = solve(shape, which, exact=noise is not None, prior=prior)
+    shape = observability(
+        fitted, curves, which, uncertain, prior=prior, exact=noise is not None
+    )
+    balance = solve(shape, which, prior=prior)
     resampled = None
     if resamples:
         observed = fitted, curves, points, which, shape

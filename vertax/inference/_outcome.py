@@ -104,6 +104,7 @@ def outcome(
     determined = spread(*edges, sure, False) & ~four_fold
     cells = (tissue.n_cells, which.cells)
     pressures = spread(*cells, result.pressure, nan)
+    print("      ", *(f"{n} {e:.3g}" for n,e in zip(balance.errors._fields,balance.errors)), "bending", f"{curves.bending:.3f}", "EV", balance.evidence)
     return InferredTensions(
         tissue=tissue,
         tensions=tensions,

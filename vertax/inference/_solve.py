@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import nnls
+from scipy.sparse import csr_array
 from scipy.sparse.linalg import splu
 
 from vertax.inference._balance import (
@@ -19,24 +20,27 @@ from vertax.inference._balance import (
     pulls,
 )
 from vertax.inference._curves import Fitted
-from vertax.inference._errors import Errors, model_errors
+from vertax.inference._errors import Errors, most_evident
 from vertax.inference._observed_geometry import ObservedGeometry
 
 # An edge is loose if the standard deviation of its direction, in radians, is larger than the first, or if it
 # is shorter than the second times the noise. Its force has the third as standard deviation, in mean tensions.
 _LOOSE, _SHORT, _UNKNOWN = 0.2, 8.0, 10.0
-# Prior standard deviation of pressures, in mean tensions over a cell diameter.
-_PRESSURE = 10.0
-# Width of the prior of tensions over their spread; smallest and largest width; initial width.
-_TIMES, _WIDTHS, _START = 2.0, (0.3, 3.0), 0.5
 # Smallest tension in the covariance of the forces.
 _SMALL = 0.2
-_FIRST = Errors(0.05, 0.5, 1.0)
-# Logarithms of the smallest noise relative to that of the points, of smooth and of rough outlines, and of the
-# largest: pixels along a straight line deviate from it by a pattern that averages out, rough outlines do not.
-_LESS, _ROUGH_LESS, _MORE = -2.3, -0.35, 0.7
-# Error of arcs, in radians, above which their weight decreases.
-_ARCS = 0.02
+# Initial standard deviations.
+_FIRST = Errors(0.05, 0.1, 0.1, 0.3, 1.0, 0.5, 1.0)
+# Smallest and largest ones (angles in radians, bends relative, priors in mean tensions).
+_ANGLES, _RATIOS, _TENSIONS, _PRESSURES = (1e-3, 1.5), (1e-2, 10.0), (0.03, 3.0), (0.01, 10.0)
+# Smallest noise relative to that of the points, of smooth and of rough outlines, and the largest: pixels
+# along a straight line deviate from it by a pattern that averages out, rough outlines do not.
+_LESS, _ROUGH_LESS, _MORE = 0.1, 0.7, 2.0
+# The same for vertices of straight edges without an image, whose noise is not known beforehand.
+_VERTICES = (0.01, 50.0)
+# Iterations of the first and of the second estimate of the errors.
+_STEPS = (25, 10)
+# Bends larger than this, in radians, are errors of arcs.
+_BENT = 1e-3
 # Largest adjustment of an angle, in radians.
 _REACH = 0.5
 
@@ -57,8 +61,10 @@ class Observability(NamedTuple):
     other, so that the balance of both ends together remains."""
     size: float
     """Root of the mean area of a cell."""
-    least_noise: float
-    """Logarithm of the smallest noise relative to that of the points."""
+    bend: Float[np.ndarray, " angles"]
+    """Size of the bend beyond the arc: of directions at their end, of arcs of both ends."""
+    bounds: dict[str, tuple[float, float]]
+    """Smallest and largest standard deviations of errors and priors."""
 
 
 class Balance(NamedTuple):
@@ -71,8 +77,9 @@ class Balance(NamedTuple):
     angle: Float[np.ndarray, " angles"]
     """The angles with which all forces balance."""
     errors: Errors
-    """Errors of the model, beyond noise, and the noise estimated from forces, relative to that of the
-    points."""
+    """Errors of the model, noise relative to that of the points, and widths of the priors."""
+    evidence: float
+    """Logarithm of the density of the observed angles, up to a constant of the tissue."""
     residual: Float[np.ndarray, " rows"]
     """Residual forces with the observed angles, over their standard deviations."""
     loose: Bool[np.ndarray, " edges"]
@@ -84,10 +91,19 @@ def observability(
     curves: Fitted,
     which: Equations,
     uncertain: Bool[np.ndarray, " all_edges"],
+    *,
+    prior: float | None,
+    exact: bool,
 ) -> Observability:
     """The observed angles of a shape, and their covariance.
 
-    `uncertain` marks edges that may be between other cells; they are loose, as those without a direction.
+    **Arguments:**
+
+    - `fitted`, `curves`: the geometry and the noise.
+    - `which`: the equations.
+    - `uncertain`: edges that may be between other cells; they are loose, as those without a direction.
+    - `prior`: standard deviation of tensions about 1; by default chosen by the evidence.
+    - `exact`: whether the noise is at most that of the points.
     """
     slope = angle_slopes(fitted, which)
     covariance = curves.noise**2 * (slope @ splu(curves.precision).solve(slope.T.toarray()))
@@ -96,6 +112,19 @@ def observability(
     loose = (variance > _LOOSE**2) | (which.chord < _SHORT * curves.noise)
     loose |= uncertain[which.edges]
     unknown = pulls(fitted, which, loose)
+    end_bend = np.stack([fitted.bend.sum(axis=1), fitted.bend[:, 0] - fitted.bend[:, 1]], axis=1)
+    edge, forward = fitted.half_edge[which.junctions], fitted.forward[which.junctions]
+    bend = np.where(forward, end_bend[edge, 0], end_bend[edge, 1]).ravel()
+    least = _LESS if curves.crisp else _ROUGH_LESS
+    bounds = {"junction": _ANGLES, "noise": (least, 1.0 if exact else _MORE)}
+    bounds["pressure"] = _PRESSURES
+    if prior is None:
+        bounds["tension"] = _TENSIONS
+    if which.n_arcs:
+        bend = np.append(bend, np.linalg.norm(fitted.bend[which.edges], axis=1))
+        bounds["arc"] = _ANGLES
+        if curves.bending > _BENT:
+            bounds |= {"bend": _RATIOS, "bent_arc": _RATIOS}
     return Observability(
         angle=angles(fitted, which),
         covariance=covariance,
@@ -103,12 +132,13 @@ def observability(
         loose=loose,
         unknown=_UNKNOWN**2 * unknown @ unknown.T,
         size=fitted.size,
-        least_noise=_LESS if curves.crisp else _ROUGH_LESS,
+        bend=np.abs(bend),
+        bounds=bounds,
     )
 
 
 # Observed are angles a with the covariance C, from the noise of points. Where the tissue is not in balance,
-# angles differ from those of a balance as well, which adds τ² to their covariance.
+# angles differ from those of a balance as well, the more the more an edge bends beyond an arc.
 # Forces r(x, a) = A(a) x are linear in the unknowns x. To first order their covariance is S = J C Jᵀ with
 # J = ∂r/∂a. Weighted least squares with fixed a would shrink the unknowns, because the noise of A and of r is
 # the same. So a is adjusted as well (total least squares: Britt & Luecke 1973,
@@ -121,7 +151,6 @@ def solve(
     shape: Observability,
     which: Equations,
     *,
-    exact: bool,
     prior: float | None,
     errors: Errors | None = None,
     rounds: int = 8,
@@ -132,9 +161,8 @@ def solve(
 
     - `shape`: the observed angles.
     - `which`: the equations.
-    - `exact`: whether the noise is at most that of the points.
-    - `prior`: standard deviation of tensions about 1; by default twice the spread of those determined.
-    - `errors`: errors of model and noise; by default estimated from the forces.
+    - `prior`: standard deviation of tensions about 1; by default chosen by the evidence.
+    - `errors`: errors of model and noise, and widths of priors; by default chosen by the evidence.
     - `rounds`: largest number of adjustments of the angles.
 
     **Returns:** the [`Balance`][vertax.inference._solve.Balance].
@@ -144,36 +172,31 @@ def solve(
     change = np.zeros(len(shape.angle))
     # Prior means: tensions of 1, and pressures of 0.
     expected = x.copy()
-    width = prior or _START
     mean = np.append(~loose, np.zeros(n_cells, bool)) / max(1, np.sum(~loose))
-    at_junctions, along = np.zeros_like(change), np.zeros_like(change)
-    at_junctions[: which.n_directions] = 1.0
-    along[which.n_directions :] = shape.length**2
-    has_errors, shares = errors is not None, (shape.least_noise, 0.0 if exact else _MORE)
-    errors = _FIRST if errors is None else errors
+    has_errors, evidence = errors is not None, np.nan
+    if errors is None:
+        absent = {name: 0.0 for name in Errors._fields if name not in shape.bounds}
+        errors = _FIRST._replace(**absent | ({} if prior is None else {"tension": prior}))
+    diagonals = _diagonals(shape, which)
     covariance = residual = np.zeros(0)
     for attempt in range(rounds):
         matrix = forces(shape.angle + change, which, loose)
         slope = force_slopes(shape.angle + change, which, np.maximum(x[:n_edges], _SMALL))
         offset = -slope @ change
         if attempt in (2, 4) and not has_errors:
-            parts = Errors(
-                (slope * at_junctions @ slope.T).toarray(),
-                (slope * along @ slope.T).toarray(),
-                slope @ (slope @ shape.covariance).T,
+            errors, evidence = most_evident(
+                matrix @ expected + offset,
+                _parts(matrix, slope, shape, diagonals, mean),
+                shape.unknown,
+                errors,
+                shape.bounds,
+                steps=_STEPS[attempt // 4],
             )
-            basis = np.linalg.svd(mean[None])[2][1:].T
-            left_over = matrix @ expected + offset
-            errors = model_errors(matrix @ basis, left_over, parts, shape.unknown, errors, shares)
-        # Arcs out of balance are not random errors: friction acts on weak edges otherwise than on strong
-        # ones, which biases tensions before it shows in the residuals. So their weight is reduced.
-        arc = errors.arc * np.sqrt(1 + (errors.arc / _ARCS) ** 2)
-        spread = errors.noise**2 * shape.covariance + np.diag(
-            errors.junction**2 * at_junctions + arc**2 * along
-        )
+        spread = errors.noise**2 * shape.covariance
+        spread += np.diag(model_deviations(errors, shape, which) ** 2)
         answer = (slope @ spread).T
         factor = np.linalg.cholesky(slope @ answer + shape.unknown)
-        deviation = np.append(np.full(n_edges, width), np.full(n_cells, _PRESSURE / shape.size))
+        deviation = np.repeat([errors.tension, errors.pressure / shape.size], [n_edges, n_cells])
         white = solve_triangular(factor, np.column_stack([matrix, offset]), lower=True)
         white, given = white[:, :-1], white[:, -1]
         normal = white.T @ white + np.diag(deviation**-2.0)
@@ -188,9 +211,6 @@ def solve(
         change = -answer @ solve_triangular(factor, residual, lower=True, trans=1)
         change *= min(1.0, _REACH / max(float(np.max(np.abs(change))), 1e-300))
         covariance = cho_solve(root, np.eye(len(x)))
-        # Only in the first rounds: where noise is large, tensions could drift with the prior.
-        if prior is None and attempt < 2:
-            width = _varied(x[:n_edges][~loose], np.diag(covariance)[:n_edges][~loose])
         if attempt > (1 if has_errors else 4) and np.max(np.abs(x - before)[:n_edges]) < 1e-3:
             break
     return Balance(
@@ -199,17 +219,48 @@ def solve(
         covariance=covariance,
         angle=shape.angle + change,
         errors=errors,
+        evidence=evidence,
         residual=residual,
         loose=loose,
     )
 
 
-def _varied(tension: Float[np.ndarray, " edges"], variance: Float[np.ndarray, " edges"]) -> float:
-    """Width of the prior of tensions: twice their spread, because tensions may be correlated over many
-    cells, and the prior treats them as independent."""
-    weight = 1 / (variance + 0.05)
-    spread = np.sum(weight * ((tension - 1) ** 2 - variance)) / max(np.sum(weight), 1e-300)
-    return float(np.clip(_TIMES * np.sqrt(max(spread, 0.0)), *_WIDTHS))
+def model_deviations(
+    errors: Errors, shape: Observability, which: Equations
+) -> Float[np.ndarray, " angles"]:
+    """Standard deviations of the angles due to errors of the model."""
+    parts = zip(errors, _diagonals(shape, which), strict=False)
+    return np.sqrt(sum((e**2 * d for e, d in parts), np.zeros(len(shape.angle))))
+
+
+def _diagonals(shape: Observability, which: Equations) -> list[Float[np.ndarray, " angles"]]:
+    """Variances of the angles for each error of the model of size 1, in the order of `Errors`."""
+    at_junctions = np.arange(len(shape.angle)) < which.n_directions
+    along = np.zeros(len(shape.angle))
+    along[which.n_directions :] = shape.length[: which.n_arcs] ** 2
+    bend = shape.bend**2
+    return [at_junctions * 1.0, at_junctions * bend, along, ~at_junctions * bend]
+
+
+def _parts(
+    matrix: Float[np.ndarray, "rows unknowns"],
+    slope: csr_array,
+    shape: Observability,
+    diagonals: list[Float[np.ndarray, " angles"]],
+    mean: Float[np.ndarray, " unknowns"],
+) -> Errors:
+    """Covariances of the forces for each standard deviation of 1."""
+    of_angles = [(slope * d @ slope.T).toarray() for d in diagonals]
+    n_edges = len(shape.loose)
+    pull, push = matrix[:, :n_edges], matrix[:, n_edges:] / shape.size
+    # The mean tension is 1.
+    common = matrix @ mean / np.linalg.norm(mean)
+    return Errors(
+        *of_angles,
+        noise=slope @ (slope @ shape.covariance).T,
+        tension=pull @ pull.T - np.outer(common, common),
+        pressure=push @ push.T,
+    )
 
 
 def _not_negative(
