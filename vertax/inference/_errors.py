@@ -16,8 +16,8 @@ class Errors(NamedTuple):
 
     junction: Float[np.ndarray, "*shape"] | float
     """Directions at junctions, radians."""
-    bend: Float[np.ndarray, "*shape"] | float
-    """Directions at junctions, relative to the bend of the edge there."""
+    grain: Float[np.ndarray, "*shape"] | float
+    """Directions of edges of the length of a cell, radians; of others in inverse proportion to the length."""
     arc: Float[np.ndarray, "*shape"] | float
     """Angles of arcs of the length of a cell, radians."""
     bent_arc: Float[np.ndarray, "*shape"] | float
@@ -25,7 +25,9 @@ class Errors(NamedTuple):
     noise: Float[np.ndarray, "*shape"] | float
     """Noise relative to that of the points."""
     tension: Float[np.ndarray, "*shape"] | float
-    """Prior of tensions about 1."""
+    """Prior of tensions about 1, independent of each other."""
+    region: Float[np.ndarray, "*shape"] | float
+    """Prior of tensions about 1, similar in regions of the tissue."""
     pressure: Float[np.ndarray, "*shape"] | float
     """Prior of pressures about 0, in mean tensions over a cell diameter."""
 

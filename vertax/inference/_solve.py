@@ -29,9 +29,18 @@ _LOOSE, _SHORT, _UNKNOWN = 0.2, 8.0, 10.0
 # Smallest tension in the covariance of the forces.
 _SMALL = 0.2
 # Initial standard deviations.
-_FIRST = Errors(0.05, 0.1, 0.1, 0.3, 1.0, 0.5, 1.0)
+_FIRST = Errors(0.05, 1e-3, 0.1, 0.3, 1.0, 0.3, 0.3, 1.0)
 # Smallest and largest ones (angles in radians, bends relative, priors in mean tensions).
-_ANGLES, _RATIOS, _TENSIONS, _PRESSURES = (1e-3, 1.5), (1e-2, 10.0), (0.03, 3.0), (0.01, 10.0)
+_ANGLES, _RATIOS, _TENSIONS, _PRESSURES = (1e-3, 1.5), (1e-2, 10.0), (0.03, 1.5), (0.3, 10.0)
+_GRAINS = (1e-5, 0.05)
+# Length of an edge, in cell diameters, below which the error of its arc does not decrease.
+_SHORTEST = 0.25
+# The errors of arcs are forces of friction along the edges. Only their sums around junctions contradict a
+# balance; the rest, which is as large or larger, changes pressures and is not in the residual.
+_HIDDEN = 2.0
+# Range of the correlation of tensions: κ² in the covariance (L + κ²)⁻², with L the Laplacian of edges that
+# meet at junctions. The correlation decreases over about √8 / κ edges.
+_KAPPA = 0.2
 # Smallest noise relative to that of the points, of smooth and of rough outlines, and the largest: pixels
 # along a straight line deviate from it by a pattern that averages out, rough outlines do not.
 _LESS, _ROUGH_LESS, _MORE = 0.1, 0.7, 2.0
@@ -61,8 +70,8 @@ class Observability(NamedTuple):
     other, so that the balance of both ends together remains."""
     size: float
     """Root of the mean area of a cell."""
-    bend: Float[np.ndarray, " angles"]
-    """Size of the bend beyond the arc: of directions at their end, of arcs of both ends."""
+    bend: Float[np.ndarray, " edges"]
+    """Size of the bend of each edge beyond its arc, radians."""
     bounds: dict[str, tuple[float, float]]
     """Smallest and largest standard deviations of errors and priors."""
 
@@ -94,6 +103,7 @@ def observability(
     *,
     prior: float | None,
     exact: bool,
+    vague: bool = False,
 ) -> Observability:
     """The observed angles of a shape, and their covariance.
 
@@ -112,27 +122,25 @@ def observability(
     loose = (variance > _LOOSE**2) | (which.chord < _SHORT * curves.noise)
     loose |= uncertain[which.edges]
     unknown = pulls(fitted, which, loose)
-    end_bend = np.stack([fitted.bend.sum(axis=1), fitted.bend[:, 0] - fitted.bend[:, 1]], axis=1)
-    edge, forward = fitted.half_edge[which.junctions], fitted.forward[which.junctions]
-    bend = np.where(forward, end_bend[edge, 0], end_bend[edge, 1]).ravel()
     least = _LESS if curves.crisp else _ROUGH_LESS
     bounds = {"junction": _ANGLES, "noise": (least, 1.0 if exact else _MORE)}
+    if vague:
+        bounds["noise"] = _VERTICES
     bounds["pressure"] = _PRESSURES
     if prior is None:
-        bounds["tension"] = _TENSIONS
+        bounds |= {"tension": _TENSIONS, "region": _TENSIONS}
     if which.n_arcs:
-        bend = np.append(bend, np.linalg.norm(fitted.bend[which.edges], axis=1))
-        bounds["arc"] = _ANGLES
+        bounds |= {"arc": _ANGLES, "grain": _GRAINS}
         if curves.bending > _BENT:
-            bounds |= {"bend": _RATIOS, "bent_arc": _RATIOS}
+            bounds["bent_arc"] = _RATIOS
     return Observability(
         angle=angles(fitted, which),
         covariance=covariance,
-        length=np.maximum(which.chord / fitted.size, 0.05),
+        length=which.chord / fitted.size,
         loose=loose,
         unknown=_UNKNOWN**2 * unknown @ unknown.T,
         size=fitted.size,
-        bend=np.abs(bend),
+        bend=np.linalg.norm(fitted.bend[which.edges], axis=1),
         bounds=bounds,
     )
 
@@ -177,7 +185,7 @@ def solve(
     if errors is None:
         absent = {name: 0.0 for name in Errors._fields if name not in shape.bounds}
         errors = _FIRST._replace(**absent | ({} if prior is None else {"tension": prior}))
-    diagonals = _diagonals(shape, which)
+    diagonals, regions = _diagonals(shape, which), _regions(which)
     covariance = residual = np.zeros(0)
     for attempt in range(rounds):
         matrix = forces(shape.angle + change, which, loose)
@@ -186,7 +194,7 @@ def solve(
         if attempt in (2, 4) and not has_errors:
             errors, evidence = most_evident(
                 matrix @ expected + offset,
-                _parts(matrix, slope, shape, diagonals, mean),
+                _parts(matrix, slope, shape, diagonals, mean, regions),
                 shape.unknown,
                 errors,
                 shape.bounds,
@@ -196,13 +204,13 @@ def solve(
         spread += np.diag(model_deviations(errors, shape, which) ** 2)
         answer = (slope @ spread).T
         factor = np.linalg.cholesky(slope @ answer + shape.unknown)
-        deviation = np.repeat([errors.tension, errors.pressure / shape.size], [n_edges, n_cells])
+        precision = _prior_precision(errors, shape, regions, n_cells)
         white = solve_triangular(factor, np.column_stack([matrix, offset]), lower=True)
         white, given = white[:, :-1], white[:, -1]
-        normal = white.T @ white + np.diag(deviation**-2.0)
+        normal = white.T @ white + precision
         heavy = 1e3 * np.trace(normal) / len(normal) * n_edges
         normal += heavy * np.outer(mean, mean)
-        right = -white.T @ given + expected / deviation**2 + heavy * mean
+        right = -white.T @ given + precision @ expected + heavy * mean
         root = cho_factor(normal)
         before, x = x, cho_solve(root, right)
         if np.any(x[:n_edges] < 0):
@@ -229,17 +237,19 @@ def model_deviations(
     errors: Errors, shape: Observability, which: Equations
 ) -> Float[np.ndarray, " angles"]:
     """Standard deviations of the angles due to errors of the model."""
+    errors = errors._replace(arc=_HIDDEN * errors.arc, bent_arc=_HIDDEN * errors.bent_arc)
     parts = zip(errors, _diagonals(shape, which), strict=False)
     return np.sqrt(sum((e**2 * d for e, d in parts), np.zeros(len(shape.angle))))
 
 
 def _diagonals(shape: Observability, which: Equations) -> list[Float[np.ndarray, " angles"]]:
     """Variances of the angles for each error of the model of size 1, in the order of `Errors`."""
-    at_junctions = np.arange(len(shape.angle)) < which.n_directions
-    along = np.zeros(len(shape.angle))
-    along[which.n_directions :] = shape.length[: which.n_arcs] ** 2
-    bend = shape.bend**2
-    return [at_junctions * 1.0, at_junctions * bend, along, ~at_junctions * bend]
+    junctions = np.arange(len(shape.angle)) < which.n_directions
+    grain, arc, bend = np.zeros((3, len(shape.angle)))
+    grain[: which.n_directions] = np.maximum(shape.length, 0.02)[which.half_edge.ravel()] ** -2
+    arc[which.n_directions :] = np.maximum(shape.length, _SHORTEST)[: which.n_arcs] ** 2
+    bend[which.n_directions :] = shape.bend[: which.n_arcs] ** 2
+    return [junctions * 1.0, grain, arc, bend]
 
 
 def _parts(
@@ -248,19 +258,44 @@ def _parts(
     shape: Observability,
     diagonals: list[Float[np.ndarray, " angles"]],
     mean: Float[np.ndarray, " unknowns"],
+    regions: Float[np.ndarray, "edges edges"],
 ) -> Errors:
     """Covariances of the forces for each standard deviation of 1."""
     of_angles = [(slope * d @ slope.T).toarray() for d in diagonals]
     n_edges = len(shape.loose)
     pull, push = matrix[:, :n_edges], matrix[:, n_edges:] / shape.size
     # The mean tension is 1.
-    common = matrix @ mean / np.linalg.norm(mean)
+    centred = pull - np.outer(pull @ np.ones(n_edges), mean[:n_edges])
     return Errors(
         *of_angles,
         noise=slope @ (slope @ shape.covariance).T,
-        tension=pull @ pull.T - np.outer(common, common),
+        tension=centred @ centred.T,
+        region=centred @ regions @ centred.T,
         pressure=push @ push.T,
     )
+
+
+def _regions(which: Equations) -> Float[np.ndarray, "edges edges"]:
+    """Covariance of tensions that are similar in regions, of mean variance 1."""
+    n = len(which.edges)
+    meet = np.zeros((n, n))
+    for k in range(3):
+        np.add.at(meet, (which.half_edge[:, k], which.half_edge[:, k - 1]), -1.0)
+    meet += meet.T
+    root = np.linalg.inv(meet + np.diag(_KAPPA - meet.sum(axis=1)))
+    covariance = root @ root
+    return covariance * n / np.trace(covariance)
+
+
+def _prior_precision(
+    errors: Errors, shape: Observability, regions: Float[np.ndarray, "edges edges"], n_cells: int
+) -> Float[np.ndarray, "unknowns unknowns"]:
+    """Inverse covariance of tensions and pressures in the prior."""
+    n = len(regions)
+    precision = np.diag(np.full(n + n_cells, (shape.size / errors.pressure) ** 2))
+    tension = errors.tension**2 * np.eye(n) + errors.region**2 * regions
+    precision[:n, :n] = np.linalg.inv(tension)
+    return precision
 
 
 def _not_negative(
