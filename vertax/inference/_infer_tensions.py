@@ -93,7 +93,7 @@ def infer_tensions(
         doi:10.1214/aos/1176350142), such as 50.
     - `seed`: seed of the random numbers of the resampling.
 
-    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; read its `doubts`.
+    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; read its `warnings`.
 
     **Raises:**
 
@@ -141,21 +141,20 @@ def infer_tensions(
             "Argument `segmentation_or_mask` must have a place where three of its cells meet, but it has "
             "none: the forces at its outline are unknown. Take a larger tissue."
         )
-    used = np.isin(course.points.edge, which.edges)
-    points = Points(*(of[used] for of in course.points))
-    noise = course.noise if noise is None else noise
-    curves = read_courses(geometry, points, course.grain, apart=course.apart, noise=noise)
-    fitted = geometry.moved(curves.change)
     uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
-    shape = observability(
-        fitted, curves, which, uncertain, prior=prior, exact=noise is not None
+    solve_as = partial(
+        _solved, course, geometry, uncertain=uncertain, noise=noise, prior=prior
     )
-    balance = solve(shape, which, prior=prior)
+    solution = solve_as(straight=not tissue.inner_arcs or edges == "straight")
+    if tissue.inner_arcs and edges is None:
+        solution = more_evident(solution, solve_as(straight=True))
+    fitted, curves, which, shape, balance = solution
     resampled = None
     if resamples:
-        observed = fitted, curves, points, which, shape
+        used = np.isin(course.points.edge, which.edges)
+        points = Points(*(of[used] for of in course.points))
         resampled = resampled_deviations(
-            *observed, balance, prior=prior, times=resamples, seed=seed
+            fitted, curves, points, which, shape, balance, prior=prior, times=resamples, seed=seed
         )
     # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain

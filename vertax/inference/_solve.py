@@ -24,8 +24,9 @@ from vertax.inference._errors import Errors, most_evident
 from vertax.inference._observed_geometry import ObservedGeometry
 
 # An edge is loose if the standard deviation of its direction, in radians, is larger than the first, or if it
-# is shorter than the second times the noise. Its force has the third as standard deviation, in mean tensions.
-_LOOSE, _SHORT, _UNKNOWN = 0.2, 8.0, 10.0
+# is shorter than the second times the noise, or the third times the size of a cell. Its force has the fourth
+# as standard deviation, in mean tensions.
+_LOOSE, _SHORT, _TINY, _UNKNOWN = 0.2, 8.0, 0.02, 10.0
 # Smallest tension in the covariance of the forces.
 _SMALL = 0.2
 # Initial standard deviations.
@@ -41,6 +42,7 @@ _HIDDEN = 2.0
 # Range of the correlation of tensions: κ² in the covariance (L + κ²)⁻², with L the Laplacian of edges that
 # meet at junctions. The correlation decreases over about √8 / κ edges.
 _KAPPA = 0.2
+_PRIORS = ("tension", "region", "pressure")
 # Smallest noise relative to that of the points, of smooth and of rough outlines, and the largest: pixels
 # along a straight line deviate from it by a pattern that averages out, rough outlines do not.
 _LESS, _ROUGH_LESS, _MORE = 0.1, 0.7, 2.0
@@ -103,7 +105,6 @@ def observability(
     *,
     prior: float | None,
     exact: bool,
-    vague: bool = False,
 ) -> Observability:
     """The observed angles of a shape, and their covariance.
 
@@ -119,13 +120,12 @@ def observability(
     covariance = curves.noise**2 * (slope @ splu(curves.precision).solve(slope.T.toarray()))
     variance = np.zeros(len(which.edges))
     np.maximum.at(variance, which.half_edge.ravel(), np.diag(covariance)[: which.n_directions])
-    loose = (variance > _LOOSE**2) | (which.chord < _SHORT * curves.noise)
+    least = max(_SHORT * curves.noise, _TINY * fitted.size)
+    loose = (variance > _LOOSE**2) | (which.chord < least)
     loose |= uncertain[which.edges]
     unknown = pulls(fitted, which, loose)
-    least = _LESS if curves.crisp else _ROUGH_LESS
-    bounds = {"junction": _ANGLES, "noise": (least, 1.0 if exact else _MORE)}
-    if vague:
-        bounds["noise"] = _VERTICES
+    smallest = _LESS if curves.crisp else _ROUGH_LESS
+    bounds = {"junction": _ANGLES, "noise": (smallest, 1.0 if exact else _MORE)}
     bounds["pressure"] = _PRESSURES
     if prior is None:
         bounds |= {"tension": _TENSIONS, "region": _TENSIONS}
@@ -192,13 +192,19 @@ def solve(
         slope = force_slopes(shape.angle + change, which, np.maximum(x[:n_edges], _SMALL))
         offset = -slope @ change
         if attempt in (2, 4) and not has_errors:
+            residual = matrix @ expected + offset
+            parts = _parts(matrix, slope, shape, diagonals, mean, regions)
+            bounds, steps = shape.bounds, _STEPS[attempt // 4]
+            if which.n_arcs:
+                # With wide priors, this is restricted maximum likelihood: the errors do not depend on how
+                # well the prior describes the tensions.
+                wide = errors._replace(tension=prior or 1.0, region=0.0 if prior else 1.0, pressure=10.0)
+                free = {k: v for k, v in bounds.items() if k not in _PRIORS}
+                errors, _ = most_evident(residual, parts, shape.unknown, wide, free, steps=steps)
+                errors = errors._replace(tension=prior or 0.3, region=0.0 if prior else 0.3, pressure=1.0)
+                bounds = {k: v for k, v in bounds.items() if k in _PRIORS}
             errors, evidence = most_evident(
-                matrix @ expected + offset,
-                _parts(matrix, slope, shape, diagonals, mean, regions),
-                shape.unknown,
-                errors,
-                shape.bounds,
-                steps=_STEPS[attempt // 4],
+                residual, parts, shape.unknown, errors, bounds, steps=steps
             )
         spread = errors.noise**2 * shape.covariance
         spread += np.diag(model_deviations(errors, shape, which) ** 2)
