@@ -8,7 +8,6 @@ on the way to rest, and Voronoi tissues with straight edges; exact and as label 
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -81,9 +80,8 @@ def row(name: str, members: list[tuple[Truth, object]]) -> None:
             return
         seconds.append(time.perf_counter() - began)
         determined.append(result.determined.sum() / np.isfinite(result.tensions).sum())
-        edges.append(getattr(result, "edges", "arcs"))
+        edges.append(result.edges)
         parts.append(compare(truth, result))
-        if "-v" in sys.argv: print("      ", *(f"{e:.3g}" for e in getattr(result, "errors_", [])), f"{result.bending:.3f}", f"{result.noise:.2g}")
     r = np.mean([pearson(p[0], p[1]) for p in parts])
     error = np.mean([np.mean(np.abs(p[1] - p[0]) / p[0]) for p in parts])
     flat = [np.ptp(p[3]) < 1e-9 for p in parts]
@@ -102,7 +100,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, help="folder where foams are kept")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("-v", action="store_true")
     parser.add_argument("--forsys", help="interpreter that has ForSys")
     arguments = parser.parse_args()
     folder = arguments.folder or Path(tempfile.mkdtemp())

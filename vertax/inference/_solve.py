@@ -104,7 +104,7 @@ def observability(
     uncertain: Bool[np.ndarray, " all_edges"],
     *,
     prior: float | None,
-    exact: bool,
+    known_noise: bool,
 ) -> Observability:
     """The observed angles of a shape, and their covariance.
 
@@ -114,7 +114,7 @@ def observability(
     - `which`: the equations.
     - `uncertain`: edges that may be between other cells; they are loose, as those without a direction.
     - `prior`: standard deviation of tensions about 1; by default chosen by the evidence.
-    - `exact`: whether the noise is at most that of the points.
+    - `known_noise`: whether the noise is at most that of the points.
     """
     slope = angle_slopes(fitted, which)
     covariance = curves.noise**2 * (slope @ splu(curves.precision).solve(slope.T.toarray()))
@@ -125,7 +125,8 @@ def observability(
     loose |= uncertain[which.edges]
     unknown = pulls(fitted, which, loose)
     smallest = _LESS if curves.crisp else _ROUGH_LESS
-    bounds = {"junction": _ANGLES, "noise": (smallest, 1.0 if exact else _MORE)}
+    noise = _VERTICES if len(curves.rest) == 0 else (smallest, _MORE)
+    bounds = {"junction": _ANGLES, "noise": (noise[0], 1.0 if known_noise else noise[1])}
     bounds["pressure"] = _PRESSURES
     if prior is None:
         bounds |= {"tension": _TENSIONS, "region": _TENSIONS}
