@@ -132,9 +132,7 @@ def to_rest(file: Path, times: int = 200) -> Path:
 
 def on_the_way(file: Path, shares: tuple[float, ...] = (0.2, 0.5, 0.8)) -> list[Path]:
     """Stop the gradient descent after shares of the decrease of the energy, and return the files."""
-    printed = run_evolver(
-        file, f"{_MOVE}\ng\nprint total_energy\ng 6000\nprint total_energy"
-    )
+    printed = run_evolver(file, f"{_MOVE}\ng\nprint total_energy\ng 6000\nprint total_energy")
     first, last = (float(x) for x in re.findall(r"^\s*([\d.]+)\s*$", printed, re.MULTILINE)[-2:])
     script, dumps = [f"{_MOVE}\ng"], []
     for share in shares:

@@ -87,7 +87,9 @@ def row(name: str, members: list[tuple[Truth, object]]) -> None:
     flat = [np.ptp(p[3]) < 1e-9 for p in parts]
     by_pressure = np.mean([np.nan if f else pearson(p[3], p[4]) for p, f in zip(parts, flat)])
     scores = [np.abs(np.concatenate([p[k] for p in parts])) for k in (2, 5)]
-    cover = [f"{np.mean(s < 1):4.0%} {np.mean(s < 2):4.0%} {np.sqrt(np.mean(s**2)):5.2f}" for s in scores]
+    cover = [
+        f"{np.mean(s < 1):4.0%} {np.mean(s < 2):4.0%} {np.sqrt(np.mean(s**2)):5.2f}" for s in scores
+    ]
     print(
         f"{name:>30} | {np.mean(determined):4.0%} | {r:6.3f} {error:6.1%} {cover[0]} | "
         f"{by_pressure:6.3f} {cover[1]} | {np.median(seconds):4.1f} | {'/'.join(sorted(set(edges)))}",
@@ -103,7 +105,9 @@ def main() -> None:
     parser.add_argument("--forsys", help="interpreter that has ForSys")
     arguments = parser.parse_args()
     folder = arguments.folder or Path(tempfile.mkdtemp())
-    print(f"{'tissue':>30} | det. | tensions: r, error, within 1, 2 s.d., rms z | pressures | s | edges")
+    print(
+        f"{'tissue':>30} | det. | tensions: r, error, within 1, 2 s.d., rms z | pressures | s | edges"
+    )
     for name, members in cases(folder, arguments.seed):
         row(name, members)
     if arguments.forsys:

@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 import vertax as vx
+from vertax.inference._mean_stress import mean_stress
 from experiments import (
     adjoint_scaling,
     benchmark_adjoints,
@@ -111,7 +112,9 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
         labels=np.arange(1, 7),
         noise=0.1,
         correlation=0.1,
-        model_errors=(0.0, 0.0),
+        edges="arcs",
+        errors={"junction": 0.0, "arc": 0.0},
+        mean_stress=mean_stress(np.zeros(3), np.zeros((3, 3)), 7),
         bending=0.0,
         pixel_size=0.4,
         four_fold=edges < 0,

@@ -199,10 +199,14 @@ def solve(
             if which.n_arcs:
                 # With wide priors, this is restricted maximum likelihood: the errors do not depend on how
                 # well the prior describes the tensions.
-                wide = errors._replace(tension=prior or 1.0, region=0.0 if prior else 1.0, pressure=10.0)
+                wide = errors._replace(
+                    tension=prior or 1.0, region=0.0 if prior else 1.0, pressure=10.0
+                )
                 free = {k: v for k, v in bounds.items() if k not in _PRIORS}
                 errors, _ = most_evident(residual, parts, shape.unknown, wide, free, steps=steps)
-                errors = errors._replace(tension=prior or 0.3, region=0.0 if prior else 0.3, pressure=1.0)
+                errors = errors._replace(
+                    tension=prior or 0.3, region=0.0 if prior else 0.3, pressure=1.0
+                )
                 bounds = {k: v for k, v in bounds.items() if k in _PRIORS}
             errors, evidence = most_evident(
                 residual, parts, shape.unknown, errors, bounds, steps=steps
