@@ -17,7 +17,7 @@ class Equations(NamedTuple):
     junctions: Int[np.ndarray, " junctions"]
     """Vertices where three cells meet: two components of force at each."""
     edges: Int[np.ndarray, " edges"]
-    """Edges that end at a junction: their tensions are unknowns, and each arc has an equation of pressures."""
+    """Edges that end at a junction: their tensions are unknowns, and each arc has an equation."""
     cells: Int[np.ndarray, " cells"]
     """Cells next to these edges: their pressures are unknowns."""
     half_edge: Int[np.ndarray, "junctions 3"]
