@@ -85,7 +85,9 @@ def row(name: str, members: list[tuple[Truth, object]]) -> None:
     r = np.mean([pearson(p[0], p[1]) for p in parts])
     error = np.mean([np.mean(np.abs(p[1] - p[0]) / p[0]) for p in parts])
     flat = [np.ptp(p[3]) < 1e-9 for p in parts]
-    by_pressure = np.mean([np.nan if f else pearson(p[3], p[4]) for p, f in zip(parts, flat)])
+    by_pressure = np.mean(
+        [np.nan if f else pearson(p[3], p[4]) for p, f in zip(parts, flat, strict=True)]
+    )
     scores = [np.abs(np.concatenate([p[k] for p in parts])) for k in (2, 5)]
     cover = [
         f"{np.mean(s < 1):4.0%} {np.mean(s < 2):4.0%} {np.sqrt(np.mean(s**2)):5.2f}" for s in scores

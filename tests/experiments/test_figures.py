@@ -11,7 +11,6 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 import vertax as vx
-from vertax.inference._mean_stress import mean_stress
 from experiments import (
     adjoint_scaling,
     benchmark_adjoints,
@@ -24,6 +23,7 @@ from experiments import (
     salt_and_pepper,
     tissue_moduli,
 )
+from vertax.inference._mean_stress import mean_stress
 from vertax.jobs import design_mechanics, infer_from_microscopy, infer_tensions
 from vertax.plotting import label_colours
 

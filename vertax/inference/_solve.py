@@ -33,7 +33,7 @@ _SMALL = 0.2
 _FIRST = Errors(0.05, 1e-3, 0.1, 0.3, 1.0, 0.3, 0.3, 1.0)
 # Smallest and largest ones (angles in radians, bends relative, priors in mean tensions).
 _ANGLES, _RATIOS, _TENSIONS, _PRESSURES = (1e-3, 1.5), (1e-2, 10.0), (0.03, 1.5), (0.3, 10.0)
-_GRAINS = (1e-5, 0.05)
+_GRAINS, _JUNCTIONS = (1e-5, 0.05), (5e-3, 1.5)
 # Length of an edge, in cell diameters, below which the error of its arc does not decrease.
 _SHORTEST = 0.25
 # The errors of arcs are forces of friction along the edges. Only their sums around junctions contradict a
@@ -126,8 +126,12 @@ def observability(
     unknown = pulls(fitted, which, loose)
     smallest = _LESS if curves.crisp else _ROUGH_LESS
     noise = _VERTICES if len(curves.rest) == 0 else (smallest, _MORE)
-    bounds = {"junction": _ANGLES, "noise": (noise[0], 1.0 if known_noise else noise[1])}
-    bounds["pressure"] = _PRESSURES
+    bounds = {
+        "junction": _JUNCTIONS if which.n_arcs else _ANGLES,
+        "noise": (noise[0], 1.0 if known_noise else noise[1]),
+    }
+    # Arcs that lag behind the pressures would make these small in the evidence.
+    bounds["pressure"] = _PRESSURES if which.n_arcs else (0.01, _PRESSURES[1])
     if prior is None:
         bounds |= {"tension": _TENSIONS, "region": _TENSIONS}
     if which.n_arcs:
