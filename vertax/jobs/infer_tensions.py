@@ -112,8 +112,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     if config.noise is not None and result.pixel_size is not None:
         options["noise"] = config.noise * np.sqrt(np.prod(pixel_sides(result.pixel_size)))
         result = config.image.tensions(source, **options)
-    for doubt in result.doubts:
-        folder.warn(doubt)
+    for warning in result.warnings:
+        folder.warn(warning)
     folder.save_tissue("seen", result.tissue)
     edges, cells = result.edge_table(), result.cell_table()
     if truth is not None:
@@ -189,11 +189,15 @@ def measure(result: inference.InferredTensions, edges: Any, cells: Any) -> dict[
         "noise_pixels": result.noise / pixel,
         "noise_correlation_pixels": result.correlation / pixel,
         "bending_degrees": np.degrees(result.bending),
-        "doubts": result.doubts,
+        "edges": result.edges,
+        "warnings": list(result.warnings),
         "area_error_max": float(np.max(np.abs(result.area_errors[is_cell]))),
-        "out_of_balance_degrees_junctions": np.degrees(result.model_errors[0]),
-        "out_of_balance_degrees_arcs": np.degrees(result.model_errors[1]),
+        "stress_anisotropy": result.mean_stress.anisotropy,
+        "stress_anisotropy_deviation": result.mean_stress.anisotropy_deviation,
+        "stress_direction_degrees": np.degrees(result.mean_stress.direction),
+        "stress_direction_deviation_degrees": np.degrees(result.mean_stress.direction_deviation),
     }
+    metrics |= {f"error_{name}": value for name, value in result.errors.items()}
     if result.mask_report is not None:
         summary = result.mask_report.summary()
         metrics |= {f"mask_{name}": value for name, value in summary.items()}
