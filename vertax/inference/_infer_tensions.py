@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Int, Shaped
 
 from vertax._base.announce import announce_compilations
+from vertax._base.blas import one_blas_thread
 from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.inference._balance import equations
@@ -38,6 +39,7 @@ _EVOLVER = (".dmp", ".fe")
 
 
 @announce_compilations("measurements of a tissue")
+@one_blas_thread()
 def infer_tensions(
     segmentation_or_mask: Segmentation
     | Foam
@@ -123,7 +125,7 @@ def infer_tensions(
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
         mask, line_width = labels_and_lines(source, kind, background, plane)
         if pixel_size is None and isinstance(source, str | os.PathLike):
-            pixel_size = _pixels_of_file(Path(source), mask)
+            pixel_size = pixels_of_file(Path(source), mask)
         source = from_labels(
             mask,
             boundary="free",
@@ -197,7 +199,7 @@ class _Course(NamedTuple):
     report: MaskReport | None = None
 
 
-def _pixels_of_file(file: Path, mask: Int[np.ndarray, "rows columns"]) -> PixelSize | None:
+def pixels_of_file(file: Path, mask: Int[np.ndarray, "rows columns"]) -> PixelSize | None:
     """Size of the pixels of a file that are not square, for a mean cell area of about 1."""
     aspect = pixel_aspect(file)
     if abs(aspect - 1) < 0.01:
@@ -223,7 +225,8 @@ def _of_mask(source: Segmentation) -> _Course:
             "Argument `segmentation_or_mask` must hold the courses of its edges, as "
             "vx.initialise.from_labels returns them. Pass its mask, or its tissue."
         )
-    copies = len(np.unique(source.labels)) < len(source.labels)
+    cells = source.labels[source.labels > 0]  # several holes have the label 0
+    copies = len(np.unique(cells)) < len(cells)
     if copies or (not source.complete.all() and source.tissue.topology.exterior is False):
         raise ValueError(
             "Argument `segmentation_or_mask` must not be mirrored at its border, where no forces "

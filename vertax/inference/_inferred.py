@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vertax._base.pixels import PixelSize, pixel_sides
+from vertax.inference._columns import with_pixels
 from vertax.inference._mean_stress import MeanStress
 from vertax.initialise import MaskReport
 from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vtk
@@ -144,18 +145,20 @@ class InferredTensions(eqx.Module):
         cells, for an edge that is four-fold), `four_fold`, `tension`, `tension_deviation` and `determined`;
         for a mask also `shown`, the share of the edge along which the mask shows the contact,
         `contact_closed`, where that is less than a half, and `contact_uncertain`, for an edge across a gap so
-        wide that other cells may touch there.
+        wide that other cells may touch there; and in pixels, from the top left corner of the image,
+        `start_column`, `start_row`, `end_column`, `end_row` and `length_pixels`.
         """
-        return edge_table(self.tissue, **self._edge_columns)
+        return with_pixels(edge_table(self.tissue, **self._edge_columns), self.pixel_size)
 
     def cell_table(self) -> dict[str, np.ndarray]:
         """The cells as a table, see [`cell_table`][vertax.io.cell_table].
 
         **Returns:** its columns, and `label`, `pressure`, `pressure_deviation`, `determined` and the stress
         as `stress_xx`, `stress_xy` and `stress_yy`; for a mask also `hole`, `pixels`, `area_error` (the area
-        of the cell over that of its pixels, less 1) and `outline_error` (in pixels, see `outline_errors`).
+        of the cell over that of its pixels, less 1), `outline_error` (in pixels, see `outline_errors`), and
+        in pixels, from the top left corner of the image, `column`, `row` and `area_pixels`.
         """
-        return cell_table(self.tissue, **self._cell_columns)
+        return with_pixels(cell_table(self.tissue, **self._cell_columns), self.pixel_size)
 
     def write(self, path: str | os.PathLike[str]) -> list[Path]:
         """Write cells and edges to two files: `NAME.csv` and `NAME-edges.csv`, and so on.
