@@ -113,9 +113,9 @@ def test_exhausted_capacity_and_invalid_arguments_are_rejected(grown, without_ty
         time > 3, vx.RESULTS.capacity_reached, vx.RESULTS.successful
     )
     full = dataclasses.replace(grown, results=jax.vmap(result)(grown.times))
-    with pytest.raises(RuntimeError, match="all cell slots .* alive.*9 cell slots"):
+    with pytest.raises(RuntimeError, match=r"all cell slots .* alive.*9 cell slots"):
         full.checked()
-    with pytest.raises(RuntimeError, match="all cell slots .* alive"):
+    with pytest.raises(RuntimeError, match=r"all cell slots .* alive"):
         jax.block_until_ready(eqx.filter_jit(lambda g: g.checked().times)(full))
     with pytest.raises(ValueError, match="with_capacity"):
         grow(random_tissue(6), energy_of, cycle, times, key=0)

@@ -73,7 +73,7 @@ class Fit(eqx.Module, Generic[Energy]):
     """One entry per epoch."""
     notes: dict[str, Shaped[np.ndarray, "epochs ..."]] = eqx.field(default_factory=dict)
     """Values returned by the callback, by name; the first axis is that of the epochs."""
-    result: RESULTS = RESULTS.successful
+    result: RESULTS = eqx.field(default_factory=lambda: RESULTS.successful)
     """How the fit ended; `interrupted` after a keyboard interrupt."""
 
 
