@@ -364,7 +364,7 @@ class TestErrors:
             tissue.boundary.lattice @ jnp.diag(jnp.stack([1.0 - time, jnp.ones_like(time)]))
         )
         short_relaxation = vx.Relaxation(transitions=None, contact_range=None, max_steps=20)
-        with pytest.raises(RuntimeError, match=r"time 1.5 \(frame 1\) .*the box folds"):
+        with pytest.raises(RuntimeError, match=r"its box folds.*time 1.5, frame 1"):
             vx.evolve(
                 tissue, energy, FRICTION, [0.0, 1.5], boundary=shrunk, relaxation=short_relaxation
             )
@@ -417,7 +417,7 @@ class TestErrors:
 
     def test_step_that_does_not_converge_raises(self):
         tissue = random_tissue(N_CELLS, 3)
-        with pytest.raises(RuntimeError, match=r"time 0\.5 \(frame 1\)"):
+        with pytest.raises(RuntimeError, match=r"time 0\.5, frame 1"):
             vx.evolve(
                 tissue,
                 ShapeFactorEnergy(3.5),

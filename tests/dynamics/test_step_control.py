@@ -132,5 +132,5 @@ class TestErrors:
             vx.Evolution(FRICTION, [0.0, 1.0], control=0.1)  # pyright: ignore[reportArgumentType]
 
     def test_too_few_steps_raise(self):
-        with pytest.raises(RuntimeError, match="a greater `most`"):
+        with pytest.raises(RuntimeError, match="Raise `most` of the `StepControl`"):
             evolved(control=StepControl(1e-6, most=3))

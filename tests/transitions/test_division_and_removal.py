@@ -249,9 +249,9 @@ def test_undeclared_axes_are_rejected_by_name(without_type_checks):
 def test_division_without_a_spare_slot_is_rejected(without_type_checks):
     tissue = random_tissue(6, 3).with_capacity(7)
     full = divide(tissue, 0).tissue
-    with pytest.raises(RuntimeError, match="capacity of 7 cells"):
+    with pytest.raises(RuntimeError, match="capacity is 7 cells"):
         divide(full, 0)
-    with pytest.raises(Exception, match="capacity of 7 cells"):
+    with pytest.raises(Exception, match="capacity is 7 cells"):
         jax.block_until_ready(jax.jit(lambda t: divide(t, 0).tissue.vertices)(full))
     change = divide(full, 0, throw=False)
     assert not change.converged
