@@ -173,7 +173,11 @@ def shear(rest: vx.Tissue, p0: Any, strains: Any, zero_stress: Any, fixed: Any) 
             return jax.lax.cond(jnp.abs(stress[0, 1]) > zero_stress, solid, lambda: jnp.zeros_like(rotation))
 
         moduli = jax.lax.map(modulus, (arrays, course.stresses))
-        return {"stress": course.stresses[:, 0, 1], "modulus": moduli, "converged": course.converged}
+        return {
+            "stress": course.stresses[:, 0, 1],
+            "modulus": moduli,
+            "converged": course.results == vx.RESULTS.successful,
+        }
 
     return jax.lax.map(one_side, jnp.array([1.0, -1.0], strains.dtype))
 

@@ -104,7 +104,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             "rms": np.sqrt(np.mean(distance**2)),
             "largest": np.max(np.abs(distance)),
             "num_t1": movie.num_t1,
-            "sound": bool(movie.sound[-1]),
+            "converged": bool(movie.converged),
             "seconds_per_epoch": np.median(fit.history.seconds),
         }
     folder.save_table("course", {"time": times, "course": course} | ratios)

@@ -58,7 +58,7 @@ PACKAGES = {
     "dynamics": "Evolution Evolved Material StepControl evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
-    "relax": "AbstractResponse Equilibrium RESULTS Relaxation equilibrate record_relaxation",
+    "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
     "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "TruncatedCG VertexTrustRegion Wrapped",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",
