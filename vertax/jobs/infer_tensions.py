@@ -32,7 +32,7 @@ PRESSURE = r"pressure $(p - \bar p)\,\sqrt{\bar A}\,/\,\bar\gamma$"
 class ImageSection(runs.ImageFile):
     """The segmented image."""
 
-    path: str | None = SYNTHETIC
+    path: str | None = Field(default=SYNTHETIC, min_length=1)
     """The file: TIFF, PNG, NPY; or synthetic, the image of a random cluster."""
     kind: Literal["auto", "outlines", "labels"] = "auto"
     """Outlines of cells, or a number or colour in each pixel of a cell; `"auto"` takes an image of two values
@@ -146,7 +146,7 @@ def draw_cluster(config: Config) -> tuple[tuple[Any, Any], np.ndarray]:
     areas = jax.random.uniform(area_key, (options.n_cells,), minval=0.9, maxval=1.3)
     bounds: dict[str, Any] = {"stiffness": options.stiffness, "low": 0.05, "high": 4.0}
     energy = inference.foam_energy(tension / jnp.mean(tension), areas, **bounds)
-    relaxed = runs.Relaxation().build()(cluster, energy).tissue
+    relaxed = runs.RelaxationSection().build()(cluster, energy).tissue
     return (energy, relaxed), inference.label_image(relaxed, options.pixels)
 
 
