@@ -127,7 +127,7 @@ def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[s
 def validate(
     model: type[Model], data: Mapping[str, Any], where: str = "the configuration"
 ) -> Model:
-    """The configuration as an instance of `model`; a `ConfigError` lists all mistakes by their dotted keys."""
+    """The configuration as an instance of `model`; a `ConfigError` lists all mistakes by key."""
     try:
         return model.model_validate(dict(data))
     except pydantic.ValidationError as error:

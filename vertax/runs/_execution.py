@@ -29,8 +29,19 @@ with requires_extra("run", "A run"):
 
 CONFIG, FAILED = "config.toml", "failed.txt"
 _FIGURES = tuple(f"figures/*.{ending}" for ending in ("png", "pdf", "svg"))
-# Files of a run. METRICS is removed first, so that a folder that has it is complete.
-_FILES = (METRICS, FAILED, "*.csv", "*.geojson", "*.npz", "*.npy", *_FIGURES, f"{PARTS}/*.npz")
+# Files of a run. METRICS is removed first: a folder that has it is complete. CONFIG, which marks the folder
+# of a run, is removed last.
+_FILES = (
+    METRICS,
+    FAILED,
+    "*.csv",
+    "*.geojson",
+    "*.npz",
+    "*.npy",
+    *_FIGURES,
+    f"{PARTS}/*.npz",
+    CONFIG,
+)
 
 
 def new_folder(
@@ -120,8 +131,8 @@ def execute(
 ) -> Mapping[str, Any]:
     """Execute or resume a run: write its results, then its metrics, and remove its checkpoints.
 
-    A run that fails leaves no folder if it wrote nothing, and otherwise `failed.txt`, so that the same command
-    can be repeated; a run that has checkpoints can be resumed.
+    A run that fails leaves no folder if it wrote nothing, and otherwise `failed.txt`, so that the same
+    command can be repeated; a run that has checkpoints can be resumed.
     """
     # The configuration sets the precision; the library does not. Figures are written to files only.
     jax.config.update("jax_enable_x64", config.precision == "float64")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import enum
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -37,9 +38,10 @@ _NO_CACHE = (
     "VERTAX_CACHE names another folder, or is off)."
 )
 
+Format = enum.StrEnum("Format", {name: name for name in ("png", "pdf", "svg")})
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help=_SET)]
 Figures = Annotated[
-    list[Literal["png", "pdf", "svg"]] | None,
+    list[Format] | None,
     typer.Option(help="Format of the figures, by default png; may be repeated."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress bar and no summary.")]
