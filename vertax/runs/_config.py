@@ -165,9 +165,10 @@ def _template_lines(schema: Any, tables: Any, defaults: Any, prefix: str) -> Ite
     sections = []
     for name, key in schema["properties"].items():
         default = defaults.get(name, key.get("default"))
-        about = " ".join(key["description"].split())
-        if "$ref" in key:
-            section = tables[key["$ref"].rpartition("/")[2]]
+        section = tables.get(key.get("$ref", "").rpartition("/")[2])
+        # Pydantic leaves out the description of a key that is that of the table.
+        about = " ".join(({"description": ""} | (section or {}) | key)["description"].split())
+        if section is not None:
             sections += ["", f"[{prefix}{name}]  # {about}"]
             sections += _template_lines(section, tables, default or {}, f"{prefix}{name}.")
         elif prefix or name != "experiment":

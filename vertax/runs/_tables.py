@@ -87,7 +87,7 @@ def summary(metrics: Mapping[str, Any]) -> str:
     everything = plain(metrics)
     groups = {k: _numbers(v) for k, v in everything.items() if isinstance(v, dict)}
     groups = {k: group for k, group in groups.items() if group} or {"": _numbers(everything)}
-    tables: list[dict[str, dict[str, float]]] = []
+    tables: list[dict[str, dict[str, Any]]] = []
     for label, group in groups.items():
         common = (t for t in tables if any(group.keys() & other.keys() for other in t.values()))
         table = next(common, None)
@@ -97,12 +97,12 @@ def summary(metrics: Mapping[str, Any]) -> str:
     return "\n\n".join(filter(None, map(_in_columns, tables)))
 
 
-def _numbers(group: Mapping[str, Any]) -> dict[str, float]:
+def _numbers(group: Mapping[str, Any]) -> dict[str, Any]:
     numeric = lambda value: isinstance(value, int | float) and not isinstance(value, bool)
     return {name: value for name, value in group.items() if numeric(value)}
 
 
-def _in_columns(groups: Mapping[str, dict[str, float]]) -> str:
+def _in_columns(groups: Mapping[str, dict[str, Any]]) -> str:
     names = dict.fromkeys(name for group in groups.values() for name in group)
     rows = [["", *groups]] if any(groups) else []
     entry = lambda group, name: f"{group[name]:.4g}" if name in group else ""

@@ -47,12 +47,13 @@ Figures = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress bar and no summary.")]
 
 
-def _show_version(wanted: bool) -> None:
+def _show_version(wanted: bool) -> bool:
     if wanted:
         from importlib.metadata import version
 
         typer.echo(f"vertax {version('vertax')}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()
