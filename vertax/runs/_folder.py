@@ -185,8 +185,9 @@ class RunFolder:
 
         def fit_one(index: int) -> Fit[Any]:
             problem = problems[index]
-            callback = None if notes is None else lambda _, record: notes(problem, record)
-            options: Any = {"callback": callback, "progress": False}
+            options: dict[str, Any] = {"progress": False}
+            if notes is not None:
+                options["callback"] = lambda _, record: notes(problem, record)
             return self.fit(f"{name} {index}", problem, fitting.build(), fitting.epochs, **options)
 
         fits = self.map_in_threads(fit_one, len(problems), progress=progress, unit="fit")
