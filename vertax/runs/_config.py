@@ -74,7 +74,7 @@ Model = TypeVar("Model", bound=Section)
 
 @functools.cache
 def with_name(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
-    """A subclass of a configuration whose key `experiment` accepts one name only."""
+    """A subclass of a configuration with a key `experiment` that accepts one name only."""
     key = pydantic.Field(name, description=config.model_fields["experiment"].description)
     fields: dict[str, Any] = {"experiment": (Literal[name], key)}
     return pydantic.create_model(

@@ -7,7 +7,6 @@ any other folder with `config.toml` a run that can be resumed.
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -16,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
+import vertax
 from vertax._base.extras import requires_extra
 from vertax.io import atomic_write
 from vertax.runs._config import ExperimentConfig, differences, read_toml, validate
@@ -120,9 +121,10 @@ def write_config(folder: Path, config: ExperimentConfig) -> None:
     """Write the configuration with all defaults; `vertax run` on the written file repeats the run."""
     # TOML has no null: a key that is None by default is left out.
     content = config.model_dump(mode="json", exclude_none=True)
-    programs = [f"{name} {installed_version(name)}" for name in ("vertax", "jax", "numpy")]
+    programs = {each.__name__: each.__version__ for each in (vertax, jax, np)}
+    versions = [*programs.items(), ("Python", platform.python_version())]
     with atomic_write(folder / CONFIG) as file:
-        file.write(f"# Run by {', '.join(programs)}; Python {platform.python_version()}.\n")
+        file.write(f"# Run by {', '.join(map(' '.join, versions))}.\n")
         file.write(tomli_w.dumps(content))
 
 
@@ -171,14 +173,6 @@ def read_metrics(folder: Path) -> dict[str, Any]:
 def parts(folder: Path) -> list[Path]:
     """The files of fits and other parts that a resumed run keeps."""
     return sorted(folder.glob(f"{PARTS}/*.npz"))
-
-
-def installed_version(name: str) -> str:
-    """The version of an installed package, or `"(not installed)"` if it runs from its source folder."""
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"
 
 
 def _end_failed(folder: Path, error: Exception) -> None:

@@ -186,8 +186,8 @@ class RunFolder:
         def fit_one(index: int) -> Fit[Any]:
             problem = problems[index]
             options: dict[str, Any] = {"progress": False}
-            if notes is not None:
-                options["callback"] = lambda _, record: notes(problem, record)
+            if (compute := notes) is not None:
+                options["callback"] = lambda _, record: compute(problem, record)
             return self.fit(f"{name} {index}", problem, fitting.build(), fitting.epochs, **options)
 
         fits = self.map_in_threads(fit_one, len(problems), progress=progress, unit="fit")

@@ -49,9 +49,9 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress bar and n
 
 def _show_version(wanted: bool) -> bool:
     if wanted:
-        from importlib.metadata import version
+        from vertax import __version__
 
-        typer.echo(f"vertax {version('vertax')}")
+        typer.echo(f"vertax {__version__}")
         raise typer.Exit
     return wanted
 
