@@ -84,9 +84,7 @@ def test_a_folder_is_overwritten_only_with_the_option(tiny):
     ("arguments", "message"),
     [
         (["none.toml"], "There is no configuration file none.toml"),
-        (["tiny.toml", "--set", "fit.epoch=3"], "did you mean `fit.epochs`"),
         (["tiny.toml", "--set", "fit.epochs=x"], "`fit.epochs` must be a valid integer"),
-        (["tiny.toml", "--set", "fit.epochs"], "must have the form key=value"),
         (
             ["tiny.toml", "--set", "data="],
             "'data=' has none: is a variable unset? An empty text is",
@@ -154,20 +152,7 @@ def test_a_run_that_fails_at_its_start_leaves_no_folder(tiny, instead, missing):
     assert (tiny / "out/metrics.json").is_file()
 
 
-def test_a_run_that_failed_later_keeps_what_it_wrote(tiny, instead):
-    def fail(config, folder, *, progress):
-        folder.save_array("positions", np.ones(3))
-        raise OSError("It broke.")
-
-    instead(fail)
-    assert vertax("run", "tiny.toml").exit_code == 1
-    # A folder without metrics is one of a run that did not end.
-    files = sorted(path.name for path in (tiny / "runs/tiny").iterdir())
-    assert files == ["config.toml", "failed.txt", "positions.npy"]
-    assert (tiny / "runs/tiny/failed.txt").read_text() == "It broke.\n"
-
-
-def test_a_failed_run_does_not_block_the_same_command(tiny, instead):
+def test_a_failed_run_keeps_its_files_and_does_not_block_the_same_command(tiny, instead):
     def fail(config, folder, *, progress):
         folder.save_array("positions", np.ones(3))
         raise OSError("It broke.")
@@ -175,6 +160,10 @@ def test_a_failed_run_does_not_block_the_same_command(tiny, instead):
     instead(fail)
     for _ in range(2):
         assert vertax("run", "tiny.toml", "--output", "out").exit_code == 1
+        # A folder without metrics is one of a run that did not end.
+        files = sorted(path.name for path in (tiny / "out").iterdir())
+        assert files == ["config.toml", "failed.txt", "positions.npy"]
+        assert (tiny / "out/failed.txt").read_text() == "It broke.\n"
     instead(lambda config, folder, *, progress: {"cost": 1.0})
     assert vertax("run", "tiny.toml", "--output", "out").exit_code == 0
     assert sorted(path.name for path in (tiny / "out").iterdir()) == ["config.toml", "metrics.json"]
@@ -302,7 +291,7 @@ def test_the_configuration_decides_the_precision(tiny, instead, precision):
 
 
 def test_help_version_list_and_describe(tiny):
-    assert "run" in vertax("--help").output
+    assert "Exit codes: 0 success, 1 the run failed" in vertax("--help").output
     assert vertax("--version").output.startswith("vertax ")
     listed = vertax("list").output
     # However many there are, and however wide their names.
@@ -389,10 +378,6 @@ def test_show_of_no_folder_is_exit_code_2(done):
     assert "it is a file" in vertax("show", "runs/done/cells.csv").stderr
     assert vertax("show", "runs/none").exit_code == 2
     assert vertax("show").exit_code == 2
-
-
-def test_help_lists_the_exit_codes():
-    assert "Exit codes: 0 success, 1 the run failed" in vertax("--help").output
 
 
 def test_the_program_runs_as_a_process():

@@ -13,7 +13,7 @@ from vertax.runs._registry import all_experiments
 EXPERIMENTS = all_experiments()
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
-VALID = 'experiment = "infer_shape_factors"\n[fit]\nepochs = 7\n'
+VALID = 'experiment = "infer_shape_factors"\nseed = 0\n[fit]\nepochs = 7\n'
 
 
 @pytest.fixture
@@ -35,10 +35,6 @@ def refusal(path, *overrides):
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_every_config_of_the_repository_is_valid(path):
     load_config(path)
-
-
-def test_there_are_configs():
-    assert {"demo", "infer_shape_factors"} <= {path.stem for path in CONFIGS}
 
 
 def test_keys_left_out_have_their_defaults(write):
@@ -64,10 +60,6 @@ def test_an_override_sets_one_key(write, override, get, expected):
     assert get(load_config(write(VALID), [override])[1]) == expected
 
 
-def test_the_last_override_wins(write):
-    assert load_config(write(VALID), ["seed=1", "seed=2"])[1].seed == 2
-
-
 def test_overrides_leave_the_original_alone_and_cannot_add_keys():
     data = {"a": {"b": 1}}
     text = "1\nc = 2"
@@ -79,37 +71,17 @@ def test_overrides_leave_the_original_alone_and_cannot_add_keys():
     assert data == {"a": {"b": 1}}
 
 
-@pytest.mark.parametrize("override", ["fit.epochs", "=3", "fit.=3", ".epochs=3"])
-def test_an_override_of_another_form_is_refused(write, override):
-    message = refusal(write(VALID), override)
-    assert repr(override) in message
-    assert "key=value" in message
-
-
-def test_a_key_inside_a_value_is_refused(write):
-    assert "`data` is a value and not a table" in refusal(write(VALID), "data=image", "data.x=1")
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("tissue.n_cell=3", ["`tissue.n_cell`", "`tissue.n_cells`"]),
-        ("epochs=3", ["`epochs`", "`fit.epochs`"]),
-        ("fit.optimizer=adam", ["`fit.optimizer`", "`fit.optimiser`"]),
-        ("relaxation.t1_treshold=1", ["`relaxation.t1_threshold`", "a number, above 0"]),
-        ("fits.epochs=1", ["`fits`", "`fit`"]),
-        ("fit.xyz=1", ["`fit.xyz`", "`fit.optimiser`", "`fit.learning_rate`", "`fit.epochs`"]),
-    ],
-)
-def test_an_unknown_key_is_refused_by_name_with_the_nearest_right_one(write, override, message):
-    message = refusal(write(VALID), override)
-    for part in ["there is no key", *message]:
-        assert part in message
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
+        ("fit.epochs", "must have the form key=value, as in fit.epochs=50, but is 'fit.epochs'."),
+        ("fit.=3", "must have the form key=value"),
+        ("seed.x=1", "Cannot set `seed.x`: `seed` is a value and not a table."),
+        ("tissue.n_cell=3", "there is no key `tissue.n_cell`; did you mean `tissue.n_cells`?"),
+        ("epochs=3", "there is no key `epochs`; did you mean `fit.epochs`?"),
+        ("fits.epochs=1", "there is no key `fits`; did you mean `fit`?"),
+        ("fit.xyz=1", "allowed are: `fit.optimiser`, `fit.learning_rate`, `fit.epochs`."),
+        (f"data={'a' * 10_000}", 'but is "' + "a" * 79 + "…."),
         ("fit.epochs=many", '`fit.epochs` must be a valid integer, but is "many".'),
         ("fit.epochs=2.5", "`fit.epochs` must be a valid integer, but is 2.5."),
         ("fit.epochs=true", "`fit.epochs` must be a valid integer, but is true."),
@@ -123,7 +95,7 @@ def test_an_unknown_key_is_refused_by_name_with_the_nearest_right_one(write, ove
         ("seed={a=1}", "`seed` must be a valid integer, but is { a = 1 }."),
     ],
 )
-def test_an_ill_typed_key_is_refused_by_name_with_what_is_allowed(write, override, message):
+def test_a_wrong_key_or_value_is_an_error_with_a_remedy(write, override, message):
     assert message in refusal(write(VALID), override)
 
 
@@ -150,10 +122,6 @@ def test_a_byte_order_mark_is_no_mistake(tmp_path):
     path = tmp_path / "windows.toml"
     path.write_bytes(b"\xef\xbb\xbf" + VALID.replace("\n", "\r\n").encode())
     assert load_config(path)[1].fit.epochs == 7
-
-
-def test_a_long_value_is_quoted_in_part(write):
-    assert len(refusal(write(VALID), f"data={'a' * 10_000}")) < 500
 
 
 def test_the_experiment_must_be_named_and_exist(write):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import concurrent.futures
 import json
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -31,7 +30,7 @@ from vertax.fitting import (
 from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
 from vertax.runs._sections import Fitting
-from vertax.runs._tables import history_table, plain
+from vertax.runs._tables import file_name, history_table, plain, sentence
 
 with requires_extra("run", "The folder of a run"):
     import matplotlib
@@ -43,7 +42,6 @@ _UNDATED: dict[str, dict[str, None]] = {"pdf": {"CreationDate": None}, "svg": {"
 _VECTOR_STYLE: Any = {"pdf.fonttype": 42, "svg.hashsalt": "vertax"}
 
 THREADS = "VERTAX_THREADS"  # the environment variable with the number of threads
-
 Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 Result = TypeVar("Result")
 
@@ -143,16 +141,15 @@ class RunFolder:
                 raise
             self.warn(str(error).rstrip("."), name)
             return error.fit
-        if outcome.interrupted:  # never reset here: other fits may run in other threads
-            self.interrupted = True
+        self.interrupted |= outcome.interrupted  # fits in other threads never reset it
+        if outcome.interrupted:
             return outcome
         for doubt in doubts(outcome):
             self.warn(doubt, name)
         solver = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
         if solver and len(outcome.history.cost) >= epochs:
-            self.warn(
-                f"the least-squares solver did not end within {epochs} epochs (raise them)", name
-            )
+            text = f"the least-squares solver did not end within {epochs} epochs (raise them)"
+            self.warn(text, name)
         return outcome
 
     def fit_in_threads(
@@ -302,7 +299,7 @@ class RunFolder:
     @property
     def warnings(self) -> list[str]:
         """The warnings, one sentence each."""
-        return [_sentence(text, sorted(names)) for text, names in self._warnings.items()]
+        return [sentence(text, sorted(names)) for text, names in self._warnings.items()]
 
     def save_tissue(self, name: str, tissue: Tissue) -> None:
         """Write a tissue to `name.npz`."""
@@ -351,14 +348,3 @@ def num_threads() -> int:
     """The number of threads: the environment variable, or one per core."""
     number = os.environ.get(THREADS, "")
     return max(int(number), 1) if number.isdecimal() else os.cpu_count() or 1
-
-
-def file_name(name: str) -> str:
-    """A name as a part of the name of a file."""
-    return re.sub("[^0-9A-Za-z.-]+", "_", name)
-
-
-def _sentence(text: str, names: Sequence[str]) -> str:
-    """A warning after the first three names that it concerns."""
-    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-    return f"{shown}: {text}." if names else f"{text[:1].upper()}{text[1:]}."

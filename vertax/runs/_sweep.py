@@ -36,11 +36,10 @@ from vertax.runs._folder import (
     THREADS,
     RunFolder,
     RunFolderError,
-    file_name,
     num_threads,
 )
 from vertax.runs._registry import find_experiment, load_config
-from vertax.runs._tables import plain
+from vertax.runs._tables import file_name, plain
 
 
 class SweepRun(NamedTuple):

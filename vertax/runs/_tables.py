@@ -1,8 +1,9 @@
-"""Tables and metrics of fits, and metrics as text."""
+"""Tables and metrics of fits, and metrics and names as text."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -77,6 +78,17 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):  # arrays and scalars of NumPy and JAX
         return plain(np.asarray(value).tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def file_name(name: str) -> str:
+    """A name as a part of the name of a file."""
+    return re.sub("[^0-9A-Za-z.-]+", "_", name)
+
+
+def sentence(text: str, names: Sequence[str]) -> str:
+    """A warning after the first three names that it concerns."""
+    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return f"{shown}: {text}." if names else f"{text[:1].upper()}{text[1:]}."
 
 
 def summary(metrics: Mapping[str, Any]) -> str:
