@@ -2,8 +2,8 @@
 
 Columns: numbers of cells and tensions; standard deviation of the prior (independent, in regions); direction
 of the mean stress from the proximal-distal axis, which is x in the files, in degrees, with its standard
-deviation; anisotropy; share of the tensions that agree within 1.96 standard deviations when each half of the junctions, chosen at random, is
-used alone; seconds of one core.
+deviation; anisotropy; share of the tensions that agree within 1.96 standard deviations when each half of the
+junctions, chosen at random, is used alone; seconds of one core.
 """
 
 from __future__ import annotations

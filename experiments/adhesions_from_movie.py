@@ -46,9 +46,10 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     frames = list(simulated.trajectory)
     noisy = [with_noise(frames[k], config.noise, rng) for k in used]
     movie = Movie(noisy, times[used], types=dict(enumerate(types.tolist())), largest_jump=3.0)
-    guess = by_type(0.1 * jnp.ones((2, 2)), movie.types, outline=jnp.array(0.1))
+    guess = by_type(0.1 * jnp.ones((2, 2)), types, outline=jnp.array(0.1))
     fit = fit_movie(movie, AreaElasticity(1.0, 1.0) + guess, noise=config.noise)
-    tensions = [e.terms[1] for e in (fit.energy, fit.deviation)]
+    energies: list[Any] = [fit.energy, fit.deviation]
+    tensions = [energy.terms[1] for energy in energies]
     values, deviations = (np.append(each.tension, each.outline) for each in tensions)
     table, outline = ADHESIONS["sorting"]
     true = np.append(model.inner_factor * np.array(table)[np.triu_indices(2)], outline)

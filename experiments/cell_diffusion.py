@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
+from experiments._shared import replicate_keys
 from vertax import plotting, runs
 
 
@@ -44,7 +45,7 @@ class Config(runs.ExperimentConfig):
     """Smallest diffusion, relative to that of a free cell, of a fluid tissue."""
     tissue: runs.TissueSection = runs.TissueSection(n_cells=36)
     """The tissues."""
-    relaxation: runs.Relaxation = runs.Relaxation(tolerance=1e-6, max_steps=500)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(tolerance=1e-6, max_steps=500)
     """Relaxation of each step."""
 
 
@@ -58,7 +59,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         name = f"v0 {speed:g} p0 {p0:g} tissue {k}"
         return folder.part(name, lambda: measure(config, speed, p0, int(k)))
 
-    results = runs.side_by_side(one, int(np.prod(shape)), folder, progress=progress, unit="run")
+    results = folder.map_in_threads(one, int(np.prod(shape)), progress=progress, unit="run")
     join = lambda name: np.stack([r[name] for r in results]).reshape(*shape, *results[0][name].shape)
     squared, rate, valid = np.nanmean(join("squared"), axis=2), join("t1_rate"), join("converged")
     rate = np.nanmean(rate, axis=2) / config.tissue.n_cells
@@ -87,7 +88,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
 def measure(config: Config, speed: float, p0: float, replicate: int) -> dict[str, np.ndarray]:
     """Mean squared displacements, rate of transitions, and the fraction of frames before a step failed."""
-    first, noise = jax.random.split(runs.replicate_keys(config.seed, config.replicates)[replicate])
+    first, noise = jax.random.split(replicate_keys(config.seed, config.replicates)[replicate])
     tissue = vx.initialise.periodic_voronoi(key=first, **config.tissue.model_dump())
     n_frames = max(round(config.duration / config.interval), 4)
     start = max(n_frames // 4, 1)

@@ -56,7 +56,7 @@ class Config(runs.ExperimentConfig):
     """Stiffness of perimeters; that of areas is 1."""
     shape_factor: float = Field(default=3.5, ge=0)
     """Target perimeter over the root of the target area."""
-    relaxation: runs.Relaxation = runs.Relaxation(contacts=True)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(contacts=True)
     """Relaxation of each step."""
     animation: bool = True
     """Draw an animation."""

@@ -28,7 +28,7 @@ def table_of(rows):
 
 
 CLUSTER = vx.initialise.free_voronoi(20, key=jax.random.key(4), lloyd_steps=20)
-STRAIGHT = CLUSTER.with_angles(0 * CLUSTER.angles)
+STRAIGHT = CLUSTER.with_angles(jnp.zeros(CLUSTER.n_edges))
 _outline = np.asarray(STRAIGHT.topology.edge_cells)[np.asarray(STRAIGHT.topology.on_outline), 0]
 INNER = [cell for cell in range(20) if cell not in _outline]
 
@@ -177,5 +177,6 @@ def test_wrong_times_and_numbers_are_named():
 
 def test_types_of_a_movie_are_those_of_an_energy():
     movie = Movie([STRAIGHT] * 2, [0, 1], types={k: k % 2 for k in range(20)})
+    assert movie.types is not None
     energy = vx.energies.by_type(jnp.eye(2), movie.types, outline=0.0)
     assert float(energy(movie.frame(0))) > 0

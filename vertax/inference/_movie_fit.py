@@ -99,8 +99,8 @@ def fit_movie(
     vectors), and a variance $s^2$ that explains the remaining residuals. Standard errors are those of the
     sandwich formula over steps, with the correlation of successive steps (Newey and West 1987,
     doi:10.2307/1913610); they require more steps than parameters. **They are too small** where edges are
-    shorter than the tracking noise: then the fit is biased, and in tests with 16 cells two of five errors were
-    within two standard errors. Leave such frames out, or vary the noise to judge the errors.
+    shorter than the tracking noise: then the fit is biased, and in tests with 16 cells two of five errors
+    were within two standard errors. Leave such frames out, or vary the noise to judge the errors.
 
     | symbol | argument | choose |
     |---|---|---|

@@ -35,7 +35,7 @@ PRESSURE = r"pressure $(p - \bar p)\,\sqrt{\bar A}\,/\,\bar\gamma$"
 class ImageSection(runs.ImageFile):
     """The segmented image."""
 
-    path: str | None = SYNTHETIC
+    path: str | None = Field(default=SYNTHETIC, min_length=1)
     """The file: TIFF, PNG, NPY; a folder, a pattern (masks/*.tif) or a movie; or synthetic, the image of a
     random cluster."""
     kind: Literal["auto", "outlines", "labels"] = "auto"
@@ -206,7 +206,7 @@ def run_frames(
             failures[frame.name] = str(error)
             return None
 
-    parts = runs.side_by_side(one, len(frames), folder, progress=progress, unit="mask")
+    parts = folder.map_in_threads(one, len(frames), progress=progress, unit="mask")
     arrays = {frame.name: part for frame, part in zip(frames, parts, strict=True) if part}
     failures = {frame.name: failures[frame.name] for frame in frames if frame.name in failures}
     inference.check_any(arrays, failures)
@@ -246,7 +246,7 @@ def draw_frames(
     reading: dict[str, Any],
 ) -> None:
     """A map of each mask, all with the same limits of the colours, and an animation of them."""
-    folder.say("maps")
+    folder.print_step("maps")
     done = [frame for frame in frames if frame.name in arrays]
     found = {}
     for name, part in arrays.items():
@@ -291,7 +291,7 @@ def draw_cluster(config: Config) -> tuple[tuple[Any, Any], np.ndarray]:
     areas = jax.random.uniform(area_key, (options.n_cells,), minval=0.9, maxval=1.3)
     bounds: dict[str, Any] = {"stiffness": options.stiffness, "low": 0.05, "high": 4.0}
     energy = inference.foam_energy(tension / jnp.mean(tension), areas, **bounds)
-    relaxed = runs.Relaxation().build()(cluster, energy).tissue
+    relaxed = runs.RelaxationSection().build()(cluster, energy).tissue
     return (energy, relaxed), inference.label_image(relaxed, options.pixels)
 
 
