@@ -252,7 +252,8 @@ def main() -> None:
         asked = np.isfinite(result.tensions).sum()
         print(
             f"{path.stem:>34} | {result.determined.sum()} of {asked}, s.d. "
-            f"{np.median(result.tension_deviations[result.determined]):.2f}, {seconds:.1f} s; {result.doubts}"
+            f"{np.median(result.tension_deviations[result.determined]):.2f}, {seconds:.1f} s; "
+            f"{result.warnings}"
         )
 
 

@@ -3,9 +3,15 @@
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field, model_validator
 
-from vertax import plotting
+from vertax import plotting, runs
+from vertax.energies import LocalSum
+from vertax.inference import foam_energy
+from vertax.mesh import Tissue
 
 
 def columns(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -31,3 +37,38 @@ def plot_tensions(panels: dict[str, Any], bounds: tuple[float, float], widths: S
     options: Any = {"edge_vmin": bounds[0], "edge_vmax": bounds[1], "edge_label": r"tension $\gamma$"}
     plotting.plot_tissues(tissues, edges=tensions, axes=axes[:n], **options)
     return figure, axes[n:]
+
+
+class TensionRange(runs.Section):
+    """Line tensions of the edges and stiffness of the cells, where the mean rest area of a cell is 1."""
+
+    low: float = Field(default=0.04, ge=0)
+    """Smallest tension."""
+    high: float = Field(default=0.28, gt=0)
+    """Largest tension; above twice the smallest one, some junctions of three edges have no balance and become
+    four-fold vertices."""
+    stiffness: float = Field(default=1.0, gt=0)
+    """Stiffness of the areas of cells."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Any:
+        if not self.low < self.high:
+            raise ValueError(f"low must be below high, but they are {self.low} and {self.high}")
+        return self
+
+    def draw(self, tissue: Tissue, spread: float, key: PRNGKeyArray) -> LocalSum:
+        """The energy E2 with tensions in the fraction `spread`, below 1, of the range about its middle."""
+        unit = jax.random.uniform(key, (tissue.n_edges,), minval=-1.0, maxval=1.0)
+        tension = self.low + (self.high - self.low) * (0.5 + 0.5 * spread * unit)
+        return foam_energy(tension, stiffness=self.stiffness, low=self.low, high=self.high)
+
+
+def replicate_keys(seed: int, n: int) -> list[PRNGKeyArray]:
+    """Random keys of replicates; each is independent of the number of replicates."""
+    return [jax.random.fold_in(jax.random.key(seed), k) for k in range(n)]
+
+
+def spread_of(values: Float[np.ndarray, " *values"]) -> dict[str, float]:
+    """Mean and standard deviation, for metrics."""
+    values = np.asarray(values, float)
+    return {"mean": float(values.mean()), "deviation": float(values.std())}

@@ -36,7 +36,7 @@ class Model(runs.Section):
     """Time step, in units of friction over stiffness."""
     temperature: float = Field(default=1e-4, ge=0)
     """Diffusion constant of a free vertex."""
-    relaxation: runs.Relaxation = runs.Relaxation(t1_threshold=0.1, tolerance=1e-5)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(t1_threshold=0.1, tolerance=1e-5)
     """Relaxation of each step."""
 
     def types(self, test: str) -> np.ndarray:

@@ -27,15 +27,15 @@ MARKERS = {"AD": "o", "Adj-ID": "^", "Sen-ID": "v", "EP": "s", "LM": "D"}
 # The colours of the paper, in shades that differ for any colour vision.
 COLOURS = dict(zip(MARKERS, ("#0072b2", "#d55e00", "#cc79a7", "#009e73", "#7f7f7f"), strict=True))
 TITLES = {"paper": "the paper's protocol", "equilibrium": "true equilibria"}
-UNROLLED = runs.Relaxation(solver="momentum", learning_rate=3e-3, tolerance=1e-6, max_steps=20_000)
+UNROLLED = runs.RelaxationSection(solver="momentum", learning_rate=3e-3, tolerance=1e-6, max_steps=20_000)
 
 
 class Protocol(runs.Section):
     """Settings of both levels of the inverse problem."""
 
-    relaxation: runs.Relaxation = runs.Relaxation()
+    relaxation: runs.RelaxationSection = runs.RelaxationSection()
     """Relaxation of tissues."""
-    unrolled: runs.Relaxation = UNROLLED
+    unrolled: runs.RelaxationSection = UNROLLED
     """The same for AD, which needs a solver of fixed steps."""
     fit: runs.Fitting = runs.Fitting()
     """Fit of the parameters."""
@@ -90,8 +90,8 @@ def fit_all(config: Config, name: str, folder: runs.RunFolder, progress: bool) -
     columns |= {"initial": initial.ravel()} | {m: values.ravel() for m, values in inferred.items()}
     folder.save_table(f"shape_factors_{name}", columns)
     labels = {m: [{"method": m, "replicate": str(k)} for k in range(config.replicates)] for m in fits}
-    histories = [runs.histories(fit, labels[method]) for method, fit in fits.items()]
-    folder.save_table(f"history_{name}", runs.joined(histories))
+    histories = [runs.history_table(fit.history, *labels[method]) for method, fit in fits.items()]
+    folder.save_table(f"history_{name}", runs.concatenate(histories))
     figure = plot_inference(fits, true, initial, inferred, title=TITLES[name])
     folder.save_figure(f"inference_{name}", figure)
     return {f"{name} {method}": recovery(true, fit) for method, fit in fits.items()}
@@ -103,7 +103,7 @@ def make_scene(config: Scenes, key: Any, response: Any, n_cells: int | None = No
     return inference.shape_factor_scene(key=key, response=response, **tissue, **config.truth.model_dump())
 
 
-def make_scenes(config: Scenes, relaxation: runs.Relaxation, n_cells: int | None = None) -> list[Any]:
+def make_scenes(config: Scenes, relaxation: runs.RelaxationSection, n_cells: int | None = None) -> list[Any]:
     """One scene per replicate; start and target have one topology, because vertices are compared by index."""
     response, scenes = relaxation.build(), []
     for key in jax.random.split(jax.random.key(config.seed), 20 * config.replicates):

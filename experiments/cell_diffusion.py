@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
+from experiments._shared import replicate_keys
 from vertax import plotting, runs
 
 
@@ -44,7 +45,7 @@ class Config(runs.ExperimentConfig):
     """Smallest diffusion, relative to that of a free cell, of a fluid tissue."""
     tissue: runs.TissueSection = runs.TissueSection(n_cells=36)
     """The tissues."""
-    relaxation: runs.Relaxation = runs.Relaxation(tolerance=1e-6, max_steps=500)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(tolerance=1e-6, max_steps=500)
     """Relaxation of each step."""
 
 
@@ -58,15 +59,21 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         name = f"v0 {speed:g} p0 {p0:g} tissue {k}"
         return folder.part(name, lambda: measure(config, speed, p0, int(k)))
 
-    results = runs.side_by_side(one, int(np.prod(shape)), folder, progress=progress, unit="run")
+    results = folder.map_in_threads(one, int(np.prod(shape)), progress=progress, unit="run")
     join = lambda name: np.stack([r[name] for r in results]).reshape(*shape, *results[0][name].shape)
-    squared, rate, valid = np.nanmean(join("squared"), axis=2), join("t1_rate"), join("sound")
+    squared, rate, valid = np.nanmean(join("squared"), axis=2), join("t1_rate"), join("converged")
     rate = np.nanmean(rate, axis=2) / config.tissue.n_cells
     lags = config.interval * np.arange(1, squared.shape[-1] + 1)
     free = np.asarray(config.speeds)[:, None] ** 2 / (2 * config.rotational_diffusion)
     diffusion = late_slope(lags, squared) / 4 / free
     speeds, p0 = np.meshgrid(config.speeds, config.shape_factors, indexing="ij")
-    table = {"speed": speeds, "p0": p0, "diffusion": diffusion, "t1_rate": rate, "sound": valid.mean(axis=2)}
+    table = {
+        "speed": speeds,
+        "p0": p0,
+        "diffusion": diffusion,
+        "t1_rate": rate,
+        "converged": valid.mean(axis=2),
+    }
     folder.save_table("diffusion", {name: values.ravel() for name, values in table.items()})
     folder.save_array("squared_displacements", squared)
     folder.save_figure("diffusion", plot_diffusion(config, lags, squared, diffusion, rate))
@@ -74,14 +81,14 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         "diffusion": diffusion.tolist(),
         "t1_rate": rate.tolist(),
         "fluid_from": [onset(config, values) for values in diffusion],
-        "sound_fraction": float(valid.mean()),
+        "converged_fraction": float(valid.mean()),
         "seconds": time.perf_counter() - began,
     }
 
 
 def measure(config: Config, speed: float, p0: float, replicate: int) -> dict[str, np.ndarray]:
     """Mean squared displacements, rate of transitions, and the fraction of frames before a step failed."""
-    first, noise = jax.random.split(runs.replicate_keys(config.seed, config.replicates)[replicate])
+    first, noise = jax.random.split(replicate_keys(config.seed, config.replicates)[replicate])
     tissue = vx.initialise.periodic_voronoi(key=first, **config.tissue.model_dump())
     n_frames = max(round(config.duration / config.interval), 4)
     start = max(n_frames // 4, 1)
@@ -92,7 +99,7 @@ def measure(config: Config, speed: float, p0: float, replicate: int) -> dict[str
     evolution = vx.Evolution(vx.dissipations.SubstrateFriction(friction), times, **options)
     movie = evolution(tissue, vx.energies.ShapeFactorEnergy(jnp.asarray(p0)), throw=False)
     # Frames after a step that did not converge are not valid.
-    n_valid = int(np.sum(movie.sound))
+    n_valid = int(np.sum(movie.results == vx.RESULTS.successful))
     places = np.asarray(unwrapped_centroids(movie.frames))[start:n_valid]
     count = max(n_valid - 1 - start, 0)
     transitions = float(movie.transitions[start + 1 : n_valid].sum())
@@ -100,7 +107,7 @@ def measure(config: Config, speed: float, p0: float, replicate: int) -> dict[str
     for k in range(1, min(len(places), n_frames // 2 + 1)):
         squared[k - 1] = np.mean(np.sum((places[k:] - places[:-k]) ** 2, axis=-1))
     rate = transitions / (count * config.interval) if count else np.nan
-    return {"squared": squared, "t1_rate": np.asarray(rate), "sound": np.asarray(count / n_frames)}
+    return {"squared": squared, "t1_rate": np.asarray(rate), "converged": np.asarray(count / n_frames)}
 
 
 @eqx.filter_jit

@@ -17,11 +17,12 @@ from scipy.stats import mannwhitneyu
 import vertax as vx
 from vertax import plotting, runs
 from vertax.inference import pearson
+from vertax.jobs import infer_from_microscopy as microscopy
 
 COLOURS = {"stiff": plotting.SERIES[0], "fluid": plotting.SERIES[1]}
 
 
-class Views(runs.Microscope):
+class Views(runs.MicroscopeSection):
     """The microscope; intensities are relative to the brightest membrane."""
 
     snr: list[float] = Field(default=[20.0, 6.0, 3.0], min_length=1)
@@ -41,17 +42,17 @@ class Config(runs.ExperimentConfig):
     """The tissue of an image."""
     microscope: Views = Views(pixels=288, background=0.15, vignetting=0.4, faint=0.05)
     """The microscope."""
-    preparation: runs.Preparation = runs.Preparation()
+    preparation: microscopy.Preparation = microscopy.Preparation()
     """Preparation of the images."""
-    segmentation: runs.Segmenter = runs.Segmenter()
+    segmentation: microscopy.Segmenter = microscopy.Segmenter()
     """Segmentation of the cells."""
-    model: runs.MicrographModel = runs.MicrographModel(border="pinned", rest_areas="equal")
+    model: microscopy.MicrographModel = microscopy.MicrographModel(border="pinned", rest_areas="equal")
     """Energy and first guess, the same for both conditions; the scale of the images is given."""
     fit: runs.Fitting = runs.Fitting(learning_rate=2e-2, epochs=120)
     """Fit of the parameters."""
     prior: float = Field(default=0.3, gt=0)
     """Standard deviation of a parameter without the image."""
-    relaxation: runs.Relaxation = runs.Relaxation(tolerance=1e-7)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(tolerance=1e-7)
     """Relaxation of the tissues."""
 
 
@@ -127,7 +128,7 @@ def infer(config: Config, pixels: Any, folder: runs.RunFolder, name: str, progre
         side = float(np.sqrt(config.tissue.n_cells))
         model = model.model_copy(update={"pixel_size": side / config.microscope.pixels})
     settings = config.preparation, config.segmentation, model, config.relaxation
-    micrograph = runs.read_micrograph(pixels, *settings)
+    micrograph = microscopy.read_micrograph(pixels, *settings)
     options: Any = {"partial": True, "progress": progress}
     optimiser, epochs = config.fit.build(), config.fit.epochs
     return micrograph, folder.fit(name, micrograph.problem, optimiser, epochs, **options)

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
-from experiments._shared import columns, plot_tensions
+from experiments._shared import TensionRange, columns, plot_tensions, replicate_keys, spread_of
 from vertax import plotting, runs
 from vertax.costs import AspectRatio, aspect_ratio
 from vertax.fitting import limits, member
@@ -39,7 +39,7 @@ class Config(runs.ExperimentConfig):
     """Size of the cluster in the figure, or the nearest one."""
     shown_target: float = Field(default=2.75, gt=1)
     """Its target, or the nearest one."""
-    tensions: runs.TensionRange = runs.TensionRange()
+    tensions: TensionRange = TensionRange()
     """Tensions of the edges and stiffness of the cells."""
     spread: float = Field(default=0.5, ge=0, lt=1)
     """Fraction of the range of tensions that the first ones are drawn from."""
@@ -49,7 +49,7 @@ class Config(runs.ExperimentConfig):
     """Fit to the aspect ratio of the start."""
     fit: runs.Fitting = runs.Fitting(learning_rate=0.1, epochs=200)
     """Fit of the logits of the tensions."""
-    relaxation: runs.Relaxation = runs.Relaxation(max_steps=300)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(max_steps=300)
     """Relaxation of the tissues."""
 
 
@@ -61,9 +61,11 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     for n in config.n_cells:
         designs[n] = start, fit = design(config, n, folder, progress)
         labels = [{"n_cells": str(n), "target": str(t), "replicate": str(k)} for t, k in members(config)]
-        tables.append(runs.histories(fit, labels) | {"aspect_ratio": fit.notes["ratio"].T.ravel()})
+        tables.append(
+            runs.history_table(fit.history, *labels) | {"aspect_ratio": fit.notes["ratio"].T.ravel()}
+        )
         metrics[f"{n} cells"] = measure(config, start, fit)
-        folder.save_table("history", runs.joined(tables))
+        folder.save_table("history", runs.concatenate(tables))
         for (target, k), ratio in zip(members(config), ratios_of(config, fit).ravel(), strict=True):
             error = {"aspect_ratio": ratio, "squared_error": (ratio - target) ** 2}
             rows.append({"n_cells": n, "target": target, "replicate": k} | error)
@@ -95,20 +97,20 @@ def design(config: Config, n_cells: int, folder: runs.RunFolder, progress: bool)
         response = vx.mechanics.BoxRelaxation(free="shape", relaxation=response)
         make = vx.initialise.periodic_voronoi
     problems = []
-    for key in runs.replicate_keys(config.seed, config.replicates):
+    for key in replicate_keys(config.seed, config.replicates):
         cluster = make(n_cells, key=key, lloyd_steps=2)
         energy = config.tensions.draw(cluster, config.spread, key)
         cost = AspectRatio(jnp.array(config.start_ratio), config.measure)
         levels: Any = {"adjoint": config.gradient.build(), "response": response}
         problems.append(vx.InverseProblem(cluster, energy, cost, **levels))
     name, options = f"{n_cells} cells", {"notes": note_ratio, "progress": progress}
-    start = runs.fit_side_by_side(folder, f"{name} first", problems, config.start, **options)
+    start = folder.fit_in_threads(f"{name} first", problems, config.start, **options)
     designs = []
     for target, k in members(config):
         tissue, energy = member((start.tissue, start.energy), k)
         parts = (tissue, energy, AspectRatio(jnp.array(target), config.measure))
         designs.append(eqx.tree_at(lambda p: (p.tissue, p.energy, p.cost), problems[k], parts))
-    return start, runs.fit_side_by_side(folder, name, designs, config.fit, **options)
+    return start, folder.fit_in_threads(name, designs, config.fit, **options)
 
 
 measure_ratio = eqx.filter_jit(aspect_ratio)
@@ -133,7 +135,7 @@ def measure(config: Config, start: vx.Fit, fit: vx.Fit) -> dict[str, Any]:
     limited_by = by_target(limits(fit, (squared <= config.accuracy**2).ravel()))
     num_t1, best_epoch = by_target(history.num_t1.sum(axis=0)), by_target(fit.best_epoch)
     return {
-        "start_ratio": runs.spread_of(ratios_of(config, start)),
+        "start_ratio": spread_of(ratios_of(config, start)),
         "squared_error_mean": squared.mean(),
         "squared_error_max": squared.max(),
         "reached_fraction": np.mean(limited_by == "reached"),
@@ -145,7 +147,7 @@ def measure(config: Config, start: vx.Fit, fit: vx.Fit) -> dict[str, Any]:
         "seconds_per_epoch": np.median(history.seconds),
         "targets": {
             str(target): {
-                "squared_error": runs.spread_of(squared[k]),
+                "squared_error": spread_of(squared[k]),
                 "ratios": ratios[k],
                 "num_t1": num_t1[k],
                 "best_epoch": best_epoch[k],

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
+from experiments._shared import replicate_keys
 from vertax import plotting, runs
 from vertax.fitting import member
 from vertax.inference import fit_onset
@@ -41,7 +42,7 @@ class Config(runs.ExperimentConfig):
     """The tissues."""
     fit: runs.Fitting = runs.Fitting(learning_rate=0.1, epochs=60)
     """Fit of the factors."""
-    relaxation: runs.Relaxation = runs.Relaxation(max_steps=500, contacts=False)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(max_steps=500, contacts=False)
     """Relaxation of the tissues."""
 
 
@@ -91,7 +92,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     table: dict[str, Any] = {"p0": config.shape_factors}
     for tuned, spread in zip(config.tuned, config.spreads, strict=True):
         problems = make_problems(config, tuned, spread)
-        fit = runs.fit_side_by_side(folder, tuned, problems, config.fit, progress=progress)
+        fit = folder.fit_in_threads(tuned, problems, config.fit, progress=progress)
         shape = (len(config.shape_factors), config.replicates)
         before, after = (np.asarray(x).reshape(shape) for x in (fit.history.cost[0], fit.cost))
         energies[tuned] = before, after
@@ -107,7 +108,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
 def make_problems(config: Config, tuned: Tuned, spread: float) -> list[vx.InverseProblem]:
     """One problem per shape factor and tissue; all shape factors have the same tissues and factors."""
-    keys = [jax.random.split(key) for key in runs.replicate_keys(config.seed, config.replicates)]
+    keys = [jax.random.split(key) for key in replicate_keys(config.seed, config.replicates)]
     first = config.tissue.draw(jnp.stack([pair[0] for pair in keys]))
     # The energy is stationary at equilibrium: the adjoint solves for rounding errors only, and may fail.
     levels: Any = {"adjoint": vx.ImplicitDifferentiation(throw=False), "response": config.relaxation.build()}

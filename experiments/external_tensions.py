@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from pydantic import Field, field_validator
+from pydantic import Field
 
 import vertax as vx
 from vertax import plotting, runs
@@ -33,12 +33,10 @@ class Foam(runs.Section):
     """Standard deviation of the tensions of edges."""
     stiffness: float = Field(default=10.0, gt=0)
     """Stiffness of the areas, not fitted."""
-    file: str = "synthetic"
+    file: str = Field(default="synthetic", min_length=1)
     """A dump of Surface Evolver with tensions, arcs and areas; or synthetic, for a random foam."""
     at_rest: bool = True
     """Relax the foam of a file under its true tensions first; otherwise its shape is the target as it is."""
-
-    _not_empty = field_validator("file")(runs.file_name)
 
 
 class Program(runs.Section):
@@ -122,7 +120,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         options: Any = {"truth": case.energy(case.true), "progress": progress}
         fit = folder.fit(name, problem, solver, config.fit.epochs, **options)
         history, label, best = fit.history, name.split()[-1].lower(), int(fit.best_epoch)
-        folder.save_table(f"history_{label}", runs.history_columns(history))
+        folder.save_table(f"history_{label}", runs.history_table(history))
         tensions[name] = inferred = np.asarray(fit.energy.terms[1].tension)
         errors[name], table[f"found_{label}"] = history.relative_error, inferred
         metrics |= {

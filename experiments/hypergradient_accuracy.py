@@ -43,7 +43,7 @@ class Case(eqx.Module):
 
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """Geometric means of the errors over replicates, and relative errors of the fits."""
-    scenes = benchmark.make_scenes(config, runs.Relaxation())
+    scenes = benchmark.make_scenes(config, runs.RelaxationSection())
     cases = [make_case(scene) for scene in scenes]
     return {
         "hypergradient": scan_tolerances(config, cases, folder),

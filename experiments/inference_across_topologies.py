@@ -84,7 +84,7 @@ class Config(runs.ExperimentConfig):
     """Gradients through the equilibrium."""
     fit: runs.Fitting = runs.Fitting(epochs=350)
     """Fit of the parameters."""
-    relaxation: runs.Relaxation = runs.Relaxation(tolerance=1e-8)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(tolerance=1e-8)
     """Relaxation of the tissues."""
 
 
@@ -115,8 +115,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         last = [mismatched_neighbours(member(fit.tissue, k), s.target) for k, s in enumerate(scenes)]
         metrics[method.name] = measure(batch, fit, last) | mismatch(last, n_edges)
         labels = [{"method": method.name, "replicate": str(k)} for k in range(len(scenes))]
-        tables.append(runs.histories(fit, labels))
-        folder.save_table("history", runs.joined(tables))
+        tables.append(runs.history_table(fit.history, *labels))
+        folder.save_table("history", runs.concatenate(tables))
     true, initial = (np.asarray(e.target_shape_factor) for e in (batch.truth, batch.guess))
     replicate, cell = (index.ravel() for index in np.indices(true.shape))
     inferred = {n: np.asarray(fit.energy.target_shape_factor).ravel() for n, fit in fits.items()}

@@ -50,7 +50,9 @@ class Config(runs.ExperimentConfig):
     """Periods; the last one is measured."""
     n_cells: int = Field(default=25, ge=0)
     """Cells of the disordered tissue; 0 skips it."""
-    relaxation: runs.Relaxation = runs.Relaxation(transitions=False, contacts=False, tolerance=1e-10)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(
+        transitions=False, contacts=False, tolerance=1e-10
+    )
     """Relaxation of each step."""
 
     @field_validator("frequencies")
@@ -91,7 +93,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             compute = lambda: {"modulus": measure(config, tissue, energy, frequencies[index])}
             return folder.part(f"{name} {frequencies[index]:g}", compute)["modulus"]
 
-        parts = runs.side_by_side(one, len(frequencies), folder, progress=progress, unit="frequency")
+        parts = folder.map_in_threads(one, len(frequencies), progress=progress, unit="frequency")
         values: Any = np.stack(parts)
         measured[name] = values
         for label, moduli in (("measured", values), ("expected", expected)):
@@ -126,7 +128,7 @@ def make_samples(config: Config, frequencies: np.ndarray) -> dict[str, Sample]:
     if config.n_cells:
         key, friction = jax.random.key(config.seed), SubstrateFriction(config.friction)
         first = vx.initialise.periodic_voronoi(config.n_cells, key=key, lloyd_steps=2)
-        tissue = runs.Relaxation(contacts=False).build()(first, energy).tissue
+        tissue = runs.RelaxationSection(contacts=False).build()(first, energy).tissue
         moduli = mechanics.complex_modulus(tissue, energy, friction, jnp.asarray(frequencies), angle=0.0)
         samples["disordered"] = (tissue, energy, np.asarray(moduli))
     return samples

@@ -56,7 +56,7 @@ class Config(runs.ExperimentConfig):
     """Stiffness of perimeters; that of areas is 1."""
     shape_factor: float = Field(default=3.5, ge=0)
     """Target perimeter over the root of the target area."""
-    relaxation: runs.Relaxation = runs.Relaxation(contacts=True)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(contacts=True)
     """Relaxation of each step."""
     animation: bool = True
     """Draw an animation."""
@@ -89,14 +89,16 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     times = jnp.linspace(0, config.duration, config.frames + 1)
     grown = vx.growth.grow(straight.with_capacity(config.room), energy, cycle, times, **options)
     seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - worked
-    if not grown.sound[-1]:
-        folder.warn("Some step came to no end, or cells overlap: see the column `sound`.")
-    if grown.full:
+    full = bool(grown.result == vx.RESULTS.capacity_reached)
+    if full:
         folder.warn(f"There was no room for more than {config.room} cells: raise `room`.")
+    elif not grown.converged:
+        folder.warn(f"A step failed, see the column `converged`: {vx.RESULTS[grown.result]}")
     frames, times, n_cells = list(grown.trajectory), np.asarray(grown.times), np.asarray(grown.n_alive)
     counts = np.stack([polygon_classes(frame) for frame in frames])
     table = {"time": times, "cells": n_cells, "inner_cells": counts.sum(axis=1)}
-    table |= {"sound": np.asarray(grown.sound)} | {f"sides_{n}": counts[:, k] for k, n in enumerate(SIDES)}
+    converged = np.asarray(grown.results == vx.RESULTS.successful)
+    table |= {"converged": converged} | {f"sides_{n}": counts[:, k] for k, n in enumerate(SIDES)}
     folder.save_table("classes", table)
     count = min(int(grown.lineage.count), grown.lineage.mother.shape[0])
     names = ("mother", "begun", "ended", "fate")
@@ -124,8 +126,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         "classes_of_divisions_alone": {int(n): float(x) for n, x in zip(SIDES, chain, strict=True)},
         "mean_sides": float(SIDES @ last / inner),
         "died": int(np.sum(np.asarray(grown.lineage.fate) == 2)),
-        "sound": bool(grown.sound[-1]),
-        "full": bool(grown.full),
+        "converged": bool(grown.converged),
+        "full": full,
         "growth_seconds": seconds,
         "growth_cpu_seconds": cpu_seconds,
         "seconds": time.perf_counter() - began,

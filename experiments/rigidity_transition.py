@@ -54,7 +54,7 @@ class Config(runs.ExperimentConfig):
     """Tissues that are relaxed as one batch: 1 is best on CPUs, all of them on a GPU."""
     resamples: int = Field(default=500, ge=10)
     """Bootstrap samples of the intervals."""
-    relaxation: runs.Relaxation = runs.Relaxation(max_steps=500)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(max_steps=500)
     """Relaxation of the tissues."""
 
 
@@ -86,7 +86,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         modes = np.asarray(count_zero_modes(some, p0), float) if config.modes else np.zeros(0)
         return {name: np.asarray(x) for name, x in results.items()} | {"shapes": shapes, "modes": modes}
 
-    results = runs.scan("p0", config.shape_factors, compute, folder, progress=progress)
+    results = folder.scan("p0", config.shape_factors, compute, progress=progress)
     seconds, energies = time.perf_counter() - began, results["energy"] / config.tissue.n_cells
     zero, converged, x = energies < config.zero_energy, results["converged"], np.asarray(config.shape_factors)
     metrics: dict[str, Any] = {}

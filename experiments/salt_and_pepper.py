@@ -16,6 +16,7 @@ from matplotlib.ticker import PercentFormatter
 from pydantic import Field
 
 import vertax as vx
+from experiments._shared import TensionRange, replicate_keys, spread_of
 from vertax import plotting, runs
 from vertax.costs import HomotypicLength
 from vertax.fitting import limits, member
@@ -40,7 +41,7 @@ class Config(runs.ExperimentConfig):
     """Cost by the fraction of these interfaces, instead of their length as in the paper."""
     tissue: runs.TissueSection = runs.TissueSection(lloyd_steps=3)
     """The tissues."""
-    tensions: runs.TensionRange = runs.TensionRange(low=0.05, high=0.2)
+    tensions: TensionRange = TensionRange(low=0.05, high=0.2)
     """Tensions of the edges and stiffness of the cells."""
     spread: float = Field(default=0.0, ge=0, lt=1)
     """Fraction of the range of tensions that the first ones are drawn from; 0: all are equal."""
@@ -48,7 +49,7 @@ class Config(runs.ExperimentConfig):
     """Gradients through the equilibrium."""
     fit: runs.Fitting = runs.Fitting(learning_rate=0.1, epochs=150)
     """Fit of the logits of the tensions."""
-    relaxation: runs.Relaxation = runs.Relaxation(max_steps=300)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(max_steps=300)
     """Relaxation of the tissues."""
 
 
@@ -60,12 +61,12 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     for boundary, n_types in ((b, n) for b in config.boundaries for n in config.n_types):
         name, problems = f"{boundary}, {n_types} types", make_problems(config, boundary, n_types)
         options: Any = {"notes": note_fraction, "progress": progress}
-        fit = runs.fit_side_by_side(folder, name, problems, config.fit, **options)
+        fit = folder.fit_in_threads(name, problems, config.fit, **options)
         curves[name] = fractions = fit.notes["share"]
         label = {"boundary": boundary, "n_types": str(n_types)}
         labels = [label | {"replicate": str(k)} for k in range(config.replicates)]
-        tables.append(runs.histories(fit, labels) | {"heterotypic_share": fractions.T.ravel()})
-        folder.save_table("history", runs.joined(tables))
+        tables.append(runs.history_table(fit.history, *labels) | {"heterotypic_share": fractions.T.ravel()})
+        folder.save_table("history", runs.concatenate(tables))
         best = np.take_along_axis(fractions, np.maximum(fit.best_epoch, 0)[None], axis=0)[0]
         metrics[name] = measure(config, fit, fractions, best)
         panels = panels or make_panels(config, problems[0], fit, (fractions[0, 0], best[0]), folder)
@@ -79,7 +80,7 @@ def make_problems(config: Config, boundary: str, n_types: int) -> list[vx.Invers
     make, n_cells = vx.initialise.free_voronoi, config.tissue.n_cells
     make = make if boundary == "free" else vx.initialise.periodic_voronoi
     problems = []
-    for key in runs.replicate_keys(config.seed, config.replicates):
+    for key in replicate_keys(config.seed, config.replicates):
         keys = jax.random.split(key, 3)
         tissue = make(n_cells, key=keys[0], lloyd_steps=config.tissue.lloyd_steps)
         types = jax.random.permutation(keys[1], jnp.arange(n_cells) % n_types)
@@ -106,9 +107,9 @@ def measure(config: Config, fit: vx.Fit, fractions: np.ndarray, best: np.ndarray
     history, reached = fit.history, best >= 1 - config.accuracy
     near = fractions.mean(axis=1) >= 1 - 2 * config.accuracy
     return {
-        "share_initial": runs.spread_of(fractions[0]),
-        "share_best": runs.spread_of(best),
-        "share_last": runs.spread_of(fractions[-1]),
+        "share_initial": spread_of(fractions[0]),
+        "share_best": spread_of(best),
+        "share_last": spread_of(fractions[-1]),
         "share_best_mean": best.mean(),
         "share_best_min": best.min(),
         "epochs_to_twice_the_accuracy": int(np.argmax(near)) if near.any() else None,

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
-from experiments._shared import columns
+from experiments._shared import columns, spread_of
 from vertax import mechanics, plotting, runs
 from vertax.energies import ShapeFactorEnergy
 from vertax.plotting import INK, SERIES
@@ -47,7 +47,7 @@ class Config(runs.ExperimentConfig):
     """Shear stress below which a tissue counts as fluid."""
     tissue: runs.TissueSection = runs.TissueSection(n_cells=64, lloyd_steps=5)
     """The tissues."""
-    relaxation: runs.Relaxation = runs.Relaxation(max_steps=1000, contacts=False)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(max_steps=1000, contacts=False)
     """Relaxation of the tissues; moduli do not include forces of contacts."""
 
 
@@ -83,7 +83,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         courses = [shear(tissue, p0 + excess, *settings) for tissue, p0 in edges]
         return columns(courses)
 
-    curves = runs.scan("excess", config.excess, compute, folder, progress=progress)
+    curves = folder.scan("excess", config.excess, compute, progress=progress)
     pairs, rows = [], []
     for i, k in np.ndindex(len(config.excess), len(edges)):
         one = {name: values[i, k] for name, values in curves.items()}
@@ -101,9 +101,9 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     by_excess = lambda name, f: {key: f(table[name][rows]) for key, rows in chosen.items()}
     return {
         "sheared": len(rows),
-        "transition": runs.spread_of(table["p0"]),
-        "critical_strain": by_excess("critical_strain", runs.spread_of),
-        "factor": by_excess("factor", runs.spread_of),
+        "transition": spread_of(table["p0"]),
+        "critical_strain": by_excess("critical_strain", spread_of),
+        "factor": by_excess("factor", spread_of),
         "factor_median": by_excess("factor", lambda values: float(np.median(values))),
     }
 
@@ -173,7 +173,11 @@ def shear(rest: vx.Tissue, p0: Any, strains: Any, zero_stress: Any, fixed: Any) 
             return jax.lax.cond(jnp.abs(stress[0, 1]) > zero_stress, solid, lambda: jnp.zeros_like(rotation))
 
         moduli = jax.lax.map(modulus, (arrays, course.stresses))
-        return {"stress": course.stresses[:, 0, 1], "modulus": moduli, "converged": course.converged}
+        return {
+            "stress": course.stresses[:, 0, 1],
+            "modulus": moduli,
+            "converged": course.results == vx.RESULTS.successful,
+        }
 
     return jax.lax.map(one_side, jnp.array([1.0, -1.0], strains.dtype))
 

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
-from experiments._shared import plot_tensions
+from experiments._shared import TensionRange, plot_tensions
 from vertax import plotting, runs
 from vertax.costs import aspect_ratio
 from vertax.energies import AreaElasticity, LineTension
@@ -41,13 +41,13 @@ class Config(runs.ExperimentConfig):
     """Knots of each tension in time."""
     friction: float = Field(default=1.0, gt=0)
     """Friction of a vertex with the substrate."""
-    tensions: runs.TensionRange = runs.TensionRange()
+    tensions: TensionRange = TensionRange()
     """Range of the tensions of edges, and stiffness of the cells."""
     fit: runs.Fitting = runs.Fitting(learning_rate=0.1, epochs=120)
     """Fit of the logits of the tensions."""
     gradient: runs.Gradient = runs.Gradient()
     """Gradients through each step."""
-    relaxation: runs.Relaxation = runs.Relaxation(max_steps=500)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(max_steps=500)
     """Relaxation of each step."""
 
 
@@ -96,7 +96,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         problem = vx.InverseProblem(tissue, material, cost, **levels)
         optimiser, epochs = config.fit.build(), config.fit.epochs
         fit = folder.fit(name, problem, optimiser, epochs, partial=True, progress=progress)
-        folder.save_table(f"history_{name}", runs.history_columns(fit.history))
+        folder.save_table(f"history_{name}", runs.history_table(fit.history))
         movie, schedule = evolution(tissue, fit.energy, throw=False), fit.energy.energy
         ratios[name] = np.asarray(eqx.filter_jit(eqx.filter_vmap(aspect_ratio))(movie.frames))
         distance = ratios[name][1:] - course[1:]
@@ -104,7 +104,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             "rms": np.sqrt(np.mean(distance**2)),
             "largest": np.max(np.abs(distance)),
             "num_t1": movie.num_t1,
-            "sound": bool(movie.sound[-1]),
+            "converged": bool(movie.converged),
             "seconds_per_epoch": np.median(fit.history.seconds),
         }
     folder.save_table("course", {"time": times, "course": course} | ratios)

@@ -36,7 +36,7 @@ class Config(runs.ExperimentConfig):
     """Smallest shear modulus of a solid tissue, relative to the affine one."""
     tissue: runs.TissueSection = runs.TissueSection(n_cells=64)
     """The tissues."""
-    relaxation: runs.Relaxation = runs.Relaxation(max_steps=1000, contacts=False)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(max_steps=1000, contacts=False)
     """Relaxation of the tissues; moduli do not include forces of contacts."""
 
 
@@ -51,7 +51,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         measured = measure(first, jnp.asarray(p0), response)
         return {name: np.asarray(value) for name, value in measured.items()}
 
-    measured = runs.scan("p0", config.shape_factors, compute, folder, progress=progress)
+    measured = folder.scan("p0", config.shape_factors, compute, progress=progress)
     valid = measured["converged"] & np.isfinite(measured["shear"])
     values = {name: np.where(valid, measured[name], np.nan) for name in NAMES}
     means = {name: mean(value) for name, value in values.items()}

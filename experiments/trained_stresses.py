@@ -24,6 +24,7 @@ from optimistix import LevenbergMarquardt
 from pydantic import Field
 
 import vertax as vx
+from experiments._shared import replicate_keys
 from vertax import energies, plotting, runs
 from vertax.costs import CellStress
 from vertax.mechanics import cell_stress
@@ -63,7 +64,9 @@ class Config(runs.ExperimentConfig):
     """The clamp of coupled learning."""
     fit: runs.Fitting = runs.Fitting(learning_rate=0.05, epochs=200)
     """Optimiser of the logits of the tensions, the same for all rules."""
-    relaxation: runs.Relaxation = runs.Relaxation(max_steps=300, contacts=False, transitions=False)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(
+        max_steps=300, contacts=False, transitions=False
+    )
     """Relaxation of the tissues."""
 
 
@@ -74,7 +77,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         raise runs.ConfigError(
             f"trained must be at most tissue.n_cells, {config.tissue.n_cells}, but is {max(config.trained)}."
         )
-    tissues = [prepare(config, key) for key in runs.replicate_keys(config.seed, config.replicates)]
+    tissues = [prepare(config, key) for key in replicate_keys(config.seed, config.replicates)]
     errors: dict[str, np.ndarray] = {}
     directions: dict[str, np.ndarray] = {}
     courses: list[Any] = []
@@ -89,7 +92,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             constants = None if clamp is None else (jnp.asarray(clamp.stiffness), jnp.asarray(clamp.share))
             return learn(problem, config.fit.build(), config.fit.epochs, constants)
 
-        courses = runs.side_by_side(one, shape[0] * shape[1], folder, progress=progress, unit=rule)
+        courses = folder.map_in_threads(one, shape[0] * shape[1], progress=progress, unit=rule)
         cost = np.stack([np.where(converged, cost, np.nan) for cost, converged, *_ in courses])
         errors[rule] = np.sqrt(cost / cost[:, :1]).reshape(*shape, config.fit.epochs)
         if rule != "least_squares":

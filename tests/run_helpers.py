@@ -4,12 +4,13 @@ import csv
 import json
 
 from vertax.runs import RunFolder, load_config
+from vertax.runs._execution import new_folder, write_config
 
 
 def run(path, output, *overrides):
     experiment, config = load_config(path, overrides)
-    folder = RunFolder.claim(path.stem, output)
-    folder.save_config(config)
+    folder = RunFolder(new_folder(output, output))
+    write_config(folder.path, config)
     folder.save_metrics(experiment.run(config, folder, progress=False))
     return folder.path, json.loads((folder.path / "metrics.json").read_text())
 

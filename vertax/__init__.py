@@ -11,7 +11,10 @@ _imported, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> object:
     if name == "__version__":  # reading it takes milliseconds, which an import alone does not need
-        from vertax.runs._versions import installed_version
+        from importlib import metadata
 
-        return installed_version("vertax")
+        try:
+            return metadata.version("vertax")
+        except metadata.PackageNotFoundError:  # run from the source folder
+            return "(not installed)"
     return _imported(name)

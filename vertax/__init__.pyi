@@ -21,6 +21,7 @@ from . import (
 )
 from ._base.compilation_cache import enable_compilation_cache as enable_compilation_cache
 from ._base.fast_compilation import enable_fast_compilation as enable_fast_compilation
+from ._base.results import RESULTS as RESULTS
 from .activities import AbstractActivity as AbstractActivity
 from .adjoints import (
     AutomaticDifferentiation as AutomaticDifferentiation,
@@ -63,7 +64,6 @@ from .plotting import (
     plot_tissue as plot_tissue,
 )
 from .relax import (
-    RESULTS as RESULTS,
     AbstractResponse as AbstractResponse,
     Equilibrium as Equilibrium,
     Relaxation as Relaxation,

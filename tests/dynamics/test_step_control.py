@@ -107,7 +107,7 @@ def test_rejected_steps_do_not_change_the_state():
     times = [0.0, 0.1, 0.3]
     control = StepControl(2e-3, first=0.1, most=60)
     run = vx.evolve(tissue, energy, FRICTION, times, relaxation=NO_CONTACT, control=control)
-    assert run.refused.sum() > 0  # the first step is far too long
+    assert run.num_rejected.sum() > 0  # the first step is far too long
     assert run.num_t1 == run.transitions.sum() > 0
     assert (jnp.diff(run.energies) < 0).all()
     fixed = vx.evolve(tissue, energy, FRICTION, times, relaxation=NO_CONTACT, substeps=100)
@@ -132,5 +132,5 @@ class TestErrors:
             vx.Evolution(FRICTION, [0.0, 1.0], control=0.1)  # pyright: ignore[reportArgumentType]
 
     def test_too_few_steps_raise(self):
-        with pytest.raises(RuntimeError, match="a greater `most`"):
+        with pytest.raises(RuntimeError, match="Raise `most` of the `StepControl`"):
             evolved(control=StepControl(1e-6, most=3))

@@ -6,7 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from vertax.runs import RunFolder, find_experiment, validate
+from vertax.runs import RunFolder
+from vertax.runs._config import validate
+from vertax.runs._execution import new_folder
+from vertax.runs._registry import find_experiment
 
 pytestmark = pytest.mark.experiments
 
@@ -15,7 +18,7 @@ def run(tmp_path, name="benchmark_adjoints", **changes):
     experiment = find_experiment(name)
     small = {"replicates": 2, "tissue": {"n_cells": 8}}
     config = validate(experiment.config, small | changes)
-    folder = RunFolder.claim("benchmark", tmp_path / name)
+    folder = RunFolder(new_folder(tmp_path / name))
     folder.save_metrics(experiment.run(config, folder, progress=False))
     return folder, json.loads((folder.path / "metrics.json").read_text())
 

@@ -8,8 +8,8 @@ import pytest
 from run_helpers import run, table
 
 import vertax as vx
+from experiments._shared import TensionRange
 from vertax.costs import HomotypicLength, aspect_ratio
-from vertax.runs import TensionRange
 
 pytestmark = pytest.mark.experiments
 

@@ -23,6 +23,7 @@ from experiments import (
     salt_and_pepper,
     tissue_moduli,
 )
+from vertax.inference._mean_stress import mean_stress
 from vertax.jobs import design_mechanics, infer_from_microscopy, infer_tensions
 from vertax.plotting import label_colours
 
@@ -111,7 +112,9 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
         labels=np.arange(1, 7),
         noise=0.1,
         correlation=0.1,
-        model_errors=(0.0, 0.0),
+        edges="arcs",
+        errors={"junction": 0.0, "arc": 0.0},
+        mean_stress=mean_stress(np.zeros(3), np.zeros((3, 3)), 7),
         bending=0.0,
         pixel_size=0.4,
         four_fold=edges < 0,

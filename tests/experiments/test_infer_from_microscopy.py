@@ -9,6 +9,7 @@ from PIL import Image
 
 import vertax as vx
 from vertax.runs import ConfigError, RunFolder, load_config
+from vertax.runs._execution import new_folder
 
 pytestmark = pytest.mark.experiments
 
@@ -30,7 +31,7 @@ CONFIG = "configs/infer_from_microscopy.toml"
 
 def run(folder, *overrides, root):
     experiment, config = load_config(root / CONFIG, overrides)
-    return experiment.run(config, RunFolder.claim("x", folder), progress=False)
+    return experiment.run(config, RunFolder(new_folder(folder)), progress=False)
 
 
 def test_the_fitted_mesh_follows_the_membranes_better(picture, tmp_path, pytestconfig):
@@ -88,7 +89,7 @@ fit = { learning_rate = 2e-2, epochs = 25 }
 def test_two_conditions_go_from_pixels_to_shape_factors(tmp_path):
     (tmp_path / "tiny.toml").write_text(CONDITIONS)
     experiment, config = load_config(tmp_path / "tiny.toml", ())
-    folder = RunFolder.claim("x", tmp_path / "run")
+    folder = RunFolder(new_folder(tmp_path / "run"))
     metrics = experiment.run(config, folder, progress=False)["SNR 20"]
     assert metrics["images"] == metrics["images_wanted"] == 2
     with open(tmp_path / "run" / "cells.csv") as file:

@@ -10,15 +10,10 @@ import pytest
 from run_helpers import run, table
 
 import vertax as vx
-from vertax.runs import (
-    EXPERIMENTS,
-    ConfigError,
-    RunFolder,
-    RunFolderError,
-    find_experiment,
-    load_config,
-    summary,
-)
+from vertax.runs import RunFolder, load_config
+from vertax.runs._execution import new_folder
+from vertax.runs._folder import RunFolderError
+from vertax.runs._tables import summary
 
 pytestmark = pytest.mark.experiments
 
@@ -142,7 +137,7 @@ def test_figures_are_pictures(tiny):
 
 
 def test_an_earlier_run_is_not_overwritten_by_default(tmp_path):
-    claim = lambda **options: RunFolder.claim("demo", root=tmp_path, **options).path
+    claim = lambda **options: new_folder(tmp_path / "demo", **options)
     first = claim()
     assert first == tmp_path / "demo"
     assert claim() == first  # still empty
@@ -160,15 +155,15 @@ def test_overwriting_removes_a_run_and_nothing_else(tmp_path):
     (tmp_path / "figures").mkdir()
     for name in (*results, "notes.txt"):
         (tmp_path / name).write_text("old")
-    RunFolder.claim("demo", tmp_path, overwrite=True)
+    new_folder(tmp_path / "demo", tmp_path, overwrite=True)
     assert (tmp_path / "notes.txt").exists()
-    assert not any((tmp_path / name).exists() for name in results if name != "config.toml")
+    assert not any((tmp_path / name).exists() for name in results)
 
 
 def test_a_folder_that_holds_no_run_is_not_overwritten(tmp_path):
     (tmp_path / "thesis.csv").write_text("years")
     with pytest.raises(RunFolderError, match="holds no run"):
-        RunFolder.claim("demo", tmp_path, overwrite=True)
+        new_folder(tmp_path / "demo", tmp_path, overwrite=True)
     assert (tmp_path / "thesis.csv").exists()
 
 
@@ -176,9 +171,9 @@ def test_a_file_in_the_way_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     for output in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(RunFolderError, match="there is a file of that name"):
-            RunFolder.claim("demo", output)
+            new_folder(tmp_path / "demo", output)
     with pytest.raises(RunFolderError, match="there is a file of that name"):
-        RunFolder.claim("demo", root=tmp_path / "file")
+        new_folder(tmp_path / "file" / "demo")
 
 
 def test_metrics_are_strict_json(tmp_path):
@@ -201,9 +196,3 @@ def test_a_summary_shows_the_numbers():
     grouped = summary({"a": {"cost": 1.0}, "b": {"cost": 2, "error": None}})
     assert grouped.split() == ["a", "b", "cost", "1", "2"]
     assert summary({"ok": "yes"}) == ""
-
-
-def test_experiments_are_found_by_name():
-    assert find_experiment("infer_shape_factors") is EXPERIMENTS["infer_shape_factors"]
-    with pytest.raises(ConfigError, match="did you mean"):
-        find_experiment("infer_shape")

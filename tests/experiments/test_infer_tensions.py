@@ -7,7 +7,8 @@ from PIL import Image
 from run_helpers import run, table
 
 import vertax as vx
-from vertax.runs import find_experiment, validate
+from vertax.runs._config import validate
+from vertax.runs._registry import find_experiment
 
 pytestmark = pytest.mark.experiments
 

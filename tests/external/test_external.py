@@ -100,7 +100,7 @@ def test_gradient_equals_implicit_differentiation(case, implicit):
     cosine = gradient @ implicit / np.linalg.norm(gradient) / np.linalg.norm(implicit)
     assert cosine > 1 - 1e-10
     assert evaluation.equilibrium.converged
-    assert evaluation.outcome.trusted
+    assert evaluation.outcome.converged
 
 
 def test_one_sided_error_is_of_first_order(case, implicit):
@@ -214,7 +214,7 @@ def test_failure_of_a_nudged_run_makes_the_gradient_unreliable(case, set_failure
     lenient = problem(case, adjoint=vx.EquilibriumPropagation(throw=False))
     evaluation = evaluate(lenient)
     assert evaluation.equilibrium.converged
-    assert not evaluation.outcome.trusted
+    assert not evaluation.outcome.converged
 
 
 @pytest.mark.thorough

@@ -376,7 +376,7 @@ def test_interrupted_fit_returns_completed_epochs(hidden):
     fit = vx.fit(problem, ADAM, 100, truth=truth, progress=False, callback=interrupt)
     # Epoch 4 was interrupted and is not recorded.
     assert len(fit.history.cost) == 4
-    assert fit.interrupted
+    assert fit.result == vx.RESULTS.interrupted
 
 
 @pytest.mark.thorough
@@ -390,7 +390,7 @@ def test_interrupted_least_squares_fit_returns_completed_epochs(hidden):
 
     problem = inverse_problem(start, guess, VertexDistance(target))
     fit = vx.fit(problem, LEAST_SQUARES, 12, truth=truth, progress=False, callback=interrupt)
-    assert fit.interrupted
+    assert fit.result == vx.RESULTS.interrupted
     np.testing.assert_array_equal(fit.notes["cost"], fit.history.cost)
     assert len(fit.history.cost) == 3
     assert fit.cost < 1e-2 * fit.history.cost[0]

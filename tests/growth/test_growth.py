@@ -1,5 +1,7 @@
 """Growth of tissues: divisions, deaths, lineage and gradients."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,7 +48,7 @@ def test_cells_divide_and_the_tissue_stays_valid(grown):
     for frame in grown.trajectory:
         frame.topology.validate()
         assert not frame.overlaps.any
-    assert grown.sound.all()
+    assert grown.converged
     np.testing.assert_array_equal(grown.number[-1] >= 0, grown.tissue.alive)
     # A daughter inherits half the target area of the mother.
     young = np.asarray(grown.tissue.alive & (grown.cells.age == 0))
@@ -65,7 +67,8 @@ def test_failed_divisions_and_deaths_are_counted():
         frame.topology.validate()
         assert not frame.overlaps.any
     # Failed divisions are counted once all slots are used.
-    assert grown.full
+    assert grown.result == vx.RESULTS.capacity_reached
+    assert not grown.converged
     failed = np.asarray(grown.failed_divisions)
     assert failed[-1] > 0
     assert (failed[np.asarray(grown.n_alive) < 5] == 0).all()
@@ -106,8 +109,14 @@ def test_lineage_is_a_binary_forest(grown):
 
 def test_exhausted_capacity_and_invalid_arguments_are_rejected(grown, without_type_checks):
     cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 5, 6)
-    with pytest.raises(RuntimeError, match="capacity of 9 cells"):
-        eqx.tree_at(lambda g: g.full, grown, jnp.array(True)).checked()
+    result = lambda time: vx.RESULTS.where(
+        time > 3, vx.RESULTS.capacity_reached, vx.RESULTS.successful
+    )
+    full = dataclasses.replace(grown, results=jax.vmap(result)(grown.times))
+    with pytest.raises(RuntimeError, match=r"all cell slots .* alive.*9 cell slots"):
+        full.checked()
+    with pytest.raises(RuntimeError, match=r"all cell slots .* alive"):
+        jax.block_until_ready(eqx.filter_jit(lambda g: g.checked().times)(full))
     with pytest.raises(ValueError, match="with_capacity"):
         grow(random_tissue(6), energy_of, cycle, times, key=0)
     with pytest.raises(ValueError, match="orientation"):

@@ -62,7 +62,7 @@ def test_a_missing_cell_is_a_hole_with_undetermined_sides(foam, mask, inner):
     assert hole.row == pytest.approx(row, abs=0.1)
     assert hole.column == pytest.approx(column, abs=0.1)
     assert any(
-        f"a hole of {hole.pixels} pixels at row {hole.row:.0f}" in d for d in inferred.doubts
+        f"a hole of {hole.pixels} pixels at row {hole.row:.0f}" in d for d in inferred.warnings
     )
     table = inferred.cell_table()
     np.testing.assert_array_equal(table["hole"], table["label"] == 0)
@@ -75,7 +75,7 @@ def test_contacts_across_a_closed_hole_are_not_determined(foam, mask, inner):
     assert inferred.edge_table()["contact_closed"].any()
     assert invented(inferred, foam) == []
     assert len(inferred.mask_report.of_kind("closed hole")) == 1
-    assert any("holes that were closed" in doubt for doubt in inferred.doubts)
+    assert any("holes that were closed" in text for text in inferred.warnings)
 
 
 @pytest.mark.parametrize("boundary", ["periodic", "mirrored"])
@@ -101,7 +101,7 @@ def test_distant_cells_with_one_label_are_two_cells(foam, mask, inner):
     (change,) = inferred.mask_report.of_kind("new cell")
     assert change.label == inner
     assert change.into == 15  # the first number that is free
-    assert any(f"label {inner} is in several pieces" in doubt for doubt in inferred.doubts)
+    assert any(f"label {inner} is in several pieces" in text for text in inferred.warnings)
     pixels = [np.sum(mask == label) for label in (inner, far)]
     split = np.isin(inferred.labels, [inner, change.into])
     assert sorted(inferred.mask_report.cell_pixels[split]) == sorted(pixels)

@@ -81,7 +81,7 @@ def test_the_watch_counts_what_differs():
         converged=flags,
         num_steps=counts,
         num_t1=counts,
-        sound=flags,
+        result=vx.RESULTS.successful,
         **dict.fromkeys((*names, *slopes), numbers),
     )
     notes = watch(0, record)

@@ -81,7 +81,7 @@ STATED_RESULTS = {
     ),
     "docs/index.md": lambda names: names["fit"].history.relative_error[-1] < 1e-5,
     "docs/masks.md": lambda names: (
-        names["found"].determined.sum() > 15 and not names["found"].doubts
+        names["found"].determined.sum() > 15 and not names["found"].warnings
     ),
     "docs/performance.md": lambda names: jnp.allclose(
         names["batch"], jnp.stack([names["relaxed_energy"](p0) for p0 in names["factors"]])

@@ -36,6 +36,7 @@ LAYERS = [
 ]
 # The packages with public names that jobs and experiments may import.
 PUBLIC = {"vertax", *(f"vertax.{name}" for name in LAYERS if name != "_base")}
+PUBLIC |= {f"vertax.jobs.{path.stem}" for path in (ROOT / "jobs").glob("[!_]*.py")}
 
 
 def module_name(path: Path) -> str:

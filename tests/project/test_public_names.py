@@ -31,11 +31,12 @@ PACKAGES = {
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty doubts "
     "fit limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
-    "inference": "EdgeMotion Event InferredTensions Micrograph Microscope Movie MovieFit MovingTensions "
-    "PinnedEnergy RecoveryWatch Scene Transition fit_movie fit_onset fit_transition foam_energy "
-    "foam_terms infer_tensions label_image micrograph_problem movie_from_table pearson read_mask "
-    "relative_error "
-    "same_neighbours shape_factor_scene",
+    "inference": "EdgeMotion Event InferredTensions MaskFrame Micrograph Microscope Movie MovieFit "
+    "MovingTensions PinnedEnergy RecoveryWatch Scene TensionsOfMasks Transition check_any "
+    "column_descriptions find_masks fit_movie fit_onset fit_transition foam_energy "
+    "foam_terms frame_summary frame_table infer_tensions infer_tensions_of_masks "
+    "join_frames label_image length_unit micrograph_problem movie_from_table pearson "
+    "read_mask relative_error same_neighbours shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport PolygonTissue "
     "Segmentation Watershed "
     "free_voronoi from_labels from_microscopy from_polygons hexagonal labels_from_skeleton "
@@ -43,21 +44,21 @@ PACKAGES = {
     "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_edge_table from_tables "
     "from_tyssue load_energy load_problem load_tissue load_trajectory pixel_aspect pixel_sides "
     "read_force_inference "
-    "read_geojson read_image read_surface_evolver read_table save_energy save_problem save_tissue "
+    "read_geojson read_image read_stack read_surface_evolver read_table save_energy save_problem save_tissue "
     "save_trajectory to_tables write_csv write_geojson write_vtk write_vtk_series",
     "mechanics": "BoxRelaxation Modes Ramp SelfStress bulk_modulus cell_stress compatibility "
     "complex_modulus deformed density_of_states elastic_tensor modes pressures "
     "principal pure_shear ramp recoil self_stresses shear_modulus simple_shear "
     "spectrum stress tensions velocities youngs_modulus zero_modes",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology Trajectory cell_polygons pad",
-    "plotting": "INK SERIES animate cell_polygons flipped_edges house_style label_colours "
+    "plotting": "INK SERIES animate animate_figures cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
     "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tissue "
     "plot_tissues same_limits scale_bar series_colours tension_layer",
     "dynamics": "Evolution Evolved Material StepControl evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
-    "relax": "AbstractResponse Equilibrium RESULTS Relaxation equilibrate record_relaxation",
+    "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
     "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "TruncatedCG VertexTrustRegion Wrapped",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",

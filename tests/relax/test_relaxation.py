@@ -246,7 +246,7 @@ def test_the_protocol_of_the_paper_reports_no_convergence():
 
 def test_no_convergence_is_an_error_by_default_and_a_result_otherwise():
     tissue, energy = random_tissue(12, 0), ShapeFactorEnergy(jnp.full(12, 3.7))
-    with pytest.raises(Exception, match="no equilibrium in 2 steps"):
+    with pytest.raises(Exception, match=r"no equilibrium.*after 2 steps"):
         vx.equilibrate(tissue, energy, max_steps=2)
     # (Without contacts two steps from the random tissue make cells overlap, which has another message.)
     few, lattice = (
@@ -285,7 +285,6 @@ def equilibrium(**outcome):
         max_force=jnp.array(0.0),
         num_steps=jnp.array(3),
         num_t1=jnp.array(0),
-        valid=jnp.array(True),
         result=vx.RESULTS.successful,
     )
     return dataclasses.replace(converged, **outcome)
@@ -295,7 +294,7 @@ def equilibrium(**outcome):
     ("outcome", "message"),
     [
         ({"result": vx.RESULTS.nonlinear_max_steps_reached}, "reached no equilibrium"),
-        ({"valid": jnp.array(False)}, "Cells of the relaxed tissue overlap"),
+        ({"result": vx.RESULTS.overlap}, "Cells of the tissue overlap"),
         ({"max_force": jnp.array(jnp.nan), "result": vx.RESULTS.nonfinite}, "must be finite"),
     ],
 )

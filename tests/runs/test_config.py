@@ -6,20 +6,14 @@ from pathlib import Path
 import pytest
 from pydantic import Field
 
-from vertax.runs import (
-    EXPERIMENTS,
-    ConfigError,
-    ExperimentConfig,
-    Section,
-    apply_overrides,
-    fields,
-    load_config,
-    template,
-)
-from vertax.runs._config import validate
+from vertax.runs import ConfigError, ExperimentConfig, Section, load_config
+from vertax.runs._config import all_keys, apply_overrides, template, validate
+from vertax.runs._registry import all_experiments
+
+EXPERIMENTS = all_experiments()
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
-VALID = 'experiment = "infer_shape_factors"\n[fit]\nepochs = 7\n'
+VALID = 'experiment = "infer_shape_factors"\nseed = 0\n[fit]\nepochs = 7\n'
 
 
 @pytest.fixture
@@ -41,10 +35,6 @@ def refusal(path, *overrides):
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_every_config_of_the_repository_is_valid(path):
     load_config(path)
-
-
-def test_there_are_configs():
-    assert {"demo", "infer_shape_factors"} <= {path.stem for path in CONFIGS}
 
 
 def test_keys_left_out_have_their_defaults(write):
@@ -70,10 +60,6 @@ def test_an_override_sets_one_key(write, override, get, expected):
     assert get(load_config(write(VALID), [override])[1]) == expected
 
 
-def test_the_last_override_wins(write):
-    assert load_config(write(VALID), ["seed=1", "seed=2"])[1].seed == 2
-
-
 def test_overrides_leave_the_original_alone_and_cannot_add_keys():
     data = {"a": {"b": 1}}
     text = "1\nc = 2"
@@ -85,51 +71,31 @@ def test_overrides_leave_the_original_alone_and_cannot_add_keys():
     assert data == {"a": {"b": 1}}
 
 
-@pytest.mark.parametrize("override", ["fit.epochs", "=3", "fit.=3", ".epochs=3"])
-def test_an_override_of_another_form_is_refused(write, override):
-    message = refusal(write(VALID), override)
-    assert repr(override) in message
-    assert "key=value" in message
-
-
-def test_a_key_inside_a_value_is_refused(write):
-    assert "`data` is a value and not a table" in refusal(write(VALID), "data=image", "data.x=1")
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("tissue.n_cell=3", ["`tissue.n_cell`", "`tissue.n_cells`", "an integer, at least 4"]),
-        ("epochs=3", ["`epochs`", "`fit.epochs`", "an integer, at least 1"]),
-        ("fit.optimizer=adam", ["`fit.optimizer`", "`fit.optimiser`", '"adam", "nadam"']),
-        ("relaxation.t1_treshold=1", ["`relaxation.t1_threshold`", "a number, above 0"]),
-        ("fits.epochs=1", ["`fits`", "`fit`", "a table with the keys optimiser, learning_rate"]),
-        ("fit.xyz=1", ["`fit.xyz`", "`fit.optimiser`", "`fit.learning_rate`", "`fit.epochs`"]),
+        ("fit.epochs", "must have the form key=value, as in fit.epochs=50, but is 'fit.epochs'."),
+        ("fit.=3", "must have the form key=value"),
+        ("seed.x=1", "Cannot set `seed.x`: `seed` is a value and not a table."),
+        ("tissue.n_cell=3", "there is no key `tissue.n_cell`; did you mean `tissue.n_cells`?"),
+        ("epochs=3", "there is no key `epochs`; did you mean `fit.epochs`?"),
+        ("fits.epochs=1", "there is no key `fits`; did you mean `fit`?"),
+        ("fit.xyz=1", "allowed are: `fit.optimiser`, `fit.learning_rate`, `fit.epochs`."),
+        (f"data={'a' * 10_000}", 'but is "' + "a" * 79 + "…."),
+        ("fit.epochs=many", '`fit.epochs` must be a valid integer, but is "many".'),
+        ("fit.epochs=2.5", "`fit.epochs` must be a valid integer, but is 2.5."),
+        ("fit.epochs=true", "`fit.epochs` must be a valid integer, but is true."),
+        ("fit.epochs=0", "`fit.epochs` must be greater than or equal to 1, but is 0."),
+        ("fit.learning_rate=nan", "`fit.learning_rate` must be a finite number, but is NaN."),
+        ("image.uneven_gain=1", "`image.uneven_gain` must be less than 1, but is 1."),
+        ("relaxation.transitions=1", "`relaxation.transitions` must be a valid boolean, but is 1."),
+        ("relaxation.tolerance=-1", "`relaxation.tolerance` must be greater than 0, but is -1."),
+        ("data=pixels", "`data` must be 'vertices', 'image' or 'both', but is \"pixels\"."),
+        ("tissue=20", "`tissue` must be a table, but is 20."),
+        ("seed={a=1}", "`seed` must be a valid integer, but is { a = 1 }."),
     ],
 )
-def test_an_unknown_key_is_refused_by_name_with_the_nearest_right_one(write, override, message):
-    message = refusal(write(VALID), override)
-    for part in ["there is no key", *message]:
-        assert part in message
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("fit.epochs=many", '`fit.epochs` must be an integer, at least 1, but is "many"'),
-        ("fit.epochs=2.5", "`fit.epochs` must be an integer, at least 1, but is 2.5"),
-        ("fit.epochs=true", "`fit.epochs` must be an integer, at least 1, but is true"),
-        ("fit.epochs=0", "`fit.epochs` must be an integer, at least 1, but is 0"),
-        ("fit.learning_rate=nan", "`fit.learning_rate` must be a number, above 0, but is nan"),
-        ("image.uneven_gain=1", "must be a number, at least 0, below 1, but is 1"),
-        ("relaxation.transitions=1", "`relaxation.transitions` must be true or false, but is 1"),
-        ("relaxation.tolerance=-1", "`relaxation.tolerance` must be a number, above 0, but is -1"),
-        ("data=pixels", '`data` must be one of "vertices", "image", "both", but is "pixels"'),
-        ("tissue=20", "`tissue` must be a table with the keys n_cells, lloyd_steps, but is 20"),
-        ("seed={a=1}", "`seed` must be an integer, at least 0, but is a table"),
-    ],
-)
-def test_an_ill_typed_key_is_refused_by_name_with_what_is_allowed(write, override, message):
+def test_a_wrong_key_or_value_is_an_error_with_a_remedy(write, override, message):
     assert message in refusal(write(VALID), override)
 
 
@@ -158,10 +124,6 @@ def test_a_byte_order_mark_is_no_mistake(tmp_path):
     assert load_config(path)[1].fit.epochs == 7
 
 
-def test_a_long_value_is_quoted_in_part(write):
-    assert len(refusal(write(VALID), f"data={'a' * 10_000}")) < 500
-
-
 def test_the_experiment_must_be_named_and_exist(write):
     assert "`experiment` is missing" in refusal(write("seed = 1"))
     message = refusal(write('experiment = "infer_shape_factor"'))
@@ -170,18 +132,12 @@ def test_the_experiment_must_be_named_and_exist(write):
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
-def test_every_key_has_a_description(experiment):
-    assert all(field.description for field in fields(experiment.config).values())
-
-
-@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
-def test_the_template_is_a_configuration_with_all_defaults(experiment):
-    required = {k for k, f in fields(experiment.config).items() if f.is_required()}
+def test_the_template_is_a_configuration_with_all_defaults_explained(experiment):
     text = template(experiment.config, experiment.name)
-    if not required:
-        assert validate(experiment.config, tomllib.loads(text)) == experiment.config()
-    for key in fields(experiment.config):
-        assert f"{key.rpartition('.')[2]} =" in text or f"[{key}]" in text
+    assert validate(experiment.config, tomllib.loads(text)) == experiment.config()
+    for key in all_keys(experiment.config):
+        assert f"{key.rpartition('.')[2]} =" in text or f"[{key}]  # " in text
+    assert "#  (" not in text  # a comment without a description
 
 
 class _Camera(Section):
@@ -248,16 +204,12 @@ def test_setting_a_default_changes_nothing(experiment):
 
 
 def test_missing_keys_paths_and_lists_are_explained():
-    with pytest.raises(
-        ConfigError, match=r"`camera` is missing; it must be a table with the keys path"
+    for data, message in (
+        ({}, "`camera` is missing."),
+        ({"camera": {}}, "`camera.path` is missing."),
+        ({"camera": {"path": "a", "crop": [1, 2.5]}}, "`camera.crop.1` must be a valid integer"),
     ):
-        validate(_Config, {})
-    with pytest.raises(
-        ConfigError, match=r"`camera.path` is missing; it must be a string, the path"
-    ):
-        validate(_Config, {"camera": {}})
-    with pytest.raises(
-        ConfigError, match=r"`camera.crop.1` must be a list, each entry an integer, but is 2.5"
-    ):
-        validate(_Config, {"camera": {"path": "a", "crop": [1, 2.5]}})
+        with pytest.raises(ConfigError, match=message):
+            validate(_Config, data)
     assert validate(_Config, {"camera": {"path": "a.tif"}}).camera.path == Path("a.tif")
+    assert "path =\n" in template(_Config, "x")

@@ -8,7 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 import vertax.jobs
-from vertax.runs import _registry, _shipped, find_experiment
+from vertax.runs import _registry
+from vertax.runs._registry import find_experiment
 from vertax.runs.command_line import app
 
 TOY = '''
@@ -35,8 +36,9 @@ def toy(tmp_path, monkeypatch):
     """A folder with the job `count`, next to all others."""
     (tmp_path / "count.py").write_text(textwrap.dedent(TOY).lstrip())
     monkeypatch.setattr(vertax.jobs, "__path__", [*vertax.jobs.__path__, str(tmp_path)])
-    monkeypatch.setitem(_registry.EXPERIMENTS, "count", _registry._all_experiments()["count"])
-    return tmp_path
+    _registry.all_experiments.cache_clear()
+    yield tmp_path
+    _registry.all_experiments.cache_clear()
 
 
 def test_a_module_and_a_configuration_make_a_job(toy, monkeypatch):
@@ -71,14 +73,13 @@ def test_modules_of_the_package_are_jobs_and_those_of_the_repository_are_experim
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
     """The state of an installed wheel: its configurations are in the package, the experiments are missing."""
-    assert _shipped.REPOSITORY is not None
-    shutil.copytree(_shipped.REPOSITORY / "configs", tmp_path / "vertax" / "configs")
-    monkeypatch.setattr(_shipped, "_PACKAGE", tmp_path / "vertax")
-    monkeypatch.setattr(_registry, "REPOSITORY", None)
-    jobs = {name: each for name, each in _registry.EXPERIMENTS.items() if each.is_job}
-    assert _registry._all_experiments() == jobs
-    for name in set(_registry.EXPERIMENTS) - set(jobs):
-        monkeypatch.delitem(_registry.EXPERIMENTS, name)
+    configs = _registry.PACKAGE.parent / "configs"
+    shutil.copytree(configs, tmp_path / "vertax" / "configs")
+    monkeypatch.setattr(_registry, "PACKAGE", tmp_path / "vertax")
+    _registry.all_experiments.cache_clear()
+    assert all(each.is_job for each in _registry.all_experiments().values())
+    yield
+    _registry.all_experiments.cache_clear()
 
 
 @pytest.mark.usefixtures("installed")

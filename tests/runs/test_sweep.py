@@ -2,11 +2,20 @@
 
 import csv
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+from filelock import FileLock
 from typer.testing import CliRunner
 
-from vertax.runs import ConfigError, RunFolderError, parse_grid, sweep, sweep_runs, sweep_table
+from vertax.jobs import infer_shape_factors
+from vertax.runs import ConfigError, _sweep
+from vertax.runs._folder import RunFolderError
+from vertax.runs._sweep import parse_grid, sweep, sweep_runs, sweep_table
 from vertax.runs.command_line import app
 
 TINY = """
@@ -37,15 +46,14 @@ def table(folder):
         ("seed=0:3", ["0", "1", "2"]),
         ("seed=4:0:-2", ["4", "2"]),
         ("data=vertices,image", ["vertices", "image"]),
-        ('data="vertices"', ['"vertices"']),
+        ('data="vertices", "a, b"', ['"vertices"', '"a, b"']),
         ("targets=[1.5, 2],[3]", ["[1.5, 2]", "[3]"]),
-        ("fit.learning_rate=1e-2", ["0.01"]),
+        ("fit.learning_rate=1e-2", ["1e-2"]),
     ],
 )
 def test_values_of_a_grid(text, values):
     (parsed,) = parse_grid([text]).values()
-    without_spaces = [value.replace(" ", "").replace(",]", "]") for value in parsed]
-    assert without_spaces == [value.replace(" ", "") for value in values]
+    assert parsed == values
 
 
 @pytest.mark.parametrize(
@@ -110,12 +118,11 @@ def test_a_sweep_continues_after_failures_and_keeps_finished_runs(tiny):
     metrics = json.loads(file.read_text())
     assert float(rows[0]["cost_final"]) == metrics["cost_final"]
 
-    # Again: what is finished is not done again, also without any process.
+    # The finished run is not repeated, also without any process.
     before = file.stat().st_mtime_ns
     (run,) = sweep_runs(["tiny.toml"], {"seed": ["0"]}, "out")
-    assert run.state == "finished"
-    assert sweep([run], "out", progress=False) == [run]
-    assert sweep_table([run])["cost_final"] == [metrics["cost_final"]]
+    assert sweep([run], tiny / "out", progress=False) == {}
+    assert sweep_table([run], {})["cost_final"] == [metrics["cost_final"]]
     assert file.stat().st_mtime_ns == before
 
     # The folder of another configuration is not touched.
@@ -123,9 +130,69 @@ def test_a_sweep_continues_after_failures_and_keeps_finished_runs(tiny):
         sweep_runs(["tiny.toml"], {"seed": ["0"]}, "out", ["fit.epochs=5"])
 
 
-def test_a_missing_scheduler_is_named(tiny, monkeypatch):
-    outcome = CliRunner().invoke(
-        app, ["sweep", "tiny.toml", "--scheduler", "nonsense://here", "--quiet"]
-    )
-    assert outcome.exit_code == 2
-    assert "no Dask scheduler at nonsense://here" in outcome.output
+@pytest.fixture
+def counted(monkeypatch):
+    """The keys of the runs that this process executes, which takes no time."""
+    seeds = []
+
+    def run(config, folder, *, progress):
+        seeds.append(config.seed)
+        folder.save_array("positions", np.ones(3))
+        if config.seed == 3:
+            raise ValueError("It broke.")
+        return {"cost": 1.0}
+
+    monkeypatch.setattr(infer_shape_factors, "run", run)
+    return seeds
+
+
+def test_a_run_is_executed_by_one_process_only(tiny, counted):
+    runs = sweep_runs(["tiny.toml"], {"seed": ["0", "1", "2", "3"]}, "out")
+    execute = lambda run: _sweep.execute_locked(run.config.model_dump(mode="json"), run.folder)
+    with FileLock(tiny / "out/.locks/tiny-seed_1.lock"):  # as another process does
+        errors = [execute(run) for run in runs]
+    assert errors == [None, None, None, "ValueError: It broke."]
+    assert counted == [0, 2, 3]
+    assert [run.is_finished for run in runs] == [True, False, True, False]
+    # The table has the failure also in a process that did not execute the run.
+    rows = sweep_table(runs, {})
+    assert rows["state"] == ["finished", "unfinished", "finished", "failed"]
+    assert rows["error"][-1] == "It broke."
+    # The same command again executes what is missing, and repeats the failed run.
+    assert [execute(run) for run in runs] == errors
+    assert counted == [0, 2, 3, 1, 3]
+
+
+DIES = """
+import os
+from vertax.jobs import infer_shape_factors
+
+def run(config, folder, *, progress):
+    if config.seed == 1:
+        os.kill(os.getpid(), 9)
+    return {"cost": 1.0}
+
+infer_shape_factors.run = run
+from vertax.__main__ import main
+if __name__ == "__main__":
+    main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs signals of Unix")
+def test_two_commands_share_the_runs_and_a_dead_process_ends_one_run_only(tiny):
+    (tiny / "program.py").write_text(DIES)
+    command = [sys.executable, "program.py", "sweep", "tiny.toml", "--grid", "seed=0:4"]
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    environment = os.environ | {"PYTHONPATH": path}
+    commands = [
+        subprocess.Popen([*command, "--workers", "1"], env=environment, **options) for _ in range(2)
+    ]
+    outputs = [process.communicate(timeout=300)[0] for process in commands]
+    assert "its process died, perhaps for lack of memory" in "".join(outputs)
+    rows = table(tiny / "runs/tiny-sweep")
+    states = {row["seed"]: row["state"] for row in rows}
+    assert [states[seed] for seed in "023"] == ["finished"] * 3
+    assert states["1"] != "finished"
+    assert sorted(process.returncode for process in commands) in ([0, 1], [1, 1])

@@ -94,12 +94,12 @@ class Player:
         angle = self.rng.uniform(0, np.pi)
         axis = jnp.asarray([np.cos(angle), np.sin(angle)], self.dtype)
         change = divide(self.tissue, self.cell(), axis, throw=False)
-        assert change.tissue.alive.sum() == self.tissue.alive.sum() + change.done
+        assert change.tissue.alive.sum() == self.tissue.alive.sum() + change.converged
         return change.tissue
 
     def remove(self):
         change = remove(self.tissue, self.cell(), throw=False)
-        assert change.tissue.alive.sum() == self.tissue.alive.sum() - change.done
+        assert change.tissue.alive.sum() == self.tissue.alive.sum() - change.converged
         return change.tissue
 
     def ablate(self):
@@ -137,7 +137,7 @@ class Player:
         equilibrium = vx.equilibrate(
             self.tissue, ENERGY, transitions=vx.T1() + vx.transitions.T2(), throw=False
         )
-        assert equilibrium.valid
+        assert equilibrium.result != vx.RESULTS.overlap
         return equilibrium.tissue
 
     def evolve(self):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
+from vertax._base.results import RESULTS, checked, result_of
 from vertax._base.tracing import is_concrete
 
 
@@ -45,17 +46,22 @@ class GradientOutcome(eqx.Module):
     negative_curvature: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
     """1 if the method detected a negative eigenvalue of the Hessian, so that the equilibrium is a saddle; NaN
     if the method does not compute this."""
-    failed: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """1 if the gradient is unreliable, otherwise 0."""
-    degenerate: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """1 if the equilibrium is not unique along motions that the cost depends on, so that the gradient does
-    not exist, or if these motions are too soft for the nudge of equilibrium propagation; NaN if the method
-    does not compute this."""
+    code: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
+    """The index of `result`: gradients are floating-point arrays."""
 
     @property
-    def trusted(self) -> Bool[Array, "*batch"]:
-        """Whether the gradient is reliable, `failed == 0`."""
-        return self.failed == 0
+    def result(self) -> RESULTS:
+        """How the computation of the gradient ended.
+
+        `degenerate`, or `nudge_not_linear`, if the equilibrium is not unique along motions that the cost
+        depends on, so that the gradient does not exist.
+        """
+        return result_of(self.code)
+
+    @property
+    def converged(self) -> Bool[Array, "*batch"]:
+        """Whether the gradient is reliable."""
+        return self.result == RESULTS.successful
 
 
 class AbstractAdjoint(optx.AbstractAdjoint):
@@ -76,8 +82,6 @@ class AbstractAdjoint(optx.AbstractAdjoint):
     """
 
     unrolls: ClassVar[bool] = False
-    reasons: ClassVar[tuple[str, str]]
-    """The error messages for an unreliable gradient: in general, and at a degenerate equilibrium."""
 
     throw: eqx.AbstractVar[bool]
     outcome: eqx.AbstractVar[GradientOutcome | None]
@@ -95,12 +99,6 @@ MAX_RELATIVE_RESIDUAL = 0.01
 """The largest relative residual of a reliable gradient: of the linear system, or of the force on a nudged
 tissue."""
 
-DEGENERATE = (
-    "the equilibrium is not unique. Along some motions (vertax.mechanics.zero_modes counts them) the tissue "
-    "has no stiffness, and the cost depends on them. Use a cost of areas, perimeters or other shapes that "
-    "these motions keep, pin vertices, or add a little stiffness"
-)
-
 
 def frozen(tree: PyTree) -> PyTree:
     """The same values as constants: derivatives through them are 0."""
@@ -114,15 +112,10 @@ def finish_gradient(
     outcome: GradientOutcome,
     throw: bool,
     like: GradientOutcome | None,
-    reasons: tuple[str, str],
 ) -> tuple[PyTree, GradientOutcome | None]:
-    """Raise an error for an unreliable gradient if `throw`, and cast the outcome to the dtypes of `like`.
-
-    The second of the reasons is for a degenerate equilibrium.
-    """
+    """Raise an error for an unreliable gradient if `throw`, and cast the outcome to the dtypes of `like`."""
     if throw:
-        index = jnp.where(outcome.degenerate == 1, 1, 0)
-        gradient = eqx.branched_error_if(gradient, ~outcome.trusted, index, reasons)
+        gradient = checked(gradient, outcome.result)
     if like is None:
         return gradient, None
     return gradient, jax.tree.map(lambda x, slot: jnp.asarray(x, slot.dtype), outcome, like)

@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax._base.optimistix import Minimisation
+from vertax._base.results import RESULTS, index_of
 from vertax.adjoints._adjoint import (
     AbstractAdjoint,
     GradientOutcome,
@@ -19,12 +20,6 @@ from vertax.adjoints._adjoint import (
     finish_gradient,
     frozen,
     materialise,
-)
-
-_REASON = (
-    "The gradient through the unrolled relaxation cannot be trusted: it had not converged when "
-    "`max_steps` ended it. Raise `max_steps`, choose a faster solver such as "
-    "Optax(optax.sgd(1e-2, momentum=0.9)), or allow it with AutomaticDifferentiation(throw=False)."
 )
 
 
@@ -59,7 +54,6 @@ class AutomaticDifferentiation(AbstractAdjoint):
     """
 
     unrolls: ClassVar[bool] = True
-    reasons: ClassVar[tuple[str, str]] = (_REASON, _REASON)
 
     checkpoints: int = eqx.field(static=True, default=16)
     rtol: float | None = None
@@ -136,12 +130,12 @@ class AutomaticDifferentiation(AbstractAdjoint):
         floats, tangents, arrays = jax.lax.while_loop(unfinished, body, (floats, tangents, arrays))
         _, state = eqx.combine(floats, arrays, static)
         final = residual(tangents)
+        failed = RESULTS.unrolling_not_converged
         return GradientOutcome(
             final / jnp.where(initial > 0, initial, 1),
             jnp.asarray(state.num_steps, final.dtype),
             jnp.nan,
-            jnp.asarray(~(final <= rtol * initial), final.dtype),
-            jnp.nan,
+            index_of(RESULTS.where(final <= rtol * initial, RESULTS.successful, failed)),
         )
 
 
@@ -206,7 +200,5 @@ def _(
     *_, slot = vjp_arg
     vjp, outcome = residuals
     (gradient,) = vjp(materialise(cotangent, root))
-    (d_fn, d_args), outcome = finish_gradient(
-        gradient, outcome, adjoint.throw, slot, adjoint.reasons
-    )
+    (d_fn, d_args), outcome = finish_gradient(gradient, outcome, adjoint.throw, slot)
     return d_fn, d_args, outcome

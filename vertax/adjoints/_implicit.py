@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -15,8 +15,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from vertax._base.optimistix import Minimisation
+from vertax._base.results import RESULTS, index_of
 from vertax.adjoints._adjoint import (
-    DEGENERATE,
     MAX_RELATIVE_RESIDUAL,
     AbstractAdjoint,
     GradientOutcome,
@@ -28,13 +28,6 @@ from vertax.precondition._preconditioned_minres import PreconditionedMINRES
 from vertax.precondition._recycled_hessian import RecycledHessian
 from vertax.precondition._sum import Preconditioner
 from vertax.solvers import MINRES
-
-_REASONS = (
-    "The gradient through the equilibrium cannot be trusted: the linear solve with the Hessian failed. "
-    "Relax to a smaller tolerance, or allow it with ImplicitDifferentiation(throw=False).",
-    f"The gradient through the equilibrium cannot be trusted: {DEGENERATE}. "
-    "ImplicitDifferentiation(throw=False) allows it.",
-)
 
 
 class ImplicitDifferentiation(AbstractAdjoint):
@@ -69,8 +62,6 @@ class ImplicitDifferentiation(AbstractAdjoint):
 
     - `ValueError` for another mode.
     """
-
-    reasons: ClassVar[tuple[str, str]] = _REASONS
 
     mode: Literal["adjoint", "sensitivity"] = eqx.field(static=True, default="adjoint")
     linear_solver: lx.AbstractLinearSolver = eqx.field(default_factory=MINRES)
@@ -184,17 +175,16 @@ class _ReportingSolver(lx.AbstractLinearSolver):
         degenerate = (
             soft | diverged | ((stat("inconsistent") == 1) & (residual > MAX_RELATIVE_RESIDUAL))
         )
+        solved = RESULTS.where(failed, RESULTS.linear_solve_failed, RESULTS.successful)
         outcome = GradientOutcome(
             residual,
             stat("num_steps"),
             stat("negative_curvature"),
-            failed | degenerate,
-            degenerate,
+            index_of(RESULTS.where(degenerate, RESULTS.degenerate, solved)),
         )
         outcome = jax.tree.map(lambda x: x.astype(float), outcome)
         if self.strict:
-            index = jnp.where(degenerate, 1, 0)
-            solution = eqx.branched_error_if(solution, ~outcome.trusted, index, _REASONS)
+            solution = outcome.result.error_if(solution, ~outcome.converged)
         return solution, lx.RESULTS.successful, stats | {"outcome": outcome}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
@@ -280,7 +270,6 @@ def _(residuals: None, cotangent: Any, perturbed: Any, vjp_arg: Any, root: Any, 
             jnp.max(outcomes.residual),
             jnp.max(outcomes.num_steps),
             jnp.max(outcomes.negative_curvature),
-            jnp.max(outcomes.failed),
-            jnp.max(outcomes.degenerate),
+            jnp.max(outcomes.code),
         )
-    return finish_gradient(gradient, outcome, system.adjoint.throw, slot, _REASONS)
+    return finish_gradient(gradient, outcome, system.adjoint.throw, slot)

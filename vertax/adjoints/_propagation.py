@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,8 +14,8 @@ import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
 from vertax._base.optimistix import Minimisation, num_steps_of
+from vertax._base.results import RESULTS, index_of
 from vertax.adjoints._adjoint import (
-    DEGENERATE,
     MAX_RELATIVE_RESIDUAL,
     AbstractAdjoint,
     GradientOutcome,
@@ -29,19 +29,6 @@ from vertax.adjoints._adjoint import (
 # gives the relative error of the gradient: ε / 2 = 2 η for one nudge, ε² / 2 = 8 η² for two opposite nudges.
 # At η = 1/2 both errors are at least as large as the gradient. (A purely quadratic force has η = 1/2.)
 _MAX_NONLINEARITY = 0.5
-NOT_LINEAR = (
-    "The gradient by equilibrium propagation cannot be trusted: a small nudge moved the tissue so far that "
-    f"its response is not linear. The usual reason: {DEGENERATE}. (For a cost of shapes use "
-    "ImplicitDifferentiation: a nudged tissue also moves along motions that change them in second order "
-    "only.) Otherwise the nudge is too strong: take a smaller `beta`. "
-    "EquilibriumPropagation(throw=False) allows it."
-)
-_REASONS = (
-    "The gradient by equilibrium propagation cannot be trusted: a nudged relaxation did not come to "
-    "rest. Raise `max_steps`, use the default solver or a larger `beta`, or allow it with "
-    "EquilibriumPropagation(throw=False).",
-    NOT_LINEAR,
-)
 
 
 class EquilibriumPropagation(AbstractAdjoint):
@@ -83,8 +70,6 @@ class EquilibriumPropagation(AbstractAdjoint):
 
     - `ValueError` for another nudge, or a `beta` or `rtol` that is not positive.
     """
-
-    reasons: ClassVar[tuple[str, str]] = _REASONS
 
     beta: float | Float[Array, ""] | None = None
     nudge: Literal["linear", "cost"] = eqx.field(static=True, default="linear")
@@ -198,7 +183,7 @@ def _(
     cotangent = materialise(cotangent, root)
     at_rest = None if adjoint.centred else slope(root)
     gradient, outcome = gradient_from_phases(adjoint, cotangent, options, phase, at_rest)
-    (d_fn, d_args), outcome = finish_gradient(gradient, outcome, adjoint.throw, slot, _REASONS)
+    (d_fn, d_args), outcome = finish_gradient(gradient, outcome, adjoint.throw, slot)
     return d_fn, d_args, outcome
 
 
@@ -367,13 +352,13 @@ def _(
     outcome = _gradient_outcome(
         jnp.max(max_forces) / force, jnp.sum(num_steps), jnp.full_like(force, jnp.nan)
     )
-    return finish_gradient(gradient, outcome, adjoint.throw, slot, _REASONS)
+    return finish_gradient(gradient, outcome, adjoint.throw, slot)
 
 
 def _gradient_outcome(
     residual: Float[Array, ""], num_steps: Array, nonlinearity: Float[Array, ""]
 ) -> GradientOutcome:
-    degenerate = nonlinearity >= _MAX_NONLINEARITY
-    failed = ~(residual < MAX_RELATIVE_RESIDUAL) | degenerate
-    reported = jnp.where(jnp.isnan(nonlinearity), jnp.nan, degenerate)
-    return GradientOutcome(residual, num_steps, jnp.nan, failed, reported)
+    at_rest = residual < MAX_RELATIVE_RESIDUAL
+    result = RESULTS.where(at_rest, RESULTS.successful, RESULTS.nudge_not_at_rest)
+    result = RESULTS.where(nonlinearity >= _MAX_NONLINEARITY, RESULTS.nudge_not_linear, result)
+    return GradientOutcome(residual, num_steps, jnp.nan, index_of(result))

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.tracing import is_concrete
+from vertax._base.results import RESULTS, checked
 from vertax.mesh import Tissue
 from vertax.mesh._trajectory import Trajectory
-from vertax.relax._response import _NOT_FINITE, Equilibrium
+from vertax.relax._response import Equilibrium
 
 
 class Evolved(Equilibrium):
     """The result of a time evolution; as an [`Equilibrium`][vertax.Equilibrium] it is the last frame.
 
     `max_force` is the maximum over the steps of the residual force (of energy and dissipation together),
-    `num_steps` and `num_t1` are sums over the steps, and `valid` and `result` are successful if they are for
-    every step.
+    `num_steps` and `num_t1` are sums over the steps, and `result` is the first failure of a step.
     """
 
     times: Float[Array, "*batch times"]
@@ -36,11 +33,11 @@ class Evolved(Equilibrium):
     drive: PyTree[Array]
     """The final state of the activity and of its random numbers. A run from the last frame with this `drive`
     continues this run, up to rounding. None without an activity."""
-    sound: Bool[Array, "*batch times"]
-    """Whether all steps up to each frame converged, without overlaps."""
+    results: RESULTS
+    """The first failure of the steps up to each frame, `successful` if there is none."""
     steps: Float[Array, "*batch times steps"]
     """Sizes of the time steps since the previous frame, padded with 0."""
-    refused: Int[Array, "*batch times"]
+    num_rejected: Int[Array, "*batch times"]
     """Number of rejected steps since the previous frame, see [`StepControl`][vertax.dynamics.StepControl]."""
 
     @property
@@ -59,43 +56,21 @@ class Evolved(Equilibrium):
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox inside `jax.jit`) if a step did not converge, or if cells overlap.
+        - `RuntimeError` (of Equinox inside `jax.jit`) with the message of `result` if a step did not.
         """
-        if not is_concrete(self.sound):
-            # In a batch the message with the largest index is raised.
-            messages = (
-                f"A time step did not converge. {_REMEDY}",
-                f"During a time evolution cells overlap, or the box folds. {_REMEDY}",
-                f"A time evolution broke down: {_NOT_FINITE}",
-            )
-            index = jnp.where(jnp.isfinite(self.max_force), jnp.where(self.valid, 0, 1), 2)
-            index = jnp.where(self.converged, 0, index)
-            # (Random keys cannot be arguments of a callback to the host.)
-            keys, rest = eqx.partition(self, _is_key)
-            checked = eqx.branched_error_if(rest, ~self.converged, index, messages)
-            return eqx.combine(checked, keys)
-        if np.all(self.sound):
-            return self
-        raise RuntimeError(self._first_failure())
+        return checked(self, self.result, self._details)
 
-    def _first_failure(self) -> str:
-        """The error message for the member of a batch that fails in the earliest frame."""
-        sound = np.asarray(self.sound)
-        n_times = sound.shape[-1]
-        sound = sound.reshape(-1, n_times)
-        failed = ~sound.all(axis=-1)
-        frames = np.where(failed, np.argmin(sound, axis=-1), n_times)
+    def _details(self) -> str:
+        """The time and the force of the member of a batch that fails in the earliest frame."""
+        converged = np.asarray(self.results == RESULTS.successful)
+        n_times = converged.shape[-1]
+        converged = converged.reshape(-1, n_times)
+        frames = np.where(converged.all(axis=-1), n_times, np.argmin(converged, axis=-1))
         number = int(np.argmin(frames))
-        of_member = lambda x: np.asarray(x).reshape(len(sound), -1)[number]
-        frame, (force,), (valid,) = frames[number], of_member(self.max_force), of_member(self.valid)
-        time = of_member(self.times)[frame]
-        context = f"Before time {time:g} (frame {frame})"
-        if self.sound.ndim > 1:
-            context += f" of member {number} ({failed.sum()} of {failed.size} failed)"
-        if not np.isfinite(force):
-            return f"{context} a step broke down: {_NOT_FINITE}"
-        reason = "a time step did not converge" if valid else "cells overlap, or the box folds"
-        return f"{context} {reason} (largest force {force:.1e}). {_REMEDY}"
+        of_member = lambda x: np.asarray(x).reshape(len(converged), -1)[number]
+        time, (force,) = of_member(self.times)[frames[number]], of_member(self.max_force)
+        member = f" of member {number}" if self.times.ndim > 1 else ""
+        return f"before time {time:g}, frame {frames[number]}{member}; largest force {force:.1e}"
 
     @property
     def trajectory(self) -> Trajectory:
@@ -117,13 +92,3 @@ class Evolved(Equilibrium):
             frame, frame_values = jax.tree.map(lambda x, i=number: x[i], (arrays, values))
             trajectory.append(eqx.combine(frame, static), **frame_values)
         return trajectory
-
-
-def _is_key(x: Any) -> bool:
-    return eqx.is_array(x) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-_REMEDY = (
-    "Take shorter steps (more `substeps`, or a greater `most` of the StepControl), raise `max_steps` of the "
-    "relaxation or loosen its `tolerance`, or pass throw=False and check `sound`."
-)

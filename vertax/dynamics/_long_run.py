@@ -21,6 +21,7 @@ from vertax._base.checkpoints import (
     digest,
     without_addresses,
 )
+from vertax._base.results import RESULTS
 from vertax._base.tracing import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.dynamics._evolved import Evolved
@@ -80,7 +81,7 @@ def evolve_by_frames(
             ends = times[len(reached.rows) - 1 : len(reached.rows) + 1]
             state, frame = _advance(reached.state, energy, _for_one_frame(evolution, ends), adjoint)
             rows = (*reached.rows, _row(ends[1], frame))
-            if throw and not bool(frame.sound[0]):
+            if throw and bool(state.result != RESULTS.successful):
                 _joined_frames(times[: len(rows)], state, rows, first).checked()  # raises the error
             reached = Progress(state, rows)
             bar.set_description(refresh=False)

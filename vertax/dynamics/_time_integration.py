@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
+from vertax._base.results import RESULTS, first_failure, result_of
 from vertax._base.tracing import tree_where
 from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
@@ -19,7 +20,8 @@ from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._incremental_potential import IncrementalPotential, with_flips_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Periodic, Tissue
-from vertax.relax import RESULTS, Equilibrium
+from vertax.relax import Equilibrium
+from vertax.relax._response import with_overlaps
 
 # The coefficient γ of the two-stage SDIRK method of order 2 (Alexander 1977, doi:10.1137/0714068). The method
 # is L-stable: fast modes are damped, as by the implicit Euler method.
@@ -38,8 +40,8 @@ class State(eqx.Module):
     max_force: Float[Array, ""]
     num_steps: Int[Array, ""]
     num_t1: Int[Array, ""]
-    valid: Bool[Array, ""]
-    converged: Bool[Array, ""]
+    result: RESULTS
+    """The first failure of a step."""
 
     def after(self, step: Equilibrium) -> State:
         """The state after one more step."""
@@ -51,17 +53,8 @@ class State(eqx.Module):
             jnp.maximum(self.max_force, frozen(step.max_force)),
             self.num_steps + step.num_steps,
             self.num_t1 + step.num_t1,
-            self.valid & step.valid & _right_handed(step.tissue.boundary),
-            self.converged & (step.result == RESULTS.successful),
+            first_failure(self.result, with_overlaps(step.result, _folded(step.tissue.boundary))),
         )
-
-    @property
-    def result(self) -> RESULTS:
-        """The result of all steps together."""
-        result = RESULTS.where(
-            self.converged, RESULTS.successful, RESULTS.nonlinear_max_steps_reached
-        )
-        return RESULTS.where(jnp.isfinite(self.max_force), result, RESULTS.nonfinite)
 
 
 class Frames(NamedTuple):
@@ -70,7 +63,7 @@ class Frames(NamedTuple):
     tissue: PyTree[Array]
     energies: Float[Array, " times"]
     transitions: Int[Array, " times"]
-    sound: Bool[Array, " times"]
+    results: RESULTS
     steps: Float[Array, "times steps"]
     num_rejected: Int[Array, " times"]
 
@@ -78,13 +71,13 @@ class Frames(NamedTuple):
 def initial_state(tissue: Tissue, evolution: Any) -> State:
     """The initial state of an `Evolution`. (Its module imports this one, therefore the type `Any`.)"""
     times = evolution.times.astype(tissue.vertices.dtype)
-    true, zero_count, zero = jnp.array(True), jnp.array(0), jnp.zeros((), times.dtype)
+    zero_count, zero = jnp.array(0), jnp.zeros((), times.dtype)
     drive = evolution.drive
     if drive is None and evolution.activity is not None:
         first, rest = jax.random.split(evolution.key)
         drive = (evolution.activity.init(tissue, first), rest)
     dt = zero if evolution.control is None else evolution.control.begin(times)
-    return State(tissue, drive, dt, zero + 1, zero, zero_count, zero_count, true, true)
+    return State(tissue, drive, dt, zero + 1, zero, zero_count, zero_count, _successful())
 
 
 def first_frame(state: State, energy: Any, evolution: Any) -> Frames:
@@ -94,7 +87,7 @@ def first_frame(state: State, energy: Any, evolution: Any) -> Frames:
     n_steps = evolution.substeps if evolution.control is None else evolution.control.most
     steps = jnp.zeros(n_steps, time.dtype)
     value = _energy_at(energy, time)(state.tissue)
-    row = Frames(tissue, value, jnp.array(0), jnp.array(True), steps, jnp.array(0))
+    row = Frames(tissue, value, jnp.array(0), _successful(), steps, jnp.array(0))
     return jax.tree.map(lambda x: x[None], row)
 
 
@@ -178,7 +171,8 @@ def integrate(
         halves, full = combined(now), combined(jax.tree.map(lambda x: x[0], parts))
         error = control.error(halves.tissue, full.tissue, evolution.order)
         # (After an earlier failure steps are accepted by their error alone.)
-        converged = (halves.converged & halves.valid) | ~(state.converged & state.valid)
+        failed_before = state.result != RESULTS.successful
+        converged = (halves.result == RESULTS.successful) | failed_before
         accepted = converged & (error <= 1)
         next_dt = control.next_step(end - start, error, state.error, converged, evolution.order)
         # A step that was shortened to end at a frame does not shorten the next one.
@@ -202,8 +196,9 @@ def integrate(
         (arrays, time), (steps, num_rejected) = jax.lax.scan(
             one, (arrays, ends[0]), None, length=control.most
         )
-        converged = arrays.converged & (time >= ends[1])
-        arrays = eqx.tree_at(lambda s: s.converged, arrays, converged)
+        reached = RESULTS.where(time >= ends[1], RESULTS.successful, RESULTS.max_time_steps_reached)
+        result = first_failure(arrays.result, reached)
+        arrays = eqx.tree_at(lambda s: s.result, arrays, result)
         # Accepted steps first, in their order.
         steps = steps[jnp.argsort(steps == 0, stable=True)]
         return arrays, steps, num_rejected.sum()
@@ -222,9 +217,8 @@ def integrate(
             arrays, _ = jax.lax.scan(substep, arrays, (times_of_steps[:-1], times_of_steps[1:]))
             steps, num_rejected = jnp.diff(times_of_steps), jnp.array(0)
         value = _energy_at(energy, ends[1])(combined(arrays).tissue)
-        sound = arrays.converged & arrays.valid
         transitions = arrays.num_t1 - before
-        return arrays, Frames(arrays.tissue, value, transitions, sound, steps, num_rejected)
+        return arrays, Frames(arrays.tissue, value, transitions, arrays.result, steps, num_rejected)
 
     arrays, static = eqx.partition(state, eqx.is_array)
     combined = lambda arrays: eqx.combine(arrays, static)
@@ -241,16 +235,15 @@ def evolved(times: Float[Array, " times"], end: State, frames: Frames) -> Evolve
         max_force=end.max_force,
         num_steps=end.num_steps,
         num_t1=end.num_t1,
-        valid=end.valid,
         result=end.result,
         times=times.astype(end.tissue.vertices.dtype),
         frames=eqx.combine(frames.tissue, static),
         energies=frames.energies,
         transitions=frames.transitions,
         drive=end.drive,
-        sound=frames.sound,
+        results=frames.results,
         steps=frames.steps,
-        refused=frames.num_rejected,
+        num_rejected=frames.num_rejected,
     )
 
 
@@ -276,6 +269,10 @@ def _energy_at(energy: Any, time: Any) -> AbstractEnergy:
     return value
 
 
-def _right_handed(boundary: AbstractBoundary) -> Bool[Array, ""]:
-    """Whether the lattice of a box has a positive determinant."""
-    return boundary.area > 0 if isinstance(boundary, Periodic) else jnp.array(True)
+def _folded(boundary: AbstractBoundary) -> Bool[Array, ""]:
+    """Whether the lattice of a box has no positive determinant."""
+    return ~(boundary.area > 0) if isinstance(boundary, Periodic) else jnp.array(False)
+
+
+def _successful() -> RESULTS:
+    return result_of(jnp.array(0))

@@ -14,6 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.results import RESULTS
 from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.adjoints._adjoint import frozen
@@ -24,9 +25,8 @@ from vertax.external._external_gradient import ExternalEquilibrium, attach_gradi
 from vertax.external._host import Job, Request, Result, run_jobs, stack_results
 from vertax.external._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
 from vertax.mesh import Tissue
-from vertax.relax import RESULTS
 from vertax.relax._equilibrium import follow_start, free_motions
-from vertax.relax._response import AbstractResponse, Equilibrium
+from vertax.relax._response import AbstractResponse, Equilibrium, with_overlaps
 
 
 class External(AbstractResponse):
@@ -161,7 +161,7 @@ class External(AbstractResponse):
             return equilibrium
         if concrete and self.ledger.failed > failed:
             raise SimulatorError(self.last_error_message())
-        if concrete and not np.all(equilibrium.converged) and np.all(equilibrium.valid):
+        if concrete and np.any(equilibrium.result == RESULTS.nonlinear_max_steps_reached):
             raise RuntimeError(
                 "The tissue that the program returned is not at rest under the energy (largest force "
                 f"{np.max(equilibrium.max_force):.1e}). {_REMEDY}"
@@ -309,7 +309,6 @@ def _relax_externally(
         max_force=force,
         num_steps=result.num_steps,
         num_t1=result.num_t1,
-        valid=~relaxed.overlaps.any,
         result=_result(relaxed, force, response, units),
     )
 
@@ -324,7 +323,7 @@ def _result(tissue: Tissue, force: Float[Array, ""], response: External, units: 
         is_converged = force <= tolerance
     result = RESULTS.where(is_converged, RESULTS.successful, RESULTS.nonlinear_max_steps_reached)
     finite = jnp.all(jnp.isfinite(tissue.vertices))
-    return RESULTS.where(finite, result, RESULTS.nonfinite)
+    return with_overlaps(RESULTS.where(finite, result, RESULTS.nonfinite), tissue.overlaps.any)
 
 
 def _n_motions(tissue: Tissue) -> int:

@@ -12,18 +12,11 @@ from jaxtyping import Array, Bool, PyTree
 
 from vertax.adjoints import EquilibriumPropagation, GradientOutcome
 from vertax.adjoints._adjoint import differentiable, finish_gradient, frozen, materialise
-from vertax.adjoints._propagation import NOT_LINEAR, Phase, RestoringForce, gradient_from_phases
+from vertax.adjoints._propagation import Phase, RestoringForce, gradient_from_phases
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units
 from vertax.external._host import Request
 from vertax.mesh import Tissue
-
-_REASONS = (
-    "The gradient by equilibrium propagation cannot be trusted: the program failed, or left a residual force "
-    "that is not small compared to the nudge. Let it relax further, raise `beta`, or allow it with "
-    "EquilibriumPropagation(throw=False).",
-    NOT_LINEAR,
-)
 
 
 def force_of(tissue: Tissue, energy: AbstractEnergy) -> PyTree[Array]:
@@ -122,7 +115,5 @@ def _(
     }
     # (The two signs are a batch, so the program may run twice in parallel.)
     gradient, outcome = gradient_from_phases(adjoint, pull, units_of_nudge, phase, slope_at_rest)
-    (d_energy, d_boundary), outcome = finish_gradient(
-        gradient, outcome, adjoint.throw, slot, _REASONS
-    )
+    (d_energy, d_boundary), outcome = finish_gradient(gradient, outcome, adjoint.throw, slot)
     return d_energy, d_boundary, outcome

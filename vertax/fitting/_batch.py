@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertax._base.batch import stack
+from vertax._base.results import first_of
 from vertax.fitting._history import Fit, History
 
 
@@ -47,5 +48,5 @@ def stack_fits(fits: Sequence[Fit[Any]], *, at_once: int = 1) -> Fit[Any]:
         best_epoch=np.stack([fit.best_epoch for fit in fits]),
         history=History(**columns),
         notes={n: np.stack([fit.notes[n][:epochs] for fit in fits], axis=1) for n in names},
-        interrupted=any(fit.interrupted for fit in fits),
+        result=first_of(stack([fit.result for fit in fits])),
     )

@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
+from vertax._base.results import RESULTS
 from vertax._base.tracing import traced, tree_where
 from vertax.fitting._epoch import (
     AbstractMethod,
@@ -203,7 +204,7 @@ def _update(
         gradient = (evaluation.gradient, evaluation.shift_gradient)
         equilibrium = evaluation.equilibrium
         record = _record(state.parameters, evaluation, gradient, true, throw)
-        active = state.active & record.sound
+        active = state.active & (record.result == RESULTS.successful)
         fitted = (state.parameters, shift)
         updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
             cast(optax.Updates, gradient),
@@ -259,7 +260,7 @@ def _record(
 ) -> Record:
     equilibrium, outcome = evaluation.equilibrium, evaluation.outcome
     norm = optax.tree.norm(gradient)
-    finite = jnp.isfinite(evaluation.cost) & jnp.isfinite(norm)
+    finite, not_finite = jnp.isfinite(evaluation.cost) & jnp.isfinite(norm), RESULTS.not_finite_cost
     return Record(
         parameters=parameters,
         tissue=equilibrium.tissue,
@@ -272,5 +273,5 @@ def _record(
         gradient_residual=outcome.residual,
         gradient_steps=outcome.num_steps,
         relative_error=relative_error(parameters, true),
-        sound=finite & outcome.trusted if throw else finite,
+        result=RESULTS.where(finite, outcome.result if throw else RESULTS.successful, not_finite),
     )

@@ -27,6 +27,7 @@ from vertax._base.checkpoints import (
     digest,
     without_addresses,
 )
+from vertax._base.results import RESULTS, index_of, result_of
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._arguments import check_arguments
@@ -92,7 +93,7 @@ def fit(
 
     **Returns:** a [`Fit`][vertax.Fit] with the parameters of lowest cost among the epochs that reached
     equilibrium (with guidance, among those of the weakest guidance). A keyboard interrupt (Ctrl-C) ends the
-    fit after the current epoch and returns the result so far, with `interrupted=True`.
+    fit after the current epoch and returns the result so far, with the `result` `interrupted`.
 
     **Raises:**
 
@@ -136,7 +137,7 @@ def fit(
     file = CheckpointFile(
         checkpoint, lambda: _identity_of(given, true, method.description(), batched)
     )
-    done, stopped, interrupted = _run(method, file, epochs, progress, callback)
+    done, stopped, result = _run(method, file, epochs, progress, callback)
     response_error = given.response.last_error_message()
     if stopped is not None and response_error is not None:
         stopped = f"{stopped}. {response_error.rstrip('.')}"
@@ -159,7 +160,7 @@ def fit(
         np.asarray(best.epoch),
         history,
         columns_of(done.notes),
-        interrupted,
+        result,
     )
     if stopped is not None:
         raise FitError(
@@ -218,8 +219,8 @@ def _run(
     epochs: int,
     progress: bool,
     callback: Callback | None,
-) -> tuple[Progress, str | None, bool]:
-    """The progress of the fit, the reason for an early end or None, and whether it was interrupted."""
+) -> tuple[Progress, str | None, RESULTS]:
+    """The progress of the fit, the reason for an early end or None, and how it ended."""
     done = Progress(None)
     try:
         done = file.load(method.start())
@@ -236,13 +237,13 @@ def _run(
             while len(done.rows) < epochs and np.any(done.state.active):
                 epoch, start = len(done.rows), time.perf_counter()
                 state, record = method.advance(done.state, epoch)
-                sound = np.asarray(record.sound)  # blocks until the epoch is done
+                failed = np.asarray(record.result != RESULTS.successful)  # blocks until it is done
                 row = _row(record, time.perf_counter() - start, method.strength(epoch))
-                if not sound.any():
+                if failed.all():
                     return (
                         Progress(state, (*done.rows, row), done.notes),
                         _failure(record, epoch),
-                        False,
+                        result_of(jnp.max(index_of(record.result))),
                     )
                 notes = None if callback is None else callback(epoch, record)
                 done = Progress(state, (*done.rows, row), _noted(done.notes, notes, epoch))
@@ -258,11 +259,11 @@ def _run(
         if not done.rows or not np.isfinite(done.state.best.facts.cost).any():
             raise
         file.save(done)
-        return done, None, True
+        return done, None, RESULTS.interrupted
     except eqx.EquinoxRuntimeError as error:
-        return done, f"epoch {len(done.rows)} broke down ({_first_line(error)})", False
+        return done, f"epoch {len(done.rows)} broke down ({_first_line(error)})", RESULTS.nonfinite
     file.save(done)
-    return done, None, False
+    return done, None, RESULTS.successful
 
 
 def _check_progress(done: Progress, method: AbstractMethod, epochs: int) -> None:

@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
+from vertax._base.results import RESULTS
 from vertax.fitting._inverse import Energy
 from vertax.mesh import Tissue
 
@@ -72,8 +73,8 @@ class Fit(eqx.Module, Generic[Energy]):
     """One entry per epoch."""
     notes: dict[str, Shaped[np.ndarray, "epochs ..."]] = eqx.field(default_factory=dict)
     """Values returned by the callback, by name; the first axis is that of the epochs."""
-    interrupted: bool = False
-    """Whether a keyboard interrupt ended the fit early."""
+    result: RESULTS = eqx.field(default_factory=lambda: RESULTS.successful)
+    """How the fit ended; `interrupted` after a keyboard interrupt."""
 
 
 class FitError(RuntimeError):
@@ -101,5 +102,5 @@ class Record(Facts):
     least-squares solver, those of its last accepted step."""
     tissue: Tissue
     """The equilibrium of these parameters."""
-    sound: Bool[Array, "*batch"]
-    """Whether cost and gradient are finite and the adjoint converged."""
+    result: RESULTS
+    """Whether cost and gradient are finite, and how the adjoint ended."""

@@ -230,8 +230,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         problem = self.without_parameters(tissue)
         evaluation = problem.evaluate(*arguments)
         if self.adjoint.throw and not problem.adjoint.throw:
-            outcome, reasons = evaluation.outcome, self.adjoint.reasons
-            gradient, _ = finish_gradient(evaluation.gradient, outcome, True, None, reasons)
+            gradient, _ = finish_gradient(evaluation.gradient, evaluation.outcome, True, None)
             evaluation = eqx.tree_at(lambda e: e.gradient, evaluation, gradient)
         if not throw:
             return evaluation

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
+from vertax._base.results import RESULTS
 from vertax._base.tracing import tree_where
 from vertax.adjoints import ImplicitDifferentiation
 from vertax.fitting._epoch import (
@@ -237,7 +238,7 @@ def _record(state: State) -> Record:
     return Record(
         parameters=state.fitted[0],
         tissue=state.placed,
-        sound=jnp.array(True),
+        result=RESULTS.successful,
         **state.facts.facts(),
     )
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.checks import as_key, as_times, check_integer, describe
+from vertax._base.results import RESULTS, checked, first_failure, result_of
 from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
@@ -21,7 +22,7 @@ from vertax.energies import AbstractEnergy
 from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, initial_lineage, record_deaths, record_division
 from vertax.mesh import Tissue, Trajectory
-from vertax.relax import RESULTS, Relaxation
+from vertax.relax import Relaxation
 from vertax.transitions import T1, T2
 from vertax.transitions._division import divided
 
@@ -45,10 +46,9 @@ class Grown(eqx.Module):
     """Index in the lineage of the cell in each slot; -1 for spare slots."""
     lineage: Lineage
     """The mother, birth and end of each cell."""
-    sound: Bool[Array, "*batch times"]
-    """Whether all steps up to a frame converged to tissues without overlaps."""
-    full: Bool[Array, "*batch"]
-    """Whether a division failed because there was no spare slot."""
+    results: RESULTS
+    """The first failure of the steps up to each frame, `successful` if there is none: a relaxation that did
+    not converge, overlaps, a division without a spare slot, a lineage with too few records."""
     failed_divisions: Int[Array, "*batch times"]
     """Number of failed divisions up to a frame: there was no spare slot, or the cell could not be cut in two.
     A failed division is tried again, and counted again, in each following step."""
@@ -74,37 +74,25 @@ class Grown(eqx.Module):
             trajectory.append(frame, time=time, cells=self.n_alive[i])
         return trajectory
 
+    @property
+    def result(self) -> RESULTS:
+        """How the growth ended: the first failure."""
+        return jax.tree.map(lambda x: x[..., -1], self.results)
+
+    @property
+    def converged(self) -> Bool[Array, "*batch"]:
+        """Whether all steps succeeded."""
+        return self.result == RESULTS.successful
+
     def checked(self) -> Grown:
-        """The result itself, or an error if it is incomplete.
+        """The same, if all steps succeeded.
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox inside `jax.jit`) if a step did not converge or cells overlap, if there
-            was no spare slot for a cell, or if the lineage was too short.
+        - `RuntimeError` (of Equinox inside `jax.jit`) with the message of `result` if they did not.
         """
         capacity, records = self.tissue.n_cells, self.lineage.mother.shape[-1]
-        checked = self
-        for failed, reason in (
-            (
-                ~self.sound[..., -1],
-                "A time step did not converge, or cells overlap. Take shorter steps (more `substeps`) or "
-                "slower rates, or pass throw=False and check `sound`.",
-            ),
-            (
-                self.full,
-                f"A cell could not divide: the tissue has a capacity of {capacity} cells, and all are alive. "
-                "Add spare slots with tissue.with_capacity(...), or pass throw=False.",
-            ),
-            (
-                ~self.lineage.complete,
-                f"The lineage has a capacity of {records} cells, but there were more. Raise `records`.",
-            ),
-        ):
-            if not is_concrete(failed):
-                checked = eqx.error_if(checked, failed, reason)
-            elif np.any(np.asarray(failed)):
-                raise RuntimeError(reason)
-        return checked
+        return checked(self, self.result, lambda: f"{capacity} cell slots, {records} records")
 
 
 def grow(
@@ -161,8 +149,8 @@ def grow(
     - `dissipation`: friction and viscosity; by default none, and the tissue relaxes in each step.
     - `relaxation`: solver and transitions of each step, by default with T1 and T2 transitions.
     - `adjoint`: how to differentiate each step.
-    - `throw`: raise an error if a step does not converge or capacity is exhausted. If False, check `sound`
-        and `full`.
+    - `throw`: raise an error if a step does not converge or capacity is exhausted. If False, look at
+        `result`.
 
     **Returns:** a [`Grown`][vertax.growth.Grown].
 
@@ -218,8 +206,7 @@ class _State(eqx.Module):
     cells: PyTree[Array]
     number: Int[Array, " cells"]
     lineage: Lineage
-    sound: Bool[Array, ""]
-    full: Bool[Array, ""]
+    result: RESULTS
     failed_divisions: Int[Array, ""]
     failed_deaths: Int[Array, ""]
     log_likelihood: Float[Array, ""]
@@ -245,22 +232,23 @@ def _grow(
         axis_key, state_key = jax.random.split(key)
         axis = cycle.axis(state.cells, state.tissue, cell, axis_key)
         change = divided(state.tissue, cell, axis, jnp.any(due))
+        done = change.result == RESULTS.successful
         daughter = jnp.argmax(change.tissue.alive & ~state.tissue.alive).astype(jnp.int32)
         pair = jnp.stack([cell, daughter])
         cells = cycle.born(
             change.inherited(state.cells, axis="cells"), change.tissue, pair, state_key
         )
-        cells = jax.tree.map(lambda a, b: jnp.where(change.done, a, b), cells, state.cells)
-        lineage, number = record_division(state.lineage, state.number, pair, time, change.done)
-        full = state.full | (jnp.any(due) & jnp.all(state.tissue.alive))
-        failed = state.failed_divisions + (jnp.any(due) & ~change.done)
+        cells = jax.tree.map(lambda a, b: jnp.where(done, a, b), cells, state.cells)
+        lineage, number = record_division(state.lineage, state.number, pair, time, done)
+        full = jnp.any(due) & jnp.all(state.tissue.alive)
+        full = RESULTS.where(full, RESULTS.capacity_reached, RESULTS.successful)
+        failed = state.failed_divisions + (jnp.any(due) & ~done)
         after = _State(
             tissue=change.tissue,
             cells=cells,
             number=number,
             lineage=lineage,
-            sound=state.sound,
-            full=full,
+            result=first_failure(state.result, full),
             failed_divisions=failed,
             failed_deaths=state.failed_deaths,
             log_likelihood=state.log_likelihood,
@@ -288,15 +276,18 @@ def _grow(
         moved = relaxation.solve(before, potential, adjoint, recompute=True)
         died = before.alive & ~moved.tissue.alive
         lineage, number = record_deaths(state.lineage, state.number, died, end)
-        sound = state.sound & (moved.result == RESULTS.successful) & moved.valid
+        # (A relaxation that failed matters more than a tissue that is full.)
+        failed = moved.result != RESULTS.successful
+        failed &= (state.result == RESULTS.successful) | (state.result == RESULTS.capacity_reached)
+        result = RESULTS.where(failed, moved.result, state.result)
+        recorded = RESULTS.where(lineage.count <= records, RESULTS.successful, RESULTS.lineage_full)
         overdue = moved.tissue.alive & cycle.overdue(state.cells, moved.tissue)
         return _State(
             tissue=moved.tissue,
             cells=state.cells,
             number=number,
             lineage=lineage,
-            sound=sound,
-            full=state.full,
+            result=first_failure(result, recorded),
             failed_divisions=state.failed_divisions,
             failed_deaths=state.failed_deaths + jnp.sum(overdue),
             log_likelihood=state.log_likelihood,
@@ -315,7 +306,7 @@ def _grow(
 
     def frame_of(arrays: _State) -> tuple:
         failed = (arrays.failed_divisions, arrays.failed_deaths)
-        return arrays.tissue, arrays.cells, arrays.number, arrays.sound, failed
+        return arrays.tissue, arrays.cells, arrays.number, arrays.result, failed
 
     first, rest = jax.random.split(key)
     lineage, number = initial_lineage(tissue, times[0], records)
@@ -324,8 +315,7 @@ def _grow(
         cells=cycle.init(tissue, first),
         number=number,
         lineage=lineage,
-        sound=jnp.array(True),
-        full=jnp.array(False),
+        result=result_of(jnp.array(0)),
         failed_divisions=jnp.array(0),
         failed_deaths=jnp.array(0),
         log_likelihood=jnp.zeros((), tissue.vertices.dtype),
@@ -335,7 +325,7 @@ def _grow(
     keys = jax.random.split(rest, times.shape[0] - 1)
     end, frames = jax.lax.scan(interval, arrays, ((times[:-1], times[1:]), keys))
     prepend = lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest])
-    tissues, cells, numbers, sound, failed = jax.tree.map(prepend, frame_of(arrays), frames)
+    tissues, cells, numbers, results, failed = jax.tree.map(prepend, frame_of(arrays), frames)
     last = combine(end)
     return Grown(
         tissue=last.tissue,
@@ -345,8 +335,7 @@ def _grow(
         cells_then=eqx.combine(cells, static.cells),
         number=numbers,
         lineage=last.lineage,
-        sound=sound,
-        full=last.full,
+        results=results,
         failed_divisions=failed[0],
         failed_deaths=failed[1],
         log_likelihood=last.log_likelihood,

@@ -28,11 +28,6 @@ class Lineage(eqx.Module):
     count: Int[Array, "*batch"]
     """Number of cells."""
 
-    @property
-    def complete(self) -> Bool[Array, "*batch"]:
-        """Whether all cells have a record."""
-        return self.count <= self.mother.shape[-1]
-
 
 def initial_lineage(
     tissue: Tissue, time: Float[Array, ""], size: int

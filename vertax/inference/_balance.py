@@ -17,7 +17,7 @@ class Equations(NamedTuple):
     junctions: Int[np.ndarray, " junctions"]
     """Vertices where three cells meet: two components of force at each."""
     edges: Int[np.ndarray, " edges"]
-    """Edges that end at a junction: their tensions are unknowns, and each has an equation of pressures."""
+    """Edges that end at a junction: their tensions are unknowns, and each arc has an equation."""
     cells: Int[np.ndarray, " cells"]
     """Cells next to these edges: their pressures are unknowns."""
     half_edge: Int[np.ndarray, "junctions 3"]
@@ -26,30 +26,44 @@ class Equations(NamedTuple):
     """Cells on the left and on the right of each edge, as indices into `cells`."""
     chord: Float[np.ndarray, " edges"]
     """Distance between the ends of each edge."""
+    lever: Float[np.ndarray, "junctions 3 2"] | None
+    """Of straight edges, the chords away from each junction, on which pressures act; None for arcs."""
+    beside: Int[np.ndarray, "junctions 3 2"]
+    """Cells on the left and on the right of each edge on the way from the junction."""
 
     @property
     def n_rows(self) -> int:
         """Number of equations."""
-        return 2 * len(self.junctions) + len(self.edges)
+        return 2 * len(self.junctions) + self.n_arcs
 
     @property
     def n_directions(self) -> int:
         """Number of directions at junctions, which come before the angles of arcs."""
         return 3 * len(self.junctions)
 
+    @property
+    def n_arcs(self) -> int:
+        """Number of equations of arcs."""
+        return len(self.edges) if self.lever is None else 0
 
-def equations(geometry: ObservedGeometry) -> Equations:
-    """The equations of all junctions that do not touch the exterior."""
+
+def equations(geometry: ObservedGeometry, *, straight: bool = False) -> Equations:
+    """The equations of all junctions that do not touch the exterior, for arcs or for straight edges."""
     junctions = np.flatnonzero(geometry.inner)
     edges = np.unique(geometry.half_edge[junctions])
     cells = np.unique(geometry.cells[edges])
+    half_edge = geometry.half_edge[junctions]
+    forward = geometry.forward[junctions][:, :, None]
+    sides = geometry.cells[half_edge]
     return Equations(
         junctions=junctions,
         edges=edges,
         cells=cells,
-        half_edge=np.searchsorted(edges, geometry.half_edge[junctions]),
+        half_edge=np.searchsorted(edges, half_edge),
         sides=np.searchsorted(cells, geometry.cells[edges]),
         chord=np.maximum(np.linalg.norm(geometry.chord[edges], axis=1), 1e-6 * geometry.size),
+        lever=np.where(forward, 1, -1) * geometry.chord[half_edge] if straight else None,
+        beside=np.searchsorted(cells, np.where(forward, sides, sides[:, :, ::-1])),
     )
 
 
@@ -57,10 +71,15 @@ def equations(geometry: ObservedGeometry) -> Equations:
 # chord c is in balance with the pressures on its two sides if 2 γ sin α = (p_left - p_right) |c|: the law of
 # Laplace, times the length of the chord. Both are forces, linear in tensions and pressures, and functions of
 # angles: the directions of the tangents, away from their junctions, and the α.
+# A straight edge with the chord c passes the force ½ (p_left - p_right) (c_y, -c_x) of the pressures on to
+# each of its ends (Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017). Together with the tension this
+# is the pull of an arc, to first order in α, and the law of Laplace is no separate equation.
 def angles(geometry: ObservedGeometry, which: Equations) -> Float[np.ndarray, " angles"]:
-    """Directions of tangents, three for each junction, and angles of arcs."""
+    """Directions of tangents, or of straight edges, three for each junction, and angles of arcs."""
     edge, forward = geometry.half_edge[which.junctions], geometry.forward[which.junctions]
     chord = np.arctan2(geometry.chord[:, 1], geometry.chord[:, 0])[edge]
+    if which.lever is not None:
+        return np.where(forward, chord, chord + np.pi).ravel()
     away = chord + geometry.bend[edge, 0] + geometry.bend[edge, 1] - geometry.angle[edge]
     back = chord + geometry.bend[edge, 0] - geometry.bend[edge, 1] + geometry.angle[edge] + np.pi
     return np.concatenate([np.where(forward, away, back).ravel(), geometry.angle[which.edges]])
@@ -78,15 +97,18 @@ def angle_slopes(geometry: ObservedGeometry, which: Equations) -> csr_array:
     bends = first + len(geometry.angle)
     row = np.arange(which.n_directions)
     way = np.where(forward, 1.0, -1.0)
-    entries = [(row, first + edge, -way), (row, bends + 2 * edge, np.ones(len(row)))]
-    entries.append((row, bends + 2 * edge + 1, way))
+    entries = []
+    if which.lever is None:
+        entries = [(row, first + edge, -way), (row, bends + 2 * edge, np.ones(len(row)))]
+        entries.append((row, bends + 2 * edge + 1, way))
     for end, sign in ((0, -1.0), (1, 1.0)):
         for axis in range(2):
             entries.append((row, 2 * geometry.ends[edge, end] + axis, sign * across[edge, axis]))
-    arcs = which.n_directions + np.arange(len(which.edges))
-    entries.append((arcs, first + which.edges, np.ones(len(arcs))))
+    if which.lever is None:
+        arcs = which.n_directions + np.arange(which.n_arcs)
+        entries.append((arcs, first + which.edges, np.ones(len(arcs))))
     rows, columns, values = (np.concatenate(x) for x in zip(*entries, strict=True))
-    shape = (which.n_directions + len(which.edges), geometry.n_geometry)
+    shape = (which.n_directions + which.n_arcs, geometry.n_geometry)
     return csr_array(coo_array((values, (rows, columns)), shape=shape))
 
 
@@ -110,6 +132,12 @@ def forces(
     for component, part in enumerate((np.cos(direction), np.sin(direction))):
         np.add.at(matrix, (row + component, which.half_edge), part)
     matrix[:, :n_edges][:, loose] = 0
+    if which.lever is not None:
+        for side, sign in enumerate((0.5, -0.5)):
+            for component, part in enumerate((which.lever[..., 1], -which.lever[..., 0])):
+                place = row + component, n_edges + which.beside[..., side]
+                np.add.at(matrix, place, sign * part)
+        return matrix
     row = 2 * n_junctions + np.arange(n_edges)
     matrix[row, np.arange(n_edges)] = 2 * np.sin(arc)
     for side, sign in enumerate((-1.0, 1.0)):
@@ -121,14 +149,15 @@ def force_slopes(
     angle: Float[np.ndarray, " angles"], which: Equations, tension: Float[np.ndarray, " edges"]
 ) -> csr_array:
     """Jacobian of the forces with respect to the angles, at given tensions."""
-    n_junctions, n_edges = len(which.junctions), len(which.edges)
+    n_junctions = len(which.junctions)
     direction, arc = angle[: which.n_directions], angle[which.n_directions :]
     pull = tension[which.half_edge].ravel()
     row, column = np.repeat(2 * np.arange(n_junctions), 3), np.arange(which.n_directions)
-    along = 2 * n_junctions + np.arange(n_edges), which.n_directions + np.arange(n_edges)
-    rows = np.concatenate([row, row + 1, along[0]])
-    columns = np.concatenate([column, column, along[1]])
-    values = [-pull * np.sin(direction), pull * np.cos(direction), 2 * tension * np.cos(arc)]
+    arcs = np.arange(which.n_arcs)
+    rows = np.concatenate([row, row + 1, 2 * n_junctions + arcs])
+    columns = np.concatenate([column, column, which.n_directions + arcs])
+    values = [-pull * np.sin(direction), pull * np.cos(direction)]
+    values.append(2 * tension[: which.n_arcs] * np.cos(arc))
     shape = (which.n_rows, len(angle))
     return csr_array(coo_array((np.concatenate(values), (rows, columns)), shape=shape))
 

@@ -1,69 +1,94 @@
-"""Sizes of the errors of noise and model, estimated from the residual forces."""
+"""Sizes of the errors of noise and model, and widths of the priors, chosen by the evidence."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import qr, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
-
-# Smallest errors of the model, in radians: of angles at junctions, and of arcs of the length of a cell;
-# largest.
-LEAST = (0.005, 0.02)
-_MOST = 1.5
 
 
 class Errors(NamedTuple):
-    """Sizes of errors; or the covariance of the forces for each error of size 1."""
+    """Standard deviations: of the angles beyond noise, of the noise, and of the priors; or their logarithms,
+    or the covariances of the forces for each standard deviation of 1."""
 
     junction: Float[np.ndarray, "*shape"] | float
-    """Angles at junctions, radians."""
+    """Directions at junctions, radians."""
+    grain: Float[np.ndarray, "*shape"] | float
+    """Directions of edges of the length of a cell, radians; of others in inverse proportion to the length."""
     arc: Float[np.ndarray, "*shape"] | float
     """Angles of arcs of the length of a cell, radians."""
+    bent_arc: Float[np.ndarray, "*shape"] | float
+    """Angles of arcs, relative to the bend of the edge."""
     noise: Float[np.ndarray, "*shape"] | float
     """Noise relative to that of the points."""
+    tension: Float[np.ndarray, "*shape"] | float
+    """Prior of tensions about 1, independent of each other."""
+    region: Float[np.ndarray, "*shape"] | float
+    """Prior of tensions about 1, similar in regions of the tissue."""
+    pressure: Float[np.ndarray, "*shape"] | float
+    """Prior of pressures about 0, in mean tensions over a cell diameter."""
 
 
-def model_errors(
-    matrix: Float[np.ndarray, "rows unknowns"],
-    given: Float[np.ndarray, " rows"],
+# With residual forces r = A x̄ - J d at the prior mean x̄, the evidence is the density of r,
+#
+#     r ~ N(0, K),   K = U + Σ_k s_k² V_k,   -2 ln p = rᵀ K⁻¹ r + ln det K,
+#
+# where V_k are the covariances of the forces, for noise, errors of the model and priors of standard deviation
+# 1, and U is that of unknown forces. Derivative: 2 s_k² [tr(K⁻¹ V_k) - rᵀ K⁻¹ V_k K⁻¹ r] for ln s_k.
+def most_evident(
+    residual: Float[np.ndarray, " rows"],
     parts: Errors,
     unknown: Float[np.ndarray, "rows rows"],
     guess: Errors,
-    shares: tuple[float, float],
-) -> Errors:
-    """The errors by restricted maximum likelihood (Patterson & Thompson 1971, doi:10.1093/biomet/58.3.545).
-
-    The combinations N of the equations without unknowns, Nᵀ A = 0, have the covariance Nᵀ S N.
+    bounds: dict[str, tuple[float, float]],
+    *,
+    steps: int,
+) -> tuple[Errors, float]:
+    """The standard deviations of the largest marginal likelihood (evidence), and its logarithm.
 
     **Arguments:**
 
-    - `matrix`: A, the forces of unit tensions and pressures.
-    - `given`: forces without them.
-    - `parts`: covariance of the forces for each error of size 1.
+    - `residual`: r, the forces at the prior mean.
+    - `parts`: covariance of the forces for each standard deviation of 1.
     - `unknown`: covariance of unknown forces.
-    - `guess`: initial errors.
-    - `shares`: logarithms of the smallest and largest noise relative to that of the points.
+    - `guess`: initial standard deviations.
+    - `bounds`: smallest and largest standard deviation by name; others keep the guess.
+    - `steps`: largest number of iterations (L-BFGS-B).
 
-    **Returns:** the [`Errors`][vertax.inference._errors.Errors].
+    **Returns:** the [`Errors`][vertax.inference._errors.Errors] and the evidence.
     """
-    factors: Any = qr(matrix, pivoting=True)  # (the type is missing in SciPy's overloads)
-    orthogonal, upper, _ = factors
-    size = np.abs(np.diag(upper))
-    free = orthogonal[:, int(np.sum(size > 1e-9 * size[0])) :]
-    z = free.T @ given
-    loose, junction, arc, noise = (free.T @ part @ free for part in (unknown, *parts))
+    free = [k for k, name in enumerate(Errors._fields) if name in bounds]
+    noise = Errors._fields.index("noise")
+    constant = unknown + sum(
+        (guess[k] ** 2 * parts[k] for k in range(len(guess)) if k not in free and guess[k]),
+        np.zeros_like(unknown),
+    )
 
-    def loss(logs: np.ndarray) -> float:
+    def loss(logs: np.ndarray) -> tuple[float, np.ndarray]:
         ratio = np.exp(2 * logs)
-        factor = np.linalg.cholesky(loose + ratio[0] * junction + ratio[1] * arc + ratio[2] * noise)
-        left = solve_triangular(factor, z, lower=True)
-        return left @ left + 2 * np.sum(np.log(np.diag(factor))) + logs[2] ** 2
+        total = constant + sum(s * parts[k] for s, k in zip(ratio, free, strict=True))
+        root = cho_factor(total, lower=True, check_finite=False)
+        inverse = cho_solve(root, np.eye(len(total)), check_finite=False)
+        force = inverse @ residual
+        value = residual @ force + 2 * np.sum(np.log(np.diag(root[0])))
+        slope = [
+            2 * s * (np.vdot(inverse, parts[k]) - force @ parts[k] @ force)
+            for s, k in zip(ratio, free, strict=True)
+        ]
+        if noise in free:
+            at = free.index(noise)
+            value += logs[at] ** 2
+            slope[at] += 2 * logs[at]
+        return float(value), np.array(slope)
 
-    bounds = [(np.log(least), np.log(_MOST)) for least in LEAST] + [shares]
-    first = np.clip(np.log(np.array(guess)), *np.transpose(bounds))
-    options = {"xatol": 0.05, "fatol": 0.02}
-    optimum = minimize(loss, first, method="Nelder-Mead", bounds=bounds, options=options)
-    return Errors(*np.exp(optimum.x).tolist())
+    limits = np.log([bounds[Errors._fields[k]] for k in free]).reshape(-1, 2)
+    first = np.clip(np.log([guess[k] for k in free]), *limits.T)
+    options = {"maxiter": steps, "ftol": 1e-6, "gtol": 0.1}
+    optimum = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=limits, options=options)
+    values = list(guess)
+    for k, log in zip(free, optimum.x, strict=True):
+        values[k] = float(np.exp(log))
+    return Errors(*values), -0.5 * float(optimum.fun)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,16 +13,17 @@ import numpy as np
 from jaxtyping import Array, Int, Shaped
 
 from vertax._base.announce import announce_compilations
+from vertax._base.blas import one_blas_thread
 from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.inference._balance import equations
-from vertax.inference._curves import Points, read_courses
+from vertax.inference._curves import Points
+from vertax.inference._edges import fit, more_evident, solution
 from vertax.inference._inferred import InferredTensions
 from vertax.inference._mask import labels_and_lines
 from vertax.inference._observed_geometry import observed_geometry
 from vertax.inference._outcome import outcome
 from vertax.inference._resampling import resampled_deviations
-from vertax.inference._solve import observability, solve
 from vertax.initialise import MaskReport, Segmentation, from_labels
 from vertax.initialise._report import LEAST_LENGTH
 from vertax.io import Foam, pixel_aspect, read_surface_evolver
@@ -31,10 +33,13 @@ from vertax.mesh._geometry import geometry_of
 # Noise of a tissue without an image, and of the points of a foam, relative to the cell diameter; and the
 # number of points of an edge without a course.
 _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
+# Initial noise of the vertices of a tissue with straight edges, relative to the cell diameter.
+_VERTEX = 0.01
 _EVOLVER = (".dmp", ".fe")
 
 
 @announce_compilations("measurements of a tissue")
+@one_blas_thread()
 def infer_tensions(
     segmentation_or_mask: Segmentation
     | Foam
@@ -49,6 +54,7 @@ def infer_tensions(
     background: int | None = None,
     gap_width: float | None = None,
     holes: str = "keep",
+    edges: str | None = None,
     noise: float | None = None,
     prior: float | None = None,
     resamples: int = 0,
@@ -84,34 +90,42 @@ def infer_tensions(
     - `pixel_size`, `background`, `gap_width`, `holes`: of a mask, see
         [`from_labels`][vertax.initialise.from_labels]. Where a TIFF file has pixels that are not square,
         their ratio is taken from it.
+    - `edges`: `"arcs"`, whose curvature determines pressures; `"straight"`, with the pressures acting on
+        vertices (Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017); by default, of a tissue with
+        arcs the one of the larger evidence, see `InferredTensions.edges`.
     - `noise`: standard deviation of the position of an edge, in units of length; by default the root mean
-        square distance of pixels (or the points of a foam) from curves, and 0.002 cell diameters for a tissue
-        without either.
-    - `prior`: standard deviation of the prior of relative tensions about 1; by default twice the spread of a
-        first estimate. A small one makes tensions too uniform.
+        square distance of pixels (or the points of a foam) from curves, 0.002 cell diameters for a tissue
+        of arcs, and chosen by the evidence for a tissue with straight edges.
+    - `prior`: standard deviation of the prior of relative tensions about 1, independent of each other; by
+        default chosen by the evidence (marginal likelihood), with a part that is similar in regions. A small
+        one makes tensions too uniform.
     - `resamples`: number of resampled shapes, as a check of the standard deviations (wild bootstrap: Wu 1986,
         doi:10.1214/aos/1176350142), such as 50.
     - `seed`: seed of the random numbers of the resampling.
 
-    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; read its `doubts`.
+    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; read its `warnings`.
 
     **Raises:**
 
     - `TypeError` for a source of another type.
-    - `ValueError` for a tissue without a junction of three cells, a tissue with straight inner edges, a
-        mirrored one, a `noise` or `prior` that is not positive, and as the readers.
+    - `ValueError` for a tissue without a junction of three cells, `edges="arcs"` for straight inner edges,
+        a mirrored tissue, a `noise` or `prior` that is not positive, and as the readers.
     """
     for name, value in (("noise", noise), ("prior", prior)):
         if value is not None:
             check_number(name, value, above=0)
     check_integer("resamples", resamples, at_least=0)
+    if edges not in (None, "arcs", "straight"):
+        raise ValueError(
+            f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
+        )
     source = segmentation_or_mask
     if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in _EVOLVER:
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
         mask, line_width = labels_and_lines(source, kind, background, plane)
         if pixel_size is None and isinstance(source, str | os.PathLike):
-            pixel_size = _pixels_of_file(Path(source), mask)
+            pixel_size = pixels_of_file(Path(source), mask)
         source = from_labels(
             mask,
             boundary="free",
@@ -133,6 +147,11 @@ def infer_tensions(
             f"is {describe(segmentation_or_mask)}."
         )
     tissue, report = course.tissue, course.report
+    if edges == "arcs" and not tissue.inner_arcs:
+        raise ValueError(
+            "Argument `edges` must not be 'arcs' for a tissue whose inner edges are straight. Make it with "
+            "`inner_arcs=True`, or pass edges='straight'."
+        )
     is_hole = course.labels == 0
     geometry = observed_geometry(tissue, is_hole, None if report is None else report.closed)
     which = equations(geometry)
@@ -141,14 +160,18 @@ def infer_tensions(
             "Argument `segmentation_or_mask` must have a place where three of its cells meet, but it has "
             "none: the forces at its outline are unknown. Take a larger tissue."
         )
+    uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
     noise = course.noise if noise is None else noise
-    curves = read_courses(geometry, points, course.grain, apart=course.apart, noise=noise)
-    fitted = geometry.moved(curves.change)
-    uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
-    shape = observability(fitted, curves, which, uncertain)
-    balance = solve(shape, which, exact=noise is not None, prior=prior)
+    curves = fit(geometry, points, course.grain, apart=course.apart, noise=noise)
+    solve_as = partial(
+        solution, geometry, curves, uncertain, known_noise=noise is not None, prior=prior
+    )
+    solved = solve_as(straight=edges == "straight" or not tissue.inner_arcs)
+    if edges is None and tissue.inner_arcs:
+        solved = more_evident(solved, solve_as(straight=True))
+    fitted, which, shape, balance = solved
     resampled = None
     if resamples:
         observed = fitted, curves, points, which, shape
@@ -176,7 +199,7 @@ class _Course(NamedTuple):
     report: MaskReport | None = None
 
 
-def _pixels_of_file(file: Path, mask: Int[np.ndarray, "rows columns"]) -> PixelSize | None:
+def pixels_of_file(file: Path, mask: Int[np.ndarray, "rows columns"]) -> PixelSize | None:
     """Size of the pixels of a file that are not square, for a mean cell area of about 1."""
     aspect = pixel_aspect(file)
     if abs(aspect - 1) < 0.01:
@@ -202,13 +225,13 @@ def _of_mask(source: Segmentation) -> _Course:
             "Argument `segmentation_or_mask` must hold the courses of its edges, as "
             "vx.initialise.from_labels returns them. Pass its mask, or its tissue."
         )
-    copies = len(np.unique(source.labels)) < len(source.labels)
+    cells = source.labels[source.labels > 0]  # several holes have the label 0
+    copies = len(np.unique(cells)) < len(cells)
     if copies or (not source.complete.all() and source.tissue.topology.exterior is False):
         raise ValueError(
             "Argument `segmentation_or_mask` must not be mirrored at its border, where no forces "
             "balance. Use vx.initialise.from_labels(mask, boundary='free')."
         )
-    _check_arcs(source.tissue)
     first = geometry_of(source.tissue).edge_vertices[:, 0]
     # Where a wide gap was closed, the mask does not show the edge.
     edge = source.courses.edge[source.courses.shown]
@@ -231,21 +254,15 @@ def _of_foam(source: Foam, noise: float | None) -> _Course:
 
 
 def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:
-    _check_arcs(tissue)
+    geometry = observed_geometry(tissue)
+    labels = np.arange(1, tissue.n_cells + 1)  # 0 is the label of the exterior
+    if not tissue.inner_arcs:
+        points = Points(np.zeros(0, int), np.zeros((0, 2)))
+        return _Course(tissue, labels, points, _VERTEX * geometry.size, None, noise, None)
     fractions = jnp.asarray((np.arange(_POINTS) + 0.5) / _POINTS, tissue.vertices.dtype)
     course = np.asarray(tissue.edge_points(jnp.append(0, fractions)), float)
     edge = np.repeat(np.arange(tissue.n_edges), _POINTS)
     points = Points(edge, (course[:, 1:] - course[:, :1]).reshape(-1, 2))
-    geometry = observed_geometry(tissue)
     noise = _EXACT * geometry.size if noise is None else noise
     apart = float(np.mean(np.linalg.norm(geometry.chord, axis=1))) / _POINTS
-    labels = np.arange(1, tissue.n_cells + 1)  # 0 is the label of the exterior
     return _Course(tissue, labels, points, noise, apart, noise, None)
-
-
-def _check_arcs(tissue: Tissue) -> None:
-    if not tissue.inner_arcs:
-        raise ValueError(
-            "Argument `segmentation_or_mask` must be a tissue whose inner edges are arcs, because their "
-            "curvature determines pressures; make it with `inner_arcs=True`."
-        )

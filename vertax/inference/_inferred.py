@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vertax._base.pixels import PixelSize, pixel_sides
+from vertax.inference._columns import with_pixels
+from vertax.inference._mean_stress import MeanStress
 from vertax.initialise import MaskReport
 from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vtk
 from vertax.mesh import Tissue
@@ -18,7 +20,7 @@ from vertax.mesh._geometry import geometry_of
 
 # Cells with a larger error of the area are named.
 _AREA_ERROR = 0.1
-# Number of places that a doubt names.
+# Number of places that a warning names.
 _PLACES = 5
 
 
@@ -58,9 +60,16 @@ class InferredTensions(eqx.Module):
     """Correlation length of this noise along an edge, in units of length."""
     bending: float
     """Standard deviation of the bends of edges beyond arcs, in radians; 0 for a foam at rest."""
-    model_errors: tuple[float, float]
-    """Standard deviation, in radians, of the differences of angles at junctions, and of angles of arcs of the
-    length of a cell, from those of a balance, beyond the noise."""
+    edges: str
+    """`"arcs"` or `"straight"`: how edges were described."""
+    errors: dict[str, float]
+    """Standard deviations chosen by the evidence: `junction`, of the directions at junctions beyond noise
+    (radians); `grain`, the same of edges of the length of a cell, in inverse proportion to the length; `arc`,
+    of arcs of the length of a cell (radians); `bent_arc`, of arcs relative to the bend; `noise`, relative to
+    that of the points; and of the priors: `tension`, independent; `region`, similar in regions; `pressure`,
+    in mean tensions over a cell diameter. 0 for errors that are not part of the model."""
+    mean_stress: MeanStress
+    """Mean stress of the tissue and its anisotropy, with standard deviations."""
     pixel_size: PixelSize | None
     """Length of a pixel side, if the tissue comes from an image; (height, width) if pixels are not square."""
     four_fold: Bool[np.ndarray, " edges"]
@@ -83,51 +92,51 @@ class InferredTensions(eqx.Module):
         return geometry_of(self.tissue).areas / pixels - 1
 
     @property
-    def doubts(self) -> list[str]:
-        """Reasons against the result, as sentences; empty if there are none."""
-        doubts = [] if self.mask_report is None else mask_doubts(self.mask_report, self)
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons to distrust parts of the result, as sentences; empty if there are none."""
+        warnings = [] if self.mask_report is None else mask_warnings(self.mask_report, self)
         unknowns = np.isfinite(self.tensions)
         share = np.mean(self.determined[unknowns]) if unknowns.any() else 0.0
         if share < 0.5:
-            doubts.append(
+            warnings.append(
                 f"of {unknowns.sum()} tensions only {share:.0%} are determined: edges are too short for "
                 "their pixels, or outlines too rough; take a finer image or a larger tissue"
             )
-        junction, arc = self.model_errors
+        junction, arc = self.errors["junction"], self.errors["arc"]
         if share > 0 and np.nanmedian(self.tension_deviations[self.determined]) > 0.15:
-            doubts.append(
+            warnings.append(
                 "half of the tensions that are determined have standard deviations above 0.15: only "
                 "strong and weak edges can be distinguished"
             )
         if junction > 0.1:
-            doubts.append(
+            warnings.append(
                 f"angles at junctions are {np.degrees(junction):.0f} degrees from those of a balance: the "
                 "tissue moves, or other forces than tensions act on junctions; variations of tension over "
                 "many cells are then smoothed out"
             )
         if self.bending > 0.03:
-            doubts.append(
+            warnings.append(
                 f"edges bend by {np.degrees(self.bending):.1f} degrees beyond arcs: the tissue moves, and "
                 "its shape is in part that of earlier tensions; the present ones differ more from each other "
                 "than the inferred ones, beyond their standard deviations"
             )
         if arc > 0.5:
-            doubts.append(
+            warnings.append(
                 f"arcs are {np.degrees(arc):.0f} degrees from those that pressures cause: pressures are not "
                 "reliable"
             )
         if share > 0 and np.mean(self.tensions[self.determined] < 0.2) > 0.03:
-            doubts.append(
+            warnings.append(
                 "many tensions are near 0: where outlines are rough and edges short, the error of each "
                 "junction adds up over many cells, and a part of the tissue loses its tension to the "
                 "others; take a finer image, or a smaller `prior`"
             )
         zero = int(np.sum(self.determined & (self.tensions < 1e-6)))
         if zero:
-            doubts.append(
+            warnings.append(
                 f"{zero} tensions are 0, the smallest allowed: the shape requires a push there"
             )
-        return doubts
+        return tuple(warnings)
 
     def edge_table(self) -> dict[str, np.ndarray]:
         """The edges as a table, see [`edge_table`][vertax.io.edge_table].
@@ -136,18 +145,20 @@ class InferredTensions(eqx.Module):
         cells, for an edge that is four-fold), `four_fold`, `tension`, `tension_deviation` and `determined`;
         for a mask also `shown`, the share of the edge along which the mask shows the contact,
         `contact_closed`, where that is less than a half, and `contact_uncertain`, for an edge across a gap so
-        wide that other cells may touch there.
+        wide that other cells may touch there; and in pixels, from the top left corner of the image,
+        `start_column`, `start_row`, `end_column`, `end_row` and `length_pixels`.
         """
-        return edge_table(self.tissue, **self._edge_columns)
+        return with_pixels(edge_table(self.tissue, **self._edge_columns), self.pixel_size)
 
     def cell_table(self) -> dict[str, np.ndarray]:
         """The cells as a table, see [`cell_table`][vertax.io.cell_table].
 
         **Returns:** its columns, and `label`, `pressure`, `pressure_deviation`, `determined` and the stress
         as `stress_xx`, `stress_xy` and `stress_yy`; for a mask also `hole`, `pixels`, `area_error` (the area
-        of the cell over that of its pixels, less 1) and `outline_error` (in pixels, see `outline_errors`).
+        of the cell over that of its pixels, less 1), `outline_error` (in pixels, see `outline_errors`), and
+        in pixels, from the top left corner of the image, `column`, `row` and `area_pixels`.
         """
-        return cell_table(self.tissue, **self._cell_columns)
+        return with_pixels(cell_table(self.tissue, **self._cell_columns), self.pixel_size)
 
     def write(self, path: str | os.PathLike[str]) -> list[Path]:
         """Write cells and edges to two files: `NAME.csv` and `NAME-edges.csv`, and so on.
@@ -221,7 +232,7 @@ class InferredTensions(eqx.Module):
         }
 
 
-def mask_doubts(report: MaskReport, result: InferredTensions) -> list[str]:
+def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
     """The changes of a mask as sentences, with places.
 
     **Arguments:**
@@ -248,7 +259,7 @@ def mask_doubts(report: MaskReport, result: InferredTensions) -> list[str]:
         (("left out",), "labelled pixels belong to no cell"),
         (("absorbed",), "labels are no cells"),
     )
-    doubts = []
+    warnings = []
     for kinds, text in groups:
         changes = report.of_kind(*kinds)
         # Single pixels off a cell are of no consequence.
@@ -259,13 +270,13 @@ def mask_doubts(report: MaskReport, result: InferredTensions) -> list[str]:
         if changes:
             places = "; ".join(map(str, changes[:_PLACES]))
             more = f"; and {len(changes) - _PLACES} more" if len(changes) > _PLACES else ""
-            doubts.append(f"{text}: {places}{more}")
+            warnings.append(f"{text}: {places}{more}")
     closed = report.closed & np.isfinite(report.shown) & ~result.four_fold
     closed &= np.all(
         np.append(result.labels, 0)[np.asarray(result.tissue.topology.edge_cells)] > 0, axis=1
     )
     if closed.any():
-        doubts.append(
+        warnings.append(
             f"{closed.sum()} contacts are not shown by the mask, because gaps or holes wider than "
             f"{report.gap_width:g} pixels were closed; their tensions are not determined"
         )
@@ -276,8 +287,8 @@ def mask_doubts(report: MaskReport, result: InferredTensions) -> list[str]:
             for k in off[np.argsort(-np.abs(result.area_errors[off]))][:_PLACES]
         ]
         more = f" and {len(off) - _PLACES} more" if len(off) > _PLACES else ""
-        doubts.append(
+        warnings.append(
             f"the areas of {len(off)} cells differ by more than {_AREA_ERROR:.0%} from those of their "
             f"pixels, because arcs do not follow their outlines: {', '.join(cells)}{more}"
         )
-    return doubts
+    return warnings

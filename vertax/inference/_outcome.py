@@ -12,6 +12,7 @@ from vertax._base.pixels import PixelSize, pixel_length
 from vertax.inference._balance import Equations
 from vertax.inference._curves import Fitted, Points, arc_distances
 from vertax.inference._inferred import InferredTensions
+from vertax.inference._mean_stress import fabric, mean_stress, stress_weights
 from vertax.inference._solve import Balance
 from vertax.initialise import MaskReport
 from vertax.mesh import Tissue
@@ -31,6 +32,8 @@ class Relative(NamedTuple):
     pressure_deviation: Float[np.ndarray, " pressures"]
     beside: Bool[np.ndarray, " pressures"]
     """Whether a cell has an edge of determined tension."""
+    slope: Float[np.ndarray, "unknowns unknowns"]
+    """Slope of these numbers with respect to tensions and pressures before the scaling."""
 
 
 def relative(balance: Balance, which: Equations) -> Relative:
@@ -58,9 +61,10 @@ def relative(balance: Balance, which: Equations) -> Relative:
     if beside.any():
         values[n:] -= np.mean(values[n:][beside])
         slope[n:] -= slope[n:][beside].mean(axis=0)
-    variance = np.sum((slope @ balance.covariance) * slope, axis=1) / scale**2
+    slope /= scale
+    variance = np.sum((slope @ balance.covariance) * slope, axis=1)
     deviations = np.sqrt(np.maximum(variance, 0))
-    return Relative(values[:n], values[n:], deviations[:n], deviations[n:], beside)
+    return Relative(values[:n], values[n:], deviations[:n], deviations[n:], beside, slope)
 
 
 def outcome(
@@ -92,6 +96,13 @@ def outcome(
     if report is not None:
         tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
     result = relative(balance, which)
+    weights, whole = stress_weights(tissue, which.edges, which.cells)
+    linear = weights @ result.slope
+    stress = mean_stress(
+        weights @ np.concatenate([result.tension, result.pressure]),
+        linear @ balance.covariance @ linear.T,
+        int(whole.sum()),
+    )
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
         array = np.full(size, fill)
@@ -117,7 +128,9 @@ def outcome(
         noise=float(curves.noise * balance.errors.noise),
         correlation=float(curves.apart),
         bending=curves.bending,
-        model_errors=(float(balance.errors.junction), float(balance.errors.arc)),
+        edges="straight" if which.n_arcs == 0 else "arcs",
+        errors={name: float(value) for name, value in balance.errors._asdict().items()},
+        mean_stress=stress,
         pixel_size=pixel_size,
         four_fold=four_fold,
         mask_report=report,
@@ -194,17 +207,9 @@ def _stresses(
 ) -> Float[np.ndarray, "cells 2 2"]:
     """Stress of each cell, ½ Σ γ ∫ t t dl / A - p I over its edges (Batchelor 1970,
     doi:10.1017/S0022112070000745)."""
-    # Along an arc the tangent t turns from -α to α; the mean of t t has an entry along the chord, `share`,
-    # and one across.
     geometry = geometry_of(tissue)
-    chord, angle, length = geometry.edge_vectors, geometry.edge_angles, geometry.edge_lengths
-    unit = chord / np.maximum(np.linalg.norm(chord, axis=1), 1e-300)[:, None]
-    aside = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
-    share = 0.5 * (1 + np.sinc(2 * angle / np.pi))
-    outer = lambda x: x[:, :, None] * x[:, None, :]
-    fabric = share[:, None, None] * outer(unit) + (1 - share)[:, None, None] * outer(aside)
     certain = np.where(determined, tensions, np.nan)
-    pulled = 0.5 * (certain * length)[:, None, None] * fabric
+    pulled = 0.5 * certain[:, None, None] * fabric(tissue)
     total = np.zeros((tissue.n_cells + 1, 2, 2))
     for side in geometry.edge_cells.T:
         np.add.at(total, side, pulled)

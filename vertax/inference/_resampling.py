@@ -10,7 +10,7 @@ from vertax.inference._balance import Equations, angle_slopes
 from vertax.inference._curves import Fitted, Points
 from vertax.inference._observed_geometry import ObservedGeometry
 from vertax.inference._outcome import relative
-from vertax.inference._solve import Balance, Observability, solve
+from vertax.inference._solve import Balance, Observability, model_deviations, solve
 
 
 # The truth of the bootstrap are the angles with which all forces balance at the inferred tensions. Added are
@@ -47,17 +47,14 @@ def resampled_deviations(
         (curves.weighted * curves.rest).toarray()
     )
     by_stretch = np.add.reduceat(by_point, np.flatnonzero(np.diff(stretch, prepend=-1)), axis=1)
-    errors = balance.errors
-    model = np.concatenate(
-        [np.full(which.n_directions, errors.junction), errors.arc * shape.length]
-    )
+    model = model_deviations(balance.errors, shape, which)
     samples = []
     for _ in range(times):
         sign = random.choice([-1.0, 1.0], size=by_stretch.shape[1])
         chance = by_stretch @ sign + model * random.normal(size=len(model))
         again = shape._replace(angle=balance.angle + chance)
         samples.append(
-            relative(solve(again, which, exact=True, prior=prior, errors=errors), which).tension
+            relative(solve(again, which, prior=prior, errors=balance.errors), which).tension
         )
     return np.std(samples, axis=0, ddof=1)
 

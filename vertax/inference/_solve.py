@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import nnls
+from scipy.sparse import csr_array
 from scipy.sparse.linalg import splu
 
 from vertax.inference._balance import (
@@ -19,24 +20,38 @@ from vertax.inference._balance import (
     pulls,
 )
 from vertax.inference._curves import Fitted
-from vertax.inference._errors import Errors, model_errors
+from vertax.inference._errors import Errors, most_evident
 from vertax.inference._observed_geometry import ObservedGeometry
 
 # An edge is loose if the standard deviation of its direction, in radians, is larger than the first, or if it
-# is shorter than the second times the noise. Its force has the third as standard deviation, in mean tensions.
-_LOOSE, _SHORT, _UNKNOWN = 0.2, 8.0, 10.0
-# Prior standard deviation of pressures, in mean tensions over a cell diameter.
-_PRESSURE = 10.0
-# Width of the prior of tensions over their spread; smallest and largest width; initial width.
-_TIMES, _WIDTHS, _START = 2.0, (0.3, 3.0), 0.5
+# is shorter than the second times the noise, or the third times the size of a cell. Its force has the fourth
+# as standard deviation, in mean tensions.
+_LOOSE, _SHORT, _TINY, _UNKNOWN = 0.2, 8.0, 0.02, 10.0
 # Smallest tension in the covariance of the forces.
 _SMALL = 0.2
-_FIRST = Errors(0.05, 0.5, 1.0)
-# Logarithms of the smallest noise relative to that of the points, of smooth and of rough outlines, and of the
-# largest: pixels along a straight line deviate from it by a pattern that averages out, rough outlines do not.
-_LESS, _ROUGH_LESS, _MORE = -2.3, -0.35, 0.7
-# Error of arcs, in radians, above which their weight decreases.
-_ARCS = 0.02
+# Initial standard deviations.
+_FIRST = Errors(0.05, 1e-3, 0.1, 0.3, 1.0, 0.3, 0.3, 1.0)
+# Smallest and largest ones (angles in radians, bends relative, priors in mean tensions).
+_ANGLES, _RATIOS, _TENSIONS, _PRESSURES = (1e-3, 1.5), (1e-2, 10.0), (0.03, 1.5), (0.3, 10.0)
+_GRAINS, _JUNCTIONS = (1e-5, 0.05), (5e-3, 1.5)
+# Length of an edge, in cell diameters, below which the error of its arc does not decrease.
+_SHORTEST = 0.25
+# The errors of arcs are forces of friction along the edges. Only their sums around junctions contradict a
+# balance; the rest, which is as large or larger, changes pressures and is not in the residual.
+_HIDDEN = 2.0
+# Range of the correlation of tensions: κ² in the covariance (L + κ²)⁻², with L the Laplacian of edges that
+# meet at junctions. The correlation decreases over about √8 / κ edges.
+_KAPPA = 0.2
+_PRIORS = ("tension", "region", "pressure")
+# Smallest noise relative to that of the points, of smooth and of rough outlines, and the largest: pixels
+# along a straight line deviate from it by a pattern that averages out, rough outlines do not.
+_LESS, _ROUGH_LESS, _MORE = 0.1, 0.7, 2.0
+# The same for vertices of straight edges without an image, whose noise is not known beforehand.
+_VERTICES = (0.01, 50.0)
+# Iterations of the first and of the second estimate of the errors.
+_STEPS = (25, 10)
+# Bends larger than this, in radians, are errors of arcs.
+_BENT = 1e-3
 # Largest adjustment of an angle, in radians.
 _REACH = 0.5
 
@@ -57,8 +72,10 @@ class Observability(NamedTuple):
     other, so that the balance of both ends together remains."""
     size: float
     """Root of the mean area of a cell."""
-    least_noise: float
-    """Logarithm of the smallest noise relative to that of the points."""
+    bend: Float[np.ndarray, " edges"]
+    """Size of the bend of each edge beyond its arc, radians."""
+    bounds: dict[str, tuple[float, float]]
+    """Smallest and largest standard deviations of errors and priors."""
 
 
 class Balance(NamedTuple):
@@ -71,8 +88,9 @@ class Balance(NamedTuple):
     angle: Float[np.ndarray, " angles"]
     """The angles with which all forces balance."""
     errors: Errors
-    """Errors of the model, beyond noise, and the noise estimated from forces, relative to that of the
-    points."""
+    """Errors of the model, noise relative to that of the points, and widths of the priors."""
+    evidence: float
+    """Logarithm of the density of the observed angles, up to a constant of the tissue."""
     residual: Float[np.ndarray, " rows"]
     """Residual forces with the observed angles, over their standard deviations."""
     loose: Bool[np.ndarray, " edges"]
@@ -84,31 +102,56 @@ def observability(
     curves: Fitted,
     which: Equations,
     uncertain: Bool[np.ndarray, " all_edges"],
+    *,
+    prior: float | None,
+    known_noise: bool,
 ) -> Observability:
     """The observed angles of a shape, and their covariance.
 
-    `uncertain` marks edges that may be between other cells; they are loose, as those without a direction.
+    **Arguments:**
+
+    - `fitted`, `curves`: the geometry and the noise.
+    - `which`: the equations.
+    - `uncertain`: edges that may be between other cells; they are loose, as those without a direction.
+    - `prior`: standard deviation of tensions about 1; by default chosen by the evidence.
+    - `known_noise`: whether the noise is at most that of the points.
     """
     slope = angle_slopes(fitted, which)
     covariance = curves.noise**2 * (slope @ splu(curves.precision).solve(slope.T.toarray()))
     variance = np.zeros(len(which.edges))
     np.maximum.at(variance, which.half_edge.ravel(), np.diag(covariance)[: which.n_directions])
-    loose = (variance > _LOOSE**2) | (which.chord < _SHORT * curves.noise)
+    least = max(_SHORT * curves.noise, _TINY * fitted.size)
+    loose = (variance > _LOOSE**2) | (which.chord < least)
     loose |= uncertain[which.edges]
     unknown = pulls(fitted, which, loose)
+    smallest = _LESS if curves.crisp else _ROUGH_LESS
+    noise = _VERTICES if len(curves.rest) == 0 else (smallest, _MORE)
+    bounds = {
+        "junction": _JUNCTIONS if which.n_arcs else _ANGLES,
+        "noise": (noise[0], 1.0 if known_noise else noise[1]),
+    }
+    # Arcs that lag behind the pressures would make these small in the evidence.
+    bounds["pressure"] = _PRESSURES if which.n_arcs else (0.01, _PRESSURES[1])
+    if prior is None:
+        bounds |= {"tension": _TENSIONS, "region": _TENSIONS}
+    if which.n_arcs:
+        bounds |= {"arc": _ANGLES, "grain": _GRAINS}
+        if curves.bending > _BENT:
+            bounds["bent_arc"] = _RATIOS
     return Observability(
         angle=angles(fitted, which),
         covariance=covariance,
-        length=np.maximum(which.chord / fitted.size, 0.05),
+        length=which.chord / fitted.size,
         loose=loose,
         unknown=_UNKNOWN**2 * unknown @ unknown.T,
         size=fitted.size,
-        least_noise=_LESS if curves.crisp else _ROUGH_LESS,
+        bend=np.linalg.norm(fitted.bend[which.edges], axis=1),
+        bounds=bounds,
     )
 
 
 # Observed are angles a with the covariance C, from the noise of points. Where the tissue is not in balance,
-# angles differ from those of a balance as well, which adds τ² to their covariance.
+# angles differ from those of a balance as well, the more the more an edge bends beyond an arc.
 # Forces r(x, a) = A(a) x are linear in the unknowns x. To first order their covariance is S = J C Jᵀ with
 # J = ∂r/∂a. Weighted least squares with fixed a would shrink the unknowns, because the noise of A and of r is
 # the same. So a is adjusted as well (total least squares: Britt & Luecke 1973,
@@ -121,7 +164,6 @@ def solve(
     shape: Observability,
     which: Equations,
     *,
-    exact: bool,
     prior: float | None,
     errors: Errors | None = None,
     rounds: int = 8,
@@ -132,9 +174,8 @@ def solve(
 
     - `shape`: the observed angles.
     - `which`: the equations.
-    - `exact`: whether the noise is at most that of the points.
-    - `prior`: standard deviation of tensions about 1; by default twice the spread of those determined.
-    - `errors`: errors of model and noise; by default estimated from the forces.
+    - `prior`: standard deviation of tensions about 1; by default chosen by the evidence.
+    - `errors`: errors of model and noise, and widths of priors; by default chosen by the evidence.
     - `rounds`: largest number of adjustments of the angles.
 
     **Returns:** the [`Balance`][vertax.inference._solve.Balance].
@@ -144,42 +185,47 @@ def solve(
     change = np.zeros(len(shape.angle))
     # Prior means: tensions of 1, and pressures of 0.
     expected = x.copy()
-    width = prior or _START
     mean = np.append(~loose, np.zeros(n_cells, bool)) / max(1, np.sum(~loose))
-    at_junctions, along = np.zeros_like(change), np.zeros_like(change)
-    at_junctions[: which.n_directions] = 1.0
-    along[which.n_directions :] = shape.length**2
-    has_errors, shares = errors is not None, (shape.least_noise, 0.0 if exact else _MORE)
-    errors = _FIRST if errors is None else errors
+    has_errors, evidence = errors is not None, np.nan
+    if errors is None:
+        absent = {name: 0.0 for name in Errors._fields if name not in shape.bounds}
+        errors = _FIRST._replace(**absent | ({} if prior is None else {"tension": prior}))
+    diagonals, regions = _diagonals(shape, which), _regions(which)
     covariance = residual = np.zeros(0)
     for attempt in range(rounds):
         matrix = forces(shape.angle + change, which, loose)
         slope = force_slopes(shape.angle + change, which, np.maximum(x[:n_edges], _SMALL))
         offset = -slope @ change
         if attempt in (2, 4) and not has_errors:
-            parts = Errors(
-                (slope * at_junctions @ slope.T).toarray(),
-                (slope * along @ slope.T).toarray(),
-                slope @ (slope @ shape.covariance).T,
+            residual = matrix @ expected + offset
+            parts = _parts(matrix, slope, shape, diagonals, mean, regions)
+            bounds, steps = shape.bounds, _STEPS[attempt // 4]
+            if which.n_arcs:
+                # With wide priors, this is restricted maximum likelihood: the errors do not depend on how
+                # well the prior describes the tensions.
+                wide = errors._replace(
+                    tension=prior or 1.0, region=0.0 if prior else 1.0, pressure=10.0
+                )
+                free = {k: v for k, v in bounds.items() if k not in _PRIORS}
+                errors, _ = most_evident(residual, parts, shape.unknown, wide, free, steps=steps)
+                errors = errors._replace(
+                    tension=prior or 0.3, region=0.0 if prior else 0.3, pressure=1.0
+                )
+                bounds = {k: v for k, v in bounds.items() if k in _PRIORS}
+            errors, evidence = most_evident(
+                residual, parts, shape.unknown, errors, bounds, steps=steps
             )
-            basis = np.linalg.svd(mean[None])[2][1:].T
-            left_over = matrix @ expected + offset
-            errors = model_errors(matrix @ basis, left_over, parts, shape.unknown, errors, shares)
-        # Arcs out of balance are not random errors: friction acts on weak edges otherwise than on strong
-        # ones, which biases tensions before it shows in the residuals. So their weight is reduced.
-        arc = errors.arc * np.sqrt(1 + (errors.arc / _ARCS) ** 2)
-        spread = errors.noise**2 * shape.covariance + np.diag(
-            errors.junction**2 * at_junctions + arc**2 * along
-        )
+        spread = errors.noise**2 * shape.covariance
+        spread += np.diag(model_deviations(errors, shape, which) ** 2)
         answer = (slope @ spread).T
         factor = np.linalg.cholesky(slope @ answer + shape.unknown)
-        deviation = np.append(np.full(n_edges, width), np.full(n_cells, _PRESSURE / shape.size))
+        precision = _prior_precision(errors, shape, regions, n_cells)
         white = solve_triangular(factor, np.column_stack([matrix, offset]), lower=True)
         white, given = white[:, :-1], white[:, -1]
-        normal = white.T @ white + np.diag(deviation**-2.0)
+        normal = white.T @ white + precision
         heavy = 1e3 * np.trace(normal) / len(normal) * n_edges
         normal += heavy * np.outer(mean, mean)
-        right = -white.T @ given + expected / deviation**2 + heavy * mean
+        right = -white.T @ given + precision @ expected + heavy * mean
         root = cho_factor(normal)
         before, x = x, cho_solve(root, right)
         if np.any(x[:n_edges] < 0):
@@ -188,9 +234,6 @@ def solve(
         change = -answer @ solve_triangular(factor, residual, lower=True, trans=1)
         change *= min(1.0, _REACH / max(float(np.max(np.abs(change))), 1e-300))
         covariance = cho_solve(root, np.eye(len(x)))
-        # Only in the first rounds: where noise is large, tensions could drift with the prior.
-        if prior is None and attempt < 2:
-            width = _varied(x[:n_edges][~loose], np.diag(covariance)[:n_edges][~loose])
         if attempt > (1 if has_errors else 4) and np.max(np.abs(x - before)[:n_edges]) < 1e-3:
             break
     return Balance(
@@ -199,17 +242,75 @@ def solve(
         covariance=covariance,
         angle=shape.angle + change,
         errors=errors,
+        evidence=evidence,
         residual=residual,
         loose=loose,
     )
 
 
-def _varied(tension: Float[np.ndarray, " edges"], variance: Float[np.ndarray, " edges"]) -> float:
-    """Width of the prior of tensions: twice their spread, because tensions may be correlated over many
-    cells, and the prior treats them as independent."""
-    weight = 1 / (variance + 0.05)
-    spread = np.sum(weight * ((tension - 1) ** 2 - variance)) / max(np.sum(weight), 1e-300)
-    return float(np.clip(_TIMES * np.sqrt(max(spread, 0.0)), *_WIDTHS))
+def model_deviations(
+    errors: Errors, shape: Observability, which: Equations
+) -> Float[np.ndarray, " angles"]:
+    """Standard deviations of the angles due to errors of the model."""
+    errors = errors._replace(arc=_HIDDEN * errors.arc, bent_arc=_HIDDEN * errors.bent_arc)
+    parts = zip(errors, _diagonals(shape, which), strict=False)
+    return np.sqrt(sum((e**2 * d for e, d in parts), np.zeros(len(shape.angle))))
+
+
+def _diagonals(shape: Observability, which: Equations) -> list[Float[np.ndarray, " angles"]]:
+    """Variances of the angles for each error of the model of size 1, in the order of `Errors`."""
+    junctions = np.arange(len(shape.angle)) < which.n_directions
+    grain, arc, bend = np.zeros((3, len(shape.angle)))
+    grain[: which.n_directions] = np.maximum(shape.length, 0.02)[which.half_edge.ravel()] ** -2
+    arc[which.n_directions :] = np.maximum(shape.length, _SHORTEST)[: which.n_arcs] ** 2
+    bend[which.n_directions :] = shape.bend[: which.n_arcs] ** 2
+    return [junctions * 1.0, grain, arc, bend]
+
+
+def _parts(
+    matrix: Float[np.ndarray, "rows unknowns"],
+    slope: csr_array,
+    shape: Observability,
+    diagonals: list[Float[np.ndarray, " angles"]],
+    mean: Float[np.ndarray, " unknowns"],
+    regions: Float[np.ndarray, "edges edges"],
+) -> Errors:
+    """Covariances of the forces for each standard deviation of 1."""
+    of_angles = [(slope * d @ slope.T).toarray() for d in diagonals]
+    n_edges = len(shape.loose)
+    pull, push = matrix[:, :n_edges], matrix[:, n_edges:] / shape.size
+    # The mean tension is 1.
+    centred = pull - np.outer(pull @ np.ones(n_edges), mean[:n_edges])
+    return Errors(
+        *of_angles,
+        noise=slope @ (slope @ shape.covariance).T,
+        tension=centred @ centred.T,
+        region=centred @ regions @ centred.T,
+        pressure=push @ push.T,
+    )
+
+
+def _regions(which: Equations) -> Float[np.ndarray, "edges edges"]:
+    """Covariance of tensions that are similar in regions, of mean variance 1."""
+    n = len(which.edges)
+    meet = np.zeros((n, n))
+    for k in range(3):
+        np.add.at(meet, (which.half_edge[:, k], which.half_edge[:, k - 1]), -1.0)
+    meet += meet.T
+    root = np.linalg.inv(meet + np.diag(_KAPPA - meet.sum(axis=1)))
+    covariance = root @ root
+    return covariance * n / np.trace(covariance)
+
+
+def _prior_precision(
+    errors: Errors, shape: Observability, regions: Float[np.ndarray, "edges edges"], n_cells: int
+) -> Float[np.ndarray, "unknowns unknowns"]:
+    """Inverse covariance of tensions and pressures in the prior."""
+    n = len(regions)
+    precision = np.diag(np.full(n + n_cells, (shape.size / errors.pressure) ** 2))
+    tension = errors.tension**2 * np.eye(n) + errors.region**2 * regions
+    precision[:n, :n] = np.linalg.inv(tension)
+    return precision
 
 
 def _not_negative(

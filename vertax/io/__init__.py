@@ -11,7 +11,11 @@ from vertax.io._data_tables import (
 from vertax.io._edge_table import from_edge_table as from_edge_table
 from vertax.io._force_inference import read_force_inference as read_force_inference
 from vertax.io._geojson import write_geojson as write_geojson
-from vertax.io._image import pixel_aspect as pixel_aspect, read_image as read_image
+from vertax.io._image import (
+    pixel_aspect as pixel_aspect,
+    read_image as read_image,
+    read_stack as read_stack,
+)
 from vertax.io._module_file import (
     load_energy as load_energy,
     load_problem as load_problem,

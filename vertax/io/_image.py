@@ -40,11 +40,39 @@ def read_image(
     - `ImportError` if the package that reads the file is not installed: the extra `[image]`.
     """
     file = Path(path)
+    pixels = _planes_and_channels(file, channel=channel, plane=plane)
+    chosen_plane = _choose("plane", plane, len(pixels), file)
+    return _one_channel(pixels[chosen_plane : chosen_plane + 1], channel, file)[0]
+
+
+def read_stack(
+    path: str | os.PathLike[str], *, channel: int | None = None
+) -> Shaped[np.ndarray, "planes rows columns"]:
+    """Read all planes of an image file: the frames of a movie (TYX), depths or pages.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `channel`: which channel of a colour or multi-channel image, from 0.
+
+    **Returns:** the pixels, shape (planes, rows, columns); one plane for a single image. Several axes of
+    planes are joined in the order of the file.
+
+    **Raises:** as [`read_image`][vertax.io.read_image].
+    """
+    file = Path(path)
+    return _one_channel(_planes_and_channels(file, channel=channel), channel, file)
+
+
+def _planes_and_channels(
+    file: Path, **choices: int | None
+) -> Shaped[np.ndarray, "planes channels rows columns"]:
+    """All pixels of a file."""
     if not file.exists():
         raise FileNotFoundError(
             f"Argument `path` must name an image file, but {file} does not exist."
         )
-    for name, index in (("channel", channel), ("plane", plane)):
+    for name, index in choices.items():
         if index is not None:
             check_integer(name, index)
     pixels, axes = _read(file)
@@ -59,12 +87,17 @@ def read_image(
     pixels = pixels.transpose(*planes, *channels, rows, columns)
     image = pixels.shape[-2:]
     n_planes = int(np.prod(pixels.shape[: len(planes)], dtype=int))
-    pixels = pixels.reshape(n_planes, -1, *image)
-    chosen_plane = _choose("plane", plane, n_planes, file)
-    planes_read = pixels[chosen_plane]
-    if channel is None and all(np.array_equal(other, planes_read[0]) for other in planes_read[1:]):
-        return planes_read[0]
-    return planes_read[_choose("channel", channel, len(planes_read), file)]
+    return pixels.reshape(n_planes, -1, *image)
+
+
+def _one_channel(
+    pixels: Shaped[np.ndarray, "planes channels rows columns"], channel: int | None, file: Path
+) -> Shaped[np.ndarray, "planes rows columns"]:
+    """The chosen channel; of several that are equal, the first."""
+    first = pixels[:, 0]
+    if channel is None and all(np.array_equal(other, first) for other in pixels.swapaxes(0, 1)[1:]):
+        return first
+    return pixels[:, _choose("channel", channel, pixels.shape[1], file)]
 
 
 def pixel_aspect(path: str | os.PathLike[str]) -> float:

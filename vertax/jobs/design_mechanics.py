@@ -50,7 +50,7 @@ class Config(runs.ExperimentConfig):
     """Gradients through the equilibrium."""
     fit: runs.Fitting = runs.Fitting(learning_rate=2e-3)
     """Fit of the parameters."""
-    relaxation: runs.Relaxation = runs.Relaxation()
+    relaxation: runs.RelaxationSection = runs.RelaxationSection()
     """Relaxation of the tissue."""
 
 
@@ -128,7 +128,7 @@ def save(initial: Tissue, fit: Fit, config: Config, folder: runs.RunFolder) -> N
     folder.save_tissue("initial", initial)
     folder.save_tissue("designed", fit.tissue)
     means = {"mean_observed": observed.mean(axis=1), "mean_parameter": targets.mean(axis=1)}
-    history = runs.history_columns(fit.history) | {config.quantity: value} | means
+    history = runs.history_table(fit.history) | {config.quantity: value} | means
     folder.save_table("history", history)
     ends = {"initial": 0, "final": best}
     columns = {"cell": np.arange(n_cells)} | {

@@ -7,21 +7,98 @@ mirrored to make it periodic, as in the paper, and the complete cells of the ori
 outline of its complete cells is pinned (`model.border`), and the cells inside are reported.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Shaped
 from matplotlib.figure import Figure
+from pydantic import Field
 
 from vertax import runs
 from vertax.fitting import Fit
-from vertax.inference import Micrograph
+from vertax.inference import Micrograph, micrograph_problem
+from vertax.initialise import Cellpose, Watershed
 from vertax.io import pixel_sides
 from vertax.mesh import Tissue
 from vertax.plotting import plot_history, plot_tissue, plot_tissues, scale_bar
 
 
-class ImageSection(runs.Preparation, runs.ImageFile):
+class Preparation(runs.Section):
+    """How an image is prepared for the comparison with the model."""
+
+    pixels: int = Field(default=256, ge=32)
+    """Longer side, in pixels, of the image that the model is compared with."""
+    background_width: float = Field(default=0.5, gt=0)
+    """Width of the filter that evens out the illumination, in mean cell diameters."""
+    psf_width: float | None = Field(default=None, gt=0)
+    """Standard deviation of the blur, in pixels of the file; left out, the one that fits best."""
+
+
+class Segmenter(runs.Section):
+    """Segmentation of the cells."""
+
+    method: Literal["watershed", "cellpose"] = "watershed"
+    """Cellpose needs its own extra and downloads a model."""
+    cell_size: float | None = Field(default=None, gt=0)
+    """Typical diameter of a cell in pixels of the file; left out, estimated from the image."""
+
+    def build(self) -> Watershed | Cellpose:
+        """The segmenter.
+
+        **Returns:** a [`Watershed`][vertax.initialise.Watershed] or
+        [`Cellpose`][vertax.initialise.Cellpose].
+        """
+        if self.method == "cellpose":
+            return Cellpose(diameter=self.cell_size)
+        return Watershed(cell_size=self.cell_size)
+
+
+class MicrographModel(runs.Section):
+    """The energy, E1 with a rest area for each cell, and the first guess."""
+
+    target_shape_factor: float = Field(default=3.7, gt=0)
+    """First guess of the target shape factor of every cell."""
+    border: Literal["mirrored", "pinned"] = "mirrored"
+    """What holds the tissue at the border of the image: the image is mirrored, cells that the border cuts
+    included (as in the paper); or the outline of its complete cells is pinned."""
+    pixel_size: float | None = Field(default=None, gt=0)
+    """Length of a pixel of the file, where rest areas are 1 (of a pinned border only); left out, the mean
+    area of the complete cells is 1. In a rigid tissue all shape factors depend on it."""
+    rest_areas: Literal["fitted", "observed", "equal"] = "fitted"
+    """Rest areas of the cells: fitted too, beginning with those of the segmented cells; as those are;
+    or the mean area in all cells but those that the border cuts, which determines shape factors best
+    where it is true. A pinned border always has equal ones."""
+
+
+def read_micrograph(
+    image: Shaped[np.ndarray, "rows columns"],
+    preparation: Preparation,
+    segmenter: Segmenter,
+    model: MicrographModel,
+    relaxation: runs.RelaxationSection,
+) -> Micrograph:
+    """Segment an image and set up the inverse problem of its shape factors.
+
+    **Arguments:**
+
+    - `image`: the image, bright membranes on dark cells.
+    - `preparation`, `segmenter`, `model`, `relaxation`: the settings.
+
+    **Returns:** the [`Micrograph`][vertax.inference.Micrograph].
+
+    **Raises:** as [`micrograph_problem`][vertax.inference.micrograph_problem].
+    """
+    return micrograph_problem(
+        np.asarray(image, float),
+        segmenter=segmenter.build(),
+        response=relaxation.build(),
+        **{name: getattr(preparation, name) for name in Preparation.model_fields},
+        **model.model_dump(),
+    )
+
+
+class ImageSection(Preparation, runs.ImageFile):
     """The image, bright membranes on dark cells, and its preparation for the comparison."""
 
 
@@ -30,13 +107,13 @@ class Config(runs.ExperimentConfig):
 
     image: ImageSection = ImageSection()
     """The image."""
-    segmentation: runs.Segmenter = runs.Segmenter()
+    segmentation: Segmenter = Segmenter()
     """Segmentation of the cells."""
-    model: runs.MicrographModel = runs.MicrographModel()
+    model: MicrographModel = MicrographModel()
     """The energy and the first guess."""
     fit: runs.Fitting = runs.Fitting(learning_rate=2e-2, epochs=150)
     """Fit of the parameters."""
-    relaxation: runs.Relaxation = runs.Relaxation(tolerance=1e-7)
+    relaxation: runs.RelaxationSection = runs.RelaxationSection(tolerance=1e-7)
     """Relaxation of the tissue."""
 
 
@@ -55,14 +132,14 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     """
     pixels = np.asarray(config.image.read(), float)
     settings = config.image, config.segmentation, config.model, config.relaxation
-    micrograph = runs.read_micrograph(pixels, *settings)
+    micrograph = read_micrograph(pixels, *settings)
     folder.save_tissue("target", micrograph.segmentation.tissue)
     folder.save_tissue("initial", micrograph.first.tissue)
     folder.save_array("image", micrograph.image)
     optimiser, epochs = config.fit.build(), config.fit.epochs
     fit = folder.fit("fit", micrograph.problem, optimiser, epochs, progress=progress)
     folder.save_tissue("fitted", fit.tissue)
-    folder.save_table("history", runs.history_columns(fit.history))
+    folder.save_table("history", runs.history_table(fit.history))
     folder.save_table("cells", cell_table(micrograph, fit))
     draw(micrograph, pixels, fit, folder)
     metrics = measure(micrograph, fit)

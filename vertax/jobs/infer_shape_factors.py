@@ -20,7 +20,7 @@ from vertax.plotting import plot_history, plot_recovery, plot_tissues, scale_bar
 NAME = "$p_0$"
 
 
-class ImageSection(runs.Microscope):
+class ImageSection(runs.MicroscopeSection):
     """The synthetic microscopy image; intensities are relative to the brightest membrane."""
 
     noise: float = Field(default=0.05, ge=0)
@@ -42,7 +42,7 @@ class Config(runs.ExperimentConfig):
     """The synthetic microscopy image."""
     fit: runs.Fitting = runs.Fitting()
     """Fit of the parameters."""
-    relaxation: runs.Relaxation = runs.Relaxation()
+    relaxation: runs.RelaxationSection = runs.RelaxationSection()
     """Relaxation of the tissue."""
 
 
@@ -120,8 +120,8 @@ def save_tables(scene: inference.Scene, fits: dict[str, Fit], folder: runs.RunFo
         name = "inferred" if len(fits) == 1 else f"inferred_{source}"
         cells[name] = shape_factors(fit.energy)
     folder.save_table("shape_factors", cells)
-    tables = [runs.history_columns(fit.history, data=source) for source, fit in fits.items()]
-    folder.save_table("history", runs.joined(tables))
+    tables = [runs.history_table(fit.history, {"data": source}) for source, fit in fits.items()]
+    folder.save_table("history", runs.concatenate(tables))
 
 
 def save_fit(

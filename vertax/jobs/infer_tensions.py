@@ -3,10 +3,13 @@
 The image has outlines of cells, or labels. Each edge becomes an arc; tensions and pressures balance at the
 junctions of three cells and along arcs. A shape determines them up to one factor: they are relative to the
 mean tension. Without an image a cluster of given tensions is drawn and segmented, and the results are
-compared.
+compared. A folder, a pattern such as masks/*.tif or a movie gives one table of all masks.
 """
 
-from typing import Any, Literal
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +19,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from vertax import inference, plotting, runs
-from vertax.initialise import MaskReport, free_voronoi
-from vertax.io import pixel_sides, write_geojson
+from vertax.initialise import free_voronoi
+from vertax.io import from_edge_table, pixel_sides, write_geojson
 
 SYNTHETIC = "synthetic"
 # Without the palest end, which looks like no colour.
@@ -32,8 +35,9 @@ PRESSURE = r"pressure $(p - \bar p)\,\sqrt{\bar A}\,/\,\bar\gamma$"
 class ImageSection(runs.ImageFile):
     """The segmented image."""
 
-    path: str | None = SYNTHETIC
-    """The file: TIFF, PNG, NPY; or synthetic, the image of a random cluster."""
+    path: str | None = Field(default=SYNTHETIC, min_length=1)
+    """The file: TIFF, PNG, NPY; a folder, a pattern (masks/*.tif) or a movie; or synthetic, the image of a
+    random cluster."""
     kind: Literal["auto", "outlines", "labels"] = "auto"
     """Outlines of cells, or a number or colour in each pixel of a cell; `"auto"` takes an image of two values
     for outlines."""
@@ -45,6 +49,18 @@ class ImageSection(runs.ImageFile):
     """Whether holes stay faces without a cell, or are given to the cells next to them."""
     pixel_size: list[float] | None = Field(default=None, min_length=2, max_length=2)
     """Height and width of a pixel that is not square; left out, from the resolution of a TIFF file."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _path_alone(cls, value: Any) -> Any:
+        return {"path": value} if isinstance(value, str) else value
+
+    def frames(self) -> list[inference.MaskFrame]:
+        """The masks of a folder, a pattern or a movie; none for a single image."""
+        if self.path in (None, SYNTHETIC) or self.channel is not None:
+            return []
+        frames = inference.find_masks(self.path, plane=self.plane)
+        return [] if frames[0].source == Path(self.path) else frames
 
     def source(self) -> Any:
         """The file, or the pixels of the channel that is chosen."""
@@ -59,11 +75,10 @@ class ImageSection(runs.ImageFile):
         plane = self.plane if self.channel is None else None
         return {"kind": self.kind, "background": self.background, "plane": plane}
 
-    def tensions(self, image: Any, **options: Any) -> inference.InferredTensions:
-        """The tensions of an image, read as this section specifies."""
+    def options(self) -> dict[str, Any]:
+        """Arguments of `infer_tensions` beside those of `read_mask`."""
         size = None if self.pixel_size is None else (self.pixel_size[0], self.pixel_size[1])
-        options |= {"gap_width": self.gap_width, "holes": self.holes, "pixel_size": size}
-        return inference.infer_tensions(image, **options)
+        return {"gap_width": self.gap_width, "holes": self.holes, "pixel_size": size}
 
 
 class Cluster(runs.Section):
@@ -98,40 +113,170 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     **Returns:** the metrics: numbers of determined tensions and pressures, their spread and uncertainty,
     noise of the image and distance from balance; for a synthetic cluster also the errors.
     """
-    del progress
+    if frames := config.image.frames():
+        return run_frames(config, frames, folder, progress)
     truth: Any = None
-    options: dict[str, Any]
     if config.image.path != SYNTHETIC:
-        source, options = config.image.source(), config.image.reading()
-        labels = config.image.labels()
+        frame = inference.MaskFrame(0, config.image.source())
+        reading, labels = config.image.reading(), config.image.labels()
     else:
         truth, labels = draw_cluster(config)
-        source, options = labels, {"kind": "labels"}
-    options["prior"] = config.prior
-    result = config.image.tensions(source, **options)
-    if config.noise is not None and result.pixel_size is not None:
-        options["noise"] = config.noise * np.sqrt(np.prod(pixel_sides(result.pixel_size)))
-        result = config.image.tensions(source, **options)
-    for doubt in result.doubts:
-        folder.warn(doubt)
+        frame, reading = inference.MaskFrame(0, labels), {"kind": "labels"}
+    result = infer(config, frame, reading)
+    for warning in result.warnings:
+        folder.warn(warning)
     folder.save_tissue("seen", result.tissue)
-    edges, cells = result.edge_table(), result.cell_table()
+    found = inferred(result)
+    edges, cells = found.edges, found.cells
     if truth is not None:
         add_truth(result, truth[0], truth[1], edges, cells)
-    folder.save_table("edges", edges)
-    folder.save_table("cells", cells)
-    if result.mask_report is not None:
-        folder.save_table("changes", result.mask_report.change_table())
+    tables = {"cells": cells, "edges": edges, "changes": found.changes}
+    save_tables(folder, config, {name: table for name, table in tables.items() if table})
     write_geojson(
         folder.path / "cells.geojson",
         result.tissue,
         cells={name: cells[name] for name in ("label", "pressure", "pressure_deviation")},
         edges={name: edges[name] for name in ("tension", "tension_deviation", "determined")},
     )
-    folder.save_figure("tensions", plot_foam(plotting.label_colours(labels), result))
+    folder.save_figure("tensions", plot_foam(plotting.label_colours(labels), found))
     if truth is not None and result.determined.any():
         folder.save_figure("recovery", plot_recovery(edges, cells))
     return measure(result, edges, cells)
+
+
+def infer(
+    config: Config, frame: inference.MaskFrame, reading: dict[str, Any]
+) -> inference.InferredTensions:
+    """The tensions of one mask."""
+    options = reading | config.image.options() | {"prior": config.prior}
+    result = frame.infer(**options)
+    if config.noise is None or result.pixel_size is None:
+        return result
+    return frame.infer(
+        **options, noise=config.noise * np.sqrt(np.prod(pixel_sides(result.pixel_size)))
+    )
+
+
+class Inferred(NamedTuple):
+    """The tables of one mask, from which its map is drawn."""
+
+    edges: dict[str, Any]
+    cells: dict[str, Any]
+    changes: dict[str, Any]
+    """The report on the mask; no rows without a mask."""
+    pixel_size: tuple[float, float]
+    """Height and width."""
+
+
+def inferred(result: inference.InferredTensions) -> Inferred:
+    """The tables of one mask."""
+    report = result.mask_report
+    changes = {} if report is None else report.change_table()
+    width, height = pixel_sides(result.pixel_size or 1.0).tolist()
+    return Inferred(result.edge_table(), result.cell_table(), changes, (height, width))
+
+
+def save_tables(folder: runs.RunFolder, config: Config, tables: dict[str, dict[str, Any]]) -> None:
+    """Write tables, and the table of the units and meanings of their columns."""
+    columns = inference.column_descriptions(tables, inference.length_unit(config.image.pixel_size))
+    for name, table in (tables | {"columns": columns}).items():
+        folder.save_table(name, table)
+
+
+def run_frames(
+    config: Config, frames: list[inference.MaskFrame], folder: runs.RunFolder, progress: bool
+) -> dict[str, Any]:
+    """Infer the tensions of many masks; a resumed run keeps those that are done."""
+    reading, failures = config.image.reading(), {}
+
+    def compute(frame: inference.MaskFrame) -> dict[str, np.ndarray]:
+        result = infer(config, frame, reading)
+        found, summary = inferred(result), inference.frame_summary(result)
+        tables = {"edges": found.edges, "cells": found.cells, "changes": found.changes}
+        arrays = {
+            f"{t}.{name}": np.asarray(c) for t, table in tables.items() for name, c in table.items()
+        }
+        return arrays | {"summary": np.asarray(json.dumps(summary))}
+
+    def one(index: int) -> dict[str, np.ndarray] | None:
+        frame = frames[index]
+        try:
+            return folder.part(f"mask {frame.name}", lambda: compute(frame))
+        except Exception as error:
+            failures[frame.name] = str(error)
+            return None
+
+    parts = folder.map_in_threads(one, len(frames), progress=progress, unit="mask")
+    arrays = {frame.name: part for frame, part in zip(frames, parts, strict=True) if part}
+    failures = {frame.name: failures[frame.name] for frame in frames if frame.name in failures}
+    inference.check_any(arrays, failures)
+    summaries = {name: json.loads(str(part.pop("summary"))) for name, part in arrays.items()}
+    tables: dict[str, Any] = {
+        kind: inference.join_frames({n: table_of(kind, part) for n, part in arrays.items()})
+        for kind in ("cells", "edges", "changes")
+    }
+    names = [*arrays, *failures]
+    tables["frames"] = inference.frame_table(names, list(summaries.values()), failures)
+    save_tables(folder, config, tables)
+    folder.save_table("failed", {"frame": list(failures), "error": list(failures.values())})
+    for name, summary in summaries.items():
+        for text in filter(None, summary["warnings"].split(" | ")):
+            folder.warn(text, str(name))
+    draw_frames(folder, frames, arrays, summaries, reading)
+    return {
+        "n_masks": len(frames),
+        "n_failed": len(failures),
+        "failed": {str(name): error for name, error in failures.items()},
+        "n_cells": sum(summary["n_cells"] for summary in summaries.values()),
+        "n_tensions_determined": sum(summary["n_determined"] for summary in summaries.values()),
+    }
+
+
+def table_of(kind: str, part: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A table of the stored arrays of a mask."""
+    prefix = f"{kind}."
+    return {name.removeprefix(prefix): x for name, x in part.items() if name.startswith(prefix)}
+
+
+def draw_frames(
+    folder: runs.RunFolder,
+    frames: list[inference.MaskFrame],
+    arrays: dict[str | int, dict[str, np.ndarray]],
+    summaries: dict[str | int, dict[str, Any]],
+    reading: dict[str, Any],
+) -> None:
+    """A map of each mask, all with the same limits of the colours, and an animation of them."""
+    folder.print_step("maps")
+    done = [frame for frame in frames if frame.name in arrays]
+    found = {}
+    for name, part in arrays.items():
+        tables = [table_of(kind, part) for kind in ("edges", "cells", "changes")]
+        size = summaries[name]["pixel_height"], summaries[name]["pixel_width"]
+        found[name] = Inferred(*tables, size)
+    limits = colour_limits(list(found.values()))
+
+    def maps() -> Iterator[Figure]:
+        for frame in done:
+            image = plotting.label_colours(frame.mask(**reading))
+            figure = plot_foam(image, found[frame.name], limits, title=str(frame.name))
+            folder.save_figure(f"{frame.name}", figure)
+            yield figure
+
+    plotting.animate_figures(maps(), folder.path / "tensions.gif", fps=4)
+
+
+def colour_limits(found: list[Inferred]) -> dict[str, float]:
+    """Limits of the colours of all masks together: of pressures and of tensions."""
+    limits: dict[str, float] = {}
+    for prefix, tables, key in (
+        ("", [each.cells for each in found], "pressure"),
+        ("edge_", [each.edges for each in found], "tension"),
+    ):
+        values = np.concatenate([table[key][table["determined"]] for table in tables])
+        if values.size:
+            low, high = np.quantile(values, (0.005, 0.995))
+            limits |= {f"{prefix}vmin": float(low), f"{prefix}vmax": float(high)}
+    return limits
 
 
 def draw_cluster(config: Config) -> tuple[tuple[Any, Any], np.ndarray]:
@@ -146,7 +291,7 @@ def draw_cluster(config: Config) -> tuple[tuple[Any, Any], np.ndarray]:
     areas = jax.random.uniform(area_key, (options.n_cells,), minval=0.9, maxval=1.3)
     bounds: dict[str, Any] = {"stiffness": options.stiffness, "low": 0.05, "high": 4.0}
     energy = inference.foam_energy(tension / jnp.mean(tension), areas, **bounds)
-    relaxed = runs.Relaxation().build()(cluster, energy).tissue
+    relaxed = runs.RelaxationSection().build()(cluster, energy).tissue
     return (energy, relaxed), inference.label_image(relaxed, options.pixels)
 
 
@@ -189,11 +334,15 @@ def measure(result: inference.InferredTensions, edges: Any, cells: Any) -> dict[
         "noise_pixels": result.noise / pixel,
         "noise_correlation_pixels": result.correlation / pixel,
         "bending_degrees": np.degrees(result.bending),
-        "doubts": result.doubts,
+        "edges": result.edges,
+        "warnings": list(result.warnings),
         "area_error_max": float(np.max(np.abs(result.area_errors[is_cell]))),
-        "out_of_balance_degrees_junctions": np.degrees(result.model_errors[0]),
-        "out_of_balance_degrees_arcs": np.degrees(result.model_errors[1]),
+        "stress_anisotropy": result.mean_stress.anisotropy,
+        "stress_anisotropy_deviation": result.mean_stress.anisotropy_deviation,
+        "stress_direction_degrees": np.degrees(result.mean_stress.direction),
+        "stress_direction_deviation_degrees": np.degrees(result.mean_stress.direction_deviation),
     }
+    metrics |= {f"error_{name}": value for name, value in result.errors.items()}
     if result.mask_report is not None:
         summary = result.mask_report.summary()
         metrics |= {f"mask_{name}": value for name, value in summary.items()}
@@ -219,48 +368,54 @@ def measure(result: inference.InferredTensions, edges: Any, cells: Any) -> dict[
 
 
 @plotting.house_style()
-def plot_foam(image: np.ndarray, result: inference.InferredTensions) -> Figure:
+def plot_foam(
+    image: np.ndarray,
+    found: Inferred,
+    limits: dict[str, float] | None = None,
+    *,
+    title: str = "arcs over the image",
+) -> Figure:
     """The image with the arcs, and a map of tensions and pressures; grey where they are not determined.
 
     On the image the sides of holes are dashed, contacts that the mask does not show are dotted, and a ring
     marks each place where the mask was changed.
     """
     rows, columns = image.shape[:2]
-    height, size = max(3.4 * rows / columns + 0.5, 2.4), result.pixel_size or 1.0
+    height = max(3.4 * rows / columns + 0.5, 2.4)
+    tissue = from_edge_table(found.edges)
     figure, ((left, right),) = plotting.new_figure(1, 2, width=3.6, height=height, room=1.2)
-    plotting.plot_tissue(result.tissue, ax=left, image=image, pixel_size=size)
-    left.set_title("arcs over the image")
-    plotting.scale_bar(left, "pixels", unit_length=pixel_sides(size)[0])
-    if result.mask_report is not None:
-        draw_report(left, result, result.mask_report)
-    pressures = np.where(result.pressures_determined, result.pressures, np.nan)
-    tensions = np.where(result.determined, result.tensions, np.nan)
+    plotting.plot_tissue(tissue, ax=left, image=image, pixel_size=found.pixel_size)
+    left.set_title(title)
+    plotting.scale_bar(left, "pixels", unit_length=found.pixel_size[1])
+    if "shown" in found.edges:
+        draw_report(left, tissue, found)
+    pressures = np.where(found.cells["determined"], found.cells["pressure"], np.nan)
+    tensions = np.where(found.edges["determined"], found.edges["tension"], np.nan)
     style: Any = {"cmap": PRESSURES, "label": PRESSURE, "edge_label": TENSION}
-    plotting.plot_tissue(result.tissue, pressures, tensions, ax=right, **style)
+    plotting.plot_tissue(tissue, pressures, tensions, ax=right, **style, **(limits or {}))
     # The y axis points down, as in the image.
     right.set(xlim=left.get_xlim(), ylim=left.get_ylim())
     right.set_title("tensions and pressures")
     return figure
 
 
-def draw_report(ax: Any, result: inference.InferredTensions, report: MaskReport) -> None:
+def draw_report(ax: Any, tissue: Any, found: Inferred) -> None:
     """Mark holes, contacts that the mask does not show, and places where the mask was changed."""
-    sides = pixel_sides(result.pixel_size or 1.0)
-    points = np.asarray(result.tissue.edge_points(jnp.linspace(0.0, 1.0, 13)), float)
-    edge_cells = np.asarray(result.tissue.topology.edge_cells)
-    between = np.append(result.labels, 0)[edge_cells]
-    hole = np.append(result.labels == 0, False)[edge_cells].any(1)
-    hidden = report.closed & np.all(between > 0, axis=1)
+    height, width = found.pixel_size
+    points = np.asarray(tissue.edge_points(jnp.linspace(0.0, 1.0, 13)), float)
+    edge_cells = np.stack([found.edges["left_cell"], found.edges["right_cell"]], axis=1)
+    hole = np.append(found.cells["hole"], False)[edge_cells].any(axis=1)
+    hidden = found.edges["contact_closed"] & ~hole & np.all(edge_cells >= 0, axis=1)
     for which, style in ((hidden, ":"), (hole, "--")):
         if which.any():
             lines = LineCollection(list(points[which]), colors="w", linestyles=style, lw=1.5)
             ax.add_collection(lines)
-    median = np.median(report.pixels)
-    for change in report.changes:
-        area = max(change.pixels, 0.01 * median) * sides.prod()
-        radius = max(3.0 * sides.min(), np.sqrt(area / np.pi))
-        place = (sides[0] * change.column, sides[1] * change.row)
-        ax.add_patch(Circle(place, radius, fill=False, ec="r", lw=1.0))
+    least = 0.01 * np.median(found.cells["pixels"])
+    changes = (found.changes[name] for name in ("row", "column", "pixels"))
+    for row, column, pixels in zip(*changes, strict=True):
+        area = max(pixels, least) * height * width
+        radius = max(3.0 * min(height, width), np.sqrt(area / np.pi))
+        ax.add_patch(Circle((width * column, height * row), radius, fill=False, ec="r", lw=1.0))
 
 
 @plotting.house_style()

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.checks import as_real, check_integer, check_number
+from vertax._base.results import RESULTS
 from vertax._base.tracing import traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
@@ -20,7 +21,7 @@ from vertax.mechanics._elasticity import elastic_tensor
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue
-from vertax.relax import RESULTS, AbstractResponse, Equilibrium, Relaxation
+from vertax.relax import AbstractResponse, Equilibrium, Relaxation
 
 # Orthogonal basis of the free strains, in components xx, yy and γ = 2 xy.
 _FREE_STRAINS = {
@@ -251,7 +252,6 @@ def _relax_box(
         max_force=final.max_force,
         num_steps=end.num_steps + before.num_steps + final.num_steps,
         num_t1=end.num_t1 + before.num_t1 + final.num_t1,
-        valid=final.valid,
         result=cast(RESULTS, result),
     )
 

@@ -7,10 +7,13 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from vertax._base.batch import member
 from vertax._base.checks import as_real, describe
-from vertax._base.tracing import is_concrete, traced
+from vertax._base.results import RESULTS, checked, first_of
+from vertax._base.tracing import traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import as_matrix, check_relaxation, check_system
@@ -58,8 +61,36 @@ class Ramp(eqx.Module):
     """Their stresses, energy per area."""
     num_t1: Int[Array, " strains"]
     """T1 transitions since the previous strain."""
-    converged: Bool[Array, " strains"]
-    """Whether the relaxation at each strain converged."""
+    results: RESULTS
+    """How the relaxation at each strain ended."""
+
+    @property
+    def tissue(self) -> Tissue:
+        """The relaxed tissue at the last strain."""
+        return member(self.frames, -1)
+
+    @property
+    def result(self) -> RESULTS:
+        """How the ramp ended: the first failure."""
+        return first_of(self.results)
+
+    @property
+    def converged(self) -> Bool[Array, ""]:
+        """Whether all relaxations converged."""
+        return self.result == RESULTS.successful
+
+    def checked(self) -> Ramp:
+        """The same, if all relaxations converged.
+
+        **Raises:**
+
+        - `RuntimeError` (of Equinox inside `jax.jit`) with the message of `result` if they did not.
+        """
+        return checked(self, self.result, self._details)
+
+    def _details(self) -> str:
+        number = int(np.argmax(self.results != RESULTS.successful))
+        return f"strain {self.strains[number]:g}, number {number}"
 
     @property
     def plastic(self) -> Bool[Array, " strains"]:
@@ -130,18 +161,7 @@ def ramp(
     tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     relaxation.check(tissue, energy, adjoint)
     result = _ramp(tissue, energy, values, deformation, relaxation.traced(), adjoint)
-    if not throw:
-        return result
-    reason = (
-        "A tissue did not come to rest at some strain of a ramp. Take smaller steps, raise `max_steps` of "
-        "its "
-        "`relaxation`, or pass throw=False and check `converged`."
-    )
-    if not is_concrete(result.converged):
-        return eqx.error_if(result, ~jnp.all(result.converged), reason)
-    if not result.converged.all():
-        raise RuntimeError(reason)
-    return result
+    return result.checked() if throw else result
 
 
 @eqx.filter_jit
@@ -160,7 +180,7 @@ def _ramp(
         start = eqx.combine(arrays, static).carried(box)
         rest = relaxation.solve(start, energy, adjoint, recompute=True)
         arrays = eqx.filter(rest.tissue, eqx.is_array)
-        frame = (arrays, rest.energy, stress(rest.tissue, energy), rest.num_t1, rest.converged)
+        frame = (arrays, rest.energy, stress(rest.tissue, energy), rest.num_t1, rest.result)
         return arrays, frame
 
     _, (frames, *rest) = jax.lax.scan(step, arrays, strains)

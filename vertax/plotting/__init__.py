@@ -4,7 +4,11 @@ from vertax._base.extras import requires_extra as _requires_extra
 from vertax.mesh import cell_polygons as cell_polygons
 
 with _requires_extra("plot", "Drawing"):
-    from vertax.plotting._animation import animate as animate, flipped_edges as flipped_edges
+    from vertax.plotting._animation import (
+        animate as animate,
+        animate_figures as animate_figures,
+        flipped_edges as flipped_edges,
+    )
     from vertax.plotting._curves import plot_history as plot_history
     from vertax.plotting._image import (
         label_colours as label_colours,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, SupportsFloat, TypeAlias
 
@@ -86,6 +86,39 @@ def animate(
     pictures = _pictures(frames, values, Colours(cmap, vmin, vmax, label), captions, mark_t1, dpi)
     with atomic_draft(path) as draft:
         write(draft, pictures, fps, linger)
+
+
+def animate_figures(
+    figures: Iterable[Figure],
+    path: str | os.PathLike[str],
+    *,
+    fps: SupportsFloat = 10.0,
+    linger: SupportsFloat = 1.5,
+    dpi: int = 100,
+) -> None:
+    """Write figures as an animation, one picture each; smaller ones have a white margin.
+
+    **Arguments:**
+
+    - `figures`: the figures, drawn one after the other.
+    - `path`, `fps`, `linger`, `dpi`: see [`animate`][vertax.animate].
+
+    **Raises:** as [`animate`][vertax.animate].
+    """
+    write = _writer(path)
+    pictures = []
+    for figure in figures:
+        figure.set_dpi(dpi)
+        pictures.append(_pixels(figure))
+    if not pictures:
+        raise ValueError("Argument `figures` must have at least one figure, but is empty.")
+    rows, columns = np.max([picture.shape[:2] for picture in pictures], axis=0)
+    padded = (
+        np.pad(p, ((0, rows - p.shape[0]), (0, columns - p.shape[1]), (0, 0)), constant_values=255)
+        for p in pictures
+    )
+    with atomic_draft(path) as draft:
+        write(draft, padded, float(fps), float(linger))
 
 
 def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
@@ -227,8 +260,7 @@ def _figure(extent: np.ndarray, bar: bool, caption: bool, dpi: int) -> tuple[Fig
 
 
 def _pixels(figure: Figure) -> np.ndarray:
-    canvas = figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
+    canvas = FigureCanvasAgg(figure)
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]
     # The video format needs even numbers of rows and columns.

@@ -9,6 +9,7 @@ from jaxtyping import Array, Complex, Float, Real
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vertax._base.results import RESULTS
 from vertax.mechanics import Ramp
 from vertax.plotting import _style
 
@@ -125,7 +126,7 @@ def plot_stress_strain(
     along = np.asarray(ramp.stresses, float)
     along = np.tensordot(along, weights, 2) if along.ndim == 3 else along
     x, y = _curve("ramp.strains", ramp.strains, "ramp.stresses", along)
-    y = np.where(np.asarray(ramp.converged), y, np.nan)
+    y = np.where(np.asarray(ramp.results == RESULTS.successful), y, np.nan)
     number = np.asarray(ramp.num_t1) * (np.arange(x.size) > 0)
     with _style.house_style():
         ax = _axes(ax, figure)

@@ -89,8 +89,8 @@ def napari_tensions(
     # The activity dock is drawn before the computation, which blocks the window.
     with progress(total=1, desc="vertax: tensions (first compiles for this size)"):
         inferred = infer_tensions(mask, kind="labels", **pixels)
-    for doubt in inferred.doubts:
-        notifications.show_warning(doubt)
+    for warning in inferred.warnings:
+        notifications.show_warning(warning)
     placed = {"scale": cells.scale, "translate": cells.translate}
     in_plane = {"scale": cells.scale[-2:], "translate": cells.translate[-2:]}
     edges, options, kind = tension_layer(inferred)

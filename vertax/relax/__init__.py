@@ -6,4 +6,3 @@ from vertax.relax._response import (
     AbstractResponse as AbstractResponse,
     Equilibrium as Equilibrium,
 )
-from vertax.relax._results import RESULTS as RESULTS

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.results import RESULTS
 from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
@@ -18,8 +19,7 @@ from vertax.precondition._sum import Preconditioner
 from vertax.relax._contacts import Contacts
 from vertax.relax._loop import Search, SearchState
 from vertax.relax._objective import coarse_preconditioner, edge_preconditioner, objective
-from vertax.relax._response import Equilibrium
-from vertax.relax._results import RESULTS
+from vertax.relax._response import Equilibrium, with_overlaps
 from vertax.solvers._stop_at_rest import AtRest, StopAtRest
 
 
@@ -102,14 +102,14 @@ def conclude(
         throw=False,
     )
     final = follow_start(moved.with_configuration(solution.value), tissue, free)
+    overlaps = final.overlaps.any if end.overlaps is None else end.overlaps
     return Equilibrium(
         tissue=final,
         energy=energy(final),
         max_force=end.max_force,
         num_steps=end.num_steps,
         num_t1=end.num_t1,
-        valid=~final.overlaps.any if end.overlaps is None else ~end.overlaps,
-        result=end.result,
+        result=with_overlaps(end.result, overlaps),
     )
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.probe_vector import probe_vector
 from vertax._base.reductions import any_of
+from vertax._base.results import RESULTS
 from vertax._base.tracing import tree_where, zeros_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -19,7 +20,6 @@ from vertax.precondition._sum import Preconditioner
 from vertax.relax._contacts import Contacts, no_contacts
 from vertax.relax._feasibility import Feasibility
 from vertax.relax._objective import coarse_preconditioner, edge_preconditioner, objective
-from vertax.relax._results import RESULTS
 from vertax.solvers._newton import NewtonCG
 from vertax.solvers._rows import table_of
 from vertax.solvers._solver import AbstractIteration

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from vertax._base.announce import announced_jit
 from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.memory_maps import warn_of_memory_maps
+from vertax._base.results import RESULTS
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import differs_between_devices, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
@@ -30,7 +31,6 @@ from vertax.relax._feasibility import Feasibility
 from vertax.relax._loop import Search
 from vertax.relax._objective import objective
 from vertax.relax._response import AbstractResponse, Equilibrium
-from vertax.relax._results import RESULTS
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
 from vertax.solvers._optimistix import check_solver
 from vertax.solvers._solver import AbstractIteration, Stepwise

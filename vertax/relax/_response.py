@@ -5,17 +5,14 @@ from __future__ import annotations
 import abc
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.tracing import is_concrete
+from vertax._base.results import RESULTS, checked
 from vertax.adjoints import AbstractAdjoint
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.precondition._recycled_hessian import RecycledHessian
-from vertax.relax._results import RESULTS
 
 
 class Equilibrium(eqx.Module):
@@ -31,74 +28,35 @@ class Equilibrium(eqx.Module):
     """Steps of the minimiser."""
     num_t1: Int[Array, "*batch"]
     """Number of transitions: T1, and T2 if the rule has them."""
-    valid: Bool[Array, "*batch"]
-    """Whether its cells tile the plane; `tissue.overlaps` says where they do not."""
     result: RESULTS
-    """Outcome of the relaxation; `vertax.RESULTS[result]` is its message."""
+    """How the relaxation ended; `vertax.RESULTS[result]` is the message. `tissue.overlaps` says where cells
+    overlap."""
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:
         """Whether the largest force fell below the tolerance, in a tissue without overlaps."""
-        return (self.result == RESULTS.successful) & self.valid
+        return self.result == RESULTS.successful
 
     def checked(self) -> Equilibrium:
         """The same, if it converged.
 
         **Raises:**
 
-        - `RuntimeError` (of Equinox inside `jax.jit`) if it did not, or if cells overlap.
+        - `RuntimeError` (of Equinox inside `jax.jit`) with the message of `result` if it did not.
         """
-        converged = self.converged
-        if not is_concrete(converged):
-            # A compiled program selects one of several messages, which cannot hold numbers. Of a batch the
-            # message with the largest index is raised.
-            messages = (
-                f"The relaxation reached no equilibrium. {_REMEDY}",
-                f"Cells of the relaxed tissue overlap. {_UNTANGLE}",
-                f"The relaxation broke down: {_NOT_FINITE}",
-                RESULTS[RESULTS.too_many_contacts],
-            )
-            which = jnp.where(self.result == RESULTS.too_many_contacts, 3, 0)
-            which = jnp.where(self.valid, which, 1)
-            which = jnp.where(jnp.isfinite(self.max_force), which, 2)
-            which = jnp.where(converged, 0, which)
-            return eqx.branched_error_if(self, ~converged, which, messages)
-        if np.all(converged):
-            return self
-        members = f" ({np.sum(~converged)} of {np.size(converged)})" if np.ndim(converged) else ""
-        forces = np.asarray(self.max_force)
-        if not np.isfinite(forces).all():
-            raise RuntimeError(f"The relaxation broke down{members}: {_NOT_FINITE}")
-        if not np.all(self.valid):
-            raise RuntimeError(
-                f"Cells of the relaxed tissue overlap{members}: {self._first_overlap()}. {_UNTANGLE}"
-            )
-        if np.any(self.result == RESULTS.too_many_contacts):
-            raise RuntimeError(f"{RESULTS[RESULTS.too_many_contacts]}{members}")
-        raise RuntimeError(
-            f"The relaxation reached no equilibrium{members} in {np.max(self.num_steps)} steps (largest "
-            f"force {np.max(forces):.1e}). {_REMEDY}"
-        )
+        return checked(self, self.result, self._details)
 
-    def _first_overlap(self) -> str:
-        """The overlap of the first overlapping tissue of a batch."""
-        ndim, number = np.ndim(self.valid), int(np.argmin(np.ravel(self.valid)))
-        one = lambda x: x.reshape(-1, *x.shape[ndim:])[number] if eqx.is_array(x) else x
-        return jax.tree.map(one, self.tissue).overlaps.describe()
+    def _details(self) -> str:
+        texts = [f"largest force {np.max(self.max_force):.1e} after {np.max(self.num_steps)} steps"]
+        if np.any(self.result == RESULTS.overlap):
+            texts.append(self.tissue.overlaps.describe())
+        return "; ".join(texts)
 
 
-_NOT_FINITE = (
-    "its forces are not finite. The parameters of the energy must be finite, but may be NaN or infinity, or "
-    "so extreme that the tissue collapses. Check them."
-)
-_UNTANGLE = (
-    "A relaxation never makes cells overlap unless `contact_range` is None, but it may start from a tissue "
-    "in which they do: look at its `overlaps`."
-)
-_REMEDY = (
-    "Raise `max_steps`, loosen `tolerance`, use the default solver, or pass throw=False and look at "
-    "`converged`."
-)
+def with_overlaps(result: RESULTS, overlaps: Bool[Array, ""]) -> RESULTS:
+    """A result, or `overlap` if there are overlaps of finite cells."""
+    finite = result != RESULTS.nonfinite
+    return RESULTS.where(overlaps & finite, RESULTS.overlap, result)
 
 
 class AbstractResponse(eqx.Module):

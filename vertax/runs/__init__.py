@@ -1,4 +1,4 @@
-"""The command `vertax run`: configurations, folders, the registry and the command line.
+"""What a job or an experiment of `vertax run` needs: configuration, folder, and tables.
 
 `__init__.pyi` lists the public names, which are imported at their first use.
 """

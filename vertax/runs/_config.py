@@ -1,30 +1,32 @@
-"""Typed configurations: common keys, reading, and error messages."""
+"""Typed configurations: common keys, reading, checks, and templates."""
 
 from __future__ import annotations
 
 import difflib
 import functools
+import json
 import os
+import re
 import tomllib
-import types
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, TypeVar
 
 from vertax._base.extras import requires_extra
-from vertax.runs._errors import ConfigError
 
 with requires_extra("run", "The configuration of experiments"):
-    import annotated_types
     import pydantic
-    from pydantic.fields import FieldInfo
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the key and what it may be."""
 
 
 class Section(pydantic.BaseModel):
     """A table of a configuration file.
 
-    Subclass it; each key is a field with a type, a default and a docstring below. Unknown keys and
-    values of another type are refused (an integer counts as a number, nothing else is converted).
+    Subclass it; each key is a field with a type, a default and a docstring below. Unknown keys and values of
+    another type are rejected (an integer counts as a number, nothing else is converted).
     """
 
     model_config = pydantic.ConfigDict(
@@ -42,13 +44,9 @@ class Section(pydantic.BaseModel):
     def _complete(cls, data: Any) -> Any:
         if not isinstance(data, Mapping):
             return data
-        defaults = {name: field.default for name, field in cls.model_fields.items()}
-        return {
-            name: _merge(default.model_dump(), value)
-            if isinstance(default := defaults.get(name), Section)
-            else value
-            for name, value in data.items()
-        }
+        defaults = {k: f.default for k, f in cls.model_fields.items() if _section(f)}
+        tables = {k: d.model_dump() for k, d in defaults.items() if isinstance(d, Section)}
+        return {k: _merge(tables[k], v) if k in tables else v for k, v in data.items()}
 
 
 class ExperimentConfig(Section):
@@ -56,13 +54,13 @@ class ExperimentConfig(Section):
 
     experiment: str = ""
     """The job or experiment to run: the name of its module."""
-    seed: int = pydantic.Field(default=0, ge=0)
+    seed: int = pydantic.Field(default=0, ge=0, lt=2**63)
     """Seed of everything random."""
     precision: Literal["float64", "float32"] = "float64"
     """Precision of floating-point numbers."""
 
     @pydantic.model_validator(mode="after")
-    def _seed_that_is_kept(self) -> Any:
+    def _seed_of_32_bits(self) -> Any:
         # JAX silently drops all but the lower 32 bits.
         if self.precision == "float32" and self.seed >= 2**32:
             raise ValueError(
@@ -71,17 +69,12 @@ class ExperimentConfig(Section):
         return self
 
 
+Model = TypeVar("Model", bound=Section)
+
+
 @functools.cache
-def named(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
-    """A configuration class with a key `experiment` that accepts one name only.
-
-    **Arguments:**
-
-    - `config`: the class with the keys of the job or experiment.
-    - `name`: the name.
-
-    **Returns:** a subclass.
-    """
+def with_name(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
+    """A subclass of a configuration with a key `experiment` that accepts one name only."""
     key = pydantic.Field(name, description=config.model_fields["experiment"].description)
     fields: dict[str, Any] = {"experiment": (Literal[name], key)}
     return pydantic.create_model(
@@ -89,27 +82,11 @@ def named(config: type[ExperimentConfig], name: str) -> type[ExperimentConfig]:
     )
 
 
-Model = TypeVar("Model", bound=Section)
-
-
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file.
-
-    **Arguments:**
-
-    - `path`: the file.
-
-    **Returns:** its content.
-
-    **Raises:**
-
-    - `ConfigError`, naming the file, if it cannot be read or is not valid TOML.
-    """
+    """The content of a TOML file; a `ConfigError` names a file that cannot be read."""
     try:
         # Editors on Windows write a byte-order mark.
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise ConfigError(f"There is no configuration file {os.fspath(path)}.") from None
     except OSError as error:
         raise ConfigError(f"Cannot read {os.fspath(path)}: {error.strerror}.") from error
     except ValueError as error:  # of TOML, of text that is not UTF-8, or of a name that is no path
@@ -119,29 +96,17 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
-    """Set single keys of a configuration.
+    """A copy of a configuration with single keys set by texts such as `"fit.epochs=50"`.
 
-    **Arguments:**
-
-    - `data`: the configuration; left as it is.
-    - `overrides`: texts `key=value` with a dotted key, e.g. `"fit.epochs=50"`. The value is written
-        as in TOML; what is not valid TOML is taken as a string, so plain words need no quotes. A
-        later one wins.
-
-    **Returns:** a new configuration.
-
-    **Raises:**
-
-    - `ConfigError` for a text without `=`, an empty key or value, or a key inside what is no table.
+    A value is written as in TOML; any other text is a string. The last override of a key is used.
     """
     config = _copy(data)
     for override in overrides:
         key, equals, text = override.partition("=")
-        parts = [part.strip() for part in key.split(".")]
+        *tables, name = parts = [part.strip() for part in key.split(".")]
         if not equals or not all(parts):
             raise ConfigError(
-                f"An override must have the form key=value, as in fit.epochs=50, but is "
-                f"{override!r}."
+                f"An override must have the form key=value, as in fit.epochs=50, but is {override!r}."
             )
         if not text.strip():
             raise ConfigError(
@@ -149,185 +114,119 @@ def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[s
                 f"text is {key}='\"\"'."
             )
         table = config
-        for depth, part in enumerate(parts[:-1], start=1):
+        for part in tables:
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
                 raise ConfigError(
-                    f"Cannot set `{'.'.join(parts)}`: `{'.'.join(parts[:depth])}` is a value and "
-                    "not a table."
+                    f"Cannot set `{'.'.join(parts)}`: `{part}` is a value and not a table."
                 )
-        table[parts[-1]] = _parse(text)
+        table[name] = _parse(text)
     return config
 
 
 def validate(
     model: type[Model], data: Mapping[str, Any], where: str = "the configuration"
 ) -> Model:
-    """Check a configuration against its model.
-
-    **Arguments:**
-
-    - `model`: the class to make.
-    - `data`: the configuration.
-    - `where`: what it is called in messages, e.g. the name of the file.
-
-    **Returns:** an instance of `model`.
-
-    **Raises:**
-
-    - `ConfigError` that lists every unknown, missing or ill-typed key by its full dotted name, with
-        what is allowed there and, for an unknown one, the nearest key that exists.
-    """
-    too_large = [
-        f"`{key}` is {value}, which is no integer of 64 bits, as TOML has them."
-        for key, value in _flat(data)
-        if isinstance(value, int) and not -(2**63) <= value < 2**63
-    ]
-    if too_large:
-        raise ConfigError(f"In {where}: {' '.join(too_large)}")
+    """The configuration as an instance of `model`; a `ConfigError` lists all mistakes by key."""
     try:
         return model.model_validate(dict(data))
     except pydantic.ValidationError as error:
-        keys = fields(model)
+        keys = list(all_keys(model))
         lines = [_explain(keys, mistake) for mistake in error.errors(include_url=False)]
         listed = "\n  ".join(["", *lines]) if len(lines) > 1 else f" {lines[0]}"
         raise ConfigError(f"In {where}:{listed}") from None
 
 
-def fields(model: type[Section], prefix: str = "") -> dict[str, FieldInfo]:
-    """All keys of a configuration by their dotted names; a table comes before the keys in it.
-
-    **Arguments:**
-
-    - `model`: the class of the configuration.
-    - `prefix`: put before each name.
-
-    **Returns:** the Pydantic field of each key.
-    """
-    keys: dict[str, FieldInfo] = {}
+def all_keys(model: type[Section], prefix: str = "") -> Iterator[str]:
+    """All dotted keys of a configuration; a table comes before its keys."""
     for name, field in model.model_fields.items():
-        keys[prefix + name] = field
-        if (section := _section(field)) is not None:
-            keys |= fields(section, f"{prefix}{name}.")
-    return keys
+        yield prefix + name
+        if section := _section(field):
+            yield from all_keys(section, f"{prefix}{name}.")
+
+
+def differences(then: Any, now: Any, name: str = "") -> list[str]:
+    """Differences between two configurations, one sentence for each key."""
+    if isinstance(then, Mapping) and isinstance(now, Mapping):
+        keys, prefix = dict.fromkeys([*then, *now]), f"{name}." if name else ""
+        return [d for k in keys for d in differences(then.get(k), now.get(k), prefix + k)]
+    return [] if then == now else [f"`{name}` was {then!r} and is {now!r}"]
 
 
 def template(model: type[ExperimentConfig], name: str) -> str:
-    """A configuration file with every key at its default, each explained in a comment.
-
-    **Arguments:**
-
-    - `model`: the class of the configuration.
-    - `name`: of the experiment.
-
-    **Returns:** the text of a TOML file.
-    """
-    lines = [f'experiment = "{name}"', *_template_lines(model, "", {})]
-    return "\n".join(lines) + "\n"
+    """A TOML file with every key at its default, each explained in a comment."""
+    schema = model.model_json_schema()
+    defaults = model.model_construct().model_dump(mode="json")
+    lines = _template_lines(schema, schema.get("$defs", {}), defaults, "")
+    return "\n".join([f'experiment = "{name}"', *lines]) + "\n"
 
 
-def allowed(field: FieldInfo) -> str:
-    """What may be written at a key, in words.
-
-    **Arguments:**
-
-    - `field`: the field of the key, see `fields`.
-
-    **Returns:** e.g. `"an integer, at least 1"`.
-    """
-    words = {
-        annotated_types.Ge: ("ge", "at least {}"),
-        annotated_types.Gt: ("gt", "above {}"),
-        annotated_types.Le: ("le", "at most {}"),
-        annotated_types.Lt: ("lt", "below {}"),
-    }
-    bounds = [
-        words[type(mark)][1].format(getattr(mark, words[type(mark)][0]))
-        for mark in field.metadata
-        if type(mark) in words
-    ]
-    return ", ".join([_type_in_words(field.annotation), *bounds])
+def _template_lines(schema: Any, tables: Any, defaults: Any, prefix: str) -> Iterator[str]:
+    sections = []
+    for name, key in schema["properties"].items():
+        default = defaults.get(name, key.get("default"))
+        section = tables.get(key.get("$ref", "").rpartition("/")[2])
+        # Pydantic leaves out the description of a key that is that of the table.
+        about = " ".join(({"description": ""} | (section or {}) | key)["description"].split())
+        if section is not None:
+            sections += ["", f"[{prefix}{name}]  # {about}"]
+            sections += _template_lines(section, tables, default or {}, f"{prefix}{name}.")
+        elif prefix or name != "experiment":
+            yield f"# {about} ({_in_words(key)})"
+            required = name in schema.get("required", ()) and default is None
+            value = "" if default is None else f" {_in_toml(default)}"
+            yield f"{'' if value or required else '# '}{name} ={value}"
+    yield from sections
 
 
-_TYPES = {int: "an integer", float: "a number", str: "a string", bool: "true or false"}
+_TYPES = {"integer": "an integer", "number": "a number", "boolean": "true or false"}
+_BOUNDS = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most"}
+_BOUNDS["exclusiveMaximum"] = "below"
 
 
-def _type_in_words(annotation: Any) -> str:
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin in (Union, types.UnionType):
-        return " or ".join(_type_in_words(a) for a in arguments if a is not types.NoneType)
-    if origin is Literal:
-        return "one of " + ", ".join(_in_toml(value) for value in arguments)
-    if origin in (list, tuple):
-        return f"a list, each entry {_type_in_words(arguments[0])}"
-    if isinstance(annotation, type) and issubclass(annotation, Section):
-        return f"a table with the keys {', '.join(annotation.model_fields)}"
-    if isinstance(annotation, type) and issubclass(annotation, Path):
-        return "a string, the path of a file"
-    return _TYPES.get(annotation, str(annotation))
+def _in_words(schema: Mapping[str, Any]) -> str:
+    """The values that a JSON schema allows."""
+    if "anyOf" in schema:
+        return " or ".join(_in_words(each) for each in schema["anyOf"] if each != {"type": "null"})
+    if "enum" in schema:
+        return "one of " + ", ".join(map(_in_toml, schema["enum"]))
+    kind = schema.get("type", "object")
+    if kind == "array":
+        return f"a list, each entry {_in_words(schema.get('items', schema.get('prefixItems', [{}])[0]))}"
+    bounds = [f"{words} {schema[bound]}" for bound, words in _BOUNDS.items() if bound in schema]
+    return ", ".join([_TYPES.get(kind, "a string" if kind == "string" else "a table"), *bounds])
 
 
-def _explain(keys: Mapping[str, FieldInfo], mistake: Any) -> str:
+def _explain(keys: list[str], mistake: Any) -> str:
     """One mistake, as Pydantic reports it, in a sentence."""
-    name = ".".join(str(part) for part in mistake["loc"])
-    # An entry of a list is judged by the field that the list belongs to.
-    field = keys.get(".".join(part for part in mistake["loc"] if isinstance(part, str)))
-    if mistake["type"] == "extra_forbidden":
-        near = _nearest(name, keys)
-        if near is not None:
-            return f"there is no key `{name}`; did you mean `{near}` ({allowed(keys[near])})?"
-        parent, _, _ = name.rpartition(".")
-        siblings = [key for key in keys if key.rpartition(".")[0] == parent]
+    name, kind = ".".join(str(part) for part in mistake["loc"]), mistake["type"]
+    if kind == "extra_forbidden":
+        if near := _nearest(name, keys):
+            return f"there is no key `{name}`; did you mean `{near}`?"
+        siblings = [k for k in keys if k.rpartition(".")[0] == name.rpartition(".")[0]]
         return f"there is no key `{name}`; allowed are: {', '.join(f'`{k}`' for k in siblings)}."
-    if mistake["type"] == "missing" and field is not None:
-        return f"`{name}` is missing; it must be {allowed(field)}."
-    if mistake["type"] == "value_error" or field is None:  # of a validator of ours
-        what = str(mistake.get("ctx", {}).get("error", mistake["msg"])).removesuffix(".")
-        return f"`{name}`: {what}." if name else f"{what}."
-    return f"`{name}` must be {allowed(field)}, but is {_in_toml(mistake['input'])}."
+    if kind == "missing":
+        return f"`{name}` is missing."
+    if kind == "value_error":  # of a validator of a section
+        text = str(mistake["ctx"]["error"]).removesuffix(".")
+        return f"`{name}`: {text}." if name else f"{text}."
+    words = re.sub(r"^\w+ should ", "", mistake["msg"]).removesuffix(" after validation")
+    words = "be a table" if kind == "model_type" else words
+    value = _in_toml(mistake["input"])
+    return f"`{name}` must {words}, but is {value if len(value) <= 80 else value[:80] + '…'}."
 
 
 def _nearest(name: str, keys: Iterable[str]) -> str | None:
     """The most similar key, also in another table."""
     alike = lambda a, b: difflib.SequenceMatcher(None, a, b).ratio()
     last = lambda key: key.rpartition(".")[2]
-    score = lambda key: alike(last(key), last(name)) + 0.5 * alike(key, name)
-    best = max(keys, key=score, default=None)
-    return best if best is not None and alike(last(best), last(name)) > 0.65 else None
+    best = max(keys, key=lambda key: alike(last(key), last(name)) + 0.5 * alike(key, name))
+    return best if alike(last(best), last(name)) > 0.65 else None
 
 
-def _template_lines(
-    model: type[Section], prefix: str, defaults: Mapping[str, Any]
-) -> Iterator[str]:
-    sections: list[tuple[str, type[Section], FieldInfo]] = []
-    for name, field in model.model_fields.items():
-        section = _section(field)
-        if section is not None:
-            sections.append((f"{prefix}{name}", section, field))
-        elif name != "experiment":
-            yield f"# {_one_line(field.description)} ({allowed(field)})"
-            default = defaults.get(name, field.get_default(call_default_factory=True))
-            if field.is_required() and name not in defaults:
-                yield f"{name} ="
-            elif default is None:
-                yield f"# {name} ="
-            else:
-                yield f"{name} = {_in_toml(default)}"
-    for name, section, field in sections:
-        yield ""
-        yield f"[{name}]  # {_one_line(field.description)}"
-        below = field.default.model_dump() if isinstance(field.default, Section) else {}
-        inherited = defaults.get(name.rpartition(".")[2])
-        yield from _template_lines(section, f"{name}.", inherited or below)
-
-
-def _section(field: FieldInfo) -> type[Section] | None:
+def _section(field: pydantic.fields.FieldInfo) -> type[Section] | None:
     kind: Any = field.annotation
     return kind if isinstance(kind, type) and issubclass(kind, Section) else None
-
-
-def _one_line(text: str | None) -> str:
-    return " ".join((text or "").split())
 
 
 def _parse(text: str) -> Any:
@@ -337,27 +236,16 @@ def _parse(text: str) -> Any:
         return text.strip()
     except RecursionError:
         raise ConfigError(f"The value {text[:20]}… is nested too deeply.") from None
-    # A text with line breaks could smuggle in more keys.
+    # A text with line breaks could set more keys.
     return table["value"] if table.keys() == {"value"} else text.strip()
 
 
 def _merge(below: Mapping[str, Any], above: Any) -> Any:
-    """Two nested tables as one; what stands above wins."""
+    """Two nested tables as one; the values of `above` replace those of `below`."""
     if not isinstance(above, Mapping):
         return above
-    merge = lambda name: (
-        _merge(below[name], above[name]) if isinstance(below.get(name), Mapping) else above[name]
-    )
-    return {**below, **{name: merge(name) for name in above}}
-
-
-def _flat(data: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """All single values with their dotted names."""
-    if isinstance(data, Mapping | list):
-        for key, value in data.items() if isinstance(data, Mapping) else enumerate(data):
-            yield from _flat(value, f"{name}.{key}" if name else str(key))
-    else:
-        yield name, data
+    nested = {k: _merge(below[k], v) for k, v in above.items() if isinstance(below.get(k), Mapping)}
+    return {**below, **above, **nested}
 
 
 def _copy(data: Any) -> Any:
@@ -365,16 +253,9 @@ def _copy(data: Any) -> Any:
 
 
 def _in_toml(value: Any) -> str:
-    if isinstance(value, Section):
-        entries = [f"{name} = {_in_toml(entry)}" for name, entry in value.model_dump().items()]
-        return f"{{ {', '.join(entries)} }}"
+    """A value as it is written in TOML."""
     if isinstance(value, Mapping):
-        return "a table"
-    if isinstance(value, bool):
-        return str(value).lower()
+        return f"{{ {', '.join(f'{k} = {_in_toml(v)}' for k, v in value.items())} }}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_in_toml, value))}]"
-    if isinstance(value, str | Path):
-        text = str(value)
-        return f'"{text if len(text) <= 80 else text[:80] + "…"}"'
-    return str(value)
+    return json.dumps(value, ensure_ascii=False, default=str)

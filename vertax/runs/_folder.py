@@ -1,15 +1,14 @@
-"""Folders of runs and their results."""
+"""The folder of a run: its fits, concurrent computations, and results."""
 
 from __future__ import annotations
 
-import contextlib
+import concurrent.futures
 import json
 import os
-import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import optimistix as optx
@@ -18,31 +17,37 @@ from tqdm import tqdm
 
 from vertax._base.archive import read_archive, write_archive
 from vertax._base.extras import requires_extra
-from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
+from vertax.fitting import (
+    Checkpoint,
+    Fit,
+    FitError,
+    InverseProblem,
+    Record,
+    doubts,
+    fit,
+    stack_fits,
+)
 from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
-from vertax.runs._claim import (
-    CONFIG,
-    FAILED,
-    FIGURES,
-    METRICS,
-    PARTS,
-    claimed,
-    existing,
-    unfinished,
-)
-from vertax.runs._config import ExperimentConfig
-from vertax.runs._errors import RunFolderError, UnfinishedRunError
-from vertax.runs._figures import checked_formats, write_figure
-from vertax.runs._summary import plain, safe, sentence
-from vertax.runs._tables import histories, history_columns
-from vertax.runs._versions import installed_version
+from vertax.runs._sections import Fitting
+from vertax.runs._tables import file_name, history_table, plain, sentence
 
 with requires_extra("run", "The folder of a run"):
-    import tomli_w
+    import matplotlib
     from matplotlib.figure import Figure
 
+METRICS, PARTS = "metrics.json", "unfinished"
+# Reproducible files, and text in a PDF as text.
+_UNDATED: dict[str, dict[str, None]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+_VECTOR_STYLE: Any = {"pdf.fonttype": 42, "svg.hashsalt": "vertax"}
+
+THREADS = "VERTAX_THREADS"  # the environment variable with the number of threads
 Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
+Result = TypeVar("Result")
+
+
+class RunFolderError(ValueError):
+    """A folder that a run must not overwrite, or without a run."""
 
 
 class RunFolder:
@@ -53,109 +58,39 @@ class RunFolder:
 
     **Arguments:**
 
-    - `path`: an existing folder; `claim` finds or makes one.
+    - `path`: an existing folder.
     - `figures`: formats of the pictures, of `"png"`, `"pdf"` and `"svg"`; each picture is written in all
         of them.
-
-    **Raises:**
-
-    - `RunFolderError` for another format.
+    - `print_steps`: whether `print_step` prints.
     """
 
     path: Path
     figure_formats: tuple[str, ...]
-    talkative: bool
-    """Whether `say` prints."""
     interrupted: bool
     """Whether a keyboard interrupt ended a fit of this run; no other one begins."""
 
-    def __init__(self, path: str | os.PathLike[str], *, figures: Sequence[str] = ("png",)):
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        figures: Sequence[str] = ("png",),
+        print_steps: bool = False,
+    ):
         self.path = Path(path)
-        self.figure_formats = checked_formats(figures)
-        self.talkative = False
+        self.figure_formats = tuple(figures)
         self.interrupted = False
+        self._print_steps = print_steps
         self._warnings: dict[str, list[str]] = {}
 
-    @classmethod
-    def claim(
-        cls,
-        name: str,
-        output: str | os.PathLike[str] | None = None,
-        *,
-        overwrite: bool = False,
-        root: str | os.PathLike[str] = "runs",
-        figures: Sequence[str] = ("png",),
-    ) -> RunFolder:
-        """Make the folder of a new run, without touching an earlier one.
-
-        **Arguments:**
-
-        - `name`: of the run; its folder is `root/name` or, if that is taken, `root/name-2`, …
-        - `output`: the folder itself, if the user chose one.
-        - `overwrite`: clear a folder that holds an earlier run, and use it again.
-        - `root`: folder of all runs.
-        - `figures`: formats of the pictures.
-
-        **Returns:** the folder, which holds no results.
-
-        **Raises:**
-
-        - `RunFolderError` if `output` is not empty and `overwrite` is not set, if what is to be
-            overwritten is not the folder of a run, if a file is in the way, or for another format.
-        """
-        figures = checked_formats(figures)  # before anything is made or cleared
-        return cls(claimed(Path(root) / name, output, overwrite), figures=figures)
-
-    @classmethod
-    def existing(cls, path: str | os.PathLike[str]) -> RunFolder:
-        """The folder of an earlier run.
-
-        **Arguments:**
-
-        - `path`: the folder.
-
-        **Returns:** the folder.
-
-        **Raises:**
-
-        - `RunFolderError` if there is no such folder, or if it is not that of a run.
-        """
-        return cls(existing(path))
-
-    @classmethod
-    def unfinished(
-        cls,
-        path: str | os.PathLike[str],
-        config: ExperimentConfig,
-        *,
-        figures: Sequence[str] = ("png",),
-    ) -> RunFolder:
-        """The folder of an earlier run, to resume it.
-
-        **Arguments:**
-
-        - `path`: the folder.
-        - `config`: the configuration, which must be that of the run.
-        - `figures`: formats of the pictures; they may be others than before.
-
-        **Returns:** the folder.
-
-        **Raises:**
-
-        - `RunFolderError` if it is not the folder of a run, if the run is finished, if its
-            configuration is another one, or for another format.
-        """
-        return cls(unfinished(path, config), figures=figures)
-
-    def say(self, what: str) -> None:
+    def print_step(self, step: str) -> None:
         """Print the current step of the run (`vertax run` without `--quiet`).
 
         **Arguments:**
 
-        - `what`: a few words, for a step that takes more than two seconds.
+        - `step`: a few words, for a step that takes more than two seconds.
         """
-        if self.talkative:
-            tqdm.write(f"  {what} …", file=sys.stderr)  # above the bars
+        if self._print_steps:
+            tqdm.write(f"  {step} …", file=sys.stderr)  # above the bars
 
     def fit(
         self,
@@ -189,52 +124,167 @@ class RunFolder:
         """
 
         def watch(epoch: int, record: Record) -> Mapping[str, ArrayLike] | None:
-            if self.interrupted:  # Ctrl-C reaches one thread only
-                raise KeyboardInterrupt
+            self._check_interrupt()
             return None if callback is None else callback(epoch, record)
 
-        if self.interrupted:
-            raise KeyboardInterrupt
+        self._check_interrupt()
         if options.get("progress", True):  # concurrent fits share one progress bar
-            self.say(f"fit: {name}")
-        checkpoint = Checkpoint(self._part(name))
+            self.print_step(f"fit: {name}")
+        options |= {"checkpoint": Checkpoint(self._part_file(name)), "callback": watch}
         try:
-            outcome = fit(
-                problem, optimiser, epochs, checkpoint=checkpoint, callback=watch, **options
-            )
+            outcome = fit(problem, optimiser, epochs, **options)
         except FitError as error:
             if error.fit is None:
                 raise
-            self._save_failed(name, error.fit)
+            self._save_failed(file_name(name), error.fit)
             if not partial:
                 raise
             self.warn(str(error).rstrip("."), name)
             return error.fit
-        # With concurrent fits the flag is only ever set.
-        self.interrupted |= outcome.interrupted
-        if not outcome.interrupted:
-            self._judge(name, optimiser, epochs, outcome)
-        return outcome
-
-    def _judge(self, name: str, optimiser: Any, epochs: int, outcome: Fit[Any]) -> None:
-        """Warn of a fit that has not converged."""
+        self.interrupted |= outcome.interrupted  # fits in other threads never reset it
+        if outcome.interrupted:
+            return outcome
         for doubt in doubts(outcome):
             self.warn(doubt, name)
         solver = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
         if solver and len(outcome.history.cost) >= epochs:
-            self.warn(
-                f"the least-squares solver did not end within {epochs} epochs (raise them)", name
-            )
+            text = f"the least-squares solver did not end within {epochs} epochs (raise them)"
+            self.warn(text, name)
+        return outcome
 
-    def _save_failed(self, name: str, outcome: Fit[Any]) -> None:
-        ending = safe(name)
-        if outcome.history.cost.ndim == 1:
-            self.save_table(f"history_{ending}", history_columns(outcome.history))
-            self.save_tissue(f"fitted_{ending}", outcome.tissue)
-        else:
-            members = range(outcome.history.cost.shape[1])
-            labels = [{"member": str(k)} for k in members]
-            self.save_table(f"history_{ending}", histories(outcome, labels))
+    def fit_in_threads(
+        self,
+        name: str,
+        problems: Sequence[InverseProblem[Any]],
+        fitting: Fitting,
+        *,
+        notes: Callable[[InverseProblem[Any], Record], Mapping[str, ArrayLike]] | None = None,
+        progress: bool = True,
+    ) -> Fit[Any]:
+        """Fit problems of one shape in threads.
+
+        In a batch each epoch takes as many steps as its slowest relaxation, which with T1 transitions is many
+        times the median.
+
+        **Arguments:**
+
+        - `name`: the name of these fits; they are numbered from 0.
+        - `problems`: the inverse problems.
+        - `fitting`: optimiser and epochs.
+        - `notes`: returns arrays to keep from each epoch, as a function of its problem and its
+            [`Record`][vertax.Record].
+        - `progress`: show a progress bar (only on a terminal).
+
+        **Returns:** the fits as one batch, with notes; seconds are their sum over the number of threads.
+
+        **Raises:** as `fit` and `map_in_threads`.
+        """
+
+        def fit_one(index: int) -> Fit[Any]:
+            problem = problems[index]
+            options: dict[str, Any] = {"progress": False}
+            if (compute := notes) is not None:
+                options["callback"] = lambda _, record: compute(problem, record)
+            return self.fit(f"{name} {index}", problem, fitting.build(), fitting.epochs, **options)
+
+        fits = self.map_in_threads(fit_one, len(problems), progress=progress, unit="fit")
+        return stack_fits(fits, at_once=num_threads())
+
+    def map_in_threads(
+        self,
+        function: Callable[[int], Result],
+        n: int,
+        *,
+        progress: bool = True,
+        unit: str = "run",
+    ) -> list[Result]:
+        """Call a function for each of 0 … n - 1 in threads, one per core.
+
+        Compiled functions of JAX release Python's lock. The first call runs alone, because it compiles. After
+        a keyboard interrupt, fits of this folder stop after their epoch and are kept, other calls run to
+        their end, and no other call begins.
+
+        **Arguments:**
+
+        - `function`: the function; calls must not share state.
+        - `n`: number of calls.
+        - `progress`: show a progress bar (only on a terminal).
+        - `unit`: unit of the progress bar.
+
+        **Returns:** the results, in the order of the numbers.
+
+        **Raises:**
+
+        - `KeyboardInterrupt` if the run was interrupted before all of them began.
+        - the error of a call, after the calls that have begun; no other call begins.
+        """
+
+        def call(index: int) -> Result:
+            self._check_interrupt()
+            return function(index)
+
+        with (
+            tqdm(total=n, unit=unit, disable=None if progress else True) as bar,
+            concurrent.futures.ThreadPoolExecutor(num_threads()) as pool,
+        ):
+            futures: list[concurrent.futures.Future[Result]] = []
+            try:
+                for first, last in ((0, min(n, 1)), (1, n)):
+                    futures += [pool.submit(call, index) for index in range(first, last)]
+                    for future in concurrent.futures.as_completed(futures[first:]):
+                        future.result()
+                        bar.update()
+            except BaseException as error:
+                self.interrupted |= isinstance(error, KeyboardInterrupt)
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        return [future.result() for future in futures]
+
+    def scan(
+        self,
+        name: str,
+        values: Sequence[float],
+        compute: Callable[[float], Mapping[str, np.ndarray]],
+        *,
+        progress: bool = True,
+    ) -> dict[str, Shaped[np.ndarray, "values ..."]]:
+        """Arrays at each of several values of a parameter; a resumed run keeps those that are computed.
+
+        **Arguments:**
+
+        - `name`: the name of the parameter, and of the parts of the run.
+        - `values`: its values, all different.
+        - `compute`: returns the arrays at one value by name; their shapes are the same at all values.
+        - `progress`: show a progress bar (only on a terminal).
+
+        **Returns:** the arrays by name, with a leading axis of the values.
+        """
+
+        def compute_one(index: int) -> dict[str, np.ndarray]:
+            value = float(values[index])
+            return self.part(f"{name} {value:g}", lambda: compute(value))
+
+        results = self.map_in_threads(compute_one, len(values), progress=progress, unit="value")
+        return {key: np.stack([result[key] for result in results]) for key in results[0]}
+
+    def part(
+        self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
+    ) -> dict[str, Shaped[np.ndarray, "..."]]:
+        """Arrays that are stored for a resumed run.
+
+        **Arguments:**
+
+        - `name`: the name of this part, unique in the run.
+        - `compute`: returns the arrays by name.
+
+        **Returns:** the arrays.
+        """
+        file = self._part_file(name)
+        if not file.exists():
+            self.print_step(name)
+            write_archive(file, "part", 1, compute())
+        arrays = read_archive(file, "part", 1)
+        return {key: array for key, array in arrays.items() if key not in ("format", "version")}
 
     def warn(self, text: str, name: str | None = None) -> None:
         """Add a warning, which is printed and part of the metrics.
@@ -251,194 +301,50 @@ class RunFolder:
         """The warnings, one sentence each."""
         return [sentence(text, sorted(names)) for text, names in self._warnings.items()]
 
-    def part(
-        self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
-    ) -> dict[str, Shaped[np.ndarray, "..."]]:
-        """Arrays that are stored for a resumed run.
-
-        **Arguments:**
-
-        - `name`: the name of this part, unique in the run.
-        - `compute`: returns the arrays by name.
-
-        **Returns:** the arrays.
-        """
-        file = self._part(name)
-        if not file.exists():
-            self.say(name)
-            write_archive(file, "part", 1, compute())
-        arrays = read_archive(file, "part", 1)
-        return {key: array for key, array in arrays.items() if key not in ("format", "version")}
-
-    def parts(self) -> list[Path]:
-        """The fits and other parts that a resumed run keeps.
-
-        **Returns:** the paths of their files, sorted by name.
-        """
-        return sorted(self.path.glob(f"{PARTS}/*.npz"))
-
-    def forget_parts(self) -> None:
-        """Remove them: the run is finished."""
-        for file in self.parts():
-            file.unlink()
-        with contextlib.suppress(OSError):  # missing, or with other files
-            (self.path / PARTS).rmdir()
-
-    def _part(self, name: str) -> Path:
-        folder = self.path / PARTS
-        folder.mkdir(exist_ok=True)
-        return folder / f"{safe(name)}.npz"
-
-    def save_config(self, config: ExperimentConfig) -> None:
-        """Write the resolved configuration, with every default spelled out.
-
-        **Arguments:**
-
-        - `config`: the configuration; `vertax run` on the written file repeats the run.
-        """
-        # TOML has no null: a key that is None by default is left out.
-        content = config.model_dump(mode="json", exclude_none=True)
-        programs = [f"{name} {installed_version(name)}" for name in ("vertax", "jax", "numpy")]
-        with atomic_write(self.path / CONFIG) as file:
-            file.write(f"# Run by {', '.join(programs)}; Python {platform.python_version()}.\n")
-            file.write(tomli_w.dumps(content))
-
     def save_tissue(self, name: str, tissue: Tissue) -> None:
-        """Write a tissue to `name.npz`.
-
-        **Arguments:**
-
-        - `name`: file name without ending.
-        - `tissue`: the tissue.
-        """
+        """Write a tissue to `name.npz`."""
         save_tissue(self.path / f"{name}.npz", tissue)
 
     def save_array(self, name: str, array: Shaped[np.ndarray, "..."]) -> None:
-        """Write an array to `name.npy`.
-
-        **Arguments:**
-
-        - `name`: file name without ending.
-        - `array`: the array.
-        """
+        """Write an array to `name.npy`."""
         with atomic_write(self.path / f"{name}.npy", "wb") as file:
             np.save(file, array, allow_pickle=False)
 
     def save_table(self, name: str, columns: Mapping[str, Sequence[Any] | np.ndarray]) -> None:
-        """Write a table to `name.csv`, as [`write_csv`][vertax.io.write_csv]: NaN is an empty field.
-
-        **Arguments:**
-
-        - `name`: file name without ending.
-        - `columns`: entries by the name of the column, all of one length.
-
-        **Raises:**
-
-        - `ValueError` if the columns differ in length.
-        """
+        """Write columns of one length to `name.csv`, as [`write_csv`][vertax.io.write_csv]."""
         write_csv(self.path / f"{name}.csv", columns)
 
     def save_figure(self, name: str, figure: Figure) -> None:
-        """Write a picture to `figures/name.png`, or in the other formats that were asked for.
-
-        **Arguments:**
-
-        - `name`: file name without ending.
-        - `figure`: the Matplotlib figure.
-        """
-        folder = self.path / "figures"
-        folder.mkdir(exist_ok=True)
+        """Write a Matplotlib figure to `figures/name.png`, or in the other formats of this folder."""
+        (self.path / "figures").mkdir(exist_ok=True)
         for ending in self.figure_formats:
-            write_figure(folder / f"{name}.{ending}", figure)
+            path = self.path / "figures" / f"{name}.{ending}"
+            with matplotlib.rc_context(_VECTOR_STYLE), atomic_write(path, "wb") as file:
+                figure.savefig(file, format=ending, dpi=200, metadata=_UNDATED.get(ending))
 
     def save_metrics(self, metrics: Mapping[str, Any]) -> None:
-        """Write the metrics; the last thing a run does.
-
-        **Arguments:**
-
-        - `metrics`: numbers, texts, lists and mappings; NaN and infinity, which strict JSON does
-            not have, become null. `warnings` of this folder are added, if there are any.
-        """
+        """Write the metrics and the warnings; NaN and infinity, which JSON does not have, become null."""
         if self.warnings:
             metrics = {**metrics, "warnings": self.warnings}
         with atomic_write(self.path / METRICS) as file:
             json.dump(plain(metrics), file, indent=2, allow_nan=False)
             file.write("\n")
 
-    def finish(self, metrics: Mapping[str, Any]) -> None:
-        """Finish the run: write its metrics and remove checkpoints.
-
-        **Arguments:**
-
-        - `metrics`: see `save_metrics`.
-
-        **Raises:**
-
-        - `KeyboardInterrupt` if a fit of the run was interrupted: then it is not finished.
-        """
-        if self.interrupted:
+    def _check_interrupt(self) -> None:
+        if self.interrupted:  # Ctrl-C reaches one thread only
             raise KeyboardInterrupt
-        self.save_metrics(metrics)
-        self.forget_parts()
 
-    def discard_if_empty(self) -> None:
-        """Remove the folder if it has only the configuration, so that the same command can be repeated."""
-        if any(file != self.path / CONFIG for file in self.files()):
-            return
-        (self.path / CONFIG).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # in use, or not there
-            for folder in (self.path / PARTS, self.path / "figures", self.path):
-                if folder.is_dir():
-                    folder.rmdir()
+    def _part_file(self, name: str) -> Path:
+        (self.path / PARTS).mkdir(exist_ok=True)
+        return self.path / PARTS / f"{file_name(name)}.npz"
 
-    def mark_failed(self, error: Exception) -> None:
-        """Write the message of the error to `failed.txt`, unless the run can be resumed or left no files.
+    def _save_failed(self, name: str, outcome: Fit[Any]) -> None:
+        self.save_table(f"history_{name}", history_table(outcome.history))
+        if outcome.history.cost.ndim == 1:
+            self.save_tissue(f"fitted_{name}", outcome.tissue)
 
-        The same command may then use the folder again.
 
-        **Arguments:**
-
-        - `error`: the error that ended the run.
-        """
-        if self.path.is_dir() and not self.parts():
-            with atomic_write(self.path / FAILED) as file:
-                file.write(f"{error}\n")
-
-    def metrics(self) -> dict[str, Any]:
-        """The metrics of a finished run.
-
-        **Returns:** the metrics.
-
-        **Raises:**
-
-        - `UnfinishedRunError` if the run is not finished.
-        - `RunFolderError` if the metrics cannot be read.
-        """
-        file = self.path / METRICS
-        try:
-            metrics = json.loads(file.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise UnfinishedRunError(
-                f"The run in {self.path} is unfinished: it has no {METRICS}, which is written last. It is "
-                f"still going, it was interrupted or it failed; to go on: vertax run {self.path / CONFIG} "
-                f"--resume {self.path}"
-            ) from None
-        except ValueError as error:
-            raise RunFolderError(f"{file} is no JSON ({error}).") from None
-        if not isinstance(metrics, dict):
-            raise RunFolderError(f"{file} is broken: it holds no metrics by name.")
-        return metrics
-
-    def files(self) -> list[Path]:
-        """All files in the folder.
-
-        **Returns:** their paths, sorted by name.
-        """
-        return sorted(file for file in self.path.rglob("*") if file.is_file())
-
-    def figures(self) -> list[Path]:
-        """The pictures written so far.
-
-        **Returns:** their paths, sorted by name.
-        """
-        return sorted(file for pattern in FIGURES for file in self.path.glob(pattern))
+def num_threads() -> int:
+    """The number of threads: the environment variable, or one per core."""
+    number = os.environ.get(THREADS, "")
+    return max(int(number), 1) if number.isdecimal() else os.cpu_count() or 1

@@ -5,12 +5,11 @@ from __future__ import annotations
 import functools
 from typing import Literal
 
-import jax
 import numpy as np
 import optax
 import optimistix as optx
-from jaxtyping import Array, Float, Key, PRNGKeyArray, Shaped
-from pydantic import Field, field_validator, model_validator
+from jaxtyping import Array, Key, Shaped
+from pydantic import Field
 
 from vertax import solvers
 from vertax.adjoints import (
@@ -19,24 +18,17 @@ from vertax.adjoints import (
     EquilibriumPropagation,
     ImplicitDifferentiation,
 )
-from vertax.energies import LocalSum
 from vertax.fitting import stack
-from vertax.inference import (
-    Micrograph,
-    Microscope as SyntheticMicroscope,
-    foam_energy,
-    micrograph_problem,
-)
-from vertax.initialise import Cellpose, Watershed, periodic_voronoi
+from vertax.inference import Microscope
+from vertax.initialise import periodic_voronoi
 from vertax.io import read_image
 from vertax.mesh import Tissue
-from vertax.relax import Relaxation as Response
-from vertax.runs._config import Section
-from vertax.runs._errors import ConfigError
+from vertax.relax import Relaxation
+from vertax.runs._config import ConfigError, Section
 from vertax.transitions import T1
 
 
-class Relaxation(Section):
+class RelaxationSection(Section):
     """Relaxation to mechanical equilibrium: the settings of `vertax.Relaxation`."""
 
     solver: Literal["newton_cg", "lbfgs", "fire", "gradient_descent", "momentum"] = "newton_cg"
@@ -55,19 +47,19 @@ class Relaxation(Section):
     """Largest force at equilibrium; left out, it depends on the precision."""
     contacts: bool = True
     """Whether contact forces prevent overlaps of cells."""
-    contact_range: float = Field(default=float(Response().contact_range or 0), ge=0)
+    contact_range: float = Field(default=float(Relaxation().contact_range or 0), ge=0)
     """Range of contact forces between corner and side, in units of the root of the mean cell area."""
-    consecutive_steps: int = Field(default=int(Response().consecutive_steps), ge=1)
+    consecutive_steps: int = Field(default=int(Relaxation().consecutive_steps), ge=1)
     """Number of consecutive steps for which the force must stay below the tolerance."""
-    max_steps: int = Field(default=int(Response().max_steps), ge=1)
+    max_steps: int = Field(default=int(Relaxation().max_steps), ge=1)
     """Largest number of steps of the minimiser."""
 
-    def build(self) -> Response:
+    def build(self) -> Relaxation:
         """The settings as an object.
 
         **Returns:** a [`Relaxation`][vertax.Relaxation].
         """
-        return Response(
+        return Relaxation(
             solver=self._minimiser(),
             transitions=T1(self.t1_threshold, self.max_flips) if self.transitions else None,
             tolerance=self.tolerance,
@@ -164,53 +156,15 @@ class ShapeFactors(Section):
     """Standard deviation."""
 
 
-class TensionRange(Section):
-    """Line tensions of the edges and stiffness of the cells, where the mean rest area of a cell is 1."""
-
-    low: float = Field(default=0.04, ge=0)
-    """Smallest tension."""
-    high: float = Field(default=0.28, gt=0)
-    """Largest tension; above twice the smallest one, some junctions of three edges have no balance and become
-    four-fold vertices."""
-    stiffness: float = Field(default=1.0, gt=0)
-    """Stiffness of the areas of cells."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> TensionRange:
-        if not self.low < self.high:
-            raise ValueError(f"low must be below high, but they are {self.low} and {self.high}")
-        return self
-
-    def draw(self, tissue: Tissue, spread: float, key: PRNGKeyArray) -> LocalSum:
-        """The energy E2 with a tension for each edge.
-
-        **Arguments:**
-
-        - `tissue`: the tissue.
-        - `spread`: the share of the range, about its middle, that tensions are drawn from; below 1.
-        - `key`: of the draw.
-
-        **Returns:** the energy, see [`foam_energy`][vertax.inference.foam_energy].
-        """
-        unit = jax.random.uniform(key, (tissue.n_edges,), minval=-1.0, maxval=1.0)
-        tension = self.low + (self.high - self.low) * (0.5 + 0.5 * spread * unit)
-        return foam_energy(tension, stiffness=self.stiffness, low=self.low, high=self.high)
-
-
 class ImageFile(Section):
     """An image in a file: the table `image` of a configuration."""
 
-    path: str | None = None
+    path: str | None = Field(default=None, min_length=1)
     """The file: TIFF, PNG, …"""
     channel: int | None = Field(default=None, ge=0)
     """Which channel, from 0, if there are several, as in a colour image."""
     plane: int | None = Field(default=None, ge=0)
     """Which plane, from 0, if it is a stack."""
-
-    @field_validator("path")
-    @classmethod
-    def _not_empty(cls, path: str | None) -> str | None:
-        return path if path is None else file_name(path)
 
     def read(self) -> Shaped[np.ndarray, "rows columns"]:
         """The image.
@@ -237,54 +191,7 @@ class ImageFile(Section):
             raise
 
 
-class Preparation(Section):
-    """How an image is prepared for the comparison with the model."""
-
-    pixels: int = Field(default=256, ge=32)
-    """Longer side, in pixels, of the image that the model is compared with."""
-    background_width: float = Field(default=0.5, gt=0)
-    """Width of the filter that evens out the illumination, in mean cell diameters."""
-    psf_width: float | None = Field(default=None, gt=0)
-    """Standard deviation of the blur, in pixels of the file; left out, the one that fits best."""
-
-
-class Segmenter(Section):
-    """Segmentation of the cells."""
-
-    method: Literal["watershed", "cellpose"] = "watershed"
-    """Cellpose needs its own extra and downloads a model."""
-    cell_size: float | None = Field(default=None, gt=0)
-    """Typical diameter of a cell in pixels of the file; left out, estimated from the image."""
-
-    def build(self) -> Watershed | Cellpose:
-        """The segmenter.
-
-        **Returns:** a [`Watershed`][vertax.initialise.Watershed] or
-        [`Cellpose`][vertax.initialise.Cellpose].
-        """
-        if self.method == "cellpose":
-            return Cellpose(diameter=self.cell_size)
-        return Watershed(cell_size=self.cell_size)
-
-
-class MicrographModel(Section):
-    """The energy, E1 with a rest area for each cell, and the first guess."""
-
-    target_shape_factor: float = Field(default=3.7, gt=0)
-    """First guess of the target shape factor of every cell."""
-    border: Literal["mirrored", "pinned"] = "mirrored"
-    """What holds the tissue at the border of the image: the image is mirrored, cells that the border cuts
-    included (as in the paper); or the outline of its complete cells is pinned."""
-    pixel_size: float | None = Field(default=None, gt=0)
-    """Length of a pixel of the file, where rest areas are 1 (of a pinned border only); left out, the mean
-    area of the complete cells is 1. In a rigid tissue all shape factors depend on it."""
-    rest_areas: Literal["fitted", "observed", "equal"] = "fitted"
-    """Rest areas of the cells: fitted too, beginning with those of the segmented cells; as those are;
-    or the mean area in all cells but those that the border cuts, which determines shape factors best
-    where it is true. A pinned border always has equal ones."""
-
-
-class Microscope(Section):
+class MicroscopeSection(Section):
     """A synthetic microscope; intensities are relative to the brightest membrane."""
 
     pixels: int = Field(default=128, ge=16)
@@ -300,7 +207,7 @@ class Microscope(Section):
     faint: float = Field(default=0.0, ge=0, le=1)
     """Share of the edges with a faint stretch."""
 
-    def build(self, noise: float) -> SyntheticMicroscope:
+    def build(self, noise: float) -> Microscope:
         """The microscope.
 
         **Arguments:**
@@ -309,80 +216,9 @@ class Microscope(Section):
 
         **Returns:** a [`Microscope`][vertax.inference.Microscope].
         """
-        return SyntheticMicroscope(
-            noise=noise, **{name: getattr(self, name) for name in Microscope.model_fields}
+        return Microscope(
+            noise=noise, **{name: getattr(self, name) for name in MicroscopeSection.model_fields}
         )
-
-
-def file_name(path: str) -> str:
-    """Check a key that names a file; an empty one usually comes from a shell variable that is not set.
-
-    **Arguments:**
-
-    - `path`: the value of the key.
-
-    **Returns:** the same.
-
-    **Raises:**
-
-    - `ValueError` if it is empty.
-    """
-    if not path.strip():
-        raise ValueError("must name a file, but is empty")
-    return path
-
-
-def read_micrograph(
-    image: Shaped[np.ndarray, "rows columns"],
-    preparation: Preparation,
-    segmenter: Segmenter,
-    model: MicrographModel,
-    relaxation: Relaxation,
-) -> Micrograph:
-    """Segment an image and set up the inverse problem of its shape factors.
-
-    **Arguments:**
-
-    - `image`: the image, bright membranes on dark cells.
-    - `preparation`, `segmenter`, `model`, `relaxation`: the settings.
-
-    **Returns:** the [`Micrograph`][vertax.inference.Micrograph].
-
-    **Raises:** as [`micrograph_problem`][vertax.inference.micrograph_problem].
-    """
-    return micrograph_problem(
-        np.asarray(image, float),
-        segmenter=segmenter.build(),
-        response=relaxation.build(),
-        **{name: getattr(preparation, name) for name in Preparation.model_fields},
-        **model.model_dump(),
-    )
-
-
-def replicate_keys(seed: int, n: int) -> list[PRNGKeyArray]:
-    """Random keys of replicates; each is independent of the number of replicates.
-
-    **Arguments:**
-
-    - `seed`: the seed of the run.
-    - `n`: number of replicates.
-
-    **Returns:** the keys.
-    """
-    return [jax.random.fold_in(jax.random.key(seed), k) for k in range(n)]
-
-
-def spread_of(values: Float[np.ndarray, " *values"]) -> dict[str, float]:
-    """Mean and standard deviation, for metrics.
-
-    **Arguments:**
-
-    - `values`: numbers.
-
-    **Returns:** both by name.
-    """
-    values = np.asarray(values, float)
-    return {"mean": float(values.mean()), "deviation": float(values.std())}
 
 
 # JAX compares Optax optimisers by identity: the same object avoids a second compilation in one process.

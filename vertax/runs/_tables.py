@@ -1,8 +1,10 @@
-"""Tables and metrics of fits."""
+"""Tables and metrics of fits, and metrics and names as text."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -11,40 +13,27 @@ import numpy as np
 from vertax.fitting import Fit, History
 
 
-def history_columns(history: History, **labels: str) -> dict[str, Any]:
-    """The columns of a table of the epochs of a fit.
+def history_table(history: History, *labels: Mapping[str, str]) -> dict[str, Any]:
+    """The table of all epochs of a fit or of a batch of fits.
 
     **Arguments:**
 
     - `history`: a [`History`][vertax.History].
-    - `labels`: columns of one repeated text each, to distinguish fits in one table.
+    - `labels`: columns of one repeated text each, for the fit or for each member of the batch; by default a
+        batch has a column `member` with its number.
 
-    **Returns:** the labels, the number of the epoch and every curve of the history.
+    **Returns:** columns by name: the labels, the number of the epoch and every curve of the history.
     """
     n = len(history.cost)
-    return {name: [text] * n for name, text in labels.items()} | {
-        "epoch": np.arange(n),
-        **history.columns(),
-    }
+    if history.cost.ndim == 1:
+        repeated = {name: [text] * n for label in labels for name, text in label.items()}
+        return repeated | {"epoch": np.arange(n), **history.columns()}
+    labels = labels or tuple({"member": str(k)} for k in range(history.cost.shape[1]))
+    single = lambda k: jax.tree.map(lambda x: x[:, k] if x.ndim > 1 else x, history)
+    return concatenate([history_table(single(k), label) for k, label in enumerate(labels)])
 
 
-def histories(outcome: Fit, labels: Sequence[dict[str, str]]) -> dict[str, Any]:
-    """The table of all epochs of a batch.
-
-    **Arguments:**
-
-    - `outcome`: the fit of the batch.
-    - `labels`: labels of each member.
-
-    **Returns:** columns by name.
-    """
-    single = lambda k: jax.tree.map(lambda x: x[:, k] if x.ndim > 1 else x, outcome.history)
-    parts = [history_columns(single(k), **label) for k, label in enumerate(labels)]
-    names = [name for name in parts[0] if all(name in part for part in parts)]
-    return {name: np.concatenate([part[name] for part in parts]) for name in names}
-
-
-def joined(tables: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def concatenate(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Concatenate tables; the result has their common columns.
 
     **Arguments:**
@@ -78,3 +67,58 @@ def fit_metrics(outcome: Fit) -> dict[str, Any]:
         "num_t1": history.num_t1.sum(),
         "converged_fraction": history.converged.mean(),
     }
+
+
+def plain(value: Any) -> Any:
+    """A value that strict JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):  # arrays and scalars of NumPy and JAX
+        return plain(np.asarray(value).tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def file_name(name: str) -> str:
+    """A name as a part of the name of a file."""
+    return re.sub("[^0-9A-Za-z.-]+", "_", name)
+
+
+def sentence(text: str, names: Sequence[str]) -> str:
+    """A warning after the first three names that it concerns."""
+    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return f"{shown}: {text}." if names else f"{text[:1].upper()}{text[1:]}."
+
+
+def summary(metrics: Mapping[str, Any]) -> str:
+    """Numbers of the metrics as text; groups with names in common are columns of one table.
+
+    If there are groups, other entries are left out.
+    """
+    everything = plain(metrics)
+    groups = {k: _numbers(v) for k, v in everything.items() if isinstance(v, dict)}
+    groups = {k: group for k, group in groups.items() if group} or {"": _numbers(everything)}
+    tables: list[dict[str, dict[str, Any]]] = []
+    for label, group in groups.items():
+        common = (t for t in tables if any(group.keys() & other.keys() for other in t.values()))
+        table = next(common, None)
+        if table is None:
+            tables.append(table := {})
+        table[label] = group
+    return "\n\n".join(filter(None, map(_in_columns, tables)))
+
+
+def _numbers(group: Mapping[str, Any]) -> dict[str, Any]:
+    numeric = lambda value: isinstance(value, int | float) and not isinstance(value, bool)
+    return {name: value for name, value in group.items() if numeric(value)}
+
+
+def _in_columns(groups: Mapping[str, dict[str, Any]]) -> str:
+    names = dict.fromkeys(name for group in groups.values() for name in group)
+    rows = [["", *groups]] if any(groups) else []
+    entry = lambda group, name: f"{group[name]:.4g}" if name in group else ""
+    rows += [[name, *(entry(group, name) for group in groups.values())] for name in names]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    line = lambda name, *entries: [name.ljust(widths[0]), *map(str.rjust, entries, widths[1:])]
+    return "\n".join("  ".join(line(*row)) for row in rows)

@@ -6,11 +6,10 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from vertax._base.axes import AXES, gather
-from vertax._base.tracing import is_concrete
+from vertax._base.results import RESULTS
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 
@@ -28,8 +27,13 @@ class Change(eqx.Module):
     interface has the parameters of the edge at its start."""
     vertices: Int[Array, "*batch vertices"]
     """Index of the old vertex with the parameters of each vertex: itself, or the start of the split edge."""
-    done: Bool[Array, "*batch"]
-    """Whether the change was made; otherwise the tissue is unchanged."""
+    result: RESULTS
+    """Why the change was not made; the tissue is unchanged unless `successful`."""
+
+    @property
+    def converged(self) -> Bool[Array, "*batch"]:
+        """Whether the change was made."""
+        return self.result == RESULTS.successful
 
     def inherited(self, tree: Tree, *, axis: str | None = None) -> Tree:
         """An energy, or another pytree, with the entries of parents for new cells, edges and vertices.
@@ -68,14 +72,5 @@ def unchanged(tissue: Tissue) -> Change:
         numbers(tissue.n_cells),
         numbers(tissue.n_edges),
         numbers(tissue.n_vertices),
-        jnp.array(False),
+        RESULTS.successful,
     )
-
-
-def raise_if(change: Change, wrong: Bool[Array, ""], reason: str) -> Change:
-    """Raise an error if `wrong`, also inside `jax.jit`; return the change."""
-    if not is_concrete(wrong):
-        return eqx.error_if(change, wrong, reason)
-    if np.any(np.asarray(wrong)):
-        raise RuntimeError(reason)
-    return change

@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.checks import as_real, check_integer
+from vertax._base.results import RESULTS, checked
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.mesh import Tissue, Topology
 from vertax.mesh._euler_operators import Slot, spare_slot, split_cell
 from vertax.mesh._topology import take
-from vertax.transitions._change import Change, raise_if, unchanged
+from vertax.transitions._change import Change, unchanged
 from vertax.transitions._cut import Cut, find_cut, points_at
 from vertax.transitions._t1 import has_new_overlaps
 
@@ -47,7 +48,7 @@ def divide(
     - `cell`: number of the cell.
     - `axis`, shape `(2,)`: direction from one daughter to the other; by default the long axis, from the
         second moments of the area.
-    - `throw`: raise an error if the cell cannot divide. If False, check `done`.
+    - `throw`: raise an error if the cell cannot divide. If False, look at `result`.
 
     **Returns:** a [`Change`][vertax.transitions.Change], with the tissue.
 
@@ -65,19 +66,8 @@ def divide(
             raise ValueError("Argument `axis` must be a direction, but is zero.")
     check_cell(tissue, cell)
     change = _divide(tissue, jnp.asarray(cell), axis)
-    if not throw:
-        return change
-    full = ~jnp.any(~tissue.alive)
-    reason = (
-        f"The cell cannot divide: the tissue has a capacity of {tissue.n_cells} cells, and all are alive. "
-        "Make room with tissue.with_capacity(...) before."
-    )
-    change = raise_if(change, full, reason)
-    return raise_if(
-        change,
-        ~change.done,
-        "The cell cannot be cut in two there. Try another axis, or throw=False.",
-    )
+    describe = f"The capacity is {tissue.n_cells} cells".format
+    return checked(change, change.result, describe) if throw else change
 
 
 def check_cell(tissue: Tissue, cell: int | Int[Array, ""]) -> None:
@@ -134,12 +124,14 @@ def divided(
         parent.astype(old.dtype), mode="drop"
     )
     edge, other = take(m.edge, out), take(m.edge, into)
+    failure = RESULTS.where(slot.available, RESULTS.division_impossible, RESULTS.capacity_reached)
+    result = RESULTS.where(valid, RESULTS.successful, failure)
     return Change(
         tree_where(valid, new, tissue),
         put(same.cells, slot.cell, cell),
         put(same.edges, jnp.stack(slot.edges), jnp.stack([edge, other, edge])),
         put(same.vertices, jnp.stack(slot.vertices), take(m.source, both)),
-        valid,
+        result,
     )
 
 

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from vertax._base.results import RESULTS, checked
 from vertax._base.tracing import tree_where
 from vertax.mesh import Tissue
-from vertax.transitions._change import Change, raise_if, unchanged
+from vertax.transitions._change import Change, unchanged
 from vertax.transitions._division import check_cell
 from vertax.transitions._edge_frames import EdgeFrames
 from vertax.transitions._t1 import has_new_overlaps, overlapping_faces
@@ -31,7 +32,7 @@ def remove(tissue: Tissue, cell: int | Int[Array, ""], *, throw: bool = True) ->
     - `tissue`: the tissue, which must support spare slots, see
         [`with_capacity`][vertax.Tissue.with_capacity].
     - `cell`: number of the cell.
-    - `throw`: raise an error if the cell cannot be removed. If False, check `done`.
+    - `throw`: raise an error if the cell cannot be removed. If False, look at `result`.
 
     **Returns:** a [`Change`][vertax.transitions.Change], with the tissue.
 
@@ -48,11 +49,7 @@ def remove(tissue: Tissue, cell: int | Int[Array, ""], *, throw: bool = True) ->
         )
     check_cell(tissue, cell)
     change = _remove(tissue, jnp.asarray(cell))
-    reason = (
-        "The cell cannot be removed: a neighbour would have too few sides, cells would overlap, or a corner "
-        "is pinned. With throw=False check `done`."
-    )
-    return raise_if(change, ~change.done, reason) if throw else change
+    return checked(change, change.result) if throw else change
 
 
 @eqx.filter_jit
@@ -97,7 +94,8 @@ def removed(tissue: Tissue, cell: Int[Array, ""], do: Bool[Array, ""]) -> Change
     possible = do & can_vanish(reduced)[cell]
     new = vanished(reduced, cell, possible)
     done = possible & ~has_new_overlaps(new, tissue)
-    return Change(tree_where(done, new, tissue), same.cells, same.edges, same.vertices, done)
+    result = RESULTS.where(done, RESULTS.successful, RESULTS.removal_impossible)
+    return Change(tree_where(done, new, tissue), same.cells, same.edges, same.vertices, result)
 
 
 def flipped(

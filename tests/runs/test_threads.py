@@ -11,7 +11,7 @@ import pytest
 from helpers import FIXED_TOPOLOGY, random_tissue
 
 import vertax as vx
-from vertax.runs import Fitting, RunFolder, _folder, fit_side_by_side, side_by_side
+from vertax.runs import Fitting, RunFolder, _folder
 
 
 def test_results_come_in_order(tmp_path):
@@ -20,8 +20,8 @@ def test_results_come_in_order(tmp_path):
         return index**2
 
     folder = RunFolder(tmp_path)
-    assert side_by_side(late_first, 5, folder, progress=False) == [0, 1, 4, 9, 16]
-    assert side_by_side(late_first, 0, folder, progress=False) == []
+    assert folder.map_in_threads(late_first, 5, progress=False) == [0, 1, 4, 9, 16]
+    assert folder.map_in_threads(late_first, 0, progress=False) == []
 
 
 def test_no_call_begins_after_an_error(tmp_path, monkeypatch):
@@ -36,7 +36,7 @@ def test_no_call_begins_after_an_error(tmp_path, monkeypatch):
 
     folder = RunFolder(tmp_path)
     with pytest.raises(ValueError, match="two"):
-        side_by_side(fail_at_two, 50, folder, progress=False)
+        folder.map_in_threads(fail_at_two, 50, progress=False)
     assert len(begun) < 10
     assert not folder.interrupted
 
@@ -52,11 +52,11 @@ def test_no_call_begins_after_an_interrupt(tmp_path, monkeypatch):
         time.sleep(0.05)
 
     with pytest.raises(KeyboardInterrupt):
-        side_by_side(interrupted_at_two, 50, folder, progress=False)
+        folder.map_in_threads(interrupted_at_two, 50, progress=False)
     assert folder.interrupted
     assert len(begun) < 10
     with pytest.raises(KeyboardInterrupt):
-        side_by_side(interrupted_at_two, 50, folder, progress=False)
+        folder.map_in_threads(interrupted_at_two, 50, progress=False)
     assert len(begun) < 10
 
 
@@ -121,20 +121,18 @@ def test_an_interrupt_ends_fits_in_other_threads_after_their_epoch(tmp_path):
 
     # On more than one core both had begun, and the run has what there is of all three.
     with contextlib.suppress(KeyboardInterrupt):
-        fit_side_by_side(folder, "x", problems, Fitting(epochs=20), notes=notes, progress=False)
+        folder.fit_in_threads("x", problems, Fitting(epochs=20), notes=notes, progress=False)
     assert len(epochs[0]) == 20
     assert 3 <= max(len(epochs[k]) for k in (1, 2)) <= 4
     # What was done is kept.
-    assert {part.stem for part in folder.parts()} >= {"x_0"}
+    assert {part.stem for part in (tmp_path / "unfinished").iterdir()} >= {"x_0"}
 
 
 def test_concurrent_fits_equal_sequential_fits(tmp_path):
     problems = [problem(3.6), problem(3.7)]
     notes = lambda problem, record: {"twice": 2 * record.cost}
     fitting = Fitting(epochs=4)
-    batch = fit_side_by_side(
-        RunFolder(tmp_path), "x", problems, fitting, notes=notes, progress=False
-    )
+    batch = RunFolder(tmp_path).fit_in_threads("x", problems, fitting, notes=notes, progress=False)
     assert batch.history.cost.shape == (4, 2)
     np.testing.assert_array_equal(batch.notes["twice"], 2 * batch.history.cost)
     for k, one in enumerate(problems):

@@ -1,0 +1,78 @@
+"""Tensions of folders, patterns, lists and movies of masks."""
+
+import numpy as np
+import pytest
+from test_damaged_masks import mask as mask
+
+from vertax.inference import find_masks, infer_tensions, infer_tensions_of_masks
+from vertax.io import read_table
+
+
+def test_one_table_of_a_folder_with_a_file_that_cannot_be_read(mask, tmp_path):
+    for name in ("m10", "m2"):
+        np.save(tmp_path / f"{name}.npy", mask)
+    (tmp_path / "m3.tif").write_text("no image")
+    assert [frame.name for frame in find_masks(tmp_path)] == ["m2.npy", "m3.tif", "m10.npy"]
+    found = infer_tensions_of_masks(tmp_path, progress=False)
+    assert list(found.results) == ["m2.npy", "m10.npy"]
+    assert "cannot be read" in found.failures["m3.tif"]
+    alone = infer_tensions(mask)
+    table = found.edge_table()
+    second = table["frame"] == "m10.npy"
+    np.testing.assert_array_equal(table["tension"][second], alone.tensions)
+    cells = found.cell_table()
+    np.testing.assert_array_equal(cells["label"], np.tile(alone.labels, 2))
+    # Columns in pixels: y grows with the row.
+    for label in np.unique(mask[mask > 0])[:3]:
+        row, column = np.argwhere(mask == label).mean(axis=0) + 0.5
+        here = np.flatnonzero(cells["label"] == label)[0]
+        assert cells["row"][here] == pytest.approx(row, abs=1)
+        assert cells["column"][here] == pytest.approx(column, abs=1)
+    found.write(tmp_path / "tables")
+    columns = read_table(tmp_path / "tables" / "columns.csv")
+    for name in ("cells", "edges", "frames"):
+        written = read_table(tmp_path / "tables" / f"{name}.csv")
+        assert set(written) == set(columns["column"][columns["table"] == name])
+
+
+def test_frames_of_a_movie_need_no_plane(mask, tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    movie = np.stack([mask, mask[::-1]]).astype(np.uint16)
+    file = tmp_path / "movie.tif"
+    metadata = {"axes": "TYX"}
+    tifffile.imwrite(file, movie[:, :, ::2], imagej=True, metadata=metadata, resolution=(1, 2))
+    for source in (movie, file):
+        frames = find_masks(source)
+        assert [frame.name for frame in frames] == [0, 1]
+    found = infer_tensions_of_masks(file, progress=False)
+    height, width = found.results[1].pixel_size
+    assert width == pytest.approx(2 * height)
+    assert [frame.name for frame in find_masks(file, plane=1)] == ["movie.tif"]
+
+
+def test_wrong_options_and_empty_sources_raise(mask, tmp_path):
+    with pytest.raises(TypeError, match="gap_with"):
+        infer_tensions_of_masks([mask], gap_with=3)
+    with pytest.raises(ValueError, match=r"all 1 failed; 0: Argument `prior`"):
+        infer_tensions_of_masks([mask], prior=-1.0, progress=False)
+    with pytest.raises(FileNotFoundError, match="files by the pattern"):
+        find_masks(str(tmp_path / "*.tif"))
+
+
+def test_two_holes_are_not_mirrored_cells(mask):
+    two = mask.copy()
+    inner = [label for label in np.unique(mask) if label and not _touches_background(mask, label)]
+    two[np.isin(mask, _apart(mask, inner))] = 0
+    assert np.sum(infer_tensions(two).labels == 0) == 2
+
+
+def _touches_background(mask, label):
+    near = [np.roll(mask == label, step, axis) for step in (-1, 1) for axis in (0, 1)]
+    return bool(np.any((mask == 0) & np.any(near, axis=0)))
+
+
+def _apart(mask, labels):
+    """The two labels farthest from each other."""
+    centres = np.array([np.argwhere(mask == label).mean(axis=0) for label in labels])
+    distance = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    return [labels[k] for k in np.unravel_index(np.argmax(distance), distance.shape)]

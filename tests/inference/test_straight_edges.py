@@ -1,0 +1,90 @@
+"""Tensions and pressures of tissues with straight edges, and the mean stress."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from free_helpers import cluster
+
+import vertax as vx
+from vertax.energies import AreaElasticity, LineTension
+from vertax.inference import infer_tensions, pearson
+from vertax.inference._balance import angles, equations, forces
+from vertax.inference._observed_geometry import observed_geometry
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """A cluster of straight edges at rest, its tensions and pressures."""
+    tissue = cluster(30, 5, lloyd_steps=3)
+    tension = jax.random.uniform(jax.random.key(1), (tissue.n_edges,), minval=0.7, maxval=1.3)
+    area = AreaElasticity(
+        20.0, jax.random.uniform(jax.random.key(2), (30,), minval=0.9, maxval=1.2)
+    )
+    relax = vx.Relaxation(tolerance=1e-10, contact_range=None)
+    relaxed = relax(tissue, area + LineTension(tension)).tissue
+    return relaxed, np.asarray(tension), np.asarray(area.pressures(relaxed))
+
+
+def test_forces_of_straight_edges_are_the_gradient_of_the_energy():
+    tissue = cluster(14, 1)
+    random = np.random.default_rng(0)
+    tension, pressure = random.uniform(0.5, 2, tissue.n_edges), random.normal(size=14)
+
+    def energy(vertices):
+        moved = tissue.with_vertices(vertices)
+        return jnp.sum(tension * moved.edge_lengths) - jnp.sum(pressure * moved.areas)
+
+    gradient = np.asarray(jax.grad(energy)(tissue.vertices))
+    geometry = observed_geometry(tissue)
+    which = equations(geometry, straight=True)
+    matrix = forces(angles(geometry, which), which, np.zeros(len(which.edges), bool))
+    force = matrix @ np.append(tension[which.edges], pressure[which.cells])
+    # Lengths are softened in the tissue.
+    np.testing.assert_allclose(force.reshape(-1, 2), -gradient[which.junctions], atol=2e-3)
+
+
+def test_tensions_and_pressures_of_straight_edges(straight):
+    tissue, tension, pressure = straight
+    result = infer_tensions(tissue)
+    assert result.edges == "straight"
+    sure = result.determined
+    true = tension[sure] / tension[sure].mean()
+    assert pearson(true, result.tensions[sure]) > 0.75
+    assert (
+        np.mean(
+            np.abs(result.tensions - tension / tension[sure].mean())[sure]
+            < 2 * result.tension_deviations[sure]
+        )
+        > 0.85
+    )
+    cells = result.pressures_determined
+    assert pearson(pressure[cells], result.pressures[cells]) > 0.9
+
+
+def test_arcs_are_chosen_where_edges_are_arcs(foam):
+    assert infer_tensions(foam[0]).edges == "arcs"
+    assert infer_tensions(foam[0], edges="straight").edges == "straight"
+
+
+def test_mean_stress_of_a_stretched_tissue_is_along_the_tension(straight):
+    tissue = straight[0]
+    pulled = tissue.with_vertices(tissue.vertices * jnp.array([1.3, 1 / 1.3]))
+    result = infer_tensions(pulled)
+    stress = result.mean_stress
+    assert stress.n_cells > 5
+    # The mean of the stresses of the cells, weighted by area, where all their tensions are determined.
+    whole = np.isfinite(result.stresses).all(axis=(1, 2))
+    if whole.sum() == stress.n_cells:
+        mean = np.average(
+            result.stresses[whole], axis=0, weights=np.asarray(result.tissue.areas)[whole]
+        )
+        np.testing.assert_allclose(stress.tensor, mean, rtol=1e-5, atol=1e-6)
+    half = np.linalg.eigvalsh(stress.tensor)
+    np.testing.assert_allclose(stress.anisotropy, 0.5 * (half[1] - half[0]), rtol=1e-6)
+    turned = infer_tensions(pulled.with_vertices(pulled.vertices[:, ::-1] * jnp.array([-1.0, 1.0])))
+    change = turned.mean_stress.direction - stress.direction
+    np.testing.assert_allclose(np.cos(2 * change), -1, atol=1e-4)
+    np.testing.assert_allclose(
+        turned.mean_stress.anisotropy_deviation, stress.anisotropy_deviation, rtol=1e-3
+    )
