@@ -47,10 +47,11 @@ def main() -> None:
             n_cells = options.cells + int(rng.integers(-5, 6))
             np.save(folder / f"mask{k}.npy", label_image(n_cells, options.side, rng))
         start, cpu = time.perf_counter(), time.process_time()
-        found = inference.infer_tensions_of_masks(folder)
+        tensions = inference.infer_tensions_of_masks(folder)
         seconds = time.perf_counter() - start, time.process_time() - cpu
         print(
-            f"{len(found.results)} masks: {seconds[0]:.0f} s, {seconds[1]:.0f} s of CPU", flush=True
+            f"{len(tensions.results)} masks: {seconds[0]:.0f} s, {seconds[1]:.0f} s of CPU",
+            flush=True,
         )
         start = time.perf_counter()
         command = ["-m", "vertax", "run", "infer_tensions", "--quiet"]
