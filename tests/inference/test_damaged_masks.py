@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from damage_helpers import contacts, damaged, random_cells, with_gaps
@@ -9,7 +10,7 @@ from foam_helpers import against_truth, invented
 from label_helpers import honeycomb
 
 from vertax.inference import infer_tensions, label_image, pearson, read_mask
-from vertax.initialise import from_labels
+from vertax.initialise import free_voronoi, from_labels
 
 
 @pytest.fixture(scope="module")
@@ -219,11 +220,21 @@ def test_cells_have_the_areas_and_outlines_of_their_pixels(mask, step):
     np.testing.assert_array_equal(table["outline_error"], result.outline_errors)
 
 
+def three_meet(clean, mask):
+    """Whether any three cells that are left in a mask touch each other in the clean one."""
+    left = contacts(np.where(np.isin(clean, mask), clean, 0))
+    return any((a, c) in left for a, b in left for d, c in left if d == b)
+
+
 def check_contacts(seed):
     """Every contact with a determined tension exists in the mask before it was damaged."""
     rng = np.random.default_rng(seed)
     clean = random_cells(rng)
     mask, pixel_size = damaged(clean, rng)
+    if not three_meet(clean, mask):
+        with pytest.raises(ValueError, match="where three of its cells meet"):
+            infer(mask, kind="labels", pixel_size=pixel_size)
+        return
     inferred = infer(mask, kind="labels", pixel_size=pixel_size)
     column, row = np.floor(np.asarray(inferred.tissue.centroids)).astype(int).T
     rows, columns = clean.shape
@@ -248,3 +259,23 @@ def test_determined_contacts_exist(seed):
 def test_determined_contacts_of_200_damaged_masks_exist(block):
     for seed in range(10 * block, 10 * block + 10):
         check_contacts(seed)
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_pixels_that_are_not_square_are_named(step):
+    """Angles at junctions show a mask with pixels of another shape than assumed."""
+    clean = np.pad(label_image(voronoi_of_60_cells(), 500), 4)
+    narrow = infer(clean[:, ::step])
+    named = [warning for warning in narrow.doubts if "pixel_size=(height, width)" in warning]
+    assert len(named) == step - 1
+    assert not any(
+        "height of a pixel" in warning
+        for warning in infer(clean[:, ::step], pixel_size=(1.0, float(step))).doubts
+    )
+    for text in named:
+        width = float(text.split("such as (1, ")[1].split(")")[0])
+        assert width == pytest.approx(step, rel=0.15)
+
+
+def voronoi_of_60_cells():
+    return free_voronoi(60, key=jax.random.key(7), lloyd_steps=3)

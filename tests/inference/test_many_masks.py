@@ -13,22 +13,22 @@ def test_one_table_of_a_folder_with_a_file_that_cannot_be_read(mask, tmp_path):
         np.save(tmp_path / f"{name}.npy", mask)
     (tmp_path / "m3.tif").write_text("no image")
     assert [frame.name for frame in find_masks(tmp_path)] == ["m2.npy", "m3.tif", "m10.npy"]
-    found = infer_tensions_of_masks(tmp_path, progress=False)
-    assert list(found.results) == ["m2.npy", "m10.npy"]
-    assert "cannot be read" in found.failures["m3.tif"]
+    tensions = infer_tensions_of_masks(tmp_path, progress=False)
+    assert list(tensions.results) == ["m2.npy", "m10.npy"]
+    assert "cannot be read" in tensions.failures["m3.tif"]
     alone = infer_tensions(mask)
-    table = found.edge_table()
+    table = tensions.edge_table()
     second = table["frame"] == "m10.npy"
     np.testing.assert_array_equal(table["tension"][second], alone.tensions)
-    cells = found.cell_table()
+    cells = tensions.cell_table()
     np.testing.assert_array_equal(cells["label"], np.tile(alone.labels, 2))
     # Columns in pixels: y grows with the row.
     for label in np.unique(mask[mask > 0])[:3]:
         row, column = np.argwhere(mask == label).mean(axis=0) + 0.5
-        here = np.flatnonzero(cells["label"] == label)[0]
-        assert cells["row"][here] == pytest.approx(row, abs=1)
-        assert cells["column"][here] == pytest.approx(column, abs=1)
-    found.write(tmp_path / "tables")
+        first = np.flatnonzero(cells["label"] == label)[0]
+        assert cells["row"][first] == pytest.approx(row, abs=1)
+        assert cells["column"][first] == pytest.approx(column, abs=1)
+    tensions.write(tmp_path / "tables")
     columns = read_table(tmp_path / "tables" / "columns.csv")
     for name in ("cells", "edges", "frames"):
         written = read_table(tmp_path / "tables" / f"{name}.csv")
@@ -44,8 +44,8 @@ def test_frames_of_a_movie_need_no_plane(mask, tmp_path):
     for source in (movie, file):
         frames = find_masks(source)
         assert [frame.name for frame in frames] == [0, 1]
-    found = infer_tensions_of_masks(file, progress=False)
-    height, width = found.results[1].pixel_size
+    tensions = infer_tensions_of_masks(file, progress=False)
+    height, width = tensions.results[1].pixel_size
     assert width == pytest.approx(2 * height)
     assert [frame.name for frame in find_masks(file, plane=1)] == ["movie.tif"]
 

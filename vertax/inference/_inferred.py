@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from vertax._base.pixels import PixelSize, pixel_sides
 from vertax.inference._columns import with_pixels
 from vertax.inference._mean_stress import MeanStress
+from vertax.inference._pixel_aspect import pixel_aspect_warning
 from vertax.initialise import MaskReport
 from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vtk
 from vertax.mesh import Tissue
@@ -95,6 +96,9 @@ class InferredTensions(eqx.Module):
     def warnings(self) -> tuple[str, ...]:
         """Reasons to distrust parts of the result, as sentences; empty if there are none."""
         warnings = [] if self.mask_report is None else mask_warnings(self.mask_report, self)
+        if self.pixel_size is not None:
+            aspect = pixel_aspect_warning(self.tissue, self.labels == 0, self.pixel_size)
+            warnings += [] if aspect is None else [aspect]
         unknowns = np.isfinite(self.tensions)
         share = np.mean(self.determined[unknowns]) if unknowns.any() else 0.0
         if share < 0.5:

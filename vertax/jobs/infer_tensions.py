@@ -126,11 +126,11 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     for warning in result.warnings:
         folder.warn(warning)
     folder.save_tissue("seen", result.tissue)
-    found = inferred(result)
-    edges, cells = found.edges, found.cells
+    content = inferred(result)
+    edges, cells = content.edges, content.cells
     if truth is not None:
         add_truth(result, truth[0], truth[1], edges, cells)
-    tables = {"cells": cells, "edges": edges, "changes": found.changes}
+    tables = {"cells": cells, "edges": edges, "changes": content.changes}
     save_tables(folder, config, {name: table for name, table in tables.items() if table})
     write_geojson(
         folder.path / "cells.geojson",
@@ -138,7 +138,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         cells={name: cells[name] for name in ("label", "pressure", "pressure_deviation")},
         edges={name: edges[name] for name in ("tension", "tension_deviation", "determined")},
     )
-    folder.save_figure("tensions", plot_foam(plotting.label_colours(labels), found))
+    folder.save_figure("tensions", plot_foam(plotting.label_colours(labels), content))
     if truth is not None and result.determined.any():
         folder.save_figure("recovery", plot_recovery(edges, cells))
     return measure(result, edges, cells)
@@ -191,8 +191,8 @@ def run_frames(
 
     def compute(frame: inference.MaskFrame) -> dict[str, np.ndarray]:
         result = infer(config, frame, reading)
-        found, summary = inferred(result), inference.frame_summary(result)
-        tables = {"edges": found.edges, "cells": found.cells, "changes": found.changes}
+        content, summary = inferred(result), inference.frame_summary(result)
+        tables = {"edges": content.edges, "cells": content.cells, "changes": content.changes}
         arrays = {
             f"{t}.{name}": np.asarray(c) for t, table in tables.items() for name, c in table.items()
         }
@@ -248,29 +248,29 @@ def draw_frames(
     """A map of each mask, all with the same limits of the colours, and an animation of them."""
     folder.print_step("maps")
     done = [frame for frame in frames if frame.name in arrays]
-    found = {}
+    content = {}
     for name, part in arrays.items():
         tables = [table_of(kind, part) for kind in ("edges", "cells", "changes")]
         size = summaries[name]["pixel_height"], summaries[name]["pixel_width"]
-        found[name] = Inferred(*tables, size)
-    limits = colour_limits(list(found.values()))
+        content[name] = Inferred(*tables, size)
+    limits = colour_limits(list(content.values()))
 
     def maps() -> Iterator[Figure]:
         for frame in done:
             image = plotting.label_colours(frame.mask(**reading))
-            figure = plot_foam(image, found[frame.name], limits, title=str(frame.name))
+            figure = plot_foam(image, content[frame.name], limits, title=str(frame.name))
             folder.save_figure(f"{frame.name}", figure)
             yield figure
 
     plotting.animate_figures(maps(), folder.path / "tensions.gif", fps=4)
 
 
-def colour_limits(found: list[Inferred]) -> dict[str, float]:
+def colour_limits(content: list[Inferred]) -> dict[str, float]:
     """Limits of the colours of all masks together: of pressures and of tensions."""
     limits: dict[str, float] = {}
     for prefix, tables, key in (
-        ("", [each.cells for each in found], "pressure"),
-        ("edge_", [each.edges for each in found], "tension"),
+        ("", [each.cells for each in content], "pressure"),
+        ("edge_", [each.edges for each in content], "tension"),
     ):
         values = np.concatenate([table[key][table["determined"]] for table in tables])
         if values.size:
@@ -370,7 +370,7 @@ def measure(result: inference.InferredTensions, edges: Any, cells: Any) -> dict[
 @plotting.house_style()
 def plot_foam(
     image: np.ndarray,
-    found: Inferred,
+    content: Inferred,
     limits: dict[str, float] | None = None,
     *,
     title: str = "arcs over the image",
@@ -382,15 +382,15 @@ def plot_foam(
     """
     rows, columns = image.shape[:2]
     height = max(3.4 * rows / columns + 0.5, 2.4)
-    tissue = from_edge_table(found.edges)
+    tissue = from_edge_table(content.edges)
     figure, ((left, right),) = plotting.new_figure(1, 2, width=3.6, height=height, room=1.2)
-    plotting.plot_tissue(tissue, ax=left, image=image, pixel_size=found.pixel_size)
+    plotting.plot_tissue(tissue, ax=left, image=image, pixel_size=content.pixel_size)
     left.set_title(title)
-    plotting.scale_bar(left, "pixels", unit_length=found.pixel_size[1])
-    if "shown" in found.edges:
-        draw_report(left, tissue, found)
-    pressures = np.where(found.cells["determined"], found.cells["pressure"], np.nan)
-    tensions = np.where(found.edges["determined"], found.edges["tension"], np.nan)
+    plotting.scale_bar(left, "pixels", unit_length=content.pixel_size[1])
+    if "shown" in content.edges:
+        draw_report(left, tissue, content)
+    pressures = np.where(content.cells["determined"], content.cells["pressure"], np.nan)
+    tensions = np.where(content.edges["determined"], content.edges["tension"], np.nan)
     style: Any = {"cmap": PRESSURES, "label": PRESSURE, "edge_label": TENSION}
     plotting.plot_tissue(tissue, pressures, tensions, ax=right, **style, **(limits or {}))
     # The y axis points down, as in the image.
@@ -399,19 +399,19 @@ def plot_foam(
     return figure
 
 
-def draw_report(ax: Any, tissue: Any, found: Inferred) -> None:
+def draw_report(ax: Any, tissue: Any, content: Inferred) -> None:
     """Mark holes, contacts that the mask does not show, and places where the mask was changed."""
-    height, width = found.pixel_size
+    height, width = content.pixel_size
     points = np.asarray(tissue.edge_points(jnp.linspace(0.0, 1.0, 13)), float)
-    edge_cells = np.stack([found.edges["left_cell"], found.edges["right_cell"]], axis=1)
-    hole = np.append(found.cells["hole"], False)[edge_cells].any(axis=1)
-    hidden = found.edges["contact_closed"] & ~hole & np.all(edge_cells >= 0, axis=1)
+    edge_cells = np.stack([content.edges["left_cell"], content.edges["right_cell"]], axis=1)
+    hole = np.append(content.cells["hole"], False)[edge_cells].any(axis=1)
+    hidden = content.edges["contact_closed"] & ~hole & np.all(edge_cells >= 0, axis=1)
     for which, style in ((hidden, ":"), (hole, "--")):
         if which.any():
             lines = LineCollection(list(points[which]), colors="w", linestyles=style, lw=1.5)
             ax.add_collection(lines)
-    least = 0.01 * np.median(found.cells["pixels"])
-    changes = (found.changes[name] for name in ("row", "column", "pixels"))
+    least = 0.01 * np.median(content.cells["pixels"])
+    changes = (content.changes[name] for name in ("row", "column", "pixels"))
     for row, column, pixels in zip(*changes, strict=True):
         area = max(pixels, least) * height * width
         radius = max(3.0 * min(height, width), np.sqrt(area / np.pi))
