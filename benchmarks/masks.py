@@ -24,10 +24,11 @@ def label_image(n_cells: int, side: int, rng: np.random.Generator) -> np.ndarray
     pixels = np.indices((side, side)).reshape(2, -1).T + 0.5
     inside = np.hypot(*(pixels - side / 2).T) < 0.48 * side
     seeds = pixels[rng.choice(np.flatnonzero(inside), n_cells, replace=False)]
-    for _ in range(4):
-        nearest = KDTree(seeds).query(pixels[inside])[1]
+    nearest = KDTree(seeds).query(pixels[inside])[1]
+    for _ in range(3):
         sums = [np.bincount(nearest, x, n_cells) for x in pixels[inside].T]
         seeds = np.stack(sums, axis=1) / np.bincount(nearest, minlength=n_cells)[:, None]
+        nearest = KDTree(seeds).query(pixels[inside])[1]
     labels = np.zeros(side**2, np.uint16)
     labels[inside] = nearest + 1
     return labels.reshape(side, side)

@@ -59,7 +59,10 @@ def cases(folder: Path, seed: int) -> Iterator[tuple[str, list[tuple[Truth, obje
         truths = [foam(file) for file in files]
         yield kind, [(truth, truth.foam) for truth in truths]
         if len(truths) > 1:
-            yield f"{kind}, 1000 pixels", [(t, label_image(t.foam, 1000)) for t in truths]
+            yield (
+                f"{kind}, 1000 pixels",
+                [(t, label_image(t.foam or t.tissue, 1000)) for t in truths],
+            )
     for noise in (0.0, 0.005, 0.02):
         shapes = [voronoi(80, 10 * seed + k, noise) for k in range(3)]
         truths = [Truth(t, tension, np.zeros(t.n_cells)) for t, tension in shapes]
@@ -70,7 +73,8 @@ def cases(folder: Path, seed: int) -> Iterator[tuple[str, list[tuple[Truth, obje
 
 def row(name: str, members: list[tuple[Truth, object]]) -> None:
     """Print correlations, errors and coverage of one kind of tissue."""
-    parts, determined, seconds, edges = [], [], [], []
+    parts: list[tuple[np.ndarray, ...]] = []
+    determined, seconds, edges = [], [], []
     for truth, source in members:
         began = time.perf_counter()
         try:
@@ -86,7 +90,7 @@ def row(name: str, members: list[tuple[Truth, object]]) -> None:
     error = np.mean([np.mean(np.abs(p[1] - p[0]) / p[0]) for p in parts])
     flat = [np.ptp(p[3]) < 1e-9 for p in parts]
     by_pressure = np.mean(
-        [np.nan if f else pearson(p[3], p[4]) for p, f in zip(parts, flat, strict=True)]
+        [np.nan if f else float(pearson(p[3], p[4])) for p, f in zip(parts, flat, strict=True)]
     )
     scores = [np.abs(np.concatenate([p[k] for p in parts])) for k in (2, 5)]
     cover = [

@@ -51,7 +51,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             key = config.seed + index + 1000 * number
             return folder.part(f"{test} {index}", lambda: simulate(config, test, times, key))
 
-        parts = runs.side_by_side(one, config.replicates, folder, progress=progress)
+        parts = folder.map_in_threads(one, config.replicates, progress=progress)
         series[test] = np.stack([part["unlike"] for part in parts])
         folder.save_table(test, {"time": times} | {f"seed {k}": x for k, x in enumerate(series[test])})
         rows = [
@@ -63,7 +63,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         panels[test] = parts[0]["outlines"]
         metrics[test] = compare(times, series[test], PUBLISHED[test])
         metrics[test] |= {"t1": [int(part["t1"]) for part in parts]}
-        metrics[test] |= {"sound": float(np.mean([part["sound"] for part in parts]))}
+        metrics[test] |= {"converged": float(np.mean([part["converged"] for part in parts]))}
     sizes = {n**2: time_per_step(config, n) for n in config.sizes}
     folder.save_table("time_per_step", {"n_cells": list(sizes), "milliseconds": list(sizes.values())})
     folder.save_figure("unlike_length", plot_series(times, series, config))
@@ -83,7 +83,7 @@ def simulate(config: Config, test: str, times: np.ndarray, key: int) -> dict[str
         "types": model.types(test),
         "outlines": outlines,
         "t1": np.asarray(movie.num_t1),
-        "sound": np.array(np.mean(np.asarray(movie.sound))),
+        "converged": np.asarray(movie.converged),
     }
 
 

@@ -119,7 +119,7 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
         pixel_size=0.4,
         four_fold=edges < 0,
     )
-    left, right = panels(infer_tensions.plot_foam(picture, result))
+    left, right = panels(infer_tensions.plot_foam(picture, infer_tensions.inferred(result)))
     np.testing.assert_allclose(left.images[0].get_array(), picture)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 7
     assert (left.get_xlim(), left.get_ylim()) == (right.get_xlim(), right.get_ylim())

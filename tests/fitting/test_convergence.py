@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import vertax as vx
-from vertax.fitting import doubts, limits, stack_fits
+from vertax.fitting import fit_warnings, limits, stack_fits
 
 
 def fitted(**curves):
@@ -45,23 +45,23 @@ def test_limits_names_the_first_limiting_condition(curves, word):
 
 
 def test_converged_fit_has_no_warnings():
-    assert doubts(fitted(cost=np.exp(-np.arange(20.0)))) == []
+    assert fit_warnings(fitted(cost=np.exp(-np.arange(20.0)))) == []
     # A constant cost counts as converged.
-    assert doubts(fitted()) == []
+    assert fit_warnings(fitted()) == []
 
 
 def test_unconverged_fit_has_warnings_with_remedies():
-    assert doubts(fitted(cost=np.linspace(2, 1, 20))) == [
+    assert fit_warnings(fitted(cost=np.linspace(2, 1, 20))) == [
         "the cost was still falling at the last epoch (raise the number of epochs)"
     ]
-    (doubt,) = doubts(fitted(converged=np.arange(20) < 15))
-    assert doubt.startswith("relaxations ended before equilibrium")
+    (warning,) = fit_warnings(fitted(converged=np.arange(20) < 15))
+    assert warning.startswith("relaxations ended before equilibrium")
     # Costs of epochs that did not converge are ignored.
-    assert doubts(fitted(cost=np.linspace(2, 1, 20), converged=np.arange(20) < 1))[1:] == []
+    assert fit_warnings(fitted(cost=np.linspace(2, 1, 20), converged=np.arange(20) < 1))[1:] == []
 
 
 def test_warnings_of_a_batch_count_the_members():
     falling, converged = fitted(cost=np.linspace(2, 1, 20)), fitted()
-    (doubt,) = doubts(stack_fits([falling, converged, falling]))
-    assert "in 2 of 3 members" in doubt
+    (warning,) = fit_warnings(stack_fits([falling, converged, falling]))
+    assert "in 2 of 3 members" in warning
     assert limits(stack_fits([falling, converged]), np.array([False, True]))[1] == "reached"

@@ -266,11 +266,11 @@ def test_pixels_that_are_not_square_are_named(step):
     """Angles at junctions show a mask with pixels of another shape than assumed."""
     clean = np.pad(label_image(voronoi_of_60_cells(), 500), 4)
     narrow = infer(clean[:, ::step])
-    named = [warning for warning in narrow.doubts if "pixel_size=(height, width)" in warning]
+    named = [warning for warning in narrow.warnings if "pixel_size=(height, width)" in warning]
     assert len(named) == step - 1
     assert not any(
         "height of a pixel" in warning
-        for warning in infer(clean[:, ::step], pixel_size=(1.0, float(step))).doubts
+        for warning in infer(clean[:, ::step], pixel_size=(1.0, float(step))).warnings
     )
     for text in named:
         width = float(text.split("such as (1, ")[1].split(")")[0])

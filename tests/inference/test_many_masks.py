@@ -45,7 +45,9 @@ def test_frames_of_a_movie_need_no_plane(mask, tmp_path):
         frames = find_masks(source)
         assert [frame.name for frame in frames] == [0, 1]
     tensions = infer_tensions_of_masks(file, progress=False)
-    height, width = tensions.results[1].pixel_size
+    size = tensions.results[1].pixel_size
+    assert isinstance(size, tuple)
+    height, width = size
     assert width == pytest.approx(2 * height)
     assert [frame.name for frame in find_masks(file, plane=1)] == ["movie.tif"]
 

@@ -37,7 +37,7 @@ def limits(fit: Fit[Any], reached: Bool[np.ndarray, "*batch"]) -> str | list[str
     return [_limit(bool(enough), *_curves(fit, k)) for k, enough in enumerate(reached)]
 
 
-def doubts(fit: Fit[Any]) -> list[str]:
+def fit_warnings(fit: Fit[Any]) -> list[str]:
     """Warnings about the convergence of a fit, with remedies.
 
     **Arguments:**

@@ -85,10 +85,10 @@ def most_evident(
         return float(value), np.array(slope)
 
     limits = np.log([bounds[Errors._fields[k]] for k in free]).reshape(-1, 2)
-    first = np.clip(np.log([guess[k] for k in free]), *limits.T)
+    values = [float(value) for value in guess]
+    first = np.clip(np.log([values[k] for k in free]), *limits.T)
     options = {"maxiter": steps, "ftol": 1e-6, "gtol": 0.1}
     optimum = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=limits, options=options)
-    values = list(guess)
     for k, log in zip(free, optimum.x, strict=True):
         values[k] = float(np.exp(log))
     return Errors(*values), -0.5 * float(optimum.fun)

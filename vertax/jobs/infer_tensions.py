@@ -252,7 +252,7 @@ def draw_frames(
     for name, part in arrays.items():
         tables = [table_of(kind, part) for kind in ("edges", "cells", "changes")]
         size = summaries[name]["pixel_height"], summaries[name]["pixel_width"]
-        content[name] = Inferred(*tables, size)
+        content[name] = Inferred(tables[0], tables[1], tables[2], size)
     limits = colour_limits(list(content.values()))
 
     def maps() -> Iterator[Figure]:
@@ -391,8 +391,10 @@ def plot_foam(
         draw_report(left, tissue, content)
     pressures = np.where(content.cells["determined"], content.cells["pressure"], np.nan)
     tensions = np.where(content.edges["determined"], content.edges["tension"], np.nan)
-    style: Any = {"cmap": PRESSURES, "label": PRESSURE, "edge_label": TENSION}
-    plotting.plot_tissue(tissue, pressures, tensions, ax=right, **style, **(limits or {}))
+    style: dict[str, Any] = {"cmap": PRESSURES, "label": PRESSURE, "edge_label": TENSION} | (
+        limits or {}
+    )
+    plotting.plot_tissue(tissue, pressures, tensions, ax=right, **style)
     # The y axis points down, as in the image.
     right.set(xlim=left.get_xlim(), ylim=left.get_ylim())
     right.set_title("tensions and pressures")

@@ -176,7 +176,7 @@ class TensionsWidget(widgets.Container):
         self.bars.min_width, self.bars.min_height = _BARS
         self.bars.visible = True
         for number, result in results.items():
-            for warning in result.doubts:
+            for warning in result.warnings:
                 show_warning(f"frame {number}: {warning}" if len(masks) > 1 else warning)
 
 

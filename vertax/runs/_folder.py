@@ -17,14 +17,15 @@ from tqdm import tqdm
 
 from vertax._base.archive import read_archive, write_archive
 from vertax._base.extras import requires_extra
+from vertax._base.results import RESULTS
 from vertax.fitting import (
     Checkpoint,
     Fit,
     FitError,
     InverseProblem,
     Record,
-    doubts,
     fit,
+    fit_warnings,
     stack_fits,
 )
 from vertax.io import atomic_write, save_tissue, write_csv
@@ -141,11 +142,12 @@ class RunFolder:
                 raise
             self.warn(str(error).rstrip("."), name)
             return error.fit
-        self.interrupted |= outcome.interrupted  # fits in other threads never reset it
-        if outcome.interrupted:
+        interrupted = bool(outcome.result == RESULTS.interrupted)
+        self.interrupted |= interrupted  # fits in other threads never reset it
+        if interrupted:
             return outcome
-        for doubt in doubts(outcome):
-            self.warn(doubt, name)
+        for warning in fit_warnings(outcome):
+            self.warn(warning, name)
         solver = isinstance(optimiser, optx.AbstractLeastSquaresSolver)
         if solver and len(outcome.history.cost) >= epochs:
             text = f"the least-squares solver did not end within {epochs} epochs (raise them)"
