@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.results import RESULTS
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
-from vertax._base.tracing import differs_between_devices, is_concrete, traced
-from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
+from vertax._base.tracing import is_concrete, traced
+from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy
@@ -26,6 +26,7 @@ from vertax.energies._units import cell_size, units_of
 from vertax.mesh import Tissue
 from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.precondition._recycled_hessian import RecycledHessian
+from vertax.relax._compatibility import check_adjoint, check_sharding
 from vertax.relax._equilibrium import SearchEnd, conclude
 from vertax.relax._feasibility import Feasibility
 from vertax.relax._loop import Search
@@ -160,8 +161,8 @@ class Relaxation(AbstractResponse):
                 f"Argument `preconditioner` must be of this tissue, but has {len(recycled.inverse)} "
                 f"coordinates for {size}. Take `preconditioner_at` of a tissue like it, or None."
             )
-        _check_adjoint(adjoint, self._solver)
-        _check_sharding((tissue, energy))
+        check_adjoint(adjoint, self._solver)
+        check_sharding((tissue, energy))
 
     def primal(self, tissue: Tissue, energy: AbstractEnergy) -> SearchEnd:
         """The relaxed tissue, by the compiled function that all callers share.
@@ -342,34 +343,3 @@ def attached(
 
 _search = announced_jit(sequential_vmap_on_cpu(search))
 _compiled_attachment = announced_jit(attached)
-
-
-def _check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
-    if not isinstance(adjoint, AbstractAdjoint):
-        raise TypeError(
-            "Argument `adjoint` must be one of vertax.adjoints, e.g. ImplicitDifferentiation(), but is "
-            f"{type(adjoint).__name__}."
-        )
-    if adjoint.unrolls and not solver.unrollable:
-        inner = solver.solver if isinstance(solver, Wrapped) else solver
-        raise ValueError(
-            f"{type(adjoint).__name__} differentiates the steps of the solver, which line searches and "
-            f"inner loops do not allow, so it does not go with {type(inner).__name__}. Pass e.g. "
-            "solver=vertax.solvers.GradientDescent() or Optax(optax.sgd(1e-2, momentum=0.9)), or "
-            "keep the solver and use ImplicitDifferentiation or EquilibriumPropagation."
-        )
-    if isinstance(adjoint, EquilibriumPropagation) and adjoint.nudge == "cost":
-        raise ValueError(
-            "EquilibriumPropagation(nudge='cost') needs to know the cost: use it in an InverseProblem, "
-            "or nudge='linear' here."
-        )
-
-
-def _check_sharding(tree: PyTree) -> None:
-    # Within `shard_map` JAX distinguishes values that differ between devices, and refuses a loop that starts
-    # at a constant 0, as the loops of Optimistix and Equinox do.
-    if any(differs_between_devices(x) for x in jax.tree.leaves(tree) if eqx.is_array(x)):
-        raise ValueError(
-            "A relaxation within jax.shard_map needs jax.shard_map(..., check_vma=False): its loops begin "
-            "with numbers that are the same on all devices."
-        )

@@ -76,6 +76,34 @@ class _State(NamedTuple):
     num_rounds: Int[Array, ""]
 
 
+class _System(NamedTuple):
+    """The arguments that all iterations of one step share."""
+
+    product: Callable[[Table], Table]
+    inverse_bounds: Float[Array, "rows 1"]
+    inverse: AbstractInverse
+    forcing: Float[Array, ""]
+    max_products: int | Int[Array, ""]
+
+    def furthest(self, step: Table) -> Float[Array, ""]:
+        """The length of the longest row, in units of its bound."""
+        return max_of(sizes(step * self.inverse_bounds))
+
+
+class _Direction(NamedTuple):
+    """The direction of an iteration."""
+
+    vector: Table
+    product: Table
+    """With the Hessian."""
+    damped: Table
+    """With the Hessian and the damping."""
+    squared: Float[Array, ""]
+    """The squared norm of the residual, $r \\cdot z$."""
+    small: Bool[Array, ""]
+    """Whether the residual is small enough: the direction is not used then."""
+
+
 class TruncatedCG(eqx.Module):
     r"""Solves $(H + \Lambda) p = -g$ by conjugate gradients, with bounds for the rows of $p$.
 
@@ -119,99 +147,112 @@ class TruncatedCG(eqx.Module):
         - `max_products`: most products with the Hessian.
         - `active`: whether to do anything; otherwise the step is zero.
         """
-        apart = 1 / bounds[:, None]
-        tiny = jnp.finfo(gradient.dtype).tiny
-
-        def iterate(s: _State) -> _State:
-            fresh, clips = s.last == 0, s.phase == _CLIP
-            factors = s.factors
-            if not isinstance(inverse, DiagonalInverse):
-                build = lambda: inverse.factors(s.damping)
-                factors = jax.lax.cond(fresh & ~clips, build, lambda: s.factors)
-            else:
-                factors = s.damping
-            z = inverse.apply(factors, s.residual)
-            rz = inner(s.residual, z)
-            # (More damping makes a residual smaller; without a step that is no progress.)
-            no_step = s.furthest == 0
-            first = jnp.where(no_step, rz, s.first)
-            small = ~clips & ~no_step & (rz <= forcing**2 * first)
-            # One iteration, unless the residual is small.
-            beta = jnp.where(fresh, 0, rz / jnp.where(fresh, 1, s.last))
-
-            def back() -> Table:
-                short = self.clip / jnp.maximum(sizes(s.step * apart), self.clip)
-                return (short - 1)[:, None] * s.step
-
-            d = jax.lax.cond(clips, back, lambda: beta * s.direction - z)
-            hd = jax.lax.cond(small, jnp.zeros_like, product, d)
-            damped = hd + s.damping[:, None] * d
-            curvature = inner(d, damped)
-            more = s.num_rounds < self.max_rounds
-            convex = curvature > 0
-            concave = ~small & ~clips & ~convex
-            alpha = jnp.where(convex & ~small, rz / jnp.where(convex, curvature, 1), 0)
-            # (Along a negative curvature: to the bounds.)
-            alpha = jnp.where(clips | (concave & ~more), 1, alpha)
-            furthest = max_of(sizes((s.step + alpha * d) * apart))
-            tried, beyond = alpha, ~small & ~clips & more & (furthest > self.overshoot)
-            # (Not further than the limit: where there is hardly any curvature that may be very far.)
-            room = (self.overshoot - s.furthest) / jnp.maximum(furthest - s.furthest, tiny)
-            alpha *= jnp.where(beyond, jnp.clip(room, 0, 1), 1)
-            step, residual = s.step + alpha * d, s.residual + alpha * damped
-            # More damping where the step is too long or the curvature negative.
-            far = furthest > jnp.where(small, self.overshoot_solved, self.overshoot)
-            wants = concave | (~clips & far)
-            again = wants & more
-            curvature = jnp.where(small | clips, s.curvature, curvature)
-
-            def damp() -> tuple[Table, Float[Array, " rows"]]:
-                last = jnp.where(small, s.direction, d)
-                rayleigh = curvature / jnp.maximum(inner(last, last), tiny)
-                reached = sizes((s.step + tried * d) * apart)
-                tighter = jnp.maximum(reached - 1, 0) * (s.damping + rayleigh)
-                concavity = -jnp.minimum(row_inner(d, hd), 0)
-                negative = 2 * concavity / jnp.maximum(row_inner(d, d), tiny)
-                extra = jnp.where(concave, negative, tighter)
-                return residual + extra[:, None] * step, s.damping + extra
-
-            residual, damping = jax.lax.cond(again, damp, lambda: (residual, s.damping))
-            num_products = s.num_products + jnp.where(small, 0, 1)
-            ends = ((small | wants) & ~again) | (num_products >= max_products)
-            clip_next = ends & (furthest > self.clip)
-            after = jnp.where(ends, jnp.where(clip_next, _CLIP, _END), _SOLVE)
-            return _State(
-                step,
-                residual,
-                d,
-                jnp.where(again, 0, rz),
-                first,
-                jnp.where(beyond, self.overshoot, furthest),
-                curvature,
-                damping,
-                factors,
-                jnp.where(clips, _END, after),
-                num_products,
-                s.num_rounds + again,
-            )
-
+        system = _System(product, 1 / bounds[:, None], inverse, forcing, max_products)
         zero, number, scalar = jnp.zeros_like(gradient), jnp.array(0), jnp.zeros((), gradient.dtype)
-        phase = jnp.where(active & (inner(gradient, gradient) > 0), _SOLVE, _END)
-        factors = zeros_of(jax.eval_shape(inverse.factors, damping))
         begin = _State(
-            zero,
-            gradient,
-            zero,
-            scalar,
-            scalar,
-            scalar,
-            scalar,
-            damping,
-            factors,
-            phase,
-            number,
-            number,
+            step=zero,
+            residual=gradient,
+            direction=zero,
+            last=scalar,
+            first=scalar,
+            furthest=scalar,
+            curvature=scalar,
+            damping=damping,
+            factors=zeros_of(jax.eval_shape(inverse.factors, damping)),
+            phase=jnp.where(active & (inner(gradient, gradient) > 0), _SOLVE, _END),
+            num_products=number,
+            num_rounds=number,
         )
+        iterate = lambda s: self._iterate(system, s)
         end = jax.lax.while_loop(lambda s: s.phase != _END, iterate, begin)
         hp = end.residual - gradient - end.damping[:, None] * end.step
         return Proposal(end.step, hp, end.damping, end.curvature, end.num_products)
+
+    def _iterate(self, system: _System, s: _State) -> _State:
+        """One iteration, or the clipping of the step."""
+        s, d = self._next_direction(system, s)
+        small, clips = d.small, s.phase == _CLIP
+        curvature = inner(d.vector, d.damped)
+        more = s.num_rounds < self.max_rounds
+        convex = curvature > 0
+        concave = ~small & ~clips & ~convex
+        length = jnp.where(convex & ~small, d.squared / jnp.where(convex, curvature, 1), 0)
+        # (Along a negative curvature: to the bounds.)
+        length = jnp.where(clips | (concave & ~more), 1, length)
+        furthest = system.furthest(s.step + length * d.vector)
+        beyond = ~small & ~clips & more & (furthest > self.overshoot)
+        # (Not further than the limit: where there is hardly any curvature that may be very far.)
+        tiny = jnp.finfo(furthest.dtype).tiny
+        room = (self.overshoot - s.furthest) / jnp.maximum(furthest - s.furthest, tiny)
+        taken = length * jnp.where(beyond, jnp.clip(room, 0, 1), 1)
+        # More damping where the step is too long or the curvature negative.
+        far = furthest > jnp.where(small, self.overshoot_solved, self.overshoot)
+        wants = concave | (~clips & far)
+        again = wants & more
+        tried = s.step + length * d.vector
+        after = s._replace(
+            step=s.step + taken * d.vector,
+            residual=s.residual + taken * d.damped,
+            direction=d.vector,
+            last=jnp.where(again, 0, d.squared),
+            furthest=jnp.where(beyond, self.overshoot, furthest),
+            curvature=jnp.where(small | clips, s.curvature, curvature),
+            num_products=s.num_products + jnp.where(small, 0, 1),
+            num_rounds=s.num_rounds + again,
+        )
+        last = lambda: jnp.where(small, s.direction, d.vector)
+        damp = lambda: self._with_damping(system, after, d, tried, concave, last())
+        residual, damping = jax.lax.cond(again, damp, lambda: (after.residual, s.damping))
+        ends = ((small | wants) & ~again) | (after.num_products >= system.max_products)
+        clip_next = ends & (furthest > self.clip)
+        phase = jnp.where(ends, jnp.where(clip_next, _CLIP, _END), _SOLVE)
+        phase = jnp.where(clips, _END, phase)
+        return after._replace(residual=residual, damping=damping, phase=phase)
+
+    def _next_direction(self, system: _System, s: _State) -> tuple[_State, _Direction]:
+        """The conjugate direction of the residual; or, in the last pass, that back to the bounds."""
+        fresh, clips = s.last == 0, s.phase == _CLIP
+        inverse, factors = system.inverse, s.damping
+        if not isinstance(inverse, DiagonalInverse):
+            build = lambda: inverse.factors(s.damping)
+            factors = jax.lax.cond(fresh & ~clips, build, lambda: s.factors)
+        z = inverse.apply(factors, s.residual)
+        squared = inner(s.residual, z)
+        # (More damping makes a residual smaller; without a step that is no progress.)
+        no_step = s.furthest == 0
+        first = jnp.where(no_step, squared, s.first)
+        small = ~clips & ~no_step & (squared <= system.forcing**2 * first)
+        beta = jnp.where(fresh, 0, squared / jnp.where(fresh, 1, s.last))
+
+        def back() -> Table:
+            longest = jnp.maximum(sizes(s.step * system.inverse_bounds), self.clip)
+            return (self.clip / longest - 1)[:, None] * s.step
+
+        vector = jax.lax.cond(clips, back, lambda: beta * s.direction - z)
+        product = jax.lax.cond(small, jnp.zeros_like, system.product, vector)
+        damped = product + s.damping[:, None] * vector
+        direction = _Direction(vector, product, damped, squared, small)
+        return s._replace(first=first, factors=factors), direction
+
+    def _with_damping(
+        self,
+        system: _System,
+        s: _State,
+        d: _Direction,
+        tried: Table,
+        concave: Bool[Array, ""],
+        last: Table,
+    ) -> tuple[Table, Float[Array, " rows"]]:
+        """The residual and the damping after an increase of the damping.
+
+        Rows of the `tried` step beyond their bounds get more in proportion to their length; where the
+        curvature is negative, rows get twice their share of it.
+        """
+        tiny = jnp.finfo(s.damping.dtype).tiny
+        rayleigh = s.curvature / jnp.maximum(inner(last, last), tiny)
+        reached = sizes(tried * system.inverse_bounds)
+        tighter = jnp.maximum(reached - 1, 0) * (s.damping + rayleigh)
+        concavity = -jnp.minimum(row_inner(d.vector, d.product), 0)
+        negative = 2 * concavity / jnp.maximum(row_inner(d.vector, d.vector), tiny)
+        extra = jnp.where(concave, negative, tighter)
+        return s.residual + extra[:, None] * s.step, s.damping + extra

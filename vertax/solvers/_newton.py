@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from vertax.solvers._rows import (
     inner,
     max_size,
     point_of,
+    rounding_error,
     sizes,
     table_of,
     typical_size,
@@ -185,7 +187,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         corrected = s.phase == _CORRECTION
         typical = typical_size(g)
         gained = s.value - value
-        below_rounding = jnp.abs(s.predicted) <= _rounding(value, unit * length)
+        below_rounding = jnp.abs(s.predicted) <= rounding_error(value, unit * length)
         # Where the gain is below rounding, the force must fall; or the gain be as predicted.
         smaller = squared < inner(s.gradient, s.gradient)
         as_predicted = gained > self.trust_region.good_gain * s.predicted
@@ -252,14 +254,12 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         gradient = model.gradient
         if "probe" in options:
             gradient = jnp.where(measures, options["probe"], gradient)
-        useful = jnp.minimum(0.1, 0.9 * (s.typical / jnp.where(s.previous > 0, s.previous, 1)) ** 2)
-        useful = jnp.where(jnp.isfinite(s.previous), useful, 0)
-        forcing = jnp.minimum(self.forcing, jnp.maximum(self._finest(s.typical, unit), useful))
         damping = jnp.where(corrects, s.proposal.damping, sizes(s.gradient) / s.radii)
         damping = jnp.where(measures, 0, damping)
         bounds = jnp.minimum(s.radii, jnp.where(corrects, self.correction_displacement, 1) * reach)
         bounds = jnp.where(corrects, bounds, s.radii)
-        near = self._finest(s.typical, unit) < self.forcing
+        finest = self._finest(s.typical, unit)
+        near = finest < self.forcing
         inverse = self._inverse(model, options, s.stiffness, near & active, measures)
         max_products = jnp.where(corrects, self.correction_products, self.max_products)
         proposal = self.conjugate_gradients(
@@ -268,7 +268,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             damping,
             bounds,
             inverse,
-            jnp.where(corrects, self.correction_forcing, forcing),
+            jnp.where(corrects, self.correction_forcing, self._forcing(s, finest)),
             jnp.where(measures, 1, max_products),
             solves,
         )
@@ -278,27 +278,21 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         trial = jnp.where(corrects, s.base + p, jnp.where(steps, p, s.trial))
         stiffness = jnp.abs(proposal.curvature) / inner(gradient, gradient)
         stiffness = jnp.where(jnp.isfinite(stiffness) & (stiffness > 0), stiffness, 1)
-        return eqx.tree_at(
-            lambda s: (
-                s.phase,
-                s.stiffness,
-                s.trial,
-                s.proposal,
-                s.predicted,
-                s.base,
-                s.num_products,
-            ),
+        return dataclasses.replace(
             s,
-            (
-                jnp.where(steps, _STEP, jnp.where(measures, _EVALUATE, s.phase)),
-                jnp.where(measures, stiffness, s.stiffness),
-                trial,
-                tree_where(steps, proposal, s.proposal),
-                jnp.where(steps, predicted, s.predicted),
-                jnp.where(steps, trial, s.base),
-                s.num_products + proposal.num_products,
-            ),
+            phase=jnp.where(steps, _STEP, jnp.where(measures, _EVALUATE, s.phase)),
+            stiffness=jnp.where(measures, stiffness, s.stiffness),
+            trial=trial,
+            proposal=tree_where(steps, proposal, s.proposal),
+            predicted=jnp.where(steps, predicted, s.predicted),
+            base=jnp.where(steps, trial, s.base),
+            num_products=s.num_products + proposal.num_products,
         )
+
+    def _forcing(self, s: NewtonState, finest: Float[Array, ""]) -> Float[Array, ""]:
+        useful = jnp.minimum(0.1, 0.9 * (s.typical / jnp.where(s.previous > 0, s.previous, 1)) ** 2)
+        useful = jnp.where(jnp.isfinite(s.previous), useful, 0)
+        return jnp.minimum(self.forcing, jnp.maximum(finest, useful))
 
     def _inverse(
         self,
@@ -351,13 +345,3 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     def _finest(self, typical: Float[Array, ""], unit: Any) -> Float[Array, ""]:
         # (14: the ratio of the norm of all forces and the typical force in a tissue of a hundred cells.)
         return jnp.sqrt(14.0 * typical / unit)
-
-
-def _rounding(value: Float[Array, ""], unit: Float[Array, ""] | float) -> Float[Array, ""]:
-    """The rounding error of an energy, in a material with this unit of energy.
-
-    A sum of squares may be far less than the unit: what is squared is a difference of lengths, then, and has
-    their rounding.
-    """
-    size = jnp.abs(value)
-    return 20 * jnp.finfo(value.dtype).eps * jnp.maximum(size, jnp.sqrt(size * unit))

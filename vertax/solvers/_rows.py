@@ -75,3 +75,13 @@ def max_size(x: Table) -> Float[Array, ""]:
     """The largest component, as a size; NaN if any is NaN."""
     finite = jnp.isfinite(inner(x, x))
     return jnp.where(finite, max_of(jnp.abs(x)), jnp.nan)
+
+
+def rounding_error(value: Float[Array, ""], unit: Float[Array, ""] | float) -> Float[Array, ""]:
+    """The rounding error of an energy, in a material with this unit of energy.
+
+    A sum of squares may be far less than the unit: what is squared is a difference of lengths, then, and has
+    their rounding.
+    """
+    size = jnp.abs(value)
+    return 20 * jnp.finfo(value.dtype).eps * jnp.maximum(size, jnp.sqrt(size * unit))
