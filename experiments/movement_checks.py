@@ -202,8 +202,13 @@ def measure_control(config: Config, solid: Any, energy: Any) -> dict[str, np.nda
     errors = np.zeros((2, len(config.tolerances)))
     counts = np.zeros_like(errors)
     for order, i in np.ndindex(errors.shape):
-        control = vx.dynamics.StepControl(config.tolerances[i], most=400)
-        options: Any = {"control": control, "order": order + 1, "relaxation": FIXED, "throw": False}
+        control = vx.dynamics.PIController(config.tolerances[i], max_steps=400)
+        options: Any = {
+            "stepsize_controller": control,
+            "order": order + 1,
+            "relaxation": FIXED,
+            "throw": False,
+        }
         friction, times = SubstrateFriction(config.friction), np.linspace(0, 1, 3)
         movie = vx.evolve(start, energy, friction, times, **options)
         errors[order, i] = jnp.max(jnp.abs(movie.tissue.vertices - fine.tissue.vertices))

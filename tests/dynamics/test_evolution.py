@@ -165,7 +165,7 @@ class TestGradients:
         )
 
         @eqx.filter_jit
-        def cost(parameters, adjoint=None, order=1):
+        def cost(parameters, adjoint=vx.ImplicitDifferentiation(), order=1):
             targets, friction, vertices, viscosity = parameters
             movie = vx.evolve(
                 start.with_vertices(vertices),

@@ -93,14 +93,14 @@ def test_interrupted_run_continues_bitwise(tmp_path, monkeypatch):
 
 @pytest.mark.thorough
 def test_checkpoints_with_step_control(tmp_path):
-    control = vx.dynamics.StepControl(1e-3, most=20)
+    control = vx.dynamics.PIController(1e-3, max_steps=20)
     run = lambda **settings: vx.evolve(
         random_tissue(9, 0),
         ENERGY,
         FRICTION,
         [0, 0.1, 0.2],
         relaxation=FIXED_TOPOLOGY,
-        control=control,
+        stepsize_controller=control,
         **settings,
     )
     at_once, by_frames = run(), run(checkpoint=tmp_path / "run.npz", progress=True)

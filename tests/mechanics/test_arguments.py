@@ -35,7 +35,7 @@ TISSUE_FUNCTIONS = [
     mechanics.zero_modes,
     lambda t, e: mechanics.modes(t, e, 2),
     lambda t, e: mechanics.complex_modulus(t, e, friction, jnp.array([1.0])),
-    lambda t, e: mechanics.recoil(t, e, 1, friction),
+    lambda t, e: mechanics.recoil(t, e, friction, 1),
     lambda t, e: mechanics.velocities(t, e, friction),
     lambda t, e: mechanics.ramp(t, e, np.array([0.0, 0.1])),
     lambda t, e: BoxRelaxation()(t, e),
@@ -116,22 +116,22 @@ WRONG = {
         "`dissipation` must be a dissipation",
     ),
     "negative edge": (
-        lambda: mechanics.recoil(tissue, energy, -1, friction),
+        lambda: mechanics.recoil(tissue, energy, friction, -1),
         "`edge` must be at least 0",
     ),
     "edge too large": (
-        lambda: mechanics.recoil(tissue, energy, 999, friction),
+        lambda: mechanics.recoil(tissue, energy, friction, 999),
         "one of the 27 edges",
     ),
     "edge not an integer": (
-        lambda: mechanics.recoil(tissue, energy, 1.5, friction),
+        lambda: mechanics.recoil(tissue, energy, friction, 1.5),
         "`edge` must be at least 0",
     ),
     "two edges": (
-        lambda: mechanics.recoil(tissue, energy, jnp.arange(2), friction),
+        lambda: mechanics.recoil(tissue, energy, friction, jnp.arange(2)),
         "`edge` must be at least 0",
     ),
-    "no dissipation": (lambda: mechanics.recoil(tissue, energy, 1, None), "must be a dissipation"),
+    "no dissipation": (lambda: mechanics.recoil(tissue, energy, None, 1), "must be a dissipation"),
     "number as dissipation": (
         lambda: mechanics.velocities(tissue, energy, 1.0),
         "must be a dissipation",

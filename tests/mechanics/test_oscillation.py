@@ -104,7 +104,7 @@ def test_recoil_against_a_dense_solution():
     n = 12
     energy = ShapeFactorEnergy(shape_factors(n, 3.5, 0.1))
     tissue = random_tissue(n, 1)
-    velocity = mechanics.recoil(tissue, energy, 5, SubstrateFriction(2.0))
+    velocity = mechanics.recoil(tissue, energy, SubstrateFriction(2.0), 5)
     grad = jax.grad(lambda x: energy(tissue.with_vertices(x)))(tissue.vertices)
     pull = jax.grad(lambda x: tissue.with_vertices(x).edge_lengths[5])(tissue.vertices)
     tension = mechanics.tensions(tissue, energy)[5]
@@ -117,7 +117,7 @@ def test_recoil_is_the_initial_velocity_without_the_tension():
     energy = ShapeFactorEnergy(shape_factors(n, 3.5, 0.1))
     tissue = FIXED_TOPOLOGY(random_tissue(n, 1), energy).tissue
     friction = SubstrateFriction(2.0) + PerimeterViscosity(0.3)
-    velocity = mechanics.recoil(tissue, energy, 5, friction)
+    velocity = mechanics.recoil(tissue, energy, friction, 5)
     # Only the four vertices near the cut move much, and its ends move apart.
     first, last = np.asarray(velocity)[tissue.topology.edge_vertices[5]]
     assert np.sum((last - first) * tissue.edge_vectors[5]) > 0
@@ -148,4 +148,4 @@ def test_invalid_arguments_raise(lattice):
     with pytest.raises(ValueError, match="at least 0"):
         mechanics.complex_modulus(lattice, elastic(jnp.array(3.0)), FRICTION, jnp.array([-1.0]))
     with pytest.raises(ValueError, match="one of the 48 edges"):
-        mechanics.recoil(lattice, elastic(jnp.array(3.0)), 48, FRICTION)
+        mechanics.recoil(lattice, elastic(jnp.array(3.0)), FRICTION, 48)

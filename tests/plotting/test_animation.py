@@ -62,7 +62,9 @@ def test_marks_stay_for_some_frames(way):
 def test_a_gif_has_a_picture_for_each_frame_and_marks_transitions(way, tmp_path):
     path = tmp_path / "way.gif"
     values = np.linspace(0, 1, 4 * 8).reshape(4, 8)
-    vx.animate(way, path, values, fps=20, linger=1, mark_t1=2, captions=list("abcd"), dpi=60)
+    vx.animate(
+        way, path, values, fps=20, last_frame_seconds=1, mark_t1=2, captions=list("abcd"), dpi=60
+    )
     frames, times = frames_of(path)
     assert [has(frame, _style.MARK) for frame in frames] == [False, True, True, False]
     # Values change between all frames, so no two frames are merged.

@@ -55,7 +55,7 @@ PACKAGES = {
     "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
     "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tissue "
     "plot_tissues same_limits scale_bar series_colours tension_layer",
-    "dynamics": "Evolution Evolved Material StepControl evolve",
+    "dynamics": "Evolution Evolved Material PIController evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
     "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",

@@ -169,7 +169,7 @@ def hypergradient_problem(tissue, seed=0, **options):
     """A loss that sees everything: positions, orientation, angles."""
     target = tissue.with_vertices(tissue.vertices + 0.1 * random_like(tissue.vertices, 5))
 
-    def loss(tension, start=tissue, adjoint=None):
+    def loss(tension, start=tissue, adjoint=vx.ImplicitDifferentiation()):
         energy = drops(tension)
         settings = {"tolerance": 1e-12, "adjoint": adjoint, "throw": False} | options
         equilibrium = equilibrate(start, energy, **settings)

@@ -189,7 +189,9 @@ def test_units_do_not_matter(solver):
 def test_another_number_compiles_nothing():
     tissue = random_tissue(12, 0)
 
-    def relax(p0: float, tolerance: float, max_steps: int, threshold: float, adjoint=None):
+    default = vx.ImplicitDifferentiation()
+
+    def relax(p0: float, tolerance: float, max_steps: int, threshold: float, adjoint=default):
         rule = vx.T1(threshold)
         settings = {"tolerance": tolerance, "max_steps": max_steps, "transitions": rule}
         settings["contact_range"] = None

@@ -29,7 +29,7 @@ def test_recoil_velocity_is_proportional_to_the_tension():
         along = rest.edge_vectors[edge] / jnp.linalg.norm(rest.edge_vectors[edge])
         speed = lambda v, ends=ends, along=along: 0.5 * (v[ends[1]] - v[ends[0]]) @ along
         finite.append(2.0 * speed((after.vertices - rest.vertices) / dt))
-        linear.append(2.0 * speed(recoil(rest, energy, edge, FRICTION)))
+        linear.append(2.0 * speed(recoil(rest, energy, FRICTION, edge)))
     # The force of very short edges is reduced by the softening.
     long = np.asarray(rest.edge_lengths > 0.05)
     assert long.sum() > 40

@@ -52,8 +52,8 @@ with warnings.catch_warnings():
             "Raise `max_contacts`."
         )
         max_time_steps_reached = (
-            "The steps of an adaptive time integration did not reach the next frame. Raise `most` of "
-            "the `StepControl`, or loosen its `tolerance`."
+            "The steps of an adaptive time integration did not reach the next frame. Raise `max_steps` of "
+            "the `PIController`, or loosen its `tolerance`."
         )
         capacity_reached = (
             "A cell could not divide: all cell slots of the tissue are alive. Add spare slots before with "

@@ -3,4 +3,4 @@
 from vertax.dynamics._evolution import Evolution as Evolution, evolve as evolve
 from vertax.dynamics._evolved import Evolved as Evolved
 from vertax.dynamics._material import Material as Material
-from vertax.dynamics._step_control import StepControl as StepControl
+from vertax.dynamics._pi_controller import PIController as PIController

@@ -24,7 +24,7 @@ from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._long_run import evolve_by_frames
 from vertax.dynamics._material import Material
-from vertax.dynamics._step_control import StepControl
+from vertax.dynamics._pi_controller import PIController
 from vertax.dynamics._time_integration import evolve_at_once
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import cell_size
@@ -52,7 +52,7 @@ class Evolution(AbstractResponse):
     - `key`: the random key or seed of the activity. Each step uses a new key that is split from it.
     - `drive`: instead of a key, the field `drive` of an [`Evolved`][vertax.dynamics.Evolved] to continue.
     - `substeps`: steps per frame.
-    - `control`: instead of `substeps`, a [`StepControl`][vertax.dynamics.StepControl]: step sizes from an
+    - `stepsize_controller`: instead of `substeps`, a [`PIController`][vertax.dynamics.PIController]: step sizes from an
         error tolerance.
     - `order`: 1, or 2 for two stages per step (an SDIRK method, stable for every $\Delta t$, but the energy
         may increase). Order 2 requires a dissipation that is half a sum of squares.
@@ -74,7 +74,7 @@ class Evolution(AbstractResponse):
     key: PRNGKeyArray | None
     drive: PyTree[Array]
     substeps: int = eqx.field(static=True)
-    control: StepControl | None
+    stepsize_controller: PIController | None
     order: int = eqx.field(static=True)
     boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None
     pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None
@@ -89,11 +89,11 @@ class Evolution(AbstractResponse):
         key: PRNGKeyArray | int | None = None,
         drive: PyTree[Array] = None,
         substeps: int = 1,
-        control: StepControl | None = None,
+        stepsize_controller: PIController | None = None,
         order: int = 1,
         boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None = None,
         pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None = None,
-        relaxation: Relaxation | None = None,
+        relaxation: Relaxation = Relaxation(),
     ):
         if not isinstance(dissipation, AbstractDissipation):
             raise TypeError(
@@ -112,7 +112,7 @@ class Evolution(AbstractResponse):
             )
         self.activity, self.drive = activity, drive
         self.key = None if key is None else as_key(key)
-        self.relaxation = Relaxation() if relaxation is None else relaxation
+        self.relaxation = relaxation
         if not isinstance(self.relaxation, Relaxation):
             raise TypeError(
                 f"Argument `relaxation` must be a vertax.Relaxation, but is {describe(relaxation)}."
@@ -131,22 +131,22 @@ class Evolution(AbstractResponse):
                 "Argument `order` can be 2 only for a dissipation that is half a sum of squares, an "
                 f"AbstractViscosity, which {type(dissipation).__name__} is not."
             )
-        if not isinstance(control, StepControl | None):
+        if not isinstance(stepsize_controller, PIController | None):
             raise TypeError(
-                "Argument `control` must be a vertax.dynamics.StepControl, e.g. StepControl(1e-3), but is "
-                f"{describe(control)}."
+                "Argument `stepsize_controller` must be a vertax.dynamics.PIController, e.g. PIController(1e-3), but is "
+                f"{describe(stepsize_controller)}."
             )
-        if control is not None and (substeps != 1 or activity is not None):
+        if stepsize_controller is not None and (substeps != 1 or activity is not None):
             conflict = "`substeps`" if activity is None else "`activity`"
             raise ValueError(
-                f"Argument `control` does not go with {conflict}: "
+                f"Argument `stepsize_controller` does not go with {conflict}: "
                 + (
                     "it determines the number of steps."
                     if activity is None
                     else "random numbers must not depend on which steps are rejected. Use `substeps`."
                 )
             )
-        self.dissipation, self.control = dissipation, control
+        self.dissipation, self.stepsize_controller = dissipation, stepsize_controller
         self.times = as_times(times)
         self.substeps, self.order = substeps, order
         self.boundary, self.pins = boundary, pins
@@ -156,7 +156,7 @@ class Evolution(AbstractResponse):
         tissue: Tissue,
         energy: AbstractEnergy | Callable[[Float[Array, ""]], AbstractEnergy],
         *,
-        adjoint: AbstractAdjoint | None = None,
+        adjoint: AbstractAdjoint = ImplicitDifferentiation(),
         throw: bool = True,
         progress: bool = False,
         checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
@@ -169,7 +169,6 @@ class Evolution(AbstractResponse):
 
         **Raises:** as [`evolve`][vertax.evolve].
         """
-        adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         response = self
         if isinstance(energy, Material):
             response, energy = self.of(energy), energy.energy
@@ -223,8 +222,11 @@ class Evolution(AbstractResponse):
 
     def traced(self) -> Evolution:
         """A copy with its numbers as arrays: other values need no recompilation."""
-        new = (*traced((self.dissipation, self.activity, self.control)), self.relaxation.traced())
-        parts = lambda e: (e.dissipation, e.activity, e.control, e.relaxation)
+        new = (
+            *traced((self.dissipation, self.activity, self.stepsize_controller)),
+            self.relaxation.traced(),
+        )
+        parts = lambda e: (e.dissipation, e.activity, e.stepsize_controller, e.relaxation)
         return eqx.tree_at(parts, self, new, is_leaf=lambda x: x is None)
 
     def finer(self, tolerance: Float[Array, ""]) -> Evolution:
@@ -290,11 +292,19 @@ def evolve(
     dissipation: AbstractDissipation,
     times: ArrayLike | Sequence[Any],
     *,
-    adjoint: AbstractAdjoint | None = None,
+    activity: AbstractActivity | None = None,
+    key: PRNGKeyArray | int | None = None,
+    drive: PyTree[Array] = None,
+    substeps: int = 1,
+    stepsize_controller: PIController | None = None,
+    order: int = 1,
+    boundary: Callable[[Float[Array, ""]], AbstractBoundary] | None = None,
+    pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None = None,
+    relaxation: Relaxation = Relaxation(),
+    adjoint: AbstractAdjoint = ImplicitDifferentiation(),
     throw: bool = True,
     progress: bool = False,
     checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
-    **settings: Any,
 ) -> Evolved:
     r"""Overdamped motion of a tissue in time, $\partial R / \partial \dot x = - \partial E / \partial x$.
 
@@ -315,6 +325,8 @@ def evolve(
         differentiate with respect to its fields).
     - `dissipation`: the dissipation $R$.
     - `times`: the times of the frames, increasing.
+    - `activity`, `key`, `drive`, `substeps`, `stepsize_controller`, `order`, `boundary`, `pins`, `relaxation`:
+        see [`Evolution`][vertax.Evolution].
     - `adjoint`: the differentiation method of each step,
         [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by default.
     - `throw`: raise an error if a step does not converge. If False, check `converged`.
@@ -323,8 +335,6 @@ def evolve(
         exists, the run continues from it, with bitwise the same results as without the interruption. With
         `progress` or `checkpoint` each frame is a separate call of a compiled function, so the call cannot be
         inside `jax.jit`.
-    - `settings`: further arguments of [`Evolution`][vertax.Evolution]: `activity`, `key`, `drive`,
-        `substeps`, `control`, `order`, `boundary`, `pins`, `relaxation`.
 
     **Returns:** an [`Evolved`][vertax.dynamics.Evolved]: `tissue` at the end, and `frames`.
 
@@ -335,7 +345,19 @@ def evolve(
         that is broken or of another run.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a step did not converge, or cells overlap.
     """
-    evolution = Evolution(dissipation, times, **settings)
+    evolution = Evolution(
+        dissipation,
+        times,
+        activity=activity,
+        key=key,
+        drive=drive,
+        substeps=substeps,
+        stepsize_controller=stepsize_controller,
+        order=order,
+        boundary=boundary,
+        pins=pins,
+        relaxation=relaxation,
+    )
     return evolution(
         tissue, energy, adjoint=adjoint, throw=throw, progress=progress, checkpoint=checkpoint
     )

@@ -34,7 +34,7 @@ class State(eqx.Module):
     tissue: Tissue
     drive: PyTree[Array]
     dt: Float[Array, ""]
-    """The next time step, with a `StepControl`."""
+    """The next time step, with a `PIController`."""
     error: Float[Array, ""]
     """The error of the last step, in units of the tolerance."""
     max_force: Float[Array, ""]
@@ -76,7 +76,11 @@ def initial_state(tissue: Tissue, evolution: Any) -> State:
     if drive is None and evolution.activity is not None:
         first, rest = jax.random.split(evolution.key)
         drive = (evolution.activity.init(tissue, first), rest)
-    dt = zero if evolution.control is None else evolution.control.begin(times)
+    dt = (
+        zero
+        if evolution.stepsize_controller is None
+        else evolution.stepsize_controller.begin(times)
+    )
     return State(tissue, drive, dt, zero + 1, zero, zero_count, zero_count, _successful())
 
 
@@ -84,7 +88,11 @@ def first_frame(state: State, energy: Any, evolution: Any) -> Frames:
     """The frame of the initial time, as one row of `Frames`."""
     time = evolution.times.astype(state.tissue.vertices.dtype)[0]
     tissue = eqx.filter(state.tissue, eqx.is_array)
-    n_steps = evolution.substeps if evolution.control is None else evolution.control.most
+    n_steps = (
+        evolution.substeps
+        if evolution.stepsize_controller is None
+        else evolution.stepsize_controller.max_steps
+    )
     steps = jnp.zeros(n_steps, time.dtype)
     value = _energy_at(energy, time)(state.tissue)
     row = Frames(tissue, value, jnp.array(0), _successful(), steps, jnp.array(0))
@@ -96,7 +104,7 @@ def integrate(
 ) -> tuple[State, Frames]:
     """Integrate from the first of the times of an `Evolution` to the last; return the later frames."""
     times = evolution.times.astype(state.tissue.vertices.dtype)
-    control, may_flip = evolution.control, evolution.relaxation.transitions is not None
+    control, may_flip = evolution.stepsize_controller, evolution.relaxation.transitions is not None
 
     def stage(
         state: State,
@@ -194,7 +202,7 @@ def integrate(
             return jax.lax.cond(carry[1] < ends[1], take_step, lambda c: (c, no_step), carry)
 
         (arrays, time), (steps, num_rejected) = jax.lax.scan(
-            one, (arrays, ends[0]), None, length=control.most
+            one, (arrays, ends[0]), None, length=control.max_steps
         )
         reached = RESULTS.where(time >= ends[1], RESULTS.successful, RESULTS.max_time_steps_reached)
         result = first_failure(arrays.result, reached)

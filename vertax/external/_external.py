@@ -118,7 +118,7 @@ class External(AbstractResponse):
         tissue: Tissue,
         energy: AbstractEnergy,
         *,
-        adjoint: AbstractAdjoint | None = None,
+        adjoint: AbstractAdjoint = EquilibriumPropagation(),
         throw: bool = True,
     ) -> Equilibrium:
         """Relax a tissue by the program.
@@ -144,7 +144,6 @@ class External(AbstractResponse):
             energy, type
         ):  # (Other objects are allowed: a program may need parameters only.)
             check_energy(energy)
-        adjoint = EquilibriumPropagation() if adjoint is None else adjoint
         self.check_compatible(adjoint)
         assert isinstance(adjoint, EquilibriumPropagation)
         inputs = (tissue, energy, self, adjoint)

@@ -106,8 +106,8 @@ def grow(
     divisions: int | None = None,
     records: int | None = None,
     dissipation: AbstractDissipation | None = None,
-    relaxation: Relaxation | None = None,
-    adjoint: AbstractAdjoint | None = None,
+    relaxation: Relaxation = Relaxation(transitions=T1() + T2()),
+    adjoint: AbstractAdjoint = ImplicitDifferentiation(),
     throw: bool = True,
 ) -> Grown:
     r"""Let the cells of a tissue grow, divide and die.
@@ -164,7 +164,7 @@ def grow(
     for name, value, kind, expected in (
         ("cycle", cycle, AbstractLifeCycle, "an AbstractLifeCycle"),
         ("dissipation", dissipation, AbstractDissipation | None, "an AbstractDissipation or None"),
-        ("relaxation", relaxation, Relaxation | None, "a Relaxation or None"),
+        ("relaxation", relaxation, Relaxation, "a Relaxation"),
     ):
         if not isinstance(value, kind):
             raise TypeError(f"Argument `{name}` must be {expected}, but is {describe(value)}.")
@@ -189,8 +189,6 @@ def grow(
     if is_concrete(tissue.topology.cell):
         labels = np.unique(np.asarray(tissue.topology.cell))
         check_integer("records", records, at_least=int(np.sum(labels < tissue.n_cells)))
-    adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
-    relaxation = Relaxation(transitions=T1() + T2()) if relaxation is None else relaxation
     times = as_times(times)
     parts = traced((tissue, energy, cycle, dissipation), tissue.vertices.dtype)
     settings = (relaxation.traced(), adjoint, times, as_key(key), (substeps, divisions, records))

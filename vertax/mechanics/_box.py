@@ -100,7 +100,7 @@ class BoxRelaxation(AbstractResponse):
         tissue: Tissue,
         energy: AbstractEnergy,
         *,
-        adjoint: AbstractAdjoint | None = None,
+        adjoint: AbstractAdjoint = ImplicitDifferentiation(),
         throw: bool = True,
     ) -> Equilibrium:
         """Relax a tissue and its box.
@@ -121,7 +121,6 @@ class BoxRelaxation(AbstractResponse):
         - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and no equilibrium was reached.
         """
         check_system(tissue, energy, box="a BoxRelaxation")
-        adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.relaxation.check(tissue, energy, adjoint)
         self.check_compatible(adjoint)
         relaxed = _relax_box(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -32,7 +31,7 @@ def elastic_tensor(
     energy: AbstractEnergy,
     *,
     affine: bool = False,
-    linear_solver: lx.AbstractLinearSolver | None = None,
+    linear_solver: lx.AbstractLinearSolver = MINRES(),
     throw: bool = True,
 ) -> Float[Array, "3 3"]:
     r"""The elastic tensor of a tissue at rest, in Voigt's notation, energy per area.
@@ -75,16 +74,21 @@ def elastic_tensor(
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the linear solver failed.
     """
     check_system(tissue, energy, box="an elastic modulus")
-    solver = MINRES() if linear_solver is None else linear_solver
-    check_linear_solver(solver)
+    check_linear_solver(linear_solver)
     tensor = _elastic_tensor(
-        *traced((tissue, energy), tissue.vertices.dtype), _Elasticity(solver, affine)
+        *traced((tissue, energy), tissue.vertices.dtype), _Elasticity(linear_solver, affine)
     )
     return checked(tensor, _REASON) if throw else tensor
 
 
 def shear_modulus(
-    tissue: Tissue, energy: AbstractEnergy, *, angle: ArrayLike | None = None, **options: Any
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    *,
+    angle: ArrayLike | None = None,
+    affine: bool = False,
+    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    throw: bool = True,
 ) -> Float[Array, ""]:
     r"""Shear modulus $G$ of a tissue at rest: stress over shear angle, energy per area.
 
@@ -95,18 +99,24 @@ def shear_modulus(
     - `angle`: direction of the shear, in radians from the x axis; 0 is $C_{xyxy}$, and π/4 pure shear
         along the axes. By default the mean over all directions, which does not depend on the axes:
         $(C_{xxxx} + C_{yyyy} - 2 C_{xxyy}) / 8 + C_{xyxy} / 2$.
-    - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
-        `throw`.
+    - `affine`, `linear_solver`, `throw`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor].
 
     **Returns:** the modulus; differentiable as `elastic_tensor` is.
 
     **Raises:** as `elastic_tensor`.
     """
-    tensor = elastic_tensor(tissue, energy, **options)
+    tensor = elastic_tensor(tissue, energy, affine=affine, linear_solver=linear_solver, throw=throw)
     return shear_part(tensor, angle)
 
 
-def bulk_modulus(tissue: Tissue, energy: AbstractEnergy, **options: Any) -> Float[Array, ""]:
+def bulk_modulus(
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    *,
+    affine: bool = False,
+    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    throw: bool = True,
+) -> Float[Array, ""]:
     r"""Bulk modulus $B$ of a tissue at rest: $A\,\mathrm d^2 E / \mathrm d A^2$ at a given shape of the
     box.
 
@@ -114,18 +124,24 @@ def bulk_modulus(tissue: Tissue, energy: AbstractEnergy, **options: Any) -> Floa
 
     - `tissue`: a periodic tissue at rest.
     - `energy`: the energy of which the tissue is at a minimum.
-    - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
-        `throw`.
+    - `affine`, `linear_solver`, `throw`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor].
 
     **Returns:** the modulus, energy per area; differentiable as `elastic_tensor` is.
 
     **Raises:** as `elastic_tensor`.
     """
-    return jnp.sum(elastic_tensor(tissue, energy, **options)[:2, :2]) / 4
+    tensor = elastic_tensor(tissue, energy, affine=affine, linear_solver=linear_solver, throw=throw)
+    return jnp.sum(tensor[:2, :2]) / 4
 
 
 def youngs_modulus(
-    tissue: Tissue, energy: AbstractEnergy, *, angle: ArrayLike = 0.0, **options: Any
+    tissue: Tissue,
+    energy: AbstractEnergy,
+    *,
+    angle: ArrayLike = 0.0,
+    affine: bool = False,
+    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    throw: bool = True,
 ) -> Float[Array, ""]:
     r"""Young's modulus along a direction: uniaxial stress over strain, at zero stress across.
 
@@ -136,14 +152,14 @@ def youngs_modulus(
     - `tissue`: a periodic tissue at rest.
     - `energy`: the energy of which the tissue is at a minimum.
     - `angle`: the direction, in radians from the x axis.
-    - `options`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor]: `affine`, `linear_solver`,
-        `throw`.
+    - `affine`, `linear_solver`, `throw`: see [`elastic_tensor`][vertax.mechanics.elastic_tensor].
 
     **Returns:** the modulus, energy per area; differentiable as `elastic_tensor` is.
 
     **Raises:** as `elastic_tensor`.
     """
-    return young_part(elastic_tensor(tissue, energy, **options), angle)
+    tensor = elastic_tensor(tissue, energy, affine=affine, linear_solver=linear_solver, throw=throw)
+    return young_part(tensor, angle)
 
 
 def young_part(tensor: Float[Array, "3 3"], angle: ArrayLike) -> Float[Array, ""]:

@@ -104,8 +104,8 @@ def ramp(
     strains: ArrayLike,
     *,
     deformation: Deformation = simple_shear,
-    relaxation: Relaxation | None = None,
-    adjoint: AbstractAdjoint | None = None,
+    relaxation: Relaxation = Relaxation(),
+    adjoint: AbstractAdjoint = ImplicitDifferentiation(),
     throw: bool = True,
 ) -> Ramp:
     r"""Deform a tissue quasi-statically at zero temperature (AQS), through its T1 transitions.
@@ -155,9 +155,7 @@ def ramp(
             f"vertax.mechanics.pure_shear, but is {describe(deformation)}."
         )
     as_matrix("deformation", jnp.zeros(jax.eval_shape(deformation, values[0]).shape))
-    relaxation = Relaxation() if relaxation is None else relaxation
     check_relaxation(relaxation)
-    adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
     tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     relaxation.check(tissue, energy, adjoint)
     result = _ramp(tissue, energy, values, deformation, relaxation.traced(), adjoint)

@@ -25,7 +25,7 @@ def velocities(
     energy: AbstractEnergy,
     dissipation: AbstractDissipation,
     *,
-    linear_solver: lx.AbstractLinearSolver | None = None,
+    linear_solver: lx.AbstractLinearSolver = MINRES(),
     throw: bool = True,
 ) -> Float[Array, "vertices 2"]:
     r"""Velocities of vertices, $\Gamma\,\dot x = - \nabla_X E$ with the matrix $\Gamma$ of the dissipation.
@@ -56,9 +56,10 @@ def velocities(
     """
     check_system(tissue, energy)
     check_dissipation(dissipation)
-    solver = MINRES() if linear_solver is None else linear_solver
-    check_linear_solver(solver)
-    velocity = _velocities(*traced((tissue, energy, dissipation), tissue.vertices.dtype), solver)
+    check_linear_solver(linear_solver)
+    velocity = _velocities(
+        *traced((tissue, energy, dissipation), tissue.vertices.dtype), linear_solver
+    )
     return checked(velocity, _REASON) if throw else velocity
 
 
@@ -80,10 +81,10 @@ def _velocities(
 def recoil(
     tissue: Tissue,
     energy: AbstractEnergy,
-    edge: int | Int[Array, ""],
     dissipation: AbstractDissipation,
+    edge: int | Int[Array, ""],
     *,
-    linear_solver: lx.AbstractLinearSolver | None = None,
+    linear_solver: lx.AbstractLinearSolver = MINRES(),
     throw: bool = True,
 ) -> Float[Array, "vertices 2"]:
     r"""Initial velocities of all vertices after the tension of an edge is removed, as by laser ablation.
@@ -97,8 +98,8 @@ def recoil(
 
     - `tissue`: a tissue at rest.
     - `energy`: an energy of areas and lengths, see [`tensions`][vertax.mechanics.tensions].
-    - `edge`: the index of the edge.
     - `dissipation`: the dissipation, which defines $\Gamma$.
+    - `edge`: the index of the edge.
     - `linear_solver`: for systems with $\Gamma$, [`MINRES`][vertax.MINRES] by default. Null vectors of
         $\Gamma$ get the velocity 0.
     - `throw`: raise an error if the linear solver fails; otherwise the result is NaN.
@@ -120,10 +121,9 @@ def recoil(
             raise ValueError(
                 f"Argument `edge` must be one of the {tissue.n_edges} edges, from 0 on, but is {number}."
             )
-    solver = MINRES() if linear_solver is None else linear_solver
-    check_linear_solver(solver)
+    check_linear_solver(linear_solver)
     tissue, energy, dissipation = traced((tissue, energy, dissipation), tissue.vertices.dtype)
-    velocity = _recoil(tissue, energy, jnp.asarray(edge), dissipation, solver)
+    velocity = _recoil(tissue, energy, jnp.asarray(edge), dissipation, linear_solver)
     return checked(velocity, _REASON) if throw else velocity
 
 

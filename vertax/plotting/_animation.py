@@ -41,7 +41,7 @@ def animate(
     vmax: SupportsFloat | None = None,
     label: str | None = None,
     captions: Sequence[str] | None = None,
-    linger: SupportsFloat = 1.5,
+    last_frame_seconds: SupportsFloat = 1.5,
     dpi: int = 120,
 ) -> None:
     """Draw a trajectory as an animation, one picture a frame.
@@ -68,7 +68,7 @@ def animate(
     - `vmin`, `vmax`: limits of the colours; by default those of all frames together. Where values lie
         beyond, the bar has an arrow with the extreme value.
     - `captions`: a text above each frame.
-    - `linger`: additional duration of the last frame in seconds.
+    - `last_frame_seconds`: additional duration of the last frame in seconds.
     - `dpi`: pixels an inch; the tissue is about three inches wide.
 
     **Raises:**
@@ -79,13 +79,13 @@ def animate(
     - `OSError` if the file cannot be written.
     """
     frames = list(trajectory)
-    fps, linger = float(fps), float(linger)
-    _check(frames, fps, mark_t1, captions, linger, dpi)
+    fps, last_frame_seconds = float(fps), float(last_frame_seconds)
+    _check(frames, fps, mark_t1, captions, last_frame_seconds, dpi)
     write = _writer(path)
     values = _cell_values(cells, frames)
     pictures = _pictures(frames, values, Colours(cmap, vmin, vmax, label), captions, mark_t1, dpi)
     with atomic_draft(path) as draft:
-        write(draft, pictures, fps, linger)
+        write(draft, pictures, fps, last_frame_seconds)
 
 
 def animate_figures(
@@ -93,7 +93,7 @@ def animate_figures(
     path: str | os.PathLike[str],
     *,
     fps: SupportsFloat = 10.0,
-    linger: SupportsFloat = 1.5,
+    last_frame_seconds: SupportsFloat = 1.5,
     dpi: int = 100,
 ) -> None:
     """Write figures as an animation, one picture each; smaller ones have a white margin.
@@ -101,7 +101,7 @@ def animate_figures(
     **Arguments:**
 
     - `figures`: the figures, drawn one after the other.
-    - `path`, `fps`, `linger`, `dpi`: see [`animate`][vertax.animate].
+    - `path`, `fps`, `last_frame_seconds`, `dpi`: see [`animate`][vertax.animate].
 
     **Raises:** as [`animate`][vertax.animate].
     """
@@ -118,7 +118,7 @@ def animate_figures(
         for p in pictures
     )
     with atomic_draft(path) as draft:
-        write(draft, padded, float(fps), float(linger))
+        write(draft, padded, float(fps), float(last_frame_seconds))
 
 
 def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
@@ -154,7 +154,7 @@ def _check(
     fps: float,
     mark_t1: int,
     captions: Sequence[str] | None,
-    linger: float,
+    last_frame_seconds: float,
     dpi: int,
 ) -> None:
     if not frames:
@@ -168,7 +168,7 @@ def _check(
     for name, value in (("fps", fps), ("dpi", dpi)):
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
-    for name, value in (("mark_t1", mark_t1), ("linger", linger)):
+    for name, value in (("mark_t1", mark_t1), ("last_frame_seconds", last_frame_seconds)):
         if not value >= 0:
             raise ValueError(f"Argument `{name}` must not be negative, but is {value}.")
     if captions is not None and len(captions) != len(frames):
@@ -294,13 +294,15 @@ def _check_ffmpeg() -> None:
         )
 
 
-def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: float) -> None:
+def _write_gif(
+    path: Path, pictures: Iterator[np.ndarray], fps: float, last_frame_seconds: float
+) -> None:
     images = [Image.fromarray(pixels) for pixels in pictures]
     palette = _palette(images)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # The format counts in hundredths of a second, and viewers slow down frames shorter than two.
     frame = 10 * max(2, round(100 / fps))
-    durations = [frame] * (len(images) - 1) + [frame + round(1000 * linger)]
+    durations = [frame] * (len(images) - 1) + [frame + round(1000 * last_frame_seconds)]
     first, *others = indexed
     first.save(
         path, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=True
@@ -322,7 +324,9 @@ def _palette(images: list[Image.Image]) -> Image.Image:
     return palette
 
 
-def _write_video(path: Path, pictures: Iterator[np.ndarray], fps: float, linger: float) -> None:
+def _write_video(
+    path: Path, pictures: Iterator[np.ndarray], fps: float, last_frame_seconds: float
+) -> None:
     from matplotlib.animation import FFMpegWriter
 
     first = next(pictures)
@@ -338,5 +342,5 @@ def _write_video(path: Path, pictures: Iterator[np.ndarray], fps: float, linger:
         for pixels in pictures:
             shown.set_data(pixels)
             writer.grab_frame()
-        for _ in range(round(linger * fps)):
+        for _ in range(round(last_frame_seconds * fps)):
             writer.grab_frame()

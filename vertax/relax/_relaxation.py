@@ -79,7 +79,7 @@ class Relaxation(AbstractResponse):
         contact range.
     """
 
-    solver: optx.AbstractMinimiser[Any, Any, Any] = eqx.field(default_factory=NewtonCG)
+    solver: optx.AbstractMinimiser[Any, Any, Any] = NewtonCG()
     transitions: AbstractTransitions | None = T1()
     tolerance: float | Float[Array, ""] | None = None
     consecutive_steps: int | Int[Array, ""] = 1
@@ -113,7 +113,7 @@ class Relaxation(AbstractResponse):
         tissue: Tissue,
         energy: AbstractEnergy,
         *,
-        adjoint: AbstractAdjoint | None = None,
+        adjoint: AbstractAdjoint = ImplicitDifferentiation(),
         throw: bool = True,
     ) -> Equilibrium:
         """Relax a tissue.
@@ -130,7 +130,6 @@ class Relaxation(AbstractResponse):
 
         **Raises:** as [`equilibrate`][vertax.equilibrate].
         """
-        adjoint = ImplicitDifferentiation() if adjoint is None else adjoint
         self.check(tissue, energy, adjoint)
         warn_of_memory_maps()
         tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
@@ -276,8 +275,8 @@ def equilibrate(
     tissue: Tissue,
     energy: AbstractEnergy,
     *,
-    solver: optx.AbstractMinimiser[Any, Any, Any] | None = None,
-    adjoint: AbstractAdjoint | None = None,
+    solver: optx.AbstractMinimiser[Any, Any, Any] = NewtonCG(),
+    adjoint: AbstractAdjoint = ImplicitDifferentiation(),
     transitions: AbstractTransitions | None = T1(),
     tolerance: float | Float[Array, ""] | None = None,
     consecutive_steps: int | Int[Array, ""] = 1,
@@ -315,7 +314,6 @@ def equilibrate(
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge, or
         its cells overlap, as they already did in `tissue`.
     """
-    solver = NewtonCG() if solver is None else solver
     response = Relaxation(
         solver, transitions, tolerance, consecutive_steps, max_steps, contact_range
     )

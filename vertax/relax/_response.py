@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.results import RESULTS, checked
-from vertax.adjoints import AbstractAdjoint
+from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.precondition._recycled_hessian import RecycledHessian
@@ -73,7 +73,7 @@ class AbstractResponse(eqx.Module):
         tissue: Tissue,
         energy: AbstractEnergy,
         *,
-        adjoint: AbstractAdjoint | None = None,
+        adjoint: AbstractAdjoint = ImplicitDifferentiation(),
         throw: bool = True,
     ) -> Equilibrium:
         """The equilibrium.

@@ -18,12 +18,12 @@ from vertax.mesh import Tissue
 _INTEGRAL, _PROPORTIONAL, _SAFETY, _MIN_FACTOR, _MAX_FACTOR = 0.7, 0.4, 0.9, 0.2, 5.0
 
 
-class StepControl(eqx.Module):
+class PIController(eqx.Module):
     r"""Adaptive time steps: the largest that an error tolerance allows.
 
     ```python
-    control = vx.dynamics.StepControl(1e-4)
-    vx.evolve(tissue, energy, friction, [0.0, 1.0, 10.0], control=control)
+    control = vx.dynamics.PIController(1e-4)
+    vx.evolve(tissue, energy, friction, [0.0, 1.0, 10.0], stepsize_controller=control)
     ```
 
     Step doubling with a PI controller (Hairer & Wanner, Solving Ordinary Differential Equations II, IV.2):
@@ -39,8 +39,8 @@ class StepControl(eqx.Module):
     **Arguments:**
 
     - `tolerance`: of the error of one step, in units of the size of a cell.
-    - `first`: the first time step; by default a tenth of the time to the first frame.
-    - `most`: maximum number of steps per frame, including rejected ones. The memory of a gradient grows with
+    - `first_step`: the first time step; by default a tenth of the time to the first frame.
+    - `max_steps`: maximum number of steps per frame, including rejected ones. The memory of a gradient grows with
         it.
 
     **Raises:**
@@ -49,18 +49,18 @@ class StepControl(eqx.Module):
     """
 
     tolerance: float | Float[Array, ""] = 1e-3
-    first: float | Float[Array, ""] | None = None
-    most: int = eqx.field(default=100, static=True)
+    first_step: float | Float[Array, ""] | None = None
+    max_steps: int = eqx.field(default=100, static=True)
 
     def __check_init__(self):
         check_number("tolerance", self.tolerance, above=0)
-        if self.first is not None:
-            check_number("first", self.first, above=0)
-        check_integer("most", self.most, at_least=1)
+        if self.first_step is not None:
+            check_number("first_step", self.first_step, above=0)
+        check_integer("max_steps", self.max_steps, at_least=1)
 
     def begin(self, times: Float[Array, " times"]) -> Float[Array, ""]:
         """The first time step."""
-        first = 0.1 * (times[1] - times[0]) if self.first is None else self.first
+        first = 0.1 * (times[1] - times[0]) if self.first_step is None else self.first_step
         return jnp.asarray(first, times.dtype)
 
     def error(self, halves: Tissue, full: Tissue, order: int) -> Float[Array, ""]:

@@ -18,7 +18,7 @@ from helpers import (
 
 import vertax as vx
 from vertax.dissipations import SubstrateFriction
-from vertax.dynamics import StepControl
+from vertax.dynamics import PIController
 from vertax.energies import ShapeFactorEnergy
 
 FRICTION = SubstrateFriction(1.0)
@@ -50,7 +50,10 @@ def evolved(order=1, **settings):
 def test_error_scales_with_the_tolerance(order):
     exact = evolved(2, substeps=300).tissue.vertices
     tolerances = np.array([1e-3, 1e-4, 1e-5])
-    runs = [evolved(order, control=StepControl(tolerance, most=200)) for tolerance in tolerances]
+    runs = [
+        evolved(order, stepsize_controller=PIController(tolerance, max_steps=200))
+        for tolerance in tolerances
+    ]
     errors = np.array([jnp.max(jnp.abs(run.tissue.vertices - exact)) for run in runs])
     counts = np.array([(run.steps > 0).sum() for run in runs])
     # The tolerance is for the local error; the global error scales with the power p / (p + 1).
@@ -83,13 +86,13 @@ def test_gradient_at_fixed_step_sizes():
             SubstrateFriction(friction),
             [0.0, 0.4],
             relaxation=precise_relaxation,
-            control=control,
+            stepsize_controller=control,
             throw=False,
         )
         return jnp.sum(weights * movie.tissue.vertices**2), movie.steps[1]
 
     # With this tolerance a small change of the friction does not change the step sizes.
-    control = StepControl(1.0, first=0.05, most=8)
+    control = PIController(1.0, first_step=0.05, max_steps=8)
     friction = jnp.linspace(0.8, 1.2, tissue.n_vertices)
     gradient, steps = jax.grad(cost, has_aux=True)(friction, control)
     assert 1 < (steps > 0).sum() < 8
@@ -105,8 +108,10 @@ def test_gradient_at_fixed_step_sizes():
 def test_rejected_steps_do_not_change_the_state():
     tissue, energy = random_tissue(9, 0), ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
     times = [0.0, 0.1, 0.3]
-    control = StepControl(2e-3, first=0.1, most=60)
-    run = vx.evolve(tissue, energy, FRICTION, times, relaxation=NO_CONTACT, control=control)
+    control = PIController(2e-3, first_step=0.1, max_steps=60)
+    run = vx.evolve(
+        tissue, energy, FRICTION, times, relaxation=NO_CONTACT, stepsize_controller=control
+    )
     assert run.num_rejected.sum() > 0  # the first step is far too long
     assert run.num_t1 == run.transitions.sum() > 0
     assert (jnp.diff(run.energies) < 0).all()
@@ -117,20 +122,20 @@ def test_rejected_steps_do_not_change_the_state():
 
 class TestErrors:
     def test_numbers_must_be_positive(self):
-        for settings in ({"tolerance": 0.0}, {"first": -1.0}, {"most": 0}):
+        for settings in ({"tolerance": 0.0}, {"first_step": -1.0}, {"max_steps": 0}):
             with pytest.raises(ValueError, match=next(iter(settings))):
-                StepControl(**settings)  # pyright: ignore[reportArgumentType]
+                PIController(**settings)  # pyright: ignore[reportArgumentType]
 
     def test_incompatible_arguments_raise(self, without_type_checks):
-        control = StepControl()
+        control = PIController()
         with pytest.raises(ValueError, match="does not go with `substeps`"):
-            vx.Evolution(FRICTION, [0.0, 1.0], control=control, substeps=2)
+            vx.Evolution(FRICTION, [0.0, 1.0], stepsize_controller=control, substeps=2)
         noise = vx.activities.ThermalNoise(0.1)
         with pytest.raises(ValueError, match="does not go with `activity`: random numbers"):
-            vx.Evolution(FRICTION, [0.0, 1.0], control=control, activity=noise, key=0)
-        with pytest.raises(TypeError, match="`control` must be a"):
-            vx.Evolution(FRICTION, [0.0, 1.0], control=0.1)  # pyright: ignore[reportArgumentType]
+            vx.Evolution(FRICTION, [0.0, 1.0], stepsize_controller=control, activity=noise, key=0)
+        with pytest.raises(TypeError, match="`stepsize_controller` must be a"):
+            vx.Evolution(FRICTION, [0.0, 1.0], stepsize_controller=0.1)  # pyright: ignore[reportArgumentType]
 
     def test_too_few_steps_raise(self):
-        with pytest.raises(RuntimeError, match="Raise `most` of the `StepControl`"):
-            evolved(control=StepControl(1e-6, most=3))
+        with pytest.raises(RuntimeError, match="Raise `max_steps` of the `PIController`"):
+            evolved(stepsize_controller=PIController(1e-6, max_steps=3))
