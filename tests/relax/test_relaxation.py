@@ -191,7 +191,13 @@ def test_another_number_compiles_nothing():
 
     default = vx.ImplicitDifferentiation()
 
-    def relax(p0: float, tolerance: float, max_steps: int, threshold: float, adjoint=default):
+    def relax(
+        p0: float,
+        tolerance: float,
+        max_steps: int,
+        threshold: float,
+        adjoint: vx.adjoints.AbstractAdjoint = default,
+    ):
         rule = vx.T1(threshold)
         settings = {"tolerance": tolerance, "max_steps": max_steps, "transitions": rule}
         settings["contact_range"] = None

@@ -52,8 +52,8 @@ class Evolution(AbstractResponse):
     - `key`: the random key or seed of the activity. Each step uses a new key that is split from it.
     - `drive`: instead of a key, the field `drive` of an [`Evolved`][vertax.dynamics.Evolved] to continue.
     - `substeps`: steps per frame.
-    - `stepsize_controller`: instead of `substeps`, a [`PIController`][vertax.dynamics.PIController]: step sizes from an
-        error tolerance.
+    - `stepsize_controller`: instead of `substeps`, a [`PIController`][vertax.dynamics.PIController]: step
+        sizes from an error tolerance.
     - `order`: 1, or 2 for two stages per step (an SDIRK method, stable for every $\Delta t$, but the energy
         may increase). Order 2 requires a dissipation that is half a sum of squares.
     - `boundary`: a function of time that returns the boundary, such as a sheared box. The tissue is mapped
@@ -133,8 +133,8 @@ class Evolution(AbstractResponse):
             )
         if not isinstance(stepsize_controller, PIController | None):
             raise TypeError(
-                "Argument `stepsize_controller` must be a vertax.dynamics.PIController, e.g. PIController(1e-3), but is "
-                f"{describe(stepsize_controller)}."
+                "Argument `stepsize_controller` must be a vertax.dynamics.PIController, e.g. "
+                f"PIController(1e-3), but is {describe(stepsize_controller)}."
             )
         if stepsize_controller is not None and (substeps != 1 or activity is not None):
             conflict = "`substeps`" if activity is None else "`activity`"
@@ -325,8 +325,8 @@ def evolve(
         differentiate with respect to its fields).
     - `dissipation`: the dissipation $R$.
     - `times`: the times of the frames, increasing.
-    - `activity`, `key`, `drive`, `substeps`, `stepsize_controller`, `order`, `boundary`, `pins`, `relaxation`:
-        see [`Evolution`][vertax.Evolution].
+    - `activity`, `key`, `drive`, `substeps`, `stepsize_controller`, `order`, `boundary`, `pins`,
+        `relaxation`: see [`Evolution`][vertax.Evolution].
     - `adjoint`: the differentiation method of each step,
         [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by default.
     - `throw`: raise an error if a step does not converge. If False, check `converged`.

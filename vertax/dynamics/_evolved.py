@@ -38,7 +38,7 @@ class Evolved(Equilibrium):
     steps: Float[Array, "*batch times steps"]
     """Sizes of the time steps since the previous frame, padded with 0."""
     num_rejected: Int[Array, "*batch times"]
-    """Number of rejected steps since the previous frame, see [`PIController`][vertax.dynamics.PIController]."""
+    """Number of rejected steps since the frame before, see [`PIController`][vertax.dynamics.PIController]."""
 
     @property
     def flipped(self) -> Bool[Array, "*batch times edges"]:

@@ -40,8 +40,8 @@ class PIController(eqx.Module):
 
     - `tolerance`: of the error of one step, in units of the size of a cell.
     - `first_step`: the first time step; by default a tenth of the time to the first frame.
-    - `max_steps`: maximum number of steps per frame, including rejected ones. The memory of a gradient grows with
-        it.
+    - `max_steps`: maximum number of steps per frame, including rejected ones. The memory of a gradient
+        grows with it.
 
     **Raises:**
 
