@@ -72,7 +72,6 @@ def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     np.testing.assert_allclose(pair[apart], 0.4)
 
 
-@pytest.mark.xfail(strict=True, reason="edges shorter than the noise bias the fit")
 def test_errors_by_tracking_noise_are_covered(evolved):
     errors, deviations = [], []
     for seed in range(6):
@@ -80,9 +79,14 @@ def test_errors_by_tracking_noise_are_covered(evolved):
         errors.append(fit.energy.terms[1].tension - TABLE[jnp.triu_indices(2)])
         deviations.append(fit.deviation.terms[1].tension)
     ratio = np.abs(np.array(errors) / np.array(deviations))
-    assert np.mean(ratio < 2) > 0.7
-    assert np.max(ratio) < 6
-    assert np.max(np.abs(errors)) < 0.1
+    assert np.mean(ratio < 1) > 0.4
+    assert np.mean(ratio < 2) > 0.8
+    assert np.max(np.abs(errors)) < 0.03
+    # With short edges the fit is biased by more than its standard error.
+    options = {"friction": FRICTION, "noise": 0.005, "min_edge_length": 0.0}
+    biased = fit_movie(noisy(evolved, 0.005, 0), GUESS, **options)
+    bias = biased.energy.terms[1].tension - TABLE[jnp.triu_indices(2)]
+    assert np.abs(np.mean(bias)) > 3 * np.abs(np.mean(errors))
 
 
 def test_windows_are_fitted_in_parallel(movie):

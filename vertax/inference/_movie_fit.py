@@ -49,6 +49,8 @@ class _Settings(eqx.Module):
     friction: Float[Array, ""]
     noise: Float[Array, ""]
     implicitness: Float[Array, ""]
+    min_edge_length: Float[Array, ""]
+    """In units of length."""
     fit_friction: bool = eqx.field(static=True)
     outline: bool = eqx.field(static=True)
 
@@ -74,6 +76,7 @@ def fit_movie(
     fit_friction: bool = False,
     noise: float = 0.0,
     implicitness: float = 1.0,
+    min_edge_length: float = 4.0,
     outline: bool = True,
     windows: int | None = None,
     max_steps: int = 30,
@@ -98,9 +101,11 @@ def fit_movie(
     with the tracking noise $\sigma$, the rows $\nabla\nabla E_v$ of its Hessian (estimated by random
     vectors), and a variance $s^2$ that explains the remaining residuals. Standard errors are those of the
     sandwich formula over steps, with the correlation of successive steps (Newey and West 1987,
-    doi:10.2307/1913610); they require more steps than parameters. **They are too small** where edges are
-    shorter than the tracking noise: then the fit is biased, and in tests with 16 cells two of five errors
-    were within two standard errors. Leave such frames out, or vary the noise to judge the errors.
+    doi:10.2307/1913610); they require more steps than parameters.
+
+    The direction of an edge of length $\ell$ is biased by noise, by about $(\sigma / \ell)^2$. So a vertex
+    counts only if its edges in frame $n - 1$ are longer than `min_edge_length` times $\sigma$; errors of that
+    frame are independent of those of $r$.
 
     | symbol | argument | choose |
     |---|---|---|
@@ -127,6 +132,7 @@ def fit_movie(
         forces, such as a known stiffness.
     - `noise`: standard deviation $\sigma$ of tracked positions, in units of length.
     - `implicitness`: $\alpha$, from 0.5 to 1.
+    - `min_edge_length`: length of the shortest edge of a vertex that is used, in units of `noise`.
     - `outline`: whether to use vertices on the outline; False for a part of a tissue.
     - `windows`: split the steps into this number of parts and fit each, in parallel.
     - `max_steps`: largest number of Newton steps; one is enough for parameters of which forces are linear
@@ -144,6 +150,7 @@ def fit_movie(
     check_number("noise", noise, at_least=0)
     if not 0.5 <= implicitness <= 1:
         raise ValueError(f"Argument `implicitness` must be from 0.5 to 1, but is {implicitness}.")
+    check_number("min_edge_length", min_edge_length, at_least=0)
     check_integer("max_steps", max_steps, at_least=1)
     n_steps = movie.n_frames - 2
     if n_steps < 1:
@@ -166,8 +173,9 @@ def fit_movie(
     dtype = movie.tissue.vertices.dtype
     zeta = jnp.asarray(friction, dtype)
     theta = jnp.append(theta, zeta) if fit_friction else theta
-    numbers = (zeta, jnp.asarray(noise, dtype), jnp.asarray(implicitness, dtype))
-    settings = _Settings(static, unravel, *numbers, fit_friction, outline)
+    numbers = (noise, implicitness, min_edge_length * noise)
+    arrays = (jnp.asarray(number, dtype) for number in numbers)
+    settings = _Settings(static, unravel, zeta, *arrays, fit_friction, outline)
     parts = np.array_split(np.arange(n_steps), n_windows)
     steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
     used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
@@ -177,7 +185,8 @@ def fit_movie(
     if not np.all(fits.num_equations > 0):
         raise ValueError(
             "Argument `movie` must have vertices that join the same three cells in three successive frames, "
-            "but has none. Take frames in shorter intervals."
+            "with edges longer than `min_edge_length` times `noise`, but has none. Take frames in shorter "
+            "intervals, or a smaller `min_edge_length`."
         )
     first = lambda x: x[0] if eqx.is_array(x) else x
     return fits if windows is not None else jax.tree.map(first, fits)
@@ -262,6 +271,8 @@ def _equations(
     to_before, in_before = matching_vertices(end, before)
     to_start, in_start = matching_vertices(end, start)
     use = in_before & in_start & used
+    shortest = before.edge_lengths[before.topology.edge.reshape(-1, 3)].min(axis=1)
+    use &= take(shortest, to_before) > settings.min_edge_length
     cells = end.topology.cell.reshape(-1, 3)
     use &= jnp.all(cells != end.n_cells + 1, axis=1)
     if not settings.outline:
