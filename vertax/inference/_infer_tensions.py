@@ -93,9 +93,10 @@ def infer_tensions(
     - `edges`: `"arcs"`, whose curvature determines pressures; `"straight"`, with the pressures acting on
         vertices (Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017); by default, of a tissue with
         arcs the one of the larger evidence, see `InferredTensions.edges`.
-    - `noise`: standard deviation of the position of an edge, in units of length; by default the root mean
-        square distance of pixels (or the points of a foam) from curves, 0.002 cell diameters for a tissue
-        of arcs, and chosen by the evidence for a tissue with straight edges.
+    - `noise`: standard deviation of the position of an edge, in pixels of a mask and otherwise in units of
+        length; by default the root mean square distance of pixels (or the points of a foam) from curves,
+        0.002 cell diameters for a tissue of arcs, and chosen by the evidence for a tissue with straight
+        edges.
     - `prior`: standard deviation of the prior of relative tensions about 1, independent of each other; by
         default chosen by the evidence (marginal likelihood), with a part that is similar in regions. A small
         one makes tensions too uniform.
@@ -136,7 +137,7 @@ def infer_tensions(
         )
         source = _across_lines(source, line_width)
     if isinstance(source, Segmentation):
-        course = _of_mask(source)
+        course = _of_mask(source, noise)
     elif isinstance(source, Foam):
         course = _of_foam(source, noise)
     elif isinstance(source, Tissue):
@@ -163,10 +164,9 @@ def infer_tensions(
     uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
-    noise = course.noise if noise is None else noise
-    curves = fit(geometry, points, course.grain, apart=course.apart, noise=noise)
+    curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
     solve_as = partial(
-        solution, geometry, curves, uncertain, known_noise=noise is not None, prior=prior
+        solution, geometry, curves, uncertain, known_noise=course.noise is not None, prior=prior
     )
     solved = solve_as(straight=edges == "straight" or not tissue.inner_arcs)
     if edges is None and tissue.inner_arcs:
@@ -195,6 +195,7 @@ class _Course(NamedTuple):
     apart: float | None
     """Distance along an edge at which the errors of two points are independent; None if it is estimated."""
     noise: float | None
+    """Standard deviation of a point, a length; None if it is estimated."""
     pixel_size: PixelSize | None
     report: MaskReport | None = None
 
@@ -219,7 +220,7 @@ def _across_lines(source: Segmentation, line_width: float) -> Segmentation:
     return dataclasses.replace(source, report=report)
 
 
-def _of_mask(source: Segmentation) -> _Course:
+def _of_mask(source: Segmentation, noise: float | None) -> _Course:
     if source.courses is None:
         raise ValueError(
             "Argument `segmentation_or_mask` must hold the courses of its edges, as "
@@ -238,9 +239,9 @@ def _of_mask(source: Segmentation) -> _Course:
     course = source.courses.points[source.courses.shown]
     points = Points(edge, course - np.asarray(source.tissue.vertices)[first][edge])
     pixel = pixel_length(source.pixel_size)
-    return _Course(
-        source.tissue, source.labels, points, pixel, None, None, source.pixel_size, source.report
-    )
+    noise = None if noise is None else noise * pixel
+    tissue, labels, size = source.tissue, source.labels, source.pixel_size
+    return _Course(tissue, labels, points, pixel, None, noise, size, source.report)
 
 
 def _of_foam(source: Foam, noise: float | None) -> _Course:
@@ -250,7 +251,7 @@ def _of_foam(source: Foam, noise: float | None) -> _Course:
     same = edge[1:] == edge[:-1]
     apart = float(np.mean(np.linalg.norm(np.diff(away, axis=0), axis=1)[same]))
     grain = _GRAIN * observed_geometry(tissue).size if noise is None else noise
-    return _Course(tissue, source.bodies, Points(edge, away), grain, apart, None, None)
+    return _Course(tissue, source.bodies, Points(edge, away), grain, apart, noise, None)
 
 
 def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:

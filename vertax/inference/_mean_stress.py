@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -11,7 +10,7 @@ from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
 
-class MeanStress(NamedTuple):
+class MeanStress(eqx.Module):
     r"""Mean stress of the cells whose edges all have an inferred tension (Batchelor 1970,
     doi:10.1017/S0022112070000745),
 

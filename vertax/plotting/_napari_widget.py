@@ -10,7 +10,7 @@ from magicgui import widgets  # pyright: ignore[reportMissingImports]
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from napari.layers import Labels  # pyright: ignore[reportMissingImports]
@@ -23,12 +23,11 @@ from napari.utils.notifications import (  # pyright: ignore[reportMissingImports
 )
 
 from vertax._base.compilation_cache import enable_compilation_cache
-from vertax.inference import InferredTensions, MaskFrame, TensionsOfMasks, length_unit
+from vertax.inference import InferredTensions, MaskFrame, TensionsOfMasks
 from vertax.plotting._napari import limits, tension_colours, tension_layer
+from vertax.plotting._tension_map import PRESSURE_COLOURS
 
 _TENSIONS = "plasma"
-# Without the palest end, which looks like no colour.
-_BLUES = ListedColormap(colormaps["Blues"](np.linspace(0.15, 1, 256)), "pressures")
 # Width and height of the colour bars in pixels.
 _BARS = 320, 150
 
@@ -98,8 +97,9 @@ class TensionsWidget(widgets.Container):
         def end() -> None:
             self.start.enabled, self.progress.visible = True, False
             if results:
-                unit = length_unit(options["pixel_size"])
-                self.tensions = TensionsOfMasks(results, failures, unit)  # pyright: ignore[reportArgumentType]
+                scaled = options["pixel_size"] is not None
+                unit = {"length_unit": "unit of the scale of the layer"} if scaled else {}
+                self.tensions = TensionsOfMasks(results, failures, **unit)  # pyright: ignore[reportArgumentType]
                 self.export.enabled = True
                 self._show(layer, masks, results)
 
@@ -190,7 +190,7 @@ def _rows(mask: np.ndarray, labels: np.ndarray, first: int) -> np.ndarray:
 
 def _label_colours(pressure: np.ndarray) -> DirectLabelColormap:
     """A colour for each row of the table of cells, grey where the pressure is not determined."""
-    colour = _BLUES(Normalize(*limits(pressure))(np.nan_to_num(pressure)))
+    colour = PRESSURE_COLOURS(Normalize(*limits(pressure))(np.nan_to_num(pressure)))
     colour[~np.isfinite(pressure)] = (0.5, 0.5, 0.5, 1.0)
     colours: dict[int | None, Any] = {row + 1: each for row, each in enumerate(colour)}
     return DirectLabelColormap(color_dict=colours | {None: np.zeros(4), 0: np.zeros(4)})
@@ -204,7 +204,7 @@ def _colour_bars(tension: tuple[float, float], pressure: tuple[float, float]) ->
         figure.subplots(2, 1),
         ("tension / mean tension", "pressure less the mean"),
         (tension, pressure),
-        (colormaps[_TENSIONS], _BLUES),
+        (colormaps[_TENSIONS], PRESSURE_COLOURS),
         strict=True,
     ):
         figure.colorbar(
