@@ -14,7 +14,7 @@ from jaxtyping import Array, Shaped
 
 from vertax.inference._infer_tensions import infer_tensions, pixels_of_file
 from vertax.inference._inferred import InferredTensions
-from vertax.inference._mask import read_mask
+from vertax.inference._mask import load_array, read_mask
 from vertax.initialise._mask_arguments import without_single_axes
 from vertax.io import read_stack
 
@@ -138,7 +138,7 @@ def _frames_of(file: Path) -> list[MaskFrame]:
     if file.suffix.lower() not in (".npy", ".tif", ".tiff") or file.name.endswith("_seg.npy"):
         return single
     try:
-        pixels = np.load(file) if file.suffix == ".npy" else read_stack(file)
+        pixels = load_array(file) if file.suffix == ".npy" else read_stack(file)
     except (
         ValueError
     ):  # colours, or a file that cannot be read: the reader of masks has the message

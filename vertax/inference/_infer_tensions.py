@@ -41,12 +41,7 @@ _EVOLVER = (".dmp", ".fe")
 @announce_compilations("measurements of a tissue")
 @one_blas_thread()
 def infer_tensions(
-    segmentation_or_mask: Segmentation
-    | Foam
-    | Tissue
-    | Shaped[np.ndarray | Array, "..."]
-    | str
-    | os.PathLike[str],
+    mask: Segmentation | Foam | Tissue | Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
     *,
     kind: str = "auto",
     plane: int | None = None,
@@ -81,7 +76,7 @@ def infer_tensions(
 
     **Arguments:**
 
-    - `segmentation_or_mask`: a label image, or an image of outlines, as an array or a file (see
+    - `mask`: a label image, or an image of outlines, as an array or a file (see
         [`read_mask`][vertax.inference.read_mask]); a dump of Surface Evolver; or a
         [`Segmentation`][vertax.initialise.Segmentation], [`Foam`][vertax.io.Foam] or
         [`Tissue`][vertax.Tissue] with arcs.
@@ -120,15 +115,15 @@ def infer_tensions(
         raise ValueError(
             f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
         )
-    source = segmentation_or_mask
+    source = mask
     if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in _EVOLVER:
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
-        mask, line_width = labels_and_lines(source, kind, background, plane)
+        labels, line_width = labels_and_lines(source, kind, background, plane)
         if pixel_size is None and isinstance(source, str | os.PathLike):
-            pixel_size = pixels_of_file(Path(source), mask)
+            pixel_size = pixels_of_file(Path(source), labels)
         source = from_labels(
-            mask,
+            labels,
             boundary="free",
             pixel_size=pixel_size,
             gap_width=gap_width,
@@ -144,8 +139,8 @@ def infer_tensions(
         course = _of_tissue(source, noise)
     else:
         raise TypeError(
-            "Argument `segmentation_or_mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
-            f"is {describe(segmentation_or_mask)}."
+            "Argument `mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
+            f"is {describe(mask)}. For several masks use vx.inference.infer_tensions_of_masks."
         )
     tissue, report = course.tissue, course.report
     if edges == "arcs" and not tissue.inner_arcs:
@@ -158,7 +153,7 @@ def infer_tensions(
     which = equations(geometry)
     if len(which.junctions) == 0:
         raise ValueError(
-            "Argument `segmentation_or_mask` must have a place where three of its cells meet, but it has "
+            "Argument `mask` must have a place where three of its cells meet, but it has "
             "none: the forces at its outline are unknown. Take a larger tissue."
         )
     uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
@@ -223,14 +218,14 @@ def _across_lines(source: Segmentation, line_width: float) -> Segmentation:
 def _of_mask(source: Segmentation, noise: float | None) -> _Course:
     if source.courses is None:
         raise ValueError(
-            "Argument `segmentation_or_mask` must hold the courses of its edges, as "
+            "Argument `mask` must hold the courses of its edges, as "
             "vx.initialise.from_labels returns them. Pass its mask, or its tissue."
         )
     cells = source.labels[source.labels > 0]  # several holes have the label 0
     copies = len(np.unique(cells)) < len(cells)
     if copies or (not source.complete.all() and source.tissue.topology.exterior is False):
         raise ValueError(
-            "Argument `segmentation_or_mask` must not be mirrored at its border, where no forces "
+            "Argument `mask` must not be mirrored at its border, where no forces "
             "balance. Use vx.initialise.from_labels(mask, boundary='free')."
         )
     first = geometry_of(source.tissue).edge_vertices[:, 0]

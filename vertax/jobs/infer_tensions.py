@@ -48,9 +48,14 @@ class ImageSection(runs.ImageFile):
     def frames(self) -> list[inference.MaskFrame]:
         """The masks."""
         assert self.path is not None  # TOML has no null
+        plane = self.plane if self.channel is None else self.plane or 0
+        try:
+            files = inference.find_masks(self.path, plane=plane)
+        except FileNotFoundError as error:
+            text = str(error).replace("Argument `masks`", "`image.path`")
+            raise runs.ConfigError(text) from error
         if self.channel is None:
-            return inference.find_masks(self.path, plane=self.plane)
-        files = inference.find_masks(self.path, plane=self.plane or 0)
+            return files
         read = lambda file: self.model_copy(update={"path": str(file)}).read()
         return [f._replace(source=read(f.source), file=f.source) for f in files]
 
