@@ -94,6 +94,7 @@ def test_several_masks_have_one_table_and_an_animation(several, tmp_path):
     assert frames["frame"] == ["m2.npy", "m10.npy", "m3.npy"]
     assert frames["error"][:2] == ["", ""]
     assert frames["error"][2] == metrics["failed"]["m3.npy"]
+    assert any(text.startswith("m3.npy: no result") for text in metrics["warnings"])
     for name in ("cells", "edges", "changes", "frames"):
         columns = table(folder / "columns.csv")
         described = [

@@ -32,7 +32,7 @@ _COLUMNS = {
     "stress_xy": ("mean tension / L", f"stress; {_Y}"),
     "stress_yy": ("mean tension / L", "stress"),
     "hole": ("", "whether the face is a hole, which is no cell"),
-    "pixels": ("pixel", "number of pixels in the mask"),
+    "pixels": ("pixel", "number of pixels, after the changes of the mask"),
     "area_error": ("1", "area over that of the pixels, less 1"),
     "outline_error": ("pixel", "root mean square distance of the outline from its arcs"),
     "edge": ("", "number of the edge in its frame, from 0"),

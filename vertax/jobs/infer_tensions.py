@@ -127,6 +127,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     for name, result in masks.results.items():
         for warning in result.warnings:
             folder.warn(warning, str(name) if len(frames) > 1 else None)
+    for name, error in masks.failures.items():
+        folder.warn(f"no result: {error.removesuffix('.')}", str(name))
     if len(frames) > 1:
         folder.print_step("maps")
         maps = draw_maps(folder, frames, masks, reading)
