@@ -170,8 +170,7 @@ def draw_maps(
     ):
         values = table[key][table["determined"]]
         if values.size:
-            low, high = np.quantile(values, (0.005, 0.995))
-            limits |= {f"{prefix}vmin": float(low), f"{prefix}vmax": float(high)}
+            limits |= {f"{prefix}vmin": values.min(), f"{prefix}vmax": values.max()}
     for frame in frames:
         if frame.name in masks.results:
             mask = frame.mask(**reading)
