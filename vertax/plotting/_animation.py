@@ -105,6 +105,8 @@ def animate_figures(
 
     **Raises:** as [`animate`][vertax.animate].
     """
+    fps, linger = float(fps), float(linger)
+    _check_timing(fps, linger, dpi)
     write = _writer(path)
     pictures = []
     for figure in figures:
@@ -118,7 +120,7 @@ def animate_figures(
         for p in pictures
     )
     with atomic_draft(path) as draft:
-        write(draft, padded, float(fps), float(linger))
+        write(draft, padded, fps, linger)
 
 
 def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
@@ -165,17 +167,22 @@ def _check(
             "Argument `trajectory` must hold single tissues of one size, but their vertices have the "
             f"shapes {sorted(sizes)}."
         )
-    for name, value in (("fps", fps), ("dpi", dpi)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
-    for name, value in (("mark_t1", mark_t1), ("linger", linger)):
-        if not value >= 0:
-            raise ValueError(f"Argument `{name}` must not be negative, but is {value}.")
+    _check_timing(fps, linger, dpi)
+    if not mark_t1 >= 0:
+        raise ValueError(f"Argument `mark_t1` must not be negative, but is {mark_t1}.")
     if captions is not None and len(captions) != len(frames):
         raise ValueError(
             f"Argument `captions` must have one text for each of the {len(frames)} frames, but has "
             f"{len(captions)}."
         )
+
+
+def _check_timing(fps: float, linger: float, dpi: int) -> None:
+    for name, value in (("fps", fps), ("dpi", dpi)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+    if not linger >= 0:
+        raise ValueError(f"Argument `linger` must not be negative, but is {linger}.")
 
 
 def _cell_values(cells: CellValues | None, frames: list[Tissue]) -> np.ndarray | None:
