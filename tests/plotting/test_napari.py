@@ -88,6 +88,8 @@ data, table = layer.data, pressures.features
 np.testing.assert_array_equal(table["label"].to_numpy()[pressures.data[data > 0]], data[data > 0])
 np.testing.assert_array_equal(table["frame"].to_numpy()[pressures.data[1][data[1] > 0]], 1)
 assert not widget.bars.native.isHidden() and not layer.visible
+widget.write()  # without a folder
+assert not list(pathlib.Path(".").glob("*.csv"))
 widget.file.value = "tables"
 widget.write()
 assert (pathlib.Path("tables") / "columns.csv").exists()

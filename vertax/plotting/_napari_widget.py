@@ -96,6 +96,9 @@ class TensionsWidget(widgets.Container):
     def write(self) -> None:
         """Write the tables to the chosen folder."""
         assert self.tensions is not None
+        if not self.file.line_edit.value:
+            show_warning("Choose a folder for the tables first.")
+            return
         files = self.tensions.write(self.file.value)
         show_info(f"Wrote {', '.join(file.name for file in files)} to {self.file.value}.")
 
