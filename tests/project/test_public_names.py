@@ -28,8 +28,8 @@ PACKAGES = {
     "PerimeterViscosity SubstrateFriction Sum ViscositySum",
     "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
     "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum TypeTension by_type",
-    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty fit_warnings "
-    "fit limits member stack stack_fits uncertainty",
+    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty fit "
+    "fit_warnings limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
     "inference": "EdgeMotion Event InferredTensions MaskFrame Micrograph Microscope Movie MovieFit "
     "MovingTensions PinnedEnergy RecoveryWatch Scene TensionsOfMasks Transition "
