@@ -24,7 +24,7 @@ from experiments import (
     tissue_moduli,
 )
 from vertax.inference._mean_stress import mean_stress
-from vertax.jobs import design_mechanics, infer_from_microscopy, infer_tensions
+from vertax.jobs import design_mechanics, infer_from_microscopy
 from vertax.plotting import label_colours
 
 pytestmark = pytest.mark.experiments
@@ -119,7 +119,7 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
         pixel_size=0.4,
         four_fold=edges < 0,
     )
-    left, right = panels(infer_tensions.plot_foam(picture, infer_tensions.inferred(result)))
+    left, right = panels(vx.plotting.plot_tensions(result, labels))
     np.testing.assert_allclose(left.images[0].get_array(), picture)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 7
     assert (left.get_xlim(), left.get_ylim()) == (right.get_xlim(), right.get_ylim())

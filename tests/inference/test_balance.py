@@ -256,7 +256,7 @@ def test_a_binary_mask_without_lines_is_refused(foam):
 def test_labels_from_which_1_was_subtracted_are_refused(foam, dtype, read):
     labels = label_image(foam[0], 200).astype(dtype)
     shifted = labels - dtype(1)  # the background is -1 or 255, one cell is 0
-    with pytest.raises(ValueError, match=r"has the label 0 beside (-1|255).*pass image \+ 1"):
+    with pytest.raises(ValueError, match=r"has the label 0 beside (-1|255).*pass mask \+ 1"):
         read(shifted)
     np.testing.assert_array_equal(shifted + dtype(1), labels)
     if dtype is np.int32:

@@ -1,10 +1,11 @@
 """Tensions of folders, patterns, lists and movies of masks."""
 
+import jax
 import numpy as np
 import pytest
 from test_damaged_masks import mask as mask
 
-from vertax.inference import find_masks, infer_tensions, infer_tensions_of_masks
+from vertax.inference import MaskFrame, find_masks, infer_tensions, infer_tensions_of_masks
 from vertax.io import read_table
 
 
@@ -52,11 +53,44 @@ def test_frames_of_a_movie_need_no_plane(mask, tmp_path):
     assert [frame.name for frame in find_masks(file, plane=1)] == ["movie.tif"]
 
 
+def test_finished_masks_are_read_from_the_cache(mask, tmp_path, monkeypatch):
+    damaged = np.where(mask == 3, 0, mask)
+    masks, cache = [damaged, mask[:, ::2]], tmp_path / "cache"
+    options = {"pixel_size": (1.0, 2.0), "cache": cache, "progress": False}
+    first = infer_tensions_of_masks(masks, **options)
+    infer = MaskFrame.infer
+    calls = []
+    monkeypatch.setattr(
+        MaskFrame, "infer", lambda self, **o: calls.append(self) or infer(self, **o)
+    )
+    second = infer_tensions_of_masks(masks, **options)
+    assert calls == []
+    assert jax.tree.structure(first) == jax.tree.structure(second)
+    jax.tree.map(np.testing.assert_array_equal, first, second)  # NaN is equal to NaN
+    for one, other in zip(first.write(tmp_path / "a"), second.write(tmp_path / "b"), strict=True):
+        assert one.read_text() == other.read_text()
+    assert len(first.change_table()["kind"]) > 0
+    # Other pixels and other options are computed.
+    infer_tensions_of_masks([mask, mask[:, ::2]], **options)
+    assert len(calls) == 1
+    infer_tensions_of_masks(masks, **options, holes="close")
+    assert len(calls) == 3
+
+
+def test_the_noise_of_a_mask_is_in_pixels(mask):
+    one, other = (infer_tensions(mask, noise=0.3, pixel_size=size) for size in (1.0, 5.0))
+    assert other.noise == pytest.approx(5 * one.noise)
+    assert one.noise == pytest.approx(0.3, rel=0.5)
+    np.testing.assert_allclose(one.tension_deviations, other.tension_deviations, rtol=1e-3)
+
+
 def test_wrong_options_and_empty_sources_raise(mask, tmp_path):
     with pytest.raises(TypeError, match="gap_with"):
         infer_tensions_of_masks([mask], gap_with=3)
-    with pytest.raises(ValueError, match=r"all 1 failed; 0: Argument `prior`"):
+    with pytest.raises(ValueError, match=r"^Argument `prior`"):
         infer_tensions_of_masks([mask], prior=-1.0, progress=False)
+    with pytest.raises(ValueError, match=r"all 2 failed; 0: Argument `prior`"):
+        infer_tensions_of_masks([mask, mask], prior=-1.0, progress=False)
     with pytest.raises(FileNotFoundError, match="files by the pattern"):
         find_masks(str(tmp_path / "*.tif"))
 

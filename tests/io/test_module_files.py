@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 import vertax as vx
 from vertax.io import load_energy, load_problem, save_energy, save_problem
-from vertax.io._module_file import _public_classes, _save
+from vertax.io._module_file import _public_classes, save_module
 from vertax.solvers._stop_at_rest import AtRest
 
 
@@ -298,9 +298,9 @@ class TestRefusedToSave:
 
     def test_something_else(self, path, tissues):
         with pytest.raises(TypeError, match="`energy` must be an AbstractEnergy, but is Tissue"):
-            _save(path, "energy", tissues["free"], vx.AbstractEnergy)
+            save_module(path, "energy", tissues["free"], vx.AbstractEnergy)
         with pytest.raises(TypeError, match="`problem` must be an InverseProblem"):
-            _save(path, "problem", ENERGIES["arrays"], vx.InverseProblem)
+            save_module(path, "problem", ENERGIES["arrays"], vx.InverseProblem)
 
     def test_the_remedies_work(self, path, tissues):
         response = vx.Relaxation(vx.solvers.Optax(optax.adam(1e-2)))

@@ -8,6 +8,7 @@ import pytest
 from free_helpers import cluster
 from helpers import random_tissue
 from matplotlib.animation import FFMpegWriter
+from matplotlib.figure import Figure
 from PIL import Image
 
 import vertax as vx
@@ -127,6 +128,46 @@ def test_invalid_arguments_raise(way, tmp_path, monkeypatch, changes, message):
     with pytest.raises(ValueError, match=message):
         vx.animate(**({"trajectory": way, "path": "way.gif"} | changes))
     assert list(tmp_path.iterdir()) == []
+
+
+def plain_figure(width, colour):
+    return Figure(figsize=(width, 1.0), facecolor=colour)
+
+
+def test_figures_become_an_animation_with_white_margins(tmp_path):
+    path = tmp_path / "figures.gif"
+    drawn = []
+
+    def figures():
+        for width, colour in ((1.0, "#cc0000"), (2.0, "#0000cc")):
+            drawn.append(colour)
+            yield plain_figure(width, colour)
+
+    vx.plotting.animate_figures(figures(), path, fps=5, linger=1.0, dpi=50)
+    assert drawn == ["#cc0000", "#0000cc"]
+    pictures, times = frames_of(path)
+    assert [p.shape for p in pictures] == [(50, 100, 3)] * 2
+    assert has(pictures[0][:, :50], "#cc0000")
+    assert np.all(pictures[0][:, 52:] > 250)
+    assert has(pictures[1][:, 60:], "#0000cc")
+    assert times == [200, 1200]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fps": 0}, "`fps` must be positive"),
+        ({"dpi": -1}, "`dpi` must be positive"),
+        ({"linger": -1}, "`linger` must not be negative"),
+        ({"figures": []}, "`figures` must have at least one figure"),
+        ({"path": "a.png"}, "`path` must end in .gif or .mp4"),
+    ],
+)
+def test_wrong_arguments_of_an_animation_of_figures_raise(tmp_path, options, message):
+    values = {"figures": [plain_figure(1.0, "r")], "path": "a.gif"} | options
+    with pytest.raises(ValueError, match=message):
+        vx.plotting.animate_figures(values.pop("figures"), tmp_path / values.pop("path"), **values)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_film_needs_ffmpeg(way, tmp_path, monkeypatch):

@@ -56,7 +56,7 @@ from napari.layers import Labels
 from npe2 import PluginManager, PluginManifest
 import jax
 jax.config.update("jax_enable_x64", True)
-import vertax, pathlib
+import vertax, pathlib, threading
 manager = PluginManager.instance()
 manager.register(PluginManifest.from_file(pathlib.Path(vertax.__file__).parent / "napari.yaml"))
 viewer = napari.Viewer(show=False)
@@ -65,6 +65,9 @@ layer = viewer.add_labels(np.stack([mask, mask[::-1]]), name="cells", scale=(1, 
 _, widget = viewer.window.add_plugin_dock_widget("vertax", "Tensions of edges")
 widget.cells.value = layer
 widget.frames.value = "all"
+compiling = set()
+listen = lambda event, _, **__: "compile" in event and compiling.add(threading.current_thread())
+jax.monitoring.register_event_duration_secs_listener(listen)
 widget.infer()
 assert len(viewer.layers) == 1  # the window is not blocked
 from qtpy.QtWidgets import QApplication
@@ -73,6 +76,7 @@ end = time.time() + 200
 while widget.tensions is None and time.time() < end:
     QApplication.instance().processEvents()
     time.sleep(0.01)
+assert compiling and threading.main_thread() not in compiling
 shapes, pressures = viewer.layers["tensions"], viewer.layers["pressures"]
 assert shapes.edge_color_mode == "colormap"
 determined = shapes.features["determined"].to_numpy()
@@ -83,7 +87,9 @@ assert tuple(shapes.scale) == (1, 2, 2)
 data, table = layer.data, pressures.features
 np.testing.assert_array_equal(table["label"].to_numpy()[pressures.data[data > 0]], data[data > 0])
 np.testing.assert_array_equal(table["frame"].to_numpy()[pressures.data[1][data[1] > 0]], 1)
-assert widget.bars.visible and not layer.visible
+assert not widget.bars.native.isHidden() and not layer.visible
+widget.write()  # without a folder
+assert not list(pathlib.Path(".").glob("*.csv"))
 widget.file.value = "tables"
 widget.write()
 assert (pathlib.Path("tables") / "columns.csv").exists()

@@ -28,14 +28,13 @@ PACKAGES = {
     "PerimeterViscosity SubstrateFriction Sum ViscositySum",
     "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
     "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum TypeTension by_type",
-    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty fit_warnings "
-    "fit limits member stack stack_fits uncertainty",
+    "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty fit "
+    "fit_warnings limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
     "inference": "EdgeMotion Event InferredTensions MaskFrame Micrograph Microscope Movie MovieFit "
-    "MovingTensions PinnedEnergy RecoveryWatch Scene TensionsOfMasks Transition check_any "
-    "column_descriptions find_masks fit_movie fit_onset fit_transition foam_energy "
-    "foam_terms frame_summary frame_table infer_tensions infer_tensions_of_masks "
-    "join_frames label_image length_unit micrograph_problem movie_from_table pearson "
+    "MovingTensions PinnedEnergy RecoveryWatch Scene TensionsOfMasks Transition "
+    "find_masks fit_movie fit_onset fit_transition foam_energy foam_terms infer_tensions "
+    "infer_tensions_of_masks label_image micrograph_problem movie_from_table pearson "
     "read_mask relative_error same_neighbours shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport PolygonTissue "
     "Segmentation Watershed "
@@ -53,7 +52,7 @@ PACKAGES = {
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology Trajectory cell_polygons pad",
     "plotting": "INK SERIES animate animate_figures cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
-    "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tissue "
+    "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tensions plot_tissue "
     "plot_tissues same_limits scale_bar series_colours tension_layer",
     "dynamics": "Evolution Evolved Material PIController evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "

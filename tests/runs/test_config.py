@@ -76,7 +76,10 @@ def test_overrides_leave_the_original_alone_and_cannot_add_keys():
     [
         ("fit.epochs", "must have the form key=value, as in fit.epochs=50, but is 'fit.epochs'."),
         ("fit.=3", "must have the form key=value"),
-        ("seed.x=1", "Cannot set `seed.x`: `seed` is a value and not a table."),
+        (
+            "seed.x=1",
+            "Cannot set `seed.x`: `seed` is 0 and not a table. Set either `seed` or its keys.",
+        ),
         ("tissue.n_cell=3", "there is no key `tissue.n_cell`; did you mean `tissue.n_cells`?"),
         ("epochs=3", "there is no key `epochs`; did you mean `fit.epochs`?"),
         ("fits.epochs=1", "there is no key `fits`; did you mean `fit`?"),

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from threadpoolctl import threadpool_limits
+import threadpoolctl
 
 _lock = threading.Lock()
 _limits: list[Any] = []
@@ -24,7 +24,8 @@ def one_blas_thread() -> Iterator[None]:
     """
     with _lock:
         if not _users:
-            _limits.append(threadpool_limits(1, "blas"))
+            _take_control()
+            _limits.append(threadpoolctl.threadpool_limits(1, "blas"))
         _users.append(None)
     try:
         yield
@@ -32,4 +33,15 @@ def one_blas_thread() -> Iterator[None]:
         with _lock:
             _users.pop()
             if not _users:
+                _take_control()
                 _limits.pop().restore_original_limits()
+
+
+def _take_control() -> None:
+    """Let this thread set the limit: newer versions of threadpoolctl ignore all but the first.
+
+    They do so without an error: the limit would not begin, or not end with the last of several calls.
+    """
+    release = getattr(threadpoolctl.OpenBLASController, "clear_controlling_thread", None)
+    if release is not None:
+        release(force=True)

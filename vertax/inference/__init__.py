@@ -1,9 +1,6 @@
 """From images, masks and synthetic data to parameters: what experiments and notebooks call."""
 
-from vertax.inference._columns import (
-    column_descriptions as column_descriptions,
-    length_unit as length_unit,
-)
+from vertax.inference._find_masks import MaskFrame as MaskFrame, find_masks as find_masks
 from vertax.inference._foam import (
     foam_energy as foam_energy,
     foam_terms as foam_terms,
@@ -11,14 +8,8 @@ from vertax.inference._foam import (
 from vertax.inference._infer_tensions import infer_tensions as infer_tensions
 from vertax.inference._inferred import InferredTensions as InferredTensions
 from vertax.inference._many import (
-    MaskFrame as MaskFrame,
     TensionsOfMasks as TensionsOfMasks,
-    check_any as check_any,
-    find_masks as find_masks,
-    frame_summary as frame_summary,
-    frame_table as frame_table,
     infer_tensions_of_masks as infer_tensions_of_masks,
-    join_frames as join_frames,
 )
 from vertax.inference._mask import read_mask as read_mask
 from vertax.inference._micrograph import (

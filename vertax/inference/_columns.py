@@ -32,7 +32,7 @@ _COLUMNS = {
     "stress_xy": ("mean tension / L", f"stress; {_Y}"),
     "stress_yy": ("mean tension / L", "stress"),
     "hole": ("", "whether the face is a hole, which is no cell"),
-    "pixels": ("pixel", "number of pixels in the mask"),
+    "pixels": ("pixel", "number of pixels, after the changes of the mask"),
     "area_error": ("1", "area over that of the pixels, less 1"),
     "outline_error": ("pixel", "root mean square distance of the outline from its arcs"),
     "edge": ("", "number of the edge in its frame, from 0"),
@@ -61,8 +61,6 @@ _COLUMNS = {
     "contact_uncertain": ("", "whether other cells may touch here, across a gap"),
     "kind": ("", "kind of change of the mask"),
     "into": ("", "label of the cell that has the pixels in the tissue; 0: none"),
-    "true_tension": ("mean tension", "tension of the synthetic cluster"),
-    "true_pressure": ("mean tension / L", "pressure of the synthetic cluster"),
     "n_cells": ("", "number of cells"),
     "n_determined": ("", "number of tensions that the shape determines"),
     "noise_pixels": ("pixel", "standard deviation of the position of an edge"),
@@ -73,11 +71,6 @@ _COLUMNS = {
 }
 
 
-def length_unit(pixel_size: Any) -> str:
-    """Unit of length of the tables: that of the given size of a pixel, or the size of a cell."""
-    return "root of the mean cell area" if pixel_size is None else "unit of `pixel_size`"
-
-
 def column_descriptions(
     tables: Mapping[str, Mapping[str, Any]], length: str
 ) -> dict[str, np.ndarray]:
@@ -86,7 +79,7 @@ def column_descriptions(
     **Arguments:**
 
     - `tables`: the tables by name.
-    - `length`: the unit of length, see `length_unit`.
+    - `length`: the unit of length.
 
     **Returns:** a table with the columns `table`, `column`, `unit` and `meaning`.
     """

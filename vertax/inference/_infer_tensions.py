@@ -41,12 +41,7 @@ _EVOLVER = (".dmp", ".fe")
 @announce_compilations("measurements of a tissue")
 @one_blas_thread()
 def infer_tensions(
-    segmentation_or_mask: Segmentation
-    | Foam
-    | Tissue
-    | Shaped[np.ndarray | Array, "..."]
-    | str
-    | os.PathLike[str],
+    mask: Segmentation | Foam | Tissue | Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
     *,
     kind: str = "auto",
     plane: int | None = None,
@@ -81,7 +76,7 @@ def infer_tensions(
 
     **Arguments:**
 
-    - `segmentation_or_mask`: a label image, or an image of outlines, as an array or a file (see
+    - `mask`: a label image, or an image of outlines, as an array or a file (see
         [`read_mask`][vertax.inference.read_mask]); a dump of Surface Evolver; or a
         [`Segmentation`][vertax.initialise.Segmentation], [`Foam`][vertax.io.Foam] or
         [`Tissue`][vertax.Tissue] with arcs.
@@ -90,12 +85,13 @@ def infer_tensions(
     - `pixel_size`, `background`, `gap_width`, `holes`: of a mask, see
         [`from_labels`][vertax.initialise.from_labels]. Where a TIFF file has pixels that are not square,
         their ratio is taken from it.
-    - `edges`: `"arcs"`, whose curvature determines pressures; `"straight"`, with the pressures acting on
+    - `edges`: `"arcs"`, where the curvature determines pressures; `"straight"`, with the pressures acting on
         vertices (Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017); by default, of a tissue with
         arcs the one of the larger evidence, see `InferredTensions.edges`.
-    - `noise`: standard deviation of the position of an edge, in units of length; by default the root mean
-        square distance of pixels (or the points of a foam) from curves, 0.002 cell diameters for a tissue
-        of arcs, and chosen by the evidence for a tissue with straight edges.
+    - `noise`: standard deviation of the position of an edge, in pixels of a mask and otherwise in units of
+        length; by default the root mean square distance of pixels (or the points of a foam) from curves,
+        0.002 cell diameters for a tissue of arcs, and chosen by the evidence for a tissue with straight
+        edges.
     - `prior`: standard deviation of the prior of relative tensions about 1, independent of each other; by
         default chosen by the evidence (marginal likelihood), with a part that is similar in regions. A small
         one makes tensions too uniform.
@@ -119,15 +115,15 @@ def infer_tensions(
         raise ValueError(
             f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
         )
-    source = segmentation_or_mask
+    source = mask
     if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in _EVOLVER:
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
-        mask, line_width = labels_and_lines(source, kind, background, plane)
+        labels, line_width = labels_and_lines(source, kind, background, plane)
         if pixel_size is None and isinstance(source, str | os.PathLike):
-            pixel_size = pixels_of_file(Path(source), mask)
+            pixel_size = pixels_of_file(Path(source), labels)
         source = from_labels(
-            mask,
+            labels,
             boundary="free",
             pixel_size=pixel_size,
             gap_width=gap_width,
@@ -136,20 +132,20 @@ def infer_tensions(
         )
         source = _across_lines(source, line_width)
     if isinstance(source, Segmentation):
-        course = _of_mask(source)
+        course = _of_mask(source, noise)
     elif isinstance(source, Foam):
         course = _of_foam(source, noise)
     elif isinstance(source, Tissue):
         course = _of_tissue(source, noise)
     else:
         raise TypeError(
-            "Argument `segmentation_or_mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
-            f"is {describe(segmentation_or_mask)}."
+            "Argument `mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
+            f"is {describe(mask)}. For several masks use vx.inference.infer_tensions_of_masks."
         )
     tissue, report = course.tissue, course.report
     if edges == "arcs" and not tissue.inner_arcs:
         raise ValueError(
-            "Argument `edges` must not be 'arcs' for a tissue whose inner edges are straight. Make it with "
+            "Argument `edges` must not be 'arcs' for a tissue with straight inner edges. Make it with "
             "`inner_arcs=True`, or pass edges='straight'."
         )
     is_hole = course.labels == 0
@@ -157,16 +153,15 @@ def infer_tensions(
     which = equations(geometry)
     if len(which.junctions) == 0:
         raise ValueError(
-            "Argument `segmentation_or_mask` must have a place where three of its cells meet, but it has "
+            "Argument `mask` must have a place where three of its cells meet, but it has "
             "none: the forces at its outline are unknown. Take a larger tissue."
         )
     uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
-    noise = course.noise if noise is None else noise
-    curves = fit(geometry, points, course.grain, apart=course.apart, noise=noise)
+    curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
     solve_as = partial(
-        solution, geometry, curves, uncertain, known_noise=noise is not None, prior=prior
+        solution, geometry, curves, uncertain, known_noise=course.noise is not None, prior=prior
     )
     solved = solve_as(straight=edges == "straight" or not tissue.inner_arcs)
     if edges is None and tissue.inner_arcs:
@@ -195,6 +190,7 @@ class _Course(NamedTuple):
     apart: float | None
     """Distance along an edge at which the errors of two points are independent; None if it is estimated."""
     noise: float | None
+    """Standard deviation of a point, a length; None if it is estimated."""
     pixel_size: PixelSize | None
     report: MaskReport | None = None
 
@@ -219,17 +215,17 @@ def _across_lines(source: Segmentation, line_width: float) -> Segmentation:
     return dataclasses.replace(source, report=report)
 
 
-def _of_mask(source: Segmentation) -> _Course:
+def _of_mask(source: Segmentation, noise: float | None) -> _Course:
     if source.courses is None:
         raise ValueError(
-            "Argument `segmentation_or_mask` must hold the courses of its edges, as "
+            "Argument `mask` must hold the courses of its edges, as "
             "vx.initialise.from_labels returns them. Pass its mask, or its tissue."
         )
     cells = source.labels[source.labels > 0]  # several holes have the label 0
     copies = len(np.unique(cells)) < len(cells)
     if copies or (not source.complete.all() and source.tissue.topology.exterior is False):
         raise ValueError(
-            "Argument `segmentation_or_mask` must not be mirrored at its border, where no forces "
+            "Argument `mask` must not be mirrored at its border, where no forces "
             "balance. Use vx.initialise.from_labels(mask, boundary='free')."
         )
     first = geometry_of(source.tissue).edge_vertices[:, 0]
@@ -238,9 +234,9 @@ def _of_mask(source: Segmentation) -> _Course:
     course = source.courses.points[source.courses.shown]
     points = Points(edge, course - np.asarray(source.tissue.vertices)[first][edge])
     pixel = pixel_length(source.pixel_size)
-    return _Course(
-        source.tissue, source.labels, points, pixel, None, None, source.pixel_size, source.report
-    )
+    noise = None if noise is None else noise * pixel
+    tissue, labels, size = source.tissue, source.labels, source.pixel_size
+    return _Course(tissue, labels, points, pixel, None, noise, size, source.report)
 
 
 def _of_foam(source: Foam, noise: float | None) -> _Course:
@@ -250,7 +246,7 @@ def _of_foam(source: Foam, noise: float | None) -> _Course:
     same = edge[1:] == edge[:-1]
     apart = float(np.mean(np.linalg.norm(np.diff(away, axis=0), axis=1)[same]))
     grain = _GRAIN * observed_geometry(tissue).size if noise is None else noise
-    return _Course(tissue, source.bodies, Points(edge, away), grain, apart, None, None)
+    return _Course(tissue, source.bodies, Points(edge, away), grain, apart, noise, None)
 
 
 def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:

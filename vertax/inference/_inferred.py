@@ -19,8 +19,9 @@ from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vt
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
-# Cells with a larger error of the area are named.
-_AREA_ERROR = 0.1
+# Cells with a larger error of the area, or distance of the outline from arcs over the root of the area, are
+# named.
+_CELL_ERROR = 0.1
 # Number of places that a warning names.
 _PLACES = 5
 
@@ -284,15 +285,24 @@ def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
             f"{closed.sum()} contacts are not shown by the mask, because gaps or holes wider than "
             f"{report.gap_width:g} pixels were closed; their tensions are not determined"
         )
-    off = np.flatnonzero((np.abs(result.area_errors) > _AREA_ERROR) & (result.labels > 0))
-    if len(off):
-        cells = [
-            f"label {result.labels[k]} ({result.area_errors[k]:+.0%})"
-            for k in off[np.argsort(-np.abs(result.area_errors[off]))][:_PLACES]
-        ]
-        more = f" and {len(off) - _PLACES} more" if len(off) > _PLACES else ""
-        warnings.append(
-            f"the areas of {len(off)} cells differ by more than {_AREA_ERROR:.0%} from those of their "
-            f"pixels, because arcs do not follow their outlines: {', '.join(cells)}{more}"
-        )
+    outline = result.outline_errors
+    distance = np.zeros(0) if outline is None else outline / np.sqrt(report.cell_pixels)
+    for errors, text, unit in (
+        (
+            result.area_errors,
+            "areas of {} cells differ by more than 10 % from those of their pixels",
+            "+",
+        ),
+        (
+            distance,
+            "outlines of {} cells are more than 10 % of the root of their area from arcs",
+            "",
+        ),
+    ):
+        off = np.flatnonzero((np.abs(errors) > _CELL_ERROR) & (result.labels[: len(errors)] > 0))
+        if len(off):
+            worst = off[np.argsort(-np.abs(errors[off]))][:_PLACES]
+            cells = ", ".join(f"label {result.labels[k]} ({errors[k]:{unit}.0%})" for k in worst)
+            more = f" and {len(off) - _PLACES} more" if len(off) > _PLACES else ""
+            warnings.append(f"the {text.format(len(off))}: {cells}{more}")
     return warnings

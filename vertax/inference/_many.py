@@ -3,112 +3,33 @@
 from __future__ import annotations
 
 import concurrent.futures
-import glob
+import hashlib
 import inspect
 import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Shaped
 from tqdm import tqdm
 
 from vertax._base.announce import announce_compilations
 from vertax._base.blas import one_blas_thread
 from vertax._base.checks import check_integer
-from vertax._base.pixels import pixel_sides
-from vertax.inference._columns import column_descriptions, length_unit
-from vertax.inference._infer_tensions import infer_tensions, pixels_of_file
+from vertax._base.pixels import pixel_length, pixel_sides
+from vertax._base.threads import num_threads
+from vertax.inference._columns import column_descriptions
+from vertax.inference._find_masks import MaskFrame, MaskSource, find_masks
+from vertax.inference._infer_tensions import infer_tensions
 from vertax.inference._inferred import InferredTensions
-from vertax.inference._mask import read_mask
-from vertax.initialise._mask_arguments import without_single_axes
-from vertax.io import read_stack, write_csv
+from vertax.inference._mean_stress import MeanStress
+from vertax.initialise import MaskChange, MaskReport
+from vertax.io import write_csv
+from vertax.io._module_file import load_module, save_module
 
-MaskSource: TypeAlias = Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str]
-
-_ENDINGS = (".tif", ".tiff", ".png", ".npy")
-
-
-class MaskFrame(NamedTuple):
-    """One of many masks."""
-
-    name: str | int
-    """Name of its file, or its number in a movie or list."""
-    source: MaskSource
-    """The file, or the pixels."""
-    file: Path | None = None
-    """The file that holds the pixels."""
-
-    def mask(self, **options: Any) -> Shaped[np.ndarray, "rows columns"]:
-        """The labels.
-
-        **Arguments:**
-
-        - `options`: as of [`read_mask`][vertax.inference.read_mask].
-
-        **Returns:** a label for each pixel.
-        """
-        return read_mask(self.source, **options)
-
-    def infer(self, **options: Any) -> InferredTensions:
-        """The tensions.
-
-        **Arguments:**
-
-        - `options`: as of [`infer_tensions`][vertax.inference.infer_tensions].
-
-        **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions].
-        """
-        if self.file is not None and options.get("pixel_size") is None:
-            reading = {key: options[key] for key in ("kind", "background") if key in options}
-            options = options | {"pixel_size": pixels_of_file(self.file, self.mask(**reading))}
-        return infer_tensions(self.source, **options)
-
-
-def find_masks(
-    masks: MaskSource | Sequence[MaskSource], *, plane: int | None = None
-) -> list[MaskFrame]:
-    """The masks in a folder, a pattern of file names, a movie, or a list.
-
-    **Arguments:**
-
-    - `masks`: a folder (its files .tif, .tiff, .png and .npy), a pattern such as `"masks/*.tif"`, one file,
-        an array of shape (rows, columns) or (frames, rows, columns), or a list of files and arrays. A single
-        file with several planes is a movie.
-    - `plane`: of files with several planes, the one to take; then no file is a movie.
-
-    **Returns:** the masks, files in natural order (2 before 10). Names are file names, with folders where
-    these repeat, and numbers from 0 in a movie or in a list of arrays.
-
-    **Raises:**
-
-    - `FileNotFoundError` if there is no such file, or no file in the folder or of the pattern.
-    - `ValueError` for an empty list, and an array with fewer than two axes.
-    """
-    if isinstance(masks, str | os.PathLike):
-        files = _files(os.fspath(masks))
-        if len(files) == 1 and plane is None:
-            return _frames_of(files[0])
-        return _named(files)
-    if isinstance(masks, np.ndarray | Array):
-        pixels = without_single_axes(np.asarray(masks))
-        if pixels.ndim < 2:
-            raise ValueError(
-                "Argument `masks` must have shape (rows, columns) or (frames, rows, columns), but its shape "
-                f"is {pixels.shape}."
-            )
-        return _planes(pixels)
-    if not len(masks):
-        raise ValueError("Argument `masks` must hold at least one mask, but is empty.")
-    named = iter(_named([Path(m) for m in masks if isinstance(m, str | os.PathLike)]))
-    is_file = [isinstance(mask, str | os.PathLike) for mask in masks]
-    return [
-        next(named) if file else MaskFrame(number if not any(is_file) else str(number), mask)
-        for number, (mask, file) in enumerate(zip(masks, is_file, strict=True))
-    ]
+_CLASSES = (InferredTensions, MeanStress, MaskReport, MaskChange)
 
 
 class TensionsOfMasks(eqx.Module):
@@ -118,7 +39,7 @@ class TensionsOfMasks(eqx.Module):
     """The result of each mask, by the name of its file or its number."""
     failures: dict[str | int, str]
     """The message of the error of each mask without a result."""
-    length_unit: str = eqx.field(static=True)
+    length_unit: str = eqx.field(static=True, default="root of the mean cell area")
     """Unit of lengths in the tables."""
 
     def cell_table(self) -> dict[str, np.ndarray]:
@@ -128,7 +49,7 @@ class TensionsOfMasks(eqx.Module):
         **Returns:** its columns, and `frame`, the name of the file or the number of the mask. A label has one
         number in all frames, as in the masks.
         """
-        return join_frames({name: result.cell_table() for name, result in self.results.items()})
+        return _joined({name: result.cell_table() for name, result in self.results.items()})
 
     def edge_table(self) -> dict[str, np.ndarray]:
         """The edges of all masks as one table, see `edge_table` of
@@ -136,20 +57,32 @@ class TensionsOfMasks(eqx.Module):
 
         **Returns:** its columns, and `frame`.
         """
-        return join_frames({name: result.edge_table() for name, result in self.results.items()})
+        return _joined({name: result.edge_table() for name, result in self.results.items()})
+
+    def change_table(self) -> dict[str, np.ndarray]:
+        """The changes of all masks as one table, see `change_table` of
+        [`MaskReport`][vertax.initialise.MaskReport].
+
+        **Returns:** its columns, and `frame`.
+        """
+        reports = {name: result.mask_report for name, result in self.results.items()}
+        return _joined({name: r.change_table() for name, r in reports.items() if r is not None})
 
     def frame_table(self) -> dict[str, np.ndarray]:
-        """The masks as a table.
+        """The masks as a table: those with a result, then those without.
 
         **Returns:** columns `frame`, `n_cells`, `n_determined` (tensions), `noise_pixels`, `pixel_height`,
         `pixel_width` (in units of length), `warnings` and `error`.
         """
-        names = [*self.results, *self.failures]
-        return frame_table(names, [frame_summary(r) for r in self.results.values()], self.failures)
+        rows = [_frame_row(result) for result in self.results.values()]
+        failed = dict.fromkeys(rows[0], np.nan) | {"n_cells": 0, "n_determined": 0, "warnings": ""}
+        rows += [failed | {"error": message} for message in self.failures.values()]
+        frames = np.array([*self.results, *self.failures])
+        return {"frame": frames} | {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write the tables `cells.csv`, `edges.csv` and `frames.csv`, and `columns.csv`, which has the unit
-        and the meaning of each column.
+        """Write the tables `cells.csv`, `edges.csv`, `changes.csv` (of the masks) and `frames.csv`, and
+        `columns.csv`, which has the unit and the meaning of each column.
 
         **Arguments:**
 
@@ -162,6 +95,7 @@ class TensionsOfMasks(eqx.Module):
         tables = {
             "cells": self.cell_table(),
             "edges": self.edge_table(),
+            "changes": self.change_table(),
             "frames": self.frame_table(),
         }
         tables["columns"] = column_descriptions(tables, self.length_unit)
@@ -173,9 +107,10 @@ class TensionsOfMasks(eqx.Module):
 @announce_compilations("measurements of a tissue")
 @one_blas_thread()
 def infer_tensions_of_masks(
-    masks: MaskSource | Sequence[MaskSource],
+    masks: MaskSource | Sequence[MaskSource | MaskFrame],
     *,
     plane: int | None = None,
+    cache: str | os.PathLike[str] | None = None,
     threads: int | None = None,
     progress: bool = True,
     **options: Any,
@@ -193,7 +128,9 @@ def infer_tensions_of_masks(
 
     - `masks`: a folder, a pattern, a movie or a list, see [`find_masks`][vertax.inference.find_masks].
     - `plane`: of files with several planes, the one to take; by default a single file is a movie.
-    - `threads`: number of threads, by default one per core.
+    - `cache`: a folder where the result of each mask is stored as soon as it is computed. A later call, such
+        as after an interrupt, reads the results of the same pixels and options from it.
+    - `threads`: number of threads, by default the environment variable `VERTAX_THREADS` or one per core.
     - `progress`: show a progress bar with the name of the last mask (only on a terminal).
     - `options`: as of [`infer_tensions`][vertax.inference.infer_tensions], the same for all masks.
 
@@ -202,7 +139,9 @@ def infer_tensions_of_masks(
     **Raises:**
 
     - `TypeError` for an unknown option.
-    - `ValueError` if no mask has a result, and as [`find_masks`][vertax.inference.find_masks].
+    - the error of the mask, if there is only one.
+    - `ValueError` if none of several masks has a result, and as
+        [`find_masks`][vertax.inference.find_masks].
     """
     inspect.signature(infer_tensions).bind(None, **options)
     if threads is not None:
@@ -213,10 +152,10 @@ def infer_tensions_of_masks(
     results: dict[str | int, InferredTensions] = {}
     failures: dict[str | int, str] = {}
     with (
-        concurrent.futures.ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool,
+        concurrent.futures.ThreadPoolExecutor(threads or num_threads()) as pool,
         tqdm(total=len(frames), unit="mask", disable=None if progress else True) as bar,
     ):
-        waiting = {pool.submit(frame.infer, **options): frame.name for frame in frames}
+        waiting = {pool.submit(_infer, frame, cache, options): frame.name for frame in frames}
         try:
             for done in concurrent.futures.as_completed(waiting):
                 name = waiting[done]
@@ -224,121 +163,68 @@ def infer_tensions_of_masks(
                 try:
                     results[name] = done.result()
                 except Exception as error:
+                    if len(frames) == 1:
+                        raise
                     failures[name] = str(error)
                 bar.update()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    check_any(results, failures)
-    order = [frame.name for frame in frames]
-    return TensionsOfMasks(
-        {name: results[name] for name in order if name in results},
-        {name: failures[name] for name in order if name in failures},
-        length_unit(options.get("pixel_size")),
-    )
-
-
-def check_any(results: Mapping[str | int, Any], failures: Mapping[str | int, str]) -> None:
-    """Raise a `ValueError` if there are no results."""
     if not results:
         name, message = next(iter(failures.items()))
         raise ValueError(
             f"Argument `masks` must hold a mask that can be inferred, but all {len(failures)} failed; "
             f"{name}: {message}"
         )
+    order = [frame.name for frame in frames]
+    unit = {} if options.get("pixel_size") is None else {"length_unit": "unit of `pixel_size`"}
+    return TensionsOfMasks(
+        {name: results[name] for name in order if name in results},
+        {name: failures[name] for name in order if name in failures},
+        **unit,
+    )
 
 
-def join_frames(tables: Mapping[str | int, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """One table of many, with the column `frame` first.
+def _infer(
+    frame: MaskFrame, cache: str | os.PathLike[str] | None, options: Mapping[str, Any]
+) -> InferredTensions:
+    """The tensions of a mask, from the cache if they are there."""
+    if cache is None:
+        return frame.infer(**options)
+    source = frame.source
+    if isinstance(source, str | os.PathLike):
+        pixels = Path(source).read_bytes()
+    else:
+        source = np.ascontiguousarray(source)
+        pixels = source.tobytes() + f"{source.shape} {source.dtype}".encode()
+    # The precision of JAX is part of the result, and the file has the size of the pixels.
+    given = f"{sorted(options.items())} {jnp.result_type(float)} {frame.file}"
+    digest = hashlib.sha256(pixels + given.encode()).hexdigest()
+    file = Path(cache) / f"{digest[:32]}.npz"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        result = frame.infer(**options)
+        save_module(file, "tensions", result, InferredTensions, _CLASSES)
+    return load_module(file, "tensions", InferredTensions, _CLASSES)
 
-    **Arguments:**
 
-    - `tables`: a table for each frame, all with the same columns.
-
-    **Returns:** the columns by name.
-    """
-    first = next(iter(tables.values()))
+def _joined(tables: Mapping[str | int, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """One table of many with the same columns, with the column `frame` first."""
     lengths = [len(next(iter(table.values()))) for table in tables.values()]
     frame = np.repeat(np.array(list(tables)), lengths)
+    first = next(iter(tables.values()), {})
     columns = {name: np.concatenate([table[name] for table in tables.values()]) for name in first}
     return {"frame": frame, **columns}
 
 
-def frame_summary(result: InferredTensions) -> dict[str, Any]:
-    """Numbers and warnings of one mask, a row of the table of frames."""
+def _frame_row(result: InferredTensions) -> dict[str, Any]:
     width, height = pixel_sides(result.pixel_size)
     return {
         "n_cells": int(np.sum(result.labels > 0)),
         "n_determined": int(result.determined.sum()),
-        "noise_pixels": result.noise / np.sqrt(width * height),
+        "noise_pixels": result.noise / pixel_length(result.pixel_size),
         "pixel_height": height,
         "pixel_width": width,
         "warnings": " | ".join(result.warnings),
+        "error": "",
     }
-
-
-def frame_table(
-    names: Sequence[str | int],
-    summaries: Sequence[Mapping[str, Any]],
-    failures: Mapping[str | int, str],
-) -> dict[str, np.ndarray]:
-    """The table of frames: those with a result first, then the others, with the message of the error."""
-    missing = {"warnings": "", "n_cells": 0, "n_determined": 0}
-    rows = [*summaries, *[{} for _ in failures]]
-    columns = {
-        key: np.array([row.get(key, missing.get(key, np.nan)) for row in rows])
-        for key in summaries[0]
-    }
-    errors = [""] * len(summaries) + list(failures.values())
-    return {"frame": np.array(names), **columns, "error": np.array(errors)}
-
-
-def _files(path: str) -> list[Path]:
-    """Files of a folder, of a pattern, or the file itself."""
-    if os.path.isdir(path):
-        files = [file for file in Path(path).iterdir() if file.suffix.lower() in _ENDINGS]
-        what = f"files {', '.join(_ENDINGS)} in the folder {path}, but it has none"
-    elif os.path.exists(path) or not glob.has_magic(path):
-        files = [Path(path)] if os.path.exists(path) else []
-        what = f"a file, but {path} does not exist"
-    else:
-        files = [Path(file) for file in glob.glob(path, recursive=True) if os.path.isfile(file)]
-        what = f"files by the pattern {path}, but there are none"
-    if not files:
-        raise FileNotFoundError(f"Argument `masks` must name {what}.")
-    return sorted(files, key=_natural)
-
-
-def _natural(file: Path) -> list[tuple[int, str]]:
-    """A key that sorts 2 before 10."""
-    parts = re.split(r"(\d+)", str(file))
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-
-def _named(files: Sequence[Path]) -> list[MaskFrame]:
-    names = [file.name for file in files]
-    if len(set(names)) < len(names):
-        names = [file.as_posix() for file in files]
-    return [MaskFrame(name, file) for name, file in zip(names, files, strict=True)]
-
-
-def _frames_of(file: Path) -> list[MaskFrame]:
-    """The frames of one file: those of a movie, or the file itself."""
-    single = [MaskFrame(file.name, file)]
-    if file.suffix.lower() not in (".npy", ".tif", ".tiff") or file.name.endswith("_seg.npy"):
-        return single
-    try:
-        pixels = np.load(file) if file.suffix == ".npy" else read_stack(file)
-    except (
-        ValueError
-    ):  # colours, or a file that cannot be read: the reader of masks has the message
-        return single
-    frames = _planes(without_single_axes(pixels))
-    return single if len(frames) == 1 else [frame._replace(file=file) for frame in frames]
-
-
-def _planes(pixels: Shaped[np.ndarray, "..."]) -> list[MaskFrame]:
-    """The frames of an array; a last axis of 3 or 4 is one of colours."""
-    if pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4)):
-        return [MaskFrame(0, pixels)]
-    return [MaskFrame(k, p) for k, p in enumerate(pixels.reshape(-1, *pixels.shape[-2:]))]

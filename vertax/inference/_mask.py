@@ -26,7 +26,7 @@ _THIN = 0.3
 
 
 def read_mask(
-    image: Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
+    mask: Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
     *,
     kind: str = "auto",
     background: int | None = None,
@@ -44,7 +44,7 @@ def read_mask(
 
     **Arguments:**
 
-    - `image`: the pixels, shape (rows, columns) or (rows, columns, colours), with `plane` also (planes, rows,
+    - `mask`: the pixels, shape (rows, columns) or (rows, columns, colours), with `plane` also (planes, rows,
         columns); or a file: TIFF, PNG, NPY. Axes of length 1 are dropped. NaN is no cell.
     - `kind`: `"labels"`, `"outlines"`, or `"auto"`: outlines if there are two values or colours.
     - `background`: the label of what is no cell, if it is not 0. Labels of cells are positive.
@@ -60,11 +60,11 @@ def read_mask(
         be that of a cell (0 and negative ones), outlines that enclose less than two cells, and two values of
         which neither is a line thinner than a third of a cell, unless `kind` is `"outlines"`.
     """
-    return labels_and_lines(image, kind, background, plane)[0]
+    return labels_and_lines(mask, kind, background, plane)[0]
 
 
 def labels_and_lines(
-    image: Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
+    mask: Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
     kind: str,
     background: int | None,
     plane: int | None,
@@ -76,10 +76,10 @@ def labels_and_lines(
         )
     if plane is not None:
         check_integer("plane", plane, at_least=0)
-    if isinstance(image, str | os.PathLike):
-        pixels = _loaded(Path(image), plane)
+    if isinstance(mask, str | os.PathLike):
+        pixels = _loaded(Path(mask), plane)
     else:
-        pixels = np.ma.filled(image, 0) if isinstance(image, np.ma.MaskedArray) else image
+        pixels = np.ma.filled(mask, 0) if isinstance(mask, np.ma.MaskedArray) else mask
         pixels = one_plane(np.asarray(pixels), plane)
     values = _numbered(pixels)
     if background is not None:
@@ -91,7 +91,7 @@ def labels_and_lines(
     colours, counts = np.unique(values, return_counts=True)
     if kind == "outlines" or (kind == "auto" and len(colours) == 2):
         if len(colours) < 2:
-            raise ValueError("Argument `image` must show lines, but all its pixels are alike.")
+            raise ValueError("Argument `mask` must show lines, but all its pixels are alike.")
         lines = [values != 0]
         if len(colours) == 2:
             lines = [values == colour for colour in colours[np.argsort(counts, kind="stable")]]
@@ -101,7 +101,7 @@ def labels_and_lines(
         if outlined is not None:
             return outlined.labels, outlined.line_width
     if pixels.ndim == 2 and pixels.dtype.kind in "iu":
-        check_zero("image", pixels, background)
+        check_zero("mask", pixels, background)
     return np.maximum(values, 0), 0.0
 
 
@@ -125,7 +125,7 @@ def one_plane(pixels: np.ndarray, plane: int | None) -> np.ndarray:
         planes = pixels.reshape(-1, *pixels.shape[-2:])
         if plane is None:
             raise ValueError(
-                "Argument `image` must have shape (rows, columns), or a third axis of colours, but its shape "
+                "Argument `mask` must have shape (rows, columns), or a third axis of colours, but its shape "
                 f"is {pixels.shape}, a stack of {len(planes)} planes. Pass one plane of a stack, by the "
                 f"argument `plane`, 0 … {len(planes) - 1}."
             )
@@ -140,25 +140,43 @@ def one_plane(pixels: np.ndarray, plane: int | None) -> np.ndarray:
 
 
 def _loaded(file: Path, plane: int | None) -> np.ndarray:
+    if not file.exists():
+        raise FileNotFoundError(f"Argument `mask` must name a file, but {file} does not exist.")
+    # Cellpose saves a dictionary, which only pickles hold; masks are plain arrays.
+    if file.name.endswith("_seg.npy"):
+        content = np.load(file, allow_pickle=True)
+        content = content.item() if content.dtype == object and content.ndim == 0 else {}
+        if not isinstance(content, dict) or "masks" not in content:
+            raise ValueError(f"{file} must hold `masks`, as Cellpose saves them, but does not.")
+        return one_plane(np.asarray(content["masks"]), plane)
     if file.suffix.lower() == ".npy":
-        if not file.exists():
-            raise FileNotFoundError(
-                f"Argument `image` must name a file, but {file} does not exist."
-            )
-        # Cellpose saves a dictionary, which only pickles hold; masks are plain arrays.
-        if file.name.endswith("_seg.npy"):
-            content = np.load(file, allow_pickle=True)
-            content = content.item() if content.dtype == object and content.ndim == 0 else {}
-            if not isinstance(content, dict) or "masks" not in content:
-                raise ValueError(f"{file} must hold `masks`, as Cellpose saves them, but does not.")
-            return one_plane(np.asarray(content["masks"]), plane)
-        return one_plane(np.load(file, allow_pickle=False), plane)
+        return one_plane(load_array(file), plane)
     try:
         return read_image(file, plane=plane)
     except ValueError as error:
+        message = str(error)
+    if "`channel`" not in message:
+        raise ValueError(message.replace("`path`", "`mask`"))
+    try:
+        return np.stack([read_image(file, channel=k, plane=plane) for k in range(3)], axis=-1)
+    except ValueError as error:
         if "`channel`" not in str(error):
             raise
-    return np.stack([read_image(file, channel=k, plane=plane) for k in range(3)], axis=-1)
+        raise ValueError(
+            f"Argument `mask` must name a file of labels or colours, but {file} has two channels. Pass one: "
+            "vx.io.read_image(file, channel=0)."
+        ) from None
+
+
+def load_array(file: Path) -> np.ndarray:
+    """The array in a file of NumPy; a `ValueError` for another file."""
+    try:
+        return np.load(file, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(
+            f"Argument `mask` must name a file of `numpy.save` with an array of numbers, but {file} cannot "
+            "be read as one."
+        ) from error
 
 
 def _numbered(pixels: Shaped[np.ndarray, "..."]) -> Int[np.ndarray, "rows columns"]:
@@ -168,16 +186,16 @@ def _numbered(pixels: Shaped[np.ndarray, "..."]) -> Int[np.ndarray, "rows column
         colours, index = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
         if _are_frames(pixels, len(colours)):
             raise ValueError(
-                "Argument `image` must have shape (rows, columns), or a third axis of colours, but its last "
+                "Argument `mask` must have shape (rows, columns), or a third axis of colours, but its last "
                 f"axis holds {pixels.shape[2]} label images that differ. Label planes are not colours: pass "
-                "one, such as image[..., 0]."
+                "one, such as mask[..., 0]."
             )
         number = np.arange(1, len(colours) + 1)
         number[np.all(colours == 0, axis=1)] = 0
         return number[index.ravel()].reshape(pixels.shape[:2])
     if pixels.ndim != 2 or pixels.size == 0:
         raise ValueError(
-            "Argument `image` must have shape (rows, columns), or a third axis of colours, but its shape is "
+            "Argument `mask` must have shape (rows, columns), or a third axis of colours, but its shape is "
             f"{pixels.shape}."
         )
     if pixels.dtype.kind == "b":
@@ -185,8 +203,8 @@ def _numbered(pixels: Shaped[np.ndarray, "..."]) -> Int[np.ndarray, "rows column
     if pixels.dtype.kind == "f":
         return _whole_numbers(pixels)
     if pixels.dtype.kind not in "iu":
-        raise ValueError(f"Argument `image` must hold numbers, but its dtype is {pixels.dtype}.")
-    check_bits("image", pixels)
+        raise ValueError(f"Argument `mask` must hold numbers, but its dtype is {pixels.dtype}.")
+    check_bits("mask", pixels)
     return pixels.astype(np.int64)
 
 
@@ -208,7 +226,7 @@ def _whole_numbers(pixels: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray,
     pixels = np.where(np.isnan(pixels), 0, pixels)
     if not np.isfinite(pixels).all() or np.any(pixels != np.rint(pixels)):
         raise ValueError(
-            "Argument `image` must hold whole numbers, a label for each pixel (or NaN), but holds "
+            "Argument `mask` must hold whole numbers, a label for each pixel (or NaN), but holds "
             f"{pixels[~(np.isfinite(pixels) & (pixels == np.rint(pixels)))].flat[0]}. A grey image must be "
             "segmented first."
         )
@@ -217,7 +235,7 @@ def _whole_numbers(pixels: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray,
     largest = float(np.max(np.abs(pixels)))
     if largest > 2.0**bits:
         raise ValueError(
-            f"Argument `image` must hold labels of at most {bits} bits, as {pixels.dtype} holds exactly, but "
+            f"Argument `mask` must hold labels of at most {bits} bits, as {pixels.dtype} holds exactly, but "
             f"its largest is {largest:.0f}. Save the labels as integers, numbered anew: "
             "numpy.unique(labels, return_inverse=True)[1]."
         )
@@ -252,7 +270,7 @@ def _outlined(
         return None
     if not outlined:
         raise ValueError(
-            "Argument `image` must show lines that enclose cells, but they enclose "
+            "Argument `mask` must show lines that enclose cells, but they enclose "
             f"{'one region' if any(regions) else 'nothing'}: are they closed?"
         )
     thin = [each for each in outlined if each.line_width < _THIN * each.cell_size]
@@ -261,7 +279,7 @@ def _outlined(
             return None
         first = outlined[0]
         raise ValueError(
-            "Argument `image` must hold labels, or lines that are thinner than cells, but what may be a line "
+            "Argument `mask` must hold labels, or lines that are thinner than cells, but what may be a line "
             f"is {first.line_width:.0f} pixels wide between regions of {first.cell_size:.0f} pixels. Number "
             "the cells of a binary mask, e.g. by scipy.ndimage.label; pass kind='outlines' for thick lines."
         )

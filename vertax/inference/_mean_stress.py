@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -11,8 +10,8 @@ from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
 
-class MeanStress(NamedTuple):
-    r"""Mean stress of the cells whose edges all have an inferred tension (Batchelor 1970,
+class MeanStress(eqx.Module):
+    r"""Mean stress of the cells with an inferred tension of each edge (Batchelor 1970,
     doi:10.1017/S0022112070000745),
 
     $$\sigma = \frac{1}{\sum_c A_c} \Big( \sum_e \frac{n_e}{2} \gamma_e \int_e t\,t^T \,dl
@@ -59,15 +58,15 @@ def stress_weights(
     geometry = geometry_of(tissue)
     missing = np.full(tissue.n_edges, True)
     missing[edges] = False
-    whole = np.isin(np.arange(tissue.n_cells), cells)
-    whole = np.append(whole, False)
-    whole[geometry.edge_cells[missing].ravel()] = False
-    area = np.where(whole[:-1], geometry.areas, 0.0)
+    included = np.isin(np.arange(tissue.n_cells), cells)
+    included = np.append(included, False)
+    included[geometry.edge_cells[missing].ravel()] = False
+    area = np.where(included[:-1], geometry.areas, 0.0)
     total = max(float(np.sum(area)), 1e-300)
-    half = 0.5 * whole[geometry.edge_cells].sum(axis=1)
+    half = 0.5 * included[geometry.edge_cells].sum(axis=1)
     pull = (half[:, None, None] * fabric(tissue))[edges].reshape(-1, 4)[:, [0, 1, 3]].T
     push = -np.outer([1, 0, 1], area[cells])
-    return np.concatenate([pull, push], axis=1) / total, whole[:-1]
+    return np.concatenate([pull, push], axis=1) / total, included[:-1]
 
 
 def mean_stress(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ _LISTED = 50
 KINDS = ("new cell", "piece", "absorbed", "left out", "hole", "closed hole")
 
 
-class MaskChange(NamedTuple):
+class MaskChange(eqx.Module):
     """A connected region of a mask that is not what its label says, or a hole."""
 
     kind: str
@@ -111,7 +112,7 @@ class MaskReport(eqx.Module):
             "n_contacts_closed": int(self.closed.sum()),
             "n_contacts_uncertain": int(np.sum(self.uncertain & ~self.closed)),
             **counts,
-            "largest_changes": [change._asdict() for change in self.changes[:_LISTED]],
+            "largest_changes": [dataclasses.asdict(change) for change in self.changes[:_LISTED]],
         }
 
     def change_table(self) -> dict[str, np.ndarray]:
@@ -119,11 +120,8 @@ class MaskReport(eqx.Module):
 
         **Returns:** columns by name: the fields of [`MaskChange`][vertax.initialise.MaskChange].
         """
-        rows = [tuple(change) for change in self.changes]
-        columns = zip(*rows, strict=True) if rows else [()] * len(MaskChange._fields)
-        return {
-            name: np.array(column) for name, column in zip(MaskChange._fields, columns, strict=True)
-        }
+        names = [field.name for field in dataclasses.fields(MaskChange)]
+        return {name: np.array([getattr(c, name) for c in self.changes]) for name in names}
 
 
 class Repaired(NamedTuple):

@@ -79,7 +79,7 @@ def save_energy(path: str | os.PathLike[str], energy: AbstractEnergy) -> None:
         number types that NumPy does not have.
     - `OSError` if the file cannot be written.
     """
-    _save(path, "energy", energy, AbstractEnergy)
+    save_module(path, "energy", energy, AbstractEnergy)
 
 
 def load_energy(
@@ -108,7 +108,7 @@ def load_energy(
         by a newer version, contains a class that is not in `classes`, or holds 64-bit numbers while JAX is
         limited to 32 bits (nothing is rounded silently: enable `jax_enable_x64`).
     """
-    return _load(path, "energy", AbstractEnergy, classes)
+    return load_module(path, "energy", AbstractEnergy, classes)
 
 
 def save_problem(path: str | os.PathLike[str], problem: InverseProblem[Any]) -> None:
@@ -134,7 +134,7 @@ def save_problem(path: str | os.PathLike[str], problem: InverseProblem[Any]) -> 
 
     **Raises:** as [`save_energy`][vertax.io.save_energy].
     """
-    _save(path, "problem", problem, InverseProblem)
+    save_module(path, "problem", problem, InverseProblem)
 
 
 def load_problem(
@@ -152,27 +152,36 @@ def load_problem(
 
     **Raises:** as [`load_energy`][vertax.io.load_energy].
     """
-    return _load(path, "problem", InverseProblem, classes)
+    return load_module(path, "problem", InverseProblem, classes)
 
 
-def _save(
-    path: str | os.PathLike[str], what: str, module: eqx.Module, kind: type[eqx.Module]
+def save_module(
+    path: str | os.PathLike[str],
+    what: str,
+    module: eqx.Module,
+    kind: type[eqx.Module],
+    classes: Iterable[type[eqx.Module]] = (),
 ) -> None:
+    """Write a module of a class, with those of `classes` and of `_public_classes` in it.
+
+    `what` is the name of the format, and of the argument in messages.
+    """
     if not isinstance(module, kind):
         raise TypeError(
             f"Argument `{what}` must be an {kind.__name__}, but is {type(module).__name__}."
         )
-    writer = _Writer(what)
+    writer = _Writer(what, classes)
     tree = json.dumps(writer.node(module, ""), allow_nan=False)
     write_archive(path, what, _VERSION, {"tree": np.asarray(tree)} | writer.arrays)
 
 
-def _load(
+def load_module(
     path: str | os.PathLike[str],
     what: str,
     kind: type[_Module],
     classes: Iterable[type[eqx.Module]],
 ) -> _Module:
+    """Read what `save_module` wrote."""
     name = os.fspath(path)
     user_classes: dict[str, type[eqx.Module]] = {}
     if isinstance(classes, type) or not isinstance(classes, Iterable):
@@ -234,8 +243,9 @@ def _public_classes() -> dict[str, type[eqx.Module]]:
 class _Writer:
     """Convert modules to JSON, and collect their arrays."""
 
-    def __init__(self, argument: str):
+    def __init__(self, argument: str, classes: Iterable[type[eqx.Module]] = ()):
         self.argument = argument
+        self.classes = tuple(classes)
         self.arrays: dict[str, np.ndarray] = {}
         self.names = {cls: name for name, cls in _public_classes().items()}
 
@@ -295,7 +305,8 @@ class _Writer:
     def module(self, module: eqx.Module, path: str) -> dict[str, Any]:
         cls = type(module)
         name = self.names.get(cls)
-        if name is None and cls.__module__.split(".")[0] == "vertax":
+        of_vertax = cls.__module__.split(".")[0] == "vertax"
+        if name is None and of_vertax and cls not in self.classes:
             raise ValueError(
                 f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is of class {cls.__name__}, "
                 f"which is not an energy, cost, adjoint, solver or other part of a problem. "

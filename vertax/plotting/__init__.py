@@ -36,4 +36,5 @@ with _requires_extra("plot", "Drawing"):
         same_limits as same_limits,
         series_colours as series_colours,
     )
+    from vertax.plotting._tension_map import plot_tensions as plot_tensions
     from vertax.plotting._tissue import plot_tissue as plot_tissue

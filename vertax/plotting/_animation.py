@@ -105,6 +105,8 @@ def animate_figures(
 
     **Raises:** as [`animate`][vertax.animate].
     """
+    fps, last_frame_seconds = float(fps), float(last_frame_seconds)
+    _check_timing(fps, last_frame_seconds, dpi)
     write = _writer(path)
     pictures = []
     for figure in figures:
@@ -118,7 +120,7 @@ def animate_figures(
         for p in pictures
     )
     with atomic_draft(path) as draft:
-        write(draft, padded, float(fps), float(last_frame_seconds))
+        write(draft, padded, fps, last_frame_seconds)
 
 
 def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
@@ -165,16 +167,23 @@ def _check(
             "Argument `trajectory` must hold single tissues of one size, but their vertices have the "
             f"shapes {sorted(sizes)}."
         )
-    for name, value in (("fps", fps), ("dpi", dpi)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
-    for name, value in (("mark_t1", mark_t1), ("last_frame_seconds", last_frame_seconds)):
-        if not value >= 0:
-            raise ValueError(f"Argument `{name}` must not be negative, but is {value}.")
+    _check_timing(fps, last_frame_seconds, dpi)
+    if not mark_t1 >= 0:
+        raise ValueError(f"Argument `mark_t1` must not be negative, but is {mark_t1}.")
     if captions is not None and len(captions) != len(frames):
         raise ValueError(
             f"Argument `captions` must have one text for each of the {len(frames)} frames, but has "
             f"{len(captions)}."
+        )
+
+
+def _check_timing(fps: float, last_frame_seconds: float, dpi: int) -> None:
+    for name, value in (("fps", fps), ("dpi", dpi)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+    if not last_frame_seconds >= 0:
+        raise ValueError(
+            f"Argument `last_frame_seconds` must not be negative, but is {last_frame_seconds}."
         )
 
 

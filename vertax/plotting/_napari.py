@@ -6,6 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from matplotlib import colormaps
 
 from vertax._base.pixels import pixel_sides
@@ -37,12 +38,7 @@ def tension_layer(inferred: InferredTensions, *, colours: str = "plasma") -> tup
 
     - `ValueError` for tensions of a tissue without an image.
     """
-    if inferred.pixel_size is None:
-        raise ValueError(
-            "Argument `inferred` must come from an image, but has no pixels. "
-            "vx.plot_tissue draws it."
-        )
-    sides = pixel_sides(inferred.pixel_size)
+    sides = sides_of_pixels(inferred)
     fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=inferred.tissue.vertices.dtype)
     course = np.asarray(inferred.tissue.edge_points(fractions), float) / sides
     tensions = np.where(inferred.determined, inferred.tensions, np.nan)
@@ -59,6 +55,16 @@ def tension_layer(inferred: InferredTensions, *, colours: str = "plasma") -> tup
     }
     # In napari the middle of a pixel has integer coordinates, in vertax its corner; and rows come first.
     return list(course[..., ::-1] - 0.5), options, "shapes"
+
+
+def sides_of_pixels(inferred: InferredTensions) -> Float[np.ndarray, " xy"]:
+    """Width and height of the pixels; a `ValueError` for tensions of a tissue without an image."""
+    if inferred.pixel_size is None:
+        raise ValueError(
+            "Argument `inferred` must come from an image, but has no pixels. "
+            "vx.plot_tissue draws it."
+        )
+    return pixel_sides(inferred.pixel_size)
 
 
 def tension_colours(tensions: np.ndarray, colours: str) -> dict[str, Any]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Generator
+from typing import Any, NamedTuple
 
 import numpy as np
 from magicgui import widgets  # pyright: ignore[reportMissingImports]
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from napari.layers import Labels  # pyright: ignore[reportMissingImports]
@@ -23,12 +23,11 @@ from napari.utils.notifications import (  # pyright: ignore[reportMissingImports
 )
 
 from vertax._base.compilation_cache import enable_compilation_cache
-from vertax.inference import InferredTensions, MaskFrame, TensionsOfMasks, length_unit
+from vertax.inference import InferredTensions, MaskFrame, TensionsOfMasks
 from vertax.plotting._napari import limits, tension_colours, tension_layer
+from vertax.plotting._tension_map import PRESSURE_COLOURS
 
 _TENSIONS = "plasma"
-# Without the palest end, which looks like no colour.
-_BLUES = ListedColormap(colormaps["Blues"](np.linspace(0.15, 1, 256)), "pressures")
 # Width and height of the colour bars in pixels.
 _BARS = 320, 150
 
@@ -73,48 +72,33 @@ class TensionsWidget(widgets.Container):
         masks = self._masks(layer)
         options = {"kind": "labels", "pixel_size": self._pixel_size(layer)}
         options |= {"gap_width": self.gap_width.value or None, "prior": self.prior.value or None}
-        results: dict[int, InferredTensions] = {}
-        failures: dict[int, str] = {}
 
-        @thread_worker
-        def work() -> Iterator[tuple[int, Any]]:
-            enable_compilation_cache()
-            for number, mask in masks.items():
-                try:
-                    yield number, MaskFrame(number, mask).infer(**options)
-                except Exception as error:
-                    yield number, error
-
-        def keep(item: tuple[int, Any]) -> None:
-            number, result = item
-            if isinstance(result, Exception):
-                failures[number] = str(result)
-                show_error(f"frame {number}: {result}" if len(masks) > 1 else str(result))
-            else:
-                results[number] = result
+        def note(item: tuple[int, str | None]) -> None:
+            number, error = item
+            if error is not None:
+                show_error(f"frame {number}: {error}" if len(masks) > 1 else error)
             if len(masks) > 1:
                 self.progress.value += 1
 
         def end() -> None:
             self.start.enabled, self.progress.visible = True, False
-            if results:
-                unit = length_unit(options["pixel_size"])
-                self.tensions = TensionsOfMasks(results, failures, unit)  # pyright: ignore[reportArgumentType]
-                self.export.enabled = True
-                self._show(layer, masks, results)
 
         self.start.enabled, self.progress.visible = False, True
         # A bar that moves while the only frame is computed, or one step for each frame.
         self.progress.range = (0, len(masks) if len(masks) > 1 else 0)
         self.progress.value = 0
-        self.worker = work()
-        self.worker.yielded.connect(keep)
+        self.worker = _infer(masks, options)
+        self.worker.yielded.connect(note)
+        self.worker.returned.connect(lambda content: content and self._show(layer, content))
         self.worker.finished.connect(end)
         self.worker.start()
 
     def write(self) -> None:
         """Write the tables to the chosen folder."""
         assert self.tensions is not None
+        if not self.file.line_edit.value:
+            show_warning("Choose a folder for the tables first.")
+            return
         files = self.tensions.write(self.file.value)
         show_info(f"Wrote {', '.join(file.name for file in files)} to {self.file.value}.")
 
@@ -136,28 +120,25 @@ class TensionsWidget(widgets.Container):
             return None
         return height, width
 
-    def _show(
-        self, layer: Labels, masks: dict[int, np.ndarray], results: dict[int, InferredTensions]
-    ) -> None:
+    def _show(self, layer: Labels, content: _Content) -> None:
         """Replace the layers of tensions and pressures, and the colour bars."""
-        assert self.tensions is not None
-        edges, cells = self.tensions.edge_table(), self.tensions.cell_table()
+        self.tensions, self.export.enabled = content.tensions, True
+        edges, cells = content.edges, content.cells
         tension = np.where(edges["determined"], edges["tension"], np.nan)
         pressure = np.where(cells["determined"], cells["pressure"], np.nan)
         for name in ("tensions", "pressures"):
             if name in self.viewer.layers:
                 self.viewer.layers.remove(name)
         shape = layer.data.shape
-        picture, first = np.zeros((int(np.prod(shape[:-2])), *shape[-2:]), np.int32), 1
-        paths = []
-        for number, result in results.items():
-            picture[number] = _rows(masks[number], result.labels, first)
-            first += len(result.labels)
+        picture = np.zeros((int(np.prod(shape[:-2])), *shape[-2:]), np.int32)
+        paths, options = [], {}
+        for number, frame in content.frames.items():
+            picture[number] = frame.rows
             place = np.unravel_index(number, shape[:-2]) if len(shape) > 2 else ()
-            for path in tension_layer(result)[0]:
+            for path in frame.paths:
                 paths.append(np.hstack([np.tile(np.array(place, float), (len(path), 1)), path]))
-        options = tension_layer(next(iter(results.values())))[1]
-        options |= tension_colours(tension, _TENSIONS)
+            options = frame.options
+        options = options | tension_colours(tension, _TENSIONS)
         options |= {"features": edges | {"determined_tension": tension}, "metadata": {}}
         where = {"scale": layer.scale, "translate": layer.translate}
         table = {name: np.append(column[:1], column) for name, column in cells.items()}
@@ -175,9 +156,57 @@ class TensionsWidget(widgets.Container):
         self.bars.set_data(_colour_bars(limits(tension), limits(pressure)))
         self.bars.min_width, self.bars.min_height = _BARS
         self.bars.visible = True
-        for number, result in results.items():
-            for warning in result.warnings:
-                show_warning(f"frame {number}: {warning}" if len(masks) > 1 else warning)
+        for number, frame in content.frames.items():
+            for warning in frame.warnings:
+                show_warning(f"frame {number}: {warning}" if len(content.frames) > 1 else warning)
+
+
+class _Frame(NamedTuple):
+    """What the layers show of a frame."""
+
+    paths: Any
+    options: dict[str, Any]
+    rows: np.ndarray
+    """The row of each pixel's cell in the table of cells, from 1."""
+    warnings: tuple[str, ...]
+
+
+class _Content(NamedTuple):
+    """What the layers show."""
+
+    tensions: TensionsOfMasks
+    edges: dict[str, np.ndarray]
+    cells: dict[str, np.ndarray]
+    frames: dict[int, _Frame]
+
+
+# The tables and paths too: JAX compiles functions for them, which would block the window.
+@thread_worker
+def _infer(
+    masks: dict[int, np.ndarray], options: dict[str, Any]
+) -> Generator[tuple[int, str | None], None, _Content | None]:
+    """Infer masks in a thread; yields the number of each, and the message of its error."""
+    enable_compilation_cache()
+    results: dict[str | int, InferredTensions] = {}
+    failures: dict[str | int, str] = {}
+    frames, first = {}, 1
+    for number, mask in masks.items():
+        try:
+            result = MaskFrame(number, mask).infer(**options)
+            paths, layer_options, _ = tension_layer(result)
+            rows = _rows(mask, result.labels, first)
+            frames[number] = _Frame(paths, layer_options, rows, result.warnings)
+            first += len(result.labels)
+            results[number] = result
+        except Exception as error:
+            failures[number] = str(error)
+        yield number, failures.get(number)
+    if not results:
+        return None
+    scaled = options["pixel_size"] is not None
+    unit = {"length_unit": "unit of the scale of the layer"} if scaled else {}
+    tensions = TensionsOfMasks(results, failures, **unit)
+    return _Content(tensions, tensions.edge_table(), tensions.cell_table(), frames)
 
 
 def _rows(mask: np.ndarray, labels: np.ndarray, first: int) -> np.ndarray:
@@ -190,7 +219,7 @@ def _rows(mask: np.ndarray, labels: np.ndarray, first: int) -> np.ndarray:
 
 def _label_colours(pressure: np.ndarray) -> DirectLabelColormap:
     """A colour for each row of the table of cells, grey where the pressure is not determined."""
-    colour = _BLUES(Normalize(*limits(pressure))(np.nan_to_num(pressure)))
+    colour = PRESSURE_COLOURS(Normalize(*limits(pressure))(np.nan_to_num(pressure)))
     colour[~np.isfinite(pressure)] = (0.5, 0.5, 0.5, 1.0)
     colours: dict[int | None, Any] = {row + 1: each for row, each in enumerate(colour)}
     return DirectLabelColormap(color_dict=colours | {None: np.zeros(4), 0: np.zeros(4)})
@@ -204,7 +233,7 @@ def _colour_bars(tension: tuple[float, float], pressure: tuple[float, float]) ->
         figure.subplots(2, 1),
         ("tension / mean tension", "pressure less the mean"),
         (tension, pressure),
-        (colormaps[_TENSIONS], _BLUES),
+        (colormaps[_TENSIONS], PRESSURE_COLOURS),
         strict=True,
     ):
         figure.colorbar(

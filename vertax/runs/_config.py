@@ -118,7 +118,8 @@ def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[s
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
                 raise ConfigError(
-                    f"Cannot set `{'.'.join(parts)}`: `{part}` is a value and not a table."
+                    f"Cannot set `{'.'.join(parts)}`: `{part}` is {table!r} and not a table. Set either "
+                    f"`{part}` or its keys."
                 )
         table[name] = _parse(text)
     return config

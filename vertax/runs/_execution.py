@@ -36,6 +36,7 @@ _FILES = (
     METRICS,
     FAILED,
     "*.csv",
+    "*.gif",
     "*.geojson",
     "*.npz",
     "*.npy",

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from vertax._base.archive import read_archive, write_archive
 from vertax._base.extras import requires_extra
 from vertax._base.results import RESULTS
+from vertax._base.threads import num_threads
 from vertax.fitting import (
     Checkpoint,
     Fit,
@@ -42,7 +43,6 @@ METRICS, PARTS = "metrics.json", "unfinished"
 _UNDATED: dict[str, dict[str, None]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 _VECTOR_STYLE: Any = {"pdf.fonttype": 42, "svg.hashsalt": "vertax"}
 
-THREADS = "VERTAX_THREADS"  # the environment variable with the number of threads
 Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 Result = TypeVar("Result")
 
@@ -82,6 +82,11 @@ class RunFolder:
         self.interrupted = False
         self._print_steps = print_steps
         self._warnings: dict[str, list[str]] = {}
+
+    @property
+    def parts(self) -> Path:
+        """The folder of archives (`.npz`) that a resumed run keeps; the end of the run removes them."""
+        return self.path / PARTS
 
     def print_step(self, step: str) -> None:
         """Print the current step of the run (`vertax run` without `--quiet`).
@@ -337,16 +342,10 @@ class RunFolder:
             raise KeyboardInterrupt
 
     def _part_file(self, name: str) -> Path:
-        (self.path / PARTS).mkdir(exist_ok=True)
-        return self.path / PARTS / f"{file_name(name)}.npz"
+        self.parts.mkdir(exist_ok=True)
+        return self.parts / f"{file_name(name)}.npz"
 
     def _save_failed(self, name: str, outcome: Fit[Any]) -> None:
         self.save_table(f"history_{name}", history_table(outcome.history))
         if outcome.history.cost.ndim == 1:
             self.save_tissue(f"fitted_{name}", outcome.tissue)
-
-
-def num_threads() -> int:
-    """The number of threads: the environment variable, or one per core."""
-    number = os.environ.get(THREADS, "")
-    return max(int(number), 1) if number.isdecimal() else os.cpu_count() or 1

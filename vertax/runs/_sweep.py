@@ -20,6 +20,7 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from vertax._base.compilation_cache import enable_compilation_cache
+from vertax._base.threads import THREADS, num_threads
 from vertax.io import write_csv
 from vertax.runs._config import ConfigError, ExperimentConfig, validate
 from vertax.runs._execution import (
@@ -31,13 +32,7 @@ from vertax.runs._execution import (
     read_metrics,
     unfinished_folder,
 )
-from vertax.runs._folder import (
-    METRICS,
-    THREADS,
-    RunFolder,
-    RunFolderError,
-    num_threads,
-)
+from vertax.runs._folder import METRICS, RunFolder, RunFolderError
 from vertax.runs._registry import find_experiment, load_config
 from vertax.runs._tables import file_name, plain
 
