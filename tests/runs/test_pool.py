@@ -78,7 +78,8 @@ def outcome(problem, interrupted):
     }
     history = vx.History(**curves | counts)
     best = (jnp.array(1.0), jnp.array(0.0), np.array(0))
-    return vx.Fit(problem.energy, problem.tissue, *best, history, interrupted=interrupted)
+    result = vx.RESULTS.interrupted if interrupted else vx.RESULTS.successful
+    return vx.Fit(problem.energy, problem.tissue, *best, history, result=result)
 
 
 def test_a_finished_fit_keeps_the_interrupt_flag(tmp_path, monkeypatch):

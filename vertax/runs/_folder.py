@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from vertax._base.archive import read_archive, write_archive
 from vertax._base.extras import requires_extra
+from vertax._base.results import RESULTS
 from vertax.fitting import Checkpoint, Fit, FitError, InverseProblem, Record, doubts, fit
 from vertax.io import atomic_write, save_tissue, write_csv
 from vertax.mesh import Tissue
@@ -211,8 +212,9 @@ class RunFolder:
             self.warn(str(error).rstrip("."), name)
             return error.fit
         # With concurrent fits the flag is only ever set.
-        self.interrupted |= outcome.interrupted
-        if not outcome.interrupted:
+        interrupted = bool(np.any(outcome.result == RESULTS.interrupted))
+        self.interrupted |= interrupted
+        if not interrupted:
             self._judge(name, optimiser, epochs, outcome)
         return outcome
 
