@@ -143,7 +143,7 @@ def test_figures_become_an_animation_with_white_margins(tmp_path):
             drawn.append(colour)
             yield plain_figure(width, colour)
 
-    vx.plotting.animate_figures(figures(), path, fps=5, linger=1.0, dpi=50)
+    vx.plotting.animate_figures(figures(), path, fps=5, last_frame_seconds=1.0, dpi=50)
     assert drawn == ["#cc0000", "#0000cc"]
     pictures, times = frames_of(path)
     assert [p.shape for p in pictures] == [(50, 100, 3)] * 2
@@ -158,7 +158,7 @@ def test_figures_become_an_animation_with_white_margins(tmp_path):
     [
         ({"fps": 0}, "`fps` must be positive"),
         ({"dpi": -1}, "`dpi` must be positive"),
-        ({"linger": -1}, "`linger` must not be negative"),
+        ({"last_frame_seconds": -1}, "`last_frame_seconds` must not be negative"),
         ({"figures": []}, "`figures` must have at least one figure"),
         ({"path": "a.png"}, "`path` must end in .gif or .mp4"),
     ],

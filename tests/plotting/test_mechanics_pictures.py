@@ -10,7 +10,7 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection
 from matplotlib.quiver import Quiver
 
-from vertax import RESULTS
+import vertax as vx
 from vertax.mechanics import Ramp
 from vertax.plotting import (
     plot_density_of_states,
@@ -70,10 +70,9 @@ def slow_shear():
     stresses[:, 0, 1] = stresses[:, 1, 0] = [0.0, 1.0, 0.5, 1.5, 2.0]
     stresses[:, 0, 0] = 3.0
     frames = jax.tree.map(lambda x: jnp.stack([x] * 5), eqx.filter(tissue, eqx.is_array))
-    t1, failed = jnp.array([7, 0, 4, 0, 0]), jnp.array([0, 0, 0, 0, 1])
-    unrelaxed = RESULTS.nonlinear_max_steps_reached
-    results = RESULTS.where(failed == 1, unrelaxed, RESULTS.successful)
-    return Ramp(jnp.arange(5) * 0.1, frames, jnp.zeros(5), jnp.asarray(stresses), t1, results)
+    t1, last = jnp.array([7, 0, 4, 0, 0]), vx.RESULTS.nonlinear_max_steps_reached
+    rest = jax.vmap(lambda i: vx.RESULTS.where(i < 4, vx.RESULTS.successful, last))(jnp.arange(5))
+    return Ramp(jnp.arange(5) * 0.1, frames, jnp.zeros(5), jnp.asarray(stresses), t1, rest)
 
 
 def test_stress_over_strain_breaks_at_plastic_events():

@@ -251,7 +251,7 @@ def test_division_without_a_spare_slot_is_rejected(without_type_checks):
     full = divide(tissue, 0).tissue
     with pytest.raises(RuntimeError, match="capacity is 7 cells"):
         divide(full, 0)
-    with pytest.raises(Exception, match="capacity is 7 cells"):
+    with pytest.raises(Exception, match="all cell slots of the tissue are alive"):
         jax.block_until_ready(jax.jit(lambda t: divide(t, 0).tissue.vertices)(full))
     change = divide(full, 0, throw=False)
     assert not change.converged

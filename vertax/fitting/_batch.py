@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from vertax._base.batch import stack
-from vertax._base.results import first_of
 from vertax.fitting._history import Fit, History
 
 
@@ -48,5 +47,5 @@ def stack_fits(fits: Sequence[Fit[Any]], *, at_once: int = 1) -> Fit[Any]:
         best_epoch=np.stack([fit.best_epoch for fit in fits]),
         history=History(**columns),
         notes={n: np.stack([fit.notes[n][:epochs] for fit in fits], axis=1) for n in names},
-        result=first_of(stack([fit.result for fit in fits])),
+        result=stack([fit.result for fit in fits]),
     )

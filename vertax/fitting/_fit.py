@@ -160,7 +160,7 @@ def fit(
         np.asarray(best.epoch),
         history,
         columns_of(done.notes),
-        result,
+        result_of(jnp.full(np.shape(best.epoch), index_of(result))),
     )
     if stopped is not None:
         raise FitError(

@@ -147,7 +147,7 @@ class RunFolder:
                 raise
             self.warn(str(error).rstrip("."), name)
             return error.fit
-        interrupted = bool(outcome.result == RESULTS.interrupted)
+        interrupted = bool(np.any(outcome.result == RESULTS.interrupted))
         self.interrupted |= interrupted  # fits in other threads never reset it
         if interrupted:
             return outcome
