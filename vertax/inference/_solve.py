@@ -304,7 +304,7 @@ def _prior_precision(
 
 
 def _least_squares(
-    white: Float[np.ndarray, "rows unknowns+1"],
+    white: Float[np.ndarray, "rows columns"],
     precision: Float[np.ndarray, "unknowns unknowns"],
     expected: Float[np.ndarray, " unknowns"],
     mean: Float[np.ndarray, " unknowns"],
