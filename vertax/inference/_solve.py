@@ -32,12 +32,12 @@ _SMALL = 0.2
 # Initial standard deviations; the pressures of arcs keep theirs, because the evidence underestimates it where
 # arcs lag behind the pressures.
 _FIRST = Errors(junction=0.05, arc=0.1, noise=1.0, tension=0.3, region=0.3, pressure=1.0)
-# Smallest and largest ones, of arcs (angles in radians, tensions in mean tensions). In noise, the evidence
-# underestimates the prior of tensions as well.
-_JUNCTIONS, _ARCS, _TENSIONS, _REGIONS = (5e-3, 1.5), (1e-3, 1.5), (0.3, 1.5), (0.03, 1.5)
-# The same of straight edges.
-_STRAIGHT = {"junction": (1e-3, 1.5), "pressure": (0.01, 10.0)}
-_STRAIGHT_TENSIONS = (0.03, 1.5)
+# Smallest and largest ones: of directions and arcs in radians; of pressures; and of tensions, in mean tensions.
+# Tensions that are not negative and uniform about a mean of 1 have 0.58. In the noise of arcs, the evidence
+# underestimates the independent part.
+_JUNCTIONS, _ARCS, _PRESSURES = (5e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
+_STRAIGHT_JUNCTIONS = (1e-3, 1.5)
+_TENSIONS, _ARC_TENSIONS = (0.03, 0.6), (0.3, 0.6)
 # Length of an edge, in cell diameters, below which the error of its arc does not decrease.
 _SHORTEST = 0.25
 # The errors of arcs are forces of friction along the edges. Only their sums around junctions contradict a
@@ -126,10 +126,12 @@ def observability(
     smallest = _LESS if curves.crisp else _ROUGH_LESS
     noise = _VERTICES if len(curves.rest) == 0 else (smallest, _MORE)
     bounds = {"noise": (noise[0], 1.0 if known_noise else noise[1])}
-    bounds |= {"junction": _JUNCTIONS, "arc": _ARCS} if which.n_arcs else _STRAIGHT
+    if which.n_arcs:
+        bounds |= {"junction": _JUNCTIONS, "arc": _ARCS}
+    else:
+        bounds |= {"junction": _STRAIGHT_JUNCTIONS, "pressure": _PRESSURES}
     if prior is None:
-        tensions = _TENSIONS if which.n_arcs else _STRAIGHT_TENSIONS
-        bounds |= {"tension": tensions, "region": _REGIONS}
+        bounds |= {"tension": _ARC_TENSIONS if which.n_arcs else _TENSIONS, "region": _TENSIONS}
     return Observability(
         angle=angles(fitted, which),
         covariance=covariance,
