@@ -32,9 +32,9 @@ _SMALL = 0.2
 # Initial standard deviations; the pressures of arcs keep theirs, because the evidence underestimates it where
 # arcs lag behind the pressures.
 _FIRST = Errors(junction=0.05, arc=0.1, noise=1.0, tension=0.3, region=0.3, pressure=1.0)
-# Smallest and largest ones: of directions and arcs in radians, of pressures, and of tensions in mean tensions.
-# Tensions that are not negative and uniform about a mean of 1 have 0.58. In the noise of arcs, the evidence
-# underestimates the independent part.
+# Smallest and largest ones: of directions and arcs in radians, of pressures, and of tensions in mean
+# tensions. Tensions that are not negative and uniform about a mean of 1 have 0.58. Of arcs in noise, the
+# evidence underestimates the independent part.
 _JUNCTIONS, _ARCS, _PRESSURES = (5e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
 _STRAIGHT_JUNCTIONS = (1e-3, 1.5)
 _TENSIONS, _ARC_TENSIONS = (0.03, 0.6), (0.3, 0.6)
