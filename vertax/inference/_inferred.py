@@ -121,7 +121,7 @@ class InferredTensions(eqx.Module):
             warnings.append(
                 f"edges bend by {np.degrees(self.bending):.1f} degrees beyond arcs: the tissue moves, and "
                 "its shape is in part that of earlier tensions; the present ones differ more from each other "
-                "than the inferred ones, beyond their standard deviations"
+                "than the inferred ones"
             )
         if arc > 0.5:
             warnings.append(

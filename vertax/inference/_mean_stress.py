@@ -59,15 +59,15 @@ def stress_weights(
     geometry = geometry_of(tissue)
     missing = np.full(tissue.n_edges, True)
     missing[edges] = False
-    whole = np.isin(np.arange(tissue.n_cells), cells)
-    whole = np.append(whole, False)
-    whole[geometry.edge_cells[missing].ravel()] = False
-    area = np.where(whole[:-1], geometry.areas, 0.0)
+    included = np.isin(np.arange(tissue.n_cells), cells)
+    included = np.append(included, False)
+    included[geometry.edge_cells[missing].ravel()] = False
+    area = np.where(included[:-1], geometry.areas, 0.0)
     total = max(float(np.sum(area)), 1e-300)
-    half = 0.5 * whole[geometry.edge_cells].sum(axis=1)
+    half = 0.5 * included[geometry.edge_cells].sum(axis=1)
     pull = (half[:, None, None] * fabric(tissue))[edges].reshape(-1, 4)[:, [0, 1, 3]].T
     push = -np.outer([1, 0, 1], area[cells])
-    return np.concatenate([pull, push], axis=1) / total, whole[:-1]
+    return np.concatenate([pull, push], axis=1) / total, included[:-1]
 
 
 def mean_stress(

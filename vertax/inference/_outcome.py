@@ -105,11 +105,11 @@ def outcome(
     if report is not None:
         tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
     result = relative(balance, which)
-    weights, whole = stress_weights(tissue, which.edges, which.cells)
+    weights, included = stress_weights(tissue, which.edges, which.cells)
     stress = mean_stress(
         weights @ np.concatenate([result.tension, result.pressure]),
         weights @ result.covariance @ weights.T,
-        int(whole.sum()),
+        int(included.sum()),
     )
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:

@@ -49,7 +49,7 @@ _KAPPA = 0.2
 # Smallest noise relative to that of the points, of smooth and of rough outlines, and the largest: pixels
 # along a straight line deviate from it by a pattern that averages out, rough outlines do not.
 _LESS, _ROUGH_LESS, _MORE = 0.1, 0.7, 2.0
-# The same for vertices of straight edges without an image, whose noise is not known beforehand.
+# The same for vertices of straight edges without an image, with a noise that is not known beforehand.
 _VERTICES = (0.01, 50.0)
 # Iterations of the first and of the second estimate of the errors.
 _STEPS = (25, 10)
@@ -312,7 +312,7 @@ def _least_squares(
     mean: Float[np.ndarray, " unknowns"],
     n_edges: int,
 ) -> tuple[Float[np.ndarray, " unknowns"], Float[np.ndarray, "unknowns unknowns"]]:
-    """Tensions of mean 1 and pressures that minimise the forces, whose last column has no unknown."""
+    """Tensions of mean 1 and pressures that minimise the forces; the last column has no unknown."""
     matrix, given = white[:, :-1], white[:, -1]
     normal = matrix.T @ matrix + precision
     heavy = 1e3 * np.trace(normal) / len(normal) * n_edges
