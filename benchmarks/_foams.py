@@ -67,8 +67,17 @@ def voronoi(n_cells: int, seed: int, noise: float = 0.0) -> tuple[vx.Tissue, np.
     cells = [regions.regions[regions.point_region[k]] for k in np.flatnonzero(inside)]
     used, corners = np.unique(np.concatenate(cells), return_inverse=True)
     parts = np.split(corners, np.cumsum([len(c) for c in cells])[:-1])
-    points = regions.vertices[used] + noise * random.normal(size=(len(used), 2))
-    tissue = vx.initialise.from_polygons(points, [list(map(int, p)) for p in parts]).tissue
+    polygons = [list(map(int, p)) for p in parts]
+    tissue = None
+    for attempt in range(50):
+        points = regions.vertices[used] + noise * random.normal(size=(len(used), 2))
+        try:
+            tissue = vx.initialise.from_polygons(points, polygons).tissue
+            break
+        except ValueError:  # sides of a short edge cross
+            if attempt == 49:
+                raise
+    assert tissue is not None
     sides = np.append(np.flatnonzero(inside), -1)[np.asarray(tissue.topology.edge_cells)]
     length = np.linalg.norm(seeds[sides[:, 0]] - seeds[sides[:, 1]], axis=1)
     return tissue, np.where(np.any(sides < 0, axis=1), np.nan, length)

@@ -29,7 +29,7 @@ def halves(tissue: vx.Tissue, random: np.random.Generator) -> np.ndarray:
     geometry = observed_geometry(tissue)
     first = random.random(geometry.n_vertices) < 0.5
     points = Points(np.zeros(0, int), np.zeros((0, 2)))
-    found = []
+    parts = []
     for half in (first, ~first):
         part = geometry._replace(inner=geometry.inner & half)
         curves = fit(part, points, 0.01 * part.size, apart=None, noise=None)
@@ -38,8 +38,8 @@ def halves(tissue: vx.Tissue, random: np.random.Generator) -> np.ndarray:
         result = relative(solved.balance, solved.which)
         values = np.full((2, tissue.n_edges), np.nan)
         values[:, solved.which.edges] = result.tension, result.tension_deviation
-        found.append(values)
-    (a, b), (c, d) = found
+        parts.append(values)
+    (a, b), (c, d) = parts
     scores = (a - c) / np.hypot(b, d)
     return scores[np.isfinite(scores)]
 

@@ -77,7 +77,7 @@ def solution(
 
 
 # Both describe the same angles. With straight edges, the angles of arcs are noise, α ~ N(0, ν² C); with arcs
-# they are unknowns of the balance, whose forces 2 γ sin α change by 2 for a change of α by 1.
+# they are unknowns of the balance; its forces 2 γ sin α change by 2 for a change of α by 1.
 def more_evident(arcs: Solution, straight: Solution) -> Solution:
     """The solution of the larger evidence."""
     n = arcs.which.n_directions

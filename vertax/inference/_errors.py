@@ -16,12 +16,8 @@ class Errors(NamedTuple):
 
     junction: Float[np.ndarray, "*shape"] | float
     """Directions at junctions, radians."""
-    grain: Float[np.ndarray, "*shape"] | float
-    """Directions of edges of the length of a cell, radians; of others in inverse proportion to the length."""
     arc: Float[np.ndarray, "*shape"] | float
     """Angles of arcs of the length of a cell, radians."""
-    bent_arc: Float[np.ndarray, "*shape"] | float
-    """Angles of arcs, relative to the bend of the edge."""
     noise: Float[np.ndarray, "*shape"] | float
     """Noise relative to that of the points."""
     tension: Float[np.ndarray, "*shape"] | float
@@ -84,6 +80,8 @@ def most_evident(
             slope[at] += 2 * logs[at]
         return float(value), np.array(slope)
 
+    if not free:
+        return guess, -0.5 * loss(np.zeros(0))[0]
     limits = np.log([bounds[Errors._fields[k]] for k in free]).reshape(-1, 2)
     values = [float(value) for value in guess]
     first = np.clip(np.log([values[k] for k in free]), *limits.T)

@@ -85,7 +85,7 @@ def infer_tensions(
     - `pixel_size`, `background`, `gap_width`, `holes`: of a mask, see
         [`from_labels`][vertax.initialise.from_labels]. Where a TIFF file has pixels that are not square,
         their ratio is taken from it.
-    - `edges`: `"arcs"`, where the curvature determines pressures; `"straight"`, with the pressures acting on
+    - `edges`: `"arcs"`, curved by pressures; `"straight"`, with the pressures acting on
         vertices (Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017); by default, of a tissue with
         arcs the one of the larger evidence, see `InferredTensions.edges`.
     - `noise`: standard deviation of the position of an edge, in pixels of a mask and otherwise in units of

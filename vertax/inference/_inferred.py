@@ -38,11 +38,11 @@ class InferredTensions(eqx.Module):
     tensions: Float[np.ndarray, " edges"]
     """Tension of each edge; NaN where no equation contains it."""
     tension_deviations: Float[np.ndarray, " edges"]
-    """Their standard deviations."""
+    """Their standard deviations. Those of arcs include an error of the contrast of all tensions."""
     determined: Bool[np.ndarray, " edges"]
     """Whether the shape determines the tension. It does not for edges of the outline or of a hole, edges
     without an end where three cells meet, edges too short for a direction, contacts that the mask does not
-    show, and where the standard deviation is above 0.3."""
+    show, and where the standard deviation without the error of the contrast is above 0.3."""
     pressures: Float[np.ndarray, " cells"]
     """Pressure of each cell less the mean; NaN where no equation contains it."""
     pressure_deviations: Float[np.ndarray, " cells"]
@@ -66,10 +66,9 @@ class InferredTensions(eqx.Module):
     """`"arcs"` or `"straight"`: how edges were described."""
     errors: dict[str, float]
     """Standard deviations chosen by the evidence: `junction`, of the directions at junctions beyond noise
-    (radians); `grain`, the same of edges of the length of a cell, in inverse proportion to the length; `arc`,
-    of arcs of the length of a cell (radians); `bent_arc`, of arcs relative to the bend; `noise`, relative to
+    (radians); `arc`, of arcs of the length of a cell (radians; 0 for straight edges); `noise`, relative to
     that of the points; and of the priors: `tension`, independent; `region`, similar in regions; `pressure`,
-    in mean tensions over a cell diameter. 0 for errors that are not part of the model."""
+    in mean tensions over a cell diameter (1 for arcs)."""
     mean_stress: MeanStress
     """Mean stress of the tissue and its anisotropy, with standard deviations."""
     pixel_size: PixelSize | None
@@ -123,7 +122,7 @@ class InferredTensions(eqx.Module):
             warnings.append(
                 f"edges bend by {np.degrees(self.bending):.1f} degrees beyond arcs: the tissue moves, and "
                 "its shape is in part that of earlier tensions; the present ones differ more from each other "
-                "than the inferred ones, beyond their standard deviations"
+                "than the inferred ones"
             )
         if arc > 0.5:
             warnings.append(

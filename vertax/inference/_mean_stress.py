@@ -11,7 +11,7 @@ from vertax.mesh._geometry import geometry_of
 
 
 class MeanStress(eqx.Module):
-    r"""Mean stress of the cells with an inferred tension of each edge (Batchelor 1970,
+    r"""Mean stress of the cells with inferred tensions of all their edges (Batchelor 1970,
     doi:10.1017/S0022112070000745),
 
     $$\sigma = \frac{1}{\sum_c A_c} \Big( \sum_e \frac{n_e}{2} \gamma_e \int_e t\,t^T \,dl

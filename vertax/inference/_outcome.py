@@ -13,7 +13,7 @@ from vertax.inference._balance import Equations
 from vertax.inference._curves import Fitted, Points, arc_distances
 from vertax.inference._inferred import InferredTensions
 from vertax.inference._mean_stress import fabric, mean_stress, stress_weights
-from vertax.inference._solve import Balance
+from vertax.inference._solve import HIDDEN, Balance
 from vertax.initialise import MaskReport
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import angle_of_area
@@ -32,8 +32,10 @@ class Relative(NamedTuple):
     pressure_deviation: Float[np.ndarray, " pressures"]
     beside: Bool[np.ndarray, " pressures"]
     """Whether a cell has an edge of determined tension."""
-    slope: Float[np.ndarray, "unknowns unknowns"]
-    """Slope of these numbers with respect to tensions and pressures before the scaling."""
+    sure: Bool[np.ndarray, " tensions"]
+    """Whether a tension is determined, up to the error of the contrast of all."""
+    covariance: Float[np.ndarray, "unknowns unknowns"]
+    """Covariance of these numbers."""
 
 
 def relative(balance: Balance, which: Equations) -> Relative:
@@ -62,9 +64,16 @@ def relative(balance: Balance, which: Equations) -> Relative:
         values[n:] -= np.mean(values[n:][beside])
         slope[n:] -= slope[n:][beside].mean(axis=0)
     slope /= scale
-    variance = np.sum((slope @ balance.covariance) * slope, axis=1)
-    deviations = np.sqrt(np.maximum(variance, 0))
-    return Relative(values[:n], values[n:], deviations[:n], deviations[n:], beside, slope)
+    covariance = slope @ balance.covariance @ slope.T
+    sure = ~balance.loose & (np.diag(covariance)[:n] < _UNKNOWN**2)
+    # Friction along edges, which is the error of arcs, hides a part of the contrast of tensions from all
+    # junctions alike: their angles follow the tensions late. As a force it is 2 γ times this error.
+    lag = HIDDEN * balance.errors.arc * np.append(values[:n] - 1, np.zeros(len(values) - n))
+    covariance += np.outer(lag, lag)
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0))
+    return Relative(
+        values[:n], values[n:], deviations[:n], deviations[n:], beside, sure, covariance
+    )
 
 
 def outcome(
@@ -96,12 +105,11 @@ def outcome(
     if report is not None:
         tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
     result = relative(balance, which)
-    weights, whole = stress_weights(tissue, which.edges, which.cells)
-    linear = weights @ result.slope
+    weights, included = stress_weights(tissue, which.edges, which.cells)
     stress = mean_stress(
         weights @ np.concatenate([result.tension, result.pressure]),
-        linear @ balance.covariance @ linear.T,
-        int(whole.sum()),
+        weights @ result.covariance @ weights.T,
+        int(included.sum()),
     )
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
@@ -111,8 +119,7 @@ def outcome(
 
     nan, edges = float("nan"), (tissue.n_edges, which.edges)
     tensions = spread(*edges, result.tension, nan)
-    sure = ~balance.loose & (result.tension_deviation < _UNKNOWN)
-    determined = spread(*edges, sure, False) & ~four_fold
+    determined = spread(*edges, result.sure, False) & ~four_fold
     cells = (tissue.n_cells, which.cells)
     pressures = spread(*cells, result.pressure, nan)
     return InferredTensions(

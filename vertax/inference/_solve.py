@@ -29,29 +29,30 @@ from vertax.inference._observed_geometry import ObservedGeometry
 _LOOSE, _SHORT, _TINY, _UNKNOWN = 0.2, 8.0, 0.02, 10.0
 # Smallest tension in the covariance of the forces.
 _SMALL = 0.2
-# Initial standard deviations.
-_FIRST = Errors(0.05, 1e-3, 0.1, 0.3, 1.0, 0.3, 0.3, 1.0)
-# Smallest and largest ones (angles in radians, bends relative, priors in mean tensions).
-_ANGLES, _RATIOS, _TENSIONS, _PRESSURES = (1e-3, 1.5), (1e-2, 10.0), (0.03, 1.5), (0.3, 10.0)
-_GRAINS, _JUNCTIONS = (1e-5, 0.05), (5e-3, 1.5)
+# Initial standard deviations; the pressures of arcs keep theirs, because the evidence underestimates it where
+# arcs lag behind the pressures.
+_FIRST = Errors(junction=0.05, arc=0.1, noise=1.0, tension=0.3, region=0.3, pressure=1.0)
+# Smallest and largest ones: of directions and arcs in radians, of pressures, and of tensions in mean
+# tensions. Tensions that are not negative and uniform about a mean of 1 have 0.58. Of arcs in noise, the
+# evidence underestimates the independent part.
+_JUNCTIONS, _ARCS, _PRESSURES = (5e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
+_STRAIGHT_JUNCTIONS = (1e-3, 1.5)
+_TENSIONS, _ARC_TENSIONS = (0.03, 0.6), (0.3, 0.6)
 # Length of an edge, in cell diameters, below which the error of its arc does not decrease.
 _SHORTEST = 0.25
 # The errors of arcs are forces of friction along the edges. Only their sums around junctions contradict a
 # balance; the rest, which is as large or larger, changes pressures and is not in the residual.
-_HIDDEN = 2.0
+HIDDEN = 2.0
 # Range of the correlation of tensions: κ² in the covariance (L + κ²)⁻², with L the Laplacian of edges that
 # meet at junctions. The correlation decreases over about √8 / κ edges.
 _KAPPA = 0.2
-_PRIORS = ("tension", "region", "pressure")
 # Smallest noise relative to that of the points, of smooth and of rough outlines, and the largest: pixels
 # along a straight line deviate from it by a pattern that averages out, rough outlines do not.
 _LESS, _ROUGH_LESS, _MORE = 0.1, 0.7, 2.0
-# The same for vertices of straight edges without an image, whose noise is not known beforehand.
+# The same for vertices of straight edges without an image, with a noise that is not known beforehand.
 _VERTICES = (0.01, 50.0)
 # Iterations of the first and of the second estimate of the errors.
 _STEPS = (25, 10)
-# Bends larger than this, in radians, are errors of arcs.
-_BENT = 1e-3
 # Largest adjustment of an angle, in radians.
 _REACH = 0.5
 
@@ -72,8 +73,6 @@ class Observability(NamedTuple):
     other, so that the balance of both ends together remains."""
     size: float
     """Root of the mean area of a cell."""
-    bend: Float[np.ndarray, " edges"]
-    """Size of the bend of each edge beyond its arc, radians."""
     bounds: dict[str, tuple[float, float]]
     """Smallest and largest standard deviations of errors and priors."""
 
@@ -126,18 +125,13 @@ def observability(
     unknown = pulls(fitted, which, loose)
     smallest = _LESS if curves.crisp else _ROUGH_LESS
     noise = _VERTICES if len(curves.rest) == 0 else (smallest, _MORE)
-    bounds = {
-        "junction": _JUNCTIONS if which.n_arcs else _ANGLES,
-        "noise": (noise[0], 1.0 if known_noise else noise[1]),
-    }
-    # Arcs that lag behind the pressures would make these small in the evidence.
-    bounds["pressure"] = _PRESSURES if which.n_arcs else (0.01, _PRESSURES[1])
-    if prior is None:
-        bounds |= {"tension": _TENSIONS, "region": _TENSIONS}
+    bounds = {"noise": (noise[0], 1.0 if known_noise else noise[1])}
     if which.n_arcs:
-        bounds |= {"arc": _ANGLES, "grain": _GRAINS}
-        if curves.bending > _BENT:
-            bounds["bent_arc"] = _RATIOS
+        bounds |= {"junction": _JUNCTIONS, "arc": _ARCS}
+    else:
+        bounds |= {"junction": _STRAIGHT_JUNCTIONS, "pressure": _PRESSURES}
+    if prior is None:
+        bounds |= {"tension": _ARC_TENSIONS if which.n_arcs else _TENSIONS, "region": _TENSIONS}
     return Observability(
         angle=angles(fitted, which),
         covariance=covariance,
@@ -145,13 +139,12 @@ def observability(
         loose=loose,
         unknown=_UNKNOWN**2 * unknown @ unknown.T,
         size=fitted.size,
-        bend=np.linalg.norm(fitted.bend[which.edges], axis=1),
         bounds=bounds,
     )
 
 
 # Observed are angles a with the covariance C, from the noise of points. Where the tissue is not in balance,
-# angles differ from those of a balance as well, the more the more an edge bends beyond an arc.
+# angles differ from those of a balance as well.
 # Forces r(x, a) = A(a) x are linear in the unknowns x. To first order their covariance is S = J C Jᵀ with
 # J = ∂r/∂a. Weighted least squares with fixed a would shrink the unknowns, because the noise of A and of r is
 # the same. So a is adjusted as well (total least squares: Britt & Luecke 1973,
@@ -188,32 +181,19 @@ def solve(
     mean = np.append(~loose, np.zeros(n_cells, bool)) / max(1, np.sum(~loose))
     has_errors, evidence = errors is not None, np.nan
     if errors is None:
-        absent = {name: 0.0 for name in Errors._fields if name not in shape.bounds}
-        errors = _FIRST._replace(**absent | ({} if prior is None else {"tension": prior}))
-    diagonals, regions = _diagonals(shape, which), _regions(which)
+        errors = _FIRST if which.n_arcs else _FIRST._replace(arc=0.0)
+        if prior is not None:
+            errors = errors._replace(tension=prior, region=0.0)
+    regions = _regions(which)
     covariance = residual = np.zeros(0)
     for attempt in range(rounds):
         matrix = forces(shape.angle + change, which, loose)
         slope = force_slopes(shape.angle + change, which, np.maximum(x[:n_edges], _SMALL))
         offset = -slope @ change
         if attempt in (2, 4) and not has_errors:
-            residual = matrix @ expected + offset
-            parts = _parts(matrix, slope, shape, diagonals, mean, regions)
-            bounds, steps = shape.bounds, _STEPS[attempt // 4]
-            if which.n_arcs:
-                # With wide priors, this is restricted maximum likelihood: the errors do not depend on how
-                # well the prior describes the tensions.
-                wide = errors._replace(
-                    tension=prior or 1.0, region=0.0 if prior else 1.0, pressure=10.0
-                )
-                free = {k: v for k, v in bounds.items() if k not in _PRIORS}
-                errors, _ = most_evident(residual, parts, shape.unknown, wide, free, steps=steps)
-                errors = errors._replace(
-                    tension=prior or 0.3, region=0.0 if prior else 0.3, pressure=1.0
-                )
-                bounds = {k: v for k, v in bounds.items() if k in _PRIORS}
-            errors, evidence = most_evident(
-                residual, parts, shape.unknown, errors, bounds, steps=steps
+            parts = _parts(matrix, slope, shape, which, mean, regions)
+            errors, evidence = _chosen(
+                matrix @ expected + offset, parts, shape, errors, prior, _STEPS[attempt // 4]
             )
         spread = errors.noise**2 * shape.covariance
         spread += np.diag(model_deviations(errors, shape, which) ** 2)
@@ -221,19 +201,10 @@ def solve(
         factor = np.linalg.cholesky(slope @ answer + shape.unknown)
         precision = _prior_precision(errors, shape, regions, n_cells)
         white = solve_triangular(factor, np.column_stack([matrix, offset]), lower=True)
-        white, given = white[:, :-1], white[:, -1]
-        normal = white.T @ white + precision
-        heavy = 1e3 * np.trace(normal) / len(normal) * n_edges
-        normal += heavy * np.outer(mean, mean)
-        right = -white.T @ given + precision @ expected + heavy * mean
-        root = cho_factor(normal)
-        before, x = x, cho_solve(root, right)
-        if np.any(x[:n_edges] < 0):
-            x = _not_negative(normal, right, n_edges)
-        residual = white @ x + given
+        before, (x, covariance) = x, _least_squares(white, precision, expected, mean, n_edges)
+        residual = white @ np.append(x, 1.0)
         change = -answer @ solve_triangular(factor, residual, lower=True, trans=1)
         change *= min(1.0, _REACH / max(float(np.max(np.abs(change))), 1e-300))
-        covariance = cho_solve(root, np.eye(len(x)))
         if attempt > (1 if has_errors else 4) and np.max(np.abs(x - before)[:n_edges]) < 1e-3:
             break
     return Balance(
@@ -252,37 +223,58 @@ def model_deviations(
     errors: Errors, shape: Observability, which: Equations
 ) -> Float[np.ndarray, " angles"]:
     """Standard deviations of the angles due to errors of the model."""
-    errors = errors._replace(arc=_HIDDEN * errors.arc, bent_arc=_HIDDEN * errors.bent_arc)
-    parts = zip(errors, _diagonals(shape, which), strict=False)
-    return np.sqrt(sum((e**2 * d for e, d in parts), np.zeros(len(shape.angle))))
+    direction, arc = _diagonals(shape, which)
+    return np.sqrt(errors.junction**2 * direction + (HIDDEN * errors.arc) ** 2 * arc)
 
 
-def _diagonals(shape: Observability, which: Equations) -> list[Float[np.ndarray, " angles"]]:
-    """Variances of the angles for each error of the model of size 1, in the order of `Errors`."""
-    junctions = np.arange(len(shape.angle)) < which.n_directions
-    grain, arc, bend = np.zeros((3, len(shape.angle)))
-    grain[: which.n_directions] = np.maximum(shape.length, 0.02)[which.half_edge.ravel()] ** -2
+def _diagonals(
+    shape: Observability, which: Equations
+) -> tuple[Float[np.ndarray, " angles"], Float[np.ndarray, " angles"]]:
+    """Variances of the angles for errors of directions and of arcs of size 1."""
+    direction = np.arange(len(shape.angle)) < which.n_directions
+    arc = np.zeros(len(shape.angle))
     arc[which.n_directions :] = np.maximum(shape.length, _SHORTEST)[: which.n_arcs] ** 2
-    bend[which.n_directions :] = shape.bend[: which.n_arcs] ** 2
-    return [junctions * 1.0, grain, arc, bend]
+    return direction * 1.0, arc
+
+
+def _chosen(
+    residual: Float[np.ndarray, " rows"],
+    parts: Errors,
+    shape: Observability,
+    errors: Errors,
+    prior: float | None,
+    steps: int,
+) -> tuple[Errors, float]:
+    """Errors and widths of the priors of the largest evidence, and its logarithm."""
+    bounds = shape.bounds
+    if "arc" in bounds:
+        # With wide priors, this is restricted maximum likelihood: the errors do not depend on how well the
+        # prior describes the tensions.
+        wide = errors._replace(tension=prior or 1.0, region=0.0 if prior else 1.0, pressure=10.0)
+        free = {name: bounds[name] for name in ("junction", "arc", "noise")}
+        first, _ = most_evident(residual, parts, shape.unknown, wide, free, steps=steps)
+        errors = errors._replace(junction=first.junction, arc=first.arc, noise=first.noise)
+        bounds = {name: bounds[name] for name in bounds if name not in free}
+    return most_evident(residual, parts, shape.unknown, errors, bounds, steps=steps)
 
 
 def _parts(
     matrix: Float[np.ndarray, "rows unknowns"],
     slope: csr_array,
     shape: Observability,
-    diagonals: list[Float[np.ndarray, " angles"]],
+    which: Equations,
     mean: Float[np.ndarray, " unknowns"],
     regions: Float[np.ndarray, "edges edges"],
 ) -> Errors:
     """Covariances of the forces for each standard deviation of 1."""
-    of_angles = [(slope * d @ slope.T).toarray() for d in diagonals]
+    direction, arc = ((slope * d @ slope.T).toarray() for d in _diagonals(shape, which))
     n_edges = len(shape.loose)
     pull, push = matrix[:, :n_edges], matrix[:, n_edges:] / shape.size
     # The mean tension is 1.
     centred = pull - np.outer(pull @ np.ones(n_edges), mean[:n_edges])
     return Errors(
-        *of_angles,
+        junction=direction,
+        arc=arc,
         noise=slope @ (slope @ shape.covariance).T,
         tension=centred @ centred.T,
         region=centred @ regions @ centred.T,
@@ -311,6 +303,26 @@ def _prior_precision(
     tension = errors.tension**2 * np.eye(n) + errors.region**2 * regions
     precision[:n, :n] = np.linalg.inv(tension)
     return precision
+
+
+def _least_squares(
+    white: Float[np.ndarray, "rows columns"],
+    precision: Float[np.ndarray, "unknowns unknowns"],
+    expected: Float[np.ndarray, " unknowns"],
+    mean: Float[np.ndarray, " unknowns"],
+    n_edges: int,
+) -> tuple[Float[np.ndarray, " unknowns"], Float[np.ndarray, "unknowns unknowns"]]:
+    """Tensions of mean 1 and pressures that minimise the forces; the last column has no unknown."""
+    matrix, given = white[:, :-1], white[:, -1]
+    normal = matrix.T @ matrix + precision
+    heavy = 1e3 * np.trace(normal) / len(normal) * n_edges
+    normal += heavy * np.outer(mean, mean)
+    right = -matrix.T @ given + precision @ expected + heavy * mean
+    root = cho_factor(normal)
+    x = cho_solve(root, right)
+    if np.any(x[:n_edges] < 0):
+        x = _not_negative(normal, right, n_edges)
+    return x, cho_solve(root, np.eye(len(x)))
 
 
 def _not_negative(
