@@ -105,6 +105,7 @@ SHORT = {
         "tolerances=[1e-2, 1e-3]",
     ],
     "oscillatory_shear": ["frequencies=[1, 10]", "steps=8", "cycles=1", "n_cells=0"],
+    "cyclic_rheology": ["n_cells=4", "steps=8", "refinement=1", "epochs=2"],
     "paper_benchmark": ["tissue.n_cells=6", "fit.epochs=2"],
     "rigidity_transition": [
         "shape_factors=[3.4, 4.1]",
