@@ -7,6 +7,7 @@ cells.
 """
 
 import time
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -35,6 +36,8 @@ class Config(runs.ExperimentConfig):
     """Cells across of the tissues for the time per step."""
     timed_steps: int = Field(default=200, ge=1)
     """Steps that are timed."""
+    vtk: bool = False
+    """Write the frames of the first run of each test for ParaView; needs the extra [files]."""
     model: Model = Model()
     """The vertex model."""
 
@@ -49,7 +52,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
         def one(index: int, test: str = test, number: int = number) -> dict[str, np.ndarray]:
             key = config.seed + index + 1000 * number
-            return folder.part(f"{test} {index}", lambda: simulate(config, test, times, key))
+            vtk = folder.path / f"{test}.pvd" if config.vtk and index == 0 else None
+            return folder.part(f"{test} {index}", lambda: simulate(config, test, times, key, vtk))
 
         parts = folder.map_in_threads(one, config.replicates, progress=progress)
         series[test] = np.stack([part["unlike"] for part in parts])
@@ -70,12 +74,17 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     return metrics | {"milliseconds_per_step": {str(n): value for n, value in sizes.items()}}
 
 
-def simulate(config: Config, test: str, times: np.ndarray, key: int) -> dict[str, np.ndarray]:
+def simulate(
+    config: Config, test: str, times: np.ndarray, key: int, vtk: Path | None
+) -> dict[str, np.ndarray]:
     """The unlike length, centroids, the last outlines, and the number of transitions of a run."""
     model = config.model
     start = honeycomb(model.across)
     movie = model.evolution(times, key=key)(start, model.energy(test), throw=False)
     frames = movie.trajectory
+    if vtk is not None:
+        types = np.tile(model.types(test), (len(frames), 1))
+        vx.io.write_vtk_series(vtk, frames, cells={"type": types})
     outlines, _ = vx.plotting.cell_polygons(movie.tissue)
     return {
         "unlike": np.asarray(unlike_length(movie.frames, model.types(test))),

@@ -45,6 +45,7 @@ SHORT = {
         "sizes=[4]",
         "timed_steps=4",
         "model.across=4",
+        "vtk=true",
     ],
     "compare_conditions": [
         "images=1",
