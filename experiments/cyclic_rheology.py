@@ -80,7 +80,7 @@ class Cycles(eqx.Module):
 class StepPotential(vx.AbstractEnergy):
     """The energy and the dissipation of a step."""
 
-    material: Material
+    material: Any
     before: vx.Tissue
     dt: jax.Array
 
@@ -131,9 +131,9 @@ def parameters(material: Any) -> np.ndarray:
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """Relative errors of the parameters, and of the predicted stress."""
     began, relaxation = time.perf_counter(), config.relaxation.build()
-    truth = make_material(config, config.truth)
+    truth: Any = make_material(config, config.truth)
     first = vx.initialise.periodic_voronoi(config.n_cells, key=jax.random.key(config.seed), lloyd_steps=2)
-    rest = runs.RelaxationSection(tolerance=1e-10).build()(first, truth.energy).tissue
+    rest: Any = runs.RelaxationSection(tolerance=1e-10).build()(first, truth.energy).tissue
     fitted = Cycles(rest.boundary.lattice, config.amplitude, tuple(config.periods))
     unseen = Cycles(rest.boundary.lattice, config.amplitude, (config.predicted,))
     friction = SubstrateFriction(1.0)  # replaced by that of the material
