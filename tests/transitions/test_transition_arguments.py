@@ -51,7 +51,7 @@ def test_invalid_axes_are_rejected(roomy, without_type_checks, axis):
 
 
 def test_transitions_without_spare_slots_are_rejected(plain, without_type_checks):
-    with pytest.raises(RuntimeError, match=r"capacity of 6 cells.*with_capacity"):
+    with pytest.raises(RuntimeError, match=r"with_capacity.*capacity is 6 cells"):
         divide(plain, 0)
     with pytest.raises(ValueError, match="with_capacity"):
         remove(plain, 0)
