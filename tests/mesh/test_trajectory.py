@@ -156,7 +156,7 @@ class TestRelaxation:
         with pytest.raises(ValueError, match="`tolerance` must be positive"):
             record_relaxation(tissue, energy, vx.Relaxation(tolerance=0.0))
         few = dataclasses.replace(FIXED_TOPOLOGY, max_steps=3)
-        with pytest.raises(RuntimeError, match=r"no equilibrium in 3 steps.*throw=False"):
+        with pytest.raises(RuntimeError, match=r"no equilibrium.*throw=False.*after 3 steps"):
             record_relaxation(tissue, energy, few, every=2)
         equilibrium, trajectory = record_relaxation(tissue, energy, few, every=2, throw=False)
         assert not equilibrium.converged

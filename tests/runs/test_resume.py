@@ -154,6 +154,9 @@ def test_resume_goes_with_no_other_folder(finished, stopped):
 def test_a_broken_checkpoint_is_named(finished, stopped):
     (stopped / "unfinished").mkdir()
     (stopped / "unfinished/vertices.npz").write_bytes(b"PK")
+    outcome = vertax("run", finished / "tiny.toml", "--output", stopped)
+    assert outcome.exit_code == 2
+    assert f"--resume {stopped} to continue it" in outcome.stderr.replace("\n", " ")
     outcome = vertax("run", finished / "tiny.toml", "--resume", stopped)
     assert outcome.exit_code == 1
     assert "vertices.npz is truncated or damaged" in outcome.stderr

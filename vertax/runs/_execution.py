@@ -61,9 +61,11 @@ def new_folder(
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             if not overwrite and not (folder / FAILED).is_file():
+                unfinished = parts(folder) and not (folder / METRICS).exists()
+                remedy = f", --resume {folder} to continue it" if unfinished else ""
                 raise RunFolderError(
                     f"The folder {folder} is not empty. Choose another with --output, or pass "
-                    "--overwrite to replace the run in it."
+                    f"--overwrite to replace the run in it{remedy}."
                 )
             _clear(folder)
     except (FileExistsError, NotADirectoryError) as error:

@@ -65,8 +65,6 @@ class RunFolder:
     - `print_steps`: whether `print_step` prints.
     """
 
-    path: Path
-    figure_formats: tuple[str, ...]
     interrupted: bool
     """Whether a keyboard interrupt ended a fit of this run; no other one begins."""
 
