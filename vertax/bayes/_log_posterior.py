@@ -123,10 +123,10 @@ class LogPosterior(eqx.Module):
         problem = dataclasses.replace(problem, adjoint=adjoint, response=response)
         dtype = problem.tissue.vertices.dtype
         if problem.tissue.vertices.ndim == 2:  # (Numbers of a batch would lack its axis.)
-            problem = problem.with_array_numbers(dtype)
+            problem = traced(problem.with_array_numbers(dtype), dtype)
         if energy is None:
             prior = _expanded(prior, _arrays_of(problem.energy), fitted_noise=callable(noise))
-        self.problem, self.prior = traced((problem, dict(prior)), dtype)
+        self.problem, self.prior = problem, traced(dict(prior), dtype)
         number = noise is not None and not callable(noise)
         self.noise = jnp.asarray(noise, dtype) if number else noise
         self.energy, self.across_t1 = energy, across_t1
@@ -178,23 +178,26 @@ class LogPosterior(eqx.Module):
 
     # Samplers move in coordinates z of all real numbers: θ = b(z) with the bijections b to the supports of
     # the priors, log p(z) = log p(b(z)) + log |det ∂b/∂z|.
-    def log_parts(
+    def log_prior(
         self, z: Float[Array, " coordinates"]
-    ) -> tuple[Float[Array, ""], Float[Array, ""], Outcome]:
-        """Log prior of real coordinates, log likelihood, and the outcome of the equilibrium."""
-        log_prior, parameters = jnp.zeros((), z.dtype), {}
+    ) -> tuple[Float[Array, ""], dict[str, Array]]:
+        """Log prior density of real coordinates, and their parameters."""
+        density, parameters = jnp.zeros((), z.dtype), {}
         for name, part in self._unravel(z).items():
             transform = biject_to(self.prior[name].support)
             parameters[name] = transform(part)
-            log_prior += jnp.sum(self.prior[name].log_prob(parameters[name]))
-            log_prior += jnp.sum(transform.log_abs_det_jacobian(part, parameters[name]))
-        terms, outcome = self.likelihood(parameters)
-        return log_prior, jnp.where(outcome.converged, jnp.sum(terms), -jnp.inf), outcome
+            density += jnp.sum(self.prior[name].log_prob(parameters[name]))
+            density += jnp.sum(transform.log_abs_det_jacobian(part, parameters[name]))
+        return density, parameters
+
+    def log_likelihood(self, z: Float[Array, " coordinates"]) -> tuple[Float[Array, ""], Outcome]:
+        """Log likelihood of real coordinates, and the outcome of the equilibrium."""
+        terms, outcome = self.likelihood(self.log_prior(z)[1])
+        return jnp.where(outcome.converged, jnp.sum(terms), -jnp.inf), outcome
 
     def parameters_at(self, z: Float[Array, " coordinates"]) -> dict[str, Array]:
         """The parameters with real coordinates z."""
-        parts = self._unravel(z).items()
-        return {name: biject_to(self.prior[name].support)(part) for name, part in parts}
+        return self.log_prior(z)[1]
 
     def coordinates_of(self, parameters: Parameters) -> Float[Array, " coordinates"]:
         """The real coordinates of parameters."""
@@ -260,8 +263,8 @@ def _expanded(
     for name, distribution in prior.items():
         if name not in arrays and not fitted_noise:
             raise ValueError(
-                f"Argument `prior` must name arrays of the energy ({', '.join(arrays) or 'it has none'}), but "
-                f"has {name!r}. Make the parameter an array, or pass `energy`, a function of the parameters."
+                f"Argument `prior` must name arrays of the energy ({', '.join(arrays) or 'it has none'}), "
+                f"but has {name!r}. Make it an array, or pass `energy`, a function of the parameters."
             )
         shape = arrays[name].shape if name in arrays else distribution.shape()
         if distribution.shape() == ():
