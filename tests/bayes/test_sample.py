@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("blackjax", reason='needs the extra: pip install "vertax[bayes]"')
 
+import equinox as eqx
 from bayes_helpers import MEAN, N_CELLS, PRIOR, SPREAD, noisy_problem
 
 import vertax as vx
@@ -27,6 +28,22 @@ def draw(density, draws=20, **options):
 def linear():
     """A problem with so little noise that its equilibrium is a linear function of the parameters."""
     return noisy_problem(1e-3)[0]
+
+
+class Limited(eqx.Module):
+    """Target shape factors; no equilibrium if that of the first cell is above a limit."""
+
+    limit: jax.Array
+
+    def __call__(self, parameters):
+        p0 = parameters[NAME]
+        return vx.energies.ShapeFactorEnergy(jnp.where(p0[0] < self.limit, p0, jnp.nan))
+
+
+def density_of(problem, noise=1e-3, limit=np.inf):
+    """A density; all share their compiled functions."""
+    prior = {NAME: PRIOR[NAME].expand([N_CELLS])}
+    return bayes.LogPosterior(problem, prior, noise, energy=Limited(jnp.array(limit)))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +64,7 @@ def closed_form(linear):
 
 
 def test_laplace_approximation_matches_the_closed_form(linear, closed_form):
-    laplace = bayes.Laplace(bayes.LogPosterior(linear, PRIOR, 1e-3))
+    laplace = bayes.Laplace(density_of(linear))
     mean, covariance = closed_form
     deviation = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(laplace.mode, mean, atol=1e-3 * deviation.min())
@@ -56,7 +73,7 @@ def test_laplace_approximation_matches_the_closed_form(linear, closed_form):
 
 
 def test_draws_match_the_closed_form(linear, closed_form):
-    posterior = draw(bayes.LogPosterior(linear, PRIOR, 1e-3), 200, warmup=100)
+    posterior = draw(density_of(linear), 200, warmup=100)
     mean, covariance = closed_form
     deviation, table = np.sqrt(np.diag(covariance)), posterior.table()
     assert (table["ess"] > 150).all()
@@ -68,42 +85,34 @@ def test_draws_match_the_closed_form(linear, closed_form):
     assert posterior.num_gradients > 400
 
 
+@pytest.mark.thorough  # each adjoint compiles the sampler
 @pytest.mark.parametrize(
     "adjoint",
-    [
-        vx.ImplicitDifferentiation("sensitivity"),
-        pytest.param(vx.EquilibriumPropagation(), marks=pytest.mark.thorough),
-    ],
+    [vx.ImplicitDifferentiation("sensitivity"), vx.EquilibriumPropagation()],
+    ids=["sensitivity", "propagation"],
 )
 def test_adjoints_give_the_same_chain(linear, adjoint):
-    first = draw(bayes.LogPosterior(linear, PRIOR, 1e-3))
-    other = draw(bayes.LogPosterior(dataclasses.replace(linear, adjoint=adjoint), PRIOR, 1e-3))
+    first = draw(density_of(linear))
+    other = draw(density_of(dataclasses.replace(linear, adjoint=adjoint)))
     deviation = first.draws(NAME).std()
     np.testing.assert_allclose(first.draws(NAME), other.draws(NAME), atol=1e-3 * deviation)
 
 
 def test_interrupted_run_continues_bit_for_bit(linear, tmp_path):
-    density = bayes.LogPosterior(linear, PRIOR, 1e-3)
+    density = density_of(linear)
     complete = draw(density, 40)
     half = draw(density, 20, checkpoint=tmp_path / "chains.npz")
     continued = draw(density, 40, checkpoint=tmp_path / "chains.npz")
     np.testing.assert_array_equal(half.draws(NAME), complete.draws(NAME)[:, :20])
     np.testing.assert_array_equal(continued.draws(NAME), complete.draws(NAME))
     assert continued.num_gradients == complete.num_gradients
-    other = bayes.LogPosterior(linear, PRIOR, 2e-3)
+    other = density_of(linear, 2e-3)
     with pytest.raises(ValueError, match=r"another density \(numbers in its arrays\)"):
         draw(other, 40, checkpoint=tmp_path / "chains.npz")
 
 
 def test_proposals_without_equilibrium_are_rejected_and_counted(linear):
-    limit = MEAN + 0.05
-
-    def energy(parameters):
-        p0 = parameters[NAME]
-        return vx.energies.ShapeFactorEnergy(jnp.where(p0 < limit, p0, jnp.nan))
-
-    prior = {NAME: PRIOR[NAME].expand([N_CELLS])}
-    density = bayes.LogPosterior(linear, prior, 0.2, energy=energy)
+    density = density_of(linear, 0.2, MEAN + 0.5 * SPREAD)
     start = {NAME: jnp.full(N_CELLS, MEAN)}
     with pytest.warns(
         UserWarning, match="trajectories met a tissue that did not reach equilibrium"
@@ -111,10 +120,10 @@ def test_proposals_without_equilibrium_are_rejected_and_counted(linear):
         posterior = draw(density, start=start)
     rejected = np.asarray(posterior.data["sample_stats"]["rejected"])
     assert 0 < rejected.sum() < rejected.size
-    assert (posterior.draws(NAME) < limit).all()
-    assert posterior.draws(NAME).std() > 0.03
+    assert (posterior.draws(NAME)[..., 0] < MEAN + 0.5 * SPREAD).all()
+    assert posterior.draws(NAME).std() > 0.05
     with pytest.raises(ValueError, match="`start` must have a finite log density"):
-        bayes.Laplace(density, {NAME: jnp.full(N_CELLS, limit + 0.1)})
+        bayes.Laplace(density, {NAME: jnp.full(N_CELLS, MEAN + SPREAD)})
 
 
 class Constant(vx.costs.AbstractLeastSquaresCost):
@@ -131,7 +140,7 @@ def test_data_that_determine_nothing_are_rejected(linear):
 def test_short_edges_cause_a_warning(linear):
     from vertax.bayes._posterior import Posterior
 
-    laplace = bayes.Laplace(bayes.LogPosterior(linear, PRIOR, 1e-3))
+    laplace = bayes.Laplace(density_of(linear))
     stats = {
         "z": np.broadcast_to(laplace.mode, (1, 4, N_CELLS)),
         "shortest_edge": np.array([[0.5, 0.001, 0.3, 0.2]]),
@@ -152,12 +161,12 @@ def test_short_edges_cause_a_warning(linear):
 
 
 def test_invalid_arguments_are_rejected(linear, without_type_checks):
-    density = bayes.LogPosterior(linear, PRIOR, 1e-3)
+    density = density_of(linear)
     with pytest.raises(TypeError, match=r"`log_posterior` must be a vertax\.bayes\.LogPosterior"):
         bayes.sample(linear, 0)
     for name, least in (("draws", 1), ("warmup", 20), ("chains", 1)):
         with pytest.raises(ValueError, match=f"`{name}` must be at least {least}"):
             draw(density, **{name: 0})
-    laplace = bayes.Laplace(bayes.LogPosterior(linear, PRIOR, None))
+    laplace = bayes.Laplace(density_of(linear, None))
     with pytest.raises(ValueError, match="`noise` of the LogPosterior must not be None"):
         bayes.Posterior(laplace, None, 0).loo()

@@ -118,14 +118,14 @@ class LogPosterior(eqx.Module):
                 "Argument `energy` must be given for a problem with `fit_position`: a function of the "
                 "parameters that returns a tuple of energy and displacement."
             )
+        if energy is None:
+            prior = _expanded(prior, _arrays_of(problem.energy), fitted_noise=callable(noise))
         adjoint = dataclasses.replace(problem.adjoint, throw=False)
         response = problem.response if across_t1 else _without_transitions(problem.response)
         problem = dataclasses.replace(problem, adjoint=adjoint, response=response)
         dtype = problem.tissue.vertices.dtype
         if problem.tissue.vertices.ndim == 2:  # (Numbers of a batch would lack its axis.)
             problem = traced(problem.with_array_numbers(dtype), dtype)
-        if energy is None:
-            prior = _expanded(prior, _arrays_of(problem.energy), fitted_noise=callable(noise))
         self.problem, self.prior = problem, traced(dict(prior), dtype)
         number = noise is not None and not callable(noise)
         self.noise = jnp.asarray(noise, dtype) if number else noise
