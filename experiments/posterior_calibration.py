@@ -8,12 +8,10 @@ Laplace approximation. The cost is that of one effective draw, against random-wa
 import time
 from typing import Any, Literal
 
-import blackjax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 from pydantic import Field
 from scipy import stats
 
@@ -61,9 +59,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     ranks: dict[str, Any] = {}
     for kind, n in (("vertices", config.replicates), ("image", config.image_replicates)):
         compute = lambda number, kind=kind: calibrate(config, kind, int(number))
-        found = folder.scan(kind, range(n), compute, progress=progress)
-        ranks[kind] = {key: found[key] for key in found if key != "rejected"}
-        metrics[f"{kind}, rejected trajectories"] = int(found["rejected"].sum())
+        ranks[kind] = folder.scan(kind, range(n), compute, progress=progress)
+        metrics[f"{kind}, rejected trajectories"] = int(ranks[kind].pop("rejected").sum())
         for key, values in ranks[kind].items():
             metrics[f"{kind}, {key}, p"] = uniformity(values, config)
             deviation = np.std((values + 0.5) / (config.draws + 1)) * np.sqrt(12)
@@ -87,6 +84,8 @@ def fitted_noise(parameters: Any) -> Any:
 
 def density(config: Config, kind: Literal["vertices", "image"], n: int, seed: int) -> tuple[Any, Any]:
     """The posterior of a synthetic tissue, and the parameters behind its data."""
+    import numpyro.distributions as dist  # (Of an extra: `bayes` names it if it is missing.)
+
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), seed), 4)
     mean = ShapeFactorEnergy(jnp.full(n, config.mean))
     first = vx.initialise.periodic_voronoi(n, key=keys[0], lloyd_steps=2)
@@ -130,6 +129,8 @@ def calibrate(config: Config, kind: Any, seed: int) -> dict[str, np.ndarray]:
 
 def cost(config: Config, n: int) -> dict[str, float]:
     """Gradients, relaxations and seconds of one effective draw of the worst determined parameter."""
+    import arviz
+
     posterior_density, _ = density(config, "vertices", n, 0)
     options: Any = {"draws": config.cost_draws, "warmup": config.warmup, "chains": 1, "progress": False}
     bayes.sample(posterior_density, 0, **options)  # compiles
@@ -141,7 +142,7 @@ def cost(config: Config, n: int) -> dict[str, float]:
     start = time.perf_counter()
     u = np.asarray(chain(posterior.laplace, jax.random.key(1), posterior.num_gradients))
     walk_seconds = time.perf_counter() - start
-    walk_ess = float(np.min(blackjax.diagnostics.effective_sample_size(u[None, len(u) // 5 :])))
+    walk_ess = min(float(arviz.ess(values[None])) for values in u[len(u) // 5 :].T)
     return {
         "cells": n,
         "gradients per effective draw": posterior.num_gradients / ess,
@@ -155,6 +156,8 @@ def cost(config: Config, n: int) -> dict[str, float]:
 
 def random_walk(laplace: bayes.Laplace, key: jax.Array, steps: int) -> jax.Array:
     """Random-walk Metropolis with the covariance of the Laplace approximation and the optimal scale."""
+
+    import blackjax
 
     def log_density(u: jax.Array) -> jax.Array:
         z = laplace.mode + laplace.factor @ u

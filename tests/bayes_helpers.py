@@ -13,7 +13,7 @@ PRIOR = {"target_shape_factor": dist.Normal(MEAN, SPREAD)}
 
 
 def noisy_problem(noise, seed=0, n_cells=N_CELLS, response=FIXED_TOPOLOGY, **options):
-    """A problem whose residuals are displacements of vertices, and the true parameters."""
+    """A problem with displacements of vertices as residuals, and the true parameters."""
     energy = vx.energies.ShapeFactorEnergy(jnp.full(n_cells, MEAN, float))
     start = FIXED_TOPOLOGY(random_tissue(n_cells, seed, lloyd_steps=2), energy).tissue
     truth = shape_factors(n_cells, MEAN, SPREAD, seed)

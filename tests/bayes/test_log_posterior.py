@@ -110,6 +110,11 @@ def test_replicates_of_different_sizes_add_their_likelihoods():
     terms, outcome = together.likelihood(parameters)
     assert outcome.converged
     assert float(jnp.sum(terms)) == pytest.approx(expected, rel=1e-6)
+    value = eqx.filter_jit(lambda z: together.log_likelihood(z)[0])
+    z = together.coordinates_of(parameters)
+    slope = eqx.filter_jit(eqx.filter_grad(value))(z)
+    difference = fine_difference(value, z, jnp.ones(2))
+    assert float(jnp.sum(slope)) == pytest.approx(float(difference), rel=1e-6)
 
 
 def test_topology_is_kept_unless_transitions_are_allowed(problem):

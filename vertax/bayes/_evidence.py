@@ -38,7 +38,7 @@ def evidence(
 
     **Arguments:**
 
-    - `laplace`: the approximation, whose `log_evidence` is the result for a Gaussian posterior.
+    - `laplace`: the approximation; for a Gaussian posterior the result is its `log_evidence`.
     - `key`: a random key or a seed.
     - `particles`: number of particles.
     - `moves`: moves of each particle at each $\lambda$.

@@ -62,7 +62,7 @@ class LogPosterior(eqx.Module):
     **Arguments:**
 
     - `problem`: the inverse problem, with a sum of squares as its cost; or a batch from
-        [`stack`][vertax.fitting.stack], whose log likelihoods add (replicates).
+        [`stack`][vertax.fitting.stack] (replicates): the log likelihood is the sum over its members.
     - `prior`: distributions of NumPyro by name of the parameter. Without `energy`, names are those of arrays
         of the energy of the problem, e.g. `"target_shape_factor"` or `"terms.0.stiffness"`, and a
         distribution of one number is that of each entry; other arrays are constants.

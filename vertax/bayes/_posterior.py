@@ -35,7 +35,7 @@ class Posterior(eqx.Module):
     """
 
     laplace: Laplace
-    """The Laplace approximation, in whose coordinates the sampler moved."""
+    """The Laplace approximation; the sampler moved in its coordinates."""
     data: Any
     """An `InferenceData` (a `DataTree` from ArviZ 1 on). Group `posterior`: the parameters. Group
     `sample_stats`: for each draw `lp` (log density), `diverging`, `acceptance_rate`, `n_steps` (gradients),
@@ -70,7 +70,6 @@ class Posterior(eqx.Module):
         **Returns:** columns `parameter`, `mean`, `deviation`, the quantiles, `ess` (effective sample size of
         the bulk), `r_hat` (near 1 if the chains agree), `laplace_deviation`.
         """
-        ess, r_hat = arviz.ess(self.data), arviz.rhat(self.data)
         approximate = self.laplace.draw(0, 2000)
         rows = []
         for name in self.laplace.log_posterior.prior:
@@ -83,8 +82,8 @@ class Posterior(eqx.Module):
                         "mean": values.mean(),
                         "deviation": values.std(),
                         **{f"{q:g}": np.quantile(values, q) for q in quantiles},
-                        "ess": float(np.asarray(ess[name])[index]),
-                        "r_hat": float(np.asarray(r_hat[name])[index]),
+                        "ess": float(arviz.ess(values)),
+                        "r_hat": float(arviz.rhat(values)),
                         "laplace_deviation": float(
                             np.std(approximate[name][(slice(None), *index)])
                         ),
@@ -99,13 +98,13 @@ class Posterior(eqx.Module):
 
         **Raises:**
 
-        - `ValueError` for `noise=None`, which has no likelihood of single residuals.
+        - `ValueError` for `noise=None`, which does not define a likelihood of single residuals.
         """
         log_posterior = self.laplace.log_posterior
         if log_posterior.noise is None:
             raise ValueError(
                 "Argument `noise` of the LogPosterior must not be None for `loo`: integrated over the noise, "
-                "residuals have no likelihood of their own. Fit the noise, see LogPosterior."
+                "single residuals have no likelihood. Fit the noise, see LogPosterior."
             )
         draws = {name: jnp.asarray(self.draws(name)) for name in log_posterior.prior}
         terms = np.asarray(_terms(log_posterior, draws))
@@ -165,7 +164,7 @@ def _warn(log_posterior: LogPosterior, stats: dict[str, np.ndarray]) -> None:
             "it. Compare with across_t1=True."
         )
     for text in texts:
-        warnings.warn(text, stacklevel=4)
+        warnings.warn(text, stacklevel=5)
 
 
 def _threshold(log_posterior: LogPosterior) -> float:
