@@ -94,12 +94,11 @@ def density(config: Config, kind: Literal["vertices", "image"], n: int, seed: in
     prior = {P0: dist.Normal(config.mean, config.deviation), NOISE: dist.LogNormal(np.log(median), 0.5)}
     response = vx.Relaxation(transitions=None, contact_range=None)
     # Parameters without equilibrium have posterior density 0: the prior leaves them out too.
-    for attempt in range(100):
-        key = jax.random.fold_in(keys[1], attempt)
-        p0 = prior[P0].sample(key, (n,))
-        relaxed = response(start, ShapeFactorEnergy(p0), throw=False)
-        if relaxed.converged:
-            break
+    attempts = iter(range(1000))
+    draw = lambda: jnp.asarray(prior[P0].sample(jax.random.fold_in(keys[1], next(attempts)), (n,)))
+    p0 = draw()
+    while not (relaxed := response(start, ShapeFactorEnergy(p0), throw=False)).converged:
+        p0 = draw()
     truth = {P0: p0, NOISE: prior[NOISE].sample(keys[2])}
     noise = lambda x: x + truth[NOISE] * jax.random.normal(keys[3], x.shape)
     target = relaxed.tissue
@@ -159,14 +158,14 @@ def random_walk(laplace: bayes.Laplace, key: jax.Array, steps: int) -> jax.Array
 
     import blackjax
 
+    walks: Any = blackjax.additive_step_random_walk
+
     def log_density(u: jax.Array) -> jax.Array:
         z = laplace.mode + laplace.factor @ u
         return laplace.log_posterior.log_prior(z)[0] + laplace.log_posterior.log_likelihood(z)[0]
 
     size = len(laplace.mode)
-    walk = blackjax.additive_step_random_walk.normal_random_walk(
-        log_density, jnp.full(size, 2.38 / size**0.5)
-    )
+    walk = walks.normal_random_walk(log_density, jnp.full(size, 2.38 / size**0.5))
     step = lambda state, key: (walk.step(key, state)[0],) * 2
     _, states = jax.lax.scan(step, walk.init(jnp.zeros(size)), jax.random.split(key, steps))
     return states.position

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -94,5 +95,6 @@ def test_evidence_of_a_gaussian_posterior_is_that_of_laplace():
 
 
 def test_invalid_arguments_are_rejected(without_type_checks):
+    wrong: Any = 3.0
     with pytest.raises(TypeError, match=r"`laplace` must be a vertax\.bayes\.Laplace"):
-        bayes.evidence(3.0, 0)
+        bayes.evidence(wrong, 0)

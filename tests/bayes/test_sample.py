@@ -40,7 +40,7 @@ class Limited(eqx.Module):
         return vx.energies.ShapeFactorEnergy(jnp.where(p0[0] < self.limit, p0, jnp.nan))
 
 
-def density_of(problem, noise=1e-3, limit=np.inf):
+def density_of(problem, noise: float | None = 1e-3, limit=np.inf):
     """A density; all share their compiled functions."""
     prior = {NAME: PRIOR[NAME].expand([N_CELLS])}
     return bayes.LogPosterior(problem, prior, noise, energy=Limited(jnp.array(limit)))
@@ -52,7 +52,7 @@ def closed_form(linear):
     residuals = jax.jit(
         lambda p: linear.residuals(vx.energies.ShapeFactorEnergy(p), linear.tissue, None)[0]
     )
-    mean = np.full(N_CELLS, MEAN)
+    mean, precision = np.full(N_CELLS, MEAN), np.eye(N_CELLS)
     for _ in range(5):  # Gauss-Newton steps to the mode
         jacobian = np.stack(
             [(residuals(mean + e) - residuals(mean - e)) / 2e-5 for e in 1e-5 * np.eye(N_CELLS)], 1

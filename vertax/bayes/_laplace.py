@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 
 import equinox as eqx
@@ -45,6 +46,8 @@ class Laplace(eqx.Module):
     r"""A matrix $L$ with $\Sigma = L L^T$."""
     log_evidence: Float[Array, ""]
     """Log marginal likelihood of the data; NaN if the mode is no maximum."""
+    num_gradients: int
+    """Evaluations of the gradient."""
 
     def __init__(self, log_posterior: LogPosterior, start: Parameters | None = None):
         z = log_posterior.start() if start is None else log_posterior.coordinates_of(start)
@@ -55,7 +58,7 @@ class Laplace(eqx.Module):
                 "reach equilibrium there, or a parameter is not finite. Start at the parameters of a fit."
             )
         scale = np.asarray(jnp.std(log_posterior.prior_draws(), axis=0))
-        u, density, prior, data = _mode(log_posterior, z, scale)
+        u, density, prior, data, self.num_gradients = _mode(log_posterior, z, scale)
         if not np.any(np.abs(data) > _UNDETERMINED):
             raise ValueError(
                 "The data determine no parameter: the likelihood does not depend on the parameters of "
@@ -85,10 +88,12 @@ _UNDETERMINED = 1e-6
 
 def _mode(
     log_posterior: LogPosterior, z: Float[Array, " n"], scale: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " n"], float, Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
-    """The mode z + scale u: u, the log density, and the curvatures of log prior and log likelihood by u."""
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, int]:
+    """The mode z + scale u: u, log density, curvatures of log prior and likelihood, number of gradients."""
+    evaluations = itertools.count()
 
     def at(u: np.ndarray) -> Point:
+        next(evaluations)
         return evaluate(log_posterior, z + jnp.asarray(scale * u, z.dtype))
 
     def value_and_slope(u: np.ndarray) -> tuple[float, np.ndarray]:
@@ -117,7 +122,7 @@ def _mode(
     if not search.success:
         warnings.warn("The search for the mode of the posterior did not converge.", stacklevel=3)
     prior, data = curvatures(search.x)
-    return search.x, -float(search.fun), prior, data
+    return search.x, -float(search.fun), prior, data, next(evaluations)
 
 
 class Point(eqx.Module):

@@ -147,7 +147,8 @@ class LogPosterior(eqx.Module):
     def draw(self, key: PRNGKeyArray) -> dict[str, Array]:
         """Draw parameters from the prior."""
         keys = jax.random.split(key, len(self.prior))
-        return {n: d.sample(k) for (n, d), k in zip(self.prior.items(), keys, strict=True)}
+        pairs = zip(self.prior.items(), keys, strict=True)
+        return {name: jnp.asarray(d.sample(key)) for (name, d), key in pairs}
 
     def residuals(self, parameters: Parameters) -> tuple[Float[Array, "..."], Outcome]:
         """Residuals of the cost at the equilibrium, with the leading axis of a batch, and its outcome."""
@@ -283,9 +284,10 @@ def _check_proper(name: str, distribution: Any) -> None:
             f"The prior of {name!r} must be a distribution of numpyro.distributions, but is "
             f"{describe(distribution)}."
         )
+    support: Any = distribution.support
     try:
         jax.eval_shape(distribution.sample, jax.random.key(0))
-        proper = not distribution.support.is_discrete
+        proper = not support.is_discrete
     except NotImplementedError:
         proper = False
     if not proper:

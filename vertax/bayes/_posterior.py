@@ -42,7 +42,7 @@ class Posterior(eqx.Module):
     `rejected` (whether the trajectory met a tissue without equilibrium), `num_t1` and `shortest_edge` (in
     units of the size of a cell)."""
     num_gradients: int
-    """Evaluations of the gradient, adaptation included."""
+    """Evaluations of the gradient, with those of the Laplace approximation and of the adaptation."""
 
     @classmethod
     def of(
@@ -53,7 +53,7 @@ class Posterior(eqx.Module):
         parameters = _parameters(laplace.log_posterior, jnp.asarray(stats.pop("z")))
         groups = {"posterior": jax.tree.map(np.asarray, parameters), "sample_stats": stats}
         _warn(laplace.log_posterior, stats)
-        num_gradients = warmup_steps + int(np.sum(stats["n_steps"]))
+        num_gradients = laplace.num_gradients + warmup_steps + int(np.sum(stats["n_steps"]))
         return cls(laplace, _inference_data(groups), num_gradients)
 
     def draws(self, name: str) -> Shaped[np.ndarray, "chains draws ..."]:
@@ -118,8 +118,8 @@ class Posterior(eqx.Module):
 
 def _inference_data(groups: dict[str, dict[str, np.ndarray]]) -> Any:
     if hasattr(arviz, "InferenceData"):
-        return arviz.from_dict(**groups)
-    return arviz.from_dict(groups)
+        return arviz.from_dict(**groups)  # pyright: ignore[reportArgumentType]
+    return arviz.from_dict(groups)  # pyright: ignore[reportArgumentType]
 
 
 @announced_jit

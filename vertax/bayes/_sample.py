@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import blackjax
 import equinox as eqx
@@ -35,7 +36,8 @@ _CHUNK = 20
 class _Chain(eqx.Module):
     """State of one chain, or of all, in the coordinates u of the Laplace approximation, z = ẑ + L u."""
 
-    state: HMCState
+    state: Any
+    """A state of BlackJAX."""
     step_size: Float[Array, "*chains"]
     inverse_mass: Float[Array, "*chains coordinates"]
     warmup_steps: Int[Array, "*chains"]
@@ -146,7 +148,7 @@ def _density(laplace: Laplace, u: Array) -> tuple[Array, Outcome]:
 def _blank(laplace: Laplace, chains: int) -> _Chain:
     """The layout of the state of all chains, before the adaptation."""
     u = jnp.zeros((chains, len(laplace.mode)), laplace.mode.dtype)
-    state = HMCState(u, u[:, 0], u)
+    state: Any = HMCState(u, u[:, 0], u)  # pyright: ignore[reportArgumentType]
     return _Chain(state, u[:, 0], u, jnp.zeros(chains, int))
 
 
@@ -167,7 +169,7 @@ def _warm_up(laplace: Laplace, keys: Array, firsts: Array, steps: int) -> _Chain
 
     def one(laplace: Laplace, key: Array, u: Array) -> _Chain:
         density = lambda u: _density(laplace, u)[0]
-        adaptation = blackjax.window_adaptation(
+        adaptation: Any = blackjax.window_adaptation(
             blackjax.nuts,
             density,
             initial_step_size=0.5,
@@ -193,8 +195,9 @@ def _advance(
         kernel, density = blackjax.nuts.build_kernel(), lambda u: _density(laplace, u)[0]
 
         # The key depends on the number of the draw: runs with and without a checkpoint are equal.
-        def step(state: HMCState, number: Int[Array, ""]) -> tuple[HMCState, dict[str, Array]]:
+        def step(state: Any, number: Int[Array, ""]) -> tuple[Any, dict[str, Any]]:
             draw_key = jax.random.fold_in(key, number)
+            info: Any
             state, info = kernel(draw_key, state, density, chain.step_size, chain.inverse_mass)
             outcome = _density(laplace, state.position)[1]
             # (A trajectory ends at its first divergence, so a failed relaxation is one of its ends.)
