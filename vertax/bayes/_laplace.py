@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_key
@@ -46,7 +46,7 @@ class Laplace(eqx.Module):
     r"""A matrix $L$ with $\Sigma = L L^T$."""
     log_evidence: Float[Array, ""]
     """Log marginal likelihood of the data; NaN if the mode is no maximum."""
-    num_gradients: int
+    num_gradients: Int[Array, ""]
     """Evaluations of the gradient."""
 
     def __init__(self, log_posterior: LogPosterior, start: Parameters | None = None):
@@ -58,7 +58,7 @@ class Laplace(eqx.Module):
                 "reach equilibrium there, or a parameter is not finite. Start at the parameters of a fit."
             )
         scale = np.asarray(jnp.std(log_posterior.prior_draws(), axis=0))
-        u, density, prior, data, self.num_gradients = _mode(log_posterior, z, scale)
+        u, density, prior, data, num_gradients = _mode(log_posterior, z, scale)
         if not np.any(np.abs(data) > _UNDETERMINED):
             raise ValueError(
                 "The data determine no parameter: the likelihood does not depend on the parameters of "
@@ -69,6 +69,9 @@ class Laplace(eqx.Module):
         # convex; there the metric of a sampler must stay finite.
         bounded = np.maximum(values, _LEAST_CURVATURE)
         self.log_posterior, self.mode = log_posterior, z + scale * jnp.asarray(u)
+        self.num_gradients = jnp.asarray(
+            num_gradients
+        )  # (A Python integer would compile samplers again.)
         self.factor = jnp.asarray(scale[:, None] * vectors / np.sqrt(bounded))
         volume = 0.5 * np.sum(np.log(2 * np.pi / bounded)) + np.sum(np.log(scale))
         log_evidence = density + volume if values[0] > 0 else np.nan

@@ -53,7 +53,7 @@ class Posterior(eqx.Module):
         parameters = _parameters(laplace.log_posterior, jnp.asarray(stats.pop("z")))
         groups = {"posterior": jax.tree.map(np.asarray, parameters), "sample_stats": stats}
         _warn(laplace.log_posterior, stats)
-        num_gradients = laplace.num_gradients + warmup_steps + int(np.sum(stats["n_steps"]))
+        num_gradients = int(laplace.num_gradients + warmup_steps + np.sum(stats["n_steps"]))
         return cls(laplace, _inference_data(groups), num_gradients)
 
     def draws(self, name: str) -> Shaped[np.ndarray, "chains draws ..."]:
