@@ -69,9 +69,8 @@ class Laplace(eqx.Module):
         # convex; there the metric of a sampler must stay finite.
         bounded = np.maximum(values, _LEAST_CURVATURE)
         self.log_posterior, self.mode = log_posterior, z + scale * jnp.asarray(u)
-        self.num_gradients = jnp.asarray(
-            num_gradients
-        )  # (A Python integer would compile samplers again.)
+        # (An array: for each other Python integer a sampler would be compiled again.)
+        self.num_gradients = jnp.asarray(num_gradients)
         self.factor = jnp.asarray(scale[:, None] * vectors / np.sqrt(bounded))
         volume = 0.5 * np.sum(np.log(2 * np.pi / bounded)) + np.sum(np.log(scale))
         log_evidence = density + volume if values[0] > 0 else np.nan
