@@ -72,9 +72,13 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
 
 def uniformity(ranks: np.ndarray, config: Config) -> float:
-    """P value of the χ² test of uniform ranks."""
+    """P value of the χ² tests of uniform ranks of each cell, with Bonferroni's correction.
+
+    (Ranks of the cells of one tissue depend on each other, so a test of all together is not valid.)
+    """
     edges = np.linspace(0, config.draws + 1, config.bins + 1)
-    return float(stats.chisquare(np.histogram(ranks, edges)[0]).pvalue)
+    cells = np.reshape(ranks, (len(ranks), -1)).T
+    return min(1.0, len(cells) * min(stats.chisquare(np.histogram(r, edges)[0]).pvalue for r in cells))
 
 
 def fitted_noise(parameters: Any) -> Any:
@@ -173,18 +177,20 @@ def random_walk(laplace: bayes.Laplace, key: jax.Array, steps: int) -> jax.Array
 
 @plotting.house_style()
 def plot_ranks(ranks: dict[str, Any], config: Config) -> Any:
-    """Histograms of the ranks of sampler and Laplace approximation, with 99 % of uniform ranks."""
+    """Histograms of the ranks of sampler and Laplace approximation, with their errors over tissues."""
     figure, axes = plotting.new_figure(2, 2, height=2.0)
     edges = np.linspace(0, 1, config.bins + 1)
     for row, (kind, groups) in zip(axes, ranks.items(), strict=True):
         for ax, name in zip(row, (P0, NOISE), strict=True):
-            for method, style in (("NUTS", "-"), ("Laplace", "--")):
-                values = (groups[f"{name}, {method}"].ravel() + 0.5) / (config.draws + 1)
-                counts, n = np.histogram(values, edges)[0], len(values)
-                ax.stairs(counts * config.bins / n, edges, ls=style, label=method)
-            low, high = stats.binom.ppf([0.005, 0.995], n, 1 / config.bins) * config.bins / n
-            ax.axhspan(low, high, color="0.9", zorder=0)
-            ax.set(title=f"{kind}: {name.replace('_', ' ')}", ylim=(0, None))
+            for method, shift in (("NUTS", -0.01), ("Laplace", 0.01)):
+                values = (groups[f"{name}, {method}"] + 0.5) / (config.draws + 1)
+                counts = np.array([np.histogram(tissue, edges)[0] for tissue in values])
+                heights = counts * config.bins / values[0].size
+                error = heights.std(0) / len(heights) ** 0.5
+                middles = edges[:-1] + 0.5 / config.bins + shift
+                ax.errorbar(middles, heights.mean(0), error, fmt="o", ms=3, label=method)
+            ax.axhline(1.0, color=plotting.INK, lw=0.8, zorder=0)
+            ax.set(title=f"{kind}: {name.replace('_', ' ')}", ylim=(0, None), xlim=(0, 1))
         row[0].set_ylabel("density of ranks")
     for ax in axes[-1]:
         ax.set_xlabel("rank of the truth / draws")

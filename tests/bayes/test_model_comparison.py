@@ -78,6 +78,7 @@ def test_leave_one_out_prefers_the_true_model():
     assert values[0] > values[1] + 10
 
 
+@pytest.mark.slow
 def test_evidence_of_a_gaussian_posterior_is_that_of_laplace():
     problem = noisy_problem(1e-3)[0]
     prior = {"mean": dist.Normal(MEAN, 0.05)}

@@ -73,7 +73,7 @@ def test_laplace_approximation_matches_the_closed_form(linear, closed_form):
 
 
 def test_draws_match_the_closed_form(linear, closed_form):
-    posterior = draw(density_of(linear), 200, warmup=100)
+    posterior = draw(density_of(linear), 200)
     mean, covariance = closed_form
     deviation, table = np.sqrt(np.diag(covariance)), posterior.table()
     assert (table["ess"] > 150).all()
