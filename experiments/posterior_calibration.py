@@ -59,7 +59,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     ranks: dict[str, Any] = {}
     for kind, n in (("vertices", config.replicates), ("image", config.image_replicates)):
         compute = lambda number, kind=kind: calibrate(config, kind, int(number))
-        ranks[kind] = folder.scan(kind, range(n), compute, progress=progress)
+        ranks[kind] = folder.scan(kind, [float(k) for k in range(n)], compute, progress=progress)
         metrics[f"{kind}, rejected trajectories"] = int(ranks[kind].pop("rejected").sum())
         for key, values in ranks[kind].items():
             metrics[f"{kind}, {key}, p"] = uniformity(values, config)
