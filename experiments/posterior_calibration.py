@@ -6,6 +6,7 @@ Laplace approximation. The cost is that of one effective draw, against random-wa
 """
 
 import time
+import warnings
 from typing import Any, Literal
 
 import equinox as eqx
@@ -57,15 +58,17 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     """P values of uniform ranks, and the cost of an effective draw."""
     metrics: dict[str, Any] = {}
     ranks: dict[str, Any] = {}
-    for kind, n in (("vertices", config.replicates), ("image", config.image_replicates)):
-        compute = lambda number, kind=kind: calibrate(config, kind, int(number))
-        ranks[kind] = folder.scan(kind, [float(k) for k in range(n)], compute, progress=progress)
-        metrics[f"{kind}, rejected trajectories"] = int(ranks[kind].pop("rejected").sum())
-        for key, values in ranks[kind].items():
-            metrics[f"{kind}, {key}, p"] = uniformity(values, config)
-            deviation = np.std((values + 0.5) / (config.draws + 1)) * np.sqrt(12)
-            metrics[f"{kind}, {key}, spread of ranks (1 if uniform)"] = float(deviation)
-    rows = [cost(config, n) for n in config.cost_sizes]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the metrics count what they state
+        for kind, n in (("vertices", config.replicates), ("image", config.image_replicates)):
+            compute = lambda number, kind=kind: calibrate(config, kind, int(number))
+            numbers = [float(k) for k in range(n)]
+            ranks[kind] = folder.scan(kind, numbers, compute, progress=progress)
+        rows = [cost(config, n) for n in config.cost_sizes]
+    for kind, groups in ranks.items():
+        for key in ("rejected trajectories", "draws with a short edge"):
+            metrics[f"{kind}, {key}"] = int(groups.pop(key).sum())
+        metrics |= {f"{kind}, {key}, p": uniformity(values, config) for key, values in groups.items()}
     folder.save_table("cost", {key: np.array([row[key] for row in rows]) for key in rows[0]})
     folder.save_figure("calibration", plot_ranks(ranks, config))
     return metrics | {f"cost at {row['cells']} cells": row for row in rows}
@@ -127,7 +130,9 @@ def calibrate(config: Config, kind: Any, seed: int) -> dict[str, np.ndarray]:
     rank = lambda draws, name: np.sum(np.asarray(draws) < np.asarray(truth[name]), axis=0)
     ranks = {f"{name}, NUTS": rank(posterior.draws(name)[0, 1::2], name) for name in truth}
     ranks |= {f"{name}, Laplace": rank(approximate[name], name) for name in truth}
-    return ranks | {"rejected": np.sum(posterior.data["sample_stats"]["rejected"].values)}
+    values = {name: posterior.data["sample_stats"][name].values for name in ("rejected", "shortest_edge")}
+    short = np.sum(values["shortest_edge"] < 0.02)
+    return ranks | {"rejected trajectories": np.sum(values["rejected"]), "draws with a short edge": short}
 
 
 def cost(config: Config, n: int) -> dict[str, float]:
