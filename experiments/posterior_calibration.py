@@ -56,14 +56,12 @@ class Config(runs.ExperimentConfig):
 
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """P values of uniform ranks, and the cost of an effective draw."""
-    metrics: dict[str, Any] = {}
-    ranks: dict[str, Any] = {}
+    metrics, ranks = {}, {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the metrics count what they state
         for kind, n in (("vertices", config.replicates), ("image", config.image_replicates)):
             compute = lambda number, kind=kind: calibrate(config, kind, int(number))
-            numbers = [float(k) for k in range(n)]
-            ranks[kind] = folder.scan(kind, numbers, compute, progress=progress)
+            ranks[kind] = folder.scan(kind, [*map(float, range(n))], compute, progress=progress)
         rows = [cost(config, n) for n in config.cost_sizes]
     for kind, groups in ranks.items():
         for key in ("rejected trajectories", "draws with a short edge"):
@@ -107,8 +105,7 @@ def density(config: Config, kind: Literal["vertices", "image"], n: int, seed: in
     while not (relaxed := response(start, ShapeFactorEnergy(p0), throw=False)).converged:
         p0 = draw()
     truth = {P0: p0, NOISE: prior[NOISE].sample(keys[2])}
-    noise = lambda x: x + truth[NOISE] * jax.random.normal(keys[3], x.shape)
-    target = relaxed.tissue
+    target, noise = relaxed.tissue, lambda x: x + truth[NOISE] * jax.random.normal(keys[3], x.shape)
     if kind == "vertices":
         data = target.with_vertices(noise(target.vertices))
         cost = n * 2.0 * vx.costs.VertexDistance(data)
@@ -135,7 +132,7 @@ def calibrate(config: Config, kind: Any, seed: int) -> dict[str, np.ndarray]:
     return ranks | {"rejected trajectories": np.sum(values["rejected"]), "draws with a short edge": short}
 
 
-def cost(config: Config, n: int) -> dict[str, float]:
+def cost(config: Config, n: int) -> dict[str, Any]:
     """Gradients, relaxations and seconds of one effective draw of the worst determined parameter."""
     import arviz
 

@@ -68,7 +68,7 @@ class Posterior(eqx.Module):
         - `quantiles`: the quantiles among the columns.
 
         **Returns:** columns `parameter`, `mean`, `deviation`, the quantiles, `ess` (effective sample size of
-        the bulk), `r_hat` (near 1 if the chains agree), `laplace_deviation`.
+        the bulk), `r_hat` (near 1 if the chains agree; NaN for one chain), `laplace_deviation`.
         """
         approximate = self.laplace.draw(0, 2000)
         rows = []
@@ -83,7 +83,7 @@ class Posterior(eqx.Module):
                         "deviation": values.std(),
                         **{f"{q:g}": np.quantile(values, q) for q in quantiles},
                         "ess": float(arviz.ess(values)),
-                        "r_hat": float(arviz.rhat(values)),
+                        "r_hat": float(arviz.rhat(values)) if len(values) > 1 else np.nan,
                         "laplace_deviation": float(
                             np.std(approximate[name][(slice(None), *index)])
                         ),
