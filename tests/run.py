@@ -30,6 +30,7 @@ CACHE = {
 # seconds to start. The longest ones come first.
 TOGETHER = (
     ("fitting",),
+    ("bayes",),
     ("adjoints", "external"),
     ("relax",),
     ("dynamics", "activities"),

@@ -1,6 +1,7 @@
 from . import (
     activities as activities,
     adjoints as adjoints,
+    bayes as bayes,
     costs as costs,
     dissipations as dissipations,
     dynamics as dynamics,

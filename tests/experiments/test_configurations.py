@@ -123,6 +123,16 @@ SHORT = {
         "tissue.n_cells=7",
         "fit.epochs=2",
     ],
+    "posterior_calibration": [
+        "replicates=2",
+        "image_replicates=2",
+        "n_cells=6",
+        "pixels=24",
+        "draws=7",
+        "warmup=20",
+        "cost_sizes=[6]",
+        "cost_draws=20",
+    ],
     "proliferation": ["duration=4", "frames=4", "room=12", "divisions=2", "animation=false"],
     "tensions_from_movie": ["substeps=10", "cluster.n_cells=7", "cluster.frames=3"],
     "timed_elongation": [

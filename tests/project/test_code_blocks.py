@@ -65,6 +65,7 @@ SLOW = {
     "docs/mechanics.md",
     "docs/performance.md",
     "docs/pictures.md",
+    "docs/posteriors.md",
     "docs/topologies.md",
     "docs/tyssue.md",
 }

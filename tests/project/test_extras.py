@@ -21,6 +21,9 @@ EXTRAS = {
     "tifffile": "image",
     "meshio": "files",
     "cellpose": "cellpose",
+    "blackjax": "bayes",
+    "arviz": "bayes",
+    "numpyro": "bayes",
 }
 
 
@@ -48,7 +51,7 @@ for package in (vx.adjoints, vx.costs, vx.energies, vx.fitting, vx.initialise, v
     assert package
 assert vx.fit and vx.equilibrate and vx.T1 and vx.load_tissue and vx.runs
 assert vx.initialise.hexagonal(2, 2).n_cells == 4
-for name in ("plot_tissue", "plotting"):
+for name in ("plot_tissue", "plotting", "bayes"):
     try:
         getattr(vx, name)
     except ImportError as error:
@@ -61,12 +64,13 @@ except ImportError as error:
     process = python(code, hide=EXTRAS)
     assert process.returncode == 0, process.stderr
     lines = process.stdout.splitlines()
-    assert len(lines) == 3
+    assert len(lines) == 4
     assert all(
         line.startswith('Drawing needs matplotlib: pip install "vertax[plot]"')
         for line in lines[:2]
     )
-    assert lines[2].startswith('Reading pictures needs pillow: pip install "vertax[image]"')
+    assert lines[2].startswith('Sampling a posterior needs blackjax: pip install "vertax[bayes]"')
+    assert lines[3].startswith('Reading pictures needs pillow: pip install "vertax[image]"')
 
 
 @pytest.mark.parametrize("missing", ["typer", "tomli_w", "matplotlib"])

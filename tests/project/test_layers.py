@@ -27,6 +27,7 @@ LAYERS = [
     "costs",
     "growth",
     "fitting",
+    "bayes",
     "initialise",
     "io",
     "inference",

@@ -10,7 +10,7 @@ AbstractActivity AbstractBoundary AbstractCost AbstractDissipation AbstractEnerg
 AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiation Checkpoint
 Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free
 GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic RESULTS Record
-Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate costs dissipations
+Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate bayes costs dissipations
 dynamics enable_compilation_cache enable_fast_compilation energies equilibrate evolve external
 fit fitting growth inference initialise io load_tissue mechanics mesh plot_history plot_recovery
 plot_tissue plotting relax runs save_tissue solvers transitions uncertainty
@@ -20,6 +20,7 @@ PACKAGES = {
     "activities": "AbstractActivity FluctuatingTensions Push SelfPropulsion Sum ThermalNoise",
     "adjoints": "AbstractAdjoint AutomaticDifferentiation EquilibriumPropagation GradientOutcome "
     "ImplicitDifferentiation",
+    "bayes": "Laplace LogPosterior Posterior evidence sample",
     "costs": "AbstractCost AbstractLeastSquaresCost Anisotropy AspectRatio BulkModulus CellAreas "
     "CellStress CentroidDistance EdgeDistance Frames HomotypicLength IndexAwareStructural "
     "MeanShapeFactor MeshImage ShearModulus SpectralGap Stress VertexDistance WeightedSum "

@@ -1,0 +1,152 @@
+"""The log density of parameters."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("blackjax", reason='needs the extra: pip install "vertax[bayes]"')
+
+import equinox as eqx
+import numpyro.distributions as dist
+from bayes_helpers import MEAN, N_CELLS, PRIOR, SPREAD, noisy_problem
+from helpers import fine_difference, random_like
+from scipy import stats
+
+import vertax as vx
+from vertax import bayes
+
+
+def with_fitted_noise(problem, **options):
+    prior = PRIOR | {"noise": dist.LogNormal(jnp.log(0.02), 1.0)}
+    return bayes.LogPosterior(problem, prior, lambda p: p["noise"], **options)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return noisy_problem(0.01)[0]
+
+
+def test_gradient_matches_finite_differences(problem):
+    density = with_fitted_noise(problem)
+    z = density.coordinates_of({"target_shape_factor": jnp.full(N_CELLS, MEAN), "noise": 0.012})
+    value = eqx.filter_jit(lambda z: density.log_prior(z)[0] + density.log_likelihood(z)[0])
+    direction = random_like(z)
+    expected = fine_difference(value, z, direction)
+    slope = eqx.filter_jit(eqx.filter_grad(value))(z)
+    assert float(jnp.vdot(slope, direction)) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_density_is_that_of_prior_and_noise(problem):
+    parameters = {"target_shape_factor": jnp.linspace(3.6, 3.7, N_CELLS), "noise": jnp.array(0.02)}
+    density = with_fitted_noise(problem)
+    energy = vx.energies.ShapeFactorEnergy(parameters["target_shape_factor"])
+    residuals = np.asarray(problem.residuals(energy, problem.tissue, None)[0])
+    expected = stats.norm(MEAN, SPREAD).logpdf(parameters["target_shape_factor"]).sum()
+    expected += stats.lognorm(s=1.0, scale=0.02).logpdf(0.02)
+    expected += stats.norm(0, 0.02).logpdf(residuals).sum()
+    assert float(density(parameters)) == pytest.approx(expected, rel=1e-9)
+    # In real coordinates the density has the factor |dσ/d log σ| = σ.
+    z = density.coordinates_of(parameters)
+    log_prior, again = density.log_prior(z)
+    assert float(again["noise"]) == pytest.approx(0.02)
+    real = float(log_prior + density.log_likelihood(z)[0])
+    assert real == pytest.approx(expected + np.log(0.02), rel=1e-9)
+
+
+def test_marginal_noise_is_the_integral_over_the_noise(problem):
+    density = bayes.LogPosterior(problem, PRIOR, None)
+    parameters = {"target_shape_factor": jnp.full(N_CELLS, 3.63)}
+    energy = vx.energies.ShapeFactorEnergy(parameters["target_shape_factor"])
+    residuals = np.asarray(problem.residuals(energy, problem.tissue, None)[0])
+    log_sigma = np.linspace(np.log(1e-3), np.log(1.0), 4001)
+    terms = stats.norm(0, np.exp(log_sigma)[:, None]).logpdf(residuals).sum(1)
+    expected = np.log(np.trapezoid(np.exp(terms - terms.max()), log_sigma)) + terms.max()
+    assert float(density.likelihood(parameters)[0]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_any_distribution_serves_as_noise(problem):
+    density = bayes.LogPosterior(problem, PRIOR, dist.StudentT(4.0, 0.0, 0.01))
+    parameters = {"target_shape_factor": jnp.full(N_CELLS, MEAN)}
+    residuals = np.asarray(problem.residuals(problem.energy, problem.tissue, None)[0])
+    expected = stats.t(4, 0, 0.01).logpdf(residuals).sum()
+    assert float(jnp.sum(density.likelihood(parameters)[0])) == pytest.approx(expected, rel=1e-9)
+
+
+def test_failed_relaxation_has_density_zero(problem):
+    response = dataclasses.replace(problem.response, max_steps=1)
+    density = bayes.LogPosterior(dataclasses.replace(problem, response=response), PRIOR, 0.01)
+    assert float(density({"target_shape_factor": jnp.full(N_CELLS, MEAN)})) > -np.inf
+    assert float(density({"target_shape_factor": jnp.linspace(3.4, 3.9, N_CELLS)})) == -np.inf
+
+
+def test_replicates_of_different_sizes_add_their_likelihoods():
+    singles = [noisy_problem(0.01, seed, n)[0] for seed, n in ((1, 5), (2, 6))]
+    shared = {"mean": dist.Normal(3.65, 0.1), "noise": dist.LogNormal(-4.0, 1.0)}
+    noise = lambda p: p["noise"]
+
+    def padded(problem):
+        tissue, target = (
+            t.with_capacity(6) for t in (problem.tissue, problem.cost.costs[0].target)
+        )
+        cost = problem.tissue.n_vertices * vx.costs.VertexDistance(target)
+        energy = vx.energies.ShapeFactorEnergy(jnp.full(6, MEAN, float))
+        return dataclasses.replace(problem, tissue=tissue, energy=energy, cost=cost)
+
+    energy_of = lambda n: lambda p: vx.energies.ShapeFactorEnergy(jnp.full(n, p["mean"]))
+    batch = vx.fitting.stack([padded(p) for p in singles])
+    together = bayes.LogPosterior(batch, shared, noise, energy=energy_of((2, 6)))
+    parameters = {"mean": jnp.array(3.7), "noise": jnp.array(0.02)}
+    expected = sum(
+        float(
+            jnp.sum(
+                bayes.LogPosterior(p, shared, noise, energy=energy_of(n)).likelihood(parameters)[0]
+            )
+        )
+        for p, n in zip(singles, (5, 6), strict=True)
+    )
+    terms, outcome = together.likelihood(parameters)
+    assert outcome.converged
+    assert float(jnp.sum(terms)) == pytest.approx(expected, rel=1e-6)
+    value = eqx.filter_jit(lambda z: together.log_likelihood(z)[0])
+    z = together.coordinates_of(parameters)
+    slope = eqx.filter_jit(eqx.filter_grad(value))(z)
+    difference = fine_difference(value, z, jnp.ones(2))
+    assert float(jnp.sum(slope)) == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_topology_is_kept_unless_transitions_are_allowed(problem):
+    problem = dataclasses.replace(problem, response=vx.Relaxation())
+    assert bayes.LogPosterior(problem, PRIOR, 0.01).problem.response.transitions is None
+    free = bayes.LogPosterior(problem, PRIOR, 0.01, across_t1=True)
+    assert isinstance(free.problem.response.transitions, vx.T1)
+
+
+def test_invalid_arguments_are_rejected(problem, without_type_checks):
+    wrong: Any = 3.7
+    with pytest.raises(TypeError, match=r"`problem` must be a vertax\.InverseProblem"):
+        bayes.LogPosterior(wrong, PRIOR, 0.01)
+    with pytest.raises(TypeError, match="`prior` must hold distributions by name"):
+        bayes.LogPosterior(problem, wrong, 0.01)
+    with pytest.raises(TypeError, match=r"prior of 'target_shape_factor' must be a distribution"):
+        bayes.LogPosterior(problem, {"target_shape_factor": wrong}, 0.01)
+    improper = dist.ImproperUniform(dist.constraints.real, (), ())
+    with pytest.raises(ValueError, match="must be a proper distribution"):
+        bayes.LogPosterior(problem, {"target_shape_factor": improper}, 0.01)
+    with pytest.raises(ValueError, match="must be a proper distribution"):
+        bayes.LogPosterior(problem, {"target_shape_factor": dist.Poisson(3.0)}, 0.01)
+    with pytest.raises(ValueError, match=r"must name arrays of the energy \(target_shape_factor\)"):
+        bayes.LogPosterior(problem, {"p0": dist.Normal(3.7, 0.1)}, 0.01)
+    with pytest.raises(ValueError, match=r"must have its shape \(6,\), but has \(3,\)"):
+        bayes.LogPosterior(
+            problem, {"target_shape_factor": dist.Normal(jnp.full(3, 3.7), 0.1)}, 0.01
+        )
+    with pytest.raises(ValueError, match="`noise` must be positive"):
+        bayes.LogPosterior(problem, PRIOR, -0.01)
+    moving = dataclasses.replace(problem, fit_position=True)
+    with pytest.raises(
+        ValueError, match="`energy` must be given for a problem with `fit_position`"
+    ):
+        bayes.LogPosterior(moving, PRIOR, 0.01)
