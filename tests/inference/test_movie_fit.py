@@ -83,8 +83,8 @@ def test_errors_by_tracking_noise_are_covered(evolved):
     assert np.mean(ratio < 2) > 0.8
     assert np.max(np.abs(errors)) < 0.03
     # With short edges the fit is biased by more than its standard error.
-    options = {"friction": FRICTION, "noise": 0.005, "min_edge_length": 0.0}
-    biased = fit_movie(noisy(evolved, 0.005, 0), GUESS, **options)
+    short = noisy(evolved, 0.005, 0)
+    biased = fit_movie(short, GUESS, friction=FRICTION, noise=0.005, min_edge_length=0.0)
     bias = biased.energy.terms[1].tension - TABLE[jnp.triu_indices(2)]
     assert np.abs(np.mean(bias)) > 3 * np.abs(np.mean(errors))
 

@@ -173,9 +173,16 @@ def fit_movie(
     dtype = movie.tissue.vertices.dtype
     zeta = jnp.asarray(friction, dtype)
     theta = jnp.append(theta, zeta) if fit_friction else theta
-    numbers = (noise, implicitness, min_edge_length * noise)
-    arrays = (jnp.asarray(number, dtype) for number in numbers)
-    settings = _Settings(static, unravel, zeta, *arrays, fit_friction, outline)
+    settings = _Settings(
+        static=static,
+        unravel=unravel,
+        friction=zeta,
+        noise=jnp.asarray(noise, dtype),
+        implicitness=jnp.asarray(implicitness, dtype),
+        min_edge_length=jnp.asarray(min_edge_length * noise, dtype),
+        fit_friction=fit_friction,
+        outline=outline,
+    )
     parts = np.array_split(np.arange(n_steps), n_windows)
     steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
     used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
