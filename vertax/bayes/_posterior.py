@@ -117,7 +117,7 @@ class Posterior(eqx.Module):
 
 
 def _inference_data(groups: dict[str, dict[str, np.ndarray]]) -> Any:
-    if hasattr(arviz, "InferenceData"):
+    if arviz.__version__.startswith("0."):
         return arviz.from_dict(**groups)  # pyright: ignore[reportArgumentType]
     return arviz.from_dict(groups)  # pyright: ignore[reportArgumentType]
 
