@@ -12,6 +12,19 @@ def cluster(n_cells: int, seed: int = 0, **options) -> vx.Tissue:
     return vx.initialise.free_voronoi(n_cells, key=jax.random.key(seed), **options)
 
 
+def at_rest(
+    tissue: vx.Tissue, *, largest_area: float, tolerance: float
+) -> tuple[vx.Tissue, np.ndarray, np.ndarray]:
+    """A cluster of random tensions and areas in equilibrium, its tensions and pressures."""
+    n, uniform = tissue.n_cells, jax.random.uniform
+    tension = uniform(jax.random.key(1), (tissue.n_edges,), minval=0.7, maxval=1.3)
+    areas = uniform(jax.random.key(2), (n,), minval=0.9, maxval=largest_area)
+    area = vx.energies.AreaElasticity(20.0, areas)
+    relax = vx.Relaxation(tolerance=tolerance, contact_range=None)
+    relaxed = relax(tissue, area + vx.energies.LineTension(tension)).tissue
+    return relaxed, np.asarray(tension), np.asarray(area.pressures(relaxed))
+
+
 def doublet(*, inner_arcs: bool = False, softening: float = 0.0) -> vx.Tissue:
     """Two cells, left and right of a straight interface; edges 0, 1, 2 are right arc, interface, left."""
     # At the lower vertex the right arc, the interface and the left arc leave counter-clockwise, at the

@@ -4,10 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from free_helpers import cluster
+from free_helpers import at_rest, cluster
 
-import vertax as vx
-from vertax.energies import AreaElasticity, LineTension
 from vertax.inference import infer_tensions, pearson
 from vertax.inference._balance import angles, equations, forces
 from vertax.inference._observed_geometry import observed_geometry
@@ -16,14 +14,7 @@ from vertax.inference._observed_geometry import observed_geometry
 @pytest.fixture(scope="module")
 def straight():
     """A cluster of straight edges at rest, its tensions and pressures."""
-    tissue = cluster(30, 5, lloyd_steps=3)
-    tension = jax.random.uniform(jax.random.key(1), (tissue.n_edges,), minval=0.7, maxval=1.3)
-    area = AreaElasticity(
-        20.0, jax.random.uniform(jax.random.key(2), (30,), minval=0.9, maxval=1.2)
-    )
-    relax = vx.Relaxation(tolerance=1e-10, contact_range=None)
-    relaxed = relax(tissue, area + LineTension(tension)).tissue
-    return relaxed, np.asarray(tension), np.asarray(area.pressures(relaxed))
+    return at_rest(cluster(30, 5, lloyd_steps=3), largest_area=1.2, tolerance=1e-10)
 
 
 def test_forces_of_straight_edges_are_the_gradient_of_the_energy():

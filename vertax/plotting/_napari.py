@@ -39,8 +39,7 @@ def tension_layer(inferred: InferredTensions, *, colours: str = "plasma") -> tup
     - `ValueError` for tensions of a tissue without an image.
     """
     sides = sides_of_pixels(inferred)
-    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=inferred.tissue.vertices.dtype)
-    course = np.asarray(inferred.tissue.edge_points(fractions), float) / sides
+    course = edge_courses(inferred) / sides
     tensions = np.where(inferred.determined, inferred.tensions, np.nan)
     diameter = np.sqrt(np.mean(np.asarray(inferred.tissue.areas)) / sides.prod())
     options = {
@@ -55,6 +54,12 @@ def tension_layer(inferred: InferredTensions, *, colours: str = "plasma") -> tup
     }
     # In napari the middle of a pixel has integer coordinates, in vertax its corner; and rows come first.
     return list(course[..., ::-1] - 0.5), options, "shapes"
+
+
+def edge_courses(inferred: InferredTensions) -> Float[np.ndarray, "edges points 2"]:
+    """Points on each edge, in units of length."""
+    fractions = jnp.linspace(0.0, 1.0, _POINTS, dtype=inferred.tissue.vertices.dtype)
+    return np.asarray(inferred.tissue.edge_points(fractions), float)
 
 
 def sides_of_pixels(inferred: InferredTensions) -> Float[np.ndarray, " xy"]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 from matplotlib import colormaps
@@ -17,7 +16,7 @@ from matplotlib.patches import Circle
 from vertax.inference import InferredTensions
 from vertax.initialise import MaskReport
 from vertax.plotting._image import label_colours, scale_bar
-from vertax.plotting._napari import sides_of_pixels
+from vertax.plotting._napari import edge_courses, sides_of_pixels
 from vertax.plotting._style import house_style, new_figure
 from vertax.plotting._tissue import plot_tissue
 
@@ -86,7 +85,7 @@ def plot_tensions(
 def _mark(ax: Axes, inferred: InferredTensions, report: MaskReport) -> None:
     """Mark holes, contacts that the mask does not show, and places where the mask was changed."""
     width, height = sides_of_pixels(inferred)
-    points = np.asarray(inferred.tissue.edge_points(jnp.linspace(0.0, 1.0, 13)), float)
+    points = edge_courses(inferred)
     # The exterior is the last face.
     beside = np.asarray(inferred.tissue.topology.edge_cells)
     hole = np.append(inferred.labels == 0, False)[beside].any(axis=1)

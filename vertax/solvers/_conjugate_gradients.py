@@ -189,7 +189,6 @@ class TruncatedCG(eqx.Module):
         far = furthest > jnp.where(small, self.overshoot_solved, self.overshoot)
         wants = concave | (~clips & far)
         again = wants & more
-        tried = s.step + length * d.vector
         after = s._replace(
             step=s.step + taken * d.vector,
             residual=s.residual + taken * d.damped,
@@ -200,8 +199,11 @@ class TruncatedCG(eqx.Module):
             num_products=s.num_products + jnp.where(small, 0, 1),
             num_rounds=s.num_rounds + again,
         )
-        last = lambda: jnp.where(small, s.direction, d.vector)
-        damp = lambda: self._with_damping(system, after, d, tried, concave, last())
+
+        def damp() -> tuple[Table, Float[Array, " rows"]]:
+            tried, last = s.step + length * d.vector, jnp.where(small, s.direction, d.vector)
+            return self._with_damping(system, after, d, tried, concave, last)
+
         residual, damping = jax.lax.cond(again, damp, lambda: (after.residual, s.damping))
         ends = ((small | wants) & ~again) | (after.num_products >= system.max_products)
         clip_next = ends & (furthest > self.clip)
