@@ -8,7 +8,7 @@ The data are computed with finer time steps than the fit.
 """
 
 import time
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -32,13 +32,15 @@ class Config(runs.ExperimentConfig):
 
     n_cells: int = Field(default=16, ge=4)
     """Cells of the tissue."""
-    truth: list[float] = Field(default=[1.5, 0.6, 0.4, 0.8], min_length=4, max_length=4)
+    truth: list[Annotated[float, Field(gt=0)]] = Field(
+        default=[1.5, 0.6, 0.4, 0.8], min_length=4, max_length=4
+    )
     """Stiffness of areas and of perimeters, viscosity of perimeters, and friction of a vertex."""
     target_perimeter: float = Field(default=3.5, gt=0)
     """Target perimeter of cells of area 1."""
     amplitude: float = Field(default=0.1, gt=0, lt=0.5)
     """Amplitude of the shear strain."""
-    periods: list[float] = Field(default=[1.0, 8.0], min_length=2, max_length=2)
+    periods: list[Annotated[float, Field(gt=0)]] = Field(default=[1.0, 8.0], min_length=2, max_length=2)
     """The periods of the fitted cycles."""
     predicted: float = Field(default=3.0, gt=0)
     """The period of the predicted cycles."""

@@ -150,3 +150,11 @@ def test_invalid_arguments_are_rejected(problem, without_type_checks):
         ValueError, match="`energy` must be given for a problem with `fit_position`"
     ):
         bayes.LogPosterior(moving, PRIOR, 0.01)
+    density = bayes.LogPosterior(problem, PRIOR, 0.01)
+    for parameters in ({}, {"target_shape_factor": jnp.full(3, 3.7)}):
+        with pytest.raises(ValueError, match="`parameters` must have the names and shapes"):
+            density(parameters)
+    with pytest.raises(ValueError, match="`start` must have the names and shapes"):
+        bayes.Laplace(density, {"p0": 3.7})
+    with pytest.raises(TypeError, match=r"`log_posterior` must be a vertax\.bayes\.LogPosterior"):
+        bayes.Laplace(problem)

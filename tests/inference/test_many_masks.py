@@ -91,8 +91,17 @@ def test_wrong_options_and_empty_sources_raise(mask, tmp_path):
         infer_tensions_of_masks([mask], prior=-1.0, progress=False)
     with pytest.raises(ValueError, match=r"all 2 failed; 0: Argument `prior`"):
         infer_tensions_of_masks([mask, mask], prior=-1.0, progress=False)
+    file = tmp_path / "a_file"
+    file.touch()
+    with pytest.raises(OSError, match="a_file"):
+        infer_tensions_of_masks([mask], cache=file / "cache", progress=False)
     with pytest.raises(FileNotFoundError, match="files by the pattern"):
         find_masks(str(tmp_path / "*.tif"))
+
+
+def test_masks_of_another_kind_raise(without_type_checks):
+    with pytest.raises(TypeError, match=r"`masks` must be a folder, .* but is None"):
+        find_masks(None)  # pyright: ignore[reportArgumentType]
 
 
 def test_two_holes_are_not_mirrored_cells(mask):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_key
-from vertax.bayes._log_posterior import LogPosterior, Parameters
+from vertax.bayes._log_posterior import LogPosterior, Parameters, check_log_posterior
 
 
 class Laplace(eqx.Module):
@@ -36,6 +36,7 @@ class Laplace(eqx.Module):
 
     **Raises:**
 
+    - `TypeError` for a density that is no `LogPosterior`.
     - `ValueError` if the density at the start is not finite, or the data determine no parameter.
     """
 
@@ -50,6 +51,7 @@ class Laplace(eqx.Module):
     """Evaluations of the gradient."""
 
     def __init__(self, log_posterior: LogPosterior, start: Parameters | None = None):
+        check_log_posterior(log_posterior)
         z = log_posterior.start() if start is None else log_posterior.coordinates_of(start)
         density = float(evaluate(log_posterior, z).log_density)
         if not np.isfinite(density):

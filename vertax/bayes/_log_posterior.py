@@ -139,7 +139,12 @@ class LogPosterior(eqx.Module):
         - `parameters`: arrays by name, as in the prior.
 
         **Returns:** the log density, without the constant; $-\\infty$ without an equilibrium.
+
+        **Raises:**
+
+        - `ValueError` for other names or shapes than those of the prior.
         """
+        self._check_parameters("parameters", parameters)
         log_prior = sum(jnp.sum(d.log_prob(parameters[n])) for n, d in self.prior.items())
         terms, outcome = self.likelihood(parameters)
         return log_prior + jnp.where(outcome.converged, jnp.sum(terms), -jnp.inf)
@@ -202,6 +207,7 @@ class LogPosterior(eqx.Module):
 
     def coordinates_of(self, parameters: Parameters) -> Float[Array, " coordinates"]:
         """The real coordinates of parameters."""
+        self._check_parameters("start", parameters)
         transforms = {name: biject_to(d.support) for name, d in self.prior.items()}
         parts = {n: t.inv(jnp.asarray(parameters[n])) for n, t in transforms.items()}
         return ravel_pytree(parts)[0].astype(self.problem.tissue.vertices.dtype)
@@ -218,6 +224,15 @@ class LogPosterior(eqx.Module):
         """Coordinates of 200 draws from the prior, for its mean and scale."""
         keys = jax.random.split(jax.random.key(0), 200)
         return jax.vmap(lambda key: self.coordinates_of(self.draw(key)))(keys)
+
+    def _check_parameters(self, argument: str, parameters: Parameters) -> None:
+        given = {name: jnp.shape(value) for name, value in parameters.items()}
+        expected = {name: d.shape() for name, d in self.prior.items()}
+        if given != expected:
+            raise ValueError(
+                f"Argument `{argument}` must have the names and shapes of the prior, {expected}, but has "
+                f"{given}."
+            )
 
     def _unravel(self, z: Float[Array, " coordinates"]) -> dict[str, Array]:
         zero = {
@@ -276,6 +291,14 @@ def _expanded(
             )
         expanded[name] = distribution
     return expanded
+
+
+def check_log_posterior(value: Any) -> None:
+    """Raise a `TypeError` for a value that is no `LogPosterior`."""
+    if not isinstance(value, LogPosterior):
+        raise TypeError(
+            f"Argument `log_posterior` must be a vertax.bayes.LogPosterior, but is {describe(value)}."
+        )
 
 
 def _check_proper(name: str, distribution: Any) -> None:

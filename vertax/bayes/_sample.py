@@ -23,10 +23,10 @@ from vertax._base.checkpoints import (
     digest,
     without_addresses,
 )
-from vertax._base.checks import as_key, check_integer, describe
+from vertax._base.checks import as_key, check_integer
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax.bayes._laplace import Laplace, evaluate
-from vertax.bayes._log_posterior import LogPosterior, Outcome, Parameters
+from vertax.bayes._log_posterior import LogPosterior, Outcome, Parameters, check_log_posterior
 from vertax.bayes._posterior import Posterior
 
 _CHUNK = 20
@@ -87,11 +87,7 @@ def sample(
     - `ValueError` for a number below 1 (`warmup` below 20), a checkpoint of another run, and as
         [`Laplace`][vertax.bayes.Laplace].
     """
-    if not isinstance(log_posterior, LogPosterior):
-        raise TypeError(
-            "Argument `log_posterior` must be a vertax.bayes.LogPosterior, but is "
-            f"{describe(log_posterior)}."
-        )
+    check_log_posterior(log_posterior)
     for name, value, least in (("draws", draws, 1), ("warmup", warmup, 20), ("chains", chains, 1)):
         check_integer(name, value, at_least=least)
     key = as_key(key)

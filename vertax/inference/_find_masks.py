@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Array, Shaped
 
+from vertax._base.checks import describe
 from vertax.inference._infer_tensions import infer_tensions, pixels_of_file
 from vertax.inference._inferred import InferredTensions
 from vertax.inference._mask import load_array, read_mask
@@ -77,6 +78,7 @@ def find_masks(
     **Raises:**
 
     - `FileNotFoundError` if there is no such file, or no file in the folder or of the pattern.
+    - `TypeError` for another kind of argument.
     - `ValueError` for an empty list, and an array with fewer than two axes.
     """
     if isinstance(masks, str | os.PathLike):
@@ -92,6 +94,11 @@ def find_masks(
                 f"is {pixels.shape}."
             )
         return _planes(pixels)
+    if not isinstance(masks, Sequence):
+        raise TypeError(
+            "Argument `masks` must be a folder, a pattern, a file, an array or a list of these, but is "
+            f"{describe(masks)}."
+        )
     if not len(masks):
         raise ValueError("Argument `masks` must hold at least one mask, but is empty.")
     named = iter(_named([Path(m) for m in masks if isinstance(m, str | os.PathLike)]))

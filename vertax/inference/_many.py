@@ -139,6 +139,7 @@ def infer_tensions_of_masks(
     **Raises:**
 
     - `TypeError` for an unknown option.
+    - `OSError` if the folder of the `cache` cannot be made.
     - the error of the mask, if there is only one.
     - `ValueError` if none of several masks has a result, and as
         [`find_masks`][vertax.inference.find_masks].
@@ -147,6 +148,8 @@ def infer_tensions_of_masks(
     if threads is not None:
         check_integer("threads", threads, at_least=1)
     frames = find_masks(masks, plane=plane)
+    if cache is not None:
+        Path(cache).mkdir(parents=True, exist_ok=True)
     if plane is not None:
         options["plane"] = plane
     results: dict[str | int, InferredTensions] = {}
@@ -202,7 +205,6 @@ def _infer(
     digest = hashlib.sha256(pixels + given.encode()).hexdigest()
     file = Path(cache) / f"{digest[:32]}.npz"
     if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
         result = frame.infer(**options)
         save_module(file, "tensions", result, InferredTensions, _CLASSES)
     return load_module(file, "tensions", InferredTensions, _CLASSES)
