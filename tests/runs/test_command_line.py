@@ -397,6 +397,9 @@ import jax, jax.numpy as jnp
 import vertax.jobs.infer_shape_factors as experiment
 from vertax.__main__ import main
 
+# (A shell without job control starts its background processes with this signal ignored.)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 class Crash:
     def __del__(self, kill=os.kill, process=os.getpid(), crash=signal.SIGSEGV):
         kill(process, crash)
