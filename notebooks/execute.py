@@ -29,7 +29,10 @@ def execute(path: Path, timeout: int) -> NotebookNode:
 
 
 def tidied(notebook: NotebookNode) -> NotebookNode:
-    """Remove metadata that differs between runs or machines, so that a diff shows only changes."""
+    """Remove what differs between runs or machines, so that a diff shows only changes.
+
+    These are metadata, and messages that a function compiles, which slow machines print.
+    """
     notebook.metadata = NotebookNode(
         kernelspec={"display_name": "Python 3", "language": "python", "name": "python3"},
         language_info={"name": "python"},
@@ -37,7 +40,14 @@ def tidied(notebook: NotebookNode) -> NotebookNode:
     for number, cell in enumerate(notebook.cells, start=1):
         cell.id = f"cell-{number:02d}"
         cell.metadata = NotebookNode()
+        outputs = cell.get("outputs", [])
+        outputs[:] = [each for each in outputs if not is_message_of_compilation(each)]
     return notebook
+
+
+def is_message_of_compilation(output: NotebookNode) -> bool:
+    """Whether an output is the message of vertax that a function compiles."""
+    return output.get("name") == "stderr" and output.text.startswith("Compiling ")
 
 
 def main() -> None:
