@@ -38,7 +38,7 @@ def main() -> None:
         start = vx.initialise.periodic_voronoi(n_cells=n_cells, key=0, lloyd_steps=2)
         logits = 0.5 * jax.random.normal(jax.random.key(1), (start.n_edges,))
         tension = 0.04 + 0.24 * jax.nn.sigmoid(logits)
-        energy = vx.inference.foam_energy(tension)
+        energy = vx.energies.foam_energy(tension)
 
         @eqx.filter_jit
         def ratio(energy, tissue):
@@ -48,7 +48,7 @@ def main() -> None:
         gradient = eqx.filter_jit(eqx.filter_grad(lambda e, t: ratio(e, t)[0]))
         tissue = ratio(energy, start)[1].checked().tissue
         _, of_gradient = first_and_best(gradient, energy, tissue, repeats=2)
-        logits_of = lambda e: vx.inference.foam_terms(e)[1].logits
+        logits_of = lambda e: e.terms[1].logits
         slopes = np.asarray(logits_of(gradient(energy, tissue)))
         edges = np.argsort(-np.abs(slopes))[:: max(1, tissue.n_edges // (2 * chosen.edges))]
         seconds, off = [], []

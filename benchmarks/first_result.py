@@ -118,7 +118,7 @@ def mask_steps() -> Iterator[tuple[str, Callable[[], Any]]]:
 
     masks = [mask(int(n), seed) for seed, n in enumerate(np.linspace(90, 110, 20))]
     for number, image in enumerate(masks):
-        yield f"mask {number}", lambda image=image: vx.inference.infer_tensions(image)
+        yield f"mask {number}", lambda image=image: vx.tensions.infer_tensions(image)
 
 
 def session(kind: str) -> None:

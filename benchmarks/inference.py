@@ -26,7 +26,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import nnls
 
 import vertax as vx
-from vertax.inference import InferredTensions, infer_tensions, label_image, pearson
+from vertax.inference import label_image, pearson
+from vertax.tensions import InferredTensions, infer_tensions
 
 jax.config.update("jax_enable_x64", True)
 

@@ -18,7 +18,8 @@ import numpy as np
 from _foams import furrow, grouped, on_the_way, start, to_rest, voronoi, write_evolver
 from inference import FORSYS, Truth, compare, foam, forsys
 
-from vertax.inference import infer_tensions, label_image, pearson
+from vertax.inference import label_image, pearson
+from vertax.tensions import infer_tensions
 
 jax.config.update("jax_enable_x64", True)
 

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 import vertax as vx
-from vertax.inference import infer_tensions
-from vertax.inference._curves import Points
-from vertax.inference._edges import fit, solution
-from vertax.inference._observed_geometry import observed_geometry
-from vertax.inference._outcome import relative
+from vertax.tensions import infer_tensions
+from vertax.tensions._curves import Points
+from vertax.tensions._edges import fit, solution
+from vertax.tensions._observed_geometry import observed_geometry
+from vertax.tensions._outcome import relative
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "wings"
 

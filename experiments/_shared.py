@@ -9,8 +9,7 @@ from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field, model_validator
 
 from vertax import plotting, runs
-from vertax.energies import LocalSum
-from vertax.inference import foam_energy
+from vertax.energies import LocalSum, foam_energy
 from vertax.mesh import Tissue
 
 

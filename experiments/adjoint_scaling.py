@@ -15,6 +15,7 @@ from pydantic import Field
 
 import vertax as vx
 from experiments import benchmark_adjoints as benchmark
+from experiments._replicates import same_limits
 from experiments._shared import columns
 from vertax import plotting, runs
 
@@ -122,7 +123,7 @@ def plot_scaling(rows: list[dict[str, Any]]) -> Any:
             ax.minorticks_off()
         time_axes.set_ylabel("time of an epoch (ms)")
         memory_axes.set_ylabel("working memory (kB)")
-    plotting.same_limits(axes[::2])
-    plotting.same_limits(axes[1::2])
+    same_limits(axes[::2])
+    same_limits(axes[1::2])
     axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="upper left", bbox_to_anchor=(1, 1))
     return figure

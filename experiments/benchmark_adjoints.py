@@ -14,6 +14,7 @@ import optimistix as optx
 from pydantic import Field
 
 import vertax as vx
+from experiments._replicates import plot_band, plot_boxes, same_limits
 from vertax import inference, plotting, runs
 
 Method = Literal["AD", "Adj-ID", "Sen-ID", "EP"]
@@ -164,20 +165,20 @@ def plot_inference(fits: Any, true: np.ndarray, initial: np.ndarray, inferred: A
     for method, values in inferred.items():
         style |= {"label": method, "colour": COLOURS[method], "marker": MARKERS[method]}
         plotting.plot_recovery(true.ravel(), values.ravel(), ax=end, **style)
-    plotting.same_limits((start, end))
+    same_limits((start, end))
     start.set_title("epoch 0")
     end.set_title("best epoch")
     for ax, name, label in ((cost, "cost", "cost (v2v)"), (error, "relative_error", "relative error")):
         for method, fit in fits.items():
             curves = getattr(fit.history, name)
-            plotting.plot_band(curves, ax=ax, log=True, label=method, colour=COLOURS[method])
+            plot_band(curves, ax, log=True, label=method, colour=COLOURS[method])
         ax.set(xlabel="epoch", ylabel=label)
     cost.legend(ncols=2, columnspacing=0.8)
     # A logarithmic axis shows no zero, which 1 - r is up to rounding.
     distances = {m: np.maximum(1 - inference.pearson(true, p), 1e-16) for m, p in inferred.items()}
     errors = {m: inference.relative_error(true, p) for m, p in inferred.items()}
-    plotting.plot_boxes(distances, ax=correlation, colours=COLOURS, log=True)
+    plot_boxes(distances, correlation, colours=COLOURS, log=True)
     correlation.set_ylabel("1 − Pearson $r$ at the end")
-    plotting.plot_boxes(errors, ax=final, colours=COLOURS, log=True)
+    plot_boxes(errors, final, colours=COLOURS, log=True)
     final.set_ylabel("relative error at the end")
     return figure

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
+from experiments._replicates import series_colours
 from experiments._shared import replicate_keys
 from vertax import plotting, runs
 
@@ -142,7 +143,7 @@ def plot_diffusion(config: Config, lags: Any, squared: Any, coefficients: Any, r
     """Mean squared displacements, diffusion (at least a tenth of the threshold) and transitions."""
     figure, ((left, middle, right),) = plotting.new_figure(1, 3, width=2.5)
     k = len(config.speeds) // 2
-    shades = plotting.series_colours(f"{p0:g}" for p0 in config.shape_factors)
+    shades = series_colours(f"{p0:g}" for p0 in config.shape_factors)
     for (name, colour), values in zip(shades.items(), squared[k], strict=True):
         left.plot(lags, values, color=colour, label=f"$p_0 = {name}$")
     # A persistent random walk: Bi et al. 2016, eq. 8.

@@ -15,6 +15,7 @@ from pydantic import Field
 from scipy.stats import mannwhitneyu
 
 import vertax as vx
+from experiments._replicates import plot_boxes, same_limits
 from vertax import plotting, runs
 from vertax.inference import pearson
 from vertax.jobs import infer_from_microscopy as microscopy
@@ -202,10 +203,10 @@ def plot_conditions(images: list[Any]) -> Any:
             plotting.plot_recovery(true, inferred, ax=scatter, label=kind, **options)
             cells[kind] = inferred
         scatter.set_title(f"SNR {snr:g}")
-        plotting.plot_boxes(cells, ax=box, colours=COLOURS)
+        plot_boxes(cells, box, colours=COLOURS)
         box.set_ylabel("inferred $p_0$")
-    plotting.same_limits(axes[0])
-    plotting.same_limits(axes[1], x=False)
+    same_limits(axes[0])
+    same_limits(axes[1], x=False)
     axes[0, 0].legend(loc="upper left")
     return figure
 

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
+from experiments._replicates import series_colours
 from experiments._shared import TensionRange, columns, plot_tensions, replicate_keys, spread_of
 from vertax import plotting, runs
 from vertax.costs import AspectRatio, aspect_ratio
@@ -76,7 +77,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     panels = {}
     for name, each, k in (("initial", start, 0), ("designed", fit, shown)):
         tissue, energy = member((each.tissue, each.energy), k)
-        tension = np.asarray(vx.inference.foam_terms(energy)[1].tension)
+        tension = np.asarray(energy.terms[1].tension)
         panels[f"{name}: $r$ = {ratios_of(config, each).ravel()[k]:.2f}"] = (tissue, tension)
         folder.save_tissue(name, tissue)
     ratios = {n: ratios_of(config, fit) for n, (_, fit) in designs.items()}
@@ -163,7 +164,7 @@ def plot_elongation(panels: Any, bounds: tuple[float, float], targets: np.ndarra
     """Tissues before and after, aspect ratios and errors against the target, by number of cells."""
     figure, (reached, error) = plot_tensions(panels, bounds, [2.7, 2.7])
     reached.plot(targets, targets, color=plotting.INK, ls=":", lw=0.8)
-    colours, step = plotting.series_colours(f"{n} cells" for n in ratios), 0.012 * (np.ptp(targets) or 1.0)
+    colours, step = series_colours(f"{n} cells" for n in ratios), 0.012 * (np.ptp(targets) or 1.0)
     for k, ((name, colour), values) in enumerate(zip(colours.items(), ratios.values(), strict=True)):
         # Shifted sideways: designs that reach their target would hide each other.
         at = targets + step * (k - (len(ratios) - 1) / 2)

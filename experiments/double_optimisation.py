@@ -18,9 +18,9 @@ from pydantic import Field
 
 import vertax as vx
 from experiments._shared import replicate_keys
+from experiments._transition import fit_onset
 from vertax import plotting, runs
 from vertax.fitting import member
-from vertax.inference import fit_onset
 
 Tuned = Literal["stiffness", "perimeter", "area"]
 

@@ -20,6 +20,7 @@ import optimistix as optx
 from pydantic import Field
 
 import vertax as vx
+from experiments._replicates import series_colours
 from vertax import plotting, runs
 from vertax.energies import AreaElasticity, LineTension
 
@@ -181,7 +182,7 @@ def plot_recovery(target: vx.Tissue, true: np.ndarray, tensions: Any, errors: An
     axes[1].axline((true.mean(), true.mean()), slope=1, color=plotting.INK, lw=0.7)
     styles: Any = ({"marker": "o", "mfc": "none"}, {"marker": "x"})
     for style, line, (name, colour) in zip(
-        styles, ("-", (0, (3, 3))), plotting.series_colours(tensions).items(), strict=False
+        styles, ("-", (0, (3, 3))), series_colours(tensions).items(), strict=False
     ):
         axes[1].plot(true, tensions[name], ls="", ms=4, mew=0.8, color=colour, label=name, **style)
         axes[2].semilogy(errors[name], color=colour, ls=line, label=name)

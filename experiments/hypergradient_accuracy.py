@@ -16,6 +16,7 @@ from pydantic import Field
 
 import vertax as vx
 from experiments import benchmark_adjoints as benchmark
+from experiments._replicates import same_limits
 from experiments._shared import columns
 from vertax import plotting, runs
 
@@ -165,7 +166,7 @@ def plot_betas(betas: dict[str, np.ndarray], errors: dict[str, np.ndarray], fitt
             values = geometric_mean(errors[f"{nudge}, {estimator}"])
             ax.plot(betas[nudge], values, style, ms=3, color=colour, label=estimator)
         ax.set(xscale="log", yscale="log", xlabel=name, title=f"nudge: {nudge}")
-    plotting.same_limits((linear, cost), x=False)
+    same_limits((linear, cost), x=False)
     linear.set_ylabel("relative error of the hypergradient")
     linear.legend()
     for k, recovery in enumerate(fitted.values()):

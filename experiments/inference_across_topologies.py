@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 from pydantic import Field
 
 import vertax as vx
+from experiments._recovery import RecoveryWatch
+from experiments._replicates import plot_band, plot_boxes, series_colours
 from vertax import costs, inference, plotting, runs
 from vertax.costs import mismatched_neighbours
 from vertax.fitting import member, stack
@@ -161,7 +163,7 @@ def fit_method(config: Config, method: Method, batch: Any, folder: runs.RunFolde
     problem = vx.InverseProblem(batch.initial, batch.guess, cost, **levels)
     guidance = config.guidance.schedule(config.tissue.n_cells) if method.guided else None
     options: dict[str, Any] = {"truth": batch.truth, "guidance": guidance, "progress": progress}
-    options |= {"callback": inference.RecoveryWatch(batch.truth, batch.target)}
+    options |= {"callback": RecoveryWatch(batch.truth, batch.target)}
     optimiser, epochs = config.fit.build(), config.fit.epochs
     return folder.fit(method.name, problem, optimiser, epochs, partial=True, batched=True, **options)
 
@@ -201,21 +203,21 @@ def measure(batch: Any, fit: vx.Fit, mismatched: list[int]) -> dict[str, Any]:
 @plotting.house_style()
 def plot_inference(curves: dict[str, Curves], metrics: dict[str, Any]) -> Any:
     """Errors, correlations and mismatched neighbours by epoch, and at the end."""
-    colours = plotting.series_colours(curves)
+    colours = series_colours(curves)
     figure, (first, last) = plotting.new_figure(2, 3, width=2.5)
     labels = ("relative error", "Pearson $r$", "mismatched neighbours")
     for k, (ax, label, log) in enumerate(zip(first, labels, (True, False, False), strict=True)):
         for name, curve in curves.items():
-            style: Any = {"log": True} if log else {"spread": "range"}
-            plotting.plot_band(curve[k], ax=ax, label=name, colour=colours[name], **style)
+            style: Any = {"log": True} if log else {"extremes": True}
+            plot_band(curve[k], ax, label=name, colour=colours[name], **style)
         ax.set(xlabel="epoch", ylabel=label)
     first[0].legend()
     final = lambda key: {name: np.asarray(metrics[name][key]) for name in curves}
     # A logarithmic axis shows no zero, which 1 - r is up to rounding.
     distances = {name: np.maximum(1 - r, 1e-16) for name, r in final("pearson").items()}
-    plotting.plot_boxes(final("relative_error"), ax=last[0], colours=colours, log=True)
-    plotting.plot_boxes(distances, ax=last[1], colours=colours, log=True)
-    plotting.plot_boxes(final("mismatched_neighbours"), ax=last[2], colours=colours)
+    plot_boxes(final("relative_error"), last[0], colours=colours, log=True)
+    plot_boxes(distances, last[1], colours=colours, log=True)
+    plot_boxes(final("mismatched_neighbours"), last[2], colours=colours)
     last[0].set(ylabel="relative error at the end")
     last[1].set(ylabel="1 − Pearson $r$ at the end")
     last[2].set(ylabel="mismatched at the end", ylim=(-0.5, None))

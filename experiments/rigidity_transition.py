@@ -17,10 +17,11 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
+from experiments._replicates import series_colours
 from experiments._shared import FLUID
+from experiments._transition import fit_onset, fit_transition
 from vertax import plotting, runs
 from vertax.energies import ShapeFactorEnergy
-from vertax.inference import fit_onset, fit_transition
 from vertax.plotting import INK, SERIES
 
 
@@ -190,7 +191,7 @@ def fit_roots(x: np.ndarray, energies: np.ndarray, config: Config) -> tuple[Any,
 def plot_transition(x: np.ndarray, curves: list[Curve], shapes: np.ndarray, modes: np.ndarray) -> Any:
     """Fractions at zero energy, energies, observed shapes and zero modes against the shape factor."""
     figure, (axes,) = plotting.new_figure(1, 4 if modes.size else 3, width=2.2)
-    colours = plotting.series_colours(curve.name for curve in curves)
+    colours = series_colours(curve.name for curve in curves)
     fine = np.linspace(x.min(), x.max(), 400)
     for curve in curves:
         style: Any = {"ms": 3, "color": colours[curve.name]}

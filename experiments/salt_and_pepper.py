@@ -16,6 +16,7 @@ from matplotlib.ticker import PercentFormatter
 from pydantic import Field
 
 import vertax as vx
+from experiments._replicates import plot_band, series_colours
 from experiments._shared import TensionRange, replicate_keys, spread_of
 from vertax import plotting, runs
 from vertax.costs import HomotypicLength
@@ -133,7 +134,7 @@ def make_panels(config: Config, problem: Any, fit: vx.Fit, fractions: Any, folde
     designs = ((first, problem.energy), member((fit.tissue, fit.energy), 0))
     panels = {}
     for name, (tissue, energy), fraction in zip(("initial", "designed"), designs, fractions, strict=True):
-        tensions = np.asarray(vx.inference.foam_terms(energy)[1].tension)
+        tensions = np.asarray(energy.terms[1].tension)
         panels[f"{name}: {fraction:.1%} heterotypic"] = (tissue, types, tensions)
         folder.save_tissue(name, tissue)
     return panels
@@ -149,8 +150,8 @@ def plot_patterns(panels: Any, bounds: tuple[float, float], curves: dict[str, np
     style: Any = {"cmap": TYPES, "vmin": -0.5, "vmax": TYPES.N - 0.5, "colorbar": "edges"}
     style |= {"edge_vmin": bounds[0], "edge_vmax": bounds[1], "edge_label": r"tension $\gamma$"}
     plotting.plot_tissues(tissues, types, list(tensions), axes=axes[:n], **style)
-    for name, colour in plotting.series_colours(curves).items():
-        plotting.plot_band(curves[name], ax=axes[n], label=name, colour=colour)
+    for name, colour in series_colours(curves).items():
+        plot_band(curves[name], axes[n], label=name, colour=colour)
     axes[n].axhline(1, color=plotting.INK, ls=":", lw=0.8)
     axes[n].set(xlabel="epoch", ylabel="heterotypic share of interfaces")
     axes[n].yaxis.set_major_formatter(PercentFormatter(1))

@@ -15,7 +15,8 @@ from pydantic import Field
 import vertax as vx
 from experiments._shared import columns
 from vertax import plotting, runs
-from vertax.inference import EdgeMotion, pearson
+from vertax.inference import pearson
+from vertax.tensions import EdgeMotion
 
 NAME = r"tension $\gamma / \bar\gamma$"
 

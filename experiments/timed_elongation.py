@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
+from experiments._replicates import series_colours
 from experiments._shared import TensionRange, plot_tensions
 from vertax import plotting, runs
 from vertax.costs import aspect_ratio
@@ -130,7 +131,7 @@ def plot_course(panels: Any, bounds: Any, times: np.ndarray, course: np.ndarray,
     """Tissues at three times, and the aspect ratio in time."""
     figure, (ax,) = plot_tensions(panels, bounds, [3.0])
     ax.plot(times, course, "o:", ms=3, color=plotting.INK, lw=0.8, label="asked for")
-    for name, colour in plotting.series_colours(ratios).items():
+    for name, colour in series_colours(ratios).items():
         ax.plot(times, ratios[name], ".-", color=colour, label=f"{name} tensions")
     ax.set(xlabel="time", ylabel="aspect ratio")
     ax.legend()

@@ -24,6 +24,7 @@ from optimistix import LevenbergMarquardt
 from pydantic import Field
 
 import vertax as vx
+from experiments._replicates import series_colours
 from experiments._shared import replicate_keys
 from vertax import energies, plotting, runs
 from vertax.costs import CellStress
@@ -228,7 +229,7 @@ def plot_training(tissue: vx.Tissue, stresses: np.ndarray, trained: list[int], e
     """A trained tissue with its stresses, distances from the target by epoch, and the smallest ones."""
     figure, ((shown, curves, distances),) = plotting.new_figure(1, 3, width=2.3)
     plotting.plot_stress(tissue, stresses, ax=shown)
-    for rule, colour in plotting.series_colours(errors).items():
+    for rule, colour in series_colours(errors).items():
         # One curve per number of cells: the paler, the smaller.
         for i, curve in enumerate(np.nanmedian(errors[rule], axis=1)):
             label = rule if i == len(trained) - 1 else None

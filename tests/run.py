@@ -39,7 +39,7 @@ TOGETHER = (
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
     ("_base", "mesh", "energies", "dissipations", "initialise"),
     ("transitions", "growth"),
-    ("runs", "inference"),
+    ("runs", "inference", "tensions"),
     ("costs", "mechanics"),
     ("project", "plotting", "io", "solvers", "precondition"),
 )

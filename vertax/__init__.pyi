@@ -18,6 +18,7 @@ from . import (
     relax as relax,
     runs as runs,
     solvers as solvers,
+    tensions as tensions,
     transitions as transitions,
 )
 from ._base.compilation_cache import enable_compilation_cache as enable_compilation_cache

@@ -23,9 +23,9 @@ from experiments import (
     salt_and_pepper,
     tissue_moduli,
 )
-from vertax.inference._mean_stress import mean_stress
 from vertax.jobs import design_mechanics, infer_from_microscopy
 from vertax.plotting import label_colours
+from vertax.tensions._mean_stress import mean_stress
 
 pytestmark = pytest.mark.experiments
 
@@ -100,7 +100,7 @@ def test_a_label_image_shows_its_labels_under_the_edges(cluster):
     labels = np.repeat(np.arange(7), 10).reshape(7, 10)
     picture = label_colours(labels)
     edges, cells = np.ones(cluster.n_edges), np.ones(cluster.n_cells)
-    result = vx.inference.InferredTensions(
+    result = vx.tensions.InferredTensions(
         tissue=cluster,
         tensions=edges,
         tension_deviations=edges,

@@ -7,11 +7,11 @@ from PIL import Image
 from run_helpers import run, table
 
 import vertax as vx
-from vertax.inference import MaskFrame
 from vertax.runs import RunFolder, load_config
 from vertax.runs._config import validate
 from vertax.runs._execution import execute, new_folder
 from vertax.runs._registry import find_experiment
+from vertax.tensions import MaskFrame
 
 pytestmark = pytest.mark.experiments
 

@@ -2,16 +2,11 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import NO_CONTACT, random_tissue
 
-import vertax as vx
-from vertax.costs import mismatched_neighbours
-from vertax.fitting import stack
 from vertax.inference import (
-    RecoveryWatch,
     pearson,
     relative_error,
     same_neighbours,
@@ -65,31 +60,6 @@ def test_correlation_and_error_of_batches():
     assert np.isnan(pearson(true, np.full_like(true, 3.7))).all()
     with pytest.raises(ValueError, match="one shape"):
         pearson(true, inferred[0])
-
-
-def test_the_watch_counts_what_differs():
-    targets = [random_tissue(8, 0), random_tissue(8, 1)]
-    truth = vx.energies.ShapeFactorEnergy(3.7 + 0.1 * jnp.arange(16.0).reshape(2, 8))
-    tissues = stack([targets[0], random_tissue(8, 2)])
-    watch = RecoveryWatch(truth, stack(targets))
-    numbers, counts, flags = jnp.zeros(2), jnp.zeros(2, int), jnp.ones(2, bool)
-    names = ("cost", "max_force", "relative_error")
-    slopes = ("gradient_norm", "gradient_residual", "gradient_steps")
-    record = vx.Record(
-        parameters=eqx.filter(truth, eqx.is_array),
-        tissue=tissues,
-        converged=flags,
-        num_steps=counts,
-        num_t1=counts,
-        result=vx.RESULTS.successful,
-        **dict.fromkeys((*names, *slopes), numbers),
-    )
-    notes = watch(0, record)
-    np.testing.assert_allclose(notes["pearson"], 1)
-    expected = mismatched_neighbours(random_tissue(8, 2), targets[1])
-    np.testing.assert_array_equal(notes["mismatched"], [0, expected])
-    assert expected > 0
-    np.testing.assert_array_equal(watch(1, record)["mismatched"], notes["mismatched"])
 
 
 def test_neighbours_do_not_depend_on_edge_numbers():

@@ -12,7 +12,8 @@ import pytest
 from helpers import random_tissue, rewritten
 
 import vertax as vx
-from vertax.io import atomic_write, load_tissue, save_tissue
+from vertax._base.atomic import atomic_write
+from vertax.io import load_tissue, save_tissue
 from vertax.mesh._topology import flip_edges
 
 

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from vertax.inference import infer_tensions
 from vertax.initialise import from_labels
 from vertax.plotting import tension_layer
+from vertax.tensions import infer_tensions
 
 
 def bricks() -> np.ndarray:

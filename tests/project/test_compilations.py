@@ -94,7 +94,7 @@ CALLS = {
     "evolve": evolve,
     "grow": grow,
     "uncertainty": lambda: vx.uncertainty(problem(), FIT(problem(), OPTIMISER)),
-    "infer_tensions": lambda: vx.inference.infer_tensions(bricks()),
+    "infer_tensions": lambda: vx.tensions.infer_tensions(bricks()),
 }
 
 

@@ -30,6 +30,7 @@ LAYERS = [
     "bayes",
     "initialise",
     "io",
+    "tensions",
     "inference",
     "plotting",
     "runs",

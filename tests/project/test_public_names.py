@@ -13,7 +13,7 @@ GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic R
 Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate bayes costs dissipations
 dynamics enable_compilation_cache enable_fast_compilation energies equilibrate evolve external
 fit fitting growth inference initialise io load_tissue mechanics mesh plot_history plot_recovery
-plot_tissue plotting relax runs save_tissue solvers transitions uncertainty
+plot_tissue plotting relax runs save_tissue solvers tensions transitions uncertainty
 """
 
 PACKAGES = {
@@ -28,20 +28,17 @@ PACKAGES = {
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity "
     "PerimeterViscosity SubstrateFriction Sum ViscositySum",
     "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
-    "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum TypeTension by_type",
+    "LineTension LocalSum PerimeterElasticity ShapeFactorEnergy Sum TypeTension by_type foam_energy",
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty fit "
     "fit_warnings limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
-    "inference": "EdgeMotion Event InferredTensions MaskFrame Micrograph Microscope Movie MovieFit "
-    "MovingTensions PinnedEnergy RecoveryWatch Scene TensionsOfMasks Transition "
-    "find_masks fit_movie fit_onset fit_transition foam_energy foam_terms infer_tensions "
-    "infer_tensions_of_masks label_image micrograph_problem movie_from_table pearson "
-    "read_mask relative_error same_neighbours shape_factor_scene",
+    "inference": "Event Micrograph Microscope Movie MovieFit PinnedEnergy Scene fit_movie label_image "
+    "micrograph_problem movie_from_table pearson relative_error same_neighbours shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport PolygonTissue "
     "Segmentation Watershed "
     "free_voronoi from_labels from_microscopy from_polygons hexagonal labels_from_skeleton "
     "periodic_voronoi",
-    "io": "BoundedTables Foam Tables atomic_write cell_table edge_table from_edge_table from_tables "
+    "io": "BoundedTables Foam Tables cell_table edge_table from_edge_table from_tables "
     "from_tyssue load_energy load_problem load_tissue load_trajectory pixel_aspect pixel_sides "
     "read_force_inference "
     "read_geojson read_image read_stack read_surface_evolver read_table save_energy save_problem save_tissue "
@@ -52,15 +49,17 @@ PACKAGES = {
     "spectrum stress tensions velocities youngs_modulus zero_modes",
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology Trajectory cell_polygons pad",
     "plotting": "INK SERIES animate animate_figures cell_polygons flipped_edges house_style label_colours "
-    "new_figure plot_band plot_boxes plot_density_of_states plot_history plot_image "
+    "new_figure plot_density_of_states plot_history plot_image "
     "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tensions plot_tissue "
-    "plot_tissues same_limits scale_bar series_colours tension_layer",
+    "plot_tissues scale_bar tension_layer",
     "dynamics": "Evolution Evolved Material PIController evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
     "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
     "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "TruncatedCG VertexTrustRegion Wrapped",
+    "tensions": "EdgeMotion InferredTensions MaskFrame MovingTensions TensionsOfMasks find_masks "
+    "infer_tensions infer_tensions_of_masks read_mask",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",
 }
 

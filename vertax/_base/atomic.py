@@ -27,7 +27,7 @@ def atomic_write(
     the temporary file is removed.
 
     ```python
-    with vertax.io.atomic_write("metrics.json") as file:
+    with atomic_write("metrics.json") as file:
         json.dump(metrics, file)
     ```
 

@@ -13,4 +13,5 @@ from vertax.energies._energy import (
     LocalSum as LocalSum,
     Sum as Sum,
 )
+from vertax.energies._foam import foam_energy as foam_energy
 from vertax.energies._tension import BoundedTension as BoundedTension, LineTension as LineTension

@@ -1,6 +1,5 @@
 """Files: tissues, energies, problems, trajectories; tables and formats of other programs."""
 
-from vertax._base.atomic import atomic_write as atomic_write
 from vertax._base.pixels import pixel_sides as pixel_sides
 from vertax.io._bounded_tables import BoundedTables as BoundedTables
 from vertax.io._data_tables import (

@@ -16,8 +16,16 @@ from matplotlib.figure import Figure
 from pydantic import Field, model_validator
 
 from vertax import inference, plotting, runs
+from vertax.energies import foam_energy
 from vertax.initialise import free_voronoi
 from vertax.io import pixel_sides, write_geojson
+from vertax.tensions import (
+    InferredTensions,
+    MaskFrame,
+    TensionsOfMasks,
+    find_masks,
+    infer_tensions_of_masks,
+)
 
 SYNTHETIC = "synthetic"
 
@@ -45,12 +53,12 @@ class ImageSection(runs.ImageFile):
     def _path_alone(cls, value: Any) -> Any:
         return {"path": value} if isinstance(value, str) else value
 
-    def frames(self) -> list[inference.MaskFrame]:
+    def frames(self) -> list[MaskFrame]:
         """The masks."""
         assert self.path is not None  # TOML has no null
         plane = self.plane if self.channel is None else self.plane or 0
         try:
-            files = inference.find_masks(self.path, plane=plane)
+            files = find_masks(self.path, plane=plane)
         except FileNotFoundError as error:
             text = str(error).replace("Argument `masks`", "`image.path`")
             raise runs.ConfigError(text) from error
@@ -111,11 +119,11 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     reading, truth = config.image.reading(), None
     if config.image.path == SYNTHETIC:
         truth, labels = draw_cluster(config)
-        frames = [inference.MaskFrame(0, labels)]
+        frames = [MaskFrame(0, labels)]
         options, reading = options | {"kind": "labels"}, {"kind": "labels"}
     else:
         frames = config.image.frames()
-    masks = inference.infer_tensions_of_masks(
+    masks = infer_tensions_of_masks(
         frames,
         **options,
         noise=config.noise,
@@ -158,8 +166,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
 def draw_maps(
     folder: runs.RunFolder,
-    frames: list[inference.MaskFrame],
-    masks: inference.TensionsOfMasks,
+    frames: list[MaskFrame],
+    masks: TensionsOfMasks,
     reading: dict[str, Any],
 ) -> Iterator[Figure]:
     """A map of each mask, all with the same limits of the colours."""
@@ -191,16 +199,14 @@ def draw_cluster(config: Config) -> tuple[tuple[Any, Any], np.ndarray]:
     tension = 1 + options.deviation * noise
     areas = jax.random.uniform(area_key, (options.n_cells,), minval=0.9, maxval=1.3)
     bounds: dict[str, Any] = {"stiffness": options.stiffness, "low": 0.05, "high": 4.0}
-    energy = inference.foam_energy(tension / jnp.mean(tension), areas, **bounds)
+    energy = foam_energy(tension / jnp.mean(tension), areas, **bounds)
     relaxed = runs.RelaxationSection().build()(cluster, energy).tissue
     return (energy, relaxed), inference.label_image(relaxed, options.pixels)
 
 
-def compare(
-    result: inference.InferredTensions, energy: Any, tissue: Any
-) -> dict[str, dict[str, np.ndarray]]:
+def compare(result: InferredTensions, energy: Any, tissue: Any) -> dict[str, dict[str, np.ndarray]]:
     """Tables of the inferred tensions and pressures with true values, in the units of the inferred ones."""
-    area, line = inference.foam_terms(energy)
+    area, line = energy.terms
     edges = result.edge_table()
     # A label is the index of the true cell plus 1.
     number = np.append(np.arange(1, tissue.n_cells + 1), 0)
@@ -257,7 +263,7 @@ def measure_errors(tables: dict[str, dict[str, np.ndarray]]) -> dict[str, Any]:
     return metrics
 
 
-def measure(result: inference.InferredTensions) -> dict[str, Any]:
+def measure(result: InferredTensions) -> dict[str, Any]:
     """The metrics of one mask."""
     pixel = float(np.sqrt(np.prod(pixel_sides(result.pixel_size))))
     is_cell = result.labels > 0
@@ -300,7 +306,7 @@ def measure(result: inference.InferredTensions) -> dict[str, Any]:
     return metrics
 
 
-def measure_masks(masks: inference.TensionsOfMasks) -> dict[str, Any]:
+def measure_masks(masks: TensionsOfMasks) -> dict[str, Any]:
     """The metrics of several masks."""
     frames = masks.frame_table()
     return {

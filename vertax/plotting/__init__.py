@@ -27,14 +27,11 @@ with _requires_extra("plot", "Drawing"):
     from vertax.plotting._napari import tension_layer as tension_layer
     from vertax.plotting._panels import plot_tissues as plot_tissues
     from vertax.plotting._recovery import plot_recovery as plot_recovery
-    from vertax.plotting._replicates import plot_band as plot_band, plot_boxes as plot_boxes
     from vertax.plotting._style import (
         INK as INK,
         SERIES as SERIES,
         house_style as house_style,
         new_figure as new_figure,
-        same_limits as same_limits,
-        series_colours as series_colours,
     )
     from vertax.plotting._tension_map import plot_tensions as plot_tensions
     from vertax.plotting._tissue import plot_tissue as plot_tissue

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from matplotlib import colormaps
 
 from vertax._base.pixels import pixel_sides
-from vertax.inference import InferredTensions
+from vertax.tensions import InferredTensions
 
 _POINTS = 13
 _UNKNOWN = (0.5, 0.5, 0.5, 1.0)

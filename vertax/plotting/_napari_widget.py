@@ -23,9 +23,9 @@ from napari.utils.notifications import (  # pyright: ignore[reportMissingImports
 )
 
 from vertax._base.compilation_cache import enable_compilation_cache
-from vertax.inference import InferredTensions, MaskFrame, TensionsOfMasks
 from vertax.plotting._napari import limits, tension_colours, tension_layer
 from vertax.plotting._tension_map import PRESSURE_COLOURS
+from vertax.tensions import InferredTensions, MaskFrame, TensionsOfMasks
 
 _TENSIONS = "plasma"
 # Width and height of the colour bars in pixels.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import matplotlib
@@ -122,36 +122,6 @@ def _sizes(name: str, size: float | Sequence[float], n: int) -> list[float]:
             f"Argument `{name}` must be a positive number of inches, or {n} of them, but is {size}."
         )
     return [float(x) for x in sizes]
-
-
-def series_colours(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each name: the same list gives the same colours.
-
-    **Arguments:**
-
-    - `names`: of the curves or groups.
-
-    **Returns:** the colours of `SERIES` by name; they repeat after seven.
-    """
-    return {name: SERIES[k % len(SERIES)] for k, name in enumerate(names)}
-
-
-def same_limits(axes: Iterable[Axes], *, x: bool = True, y: bool = True) -> None:
-    """Give panels common limits that show all data.
-
-    **Arguments:**
-
-    - `axes`: the panels; call this after drawing everything.
-    - `x`, `y`: whether to change that axis.
-    """
-    panels = list(axes)
-    for wanted, limits, change in (
-        (x, [ax.get_xlim() for ax in panels], Axes.set_xlim),
-        (y, [ax.get_ylim() for ax in panels], Axes.set_ylim),
-    ):
-        if wanted:
-            for ax in panels:
-                change(ax, np.min(limits), np.max(limits))
 
 
 def new_axes(

@@ -13,12 +13,12 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from vertax.inference import InferredTensions
 from vertax.initialise import MaskReport
 from vertax.plotting._image import label_colours, scale_bar
 from vertax.plotting._napari import edge_courses, sides_of_pixels
 from vertax.plotting._style import house_style, new_figure
 from vertax.plotting._tissue import plot_tissue
+from vertax.tensions import InferredTensions
 
 # Without the palest end, which looks like no colour.
 PRESSURE_COLOURS = ListedColormap(colormaps["Blues"](np.linspace(0.15, 1, 256)), "pressures")

@@ -18,8 +18,8 @@ import jax
 import numpy as np
 
 import vertax
+from vertax._base.atomic import atomic_write
 from vertax._base.extras import requires_extra
-from vertax.io import atomic_write
 from vertax.runs._config import ExperimentConfig, differences, read_toml, validate
 from vertax.runs._folder import METRICS, PARTS, RunFolder, RunFolderError
 from vertax.runs._registry import Experiment

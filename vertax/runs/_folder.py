@@ -16,6 +16,7 @@ from jaxtyping import ArrayLike, Shaped
 from tqdm import tqdm
 
 from vertax._base.archive import read_archive, write_archive
+from vertax._base.atomic import atomic_write
 from vertax._base.extras import requires_extra
 from vertax._base.results import RESULTS
 from vertax._base.threads import num_threads
@@ -29,7 +30,7 @@ from vertax.fitting import (
     fit_warnings,
     stack_fits,
 )
-from vertax.io import atomic_write, save_tissue, write_csv
+from vertax.io import save_tissue, write_csv
 from vertax.mesh import Tissue
 from vertax.runs._sections import Fitting
 from vertax.runs._tables import file_name, history_table, plain, sentence

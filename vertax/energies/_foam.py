@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from jaxtyping import ArrayLike
 
-from vertax.energies import AbstractEnergy, AreaElasticity, BoundedTension, LocalSum
+from vertax.energies._elasticity import AreaElasticity
+from vertax.energies._energy import LocalSum
+from vertax.energies._tension import BoundedTension
 
 
 def foam_energy(
@@ -28,34 +30,10 @@ def foam_energy(
         three edges cannot balance, and collapse to four-fold vertices.
 
     **Returns:** the sum of an [`AreaElasticity`][vertax.energies.AreaElasticity] and a
-    [`BoundedTension`][vertax.energies.BoundedTension].
+    [`BoundedTension`][vertax.energies.BoundedTension]; these two are its `terms`.
 
     **Raises:**
 
     - `ValueError` for bounds that are not ordered, or a tension not between them.
     """
     return LocalSum((AreaElasticity(stiffness, target_area), BoundedTension(tension, low, high)))
-
-
-def foam_terms(energy: AbstractEnergy) -> tuple[AreaElasticity, BoundedTension]:
-    """The two parts of an energy E2 with bounded tensions.
-
-    **Arguments:**
-
-    - `energy`: from [`foam_energy`][vertax.inference.foam_energy], or the result of a fit that started from
-        it; or a batch.
-
-    **Returns:** the energy of the areas, with its `pressures`, and that of the edges, with their `tension`.
-
-    **Raises:**
-
-    - `TypeError` for another energy.
-    """
-    if isinstance(energy, LocalSum) and len(energy.terms) == 2:
-        area, tension = energy.terms
-        if isinstance(area, AreaElasticity) and isinstance(tension, BoundedTension):
-            return area, tension
-    raise TypeError(
-        "Argument `energy` must be a sum of AreaElasticity and BoundedTension, as made by foam_energy, but "
-        f"is {type(energy).__name__}."
-    )

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 from vertax._base.checks import describe
-from vertax.inference._infer_tensions import infer_tensions, pixels_of_file
-from vertax.inference._inferred import InferredTensions
-from vertax.inference._mask import load_array, read_mask
 from vertax.initialise._mask_arguments import without_single_axes
 from vertax.io import read_stack
+from vertax.tensions._infer_tensions import infer_tensions, pixels_of_file
+from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._mask import load_array, read_mask
 
 MaskSource: TypeAlias = Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str]
 
@@ -39,7 +39,7 @@ class MaskFrame(NamedTuple):
 
         **Arguments:**
 
-        - `options`: as of [`read_mask`][vertax.inference.read_mask].
+        - `options`: as of [`read_mask`][vertax.tensions.read_mask].
 
         **Returns:** a label for each pixel.
         """
@@ -50,9 +50,9 @@ class MaskFrame(NamedTuple):
 
         **Arguments:**
 
-        - `options`: as of [`infer_tensions`][vertax.inference.infer_tensions].
+        - `options`: as of [`infer_tensions`][vertax.tensions.infer_tensions].
 
-        **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions].
+        **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
         """
         if self.file is not None and options.get("pixel_size") is None:
             reading = {key: options[key] for key in ("kind", "background") if key in options}

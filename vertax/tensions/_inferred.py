@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vertax._base.pixels import PixelSize, pixel_sides
-from vertax.inference._columns import with_pixels
-from vertax.inference._mean_stress import MeanStress
-from vertax.inference._pixel_aspect import pixel_aspect_warning
 from vertax.initialise import MaskReport
 from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vtk
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
+from vertax.tensions._columns import with_pixels
+from vertax.tensions._mean_stress import MeanStress
+from vertax.tensions._pixel_aspect import pixel_aspect_warning
 
 # Cells with a larger error of the area, or distance of the outline from arcs over the root of the area, are
 # named.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import vertax as vx
-from vertax.inference import EdgeMotion
+from vertax.tensions import EdgeMotion
 
 DATA = Path(os.environ.get("VERTAX_DATA", Path(__file__).parents[3] / "shared/data"))
 

@@ -15,8 +15,8 @@ class Transition(NamedTuple):
     centre: float
     """The value of the parameter."""
     width: float
-    """Of a logistic curve, see [`fit_transition`][vertax.inference.fit_transition]; or the inverse of a
-    slope, see [`fit_onset`][vertax.inference.fit_onset]."""
+    """Of a logistic curve, see `fit_transition`; or the inverse of a
+    slope, see `fit_onset`."""
 
 
 def fit_transition(
@@ -32,7 +32,7 @@ def fit_transition(
     - `successes`: how many of the trials there succeeded, such as tissues without energy.
     - `trials`: number of trials at each.
 
-    **Returns:** the [`Transition`][vertax.inference.Transition]; NaN if all trials succeeded, or none. It is
+    **Returns:** the `Transition`; NaN if all trials succeeded, or none. It is
     no steeper than the spacing of the values resolves.
 
     **Raises:**

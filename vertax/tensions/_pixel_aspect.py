@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vertax._base.pixels import PixelSize, pixel_sides
-from vertax.inference._observed_geometry import observed_geometry
 from vertax.mesh import Tissue
+from vertax.tensions._observed_geometry import observed_geometry
 
 # Smallest ratio, number of standard errors, and number of junctions for a warning. (In a wing of a fly, where
 # tensions depend on the direction, the ratio is 1.3.)

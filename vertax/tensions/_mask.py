@@ -69,7 +69,7 @@ def labels_and_lines(
     background: int | None,
     plane: int | None,
 ) -> tuple[Int[np.ndarray, "rows columns"], float]:
-    """The labels of [`read_mask`][vertax.inference.read_mask], and the width of the lines in pixels, or 0."""
+    """The labels of [`read_mask`][vertax.tensions.read_mask], and the width of the lines in pixels, or 0."""
     if kind not in _KINDS:
         raise ValueError(
             f"Argument `kind` must be one of {', '.join(map(repr, _KINDS))}, but is {kind!r}."

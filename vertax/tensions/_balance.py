@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array
 
-from vertax.inference._observed_geometry import ObservedGeometry
+from vertax.tensions._observed_geometry import ObservedGeometry
 
 
 class Equations(NamedTuple):

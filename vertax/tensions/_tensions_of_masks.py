@@ -20,14 +20,14 @@ from vertax._base.blas import one_blas_thread
 from vertax._base.checks import check_integer
 from vertax._base.pixels import pixel_length, pixel_sides
 from vertax._base.threads import num_threads
-from vertax.inference._columns import column_descriptions
-from vertax.inference._find_masks import MaskFrame, MaskSource, find_masks
-from vertax.inference._infer_tensions import infer_tensions
-from vertax.inference._inferred import InferredTensions
-from vertax.inference._mean_stress import MeanStress
 from vertax.initialise import MaskChange, MaskReport
 from vertax.io import write_csv
 from vertax.io._module_file import load_module, save_module
+from vertax.tensions._columns import column_descriptions
+from vertax.tensions._find_masks import MaskFrame, MaskSource, find_masks
+from vertax.tensions._infer_tensions import infer_tensions
+from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._mean_stress import MeanStress
 
 _CLASSES = (InferredTensions, MeanStress, MaskReport, MaskChange)
 
@@ -44,7 +44,7 @@ class TensionsOfMasks(eqx.Module):
 
     def cell_table(self) -> dict[str, np.ndarray]:
         """The cells of all masks as one table, see `cell_table` of
-        [`InferredTensions`][vertax.inference.InferredTensions].
+        [`InferredTensions`][vertax.tensions.InferredTensions].
 
         **Returns:** its columns, and `frame`, the name of the file or the number of the mask. A label has one
         number in all frames, as in the masks.
@@ -53,7 +53,7 @@ class TensionsOfMasks(eqx.Module):
 
     def edge_table(self) -> dict[str, np.ndarray]:
         """The edges of all masks as one table, see `edge_table` of
-        [`InferredTensions`][vertax.inference.InferredTensions].
+        [`InferredTensions`][vertax.tensions.InferredTensions].
 
         **Returns:** its columns, and `frame`.
         """
@@ -118,7 +118,7 @@ def infer_tensions_of_masks(
     """Tensions of many masks, side by side in threads.
 
     ```python
-    movie = vx.inference.infer_tensions_of_masks("masks/*.tif")
+    movie = vx.tensions.infer_tensions_of_masks("masks/*.tif")
     movie.write("tensions")
     ```
 
@@ -126,15 +126,15 @@ def infer_tensions_of_masks(
 
     **Arguments:**
 
-    - `masks`: a folder, a pattern, a movie or a list, see [`find_masks`][vertax.inference.find_masks].
+    - `masks`: a folder, a pattern, a movie or a list, see [`find_masks`][vertax.tensions.find_masks].
     - `plane`: of files with several planes, the one to take; by default a single file is a movie.
     - `cache`: a folder where the result of each mask is stored as soon as it is computed. A later call, such
         as after an interrupt, reads the results of the same pixels and options from it.
     - `threads`: number of threads, by default the environment variable `VERTAX_THREADS` or one per core.
     - `progress`: show a progress bar with the name of the last mask (only on a terminal).
-    - `options`: as of [`infer_tensions`][vertax.inference.infer_tensions], the same for all masks.
+    - `options`: as of [`infer_tensions`][vertax.tensions.infer_tensions], the same for all masks.
 
-    **Returns:** the [`TensionsOfMasks`][vertax.inference.TensionsOfMasks].
+    **Returns:** the [`TensionsOfMasks`][vertax.tensions.TensionsOfMasks].
 
     **Raises:**
 
@@ -142,7 +142,7 @@ def infer_tensions_of_masks(
     - `OSError` if the folder of the `cache` cannot be made.
     - the error of the mask, if there is only one.
     - `ValueError` if none of several masks has a result, and as
-        [`find_masks`][vertax.inference.find_masks].
+        [`find_masks`][vertax.tensions.find_masks].
     """
     inspect.signature(infer_tensions).bind(None, **options)
     if threads is not None:

@@ -9,15 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vertax._base.pixels import PixelSize, pixel_length
-from vertax.inference._balance import Equations
-from vertax.inference._curves import Fitted, Points, arc_distances
-from vertax.inference._inferred import InferredTensions
-from vertax.inference._mean_stress import fabric, mean_stress, stress_weights
-from vertax.inference._solve import HIDDEN, Balance
 from vertax.initialise import MaskReport
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import angle_of_area
 from vertax.mesh._geometry import geometry_of
+from vertax.tensions._balance import Equations
+from vertax.tensions._curves import Fitted, Points, arc_distances
+from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._mean_stress import fabric, mean_stress, stress_weights
+from vertax.tensions._solve import HIDDEN, Balance
 
 # A tension with a larger standard deviation, relative to the mean, is not determined.
 _UNKNOWN = 0.3
@@ -46,7 +46,7 @@ def relative(balance: Balance, which: Equations) -> Relative:
     - `balance`: the solution of the balance of forces.
     - `which`: the equations.
 
-    **Returns:** the [`Relative`][vertax.inference._outcome.Relative] numbers.
+    **Returns:** the [`Relative`][vertax.tensions._outcome.Relative] numbers.
     """
     n = len(which.edges)
     deviation = np.sqrt(np.diag(balance.covariance)[:n])
@@ -98,7 +98,7 @@ def outcome(
     - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
     - `resampled`: standard deviations of tensions by resampling.
 
-    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions].
+    **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
     """
     labels, pixel_size, four_fold, report = source
     tissue = _moved(tissue, curves.change)

@@ -47,7 +47,7 @@ class EdgeMotion:
 
     ```python
     foams = [vx.io.read_surface_evolver(path) for path in paths]
-    motion = vx.inference.EdgeMotion(
+    motion = vx.tensions.EdgeMotion(
         [f.tissue for f in foams], [f.chains for f in foams], [f.time for f in foams]
     )
     motion.tensions().tension

@@ -54,7 +54,7 @@ def most_evident(
     - `bounds`: smallest and largest standard deviation by name; others keep the guess.
     - `steps`: largest number of iterations (L-BFGS-B).
 
-    **Returns:** the [`Errors`][vertax.inference._errors.Errors] and the evidence.
+    **Returns:** the [`Errors`][vertax.tensions._errors.Errors] and the evidence.
     """
     free = [k for k, name in enumerate(Errors._fields) if name in bounds]
     noise = Errors._fields.index("noise")

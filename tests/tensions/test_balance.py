@@ -10,7 +10,8 @@ from foam_helpers import against_truth
 from free_helpers import cluster
 
 import vertax as vx
-from vertax.inference import infer_tensions, label_image, pearson, read_mask
+from vertax.inference import label_image, pearson
+from vertax.tensions import infer_tensions, read_mask
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(

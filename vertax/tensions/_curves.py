@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from vertax.inference._observed_geometry import ObservedGeometry
+from vertax.tensions._observed_geometry import ObservedGeometry
 
 # Prior standard deviations, for parameters that no point determines, such as the angle of an edge of two
 # pixels: of a vertex in grains (its initial position is the corner of a pixel) and of an angle in radians.
@@ -79,7 +79,7 @@ def read_courses(
     - `apart`: distance between points that are exact; by default the correlation length of the residuals.
     - `noise`: standard deviation of a point; by default that of the fit.
 
-    **Returns:** the [`Fitted`][vertax.inference._curves.Fitted] curves.
+    **Returns:** the [`Fitted`][vertax.tensions._curves.Fitted] curves.
     """
     length = np.linalg.norm(tissue.chord, axis=1)
     used = np.unique(points.edge)
@@ -135,7 +135,7 @@ def fit_curves(
     - `noise`: standard deviation of the points, relative to which the prior is weighted.
     - `rounds`: largest number of Gauss–Newton steps.
 
-    **Returns:** the [`Fitted`][vertax.inference._curves.Fitted] curves.
+    **Returns:** the [`Fitted`][vertax.tensions._curves.Fitted] curves.
     """
     edge, away = points
     n_vertices, n_edges, n = tissue.n_vertices, len(tissue.angle), tissue.n_geometry

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse.linalg import splu
 
-from vertax.inference._balance import Equations, angle_slopes
-from vertax.inference._curves import Fitted, Points
-from vertax.inference._observed_geometry import ObservedGeometry
-from vertax.inference._outcome import relative
-from vertax.inference._solve import Balance, Observability, model_deviations, solve
+from vertax.tensions._balance import Equations, angle_slopes
+from vertax.tensions._curves import Fitted, Points
+from vertax.tensions._observed_geometry import ObservedGeometry
+from vertax.tensions._outcome import relative
+from vertax.tensions._solve import Balance, Observability, model_deviations, solve
 
 
 # The truth of the bootstrap are the angles with which all forces balance at the inferred tensions. Added are

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from free_helpers import at_rest, cluster
 
-from vertax.inference import infer_tensions, pearson
-from vertax.inference._balance import angles, equations, forces
-from vertax.inference._observed_geometry import observed_geometry
+from vertax.inference import pearson
+from vertax.tensions import infer_tensions
+from vertax.tensions._balance import angles, equations, forces
+from vertax.tensions._observed_geometry import observed_geometry
 
 
 @pytest.fixture(scope="module")

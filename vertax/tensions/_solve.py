@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import splu
 
-from vertax.inference._balance import (
+from vertax.tensions._balance import (
     Equations,
     angle_slopes,
     angles,
@@ -19,9 +19,9 @@ from vertax.inference._balance import (
     forces,
     pulls,
 )
-from vertax.inference._curves import Fitted
-from vertax.inference._errors import Errors, most_evident
-from vertax.inference._observed_geometry import ObservedGeometry
+from vertax.tensions._curves import Fitted
+from vertax.tensions._errors import Errors, most_evident
+from vertax.tensions._observed_geometry import ObservedGeometry
 
 # An edge is loose if the standard deviation of its direction, in radians, is larger than the first, or if it
 # is shorter than the second times the noise, or the third times the size of a cell. Its force has the fourth
@@ -171,7 +171,7 @@ def solve(
     - `errors`: errors of model and noise, and widths of priors; by default chosen by the evidence.
     - `rounds`: largest number of adjustments of the angles.
 
-    **Returns:** the [`Balance`][vertax.inference._solve.Balance].
+    **Returns:** the [`Balance`][vertax.tensions._solve.Balance].
     """
     n_edges, n_cells, loose = len(which.edges), len(which.cells), shape.loose
     x = np.concatenate([np.ones(n_edges), np.zeros(n_cells)])

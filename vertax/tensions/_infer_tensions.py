@@ -16,19 +16,19 @@ from vertax._base.announce import announce_compilations
 from vertax._base.blas import one_blas_thread
 from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.pixels import PixelSize, pixel_length
-from vertax.inference._balance import equations
-from vertax.inference._curves import Points
-from vertax.inference._edges import fit, more_evident, solution
-from vertax.inference._inferred import InferredTensions
-from vertax.inference._mask import labels_and_lines
-from vertax.inference._observed_geometry import observed_geometry
-from vertax.inference._outcome import outcome
-from vertax.inference._resampling import resampled_deviations
 from vertax.initialise import MaskReport, Segmentation, from_labels
 from vertax.initialise._report import LEAST_LENGTH
 from vertax.io import Foam, pixel_aspect, read_surface_evolver
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
+from vertax.tensions._balance import equations
+from vertax.tensions._curves import Points
+from vertax.tensions._edges import fit, more_evident, solution
+from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._mask import labels_and_lines
+from vertax.tensions._observed_geometry import observed_geometry
+from vertax.tensions._outcome import outcome
+from vertax.tensions._resampling import resampled_deviations
 
 # Noise of a tissue without an image, and of the points of a foam, relative to the cell diameter; and the
 # number of points of an edge without a course.
@@ -58,7 +58,7 @@ def infer_tensions(
     r"""Tensions of edges and pressures of cells that balance in the observed shape of a tissue.
 
     ```python
-    found = vx.inference.infer_tensions("NAME_cp_masks.tif")
+    found = vx.tensions.infer_tensions("NAME_cp_masks.tif")
     found.write("tensions.csv")
     ```
 
@@ -77,7 +77,7 @@ def infer_tensions(
     **Arguments:**
 
     - `mask`: a label image, or an image of outlines, as an array or a file (see
-        [`read_mask`][vertax.inference.read_mask]); a dump of Surface Evolver; or a
+        [`read_mask`][vertax.tensions.read_mask]); a dump of Surface Evolver; or a
         [`Segmentation`][vertax.initialise.Segmentation], [`Foam`][vertax.io.Foam] or
         [`Tissue`][vertax.Tissue] with arcs.
     - `kind`: of a mask, `"labels"`, `"outlines"` or `"auto"`.
@@ -99,7 +99,7 @@ def infer_tensions(
         doi:10.1214/aos/1176350142), such as 50.
     - `seed`: seed of the random numbers of the resampling.
 
-    **Returns:** the [`InferredTensions`][vertax.inference.InferredTensions]; read its `warnings`.
+    **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions]; read its `warnings`.
 
     **Raises:**
 
@@ -140,7 +140,7 @@ def infer_tensions(
     else:
         raise TypeError(
             "Argument `mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
-            f"is {describe(mask)}. For several masks use vx.inference.infer_tensions_of_masks."
+            f"is {describe(mask)}. For several masks use vx.tensions.infer_tensions_of_masks."
         )
     tissue, report = course.tissue, course.report
     if edges == "arcs" and not tissue.inner_arcs:

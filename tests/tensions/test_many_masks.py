@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from test_damaged_masks import mask as mask
 
-from vertax.inference import MaskFrame, find_masks, infer_tensions, infer_tensions_of_masks
 from vertax.io import read_table
+from vertax.tensions import MaskFrame, find_masks, infer_tensions, infer_tensions_of_masks
 
 
 def test_one_table_of_a_folder_with_a_file_that_cannot_be_read(mask, tmp_path):

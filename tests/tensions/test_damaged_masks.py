@@ -9,8 +9,9 @@ from damage_helpers import contacts, damaged, random_cells, with_gaps
 from foam_helpers import against_truth, invented
 from label_helpers import honeycomb
 
-from vertax.inference import infer_tensions, label_image, pearson, read_mask
+from vertax.inference import label_image, pearson
 from vertax.initialise import free_voronoi, from_labels
+from vertax.tensions import infer_tensions, read_mask
 
 
 @pytest.fixture(scope="module")

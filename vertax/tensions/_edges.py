@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.sparse import csc_array, diags_array
 
-from vertax.inference._balance import Equations, equations
-from vertax.inference._curves import Fitted, Points, read_courses
-from vertax.inference._observed_geometry import ObservedGeometry
-from vertax.inference._solve import Balance, Observability, observability, solve
+from vertax.tensions._balance import Equations, equations
+from vertax.tensions._curves import Fitted, Points, read_courses
+from vertax.tensions._observed_geometry import ObservedGeometry
+from vertax.tensions._solve import Balance, Observability, observability, solve
 
 
 class Solution(NamedTuple):
@@ -68,7 +68,7 @@ def solution(
     - `known_noise`: whether the noise is at most that of the points.
     - `prior`: standard deviation of tensions about 1.
 
-    **Returns:** the [`Solution`][vertax.inference._edges.Solution].
+    **Returns:** the [`Solution`][vertax.tensions._edges.Solution].
     """
     fitted = geometry.moved(curves.change)
     which = equations(fitted, straight=straight)
