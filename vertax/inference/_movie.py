@@ -145,9 +145,9 @@ class _Frame:
             self.neighbours.setdefault(a, set()).add(b)
             self.neighbours.setdefault(b, set()).add(a)
 
-    def displacement(self, places: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """Vector from a point to others, across a periodic boundary."""
-        away = places - origin
+    def displacement(self, places: np.ndarray, origins: np.ndarray) -> np.ndarray:
+        """Vectors from points to others, across a periodic boundary."""
+        away = places - origins
         if isinstance(self.boundary, Periodic):
             return np.asarray(self.boundary.shortest(jnp.asarray(away)))
         return away
@@ -177,24 +177,29 @@ def _check_jumps(frames: list[_Frame], largest: float) -> None:
     """Raise an error for cells that move too far from one of their frames to the next."""
     last: dict[int, int] = {}
     for now, frame in enumerate(frames):
-        for cell, place in frame.places.items():
-            before = last.get(cell)
-            last[cell] = now
-            if before is None:
-                continue
-            away = frame.distance(place, frames[before].places[cell]) / frame.size
-            if away <= largest * (now - before):
-                continue
-            fact = f"cell {cell} is {away:.3g} cell sizes away from its place in frame {before}"
-            if now - before > 1:
-                raise ValueError(
-                    "Argument `cells` must not use the number of a lost cell again, but in frame "
-                    f"{now} {fact}. Give the new cell another number."
-                )
-            raise ValueError(
-                f"Cells must not jump, but in frame {now} {fact}. Correct the tracking, or pass a larger "
-                "`largest_jump`."
-            )
+        cells = [cell for cell in frame.places if cell in last]
+        if cells:
+            places = np.array([frame.places[cell] for cell in cells])
+            origins = np.array([frames[last[cell]].places[cell] for cell in cells])
+            away = np.linalg.norm(frame.displacement(places, origins), axis=1) / frame.size
+            elapsed = now - np.array([last[cell] for cell in cells])
+            for k in np.flatnonzero(away > largest * elapsed):
+                _raise_jump(cells[k], now, last[cells[k]], away[k])
+        last |= dict.fromkeys(frame.places, now)
+
+
+def _raise_jump(cell: int, now: int, before: int, away: float) -> None:
+    """Raise the error for a cell that moved by `away` cell sizes."""
+    fact = f"cell {cell} is {away:.3g} cell sizes away from its place in frame {before}"
+    if now - before > 1:
+        raise ValueError(
+            f"Argument `cells` must not use the number of a lost cell again, but in frame {now} {fact}. Give "
+            "the new cell another number."
+        )
+    raise ValueError(
+        f"Cells must not jump, but in frame {now} {fact}. Correct the tracking, or pass a larger "
+        "`largest_jump`."
+    )
 
 
 def _events(frames: list[_Frame]) -> list[Event]:

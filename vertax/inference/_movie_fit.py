@@ -11,6 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.checks import check_integer, check_number
 from vertax.costs._positions import matching_vertices
 from vertax.energies import AbstractEnergy
@@ -186,9 +187,10 @@ def fit_movie(
     parts = np.array_split(np.arange(n_steps), n_windows)
     steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
     used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
-    fits = _fit_windows(
-        movie.tissue, movie.times.astype(dtype), settings, theta, steps, used, max_steps
-    )
+    with announce_compilations("a fit of a movie"):
+        fits = _fit_windows(
+            movie.tissue, movie.times.astype(dtype), settings, theta, steps, used, max_steps
+        )
     if not np.all(fits.num_equations > 0):
         raise ValueError(
             "Argument `movie` must have vertices that join the same three cells in three successive frames, "
@@ -199,7 +201,7 @@ def fit_movie(
     return fits if windows is not None else jax.tree.map(first, fits)
 
 
-@eqx.filter_jit
+@announced_jit
 def _fit_windows(
     frames: Tissue,
     times: Float[Array, " frames"],
@@ -225,23 +227,27 @@ def _fit_windows(
 
     def fit(steps: Array, used: Array) -> MovieFit:
         def newton(carry: tuple) -> tuple:
-            theta, floor, _, count = carry
-            moments, slopes, scales, squares = (
-                x.sum(axis=0) for x in sums(theta, floor, steps, used)
-            )
+            theta, floor, _, count, _ = carry
+            of_steps = sums(theta, floor, steps, used)
+            moments, slopes, scales, squares = (x.sum(axis=0) for x in of_steps)
             step = _inverse(slopes, scales)[0] @ moments
             squared, tracking, n = squares
             mean = squared / jnp.maximum(n, 1)
             excess = jnp.maximum((squared - tracking) / jnp.maximum(n, 1), 1e-3 * mean)
             change = jnp.max(jnp.abs(step) / (1e-3 + jnp.abs(theta)))
             change = jnp.maximum(change, jnp.abs(excess - floor) / (excess + 1e-6))
-            return theta - step, excess + jnp.finfo(theta.dtype).tiny, change, count + 1
+            floor = excess + jnp.finfo(theta.dtype).tiny
+            return theta - step, floor, change, count + 1, of_steps
 
         going = lambda carry: (carry[2] > 1e-6) & (carry[3] < max_steps)
-        # First with equal weights.
-        start = newton((theta, jnp.ones((), theta.dtype), jnp.ones((), theta.dtype), 0))
-        best, floor, change, _ = jax.lax.while_loop(going, newton, start)
-        moments, slopes, scales, squares = sums(best, floor, steps, used)
+        p, one = theta.size, jnp.ones((), theta.dtype)
+        shapes = [(p,), (p, p), (2, p), (3,)]
+        empty = tuple(jnp.zeros((len(steps), *shape), theta.dtype) for shape in shapes)
+        # First with equal weights. The sums of the last step, where parameters changed by less than 1e-6,
+        # also give the covariance: a second trace of the equations would double the compile time.
+        start = (theta, one, jnp.inf * one, 0, empty)
+        best, _, change, _, of_steps = jax.lax.while_loop(going, newton, start)
+        moments, slopes, scales, squares = of_steps
         covariance = _covariance(moments, slopes.sum(axis=0), scales.sum(axis=0), used)
         deviations = jnp.sqrt(jnp.diag(covariance))
         n = jnp.maximum(squares[:, 2].sum(), 1)
@@ -287,20 +293,21 @@ def _equations(
     velocity = end.boundary.shortest(end.vertices - take(start.vertices, to_start)) / dt
     alpha = settings.implicitness
 
-    def residual(theta: Array) -> Array:
+    def residual(theta: Array) -> tuple[Array, Array]:
         force = alpha * settings.slope(theta, end)
         force += (1 - alpha) * take(settings.slope(theta, start), to_start)
-        return settings.zeta(theta) * velocity + force
+        return (settings.zeta(theta) * velocity + force,) * 2
 
-    def instrument(theta: Array) -> Array:
-        return settings.slope(theta, before)
+    def instrument(theta: Array) -> tuple[Array, Array]:
+        return (settings.slope(theta, before),) * 2
 
-    r, g = residual(theta), jax.jacfwd(residual)(theta)
-    z = take(jax.jacfwd(instrument)(theta), to_before)
+    g, r = jax.jacfwd(residual, has_aux=True)(theta)
+    z, force_before = jax.jacfwd(instrument, has_aux=True)(theta)
+    z = take(z, to_before)
     zeta = settings.zeta(theta)
     if settings.fit_friction:
         # The velocity that the forces of the frame before predict.
-        z = z.at[..., -1].set(-take(instrument(theta), to_before) / zeta)
+        z = z.at[..., -1].set(-take(force_before, to_before) / zeta)
     slope_at = lambda x: settings.slope(theta, before.with_vertices(x))
     probes = jax.random.normal(jax.random.key(0), (_N_PROBES, *before.vertices.shape), r.dtype)
     product = lambda v: jax.jvp(slope_at, (before.vertices,), (v,))[1]
