@@ -71,6 +71,7 @@ class TestThermalNoise:
         np.testing.assert_allclose((work**2).mean(axis=0), expected, rtol=0.08)
         np.testing.assert_allclose(work.mean(axis=0) / np.sqrt(expected), 0, atol=0.06)
 
+    @pytest.mark.thorough
     def test_modes_satisfy_equipartition(self):
         # With implicit Euler steps λ <q²> = T / (1 + λ dt / 2 ζ) for each mode.
         tissue, energy = solid()
@@ -178,6 +179,7 @@ class TestSelfPropulsion:
             correlation, np.exp(-diffusion * dt * np.arange(n + 1)), atol=0.04
         )
 
+    @pytest.mark.thorough
     def test_centroid_velocity_is_total_force_over_friction(self):
         tissue = cluster(9, 2)
         energy = ShapeFactorEnergy(jnp.full(9, 3.4))

@@ -450,6 +450,7 @@ def fluid():
 class TestDegenerateEquilibrium:
     """Along motions without stiffness the equilibrium and costs of positions are not unique."""
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize("adjoint", [vx.ImplicitDifferentiation(), vx.EquilibriumPropagation()])
     def test_gradient_of_a_cost_of_positions_is_rejected(self, adjoint):
         for function in (evaluate, plain_gradient):

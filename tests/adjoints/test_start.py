@@ -78,9 +78,8 @@ def test_centroid_of_a_periodic_tissue_follows_the_start(adjoint, response):
     np.testing.assert_allclose(slope, jnp.broadcast_to(weight, slope.shape), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "adjoint", [IMPLICIT, pytest.param(vx.EquilibriumPropagation(), marks=pytest.mark.thorough)]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("adjoint", [IMPLICIT, vx.EquilibriumPropagation()])
 def test_orientation_of_a_free_tissue_follows_the_start(adjoint):
     slope = check_against_differences(FREE, FREE_ENERGY, adjoint)
     # The derivative is not only that of the centroid.
@@ -135,10 +134,8 @@ def test_only_motions_that_the_energy_does_not_determine_follow_the_start():
     np.testing.assert_array_equal(slope[:, 0], 0)
 
 
-@pytest.mark.parametrize(
-    "dissipation",
-    [PerimeterViscosity(0.5), pytest.param(SubstrateFriction(1.0), marks=pytest.mark.thorough)],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("dissipation", [PerimeterViscosity(0.5), SubstrateFriction(1.0)])
 def test_position_after_evolution_follows_the_start(dissipation):
     # Friction depends on the position at the start of each step; viscosity alone does not fix the position.
     tissue, weights = PERIODIC, random_like(PERIODIC.vertices, 3)

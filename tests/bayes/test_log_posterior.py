@@ -82,6 +82,7 @@ def test_failed_relaxation_has_density_zero(problem):
     assert float(density({"target_shape_factor": jnp.linspace(3.4, 3.9, N_CELLS)})) == -np.inf
 
 
+@pytest.mark.thorough
 def test_replicates_of_different_sizes_add_their_likelihoods():
     singles = [noisy_problem(0.01, seed, n)[0] for seed, n in ((1, 5), (2, 6))]
     shared = {"mean": dist.Normal(3.65, 0.1), "noise": dist.LogNormal(-4.0, 1.0)}

@@ -215,6 +215,7 @@ def test_invalid_options_of_image_costs_are_rejected():
         render(random_tissue(5), (5, 64), 0.1)
 
 
+@pytest.mark.thorough
 def test_least_squares_costs_are_half_their_squared_residuals():
     tissue, energy = relaxed(12, 1)
     target = tissue.with_configuration(tissue.vertices + 0.05 * random_like(tissue.vertices))

@@ -82,6 +82,7 @@ def test_costs_do_not_depend_on_spare_slots(name):
     np.testing.assert_allclose(other_slope[len(slope) :], 0, atol=1e-15)
 
 
+@pytest.mark.thorough
 def test_structural_cost_compares_tissues_with_different_cell_numbers():
     target = random_tissue(CELLS, 3, lloyd_steps=2).with_capacity(CAPACITY)
     cost = IndexAwareStructural(target)

@@ -224,6 +224,7 @@ class TestGradients:
         )
 
 
+@pytest.mark.thorough
 def test_stress_after_a_step_strain_of_the_hexagonal_lattice():
     # Tong et al. 2022 (doi:10.1371/journal.pcbi.1010135): the initial modulus is 3√3 K_P (1 - p0/c), the
     # final modulus 2/3 of it.

@@ -55,6 +55,7 @@ def test_flips_dissipate_nothing_and_translations_do():
     np.testing.assert_array_equal(with_flips_of(tissue, moved).vertices, tissue.vertices)
 
 
+@pytest.mark.thorough
 def test_inversion_barrier_of_driven_tissues():
     tissue = random_tissue(12, 3)
     corner, number = EdgeFrames(tissue), 4

@@ -108,6 +108,7 @@ def test_checkpoints_with_step_control(tmp_path):
     np.testing.assert_allclose(at_once.tissue.vertices, by_frames.tissue.vertices, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_times_equal_up_to_rounding_continue(tmp_path):
     file = tmp_path / "run.npz"
     run = lambda times: vx.evolve(

@@ -136,6 +136,7 @@ class TestErrors:
         with pytest.raises(TypeError, match="`stepsize_controller` must be a"):
             vx.Evolution(FRICTION, [0.0, 1.0], stepsize_controller=0.1)  # pyright: ignore[reportArgumentType]
 
+    @pytest.mark.thorough
     def test_too_few_steps_raise(self):
         with pytest.raises(RuntimeError, match="Raise `max_steps` of the `PIController`"):
             evolved(stepsize_controller=PIController(1e-6, max_steps=3))

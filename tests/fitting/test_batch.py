@@ -53,6 +53,7 @@ def test_member_rejects_an_index_out_of_range():
         member(stack([jnp.zeros(2), jnp.ones(2)]), 2)
 
 
+@pytest.mark.thorough
 def test_batched_fit_with_guidance_matches_single_fits():
     fit = lambda problem, **options: vx.fit(
         problem,

@@ -79,6 +79,7 @@ MARKS: dict[str, Any] = dict.fromkeys(
 MARKS |= dict.fromkeys(("least squares", "position"), pytest.mark.thorough)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", [pytest.param(c, marks=MARKS.get(c, ())) for c in CASES])
 def test_resumed_fit_matches_uninterrupted_fit(case, path):
     uninterrupted = run(case, callback=interrupt_at(None))

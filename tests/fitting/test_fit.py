@@ -135,6 +135,7 @@ def test_custom_energy_is_fitted():
     assert len(jax.tree.leaves(eqx.filter(fit.energy, eqx.is_inexact_array))) == 1
 
 
+@pytest.mark.thorough
 def test_optimiser_state_persists_over_epochs(hidden):
     # Compare with three epochs of Adam in a plain loop.
     target, truth, guess, start = hidden

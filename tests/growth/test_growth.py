@@ -55,6 +55,7 @@ def test_cells_divide_and_the_tissue_stays_valid(grown):
     assert (np.asarray(grown.cells.target_area)[young] < 1.2).all()
 
 
+@pytest.mark.thorough
 def test_failed_divisions_and_deaths_are_counted():
     tissue, times = vx.initialise.free_voronoi(2, key=0).with_capacity(5), jnp.linspace(0, 10, 9)
     run = lambda cycle: grow(
@@ -82,6 +83,7 @@ def test_failed_divisions_and_deaths_are_counted():
     assert (dying.failed_divisions == 0).all()
 
 
+@pytest.mark.thorough
 def test_growth_can_start_from_one_periodic_cell():
     tissue, times = random_tissue(1).with_capacity(5), jnp.linspace(0, 8, 9)
     cycle = GrowAndDivide(0.2, 1.5)

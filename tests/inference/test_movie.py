@@ -71,7 +71,7 @@ def test_t1_transition_is_recognised():
     assert sorted(map(sorted, new)) == sorted(map(sorted, gained))
 
 
-@pytest.mark.parametrize("keeps_number", [True, False])
+@pytest.mark.parametrize("keeps_number", [pytest.param(True, marks=pytest.mark.thorough), False])
 def test_division_is_recognised(keeps_number):
     mother, start = INNER[0], STRAIGHT.with_capacity(21)
     divided = vx.transitions.divide(start, mother).tissue.without_spare()
@@ -89,6 +89,7 @@ def test_division_is_recognised(keeps_number):
     np.testing.assert_allclose(movie.frame(0).areas.sum(), STRAIGHT.areas.sum(), rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_death_is_recognised():
     dead = INNER[0]
     removed = vx.transitions.remove(STRAIGHT.with_capacity(20), dead).tissue.without_spare()

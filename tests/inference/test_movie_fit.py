@@ -44,12 +44,14 @@ def test_parameters_of_an_exact_movie_are_recovered_across_transitions(movie):
     assert fit.friction_deviation == 0
 
 
+@pytest.mark.thorough
 def test_friction_is_fitted_with_a_known_stiffness(movie):
     fit = fit_movie(movie, GUESS, friction=1.5, fit_friction=True)
     assert float(fit.friction) == pytest.approx(FRICTION, rel=1e-4)
     np.testing.assert_allclose(fit.energy.terms[1].table, TABLE, rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_parameters_scale_with_the_friction(movie):
     energy = AreaElasticity(jnp.array(0.8), 1.0) + by_type(0.2 * jnp.ones((2, 2)), TYPES)
     fit = fit_movie(movie, energy, friction=3 * FRICTION)
@@ -57,6 +59,7 @@ def test_parameters_scale_with_the_friction(movie):
     assert float(fit.energy.terms[0].stiffness) == pytest.approx(3, rel=1e-4)
 
 
+@pytest.mark.thorough
 def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     energy = AreaElasticity(jnp.ones(16), 1.0) + by_type(0.4 * jnp.ones((16, 16)), jnp.arange(16))
     fit = fit_movie(movie, energy, friction=FRICTION)
@@ -72,6 +75,7 @@ def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     np.testing.assert_allclose(pair[apart], 0.4)
 
 
+@pytest.mark.thorough
 def test_errors_by_tracking_noise_are_covered(evolved):
     errors, deviations = [], []
     for seed in range(6):
@@ -89,6 +93,7 @@ def test_errors_by_tracking_noise_are_covered(evolved):
     assert np.abs(np.mean(bias)) > 3 * np.abs(np.mean(errors))
 
 
+@pytest.mark.thorough
 def test_windows_are_fitted_in_parallel(movie):
     fit = fit_movie(movie, GUESS, friction=FRICTION, windows=3)
     assert fit.energy.terms[1].tension.shape == (3, 3)

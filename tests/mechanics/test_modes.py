@@ -29,6 +29,7 @@ def test_dense_modes_are_eigenvectors_of_the_hessian():
     assert ((modes.participation_ratios > 0) & (modes.participation_ratios <= 1 + 1e-12)).all()
 
 
+@pytest.mark.thorough
 def test_sparse_and_dense_hessians_agree():
     from vertax.mechanics._hessian import sparse_hessian
     from vertax.mechanics._landscape import Landscape

@@ -152,6 +152,7 @@ def test_a_fluid_tissue_has_no_shear_modulus():
     assert mechanics.shear_modulus(tissue, energy, affine=True) > 0.1
 
 
+@pytest.mark.thorough
 def test_coarser_fallback_solve_gives_the_same_modulus(disordered):
     exact = mechanics.shear_modulus(*disordered)
     # In 3 steps the first solve fails, and the fallback runs.

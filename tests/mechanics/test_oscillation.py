@@ -71,6 +71,7 @@ def test_perimeter_viscosity_against_a_dense_solution(lattice):
         assert complex(value) == pytest.approx(expected, rel=1e-7)
 
 
+@pytest.mark.thorough
 def test_sparse_and_dense_methods_agree():
     # Not at rest, but the tension makes the Hessian positive, and nothing vanishes by symmetry.
     tissue, energy = vx.initialise.hexagonal(6, 6), ShapeFactorEnergy(shape_factors(36, 3.5, 0.02))

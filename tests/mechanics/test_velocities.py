@@ -30,6 +30,7 @@ def test_velocities_balance_forces_and_dissipation():
     np.testing.assert_allclose(both.ravel(), dense, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.thorough
 def test_pinned_vertices_have_zero_velocity_and_gradients_match_differences():
     free = random_tissue(9, 4)
     tissue = vx.Tissue(

@@ -28,6 +28,7 @@ def test_similar_sizes_share_size_classes():
     assert len({size_class(n) for n in range(90, 111)}) == 2
 
 
+@pytest.mark.thorough
 def test_relaxation_does_not_depend_on_padding():
     tissue, energy = random_tissue(N), vx.energies.ShapeFactorEnergy(jnp.linspace(3.6, 3.8, N))
     padded, longer = pad(tissue, energy)

@@ -119,6 +119,7 @@ class TestRelaxation:
         steps = np.diff([np.asarray(frame.vertices.mean(axis=0)) for frame in trajectory], axis=0)
         assert np.abs(steps).max() < 0.2
 
+    @pytest.mark.thorough
     def test_relaxation_of_an_equilibrium_has_one_frame(self, relaxation):
         _, energy, equilibrium, _ = relaxation
         # (The default tolerance is in units of the stiffness at the start.)
@@ -147,6 +148,7 @@ class TestRelaxation:
         assert trajectory[1].vertices.dtype == jnp.float32
         assert same_bits(trajectory[0].topology, trajectory[-1].topology)
 
+    @pytest.mark.thorough
     def test_refusals(self):
         tissue, energy = random_tissue(4), vx.energies.ShapeFactorEnergy(3.7)
         with pytest.raises(ValueError, match="`every` must be at least 1"):

@@ -73,6 +73,7 @@ def test_blocks_are_those_of_the_hessian_without_pressures(energy):
         np.testing.assert_allclose(missing, 0, atol=1e-8 * np.abs(hessian).max())
 
 
+@pytest.mark.thorough
 @settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
@@ -162,6 +163,7 @@ def test_negative_eigenvalues_are_removed(entries):
     )
 
 
+@pytest.mark.thorough
 def test_contacts_add_their_hessian():
     # Of a corner that comes near a side: three vertices, each with a block on the diagonal.
     tissue = foam(100, seed=2)
@@ -194,6 +196,7 @@ def _vertices_of(contacts, tissue) -> np.ndarray:
     return np.concatenate([corner[real], side[real], after[real]]) // 3
 
 
+@pytest.mark.thorough
 def test_conjugate_gradients_take_fewer_iterations_under_tensions():
     tissue = foam(200, seed=3)
     energy = tense(tissue)

@@ -113,6 +113,7 @@ def _results(relaxation, tissue, energy):
     return rest, evaluation.gradient, products, evaluation.outcome.num_steps
 
 
+@pytest.mark.thorough
 def test_solutions_are_the_same_with_fewer_products(at_rest, recycled):
     without = RELAXATION.with_preconditioner(RecycledHessian.unknown(at_rest.configuration))
     rest, gradient, products, steps = _results(without, at_rest, energy_of(1))

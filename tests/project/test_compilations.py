@@ -99,7 +99,14 @@ CALLS = {
 
 
 # These compile for 15 seconds each.
-LONG = ("fit of a batch", "fit of a batch by least squares", "grow", "uncertainty")
+LONG = (
+    "fit of a batch",
+    "fit by least squares",
+    "fit of a batch by least squares",
+    "evolve",
+    "grow",
+    "uncertainty",
+)
 MARKS = {name: [pytest.mark.thorough] for name in LONG}
 
 
@@ -113,6 +120,7 @@ def test_a_second_call_compiles_nothing(call):
     assert second.n == 0
 
 
+@pytest.mark.thorough
 def test_relaxation_preserves_shapes_and_dtypes():
     kind = lambda x: (jnp.shape(x), jnp.result_type(x), jax.typeof(x).weak_type)
     starts = [random_tissue(N, 1), vx.initialise.free_voronoi(N, key=jax.random.key(0))]
@@ -131,6 +139,7 @@ def test_epochs_after_the_first_compile_nothing():
     assert counts[1] == counts[2] > 0
 
 
+@pytest.mark.thorough
 def test_equilibrate_gradient_and_fit_share_the_relaxation(monkeypatch):
     from vertax.relax import _loop
 
@@ -167,6 +176,7 @@ def test_another_optimiser_compiles_only_its_update():
     assert count.n <= 2  # initial state and update
 
 
+@pytest.mark.thorough
 def test_gradient_agrees_with_one_compiled_program():
     p = problem()
     shared = p.value_and_gradient()

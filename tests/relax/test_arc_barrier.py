@@ -32,6 +32,7 @@ def distance_between(one, other):
     return RANGE * float(jnp.sqrt(barrier_of().nearness(one, other, unjoined, unjoined)[0]))
 
 
+@pytest.mark.thorough
 @settings(max_examples=200, deadline=None)
 @given(
     bulge=st.floats(0.05, 2.5),
@@ -73,7 +74,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name == "bulge against an arc" else pytest.mark.thorough)
+        for name in CASES
+    ],
+)
 def test_derivatives_are_finite_differences(name):
     *ends, joined = CASES[name]
     barrier = barrier_of(distance=0.15, **joined)

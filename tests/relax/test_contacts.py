@@ -157,6 +157,7 @@ def test_contacts_do_not_change_a_tissue_without_contacts():
     np.testing.assert_allclose(held.tissue.vertices, free.tissue.vertices, rtol=0, atol=1e-13)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("offset", [0.0, 1e-3])
 def test_an_edge_that_vanishes_along_another_side_has_a_moderate_curvature(offset):
     tissue = tissue_of(0)
@@ -215,6 +216,7 @@ def cost_and_slope(targets, start, adjoint):
     return jax.value_and_grad(cost)(targets)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("adjoint", "rtol"),
     [
@@ -234,6 +236,7 @@ def test_hypergradients_of_a_tissue_in_contact(adjoint, rtol):
     np.testing.assert_allclose(slope @ direction, expected, rtol=rtol)
 
 
+@pytest.mark.thorough
 def test_contacts_beyond_the_room_are_reported_and_repeated_with_more_room(in_contact_case):
     tissue, energy = in_contact_case
     narrow = vx.Relaxation(contact_range=0.05, max_contacts=1)

@@ -194,6 +194,7 @@ def test_hypergradient_from_far_away_against_central_differences(inner_arcs):
 
 
 # Clusters that are not about to undergo a T1 transition, where positions jump.
+@pytest.mark.thorough
 @pytest.mark.parametrize(("n_pinned", "seed"), [pytest.param(1, 1, marks=pytest.mark.slow), (3, 6)])
 def test_pinned_vertices_stay_and_are_differentiable(n_pinned, seed):
     free = cluster(7, seed)
@@ -292,6 +293,7 @@ def test_a_fit_finds_line_tensions():
     assert fit.cost < 0.1 * fit.history.cost[0]
 
 
+@pytest.mark.thorough
 def test_images_of_free_tissues():
     tissue = cluster(6, 1, random_angles=True)
     tissue = tissue.with_vertices(tissue.vertices - tissue.vertices.min(0) + 0.8)
@@ -317,6 +319,7 @@ def test_images_of_free_tissues():
     assert slope == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_images_show_nothing_of_what_lies_outside():
     tissue = cluster(4, 1)
     far = tissue.with_vertices(tissue.vertices + jnp.array([60.0, 2.0]))

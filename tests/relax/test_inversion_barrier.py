@@ -59,6 +59,7 @@ def numbers(inversion: InversionBarrier, tissue: vx.Tissue) -> list[int]:
     return [e for e in inversion.edges.tolist() if e < tissue.n_edges]
 
 
+@pytest.mark.thorough
 def test_the_barrier_of_an_edge_turns_on_by_counts_and_off_by_length():
     short = with_edge(random_tissue(12, 3), REACH)
     assert numbers(held(short, _OFTEN - 1), short) == []
@@ -87,7 +88,10 @@ def test_more_edges_than_rows_keep_some_barriers():
     assert np.isfinite(holding(tissue, inversion)(tissue))
 
 
-@pytest.mark.parametrize("arcs", [False, True], ids=["straight", "arcs"])
+@pytest.mark.parametrize(
+    "arcs",
+    [pytest.param(False, id="straight"), pytest.param(True, id="arcs", marks=pytest.mark.thorough)],
+)
 @pytest.mark.parametrize("across", [0.0, 0.5])
 def test_derivatives_agree_with_finite_differences(across, arcs):
     tissue = cluster(12, 3, inner_arcs=True) if arcs else random_tissue(12, 3)
@@ -150,6 +154,7 @@ class Turning(vx.AbstractEnergy):
         return self.force * jnp.dot(edge, axis) / jnp.linalg.norm(axis)
 
 
+@pytest.mark.thorough
 def test_a_compressed_edge_relaxes():
     tissue = random_tissue(20, 0)
     energy = vx.energies.ShapeFactorEnergy(jnp.full(20, 3.7)) + Turning(jnp.asarray(1.0))
@@ -162,6 +167,7 @@ def test_a_compressed_edge_relaxes():
     assert 0 < share < REACH
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [35, 170])
 def test_a_fluid_tissue_with_fourfold_vertices_relaxes(seed):
     tissue = vx.initialise.periodic_voronoi(100, key=seed)

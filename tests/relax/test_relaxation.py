@@ -143,6 +143,7 @@ def test_vmap_and_single_runs_agree():
         np.testing.assert_allclose(alone.tissue.vertices, together.tissue.vertices[k], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_relaxation_does_not_drift():
     tissue = random_tissue(12, 3)
     equilibrium = vx.equilibrate(tissue, ShapeFactorEnergy(jnp.full(12, 3.7)))

@@ -179,6 +179,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform == "win32", reason="needs signals of Unix")
 def test_two_commands_share_the_runs_and_a_dead_process_ends_one_run_only(tiny):
     (tiny / "program.py").write_text(DIES)

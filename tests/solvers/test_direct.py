@@ -51,6 +51,7 @@ def test_an_inconsistent_system_is_reported():
         lx.linear_solve(lx.MatrixLinearOperator(jnp.eye(2)), jnp.ones(2), Direct())
 
 
+@pytest.mark.thorough
 def test_sensitivities_are_those_of_minres():
     tissue, p0 = random_tissue(N, 2), shape_factors(N, 3.6, 0.05)
 

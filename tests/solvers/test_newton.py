@@ -44,6 +44,7 @@ def steps(fn, y, args, n, solver: Any = NEWTON, **options):
     return run(n)
 
 
+@pytest.mark.thorough
 def test_one_difficult_region_does_not_slow_the_others():
     start = jnp.zeros((N, 2))
     radii = np.array([steps(landscape, start, 1.0, n)[1].radii for n in range(1, 12)])

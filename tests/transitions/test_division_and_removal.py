@@ -98,6 +98,7 @@ def test_repeated_divisions_of_a_periodic_cell():
     assert grown.areas.sum() == pytest.approx(1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("inner_arcs", [False, True])
 def test_a_doublet_can_divide_along_any_axis(inner_arcs):
     # The corners of its cells are collinear, and a cut may intersect one arc twice.
@@ -392,6 +393,7 @@ def run_events(n_events):
     return tissue, np.asarray(counts)
 
 
+@pytest.mark.thorough
 def test_random_events_preserve_all_invariants():
     _, counts = run_events(300)
     assert (counts > 20).all()
