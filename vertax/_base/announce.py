@@ -20,9 +20,17 @@ DELAY = 1.0
 """Seconds of compilation after which a message is printed."""
 
 
+class _Job:
+    """The job that a message names, once."""
+
+    def __init__(self, label: str):
+        self.label = label
+        self.announced = False
+
+
 class _Thread(threading.local):
-    label: str | None = None
-    """Name of the compiled function in the message; None for no message."""
+    job: _Job | None = None
+    """The job of the message; None for no message."""
     timer: threading.Timer | None = None
     """Timer of the outermost compiled function that is being called."""
 
@@ -49,10 +57,12 @@ def announced_jit(function: Function, *, inline: bool = False) -> Function:
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         compiled = fast if compiles_fast((args, kwargs)) else optimised
-        label = _thread.label or next(iter(_label_of_process), None)
-        if label is None or _thread.timer is not None:
+        job = _thread.job
+        if job is None and _label_of_process:
+            job = _Job(_label_of_process[0])
+        if job is None or job.announced or _thread.timer is not None:
             return compiled(*args, **kwargs)
-        _thread.timer = threading.Timer(DELAY, _print_message, (label,))
+        _thread.timer = threading.Timer(DELAY, _print_message, (job,))
         _thread.timer.daemon = True
         try:
             return compiled(*args, **kwargs)
@@ -65,18 +75,18 @@ def announced_jit(function: Function, *, inline: bool = False) -> Function:
 
 @contextlib.contextmanager
 def announce_compilations(label: str) -> Iterator[None]:
-    """Print "Compiling `label`" when a compilation takes longer than `DELAY`.
+    """Print "Compiling `label`" once when a compilation takes longer than `DELAY`.
 
     The message appears on a terminal and in a notebook; elsewhere only after `announce_in_this_process`.
     """
-    before = _thread.label
+    before = _thread.job
     # The outermost context names the job that the user started.
     if before is None and (sys.stderr.isatty() or "ipykernel" in sys.modules or _label_of_process):
-        _thread.label = label
+        _thread.job = _Job(label)
     try:
         yield
     finally:
-        _thread.label = before
+        _thread.job = before
 
 
 def announce_in_this_process(label: str) -> None:
@@ -84,5 +94,6 @@ def announce_in_this_process(label: str) -> None:
     _label_of_process[:] = [label]
 
 
-def _print_message(label: str) -> None:
-    tqdm.write(f"Compiling {label} (once for each size and kind of tissue) …", file=sys.stderr)
+def _print_message(job: _Job) -> None:
+    job.announced = True
+    tqdm.write(f"Compiling {job.label} (once for each size and kind of tissue) …", file=sys.stderr)
