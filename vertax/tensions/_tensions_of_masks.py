@@ -173,19 +173,18 @@ def infer_tensions_of_masks(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+    # In the order of the masks, not of the threads.
+    order = [frame.name for frame in frames]
+    results = {name: results[name] for name in order if name in results}
+    failures = {name: failures[name] for name in order if name in failures}
     if not results:
         name, message = next(iter(failures.items()))
         raise ValueError(
             f"Argument `masks` must hold a mask that can be inferred, but all {len(failures)} failed; "
             f"{name}: {message}"
         )
-    order = [frame.name for frame in frames]
     unit = {} if options.get("pixel_size") is None else {"length_unit": "unit of `pixel_size`"}
-    return TensionsOfMasks(
-        {name: results[name] for name in order if name in results},
-        {name: failures[name] for name in order if name in failures},
-        **unit,
-    )
+    return TensionsOfMasks(results, failures, **unit)
 
 
 def _infer(
