@@ -29,19 +29,21 @@ CACHE = {
 # Each row is a process: folders, and single files that are taken out of their folder. A process takes seven
 # seconds to start. The longest ones come first.
 TOGETHER = (
-    ("fitting",),
-    ("bayes",),
+    ("_base", "mesh", "energies", "dissipations"),
+    ("io", "plotting", "precondition"),
+    ("project", "solvers"),
+    ("inference", "tensions"),
+    ("transitions", "growth"),
     ("adjoints", "external"),
-    ("relax",),
     ("dynamics", "activities"),
+    ("costs", "mechanics"),
+    ("relax",),
+    ("fitting",),
     ("relax/test_free_equilibrium.py", "relax/test_relaxation.py"),
+    ("bayes", "initialise"),
+    ("runs",),
     ("experiments",),
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
-    ("_base", "mesh", "energies", "dissipations", "initialise"),
-    ("transitions", "growth"),
-    ("runs", "inference", "tensions"),
-    ("costs", "mechanics"),
-    ("project", "plotting", "io", "solvers", "precondition"),
 )
 NOTHING_SELECTED = 5
 

@@ -44,6 +44,16 @@ def test_parameters_of_an_exact_movie_are_recovered_across_transitions(movie):
     assert fit.friction_deviation == 0
 
 
+def test_frames_that_are_far_apart_are_named(evolved):
+    coarse = Movie(list(evolved.trajectory)[:16:2], evolved.times[:16:2])
+    with pytest.warns(UserWarning, match="Frames are too far apart: .* 4.9 standard errors"):
+        fit = fit_movie(coarse, GUESS, friction=FRICTION)
+    error = np.abs(fit.energy.terms[1].tension - TABLE[jnp.triu_indices(2)])
+    change = np.abs(fit.interval_error.terms[1].tension)
+    assert np.all(error < change)
+    assert np.all(error > 0.3 * change)
+
+
 @pytest.mark.thorough
 def test_friction_is_fitted_with_a_known_stiffness(movie):
     fit = fit_movie(movie, GUESS, friction=1.5, fit_friction=True)

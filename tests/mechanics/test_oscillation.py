@@ -12,6 +12,8 @@ from vertax import mechanics
 from vertax.dissipations import PerimeterViscosity, SubstrateFriction
 from vertax.energies import AreaElasticity, PerimeterElasticity, ShapeFactorEnergy
 
+pytestmark = pytest.mark.thorough
+
 C = hexagon_index()
 OMEGAS = jnp.array([0.0, 0.3, 2.0, 1e7])
 

@@ -10,6 +10,8 @@ from hypothesis import given, settings, strategies as st
 
 import vertax as vx
 
+pytestmark = pytest.mark.thorough
+
 
 def free_tissue(n_cells=7, seed=1, **options):
     return vx.initialise.free_voronoi(n_cells, key=seed, lloyd_steps=2, **options)

@@ -8,6 +8,8 @@ import pytest
 import vertax as vx
 from vertax.mesh._edge_ends import gather_at_ends
 
+pytestmark = pytest.mark.thorough
+
 TISSUES = {
     "periodic": vx.initialise.periodic_voronoi(12, key=0),
     "free": vx.initialise.free_voronoi(9, key=1),

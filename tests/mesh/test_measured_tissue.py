@@ -10,6 +10,8 @@ from free_helpers import cluster
 import vertax as vx
 from vertax.mesh._measured_tissue import MeasuredTissue
 
+pytestmark = pytest.mark.thorough
+
 TISSUES = {
     "periodic": lambda: vx.initialise.periodic_voronoi(12, key=0),
     "spare slots": lambda: vx.initialise.periodic_voronoi(12, key=0).with_capacity(14),

@@ -12,6 +12,8 @@ from vertax.precondition._edge_blocks import EdgeBlocks, EdgeInverse, Symmetric
 from vertax.relax._objective import objective
 from vertax.solvers._solver import value_and_gradient
 
+pytestmark = pytest.mark.thorough
+
 
 @eqx.filter_jit
 def blocks_of(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> EdgeBlocks:

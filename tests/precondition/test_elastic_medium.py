@@ -13,6 +13,8 @@ from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.precondition._preconditioned_minres import PreconditionedMINRES
 from vertax.precondition._sum import Preconditioner
 
+pytestmark = pytest.mark.thorough
+
 SIDE = 18
 STIFFNESS = jnp.asarray(6.0)
 

@@ -16,6 +16,8 @@ from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
 from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.precondition._recycled_hessian import RecycledHessian
 
+pytestmark = pytest.mark.thorough
+
 N_CELLS = 16
 START = random_tissue(N_CELLS)
 RELAXATION = vx.Relaxation(tolerance=1e-9)

@@ -15,6 +15,8 @@ from vertax.relax._contacts import Contacts, no_contacts
 from vertax.relax._inversion_barrier import _FADE, _LONG, _OFTEN, REACH, InversionBarrier
 from vertax.transitions._edge_frames import EdgeFrames, edge_axis
 
+pytestmark = pytest.mark.thorough
+
 NUMBER = 4
 
 

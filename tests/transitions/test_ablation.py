@@ -10,6 +10,8 @@ from helpers import random_tissue
 import vertax as vx
 from vertax.transitions import ablate, divide
 
+pytestmark = pytest.mark.thorough
+
 FORCE = jax.jit(lambda t, e: -jax.grad(lambda y: e(t.with_configuration(y)))(t.configuration))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -28,6 +29,9 @@ class MovieFit(eqx.Module):
     """The energy with the fitted parameters."""
     deviation: AbstractEnergy
     """Standard errors in the place of the parameters; NaN for those that the movie does not determine."""
+    interval_error: AbstractEnergy
+    """Change of the parameters with the other `implicitness`, 0.5 or 1: the order of magnitude of the error
+    by the time between frames."""
     friction: Float[Array, "*windows"]
     """The friction of a vertex, fitted or given."""
     friction_deviation: Float[Array, "*windows"]
@@ -40,6 +44,21 @@ class MovieFit(eqx.Module):
     """Number of force components that were used."""
     converged: Bool[Array, "*windows"]
     """Whether the parameters no longer changed in the last step."""
+
+    @property
+    def largest_interval_error(self) -> Float[Array, "*windows"]:
+        """Largest `interval_error` of a parameter in units of its standard error; 0 if that is unknown."""
+        change, deviation = (
+            jnp.concatenate([x.reshape(*self.misfit.shape, -1) for x in _parameters(energy)], -1)
+            for energy in (self.interval_error, self.deviation)
+        )
+        known = deviation > 0
+        ratio = jnp.abs(change) / jnp.where(known, deviation, 1)
+        return jnp.max(jnp.where(known, ratio, 0), axis=-1)
+
+
+def _parameters(energy: AbstractEnergy) -> list[Array]:
+    return jax.tree.leaves(eqx.filter(energy, eqx.is_inexact_array))
 
 
 class _Settings(eqx.Module):
@@ -108,6 +127,10 @@ def fit_movie(
     counts only if its edges in frame $n - 1$ are longer than `min_edge_length` times $\sigma$; errors of that
     frame are independent of those of $r$.
 
+    Velocities between frames approximate those of the motion only if the forces change little in that time.
+    The fit is repeated with $\alpha = 0.5$, or 1 if $\alpha \le 0.75$, and `interval_error` is the
+    difference. A warning appears if a parameter changes by more than three standard errors and 5 %.
+
     | symbol | argument | choose |
     |---|---|---|
     | $\alpha$ | `implicitness` | 1 if tissues relax between frames; 0.5 if frames are closer |
@@ -140,6 +163,8 @@ def fit_movie(
         functions, but weights change.
 
     **Returns:** a [`MovieFit`][vertax.inference.MovieFit].
+
+    **Warns:** if frames are too far apart for the motion between them.
 
     **Raises:**
 
@@ -187,9 +212,13 @@ def fit_movie(
     parts = np.array_split(np.arange(n_steps), n_windows)
     steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
     used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
+    given = movie.tissue, movie.times.astype(dtype)
+    other = eqx.tree_at(
+        lambda s: s.implicitness, settings, jnp.asarray(1.0 if implicitness <= 0.75 else 0.5, dtype)
+    )
     with announce_compilations("a fit of a movie"):
-        fits = _fit_windows(
-            movie.tissue, movie.times.astype(dtype), settings, theta, steps, used, max_steps
+        fits, others = (
+            _fit_windows(*given, each, theta, steps, used, max_steps) for each in (settings, other)
         )
     if not np.all(fits.num_equations > 0):
         raise ValueError(
@@ -197,8 +226,31 @@ def fit_movie(
             "with edges longer than `min_edge_length` times `noise`, but has none. Take frames in shorter "
             "intervals, or a smaller `min_edge_length`."
         )
+    difference = lambda a, b: a - b if eqx.is_inexact_array(a) else a
+    fits = eqx.tree_at(
+        lambda f: f.interval_error,
+        fits,
+        jax.tree.map(difference, others.energy, fits.energy),
+    )
+    _warn_of_long_intervals(fits)
     first = lambda x: x[0] if eqx.is_array(x) else x
     return fits if windows is not None else jax.tree.map(first, fits)
+
+
+def _warn_of_long_intervals(fits: MovieFit) -> None:
+    """Warn if a parameter changes by more than 3 standard errors and 5 % with the other implicitness."""
+    rows = zip(
+        *(_parameters(energy) for energy in (fits.energy, fits.interval_error, fits.deviation)),
+        strict=True,
+    )
+    large = lambda p, change, s: np.abs(change) > np.maximum(3 * s, 0.05 * np.abs(p))
+    if any(np.any(large(*row)) for row in rows):
+        warnings.warn(
+            "Frames are too far apart: with the other `implicitness` parameters change by up to "
+            f"{float(jnp.max(fits.largest_interval_error)):.2g} standard errors (`interval_error`). Take "
+            "frames in shorter intervals, or only those after fast changes.",
+            stacklevel=3,
+        )
 
 
 @announced_jit
@@ -256,6 +308,7 @@ def _fit_windows(
         return MovieFit(
             energy=settings.energy(best),
             deviation=eqx.combine(settings.unravel(parameters), settings.static),
+            interval_error=settings.energy(jnp.zeros_like(best)),
             friction=settings.zeta(best),
             friction_deviation=zeta_deviation,
             covariance=covariance,

@@ -25,9 +25,10 @@ def movie_from_table(
     movie.events
     ```
 
-    Cells that touch must have the same coordinates at common corners. A frame may lack cells: a hole between
-    cells becomes the missing cell that was last seen closest to it, if there is one, so that its neighbours
-    keep their places. Frames may be missing altogether.
+    Cells that touch must have the same coordinates at common corners. Include points along curved sides on
+    the outline: such a side becomes an arc that keeps the area of its cell. A frame may lack cells: a hole
+    between cells becomes the missing cell that was last seen closest to it, if there is one, so that its
+    neighbours keep their places. Frames may be missing altogether.
 
     **Arguments:**
 
