@@ -4,28 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from movie_helpers import rows_of, table_of
 
 import vertax as vx
 from vertax.inference import Event, Movie, movie_from_table
-from vertax.mesh import cell_polygons
-
-
-def rows_of(tissue, frame, numbers=None, leave_out=(), **columns):
-    """The rows of the corners of a tissue with straight edges."""
-    numbers = np.arange(tissue.n_cells) if numbers is None else numbers
-    polygons, sizes = cell_polygons(tissue, 1)
-    return [
-        {"frame": frame, "cell": int(number), "x": x, "y": y}
-        | {name: values[k] for name, values in columns.items()}
-        for k, (number, polygon, size) in enumerate(zip(numbers, polygons, sizes, strict=True))
-        if number not in leave_out
-        for x, y in polygon[:size]
-    ]
-
-
-def table_of(rows):
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
-
 
 CLUSTER = vx.initialise.free_voronoi(20, key=jax.random.key(4), lloyd_steps=20)
 STRAIGHT = CLUSTER.with_angles(jnp.zeros(CLUSTER.n_edges))
@@ -54,6 +36,17 @@ def test_cells_are_matched_by_number_in_any_order():
         movie.frame(frame).topology.validate()
         np.testing.assert_allclose(movie.frame(frame).areas, by_number, rtol=1e-12)
     assert movie.events == ()
+
+
+def test_cells_of_a_periodic_box_are_matched_across_its_boundary():
+    tissue = vx.initialise.periodic_voronoi(12, key=jax.random.key(2))
+    moved = tissue.with_vertices(tissue.vertices + 0.4)  # corners leave the box
+    table = table_of(rows_of(tissue, 0) + rows_of(moved, 1))
+    movie = movie_from_table(table, box=tissue.boundary.lattice)
+    assert movie.events == ()
+    for frame, original in enumerate((tissue, moved)):
+        np.testing.assert_allclose(movie.frame(frame).areas, original.areas, rtol=1e-9)
+        assert movie.frame(frame).n_vertices == tissue.n_vertices
 
 
 def test_t1_transition_is_recognised():

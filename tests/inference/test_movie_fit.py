@@ -4,10 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from free_helpers import cluster
+from movie_helpers import rows_of, table_of
 
 import vertax as vx
 from vertax.energies import AreaElasticity, by_type
-from vertax.inference import Movie, fit_movie
+from vertax.inference import Movie, fit_movie, movie_from_table
 
 TYPES = np.arange(16) % 2
 TABLE = jnp.array([[0.6, 0.3], [0.3, 0.5]])
@@ -61,6 +63,8 @@ def test_friction_is_fitted_with_a_known_stiffness(movie):
     np.testing.assert_allclose(fit.energy.terms[1].table, TABLE, rtol=1e-4)
 
 
+# (The frames are exact steps of the implicit Euler method.)
+@pytest.mark.filterwarnings("ignore:Frames are too far apart")
 @pytest.mark.thorough
 def test_parameters_scale_with_the_friction(movie):
     energy = AreaElasticity(jnp.array(0.8), 1.0) + by_type(0.2 * jnp.ones((2, 2)), TYPES)
@@ -123,3 +127,28 @@ def test_wrong_arguments_are_named(movie, evolved):
     short = Movie(list(evolved.trajectory)[:2], evolved.times[:2])
     with pytest.raises(ValueError, match="three frames or more"):
         fit_movie(short, GUESS)
+
+
+@pytest.mark.thorough
+def test_corners_without_the_bulges_of_the_outline_are_named():
+    types = np.arange(24) % 2
+    tension = by_type(TABLE / 2, types, outline=jnp.array(0.25))
+    energy = AreaElasticity(1.0, 1.2) + tension
+    relax = vx.Relaxation(tolerance=1e-11, contact_range=None)
+    at_rest = relax(cluster(24, 3, lloyd_steps=3), energy).tissue
+    guess = AreaElasticity(1.0, 1.2) + by_type(
+        0.1 * jnp.ones((2, 2)), types, outline=jnp.array(0.1)
+    )
+
+    def movie(points):
+        rows = [row for k in range(8) for row in rows_of(at_rest, k, points=points)]
+        return movie_from_table(table_of(rows))
+
+    with pytest.warns(UserWarning, match="outline are straight"):
+        wrong = fit_movie(movie(1), guess).energy.terms[1]
+    assert np.max(np.abs(wrong.tension - tension.tension)) > 0.05
+    inner = fit_movie(movie(1), guess, outline=False).energy.terms[1]
+    np.testing.assert_allclose(inner.tension, tension.tension, rtol=0.01)
+    fit = fit_movie(movie(200), guess).energy.terms[1]
+    np.testing.assert_allclose(fit.tension, tension.tension, rtol=0.01)
+    assert float(fit.outline) == pytest.approx(0.25, rel=0.01)

@@ -18,7 +18,7 @@ from vertax.costs._positions import matching_vertices
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy
 from vertax.inference._movie import Movie
-from vertax.mesh import Tissue
+from vertax.mesh import Free, Tissue
 from vertax.mesh._topology import take
 
 
@@ -157,14 +157,16 @@ def fit_movie(
     - `noise`: standard deviation $\sigma$ of tracked positions, in units of length.
     - `implicitness`: $\alpha$, from 0.5 to 1.
     - `min_edge_length`: length of the shortest edge of a vertex that is used, in units of `noise`.
-    - `outline`: whether to use vertices on the outline; False for a part of a tissue.
+    - `outline`: whether to use the vertices of cells on the outline; False for a part of a tissue, and for
+        tables of corners without the bulges of outer sides.
     - `windows`: split the steps into this number of parts and fit each, in parallel.
     - `max_steps`: largest number of Newton steps; one is enough for parameters of which forces are linear
         functions, but weights change.
 
     **Returns:** a [`MovieFit`][vertax.inference.MovieFit].
 
-    **Warns:** if frames are too far apart for the motion between them.
+    **Warns:** if frames are too far apart for the motion between them, and if the vertices of outer cells are
+    used but all outer sides are straight.
 
     **Raises:**
 
@@ -209,6 +211,7 @@ def fit_movie(
         fit_friction=fit_friction,
         outline=outline,
     )
+    _warn_of_straight_outlines(movie.tissue, outline)
     parts = np.array_split(np.arange(n_steps), n_windows)
     steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
     used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
@@ -235,6 +238,18 @@ def fit_movie(
     _warn_of_long_intervals(fits)
     first = lambda x: x[0] if eqx.is_array(x) else x
     return fits if windows is not None else jax.tree.map(first, fits)
+
+
+def _warn_of_straight_outlines(frames: Tissue, outline: bool) -> None:
+    """Warn if outer cells are used but have straight outer sides, as tables of corners have."""
+    angles = eqx.filter_vmap(lambda tissue: tissue.angles)(frames)
+    straight = angles is None or not jnp.any(jnp.abs(angles) > 1e-6)
+    if outline and straight and isinstance(frames.boundary, Free):
+        warnings.warn(
+            "All sides on the outline are straight, so the pressure of outer cells is unknown. Include "
+            "points along these sides in the table, or pass `outline=False`.",
+            stacklevel=3,
+        )
 
 
 def _warn_of_long_intervals(fits: MovieFit) -> None:
@@ -342,7 +357,9 @@ def _equations(
     cells = end.topology.cell.reshape(-1, 3)
     use &= jnp.all(cells != end.n_cells + 1, axis=1)
     if not settings.outline:
-        use &= jnp.all(cells != end.n_cells, axis=1)
+        outside = end.topology.cell[end.topology.twin] == end.n_cells
+        outer = jnp.zeros(end.n_cells + 2, bool).at[end.topology.cell].max(outside)
+        use &= ~jnp.any(outer[cells] | (cells == end.n_cells), axis=1)
     velocity = end.boundary.shortest(end.vertices - take(start.vertices, to_start)) / dt
     alpha = settings.implicitness
 

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float, Int
 
 from vertax._base.checks import as_float64
 from vertax.inference._movie import Movie
-from vertax.initialise._polygons import tissue_from_corners
+from vertax.initialise._polygons import checked_lattice, tissue_from_corners
 from vertax.io._read_table import column, whole_numbers
 from vertax.mesh import Tissue
 from vertax.mesh._faces import Names
@@ -25,10 +25,11 @@ def movie_from_table(
     movie.events
     ```
 
-    Cells that touch must have the same coordinates at common corners. Include points along curved sides on
-    the outline: such a side becomes an arc that keeps the area of its cell. A frame may lack cells: a hole
-    between cells becomes the missing cell that was last seen closest to it, if there is one, so that its
-    neighbours keep their places. Frames may be missing altogether.
+    Cells that touch must have the same coordinates at common corners, in a periodic box up to a lattice
+    vector. Include points along curved sides on the outline: such a side becomes an arc that keeps the area
+    of its cell. A frame may lack cells: a hole between cells becomes the missing cell that was last seen
+    closest to it, if there is one, so that its neighbours keep their places. Frames may be missing
+    altogether.
 
     **Arguments:**
 
@@ -92,10 +93,14 @@ def _one_frame(
             f"Argument `table` must have each cell once per frame, but cell {unique[counts > 1][0]} appears "
             f"twice in frame {number}. Give the other one another number, or put its corners together."
         )
-    # Equal coordinates are one point.
-    extent = np.ptp(places, axis=0).max()
-    grid = np.rint((places - places.min(axis=0)) / (1e-9 * extent)).astype(np.int64)
-    _, first, point = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    # Equal coordinates are one point, also across a periodic boundary.
+    if box is None:
+        grid = np.rint((places - places.min(axis=0)) / np.ptp(places, axis=0).max() * _GRID)
+    else:
+        grid = np.rint(places @ np.linalg.inv(checked_lattice(box)) * _GRID) % _GRID
+    _, first, point = np.unique(
+        grid.astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
     corners = [part.tolist() for part in np.split(point.ravel(), starts[1:])]
     points, added = places[first], []
     if box is None:
@@ -115,6 +120,10 @@ def _one_frame(
     result = tissue_from_corners(points, corners, named, box=box)
     last_seen.update(zip(numbers.tolist(), np.asarray(result.tissue.centroids), strict=True))
     return result.tissue, numbers, added
+
+
+_GRID = 1e9
+"""Points closer than 1 / _GRID of the extent, or of the box, are one point."""
 
 
 def _holes(corners: list[list[int]], points: Float[np.ndarray, "points 2"]) -> list[list[int]]:
