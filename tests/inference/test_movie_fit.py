@@ -132,7 +132,7 @@ def test_wrong_arguments_are_named(movie, evolved):
 @pytest.mark.thorough
 def test_corners_without_the_bulges_of_the_outline_are_named():
     types = np.arange(24) % 2
-    tension = by_type(TABLE / 2, types, outline=jnp.array(0.25))
+    tension = by_type([[0.28, 0.24], [0.24, 0.26]], types, outline=jnp.array(0.25))
     energy = AreaElasticity(1.0, 1.2) + tension
     relax = vx.Relaxation(tolerance=1e-11, contact_range=None)
     at_rest = relax(cluster(24, 3, lloyd_steps=3), energy).tissue
@@ -146,9 +146,9 @@ def test_corners_without_the_bulges_of_the_outline_are_named():
 
     with pytest.warns(UserWarning, match="outline are straight"):
         wrong = fit_movie(movie(1), guess).energy.terms[1]
-    assert np.max(np.abs(wrong.tension - tension.tension)) > 0.05
+    assert np.max(np.abs(wrong.tension - tension.tension)) > 0.015
     inner = fit_movie(movie(1), guess, outline=False).energy.terms[1]
-    np.testing.assert_allclose(inner.tension, tension.tension, rtol=0.01)
+    np.testing.assert_allclose(inner.tension, tension.tension, rtol=1e-3)
     fit = fit_movie(movie(200), guess).energy.terms[1]
-    np.testing.assert_allclose(fit.tension, tension.tension, rtol=0.01)
-    assert float(fit.outline) == pytest.approx(0.25, rel=0.01)
+    np.testing.assert_allclose(fit.tension, tension.tension, rtol=1e-3)
+    assert float(fit.outline) == pytest.approx(0.25, rel=1e-3)
