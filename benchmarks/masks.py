@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
+from vertax.tensions import infer_tensions_of_masks
+
 
 def label_image(n_cells: int, side: int, rng: np.random.Generator) -> np.ndarray:
     """A disc of Voronoi cells after three Lloyd steps."""
@@ -46,10 +48,10 @@ def main() -> None:
             n_cells = options.cells + int(rng.integers(-5, 6))
             np.save(folder / f"mask{k}.npy", label_image(n_cells, options.side, rng))
         start, cpu = time.perf_counter(), time.process_time()
-        tensions = tensions.infer_tensions_of_masks(folder)
+        masks = infer_tensions_of_masks(folder)
         seconds = time.perf_counter() - start, time.process_time() - cpu
         print(
-            f"{len(tensions.results)} masks: {seconds[0]:.0f} s, {seconds[1]:.0f} s of CPU",
+            f"{len(masks.results)} masks: {seconds[0]:.0f} s, {seconds[1]:.0f} s of CPU",
             flush=True,
         )
         start = time.perf_counter()

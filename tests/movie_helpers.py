@@ -1,11 +1,13 @@
 """Tables of movies for the tests."""
 
+from typing import Any
+
 import numpy as np
 
 from vertax.mesh import cell_polygons
 
 
-def rows_of(tissue, frame, numbers=None, leave_out=(), points=1, **columns):
+def rows_of(tissue, frame, numbers=None, leave_out=(), points: Any = 1, **columns):
     """The rows of the corners of a frame, or of several points of each edge."""
     numbers = np.arange(tissue.n_cells) if numbers is None else numbers
     polygons, sizes = cell_polygons(tissue, points)

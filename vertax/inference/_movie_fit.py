@@ -52,9 +52,9 @@ class MovieFit(eqx.Module):
             jnp.concatenate([x.reshape(*self.misfit.shape, -1) for x in _parameters(energy)], -1)
             for energy in (self.interval_error, self.deviation)
         )
-        known = deviation > 0
-        ratio = jnp.abs(change) / jnp.where(known, deviation, 1)
-        return jnp.max(jnp.where(known, ratio, 0), axis=-1)
+        determined = deviation > 0
+        ratio = jnp.abs(change) / jnp.where(determined, deviation, 1)
+        return jnp.max(jnp.where(determined, ratio, 0), axis=-1)
 
 
 def _parameters(energy: AbstractEnergy) -> list[Array]:
@@ -366,10 +366,12 @@ def _equations(
     def residual(theta: Array) -> tuple[Array, Array]:
         force = alpha * settings.slope(theta, end)
         force += (1 - alpha) * take(settings.slope(theta, start), to_start)
-        return (settings.zeta(theta) * velocity + force,) * 2
+        r = settings.zeta(theta) * velocity + force
+        return r, r
 
     def instrument(theta: Array) -> tuple[Array, Array]:
-        return (settings.slope(theta, before),) * 2
+        force = settings.slope(theta, before)
+        return force, force
 
     g, r = jax.jacfwd(residual, has_aux=True)(theta)
     z, force_before = jax.jacfwd(instrument, has_aux=True)(theta)
