@@ -1,0 +1,136 @@
+"""Equations of the fit of a movie: residuals of forces, instruments, and their sums."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vertax.costs._positions import matching_vertices
+from vertax.energies import AbstractEnergy
+from vertax.mesh import Tissue
+from vertax.mesh._topology import take
+
+
+class Settings(eqx.Module):
+    """The arguments of `fit_movie` that do not depend on the frames."""
+
+    static: Any
+    unravel: Any = eqx.field(static=True)
+    friction: Float[Array, ""]
+    noise: Float[Array, ""]
+    implicitness: Float[Array, ""]
+    min_edge_length: Float[Array, ""]
+    """In units of length."""
+    fit_friction: bool = eqx.field(static=True)
+    outline: bool = eqx.field(static=True)
+
+    def energy(self, theta: Float[Array, " parameters"]) -> AbstractEnergy:
+        parameters = theta[:-1] if self.fit_friction else theta
+        return eqx.combine(self.unravel(parameters), self.static)
+
+    def zeta(self, theta: Float[Array, " parameters"]) -> Float[Array, ""]:
+        return theta[-1] if self.fit_friction else self.friction
+
+    def slope(
+        self, theta: Float[Array, " parameters"], tissue: Tissue
+    ) -> Float[Array, "vertices 2"]:
+        energy = self.energy(theta)
+        return jax.grad(lambda x: energy(tissue.with_vertices(x)))(tissue.vertices)
+
+
+def equations(
+    settings: Settings,
+    theta: Float[Array, " parameters"],
+    floor: Float[Array, ""],
+    triple: list[Tissue],
+    dt: Float[Array, ""],
+    used: Bool[Array, ""],
+) -> tuple[Array, ...]:
+    """Of one step: ZᵀWr, ZᵀWG, the diagonals of ZᵀWZ and GᵀWG, and sums of squares.
+
+    The sums are those of squared residuals and of variances by tracking, per component, and the number of
+    vertices.
+    """
+    before, start, end = triple
+    to_before, in_before = matching_vertices(end, before)
+    to_start, in_start = matching_vertices(end, start)
+    use = in_before & in_start & used
+    shortest = before.edge_lengths[before.topology.edge.reshape(-1, 3)].min(axis=1)
+    use &= take(shortest, to_before) > settings.min_edge_length
+    cells = end.topology.cell.reshape(-1, 3)
+    use &= jnp.all(cells != end.n_cells + 1, axis=1)
+    if not settings.outline:
+        outside = end.topology.cell[end.topology.twin] == end.n_cells
+        outer = jnp.zeros(end.n_cells + 2, bool).at[end.topology.cell].max(outside)
+        use &= ~jnp.any(outer[cells] | (cells == end.n_cells), axis=1)
+    velocity = end.boundary.shortest(end.vertices - take(start.vertices, to_start)) / dt
+    alpha = settings.implicitness
+
+    def residual(theta: Array) -> tuple[Array, Array]:
+        force = alpha * settings.slope(theta, end)
+        force += (1 - alpha) * take(settings.slope(theta, start), to_start)
+        r = settings.zeta(theta) * velocity + force
+        return r, r
+
+    def instrument(theta: Array) -> tuple[Array, Array]:
+        force = settings.slope(theta, before)
+        return force, force
+
+    g, r = jax.jacfwd(residual, has_aux=True)(theta)
+    z, force_before = jax.jacfwd(instrument, has_aux=True)(theta)
+    z = take(z, to_before)
+    zeta = settings.zeta(theta)
+    if settings.fit_friction:
+        # The velocity that the forces of the frame before predict.
+        z = z.at[..., -1].set(-take(force_before, to_before) / zeta)
+    slope_at = lambda x: settings.slope(theta, before.with_vertices(x))
+    probes = jax.random.normal(jax.random.key(0), (_N_PROBES, *before.vertices.shape), r.dtype)
+    product = lambda v: jax.jvp(slope_at, (before.vertices,), (v,))[1]
+    spread = jnp.mean(jnp.sum(jax.vmap(product)(probes) ** 2, axis=-1), axis=0) / 2
+    tracking = settings.noise**2 * (take(spread, to_before) + 2 * (zeta / dt) ** 2)
+    clean = lambda x: jnp.where(use.reshape(-1, *[1] * (x.ndim - 1)), x, 0)
+    r, g, z, tracking = clean(r), clean(g), clean(z), clean(tracking)
+    w = use / (tracking + floor)
+    moments = jnp.einsum("vip,v,vi->p", z, w, r)
+    slopes = jnp.einsum("vip,v,viq->pq", z, w, g)
+    scales = jnp.stack([jnp.einsum("vip,v,vip->p", x, w, x) for x in (z, g)])
+    squares = jnp.stack([jnp.sum(r**2) / 2, jnp.sum(tracking), jnp.sum(use).astype(r.dtype)])
+    return moments, slopes, scales, squares
+
+
+_N_PROBES = 16
+"""Random vectors that estimate the rows of a Hessian: weights within about 20 %."""
+
+
+def scaled_inverse(
+    slopes: Float[Array, "parameters parameters"], scales: Float[Array, "2 parameters"]
+) -> tuple[Float[Array, "parameters parameters"], Bool[Array, " parameters"]]:
+    """The pseudoinverse of ZᵀWG, scaled, and which parameters are determined."""
+    size = jnp.sqrt(jnp.where(scales > 0, scales, 1))
+    scaled = slopes / size[0][:, None] / size[1]
+    inverse = jnp.linalg.pinv(scaled, rtol=1e-8)
+    determined = jnp.diag(inverse @ scaled) > 0.99
+    return inverse / size[1][:, None] / size[0], determined
+
+
+def sandwich_covariance(
+    moments: Float[Array, "steps parameters"],
+    slopes: Float[Array, "parameters parameters"],
+    scales: Float[Array, "2 parameters"],
+    used: Bool[Array, " steps"],
+) -> Float[Array, "parameters parameters"]:
+    """Sandwich formula over steps, with a correlation of successive steps of weight 1/2."""
+    following = moments[:-1].T @ moments[1:]
+    middle = moments.T @ moments + 0.5 * (following + following.T)
+    inverse, determined = scaled_inverse(slopes, scales)
+    n_steps, n_parameters = used.sum(), len(slopes)
+    factor = jnp.where(
+        n_steps > n_parameters, n_steps / jnp.maximum(n_steps - n_parameters, 1), jnp.nan
+    )
+    covariance = factor * inverse @ middle @ inverse.T
+    both = determined[:, None] & determined
+    return jnp.where(both, covariance, jnp.nan)
