@@ -26,7 +26,7 @@ demo: $(VENV)/.base ## infer hidden shape factors of a synthetic tissue and show
 test: $(VENV)/.dev ## the tests that run on every change
 	$(BIN)/python tests/run.py --workers $(WORKERS) --without experiments $(PYTEST_OPTIONS)
 
-test-thorough: $(VENV)/.dev ## the same with other solvers, adjoints and boundaries
+test-thorough: $(VENV)/.dev ## tests that compile for longer; other solvers, adjoints and boundaries
 	$(BIN)/python tests/run.py --workers $(WORKERS) -m "thorough and not slow" $(PYTEST_OPTIONS)
 
 test-docs: $(VENV)/.dev ## the code in the README and in the documentation

@@ -11,7 +11,7 @@ pytest.importorskip("blackjax", reason='needs the extra: pip install "vertax[bay
 
 import equinox as eqx
 import numpyro.distributions as dist
-from bayes_helpers import MEAN, N_CELLS, PRIOR, SPREAD, noisy_problem
+from bayes_helpers import MEAN, N_CELLS, PRIOR, SPREAD, noisy_problem, padded
 from helpers import fine_difference, random_like
 from scipy import stats
 
@@ -88,16 +88,8 @@ def test_replicates_of_different_sizes_add_their_likelihoods():
     shared = {"mean": dist.Normal(3.65, 0.1), "noise": dist.LogNormal(-4.0, 1.0)}
     noise = lambda p: p["noise"]
 
-    def padded(problem):
-        tissue, target = (
-            t.with_capacity(6) for t in (problem.tissue, problem.cost.costs[0].target)
-        )
-        cost = problem.tissue.n_vertices * vx.costs.VertexDistance(target)
-        energy = vx.energies.ShapeFactorEnergy(jnp.full(6, MEAN, float))
-        return dataclasses.replace(problem, tissue=tissue, energy=energy, cost=cost)
-
     energy_of = lambda n: lambda p: vx.energies.ShapeFactorEnergy(jnp.full(n, p["mean"]))
-    batch = vx.fitting.stack([padded(p) for p in singles])
+    batch = vx.fitting.stack([padded(p, 6) for p in singles])
     together = bayes.LogPosterior(batch, shared, noise, energy=energy_of((2, 6)))
     parameters = {"mean": jnp.array(3.7), "noise": jnp.array(0.02)}
     expected = sum(

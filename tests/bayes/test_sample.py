@@ -11,7 +11,8 @@ import pytest
 pytest.importorskip("blackjax", reason='needs the extra: pip install "vertax[bayes]"')
 
 import equinox as eqx
-from bayes_helpers import MEAN, N_CELLS, PRIOR, SPREAD, noisy_problem
+import numpyro.distributions as dist
+from bayes_helpers import MEAN, N_CELLS, PRIOR, SPREAD, noisy_problem, padded
 
 import vertax as vx
 from vertax import bayes
@@ -170,3 +171,30 @@ def test_invalid_arguments_are_rejected(linear, without_type_checks):
     laplace = bayes.Laplace(density_of(linear, None))
     with pytest.raises(ValueError, match="`noise` of the LogPosterior must not be None"):
         bayes.Posterior(laplace, None, 0).loo()
+
+
+@pytest.mark.slow
+def test_hyperparameters_of_replicates_of_different_sizes_are_recovered():
+    mean, spread, size, sizes = 3.62, 0.05, 8, (6, 8, 6, 8, 6)
+    noise, keys = 0.002, jax.random.split(jax.random.key(3), 5)
+    z = [jax.random.normal(key, (n,)) for key, n in zip(keys, sizes, strict=True)]
+    replicates = [
+        padded(noisy_problem(noise, seed, n, truth=mean + spread * z[seed])[0], size)
+        for seed, n in enumerate(sizes)
+    ]
+    hierarchy = {
+        "mean": dist.Normal(MEAN, SPREAD),
+        "spread": dist.HalfNormal(SPREAD),
+        "z": dist.Normal(0.0, 1.0).expand([len(sizes), size]),
+    }
+    energy = lambda p: vx.energies.ShapeFactorEnergy(p["mean"] + p["spread"] * p["z"])
+    density = bayes.LogPosterior(vx.fitting.stack(replicates), hierarchy, noise, energy=energy)
+    posterior = bayes.sample(density, 0, draws=300, warmup=200, chains=2, progress=False)
+    assert not posterior.data["sample_stats"]["diverging"].values.any()
+    for name, true in (("mean", mean), ("spread", spread)):
+        draws = posterior.draws(name).ravel()
+        assert abs(draws.mean() - true) < 2 * draws.std(), name
+        # 34 cells: standard errors 0.05 / sqrt(34) and 0.05 / sqrt(68), and more by noise.
+        assert 0.005 < draws.std() < 0.015, name
+    table = posterior.table()
+    assert (table["r_hat"] < 1.05).all()
