@@ -1,5 +1,6 @@
 """Parameters of an energy from the motion in a movie with neighbour changes."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from movie_helpers import rows_of, table_of
 import vertax as vx
 from vertax.energies import AreaElasticity, by_type
 from vertax.inference import Movie, fit_movie, movie_from_table
+from vertax.inference._tracking_noise import tracking_noise
 
 TYPES = np.arange(16) % 2
 TABLE = jnp.array([[0.6, 0.3], [0.3, 0.5]])
@@ -46,10 +48,22 @@ def test_parameters_of_an_exact_movie_are_recovered_across_transitions(movie):
     assert fit.friction_deviation == 0
 
 
+def test_tracking_noise_is_estimated(evolved, movie):
+    assert float(tracking_noise(movie.tissue, movie.times)) < 2e-3
+    for seed, noise in enumerate((0.003, 0.01)):
+        tracked = noisy(evolved, noise, seed)
+        assert float(tracking_noise(tracked.tissue, tracked.times)) == pytest.approx(noise, rel=0.1)
+    # Unequal intervals, or fewer than six frames.
+    times = jnp.cumsum(1.0 + 0.5 * (jnp.arange(movie.n_frames) % 2))
+    assert float(tracking_noise(movie.tissue, times)) == 0
+    few = jax.tree.map(lambda x: x[:5] if eqx.is_array(x) else x, movie.tissue)
+    assert float(tracking_noise(few, movie.times[:5])) == 0
+
+
 def test_frames_that_are_far_apart_are_named(evolved):
     coarse = Movie(list(evolved.trajectory)[:16:2], evolved.times[:16:2])
     with pytest.warns(UserWarning, match="Frames are too far apart: .* 4.9 standard errors"):
-        fit = fit_movie(coarse, GUESS, friction=FRICTION)
+        fit = fit_movie(coarse, GUESS, friction=FRICTION, noise=0.0)
     error = np.abs(fit.energy.terms[1].tension - TABLE[jnp.triu_indices(2)])
     change = np.abs(fit.interval_error.terms[1].tension)
     assert np.all(error < change)
@@ -76,7 +90,7 @@ def test_parameters_scale_with_the_friction(movie):
 @pytest.mark.thorough
 def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     energy = AreaElasticity(jnp.ones(16), 1.0) + by_type(0.4 * jnp.ones((16, 16)), jnp.arange(16))
-    fit = fit_movie(movie, energy, friction=FRICTION)
+    fit = fit_movie(movie, energy, friction=FRICTION, noise=0.0)
     pair = np.asarray(fit.energy.terms[1].table)
     first, second = np.asarray(movie.frame(20).topology.edge_cells).T
     expected = np.asarray(TABLE)[TYPES[first], TYPES[second]]
@@ -107,6 +121,7 @@ def test_errors_by_tracking_noise_are_covered(evolved):
     assert np.abs(np.mean(bias)) > 3 * np.abs(np.mean(errors))
 
 
+@pytest.mark.filterwarnings("ignore:Frames are too far apart")
 @pytest.mark.thorough
 def test_windows_are_fitted_in_parallel(movie):
     fit = fit_movie(movie, GUESS, friction=FRICTION, windows=3)

@@ -22,6 +22,7 @@ from vertax.inference._movie_equations import (
     sandwich_covariance,
     scaled_inverse,
 )
+from vertax.inference._tracking_noise import tracking_noise
 from vertax.mesh import Free, Tissue
 
 
@@ -41,6 +42,8 @@ class MovieFit(eqx.Module):
     """Its standard error; 0 if it was given."""
     covariance: Float[Array, "*windows parameters parameters"]
     """Covariance of the parameters, the friction last if it was fitted."""
+    noise: Float[Array, "*windows"]
+    """The tracking noise, estimated or given."""
     misfit: Float[Array, "*windows"]
     """Root mean square of a component of the residual force."""
     num_equations: Int[Array, "*windows"]
@@ -70,7 +73,7 @@ def fit_movie(
     *,
     friction: float | Float[Array, ""] = 1.0,
     fit_friction: bool = False,
-    noise: float = 0.0,
+    noise: float | None = None,
     implicitness: float = 1.0,
     min_edge_length: float = 4.0,
     outline: bool = True,
@@ -119,7 +122,7 @@ def fit_movie(
 
     ```python
     guess = vx.energies.AreaElasticity(1.0, 1.0) + vx.energies.by_type(0.1 * jnp.ones((2, 2)), movie.types)
-    fit = vx.inference.fit_movie(movie, guess, noise=0.02)
+    fit = vx.inference.fit_movie(movie, guess)
     fit.energy, fit.deviation
     ```
 
@@ -130,7 +133,10 @@ def fit_movie(
     - `friction`: friction $\zeta$ of a vertex, force over velocity; a first guess with `fit_friction`.
     - `fit_friction`: fit the friction too. That requires a constant in the energy that sets the scale of
         forces, such as a known stiffness.
-    - `noise`: standard deviation $\sigma$ of tracked positions, in units of length.
+    - `noise`: standard deviation $\sigma$ of tracked positions, in units of length. By default it is
+        estimated from the second differences of the positions of vertices that survive six frames at equal
+        intervals, $\sigma^2 = \langle a_n a_{n+2} \rangle - \langle a_n a_{n+3} \rangle$; it is 0 if there
+        are none.
     - `implicitness`: $\alpha$, from 0.5 to 1.
     - `min_edge_length`: length of the shortest edge of a vertex that is used, in units of `noise`.
     - `outline`: whether to use the vertices of cells on the outline; False for a part of a tissue, and for
@@ -151,7 +157,8 @@ def fit_movie(
     """
     check_energy(energy)
     check_number("friction", friction, above=0)
-    check_number("noise", noise, at_least=0)
+    if noise is not None:
+        check_number("noise", noise, at_least=0)
     if not 0.5 <= implicitness <= 1:
         raise ValueError(f"Argument `implicitness` must be from 0.5 to 1, but is {implicitness}.")
     check_number("min_edge_length", min_edge_length, at_least=0)
@@ -175,15 +182,16 @@ def fit_movie(
             "jnp.array(0.1)."
         )
     dtype = movie.tissue.vertices.dtype
-    zeta = jnp.asarray(friction, dtype)
+    zeta, times = jnp.asarray(friction, dtype), movie.times.astype(dtype)
+    sigma = tracking_noise(movie.tissue, times) if noise is None else jnp.asarray(noise, dtype)
     theta = jnp.append(theta, zeta) if fit_friction else theta
     settings = Settings(
         static=static,
         unravel=unravel,
         friction=zeta,
-        noise=jnp.asarray(noise, dtype),
+        noise=sigma,
         implicitness=jnp.asarray(implicitness, dtype),
-        min_edge_length=jnp.asarray(min_edge_length * noise, dtype),
+        min_edge_length=min_edge_length * sigma,
         fit_friction=fit_friction,
         outline=outline,
     )
@@ -191,7 +199,7 @@ def fit_movie(
     parts = np.array_split(np.arange(n_steps), n_windows)
     steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
     used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
-    given = movie.tissue, movie.times.astype(dtype)
+    given = movie.tissue, times
     other = eqx.tree_at(
         lambda s: s.implicitness, settings, jnp.asarray(1.0 if implicitness <= 0.75 else 0.5, dtype)
     )
@@ -303,6 +311,7 @@ def _fit_windows(
             friction=settings.zeta(best),
             friction_deviation=zeta_deviation,
             covariance=covariance,
+            noise=settings.noise,
             misfit=jnp.sqrt(squares[:, 0].sum() / n),
             num_equations=2 * squares[:, 2].sum().astype(int),
             converged=change <= 1e-6,

@@ -1,0 +1,49 @@
+"""Estimate of the tracking noise of a movie."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from vertax.costs._positions import matching_vertices
+from vertax.mesh import Tissue
+from vertax.mesh._topology import take
+
+
+@eqx.filter_jit
+def tracking_noise(frames: Tissue, times: Float[Array, " frames"]) -> Float[Array, ""]:
+    r"""Standard deviation $\sigma$ of the error of a coordinate, from vertices that survive six frames.
+
+    Second differences $a_n = x_{n+1} - 2 x_n + x_{n-1}$ of positions with independent errors have
+
+    $$\langle a_n a_{n+2} \rangle - \langle a_n a_{n+3} \rangle = \sigma^2.$$
+
+    A random walk does not contribute, and a smooth motion contributes to both terms alike (compare the
+    estimators of Vestergaard et al. 2014, doi:10.1103/PhysRevE.89.022726). Windows of six frames with unequal
+    intervals are left out.
+
+    **Returns:** $\sigma$; 0 if there is no such vertex.
+    """
+    if len(times) < 6:
+        return jnp.zeros((), times.dtype)
+    arrays, static = eqx.partition(frames, eqx.is_array)
+    pick = lambda k: eqx.combine(jax.tree.map(lambda x: x[k], arrays), static)
+
+    def one(first: Int[Array, ""]) -> tuple[Array, Array]:
+        middle = pick(first + 3)
+        paths, use = [], jnp.all(middle.topology.cell.reshape(-1, 3) != middle.n_cells + 1, axis=1)
+        for k in range(6):
+            other = pick(first + k)
+            place, matched = matching_vertices(middle, other)
+            paths.append(middle.boundary.shortest(take(other.vertices, place) - middle.vertices))
+            use &= matched
+        intervals = jnp.diff(jax.lax.dynamic_slice(times, (first,), (6,)))
+        use &= jnp.ptp(intervals) < 0.01 * jnp.mean(intervals)
+        curvature = jnp.diff(jnp.stack(paths), n=2, axis=0)
+        product = jnp.sum(curvature[0] * (curvature[2] - curvature[3]), axis=-1) / 2
+        return jnp.sum(jnp.where(use, product, 0)), jnp.sum(use)
+
+    sums, counts = jax.lax.map(one, jnp.arange(len(times) - 5))
+    return jnp.sqrt(jnp.maximum(jnp.sum(sums) / jnp.maximum(jnp.sum(counts), 1), 0))
