@@ -147,7 +147,8 @@ def run(
             path = unfinished_folder(resume, settings)
         folder = RunFolder(path, figures=figures or ("png",), print_steps=not quiet)
         if not quiet:
-            kept = ", ".join(part.stem for part in parts(path))
+            kept = [part.stem for part in parts(path)]
+            kept = ", ".join(kept) if len(kept) <= 5 else f"{len(kept)} parts"
             resumed = f" (resumed; kept so far: {kept})" if kept else ""
             typer.echo(f"{experiment.name}: {config} → {path}{resumed}")
             announce_in_this_process(f"functions for {experiment.name}")
