@@ -15,7 +15,6 @@ import vertax as vx
 from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import stack
 
-
 N = 5
 EVENT = "/jax/core/compile/backend_compile_duration"
 _events: list[str] = []
