@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -183,12 +183,13 @@ def _check_jumps(frames: list[_Frame], largest: float) -> None:
             origins = np.array([frames[last[cell]].places[cell] for cell in cells])
             away = np.linalg.norm(frame.displacement(places, origins), axis=1) / frame.size
             elapsed = now - np.array([last[cell] for cell in cells])
-            for k in np.flatnonzero(away > largest * elapsed):
+            if (jumps := np.flatnonzero(away > largest * elapsed)).size:
+                k = int(jumps[0])
                 _raise_jump(cells[k], now, last[cells[k]], away[k])
         last |= dict.fromkeys(frame.places, now)
 
 
-def _raise_jump(cell: int, now: int, before: int, away: float) -> None:
+def _raise_jump(cell: int, now: int, before: int, away: float) -> NoReturn:
     """Raise the error for a cell that moved by `away` cell sizes."""
     fact = f"cell {cell} is {away:.3g} cell sizes away from its place in frame {before}"
     if now - before > 1:

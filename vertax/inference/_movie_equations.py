@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vertax.costs._positions import matching_vertices
 from vertax.energies import AbstractEnergy
@@ -40,6 +40,11 @@ class Settings(eqx.Module):
     ) -> Float[Array, "vertices 2"]:
         energy = self.energy(theta)
         return jax.grad(lambda x: energy(tissue.with_vertices(x)))(tissue.vertices)
+
+
+def frame_at(frames: Tissue, number: Int[Array, ""]) -> Tissue:
+    """One frame of a batch, also in a compiled function."""
+    return jax.tree.map(lambda x: x[number] if eqx.is_array(x) else x, frames)
 
 
 def equations(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.announce import announce_compilations, announced_jit
+from vertax._base.batch import member
 from vertax._base.checks import check_integer, check_number
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy
@@ -19,6 +21,7 @@ from vertax.inference._movie import Movie
 from vertax.inference._movie_equations import (
     Settings,
     equations,
+    frame_at,
     sandwich_covariance,
     scaled_inverse,
 )
@@ -51,20 +54,15 @@ class MovieFit(eqx.Module):
     converged: Bool[Array, "*windows"]
     """Whether the parameters no longer changed in the last step."""
 
-    @property
-    def largest_interval_error(self) -> Float[Array, "*windows"]:
-        """Largest `interval_error` of a parameter in units of its standard error; 0 if that is unknown."""
-        change, deviation = (
-            jnp.concatenate([x.reshape(*self.misfit.shape, -1) for x in _parameters(energy)], -1)
-            for energy in (self.interval_error, self.deviation)
-        )
-        determined = deviation > 0
-        ratio = jnp.abs(change) / jnp.where(determined, deviation, 1)
-        return jnp.max(jnp.where(determined, ratio, 0), axis=-1)
 
+class _Solution(NamedTuple):
+    """Parameters of each window, and how well they are determined."""
 
-def _parameters(energy: AbstractEnergy) -> list[Array]:
-    return jax.tree.leaves(eqx.filter(energy, eqx.is_inexact_array))
+    theta: Float[Array, "windows parameters"]
+    covariance: Float[Array, "windows parameters parameters"]
+    misfit: Float[Array, " windows"]
+    num_equations: Int[Array, " windows"]
+    converged: Bool[Array, " windows"]
 
 
 def fit_movie(
@@ -199,29 +197,38 @@ def fit_movie(
     parts = np.array_split(np.arange(n_steps), n_windows)
     steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
     used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
-    given = movie.tissue, times
     other = eqx.tree_at(
         lambda s: s.implicitness, settings, jnp.asarray(1.0 if implicitness <= 0.75 else 0.5, dtype)
     )
     with announce_compilations("a fit of a movie"):
-        fits, others = (
-            _fit_windows(*given, each, theta, steps, used, max_steps) for each in (settings, other)
+        best, compared = (
+            _solve_windows(movie.tissue, times, each, theta, steps, used, max_steps)
+            for each in (settings, other)
         )
-    if not np.all(fits.num_equations > 0):
+    if not np.all(best.num_equations > 0):
         raise ValueError(
             "Argument `movie` must have vertices that join the same three cells in three successive frames, "
             "with edges longer than `min_edge_length` times `noise`, but has none. Take frames in shorter "
             "intervals, or a smaller `min_edge_length`."
         )
-    difference = lambda a, b: a - b if eqx.is_inexact_array(a) else a
-    fits = eqx.tree_at(
-        lambda f: f.interval_error,
-        fits,
-        jax.tree.map(difference, others.energy, fits.energy),
+    deviations = jnp.sqrt(jnp.diagonal(best.covariance, axis1=1, axis2=2))
+    change = compared.theta - best.theta
+    n = theta.size - fit_friction
+    _warn_of_long_intervals(best.theta[:, :n], change[:, :n], deviations[:, :n])
+    in_energy = eqx.filter_vmap(settings.energy, out_axes=eqx.if_array(0))
+    fits = MovieFit(
+        energy=in_energy(best.theta),
+        deviation=in_energy(deviations),
+        interval_error=in_energy(change),
+        friction=jax.vmap(settings.zeta)(best.theta),
+        friction_deviation=deviations[:, -1] if fit_friction else jnp.zeros(n_windows, dtype),
+        covariance=best.covariance,
+        noise=jnp.full(n_windows, sigma),
+        misfit=best.misfit,
+        num_equations=best.num_equations,
+        converged=best.converged,
     )
-    _warn_of_long_intervals(fits)
-    first = lambda x: x[0] if eqx.is_array(x) else x
-    return fits if windows is not None else jax.tree.map(first, fits)
+    return fits if windows is not None else member(fits, 0)
 
 
 def _warn_of_straight_outlines(frames: Tissue, outline: bool) -> None:
@@ -236,24 +243,25 @@ def _warn_of_straight_outlines(frames: Tissue, outline: bool) -> None:
         )
 
 
-def _warn_of_long_intervals(fits: MovieFit) -> None:
+def _warn_of_long_intervals(
+    theta: Float[Array, "windows parameters"],
+    change: Float[Array, "windows parameters"],
+    deviations: Float[Array, "windows parameters"],
+) -> None:
     """Warn if a parameter changes by more than 3 standard errors and 5 % with the other implicitness."""
-    rows = zip(
-        *(_parameters(energy) for energy in (fits.energy, fits.interval_error, fits.deviation)),
-        strict=True,
-    )
-    large = lambda p, change, s: np.abs(change) > np.maximum(3 * s, 0.05 * np.abs(p))
-    if any(np.any(large(*row)) for row in rows):
+    large = jnp.abs(change) > jnp.maximum(3 * deviations, 0.05 * jnp.abs(theta))
+    if jnp.any(large):
+        ratio = jnp.max(jnp.where(deviations > 0, jnp.abs(change) / deviations, 0))
         warnings.warn(
             "Frames are too far apart: with the other `implicitness` parameters change by up to "
-            f"{float(jnp.max(fits.largest_interval_error)):.2g} standard errors (`interval_error`). Take "
-            "frames in shorter intervals, or only those after fast changes.",
+            f"{float(ratio):.2g} standard errors (`interval_error`). Take frames in shorter "
+            "intervals, or only those after fast changes.",
             stacklevel=3,
         )
 
 
 @announced_jit
-def _fit_windows(
+def _solve_windows(
     frames: Tissue,
     times: Float[Array, " frames"],
     settings: Settings,
@@ -261,22 +269,20 @@ def _fit_windows(
     steps: Int[Array, "windows steps"],
     used: Bool[Array, "windows steps"],
     max_steps: int,
-) -> MovieFit:
-    """The fit of each window."""
-    arrays, static = eqx.partition(frames, eqx.is_array)
+) -> _Solution:
+    """The solution in each window."""
 
     def sums(theta: Array, floor: Array, steps: Array, used: Array) -> tuple[Array, ...]:
         """The equations of each step, see `equations`."""
 
         def one(item: tuple[Array, Array]) -> tuple[Array, ...]:
-            pick = lambda k: eqx.combine(jax.tree.map(lambda x: x[k], arrays), static)
-            triple = [pick(item[0] + j) for j in range(3)]
+            triple = [frame_at(frames, item[0] + j) for j in range(3)]
             dt = times[item[0] + 2] - times[item[0] + 1]
             return equations(settings, theta, floor, triple, dt, item[1])
 
         return jax.lax.map(one, (steps, used))
 
-    def fit(steps: Array, used: Array) -> MovieFit:
+    def solve(steps: Array, used: Array) -> _Solution:
         def newton(carry: tuple) -> tuple:
             theta, floor, _, count, _ = carry
             of_steps = sums(theta, floor, steps, used)
@@ -300,21 +306,13 @@ def _fit_windows(
         best, _, change, _, of_steps = jax.lax.while_loop(going, newton, start)
         moments, slopes, scales, squares = of_steps
         covariance = sandwich_covariance(moments, slopes.sum(axis=0), scales.sum(axis=0), used)
-        deviations = jnp.sqrt(jnp.diag(covariance))
         n = jnp.maximum(squares[:, 2].sum(), 1)
-        parameters = deviations[:-1] if settings.fit_friction else deviations
-        zeta_deviation = deviations[-1] if settings.fit_friction else jnp.zeros(())
-        return MovieFit(
-            energy=settings.energy(best),
-            deviation=eqx.combine(settings.unravel(parameters), settings.static),
-            interval_error=settings.energy(jnp.zeros_like(best)),
-            friction=settings.zeta(best),
-            friction_deviation=zeta_deviation,
+        return _Solution(
+            theta=best,
             covariance=covariance,
-            noise=settings.noise,
             misfit=jnp.sqrt(squares[:, 0].sum() / n),
             num_equations=2 * squares[:, 2].sum().astype(int),
             converged=change <= 1e-6,
         )
 
-    return eqx.filter_vmap(fit, out_axes=eqx.if_array(0))(steps, used)
+    return jax.vmap(solve)(steps, used)

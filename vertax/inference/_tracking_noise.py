@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from vertax._base.announce import announced_jit
 from vertax.costs._positions import matching_vertices
+from vertax.inference._movie_equations import frame_at
 from vertax.mesh import Tissue
 from vertax.mesh._topology import take
 
 
-@eqx.filter_jit
+@announced_jit
 def tracking_noise(frames: Tissue, times: Float[Array, " frames"]) -> Float[Array, ""]:
     r"""Standard deviation $\sigma$ of the error of a coordinate, from vertices that survive six frames.
 
@@ -28,14 +29,12 @@ def tracking_noise(frames: Tissue, times: Float[Array, " frames"]) -> Float[Arra
     """
     if len(times) < 6:
         return jnp.zeros((), times.dtype)
-    arrays, static = eqx.partition(frames, eqx.is_array)
-    pick = lambda k: eqx.combine(jax.tree.map(lambda x: x[k], arrays), static)
 
     def one(first: Int[Array, ""]) -> tuple[Array, Array]:
-        middle = pick(first + 3)
+        middle = frame_at(frames, first + 3)
         paths, use = [], jnp.all(middle.topology.cell.reshape(-1, 3) != middle.n_cells + 1, axis=1)
         for k in range(6):
-            other = pick(first + k)
+            other = frame_at(frames, first + k)
             place, matched = matching_vertices(middle, other)
             paths.append(middle.boundary.shortest(take(other.vertices, place) - middle.vertices))
             use &= matched

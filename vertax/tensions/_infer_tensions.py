@@ -58,8 +58,8 @@ def infer_tensions(
     r"""Tensions of edges and pressures of cells that balance in the observed shape of a tissue.
 
     ```python
-    found = vx.tensions.infer_tensions("NAME_cp_masks.tif")
-    found.write("tensions.csv")
+    inferred = vx.tensions.infer_tensions("NAME_cp_masks.tif")
+    inferred.write("tensions.csv")
     ```
 
     Where three cells meet, tensions balance, and across every arc they balance the difference of pressures
