@@ -12,6 +12,7 @@ from vertax.initialise import periodic_voronoi
 pytestmark = pytest.mark.experiments
 
 CONFIGS = Path(__file__).parents[2] / "configs"
+WINGS = Path(__file__).parents[3] / "shared" / "data" / "wings"
 ONE_METHOD = '[{name = "guided", distance = "centroids", guided = true}]'
 
 SHORT = {
@@ -149,6 +150,7 @@ SHORT = {
         "tissue.n_cells=9",
     ],
     "trained_stresses": ["trained=[1, 4]", "replicates=1", "tissue.n_cells=4", "fit.epochs=2"],
+    "wing_posteriors": ["wings=1", "draws=20", "warmup=20", "chains=1", "synthetic_noise=[0.01]"],
 }
 
 
@@ -175,6 +177,9 @@ def micrograph(tmp_path_factory):
 def test_a_configuration_runs(name, tmp_path, micrograph):
     if name == "external_tensions" and shutil.which("evolver") is None:
         pytest.skip("Surface Evolver is not installed: apt-get install evolver-nox")
-    changes = [f"image.path={micrograph}"] if name == "infer_from_microscopy" else []
+    if name == "wing_posteriors" and not WINGS.exists():
+        pytest.skip("the folder shared/data/wings is not there")
+    data = {"infer_from_microscopy": f"image.path={micrograph}", "wing_posteriors": f"data={WINGS}"}
+    changes = [data[name]] if name in data else []
     _, metrics = run(CONFIGS / f"{name}.toml", tmp_path / "run", *SHORT[name], *changes)
     assert metrics

@@ -1,0 +1,253 @@
+r"""Mechanics of fly wings by two posteriors: forward model and force balance.
+
+Each wing is a free tissue of straight edges; the cells at its outline are pinned. With areas in units of the
+mean observed one, and $\bar P$ the mean perimeter, the energy is
+
+$$E = \tfrac12 \sum_c (A_c - 1 - s\,(a_c - 1))^2
+    + T \Bigl[(1 - g) \sum_e \ell_e + \frac{g}{4 \bar P} \sum_c P_c^2\Bigr]$$
+
+- $T$: mean tension of the edges;
+- $g$: share of the tension that is proportional to the perimeters of the two cells;
+- $s$: share of the deviation of an observed area $a_c$ that the target area has.
+
+The forward model compares equilibrium and observed vertices, with noise of positions. The usual force balance
+assumes independent noise of the forces at the observed vertices, in units of $T$ (Ogita et al. 2022,
+doi:10.1371/journal.pcbi.1010209). It determines $g$ and the *pressure contrast* $\kappa = (1 - s) / T$ alone.
+Both are applied to each wing, to all together, and to synthetic wings with given parameters.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from pydantic import Field
+
+import vertax as vx
+from experiments._shared import columns
+from vertax import bayes, plotting, runs
+from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity
+
+SYMBOLS = {"contrast": r"pressure contrast $\kappa$", "share": "perimeter share $g$", "noise": "noise"}
+"""Quantities that both posteriors have."""
+
+
+class Parameters(runs.Section):
+    """Parameters of a wing."""
+
+    tension: float = Field(default=0.1, gt=0)
+    """T: mean tension of the edges."""
+    share: float = 0.5
+    """g: share of the tension that is proportional to perimeters."""
+    targets: float = 0.5
+    """s: share of the deviation of an observed area that the target area has."""
+
+
+class Config(runs.ExperimentConfig):
+    """Configuration of this experiment."""
+
+    data: str = Field(default="wings", min_length=1)
+    """Folder with vertex files of the Bayesian force inference (`*.dat`)."""
+    wings: int | None = Field(default=None, ge=1)
+    """Number of wings; by default all."""
+    draws: int = Field(default=100, ge=20)
+    """Draws of a chain."""
+    warmup: int = Field(default=60, ge=20)
+    """Steps of the adaptation (five times as many for the force balance)."""
+    chains: int = Field(default=2, ge=1)
+    """Chains of a posterior."""
+    synthetic: Parameters = Parameters()
+    """Parameters of the synthetic wings."""
+    synthetic_noise: list[float] = Field(default=[0.003, 0.03], min_length=1)
+    """Noise of their vertices, in cell sizes."""
+
+
+class Wing(NamedTuple):
+    """A wing in units of the size of a cell."""
+
+    tissue: vx.Tissue
+    model: "Model"
+
+
+class Model(eqx.Module):
+    """The energy of a wing, or of a batch of wings, as a function of the parameters."""
+
+    areas: Float[Array, "*wings cells"]
+    perimeter: Float[Array, "*wings"]
+
+    def __call__(self, parameters: Any) -> vx.AbstractEnergy:
+        """The energy, with the leading axis of the batch."""
+        build = eqx.filter_vmap(energy, in_axes=(0, 0, None)) if self.areas.ndim == 2 else energy
+        return build(self.areas, self.perimeter, parameters)
+
+
+def energy(areas: Array, perimeter: Array, parameters: Any) -> vx.AbstractEnergy:
+    """The energy of a wing."""
+    tension, share = parameters["tension"], parameters["share"]
+    area = AreaElasticity(jnp.ones_like(perimeter), 1 + parameters["targets"] * (areas - 1))
+    contractility = PerimeterElasticity(share * tension / (2 * perimeter), jnp.zeros_like(perimeter))
+    return area + contractility + LineTension(tension * (1 - share))
+
+
+def priors() -> dict[str, Any]:
+    """The priors of both posteriors."""
+    import numpyro.distributions as dist  # (Of an extra: `bayes` names it if it is missing.)
+
+    return {
+        "tension": dist.LogNormal(np.log(0.1), 1.0),
+        "share": dist.Normal(0.0, 1.0),
+        "targets": dist.Normal(0.5, 0.5),
+        "noise": dist.LogNormal(np.log(0.1), 1.0),
+    }
+
+
+def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
+    """Difference of the two posteriors over its standard deviation, by quantity and data."""
+    paths = sorted(Path(config.data).glob("*.dat"))[: config.wings]
+    if not paths:
+        raise ValueError(
+            f"Key `data` must be a folder with files *.dat, but there are none in {config.data}."
+        )
+    wings = {path.stem: pinned(vx.io.read_force_inference(path).tissue) for path in paths}
+    capacity = max(wing.tissue.n_cells for wing in wings.values())
+    truth = {name: jnp.asarray(value) for name, value in config.synthetic.model_dump().items()}
+    sets = {name: [padded(wing, capacity)] for name, wing in wings.items()}
+    sets["all"] = [wing for (wing,) in sets.values()]
+    first = next(iter(wings.values()))
+    for number, noise in enumerate(config.synthetic_noise):
+        sets[f"synthetic, noise {noise:g}"] = [padded(synthetic(first, truth, noise, number), capacity)]
+    rows = []
+    for name, members in sets.items():
+        for likelihood, sampler in (("forward", forward), ("force balance", force_balance)):
+            part = folder.part(f"{name}, {likelihood}", lambda: sampler(config, members))  # noqa: B023
+            rows.append({"data": name, "likelihood": likelihood} | summary(part))
+    folder.save_table("posteriors", columns(rows))
+    known = {"contrast": float((1 - truth["targets"]) / truth["tension"]), "share": float(truth["share"])}
+    folder.save_figure("posteriors", plot(rows, known))
+    score = lambda a, b, x: (a[x] - b[x]) / np.hypot(a[f"{x}_deviation"], b[f"{x}_deviation"])
+    pairs = list(zip(rows[::2], rows[1::2], strict=True))
+    return {
+        f"difference of the posteriors over its standard deviation, {name}": {
+            a["data"]: float(score(a, b, name)) for a, b in pairs
+        }
+        for name in known
+    }
+
+
+def pinned(tissue: vx.Tissue) -> Wing:
+    """A free tissue in units of the size of its inner cells, with those at the outline pinned."""
+    topology, n = tissue.topology, tissue.n_cells
+    outer = np.zeros(n + 1, bool)  # the exterior is the last one
+    outer[np.asarray(topology.edge_cells)[np.asarray(topology.on_outline)]] = True
+    held = np.zeros(tissue.n_vertices, bool)
+    held[np.asarray(topology.source)[outer[np.minimum(np.asarray(topology.cell), n)]]] = True
+    inner = ~outer[:n]
+    size = np.sqrt(np.mean(np.asarray(tissue.areas)[inner]))
+    scaled = vx.Tissue(np.asarray(tissue.vertices) / size, topology, vx.Free(), pinned=held)
+    areas = jnp.where(inner, scaled.areas, 1.0)
+    return Wing(scaled, Model(areas, jnp.mean(scaled.perimeters[inner])))
+
+
+def padded(wing: Wing, capacity: int) -> Wing:
+    """The wing with spare cells: all wings share compiled functions."""
+    room = (0, capacity - wing.tissue.n_cells)
+    areas = jnp.pad(wing.model.areas, room, constant_values=1.0)
+    return Wing(wing.tissue.with_capacity(capacity), Model(areas, wing.model.perimeter))
+
+
+def synthetic(wing: Wing, parameters: Any, noise: float, seed: int) -> Wing:
+    """The equilibrium of given parameters, seen with noise."""
+    relaxed = response()(wing.tissue, wing.model(parameters)).tissue
+    errors = noise * jax.random.normal(jax.random.key(seed), relaxed.vertices.shape)
+    return Wing(relaxed.with_vertices(relaxed.vertices + errors), wing.model)
+
+
+def response() -> vx.Relaxation:
+    """A relaxation that keeps the topology."""
+    return vx.Relaxation(transitions=None, contact_range=None)
+
+
+def forward(config: Config, wings: Sequence[Wing]) -> dict[str, np.ndarray]:
+    """Draws of the posterior of the equilibrium, with noise of positions."""
+    problems = []
+    for tissue, model in wings:
+        cost = float(jnp.sum(tissue.topology.alive_vertices)) * vx.costs.VertexDistance(tissue)
+        start = model({name: jnp.asarray(value) for name, value in Parameters()})
+        problems.append(vx.InverseProblem(tissue, start, cost, response=response()))
+    problem, model = problems[0], wings[0].model
+    if len(wings) > 1:
+        problem = vx.fitting.stack(problems)
+        model = jax.tree.map(lambda *x: jnp.stack(x), *(wing.model for wing in wings))
+    density = bayes.LogPosterior(problem, priors(), fitted_noise, energy=model)
+    options: Any = {"draws": config.draws, "warmup": config.warmup, "chains": config.chains}
+    posterior = bayes.sample(density, config.seed, progress=False, **options)
+    return {name: posterior.draws(name) for name in density.prior}
+
+
+def fitted_noise(parameters: Any) -> Any:
+    """The noise is a parameter."""
+    return parameters["noise"]
+
+
+def force_balance(config: Config, wings: Sequence[Wing]) -> dict[str, np.ndarray]:
+    """Draws of the posterior of the forces at the observed vertices, with independent noise."""
+    import numpyro
+    from numpyro.infer import MCMC, NUTS
+
+    def model() -> None:
+        parameters = {name: numpyro.sample(name, prior) for name, prior in priors().items()}
+        noise = numpyro.distributions.Normal(0.0, parameters["noise"])
+        for number, (tissue, build) in enumerate(wings):
+            forces = jax.grad(lambda x: build(parameters)(tissue.with_vertices(x)))(tissue.vertices)  # noqa: B023
+            held: Any = tissue.held
+            terms = noise.log_prob(forces / parameters["tension"])
+            numpyro.factor(f"forces {number}", jnp.sum(jnp.where(held[:, None], 0, terms)))
+
+    chain = MCMC(
+        NUTS(model, dense_mass=True),
+        num_warmup=5 * config.warmup,
+        num_samples=config.draws,
+        num_chains=config.chains,
+        chain_method="sequential",
+        progress_bar=False,
+    )
+    chain.run(jax.random.key(config.seed))
+    return {name: np.asarray(x) for name, x in chain.get_samples(group_by_chain=True).items()}
+
+
+def summary(draws: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Means, standard deviations and R-hat."""
+    import arviz
+
+    values = draws | {"contrast": (1 - draws["targets"]) / draws["tension"]}
+    row: dict[str, Any] = {}
+    for name in (*SYMBOLS, "tension", "targets"):
+        row |= {name: values[name].mean(), f"{name}_deviation": values[name].std()}
+        row |= {f"{name}_r_hat": float(arviz.rhat(values[name]))}
+    return row
+
+
+@plotting.house_style()
+def plot(rows: list[dict[str, Any]], truth: dict[str, float]) -> Any:
+    """Mean and standard deviation of each quantity, a line per data set."""
+    figure, (axes,) = plotting.new_figure(1, len(SYMBOLS), width=2.2, height=3.2)
+    names = list(dict.fromkeys(row["data"] for row in rows))
+    for ax, (quantity, label) in zip(axes, SYMBOLS.items(), strict=True):
+        for number, method in enumerate(dict.fromkeys(row["likelihood"] for row in rows)):
+            own = [row for row in rows if row["likelihood"] == method]
+            places = np.array([names.index(row["data"]) for row in own]) + 0.16 * (2 * number - 1)
+            means, errors = [row[quantity] for row in own], [row[f"{quantity}_deviation"] for row in own]
+            ax.errorbar(
+                means, places, xerr=errors, fmt="o", ms=3, color=plotting.SERIES[number], label=method
+            )
+        if quantity in truth:
+            n = sum(name.startswith("synthetic") for name in names)
+            ax.plot([truth[quantity]] * 2, [len(names) - n - 0.5, len(names) - 0.5], color=plotting.INK, lw=1)
+        ax.set(xlabel=label, yticks=range(len(names)), yticklabels=[], ylim=(len(names) - 0.5, -0.5))
+    axes[0].set_yticklabels(names)
+    axes[-1].legend()
+    return figure
