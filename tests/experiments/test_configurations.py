@@ -150,7 +150,7 @@ SHORT = {
         "tissue.n_cells=9",
     ],
     "trained_stresses": ["trained=[1, 4]", "replicates=1", "tissue.n_cells=4", "fit.epochs=2"],
-    "wing_posteriors": ["wings=1", "draws=20", "warmup=20", "chains=1", "synthetic_noise=[0.01]"],
+    "wing_posteriors": ["wings=1", "draws=20", "warmup=20", "synthetic_noise=[0.01]"],
 }
 
 

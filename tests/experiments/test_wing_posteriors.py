@@ -47,7 +47,7 @@ def test_the_outer_cells_do_not_act_on_free_vertices(wing):
 
 
 def test_exact_forces_determine_contrast_and_share(wing):
-    config = experiment.Config(experiment="wing_posteriors", draws=100, warmup=60)
+    config = experiment.Config(experiment="wing_posteriors")
     tissue, model = wing
     errors = 1e-4 * jax.random.normal(jax.random.key(2), tissue.vertices.shape)
     seen = experiment.Wing(tissue.with_vertices(tissue.vertices + errors), model)
