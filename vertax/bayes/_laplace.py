@@ -14,7 +14,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_key
-from vertax.bayes._log_posterior import LogPosterior, Parameters, check_log_posterior
+from vertax.bayes._log_posterior import (
+    LogPosterior,
+    Outcome,
+    Parameters,
+    check_log_posterior,
+)
 
 
 class Laplace(eqx.Module):
@@ -130,11 +135,12 @@ def _mode(
 
 
 class Point(eqx.Module):
-    """The log density at a point, its parts and its gradients."""
+    """The log density at a point, its gradients, and the equilibrium."""
 
     log_density: Float[Array, ""]
     prior_slope: Float[Array, " coordinates"]
     data_slope: Float[Array, " coordinates"]
+    outcome: Outcome
 
 
 @announced_jit
@@ -142,5 +148,5 @@ def evaluate(log_posterior: LogPosterior, z: Float[Array, " coordinates"]) -> Po
     """The log density at real coordinates, with its gradients."""
     (log_prior, _), prior_slope = jax.value_and_grad(log_posterior.log_prior, has_aux=True)(z)
     likelihood = jax.value_and_grad(log_posterior.log_likelihood, has_aux=True)
-    (log_likelihood, _), data_slope = likelihood(z)
-    return Point(log_prior + log_likelihood, prior_slope, data_slope)
+    (log_likelihood, outcome), data_slope = likelihood(z)
+    return Point(log_prior + log_likelihood, prior_slope, data_slope, outcome)

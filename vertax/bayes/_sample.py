@@ -10,6 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from blackjax.adaptation.mass_matrix import mass_matrix_adaptation
+from blackjax.adaptation.step_size import dual_averaging_adaptation
+from blackjax.adaptation.window_adaptation import build_schedule
 from blackjax.mcmc.hmc import HMCState
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from tqdm import tqdm
@@ -26,21 +29,24 @@ from vertax._base.checkpoints import (
 from vertax._base.checks import as_key, check_integer
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax.bayes._laplace import Laplace, evaluate
-from vertax.bayes._log_posterior import LogPosterior, Outcome, Parameters, check_log_posterior
+from vertax.bayes._log_posterior import LogPosterior, Parameters, check_log_posterior
 from vertax.bayes._posterior import Posterior
 
 _CHUNK = 20
-"""Draws between two updates of the progress bar; a checkpoint holds multiples of it."""
+"""Steps between two updates of the progress bar; a checkpoint holds multiples of it."""
+_FAST, _SLOW, _END_OF_WINDOW, _DRAW = range(4)
+"""What a step adapts: the step size; also the scales, which change at the end of a window; or nothing."""
 
 
 class _Chain(eqx.Module):
     """State of one chain, or of all, in the coordinates u of the Laplace approximation, z = ẑ + L u."""
 
     state: Any
-    """A state of BlackJAX."""
-    step_size: Float[Array, "*chains"]
-    inverse_mass: Float[Array, "*chains coordinates"]
-    warmup_steps: Int[Array, "*chains"]
+    """State of the Hamiltonian Monte Carlo of BlackJAX."""
+    step_size: Any
+    """State of the dual averaging of BlackJAX."""
+    scales: Any
+    """State of its estimate of the variance of each u_i."""
 
 
 @announce_compilations("a sampler")
@@ -59,8 +65,8 @@ def sample(
 
     1. Find the mode and the [`Laplace`][vertax.bayes.Laplace] approximation $N(\hat z, L L^T)$.
     2. Move in $u$ with $z = \hat z + L u$: there the metric of the Laplace approximation is the identity.
-    3. Each chain starts at a draw of that approximation; window adaptation (Stan) adjusts its step size and
-        the scale of each $u_i$.
+    3. Each chain starts at a draw of that approximation. The first steps, in the windows of Stan, adapt its
+        step size and the scale of each $u_i$.
     4. Draw.
 
     A gradient that is not exact costs efficiency and no bias: a leapfrog step with any fixed field of
@@ -71,7 +77,7 @@ def sample(
     - `log_posterior`: the density.
     - `key`: a random key or a seed.
     - `draws`: draws of each chain.
-    - `warmup`: steps of the adaptation of each chain, not part of the draws.
+    - `warmup`: steps of the adaptation of each chain, not part of the draws; rounded up to a multiple of 20.
     - `chains`: number of chains, one after the other on a CPU and in parallel elsewhere.
     - `start`: see [`Laplace`][vertax.bayes.Laplace].
     - `progress`: show a progress bar (only on a terminal).
@@ -103,103 +109,123 @@ def sample(
 
     file = CheckpointFile(checkpoint, identity, "run of a sampler")
     laplace = Laplace(log_posterior, start)
-    keys = jax.random.split(key, (2, chains))
-    n_chunks = -(-draws // _CHUNK)
-    done = file.load(_blank(laplace, chains))
-    if not np.any(done.state.warmup_steps):
-        done = Progress(_warm_up(laplace, *_starts(laplace, keys[0]), warmup))
+    n_warmup, n_chunks = -(-warmup // _CHUNK), -(-warmup // _CHUNK) - (-draws // _CHUNK)
+    stages = _stages(n_warmup * _CHUNK, n_chunks * _CHUNK).reshape(n_chunks, _CHUNK)
+    keys, start_keys = jax.random.split(key, (2, chains))
+    done = file.load(
+        jax.tree.map(lambda *x: jnp.stack(x), *(_first(laplace, k) for k in start_keys))
+    )
     try:
         with tqdm(
             total=n_chunks * _CHUNK,
             initial=len(done.rows) * _CHUNK,
-            unit="draw",
+            unit="step",
             disable=None if progress else True,
         ) as bar:
             while len(done.rows) < n_chunks:
-                first = jnp.asarray(len(done.rows) * _CHUNK)
-                state, row = _advance(laplace, done.state, keys[1], first)
+                number = len(done.rows)
+                first = jnp.asarray(number * _CHUNK)
+                state, row = _advance(laplace, done.state, keys, first, stages[number])
                 row = {name: np.asarray(value) for name, value in row.items()}
                 done = Progress(state, (*done.rows, row))
                 bar.update(_CHUNK)
                 file.save_if_due(done)
     finally:
         file.save(done)
-    # (chunks, chains, draws of a chunk, …) → (chains, draws, …)
+    # (chunks, chains, steps of a chunk, …) → (chains, steps, …)
     columns = columns_of(done.rows[:n_chunks])
     joined = {n: np.swapaxes(x, 0, 1).reshape(chains, -1, *x.shape[3:]) for n, x in columns.items()}
-    return Posterior.of(
-        laplace,
-        {name: x[:, :draws] for name, x in joined.items()},
-        int(np.sum(done.state.warmup_steps)),
-    )
+    warmup_steps = int(np.sum(joined["n_steps"][:, : n_warmup * _CHUNK]))
+    drawn = {name: x[:, n_warmup * _CHUNK :][:, :draws] for name, x in joined.items()}
+    # The compiled function of the Laplace approximation: another in `_advance` would double its compilation.
+    points = [
+        evaluate(log_posterior, jnp.asarray(z)) for z in drawn["z"].reshape(-1, len(laplace.mode))
+    ]
+    for name in ("num_t1", "shortest_edge"):
+        values = np.array([getattr(point.outcome, name) for point in points])
+        drawn[name] = values.reshape(chains, draws)
+    return Posterior.of(laplace, drawn, warmup_steps)
 
 
-def _density(laplace: Laplace, u: Array) -> tuple[Array, Outcome]:
-    """Log density in the coordinates u, up to a constant."""
-    posterior, z = laplace.log_posterior, laplace.mode + laplace.factor @ u
-    log_likelihood, outcome = posterior.log_likelihood(z)
-    return posterior.log_prior(z)[0] + log_likelihood, outcome
+def _stages(warmup: int, steps: int) -> Int[Array, " steps"]:
+    """What each step adapts."""
+    schedule = np.asarray(build_schedule(warmup), int)
+    stages = np.full(steps, _DRAW)
+    stages[:warmup] = np.where(schedule[:, 1], _END_OF_WINDOW, schedule[:, 0])
+    return jnp.asarray(stages)
 
 
-def _blank(laplace: Laplace, chains: int) -> _Chain:
-    """The layout of the state of all chains, before the adaptation."""
-    u = jnp.zeros((chains, len(laplace.mode)), laplace.mode.dtype)
-    state: Any = HMCState(u, u[:, 0], u)  # pyright: ignore[reportArgumentType]
-    return _Chain(state, u[:, 0], u, jnp.zeros(chains, int))
-
-
-def _starts(laplace: Laplace, keys: Array) -> tuple[Array, Array]:
-    """A key and the first u of each chain: a draw of the Laplace approximation, or its mode."""
-    pairs = [jax.random.split(key) for key in keys]
-    firsts = []
-    for key, _ in pairs:
-        u = jax.random.normal(key, laplace.mode.shape, laplace.mode.dtype)
+def _first(laplace: Laplace, key: PRNGKeyArray) -> _Chain:
+    """A chain at a draw of the Laplace approximation, or at its mode if that draw has no equilibrium."""
+    draw = jax.random.normal(key, laplace.mode.shape, laplace.mode.dtype)
+    for u in (draw, jnp.zeros_like(draw)):
         point = evaluate(laplace.log_posterior, laplace.mode + laplace.factor @ u)
-        firsts.append(jnp.where(jnp.isfinite(point.log_density), u, 0))
-    return jnp.stack([key for _, key in pairs]), jnp.stack(firsts)
+        if jnp.isfinite(point.log_density):
+            break
+    slope = laplace.factor.T @ (point.prior_slope + point.data_slope)
+    step_size, scales = _STEP_SIZE[0](0.5), _SCALES[0](u.size)
+    arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, u.dtype)), tree)
+    state: Any = HMCState(u, point.log_density, slope)  # pyright: ignore[reportArgumentType]
+    return _Chain(state, arrays(step_size), arrays(scales))
 
 
-@announced_jit
-def _warm_up(laplace: Laplace, keys: Array, firsts: Array, steps: int) -> _Chain:
-    """The state of each chain after the adaptation."""
+# Each a triple of functions: initial state, update, result.
+_STEP_SIZE = dual_averaging_adaptation(0.8)
+_SCALES = mass_matrix_adaptation(True)
 
-    def one(laplace: Laplace, key: Array, u: Array) -> _Chain:
-        density = lambda u: _density(laplace, u)[0]
-        adaptation: Any = blackjax.window_adaptation(
-            blackjax.nuts,
-            density,
-            initial_step_size=0.5,
-            adaptation_info_fn=lambda state, info, _: info.num_integration_steps,
-        )
-        (state, tuned), n_steps = adaptation.run(key, u, num_steps=steps)
-        inverse_mass = tuned["inverse_mass_matrix"].astype(u.dtype)
-        step_size = jnp.asarray(tuned["step_size"], u.dtype)
-        return _Chain(state, step_size, inverse_mass, jnp.sum(n_steps).astype(int))
 
-    return eqx.filter_vmap(sequential_vmap_on_cpu(one), in_axes=(None, 0, 0))(laplace, keys, firsts)
+def _adapted(chain: _Chain, stage: Int[Array, ""], acceptance: Float[Array, ""]) -> _Chain:
+    """The chain with another step size and other scales, as the stage demands."""
+    (restart, update, result), (_, observe, estimate) = _STEP_SIZE, _SCALES
+    select = lambda condition, new, old: jax.tree.map(
+        lambda x, y: jnp.where(condition, x, y).astype(jnp.asarray(y).dtype), new, old
+    )
+    adapts, ends = stage != _DRAW, stage == _END_OF_WINDOW
+    step_size = select(adapts, update(chain.step_size, acceptance), chain.step_size)
+    observes = ends | (stage == _SLOW)
+    scales = select(observes, observe(chain.scales, chain.state.position), chain.scales)
+    step_size = select(ends, restart(result(step_size)), step_size)
+    return _Chain(chain.state, step_size, select(ends, estimate(scales), scales))
 
 
 @announced_jit
 def _advance(
-    laplace: Laplace, chains: _Chain, keys: Array, first: Int[Array, ""]
+    laplace: Laplace,
+    chains: _Chain,
+    keys: Array,
+    first: Int[Array, ""],
+    stages: Int[Array, " steps"],
 ) -> tuple[_Chain, dict[str, Array]]:
-    """The next draws of each chain, numbered from `first`, with an axis of chains and one of draws."""
+    """The next steps of each chain, numbered from `first`, with an axis of chains and one of steps."""
 
     def one(
-        laplace: Laplace, chain: _Chain, key: Array, first: Int[Array, ""]
+        laplace: Laplace,
+        chain: _Chain,
+        key: Array,
+        first: Int[Array, ""],
+        stages: Int[Array, " steps"],
     ) -> tuple[_Chain, dict[str, Array]]:
-        kernel, density = blackjax.nuts.build_kernel(), lambda u: _density(laplace, u)[0]
+        kernel = blackjax.nuts.build_kernel()
 
-        # The key depends on the number of the draw: runs with and without a checkpoint are equal.
-        def step(state: Any, number: Int[Array, ""]) -> tuple[Any, dict[str, Any]]:
+        def density(u: Array) -> Array:
+            z = laplace.mode + laplace.factor @ u
+            return (
+                laplace.log_posterior.log_prior(z)[0] + laplace.log_posterior.log_likelihood(z)[0]
+            )
+
+        # The key depends on the number of the step: runs with and without a checkpoint are equal.
+        def step(chain: _Chain, now: tuple[Array, Array]) -> tuple[_Chain, dict[str, Any]]:
+            number, stage = now
+            sizes = chain.step_size
+            log_step_size = jnp.where(stage == _DRAW, sizes.log_step_size_avg, sizes.log_step_size)
+            scales = chain.scales.inverse_mass_matrix
             draw_key = jax.random.fold_in(key, number)
-            info: Any
-            state, info = kernel(draw_key, state, density, chain.step_size, chain.inverse_mass)
-            outcome = _density(laplace, state.position)[1]
+            state, info = kernel(draw_key, chain.state, density, jnp.exp(log_step_size), scales)
             # (A trajectory ends at its first divergence, so a failed relaxation is one of its ends.)
             ends = (info.trajectory_leftmost_state, info.trajectory_rightmost_state)
             rejected = ~jnp.isfinite(ends[0].logdensity) | ~jnp.isfinite(ends[1].logdensity)
-            return state, {
+            moved = eqx.tree_at(lambda c: c.state, chain, state)
+            return _adapted(moved, stage, info.acceptance_rate), {
                 "z": laplace.mode + laplace.factor @ state.position,
                 "lp": state.logdensity,
                 "energy": info.energy,
@@ -207,12 +233,9 @@ def _advance(
                 "diverging": info.is_divergent,
                 "n_steps": info.num_integration_steps,
                 "rejected": rejected,
-                "num_t1": outcome.num_t1,
-                "shortest_edge": outcome.shortest_edge,
             }
 
-        state, rows = jax.lax.scan(step, chain.state, first + jnp.arange(_CHUNK))
-        return eqx.tree_at(lambda c: c.state, chain, state), rows
+        return jax.lax.scan(step, chain, (first + jnp.arange(_CHUNK), stages))
 
-    run = eqx.filter_vmap(sequential_vmap_on_cpu(one), in_axes=(None, 0, 0, None))
-    return run(laplace, chains, keys, first)
+    run = eqx.filter_vmap(sequential_vmap_on_cpu(one), in_axes=(None, 0, 0, None, None))
+    return run(laplace, chains, keys, first, stages)
