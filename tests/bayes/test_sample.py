@@ -198,3 +198,58 @@ def test_hyperparameters_of_replicates_of_different_sizes_are_recovered():
         assert 0.005 < draws.std() < 0.015, name
     table = posterior.table()
     assert (table["r_hat"] < 1.05).all()
+
+
+def test_the_adaptation_is_that_of_blackjax():
+    import blackjax
+
+    from vertax.bayes import _sample
+
+    deviations = jnp.array([0.5, 1.0, 3.0])
+    density = lambda u: -0.5 * jnp.sum((u / deviations) ** 2)
+    key, first, steps = jax.random.key(0), jnp.ones(3), 100
+    (_, tuned), _ = blackjax.window_adaptation(blackjax.nuts, density, initial_step_size=0.5).run(
+        key, first, steps
+    )
+    kernel = blackjax.nuts.build_kernel()
+    adaptation = jax.tree.map(jnp.asarray, (_sample._STEP_SIZE[0](0.5), _sample._SCALES[0](3)))
+
+    def step(chain, now):
+        step_size = jnp.exp(chain.step_size.log_step_size)
+        scales = chain.scales.inverse_mass_matrix
+        state, info = kernel(now[0], chain.state, density, step_size, scales)
+        moved = _sample._Chain(state, chain.step_size, chain.scales)
+        return _sample._adapted(moved, now[1], info.acceptance_rate), None
+
+    start = _sample._Chain(blackjax.nuts.init(first, density), *adaptation)
+    stages = _sample._stages(steps, steps + 20)
+    assert (stages[steps:] == _sample._DRAW).all()
+    chain, _ = jax.lax.scan(step, start, (jax.random.split(key, steps), stages[:steps]))
+    np.testing.assert_allclose(
+        jnp.exp(chain.step_size.log_step_size_avg), tuned["step_size"], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        chain.scales.inverse_mass_matrix, tuned["inverse_mass_matrix"], rtol=1e-6
+    )
+    assert chain.scales.inverse_mass_matrix[2] > 4 * chain.scales.inverse_mass_matrix[1]
+    same = _sample._adapted(chain, stages[-1], jnp.asarray(0.1))
+    jax.tree.map(np.testing.assert_array_equal, same, chain)
+
+
+@pytest.mark.thorough  # it compiles the sampler again
+def test_the_sampler_compiles_once(linear):
+    programs = []
+
+    def listener(event: str, seconds: float, **data: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            programs.append(str(data.get("fun_name")))
+
+    jax.monitoring.register_event_duration_secs_listener(listener)
+
+    class Another(Limited):
+        """A new class, so that nothing is compiled."""
+
+    prior = {NAME: PRIOR[NAME].expand([N_CELLS])}
+    draw(bayes.LogPosterior(linear, prior, 1e-3, energy=Another(jnp.array(np.inf))), 40)
+    for function in ("_advance", "evaluate"):
+        assert sum(function in program for program in programs) == 1

@@ -28,6 +28,7 @@ from vertax._base.checkpoints import (
 )
 from vertax._base.checks import as_key, check_integer
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
+from vertax._base.tracing import tree_where
 from vertax.bayes._laplace import Laplace, evaluate
 from vertax.bayes._log_posterior import LogPosterior, Parameters, check_log_posterior
 from vertax.bayes._posterior import Posterior
@@ -163,10 +164,11 @@ def _first(laplace: Laplace, key: PRNGKeyArray) -> _Chain:
         if jnp.isfinite(point.log_density):
             break
     slope = laplace.factor.T @ (point.prior_slope + point.data_slope)
-    step_size, scales = _STEP_SIZE[0](0.5), _SCALES[0](u.size)
-    arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, u.dtype)), tree)
     state: Any = HMCState(u, point.log_density, slope)  # pyright: ignore[reportArgumentType]
-    return _Chain(state, arrays(step_size), arrays(scales))
+    adaptation = jax.tree.map(np.asarray, (_STEP_SIZE[0](0.5), _SCALES[0](u.size)))
+    # (In the types that `_advance` returns, so that it compiles once.)
+    strong = lambda x: jnp.asarray(x, u.dtype if x.dtype.kind == "f" else x.dtype)
+    return _Chain(state, *jax.tree.map(strong, adaptation))
 
 
 # Each a triple of functions: initial state, update, result.
@@ -177,15 +179,14 @@ _SCALES = mass_matrix_adaptation(True)
 def _adapted(chain: _Chain, stage: Int[Array, ""], acceptance: Float[Array, ""]) -> _Chain:
     """The chain with another step size and other scales, as the stage demands."""
     (restart, update, result), (_, observe, estimate) = _STEP_SIZE, _SCALES
-    select = lambda condition, new, old: jax.tree.map(
-        lambda x, y: jnp.where(condition, x, y).astype(jnp.asarray(y).dtype), new, old
-    )
+    # (`tree_where` needs arrays; the initial states of BlackJAX have Python numbers.)
+    pick = lambda condition, new, old: tree_where(condition, jax.tree.map(jnp.asarray, new), old)
     adapts, ends = stage != _DRAW, stage == _END_OF_WINDOW
-    step_size = select(adapts, update(chain.step_size, acceptance), chain.step_size)
     observes = ends | (stage == _SLOW)
-    scales = select(observes, observe(chain.scales, chain.state.position), chain.scales)
-    step_size = select(ends, restart(result(step_size)), step_size)
-    return _Chain(chain.state, step_size, select(ends, estimate(scales), scales))
+    step_size = pick(adapts, update(chain.step_size, acceptance), chain.step_size)
+    step_size = pick(ends, restart(result(step_size)), step_size)
+    scales = pick(observes, observe(chain.scales, chain.state.position), chain.scales)
+    return _Chain(chain.state, step_size, pick(ends, estimate(scales), scales))
 
 
 @announced_jit
