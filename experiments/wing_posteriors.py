@@ -55,9 +55,9 @@ class Config(runs.ExperimentConfig):
     """Folder with vertex files of the Bayesian force inference (`*.dat`)."""
     wings: int | None = Field(default=None, ge=1)
     """Number of wings; by default all."""
-    draws: int = Field(default=60, ge=20)
+    draws: int = Field(default=150, ge=20)
     """Draws of a chain of the forward model; 500 of the force balance."""
-    warmup: int = Field(default=40, ge=20)
+    warmup: int = Field(default=100, ge=20)
     """Steps of its adaptation; 500 of the force balance."""
     chains: int = Field(default=2, ge=2)
     """Chains of a posterior."""
@@ -132,9 +132,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     score = lambda a, b, x: (a[x] - b[x]) / np.hypot(a[f"{x}_deviation"], b[f"{x}_deviation"])
     pairs = list(zip(rows[::2], rows[1::2], strict=True))
     return {
-        f"difference of the posteriors over its standard deviation, {name}": {
-            a["data"]: float(score(a, b, name)) for a, b in pairs
-        }
+        f"{name}: difference / deviation": {a["data"]: float(score(a, b, name)) for a, b in pairs}
         for name in known
     }
 
@@ -272,5 +270,5 @@ def plot(rows: list[dict[str, Any]], truth: dict[str, float]) -> Any:
             ax.plot([truth[quantity]] * 2, [len(names) - n - 0.5, len(names) - 0.5], color=plotting.INK, lw=1)
         ax.set(xlabel=label, yticks=range(len(names)), yticklabels=[], ylim=(len(names) - 0.5, -0.5))
     axes[0].set_yticklabels(names)
-    axes[-1].legend()
+    axes[-1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure
