@@ -127,13 +127,13 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             part = folder.part(f"{name}, {likelihood}", lambda: sampler(config, members))  # noqa: B023
             rows.append({"data": name, "likelihood": likelihood} | summary(part))
     folder.save_table("posteriors", columns(rows))
-    known = {"contrast": float((1 - truth["targets"]) / truth["tension"]), "share": float(truth["share"])}
-    folder.save_figure("posteriors", plot(rows, known))
+    expected = {"contrast": float((1 - truth["targets"]) / truth["tension"]), "share": float(truth["share"])}
+    folder.save_figure("posteriors", plot(rows, expected))
     score = lambda a, b, x: (a[x] - b[x]) / np.hypot(a[f"{x}_deviation"], b[f"{x}_deviation"])
     pairs = list(zip(rows[::2], rows[1::2], strict=True))
     return {
         f"{name}: difference / deviation": {a["data"]: float(score(a, b, name)) for a, b in pairs}
-        for name in known
+        for name in expected
     }
 
 
@@ -259,9 +259,12 @@ def plot(rows: list[dict[str, Any]], truth: dict[str, float]) -> Any:
     names = list(dict.fromkeys(row["data"] for row in rows))
     for ax, (quantity, label) in zip(axes, SYMBOLS.items(), strict=True):
         for number, method in enumerate(dict.fromkeys(row["likelihood"] for row in rows)):
-            own = [row for row in rows if row["likelihood"] == method]
-            places = np.array([names.index(row["data"]) for row in own]) + 0.16 * (2 * number - 1)
-            means, errors = [row[quantity] for row in own], [row[f"{quantity}_deviation"] for row in own]
+            chosen = [row for row in rows if row["likelihood"] == method]
+            places = np.array([names.index(row["data"]) for row in chosen]) + 0.16 * (2 * number - 1)
+            means, errors = (
+                [row[quantity] for row in chosen],
+                [row[f"{quantity}_deviation"] for row in chosen],
+            )
             ax.errorbar(
                 means, places, xerr=errors, fmt="o", ms=3, color=plotting.SERIES[number], label=method
             )

@@ -50,8 +50,8 @@ def test_exact_forces_determine_contrast_and_share(wing):
     config = experiment.Config(experiment="wing_posteriors")
     tissue, model = wing
     errors = 1e-4 * jax.random.normal(jax.random.key(2), tissue.vertices.shape)
-    seen = experiment.Wing(tissue.with_vertices(tissue.vertices + errors), model)
-    row = experiment.summary(experiment.force_balance(config, [seen]))
+    noisy = experiment.Wing(tissue.with_vertices(tissue.vertices + errors), model)
+    row = experiment.summary(experiment.force_balance(config, [noisy]))
     for name, truth in (("contrast", 5.0), ("share", 0.5)):
         assert abs(row[name] - truth) < 4 * row[f"{name}_deviation"]
     assert row["share_deviation"] < 0.1
