@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -208,9 +209,8 @@ def test_the_adaptation_is_that_of_blackjax():
     deviations = jnp.array([0.5, 1.0, 3.0])
     density = lambda u: -0.5 * jnp.sum((u / deviations) ** 2)
     key, first, steps = jax.random.key(0), jnp.ones(3), 100
-    (_, tuned), _ = blackjax.window_adaptation(blackjax.nuts, density, initial_step_size=0.5).run(
-        key, first, steps
-    )
+    adapt: Any = blackjax.window_adaptation(blackjax.nuts, density, initial_step_size=0.5).run
+    (_, tuned), _ = adapt(key, first, steps)
     kernel = blackjax.nuts.build_kernel()
     adaptation = jax.tree.map(jnp.asarray, (_sample._STEP_SIZE[0](0.5), _sample._SCALES[0](3)))
 
@@ -240,7 +240,7 @@ def test_the_adaptation_is_that_of_blackjax():
 def test_the_sampler_compiles_once(linear):
     programs = []
 
-    def listener(event: str, seconds: float, **data: str | int) -> None:
+    def listener(event: str, duration_secs: float, **data: str | int) -> None:
         if event == "/jax/core/compile/backend_compile_duration":
             programs.append(str(data.get("fun_name")))
 

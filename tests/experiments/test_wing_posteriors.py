@@ -21,7 +21,7 @@ TRUTH = {name: jnp.asarray(value) for name, value in experiment.Parameters()}
 
 @pytest.fixture(scope="module")
 def wing():
-    """An equilibrium with the true parameters, whose target areas differ."""
+    """An equilibrium with the true parameters and different target areas."""
     first = experiment.pinned(vx.initialise.free_voronoi(40, key=0, lloyd_steps=2))
     areas = 1 + 0.3 * jax.random.normal(jax.random.key(1), first.model.areas.shape)
     unlike = experiment.Wing(first.tissue, experiment.Model(areas, first.model.perimeter))
