@@ -18,6 +18,11 @@ def columns(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
+def fitted_noise(parameters: Any) -> Any:
+    """The noise of a posterior is one of its parameters."""
+    return parameters["noise"]
+
+
 FLUID = 3.81
 """Target shape factor at which disordered tissues become fluid (Bi et al. 2015, doi:10.1038/nphys3471)."""
 HEXAGON = float(np.sqrt(8 * np.sqrt(3)))

@@ -17,6 +17,7 @@ from pydantic import Field
 from scipy import stats
 
 import vertax as vx
+from experiments._shared import fitted_noise
 from vertax import bayes, plotting, runs
 from vertax.energies import ShapeFactorEnergy
 
@@ -80,11 +81,6 @@ def uniformity(ranks: np.ndarray, config: Config) -> float:
     edges = np.linspace(0, config.draws + 1, config.bins + 1)
     cells = np.reshape(ranks, (len(ranks), -1)).T
     return min(1.0, len(cells) * min(stats.chisquare(np.histogram(r, edges)[0]).pvalue for r in cells))
-
-
-def fitted_noise(parameters: Any) -> Any:
-    """The noise is a parameter."""
-    return parameters[NOISE]
 
 
 def density(config: Config, kind: Literal["vertices", "image"], n: int, seed: int) -> tuple[Any, Any]:
@@ -166,10 +162,7 @@ def random_walk(laplace: bayes.Laplace, key: jax.Array, steps: int) -> jax.Array
 
     walks: Any = blackjax.additive_step_random_walk
 
-    def log_density(u: jax.Array) -> jax.Array:
-        z = laplace.mode + laplace.factor @ u
-        return laplace.log_posterior.log_prior(z)[0] + laplace.log_posterior.log_likelihood(z)[0]
-
+    log_density = lambda u: laplace.log_posterior.log_density(laplace.mode + laplace.factor @ u)
     size = len(laplace.mode)
     walk = walks.normal_random_walk(log_density, jnp.full(size, 2.38 / size**0.5))
     step = lambda state, key: (walk.step(key, state)[0],) * 2

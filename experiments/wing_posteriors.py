@@ -26,10 +26,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 import vertax as vx
-from experiments._shared import columns
+from experiments._shared import columns, fitted_noise
 from vertax import bayes, plotting, runs
 from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity
 
@@ -63,15 +63,8 @@ class Config(runs.ExperimentConfig):
     """Chains of a posterior."""
     synthetic: Parameters = Parameters()
     """Parameters of the synthetic wings."""
-    synthetic_noise: list[float] = Field(default=[0.003, 0.03], min_length=1)
+    synthetic_noise: list[PositiveFloat] = Field(default=[0.003, 0.03], min_length=1)
     """Noise of their vertices, in cell sizes."""
-
-
-class Wing(NamedTuple):
-    """A wing in units of the size of a cell."""
-
-    tissue: vx.Tissue
-    model: "Model"
 
 
 class Model(eqx.Module):
@@ -84,6 +77,13 @@ class Model(eqx.Module):
         """The energy, with the leading axis of the batch."""
         build = eqx.filter_vmap(energy, in_axes=(0, 0, None)) if self.areas.ndim == 2 else energy
         return build(self.areas, self.perimeter, parameters)
+
+
+class Wing(NamedTuple):
+    """A wing in units of the size of a cell."""
+
+    tissue: vx.Tissue
+    model: Model
 
 
 def energy(areas: Array, perimeter: Array, parameters: Any) -> vx.AbstractEnergy:
@@ -143,8 +143,10 @@ def pinned(tissue: vx.Tissue) -> Wing:
     outer = np.zeros(n + 1, bool)  # the exterior is the last one
     outer[np.asarray(topology.edge_cells)[np.asarray(topology.on_outline)]] = True
     held = np.zeros(tissue.n_vertices, bool)
-    held[np.asarray(topology.source)[outer[np.minimum(np.asarray(topology.cell), n)]]] = True
+    held[np.asarray(topology.source)[outer[np.asarray(topology.cell)]]] = True
     inner = ~outer[:n]
+    if not inner.any():
+        raise ValueError(f"A wing must have cells inside, but all of its {n} cells are at the outline.")
     size = np.sqrt(np.mean(np.asarray(tissue.areas)[inner]))
     scaled = vx.Tissue(np.asarray(tissue.vertices) / size, topology, vx.Free(), pinned=held)
     areas = jnp.where(inner, scaled.areas, 1.0)
@@ -185,11 +187,6 @@ def forward(config: Config, wings: Sequence[Wing]) -> dict[str, np.ndarray]:
     options: Any = {"draws": config.draws, "warmup": config.warmup, "chains": config.chains}
     posterior = bayes.sample(density, config.seed, progress=False, **options)
     return {name: posterior.draws(name) for name in density.prior}
-
-
-def fitted_noise(parameters: Any) -> Any:
-    """The noise is a parameter."""
-    return parameters["noise"]
 
 
 def force_balance(config: Config, wings: Sequence[Wing]) -> dict[str, np.ndarray]:

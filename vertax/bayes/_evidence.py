@@ -86,8 +86,7 @@ def _step(
 
     def log_weight(u: Array) -> Array:
         z = laplace.mode + laplace.factor @ u
-        density = posterior.log_prior(z)[0] + posterior.log_likelihood(z)[0]
-        return jnp.maximum(density - log_reference(u), _LEAST_LOG_WEIGHT)
+        return jnp.maximum(posterior.log_density(z) - log_reference(u), _LEAST_LOG_WEIGHT)
 
     kernel = adaptive_tempered.build_kernel(
         log_reference, log_weight, hmc.build_kernel(), hmc.init, resampling.systematic, 0.5

@@ -201,6 +201,10 @@ class LogPosterior(eqx.Module):
         terms, outcome = self.likelihood(self.log_prior(z)[1])
         return jnp.where(outcome.converged, jnp.sum(terms), -jnp.inf), outcome
 
+    def log_density(self, z: Float[Array, " coordinates"]) -> Float[Array, ""]:
+        """Log density of real coordinates, up to a constant."""
+        return self.log_prior(z)[0] + self.log_likelihood(z)[0]
+
     def parameters_at(self, z: Float[Array, " coordinates"]) -> dict[str, Array]:
         """The parameters with real coordinates z."""
         return self.log_prior(z)[1]

@@ -110,7 +110,8 @@ def sample(
 
     file = CheckpointFile(checkpoint, identity, "run of a sampler")
     laplace = Laplace(log_posterior, start)
-    n_warmup, n_chunks = -(-warmup // _CHUNK), -(-warmup // _CHUNK) - (-draws // _CHUNK)
+    n_warmup = -(-warmup // _CHUNK)
+    n_chunks = n_warmup + -(-draws // _CHUNK)
     stages = _stages(n_warmup * _CHUNK, n_chunks * _CHUNK).reshape(n_chunks, _CHUNK)
     keys, start_keys = jax.random.split(key, (2, chains))
     done = file.load(
@@ -207,12 +208,7 @@ def _advance(
         stages: Int[Array, " steps"],
     ) -> tuple[_Chain, dict[str, Array]]:
         kernel = blackjax.nuts.build_kernel()
-
-        def density(u: Array) -> Array:
-            z = laplace.mode + laplace.factor @ u
-            return (
-                laplace.log_posterior.log_prior(z)[0] + laplace.log_posterior.log_likelihood(z)[0]
-            )
+        density = lambda u: laplace.log_posterior.log_density(laplace.mode + laplace.factor @ u)
 
         # The key depends on the number of the step: runs with and without a checkpoint are equal.
         def step(chain: _Chain, now: tuple[Array, Array]) -> tuple[_Chain, dict[str, Any]]:
