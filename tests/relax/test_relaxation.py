@@ -75,6 +75,20 @@ def test_every_solver_works_in_float32(solver, force, disturbed):
     assert equilibrium.max_force < 5e-3
     assert equilibrium.energy == pytest.approx(float(energy(reference)), rel=1e-3)
 
+@pytest.mark.thorough
+def test_float32_tissue_relaxes_where_float64_is_enabled():
+    to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
+    tissue = jax.tree.map(to32, random_tissue(20, 0))
+    energy = ShapeFactorEnergy(jnp.full(20, 3.7, jnp.float32))
+    near = vx.equilibrate(tissue, energy)
+    assert near.converged
+    assert near.tissue.vertices.dtype == near.energy.dtype == jnp.float32
+    # Rounded to 1e-4, coordinates allow no smaller force than the default tolerance far from the origin.
+    far = vx.equilibrate(tissue.with_vertices(tissue.vertices + 1000), energy)
+    assert far.converged
+    assert 10 * near.max_force < far.max_force
+    assert far.energy == pytest.approx(float(near.energy), rel=1e-2)
+
 
 @eqx.filter_jit
 def relaxed_one_by_one(tissues, targets):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from vertax.mechanics._elasticity import shear_part, young_part
 from vertax.mesh import Tissue
 
 # With the components xx, yy and √2 xy, the sum of squares is that of all four components.
-_SHEAR = np.sqrt(2.0)
+_SHEAR = math.sqrt(2.0)
 
 
 class Stress(AbstractLeastSquaresCost):

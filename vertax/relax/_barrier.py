@@ -12,13 +12,13 @@ Automatic differentiation through the same expressions compiles to several times
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vertax._base.sums import total
@@ -42,7 +42,7 @@ def profile(x: Float[Array, "*shape"]) -> Profile:
     inside = x < 1
     x = jnp.where(inside, x, 1)
     gap, inverse = 1 - x, 1 / (x + FLOOR)
-    log = np.log1p(FLOOR) - jnp.log(x + FLOOR)
+    log = math.log1p(FLOOR) - jnp.log(x + FLOOR)
     first = -2 * gap * log - gap**2 * inverse
     second = 2 * log + 4 * gap * inverse + (gap * inverse) ** 2
     zero = lambda f: jnp.where(inside, f, 0)

@@ -69,7 +69,8 @@ class Search(eqx.Module):
     - `feasibility`: what an accepted point must be.
     - `length`: the size of a cell.
     - `stiffness`: see `Units`; None if the minimiser measures it in the first trip.
-    - `tolerance`: largest force at rest; None for 1e-10 of the unit of force (1e-5 in float32).
+    - `tolerance`: largest force at rest; None for `precision` in the unit of force.
+    - `precision`: see there.
     - `consecutive_steps`: steps in a row after which the force must be below the tolerance.
     - `contact_range`: of contacts; None to let cells overlap.
     - `max_contacts`: most contacts; None for a default by the size of the tissue.
@@ -81,6 +82,7 @@ class Search(eqx.Module):
     length: Float[Array, ""]
     stiffness: Float[Array, ""] | None
     tolerance: Float[Array, ""] | None
+    precision: Float[Array, ""]
     consecutive_steps: int | Int[Array, ""]
     contact_range: float | Float[Array, ""] | None
     max_contacts: int | None = eqx.field(static=True)
@@ -121,8 +123,7 @@ class Search(eqx.Module):
             measured = {"probe": probe_of(state.tissue)}
         tolerance = self.tolerance
         if tolerance is None:
-            precise = stiffness.dtype == jnp.float64
-            tolerance = (1e-10 if precise else 1e-5) * stiffness * self.length
+            tolerance = self.precision * stiffness * self.length
         tolerance = jnp.asarray(tolerance, stiffness.dtype)
         sizes = {"length_scale": self.length, "stiffness": stiffness, "tolerance": tolerance}
         return sizes | measured
