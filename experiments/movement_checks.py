@@ -180,7 +180,7 @@ def measure_gradients(config: Config, solid: Any, energy: Any) -> dict[str, np.n
     targets = jnp.asarray(energy.target_shape_factor)
 
     @eqx.filter_jit
-    def cost(x: Any, adjoint: Any = None) -> Any:
+    def cost(x: Any, adjoint: Any = vx.ImplicitDifferentiation()) -> Any:
         friction, changed = SubstrateFriction(config.friction * (1 + x)), targets + x * draws[1]
         options: Any = {"relaxation": EXACT, "adjoint": adjoint, "throw": False}
         movie = vx.evolve(start, ShapeFactorEnergy(changed), friction, [0.0, 0.1, 0.4], **options)

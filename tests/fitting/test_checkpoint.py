@@ -84,12 +84,12 @@ MARKS |= dict.fromkeys(("least squares", "position"), pytest.mark.thorough)
 def test_resumed_fit_matches_uninterrupted_fit(case, path):
     uninterrupted = run(case, callback=interrupt_at(None))
     stopped = run(case, callback=interrupt_at(3), checkpoint=path)
-    assert stopped.result == vx.RESULTS.interrupted
+    assert np.all(stopped.result == vx.RESULTS.interrupted)
     assert len(stopped.history.cost) == 3
     epochs_run = []
     callback = lambda epoch, record: epochs_run.append(epoch) or {"cost": record.cost}
     resumed = run(case, callback=callback, checkpoint=path)
-    assert resumed.result == vx.RESULTS.successful
+    assert np.all(resumed.result == vx.RESULTS.successful)
     assert epochs_run == list(range(3, len(uninterrupted.history.cost)))
     assert bits(resumed) == bits(uninterrupted)
     np.testing.assert_array_equal(resumed.notes["cost"], uninterrupted.history.cost)

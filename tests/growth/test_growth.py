@@ -30,7 +30,7 @@ def founders(capacity=9):
 # Contacts and transitions make compilation several times longer.
 RELAXATIONS = [
     pytest.param(FIXED_TOPOLOGY, id="still"),
-    pytest.param(None, id="default", marks=pytest.mark.slow),
+    pytest.param(vx.Relaxation(), id="default", marks=pytest.mark.slow),
 ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Integer
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -28,7 +28,7 @@ _RADIUS = 3.0
 
 @house_style()
 def plot_tensions(
-    inferred: InferredTensions, mask: Int[np.ndarray | Array, "rows columns"], **options: Any
+    inferred: InferredTensions, mask: Integer[np.ndarray | Array, "rows columns"], **options: Any
 ) -> Figure:
     r"""Draw the mask with its arcs, and a map of tensions and pressures, grey where not determined.
 
