@@ -66,3 +66,26 @@ def test_unknown_choices_are_refused(image):
         micrograph_problem(image, border="open")
     with pytest.raises(ValueError, match="`rest_areas` must be one of"):
         micrograph_problem(image, rest_areas="none")
+
+
+def test_a_cell_of_two_sides_on_a_pinned_outline_is_left_out(image):
+    class Sliver(vx.initialise.Watershed):
+        def __call__(self, image):
+            labels = super().__call__(image)
+            rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+            labels = np.where(np.isin(labels, rim), 0, labels)
+            # A bump outside of a cell, on the lowest row of all cells.
+            bottom = int(np.flatnonzero((labels > 0).any(axis=1)).max())
+            middle = int(np.median(np.flatnonzero(labels[bottom] > 0)))
+            labels[bottom + 1 : bottom + 5, middle - 4 : middle + 5] = labels.max() + 1
+            return labels
+
+    segmented = np.asarray(Sliver()(image))
+    sliver = segmented.max()
+    free = vx.initialise.from_labels(segmented, boundary="free", holes="close")
+    assert sliver in free.labels
+    read = micrograph_problem(
+        image, segmenter=Sliver(), border="pinned", pixels=96, response=NO_CONTACT
+    )
+    assert set(read.segmentation.labels) == set(free.labels) - {sliver}
+    assert not read.problem.tissue.overlaps.any

@@ -75,6 +75,7 @@ def test_every_solver_works_in_float32(solver, force, disturbed):
     assert equilibrium.max_force < 5e-3
     assert equilibrium.energy == pytest.approx(float(energy(reference)), rel=1e-3)
 
+
 @pytest.mark.thorough
 def test_float32_tissue_relaxes_where_float64_is_enabled():
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x

@@ -51,7 +51,7 @@ class PurseString(vx.AbstractLocalEnergy):
 @pytest.mark.slow
 def test_a_purse_string_closes_a_wound():
     n = 25
-    tissue = random_tissue(n, 4, lloyd_steps=20).with_capacity(n)
+    tissue = random_tissue(n, 1, lloyd_steps=20).with_capacity(n)
     energy = vx.energies.ShapeFactorEnergy(3.8, 1.4)  # target area above the mean area
     rest = vx.equilibrate(tissue, energy).tissue
     m = rest.topology

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.checks import check_number
 from vertax._base.pixels import pixel_length
@@ -188,7 +188,8 @@ def micrograph_problem(
     - `segmenter`: how cells are found, [`Watershed`][vertax.initialise.Watershed]`()` by default.
     - `target_shape_factor`: first guess for every cell.
     - `border`: what holds the tissue at the border of the image: it is `"mirrored"`, cells that the border
-        cuts included (as in the paper); or the outline of the cells that lie whole in it is `"pinned"`.
+        cuts included (as in the paper); or the outline of the cells that lie whole in it is `"pinned"`. Cells
+        on this outline that overlap without their arcs (those with two sides) are left out.
     - `rest_areas`: of the cells: `"fitted"` too, beginning with those of the segmented cells; as those are
         `"observed"`; or `"equal"` to the mean area in all cells but those that the border cuts, which
         determines shape factors best where it is true. A pinned border goes with equal ones in any case.
@@ -289,16 +290,14 @@ def _pinned(
     rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     check_zero("segmenter(image)", labels, None)
     labels = np.maximum(np.where(np.isin(labels, rim), 0, labels), 0)
-    segmentation = from_labels(labels, boundary="free", pixel_size=pixel_size, holes="close")
+    segmentation, labels = _with_straight_edges(labels, pixel_size)
     cluster = segmentation.tissue
     on_outline = np.asarray(cluster.topology.on_outline)
     outline = np.asarray(cluster.topology.edge_cells)[on_outline]
     inner = ~np.isin(np.arange(cluster.n_cells), outline)
     ends = np.asarray(cluster.topology.edge_vertices)[on_outline]
     pinned = np.isin(np.arange(cluster.n_vertices), ends)
-    tissue = Tissue(
-        cluster.vertices, cluster.topology, cluster.boundary, cluster.softening, pinned=pinned
-    )
+    tissue = eqx.tree_at(lambda t: t.pinned, cluster, pinned, is_leaf=lambda x: x is None)
     side = pixel_length(segmentation.pixel_size)
     even = prepare(side)
     pixel = side * segmentation.image_shape[1] / even.shape[1]
@@ -316,3 +315,32 @@ def _pinned(
         lambda s: s.tissue, segmentation, tissue, is_leaf=lambda x: isinstance(x, Tissue)
     )
     return _Read(segmentation, guess, eqx.is_inexact_array, inner, even, options)
+
+
+def _with_straight_edges(
+    labels: Int[np.ndarray, "rows columns"], pixel_size: float | None
+) -> tuple[Segmentation, Int[np.ndarray, "rows columns"]]:
+    """The free tissue of a mask with straight edges, and the labels of its cells.
+
+    Cells on the outline that overlap without their arcs are left out, until there are none.
+    """
+    while True:
+        segmentation = from_labels(labels, boundary="free", pixel_size=pixel_size, holes="close")
+        curved = segmentation.tissue
+        m = curved.topology
+        tissue = Tissue(curved.vertices, m, curved.boundary, curved.softening)
+        overlaps = tissue.overlaps
+        if not overlaps.any:
+            is_tissue = lambda x: isinstance(x, Tissue)
+            straight = eqx.tree_at(lambda s: s.tissue, segmentation, tissue, is_leaf=is_tissue)
+            return straight, labels
+        cell = np.asarray(m.cell)
+        crossed = cell[np.asarray(m.twin)[np.asarray(overlaps.sides) & (cell == m.n_cells)]]
+        bad = np.union1d(np.flatnonzero(overlaps.cells), crossed)
+        left_out = np.isin(labels, segmentation.labels[bad]) & (labels > 0)
+        if not left_out.any():
+            raise ValueError(
+                f"Cells of the image overlap if their edges are straight: {overlaps.describe()}. Use "
+                "border='mirrored', or another segmenter."
+            )
+        labels = np.where(left_out, 0, labels)
