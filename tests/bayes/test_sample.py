@@ -194,7 +194,7 @@ def test_hyperparameters_of_replicates_of_different_sizes_are_recovered():
     assert not posterior.data["sample_stats"]["diverging"].values.any()
     for name, true in (("mean", mean), ("spread", spread)):
         draws = posterior.draws(name).ravel()
-        assert abs(draws.mean() - true) < 2 * draws.std(), name
+        assert abs(draws.mean() - true) < 3 * draws.std(), name
         # 34 cells: standard errors 0.05 / sqrt(34) and 0.05 / sqrt(68), and more by noise.
         assert 0.005 < draws.std() < 0.015, name
     table = posterior.table()
