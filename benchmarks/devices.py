@@ -145,7 +145,7 @@ PARTS = {f.__name__: f for f in (relaxation, gradient, batch, image, evolution)}
 
 def main() -> None:
     """Print a row for each part and size."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--precision", choices=["float64", "float32"], default="float64")
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--cells", type=count, nargs="+", default=[100, 1000])

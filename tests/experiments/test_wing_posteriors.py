@@ -11,7 +11,7 @@ from run_helpers import run
 import vertax as vx
 
 pytest.importorskip("blackjax")
-from experiments import wing_posteriors as experiment
+from experiments import _wings, wing_posteriors as experiment
 
 pytestmark = pytest.mark.experiments
 
@@ -22,10 +22,10 @@ TRUTH = {name: jnp.asarray(value) for name, value in experiment.Parameters()}
 @pytest.fixture(scope="module")
 def wing():
     """An equilibrium with the true parameters and different target areas."""
-    first = experiment.pinned(vx.initialise.free_voronoi(40, key=0, lloyd_steps=2))
+    first = _wings.pinned(vx.initialise.free_voronoi(40, key=0, lloyd_steps=2))
     areas = 1 + 0.3 * jax.random.normal(jax.random.key(1), first.model.areas.shape)
-    unlike = experiment.Wing(first.tissue, experiment.Model(areas, first.model.perimeter))
-    return experiment.synthetic(unlike, TRUTH, noise=0.0, seed=0)
+    unlike = _wings.Wing(first.tissue, _wings.Model(areas, first.model.perimeter))
+    return _wings.synthetic(unlike, TRUTH, noise=0.0, seed=0)
 
 
 def test_the_outer_cells_do_not_act_on_free_vertices(wing):
@@ -35,7 +35,7 @@ def test_the_outer_cells_do_not_act_on_free_vertices(wing):
         np.asarray(tissue.topology.edge_cells)[np.asarray(tissue.topology.on_outline)]
     )
     outer = outer[outer < tissue.n_cells]
-    other = experiment.Model(model.areas.at[outer].set(5.0), model.perimeter)
+    other = _wings.Model(model.areas.at[outer].set(5.0), model.perimeter)
     forces = [
         jax.grad(lambda x, m=m: m(TRUTH)(tissue.with_vertices(x)))(tissue.vertices)
         for m in (model, other)
@@ -50,7 +50,7 @@ def test_exact_forces_determine_contrast_and_share(wing):
     config = experiment.Config(experiment="wing_posteriors")
     tissue, model = wing
     errors = 1e-4 * jax.random.normal(jax.random.key(2), tissue.vertices.shape)
-    noisy = experiment.Wing(tissue.with_vertices(tissue.vertices + errors), model)
+    noisy = _wings.Wing(tissue.with_vertices(tissue.vertices + errors), model)
     row = experiment.summary(experiment.force_balance(config, [noisy]))
     for name, truth in (("contrast", 5.0), ("share", 0.5)):
         assert abs(row[name] - truth) < 4 * row[f"{name}_deviation"]
