@@ -69,8 +69,8 @@ class Search(eqx.Module):
     - `feasibility`: what an accepted point must be.
     - `length`: the size of a cell.
     - `stiffness`: see `Units`; None if the minimiser measures it in the first trip.
-    - `tolerance`: largest force at rest; None for `precision` in the unit of force.
-    - `precision`: see there.
+    - `tolerance`: largest force at rest; None for `precision`.
+    - `precision`: the default tolerance, in the unit of force.
     - `consecutive_steps`: steps in a row after which the force must be below the tolerance.
     - `contact_range`: of contacts; None to let cells overlap.
     - `max_contacts`: most contacts; None for a default by the size of the tissue.
