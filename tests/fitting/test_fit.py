@@ -418,6 +418,20 @@ def test_fit_without_equilibrium_raises(hidden):
         vx.fit(problem, ADAM, 2, truth=truth, progress=False)
 
 
+@pytest.mark.thorough
+def test_fit_from_a_tissue_with_overlaps_names_them(hidden):
+    target, _, guess, start = hidden
+    # Pinned, so that no relaxation removes the overlaps.
+    mirrored = start.vertices * jnp.array([1.0, -1.0])
+    inside_out = vx.Tissue(
+        mirrored, start.topology, start.boundary, pinned=np.arange(start.n_vertices) > 0
+    )
+    response = vx.Relaxation(transitions=None, contact_range=0.0)
+    problem = inverse_problem(inside_out, guess, VertexDistance(target), response=response)
+    with pytest.raises(vx.FitError, match="tissue of the problem has overlaps: cell 1,"):
+        vx.fit(problem, ADAM, 2, progress=False)
+
+
 def test_invalid_problems_are_rejected(hidden):
     target, _, guess, start = hidden
     cost = VertexDistance(target)

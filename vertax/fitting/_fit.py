@@ -146,10 +146,12 @@ def fit(
     best = done.state.best
     history = History(**columns_of(done.rows))
     if not np.isfinite(best.facts.cost).any():
+        overlaps = "" if batched else given.tissue.overlaps.describe()
         raise FitError(
             "No epoch of the fit reached equilibrium: raise `max_steps`, loosen `tolerance`, or use the "
             f"default solver (largest force: {history.max_force.min():.1e}). Stopped because "
-            f"{stopped or 'all epochs were done'}.",
+            f"{stopped or 'all epochs were done'}."
+            + (f" The tissue of the problem has overlaps: {overlaps}." if overlaps else ""),
             None,
         )
     fit_result = Fit(
