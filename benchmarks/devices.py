@@ -15,7 +15,6 @@ measures the CPU of the same machine.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -23,10 +22,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from _arguments import count
+from _problems import kicked_problem
+from _timing import first_and_best
 
 import vertax as vx
-
-REPEATS = 3
 
 
 def row(
@@ -34,21 +33,14 @@ def row(
     n_cells: int,
     function: Callable[..., Any],
     *args: Any,
-    note: Callable[[Any], str] = lambda result: "",
+    note: Callable[[Any], str] | None = None,
 ) -> None:
-    """Measure a function and print a row, with a note on its result."""
-
-    def timed() -> tuple[Any, float]:
-        began = time.perf_counter()
-        result = function(*args)
-        jax.block_until_ready(eqx.filter(result, eqx.is_array))
-        return result, time.perf_counter() - began
-
-    result, first = timed()
-    best = min(timed()[1] for _ in range(REPEATS))
+    """Measure a function and print a row, with a note on its result (which takes one more call)."""
+    first, best = first_and_best(function, *args, repeats=3)
     precision = jnp.result_type(float).name
+    said = "" if note is None else note(function(*args))
     times = f"{first - best:10.1f} {best:12.5f}"
-    print(f"{part:>12} {n_cells:8d} {precision:>8} {times}  {note(result)}", flush=True)
+    print(f"{part:>12} {n_cells:8d} {precision:>8} {times}  {said}", flush=True)
 
 
 def random_tissue(n_cells: int, seed: int = 0) -> tuple[vx.Tissue, vx.AbstractEnergy]:
@@ -80,14 +72,7 @@ def gradient(sizes: list[int]) -> None:
     """Gradients at an equilibrium."""
     for n_cells in sizes:
         tissue, energy = random_tissue(n_cells)
-        rest = relaxed(tissue, energy).tissue
-        kicks = 0.01 * jax.random.normal(jax.random.key(2), rest.vertices.shape)
-        problem = vx.InverseProblem(
-            tissue=rest,
-            energy=energy,
-            cost=vx.costs.VertexDistance(rest.with_vertices(rest.vertices + kicks)),
-            adjoint=vx.ImplicitDifferentiation(throw=False),
-        )
+        problem = kicked_problem(relaxed(tissue, energy).tissue, energy)
         evaluate = eqx.filter_jit(lambda problem: problem.value_and_gradient(throw=False))
         note = lambda value: f"{int(value.outcome.num_steps)} iterations of MINRES"
         row("gradient", n_cells, evaluate, problem, note=note)
@@ -131,13 +116,13 @@ def evolution(sizes: list[int], n_steps: int = 20) -> None:
     for n_cells in [n for n in sizes if n <= 100_000]:
         tissue, energy = random_tissue(n_cells)
 
-        def area(energy, tissue=tissue):
+        def cost(energy, tissue=tissue):
             friction = vx.dissipations.SubstrateFriction(1.0)
             movie = vx.evolve(tissue, energy, friction, times, throw=False)
-            return jnp.sum(movie.tissue.perimeters[-1] ** 2)
+            return jnp.sum(movie.tissue.perimeters**2)
 
-        row("evolution", n_cells, eqx.filter_jit(area), energy, note=lambda _: f"{n_steps} steps")
-        row("and gradient", n_cells, eqx.filter_jit(eqx.filter_grad(area)), energy)
+        row("evolution", n_cells, eqx.filter_jit(cost), energy, note=lambda _: f"{n_steps} steps")
+        row("and gradient", n_cells, eqx.filter_jit(eqx.filter_grad(cost)), energy)
 
 
 PARTS = {f.__name__: f for f in (relaxation, gradient, batch, image, evolution)}

@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from _arguments import count
+from _problems import kicked_problem
 from _timing import first_and_best
 
 import vertax as vx
@@ -67,14 +68,7 @@ def row(n_cells: int, kind: str, fewest: int, tissues: int, repeats: int) -> str
     steps, t1s, products, seconds = np.array(rows).T
 
     (_, energy), first = tissue_and_energy(0), relaxed[0]
-    kicks = 0.01 * jax.random.normal(jax.random.key(2), first.vertices.shape)
-    problem = vx.InverseProblem(
-        tissue=first,
-        energy=energy,
-        cost=vx.costs.VertexDistance(first.with_vertices(first.vertices + kicks)),
-        response=vx.Relaxation(tolerance=TOLERANCE),
-        adjoint=vx.ImplicitDifferentiation(throw=False),
-    )
+    problem = kicked_problem(first, energy, response=vx.Relaxation(tolerance=TOLERANCE))
     gradient = eqx.filter_jit(lambda problem: problem.value_and_gradient(throw=False))
     _, gradient_seconds = first_and_best(gradient, problem, repeats=repeats)
     linear = gradient(problem).outcome.num_steps

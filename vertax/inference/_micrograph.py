@@ -290,8 +290,7 @@ def _pinned(
     rim = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     check_zero("segmenter(image)", labels, None)
     labels = np.maximum(np.where(np.isin(labels, rim), 0, labels), 0)
-    segmentation, labels = _with_straight_edges(labels, pixel_size)
-    cluster = segmentation.tissue
+    segmentation, cluster, labels = _with_straight_edges(labels, pixel_size)
     on_outline = np.asarray(cluster.topology.on_outline)
     outline = np.asarray(cluster.topology.edge_cells)[on_outline]
     inner = ~np.isin(np.arange(cluster.n_cells), outline)
@@ -319,8 +318,8 @@ def _pinned(
 
 def _with_straight_edges(
     labels: Int[np.ndarray, "rows columns"], pixel_size: float | None
-) -> tuple[Segmentation, Int[np.ndarray, "rows columns"]]:
-    """The free tissue of a mask with straight edges, and the labels of its cells.
+) -> tuple[Segmentation, Tissue, Int[np.ndarray, "rows columns"]]:
+    """The cells of a mask, their free tissue with straight edges, and the labels that are left.
 
     Cells on the outline that overlap without their arcs are left out, until there are none.
     """
@@ -331,9 +330,7 @@ def _with_straight_edges(
         tissue = Tissue(curved.vertices, m, curved.boundary, curved.softening)
         overlaps = tissue.overlaps
         if not overlaps.any:
-            is_tissue = lambda x: isinstance(x, Tissue)
-            straight = eqx.tree_at(lambda s: s.tissue, segmentation, tissue, is_leaf=is_tissue)
-            return straight, labels
+            return segmentation, tissue, labels
         cell = np.asarray(m.cell)
         crossed = cell[np.asarray(m.twin)[np.asarray(overlaps.sides) & (cell == m.n_cells)]]
         bad = np.union1d(np.flatnonzero(overlaps.cells), crossed)
