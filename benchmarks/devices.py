@@ -38,9 +38,9 @@ def row(
     """Measure a function and print a row, with a note on its result (which takes one more call)."""
     first, best = first_and_best(function, *args, repeats=3)
     precision = jnp.result_type(float).name
-    said = "" if note is None else note(function(*args))
+    comment = "" if note is None else note(function(*args))
     times = f"{first - best:10.1f} {best:12.5f}"
-    print(f"{part:>12} {n_cells:8d} {precision:>8} {times}  {said}", flush=True)
+    print(f"{part:>12} {n_cells:8d} {precision:>8} {times}  {comment}", flush=True)
 
 
 def random_tissue(n_cells: int, seed: int = 0) -> tuple[vx.Tissue, vx.AbstractEnergy]:
