@@ -137,7 +137,7 @@ def test_a_step_across_a_barrier_is_shortened(times):
     edge = tissue.edge_vectors[NUMBER]
     # A little beyond its middle, both from one end and from the other.
     goal = tissue.with_vertices(tissue.vertices.at[ends].add(0.6 * jnp.stack([edge, -edge])))
-    arrived = search.feasibility(start, goal, energy, true, true)
+    arrived = search.feasibility(start, goal, energy, active=true, guarded=true, first=~true)
     assert not arrived.overlapping.any()
     other = jnp.ones(tissue.n_vertices, bool).at[ends].set(False)
     assert (arrived.fraction[other] == 1).all()

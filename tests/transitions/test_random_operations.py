@@ -45,7 +45,7 @@ def swept(tissue, rule):
     search = vx.Relaxation(transitions=rule, tolerance=1e-30).search(tissue, ENERGY)
     state, true = search.begin(tissue, ENERGY), jnp.array(True)
     start = search.feasibility.start(tissue, state.contacts, state.counts)
-    return search.feasibility(start, tissue, ENERGY, true, true).tissue
+    return search.feasibility(start, tissue, ENERGY, active=true, guarded=true, first=~true).tissue
 
 
 @eqx.filter_jit

@@ -39,7 +39,8 @@ class Feasibility(eqx.Module):
     2. If cells overlap, shorten the step of their vertices, and their new edges, by `shortening`. Try again.
     3. After `max_shortenings` attempts freeze these vertices; then a neighbourhood that grows with each
         attempt; all other vertices take the full step. At the last attempt all vertices are frozen.
-    4. If cells overlap even then, reject the step.
+    4. If cells overlap even then, reject the step. Before the first step they overlap in the initial tissue:
+       accept it, without transitions.
 
     **Arguments:**
 
@@ -59,8 +60,10 @@ class Feasibility(eqx.Module):
         before: Feasible,
         trial: Tissue,
         energy: AbstractEnergy,
+        *,
         active: Bool[Array, ""],
         guarded: Bool[Array, ""],
+        first: Bool[Array, ""],
     ) -> Feasible:
         """The feasible tissue next to a trial point.
 
@@ -71,6 +74,7 @@ class Feasibility(eqx.Module):
         - `energy`: which transitions are to lower.
         - `active`: whether to do anything; otherwise the result is the trial point.
         - `guarded`: whether to avoid overlaps.
+        - `first`: whether the trial point is the initial tissue.
         """
         if self.transitions is None and before.contacts is None:
             return eqx.tree_at(lambda f: f.tissue, before, trial)
@@ -90,7 +94,7 @@ class Feasibility(eqx.Module):
             lambda f: f.fraction, eqx.filter(before, eqx.is_array), jnp.zeros_like(end.fraction)
         )
         # (A selection would be a kernel for each array.)
-        rejected = guarded & any_of(end.overlapping)
+        rejected = guarded & any_of(end.overlapping) & ~first
         return eqx.combine(jax.lax.cond(rejected, lambda: stays, lambda: end), static)
 
     def start(self, tissue: Tissue, contacts: Contacts | None, counts: Array) -> Feasible:

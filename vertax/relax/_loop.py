@@ -163,10 +163,11 @@ class Search(eqx.Module):
             state.iteration,
         )
         progress, trial = iteration.progress(minimiser), before.with_configuration(y)
-        # (An overlap of the initial tissue is not the fault of a step.)
-        arrives, guarded = progress.moved | ~state.started, state.started & ~state.overlaps
+        arrives = progress.moved | ~state.started
         start = self.feasibility.start(before, state.contacts, state.counts)
-        feasible = self.feasibility(start, trial, energy, arrives, guarded)
+        feasible = self.feasibility(
+            start, trial, energy, active=arrives, guarded=~state.overlaps, first=~state.started
+        )
         tissue, contacts = feasible.tissue, feasible.contacts
         flipped = any_of(feasible.counts != state.counts)
         changed = flipped | _moved(trial, tissue)
