@@ -54,6 +54,29 @@ def test_a_random_cluster_stays_valid(seed, inner_arcs):
     assert faces_that_overlap(equilibrium.tissue, 200) == []
 
 
+def test_transitions_of_the_initial_tissue_make_no_overlaps():
+    """The first flips happen before the first step. (One of edge 42 would make cells overlap.)"""
+    tissue, energy, flips = tissue_of(9), shapes(np.full(N, 3.7)), 0
+    directions = jax.random.normal(jax.random.key(1009), tissue.vertices.shape)
+    displaced = lambda by: tissue.with_vertices(tissue.vertices + by * directions)
+    valid, invalid = 0.0, 1.0
+    for _ in range(30):
+        middle = (valid + invalid) / 2
+        valid, invalid = (valid, middle) if displaced(middle).overlaps.any else (middle, invalid)
+    crowded = displaced(valid)
+    for (start, end), vector in zip(
+        np.asarray(crowded.topology.edge_vertices), np.asarray(crowded.edge_vectors), strict=True
+    ):
+        # Shorter than the threshold of T1.
+        shift = 0.5 * (1 - 0.005 / np.hypot(*vector)) * vector
+        short = crowded.with_vertices(crowded.vertices.at[start].add(shift).at[end].add(-shift))
+        if not short.overlaps.any:
+            stepped = vx.Relaxation(max_steps=1)(short, energy, throw=False)
+            assert not stepped.tissue.overlaps.any
+            flips += int(stepped.num_t1)
+    assert flips > 5
+
+
 @pytest.mark.parametrize(
     "solver",
     [
