@@ -12,6 +12,8 @@ import nbformat
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
+from vertax._base.fast_compilation import OPTIONS, has_options
+
 FOLDER = Path(__file__).resolve().parent
 
 
@@ -63,6 +65,9 @@ def main() -> None:
         parser.error("the outputs that are kept are those of the full setting")
     if options.light:
         os.environ["VERTAX_LIGHT"] = "1"
+        if has_options():  # Compilation takes most of the time.
+            flags = (f"--{name}={str(value).lower()}" for name, value in OPTIONS.items())
+            os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
     else:
         os.environ.pop("VERTAX_LIGHT", None)
 
