@@ -40,7 +40,7 @@ class Feasibility(eqx.Module):
     3. After `max_shortenings` attempts freeze these vertices; then a neighbourhood that grows with each
         attempt; all other vertices take the full step. At the last attempt all vertices are frozen.
     4. If cells overlap even then, reject the step. Before the first step they overlap in the initial tissue:
-       accept it, without transitions.
+       accept it, without flips.
 
     **Arguments:**
 
