@@ -1,6 +1,7 @@
 """Cells never overlap on the way to equilibrium, and rest against each other smoothly."""
 
 import functools
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -54,9 +55,9 @@ def test_a_random_cluster_stays_valid(seed, inner_arcs):
     assert faces_that_overlap(equilibrium.tissue, 200) == []
 
 
-def test_transitions_of_the_initial_tissue_make_no_overlaps():
-    """The first flips happen before the first step. (One of edge 42 would make cells overlap.)"""
-    tissue, energy, flips = tissue_of(9), shapes(np.full(N, 3.7)), 0
+def crowded_tissues() -> Iterator[vx.Tissue]:
+    """A tissue that nearly overlaps, in each copy with another short edge. (A flip of edge 42 overlaps.)"""
+    tissue = tissue_of(9)
     directions = jax.random.normal(jax.random.key(1009), tissue.vertices.shape)
     displaced = lambda by: tissue.with_vertices(tissue.vertices + by * directions)
     valid, invalid = 0.0, 1.0
@@ -71,10 +72,36 @@ def test_transitions_of_the_initial_tissue_make_no_overlaps():
         shift = 0.5 * (1 - 0.005 / np.hypot(*vector)) * vector
         short = crowded.with_vertices(crowded.vertices.at[start].add(shift).at[end].add(-shift))
         if not short.overlaps.any:
-            stepped = vx.Relaxation(max_steps=1)(short, energy, throw=False)
-            assert not stepped.tissue.overlaps.any
-            flips += int(stepped.num_t1)
+            yield short
+
+
+def test_transitions_of_the_initial_tissue_make_no_overlaps():
+    """The first flips happen before the first step."""
+    energy, flips = shapes(np.full(N, 3.7)), 0
+    for tissue in crowded_tissues():
+        stepped = vx.Relaxation(max_steps=1)(tissue, energy, throw=False)
+        assert not stepped.tissue.overlaps.any
+        flips += int(stepped.num_t1)
     assert flips > 5
+
+
+def test_flips_that_overlap_do_not_shorten_the_step():
+    """Only the new edge is shortened, or the edge does not flip: the trial point itself is valid."""
+    energy, relaxation, before = shapes(np.full(N, 3.7)), vx.Relaxation(), tissue_of(9)
+
+    @eqx.filter_jit
+    def feasible(tissue):
+        search = relaxation.search(tissue, energy)
+        state = search.begin(tissue, energy)
+        start = search.feasibility.start(before, state.contacts, state.counts)
+        yes, no = jnp.array(True), jnp.array(False)
+        return search.feasibility(start, tissue, energy, active=yes, guarded=yes, first=no)
+
+    ends = [feasible(tissue) for tissue in crowded_tissues()]
+    for end in ends:
+        np.testing.assert_array_equal(end.fraction, 1)
+        assert not end.tissue.overlaps.any
+    assert max(int(end.num_attempts) for end in ends) > 1
 
 
 @pytest.mark.parametrize(

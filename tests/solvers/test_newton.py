@@ -102,12 +102,17 @@ def test_radii_do_not_grow_where_steps_were_shortened():
     fraction = jnp.where(jnp.arange(N) < 3, 0.0, 1.0)
     false, true = jnp.array(False), jnp.array(True)
     cut = solver.moved(after, fraction, false, true, {})
-    assert (cut.radii[:3] <= 0.25 * after.radii[:3]).all()
+    # (Not only a quarter of the radius, which may be much longer than the step.)
+    taken = jnp.minimum(after.radii, _rows.sizes(after.proposal.step))
+    assert (cut.radii[:3] <= 0.25 * taken[:3]).all()
     np.testing.assert_array_equal(cut.radii[3:], after.radii[3:])
     # If short steps do not help either, they start again with the largest radius.
-    for _ in range(8):
+    radii = []
+    for _ in range(12):
         cut = solver.moved(cut, fraction, false, true, {})
-    assert (cut.radii[:3] > 1e-3 * 0.2).all()
+        radii.append(float(cut.radii[0]))
+    assert min(radii) < 1e-4
+    assert 0.2 in radii
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

@@ -36,9 +36,11 @@ class Feasibility(eqx.Module):
     """Makes a trial point feasible.
 
     1. Apply T1 transitions at the trial point, and compute the contacts.
-    2. If cells overlap, shorten the step of their vertices, and their new edges, by `shortening`. Try again.
-    3. After `max_shortenings` attempts freeze these vertices; then a neighbourhood that grows with each
-        attempt; all other vertices take the full step. At the last attempt all vertices are frozen.
+    2. If cells overlap that a transition has changed, shorten its new edge by `shortening`; if other cells
+        overlap, shorten the step of their vertices. Try again.
+    3. After `max_shortenings` attempts these edges do not flip, and these vertices are frozen; then a
+        neighbourhood that grows with each attempt; all other vertices take the full step. At the last attempt
+        all vertices are frozen.
     4. If cells overlap even then, reject the step. Before the first step they overlap in the initial tissue:
        accept it, without flips.
 
@@ -116,23 +118,24 @@ class Feasibility(eqx.Module):
         """One attempt, with shorter steps where the last one made cells overlap."""
         shortens = last.num_attempts < self.max_shortenings
         factor = jnp.where(shortens, self.shortening, 0)
-        fraction = jnp.where(last.overlapping, factor, 1) * last.fraction
+        crowded = _flipped(before, last) & _at_ends(last.tissue, last.overlapping)
+        length_fraction = jnp.where(crowded, factor, 1) * last.length_fraction
+        # (A shorter step would only undo the flip, and end where the energy is higher.)
+        too_far = last.overlapping & ~dilated(last.tissue, _ends(last.tissue, crowded))
+        fraction = jnp.where(too_far, factor, 1) * last.fraction
         frozen = dilated(before.tissue, last.overlapping | (fraction == 0))
         frozen &= last.num_attempts > self.max_shortenings
         frozen |= last.num_attempts == self.max_attempts - 1
         fraction = jnp.where(frozen, 0, fraction)
         point = interpolated(before.tissue, trial, fraction)
         tissue, counts = point, before.counts
-        length_fraction = jnp.where(_at_ends(tissue, frozen), 0, last.length_fraction)
+        length_fraction = jnp.where(_at_ends(tissue, frozen), 0, length_fraction)
         if self.transitions is not None:
             tissue, counts = self.transitions.sweep(point, energy, counts, length_fraction)
         contacts, overlapping = before.contacts, last.overlapping
         if contacts is not None:
             unflipped = counts == before.counts
             contacts, overlapping = contacts.updated(point, tissue, unflipped, shortens)
-            flips = ~functools.reduce(jnp.logical_and, list(unflipped.reshape(-1, tissue.n_edges)))
-            crowded = flips & _at_ends(tissue, overlapping)
-            length_fraction = jnp.where(crowded, self.shortening, 1) * length_fraction
         return Feasible(
             tissue,
             contacts,
@@ -164,6 +167,18 @@ def dilated(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, "
     if m.n_faces > m.n_cells:
         corners &= m.cell < m.n_cells
     return vertices | corners[::3] | corners[1::3] | corners[2::3]
+
+
+def _flipped(before: Feasible, after: Feasible) -> Bool[Array, " edges"]:
+    """Which edges have taken part in a transition."""
+    differ = (before.counts != after.counts).reshape(-1, before.tissue.n_edges)
+    return functools.reduce(jnp.logical_or, list(differ))
+
+
+def _ends(tissue: Tissue, edges: Bool[Array, " edges"]) -> Bool[Array, " vertices"]:
+    """The ends of some edges."""
+    start, end = tissue.topology.edge_vertices.T
+    return jnp.zeros(tissue.n_vertices, bool).at[jnp.stack([start, end])].max(edges)
 
 
 def _at_ends(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, " edges"]:

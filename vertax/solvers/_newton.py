@@ -320,7 +320,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     ) -> NewtonState:
         reach = self.max_displacement * options.get("length_scale", 1.0)
         rows = table_of(fraction)[:, 0]
-        radii = self.trust_region.cut(state.radii, rows, reach)
+        radii = self.trust_region.cut(state.radii, state.proposal.step, rows, reach)
         return eqx.tree_at(lambda s: s.radii, state, jnp.where(changed, radii, state.radii))
 
     def stiffness(self, state: NewtonState) -> Float[Array, ""]:

@@ -37,7 +37,7 @@ class VertexTrustRegion(eqx.Module):
     few: float = 0.1
     min_radius: float = 1e-10
     collapsed: float = 1e-9
-    shortest: float = 1e-3
+    shortest: float = 1e-5
     """A radius that steps cut short have made shorter than this, in units of the largest one, begins anew."""
 
     def error(
@@ -94,11 +94,12 @@ class VertexTrustRegion(eqx.Module):
     def cut(
         self,
         radii: Float[Array, " rows"],
+        step: Table,
         fraction: Float[Array, " rows"],
         largest: Float[Array, ""] | float,
     ) -> Float[Array, " rows"]:
-        """The radii after a step of which rows could take only a fraction."""
-        quarter = self.shrink * radii
+        """The radii after a step of which rows could take only a fraction: as after a rejected one."""
+        quarter = self.shrink * jnp.minimum(sizes(step), radii)
         quarter = jnp.where(quarter < self.shortest * largest, largest, quarter)
         return self.restarted(jnp.where(fraction < 1, quarter, radii), largest)
 
