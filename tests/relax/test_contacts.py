@@ -86,7 +86,7 @@ def test_transitions_of_the_initial_tissue_make_no_overlaps():
 
 
 def test_flips_that_overlap_do_not_shorten_the_step():
-    """Only the new edge is shortened, or the edge does not flip: the trial point itself is valid."""
+    """The edge does not flip: the trial point itself is valid."""
     energy, relaxation, before = shapes(np.full(N, 3.7)), vx.Relaxation(), tissue_of(9)
 
     @eqx.filter_jit
@@ -128,7 +128,7 @@ class _Spoiler(vx.transitions.AbstractTransitions):
     def init(self, tissue):
         return jnp.zeros(tissue.n_edges, jnp.int32)
 
-    def sweep(self, tissue, energy, counts, length_fraction=1.0):
+    def sweep(self, tissue, energy, counts, allowed=True):
         moved = (tissue.vertices != self.start).any(axis=1)
         far = jnp.where((self.where & moved).any(), 2.0, 0.0)
         return tissue.with_vertices(tissue.vertices.at[self.vertex].add(far)), counts

@@ -26,8 +26,8 @@ class Feasible(eqx.Module):
     """How often each edge took part in a transition."""
     fraction: Float[Array, " vertices"]
     """Which fraction of the step each vertex has taken."""
-    length_fraction: Float[Array, " edges"]
-    """The length of new edges, in units of the usual one."""
+    allowed: Bool[Array, " edges"]
+    """Which edges may flip."""
     overlapping: Bool[Array, " vertices"]
     num_attempts: Int[Array, ""]
 
@@ -36,11 +36,10 @@ class Feasibility(eqx.Module):
     """Makes a trial point feasible.
 
     1. Apply T1 transitions at the trial point, and compute the contacts.
-    2. If cells overlap that a transition has changed, shorten its new edge by `shortening`; if other cells
-        overlap, shorten the step of their vertices. Try again.
-    3. After `max_shortenings` attempts these edges do not flip, and these vertices are frozen; then a
-        neighbourhood that grows with each attempt; all other vertices take the full step. At the last attempt
-        all vertices are frozen.
+    2. If cells overlap near edges that have flipped, these edges do not flip. Try again.
+    3. If cells overlap elsewhere, shorten the step of their vertices by `shortening`. Try again. After
+       `max_shortenings` times freeze these vertices; then a neighbourhood that grows with each attempt; all
+       other vertices take the full step. At the last attempt all vertices are frozen.
     4. If cells overlap even then, reject the step. Before the first step they overlap in the initial tissue:
        accept it, without flips.
 
@@ -48,7 +47,7 @@ class Feasibility(eqx.Module):
 
     - `transitions`: the rule for topology changes, or None.
     - `max_attempts`: most attempts; then the step is rejected.
-    - `max_shortenings`: attempts after which vertices of overlapping cells are frozen.
+    - `max_shortenings`: after how often vertices of overlapping cells are frozen.
     - `shortening`: factor of a step that made cells overlap.
     """
 
@@ -107,7 +106,7 @@ class Feasibility(eqx.Module):
             contacts,
             counts,
             fraction=jnp.ones(tissue.n_vertices, dtype),
-            length_fraction=jnp.ones(tissue.n_edges, dtype),
+            allowed=jnp.ones(tissue.n_edges, bool),
             overlapping=jnp.zeros(tissue.n_vertices, bool),
             num_attempts=jnp.array(0),
         )
@@ -115,36 +114,43 @@ class Feasibility(eqx.Module):
     def _attempt(
         self, before: Feasible, trial: Tissue, energy: AbstractEnergy, last: Feasible
     ) -> Feasible:
-        """One attempt, with shorter steps where the last one made cells overlap."""
-        shortens = last.num_attempts < self.max_shortenings
-        factor = jnp.where(shortens, self.shortening, 0)
-        crowded = _flipped(before, last) & _at_ends(last.tissue, last.overlapping)
-        length_fraction = jnp.where(crowded, factor, 1) * last.length_fraction
-        # (A shorter step would only undo the flip, and end where the energy is higher.)
-        too_far = last.overlapping & ~dilated(last.tissue, _ends(last.tissue, crowded))
-        fraction = jnp.where(too_far, factor, 1) * last.fraction
-        frozen = dilated(before.tissue, last.overlapping | (fraction == 0))
-        frozen &= last.num_attempts > self.max_shortenings
-        frozen |= last.num_attempts == self.max_attempts - 1
-        fraction = jnp.where(frozen, 0, fraction)
+        """One attempt, without the flips or with shorter steps where the last one made cells overlap."""
+        fraction, allowed = self._shortened(before.tissue, last, _flipped(before, last))
         point = interpolated(before.tissue, trial, fraction)
         tissue, counts = point, before.counts
-        length_fraction = jnp.where(_at_ends(tissue, frozen), 0, length_fraction)
         if self.transitions is not None:
-            tissue, counts = self.transitions.sweep(point, energy, counts, length_fraction)
+            tissue, counts = self.transitions.sweep(point, energy, counts, allowed)
         contacts, overlapping = before.contacts, last.overlapping
         if contacts is not None:
-            unflipped = counts == before.counts
-            contacts, overlapping = contacts.updated(point, tissue, unflipped, shortens)
+            unflipped, holds = counts == before.counts, last.num_attempts < self.max_shortenings
+            contacts, overlapping = contacts.updated(point, tissue, unflipped, holds)
         return Feasible(
             tissue,
             contacts,
             counts,
             fraction,
-            length_fraction,
+            allowed,
             overlapping,
             last.num_attempts + 1,
         )
+
+    def _shortened(
+        self, before: Tissue, last: Feasible, flipped: Bool[Array, " edges"]
+    ) -> tuple[Float[Array, " vertices"], Bool[Array, " edges"]]:
+        """The fractions of the next attempt, and which edges may flip in it."""
+        if last.contacts is None:
+            return last.fraction, last.allowed
+        near = dilated(last.tissue, last.overlapping)
+        crowded = flipped & _at_ends(last.tissue, near) & last.allowed
+        # (A shorter step would also prevent the flip, but it ends where the energy is higher.)
+        too_far = last.overlapping & ~any_of(crowded)
+        shorter = self.shortening * last.fraction
+        shorter = jnp.where(shorter > 2 * self.shortening**self.max_shortenings, shorter, 0)
+        fraction = jnp.where(too_far, shorter, last.fraction)
+        frozen = dilated(before, last.overlapping | (fraction == 0))
+        frozen &= any_of(too_far & (last.fraction == 0))
+        frozen |= last.num_attempts == self.max_attempts - 1
+        return jnp.where(frozen, 0, fraction), last.allowed & ~crowded & ~_at_ends(before, frozen)
 
 
 def interpolated(one: Tissue, other: Tissue, fraction: Float[Array, " vertices"]) -> Tissue:
@@ -173,12 +179,6 @@ def _flipped(before: Feasible, after: Feasible) -> Bool[Array, " edges"]:
     """Which edges have taken part in a transition."""
     differ = (before.counts != after.counts).reshape(-1, before.tissue.n_edges)
     return functools.reduce(jnp.logical_or, list(differ))
-
-
-def _ends(tissue: Tissue, edges: Bool[Array, " edges"]) -> Bool[Array, " vertices"]:
-    """The ends of some edges."""
-    start, end = tissue.topology.edge_vertices.T
-    return jnp.zeros(tissue.n_vertices, bool).at[jnp.stack([start, end])].max(edges)
 
 
 def _at_ends(tissue: Tissue, vertices: Bool[Array, " vertices"]) -> Bool[Array, " edges"]:

@@ -40,8 +40,7 @@ class T1(AbstractTransitions):
     energy when it grows from a quarter of its length. Otherwise an edge with a tension too high for either
     configuration, where four cells meet in one point, would flip back and forth.
 
-    If a flipped edge makes cells overlap, a relaxation makes it shorter (`length_fraction` of
-    [`sweep`][vertax.AbstractTransitions]); if they still overlap, the edge does not flip. An inverted edge
+    If a flipped edge makes cells overlap, it does not flip in this step of the relaxation. An inverted edge
     below the threshold that does not flip is turned by half a turn.
 
     Lengths are those of arcs where edges are arcs; an edge that flips becomes straight, or an arc of
@@ -83,11 +82,10 @@ class T1(AbstractTransitions):
         tissue: Tissue,
         energy: AbstractEnergy,
         counts: Int[Array, " edges"],
-        length_fraction: Float[Array, " edges"] | float = 1.0,
+        allowed: Bool[Array, " edges"] | bool = True,
     ) -> tuple[Tissue, Int[Array, " edges"]]:
         """Try every candidate once; returns the new tissue and the updated counts."""
         threshold = self.threshold * cell_size(tissue)
-        length_fraction = jnp.broadcast_to(length_fraction, tissue.n_edges)
 
         # Each round tries candidates that share no cell; the others wait for the next round. A round removes
         # at least one edge from `todo`, so the loop ends.
@@ -99,11 +97,11 @@ class T1(AbstractTransitions):
             frames = EdgeFrames(tissue)
             short = frames.length < threshold
             may_flip = todo & frames.can_flip & (short | frames.inside_out)
-            may_flip &= (counts < self.max_flips) & (length_fraction > 0)
+            may_flip &= (counts < self.max_flips) & allowed
             may_turn = todo & frames.inside_out & short & frames.free
             candidates = may_flip | may_turn
             chosen = _independent(candidates, frames, tissue.n_cells)
-            size = length_fraction * jnp.maximum(frames.length, threshold)
+            size = jnp.maximum(frames.length, threshold)
             costs = jnp.zeros((_N_TRIALS, tissue.n_edges), size.dtype)
             local = isinstance(energy, AbstractLocalEnergy)
             n_trials = _N_TRIALS if local else _N_TRIALS * jnp.sum(chosen)

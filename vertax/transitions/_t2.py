@@ -58,11 +58,11 @@ class T2(AbstractTransitions):
         tissue: Tissue,
         energy: AbstractEnergy,
         counts: Int[Array, " edges"],
-        length_fraction: Float[Array, " edges"] | float = 1.0,
+        allowed: Bool[Array, " edges"] | bool = True,
     ) -> tuple[Tissue, Int[Array, " edges"]]:
         """Remove every small cell that can vanish; return the new tissue and the updated counts.
 
-        `length_fraction` has no effect, because no edge is created.
+        `allowed` has no effect, because a cell stays anyway if cells would overlap.
         """
         limit = self.threshold * mean_area(tissue)
 

@@ -6,7 +6,7 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -28,7 +28,7 @@ class AbstractTransitions(eqx.Module):
         tissue: Tissue,
         energy: AbstractEnergy,
         counts: Int[Array, "*rules edges"],
-        length_fraction: Float[Array, " edges"] | float = 1.0,
+        allowed: Bool[Array, " edges"] | bool = True,
     ) -> tuple[Tissue, Int[Array, "*rules edges"]]:
         """Try every candidate once.
 
@@ -37,8 +37,7 @@ class AbstractTransitions(eqx.Module):
         - `tissue`: the tissue.
         - `energy`: its energy, by which candidates are accepted or rejected.
         - `counts`: number of transitions of each edge.
-        - `length_fraction`: length of a new edge, as a fraction of its default length; an edge with
-            fraction 0 does not flip. A relaxation reduces it for new edges that cause overlaps.
+        - `allowed`: which edges may flip. A relaxation excludes those that would cause overlaps.
 
         **Returns:** the new tissue and the updated counts.
         """
@@ -64,12 +63,12 @@ class InTurn(AbstractTransitions):
         tissue: Tissue,
         energy: AbstractEnergy,
         counts: Int[Array, "rules edges"],
-        length_fraction: Float[Array, " edges"] | float = 1.0,
+        allowed: Bool[Array, " edges"] | bool = True,
     ) -> tuple[Tissue, Int[Array, "rules edges"]]:
         """Make one sweep of each rule; return the new tissue and the updated counts."""
         updated = []
         for rule, old in zip(self.rules, counts, strict=True):
-            tissue, new = rule.sweep(tissue, energy, old, length_fraction)
+            tissue, new = rule.sweep(tissue, energy, old, allowed)
             updated.append(new)
         return tissue, jnp.stack(updated)
 
