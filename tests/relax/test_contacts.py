@@ -94,8 +94,8 @@ def test_flips_that_overlap_do_not_shorten_the_step():
         search = relaxation.search(tissue, energy)
         state = search.begin(tissue, energy)
         start = search.feasibility.start(before, state.contacts, state.counts)
-        yes, no = jnp.array(True), jnp.array(False)
-        return search.feasibility(start, tissue, energy, active=yes, guarded=yes, first=no)
+        true, false = jnp.array(True), jnp.array(False)
+        return search.feasibility(start, tissue, energy, active=true, guarded=true, first=false)
 
     ends = [feasible(tissue) for tissue in crowded_tissues()]
     for end in ends:
