@@ -115,7 +115,7 @@ class Feasibility(eqx.Module):
         self, before: Feasible, trial: Tissue, energy: AbstractEnergy, last: Feasible
     ) -> Feasible:
         """One attempt, without the flips or with shorter steps where the last one made cells overlap."""
-        fraction, allowed = self._shortened(before.tissue, last, _flipped(before, last))
+        fraction, allowed = self._reduced(before, last)
         point = interpolated(before.tissue, trial, fraction)
         tissue, counts = point, before.counts
         if self.transitions is not None:
@@ -134,23 +134,24 @@ class Feasibility(eqx.Module):
             last.num_attempts + 1,
         )
 
-    def _shortened(
-        self, before: Tissue, last: Feasible, flipped: Bool[Array, " edges"]
+    def _reduced(
+        self, before: Feasible, last: Feasible
     ) -> tuple[Float[Array, " vertices"], Bool[Array, " edges"]]:
         """The fractions of the next attempt, and which edges may flip in it."""
         if last.contacts is None:
             return last.fraction, last.allowed
         near = dilated(last.tissue, last.overlapping)
-        crowded = flipped & _at_ends(last.tissue, near) & last.allowed
+        crowded = _flipped(before, last) & _at_ends(last.tissue, near) & last.allowed
         # (A shorter step would also prevent the flip, but it ends where the energy is higher.)
         too_far = last.overlapping & ~any_of(crowded)
         shorter = self.shortening * last.fraction
         shorter = jnp.where(shorter > 2 * self.shortening**self.max_shortenings, shorter, 0)
         fraction = jnp.where(too_far, shorter, last.fraction)
-        frozen = dilated(before, last.overlapping | (fraction == 0))
+        frozen = dilated(before.tissue, last.overlapping | (fraction == 0))
         frozen &= any_of(too_far & (last.fraction == 0))
         frozen |= last.num_attempts == self.max_attempts - 1
-        return jnp.where(frozen, 0, fraction), last.allowed & ~crowded & ~_at_ends(before, frozen)
+        allowed = last.allowed & ~crowded & ~_at_ends(before.tissue, frozen)
+        return jnp.where(frozen, 0, fraction), allowed
 
 
 def interpolated(one: Tissue, other: Tissue, fraction: Float[Array, " vertices"]) -> Tissue:
