@@ -288,11 +288,14 @@ def test_hypergradients_of_a_tissue_in_contact(adjoint, rtol):
 
 @pytest.mark.thorough
 def test_contacts_beyond_the_room_are_reported_and_repeated_with_more_room(in_contact_case):
-    tissue, energy = in_contact_case
+    random, energy = in_contact_case
     narrow = vx.Relaxation(contact_range=0.05, max_contacts=1)
-    wide = vx.Relaxation(contact_range=0.05)(tissue, energy)
+    wide = vx.Relaxation(contact_range=0.05)
+    # (From a random tissue, rounding errors decide which equilibrium is reached.)
+    tissue = wide(random, jax.tree.map(lambda x: 1.001 * x, energy)).tissue
     repeated = narrow(tissue, energy)
-    np.testing.assert_allclose(repeated.tissue.vertices, wide.tissue.vertices, atol=1e-8)
+    expected = wide(tissue, energy).tissue.vertices
+    np.testing.assert_allclose(repeated.tissue.vertices, expected, atol=1e-8)
     inside = eqx.filter_jit(lambda: narrow(tissue, energy, throw=False))()
     assert inside.result == vx.RESULTS.too_many_contacts
     assert not inside.converged
