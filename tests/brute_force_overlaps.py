@@ -35,13 +35,16 @@ def faces_that_overlap(tissue: vx.Tissue, points: int = 48) -> list[int]:
 
 
 def side_points(p: np.ndarray, q: np.ndarray, angle: float, points: int) -> np.ndarray:
-    """Points on an arc from p (included) to q (excluded) that bulges to the right of its chord."""
+    """Points on an arc from p (included) to q (excluded) that bulges to the right of its chord.
+
+    They are closer at the ends: two arcs that touch at a common end may cross next to it.
+    """
     if abs(angle) < 1e-9:
         return p[None]
     chord = q - p
     right = np.array([chord[1], -chord[0]])
     centre = 0.5 * (p + q) - right * 0.5 / np.tan(angle)
-    turn = np.linspace(0, 2 * angle, points, endpoint=False)
+    turn = angle * (1 - np.cos(np.linspace(0, np.pi, points, endpoint=False)))
     x, y = (p - centre).T
     return centre + np.stack(
         [x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], axis=-1
