@@ -247,6 +247,7 @@ def test_tensions_have_the_right_variance_for_short_steps_in_float32():
     assert np.std(after) == pytest.approx(np.sqrt(2 * 2e-8), rel=0.1)
 
 
+@pytest.mark.thorough
 def test_custom_activity_can_be_added():
     class Wind(vx.AbstractActivity):
         force: float

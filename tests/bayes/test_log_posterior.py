@@ -29,6 +29,7 @@ def problem():
     return noisy_problem(0.01)[0]
 
 
+@pytest.mark.thorough
 def test_gradient_matches_finite_differences(problem):
     density = with_fitted_noise(problem)
     z = density.coordinates_of({"target_shape_factor": jnp.full(N_CELLS, MEAN), "noise": 0.012})

@@ -100,6 +100,7 @@ def test_adjoints_give_the_same_chain(linear, adjoint):
     np.testing.assert_allclose(first.draws(NAME), other.draws(NAME), atol=1e-3 * deviation)
 
 
+@pytest.mark.thorough
 def test_interrupted_run_continues_bit_for_bit(linear, tmp_path):
     density = density_of(linear)
     complete = draw(density, 40)
@@ -203,6 +204,7 @@ def test_hyperparameters_of_replicates_of_different_sizes_are_recovered():
     assert (table["r_hat"] < 1.05).all()
 
 
+@pytest.mark.thorough
 def test_the_adaptation_is_that_of_blackjax():
     import blackjax
 

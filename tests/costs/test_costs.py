@@ -102,6 +102,7 @@ def test_pixels_of_weight_zero_are_ignored():
     assert MeshImage(image, 0.12)(tissue, energy) > 0.1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("fit_intensity", [True, False])
 def test_image_cost_derivatives_match_finite_differences(fit_intensity):
     target, _ = relaxed(12, 1)

@@ -123,6 +123,7 @@ class TestWithoutActivity:
         with pytest.raises(RuntimeError, match="broke down: its forces are not finite"):
             broken.checked()
 
+    @pytest.mark.thorough
     def test_frames_transitions_and_flips_are_consistent(self):
         tissue = random_tissue(9, 4)
         energy = ShapeFactorEnergy(jnp.linspace(3.2, 3.6, 9))
@@ -257,6 +258,7 @@ def test_stress_after_a_step_strain_of_the_hexagonal_lattice():
     np.testing.assert_allclose(stresses[2], 2 * 3**0.5 * unit, rtol=1e-3)
 
 
+@pytest.mark.thorough
 def test_pinned_vertices_follow_pins():
     tissue = vx.initialise.periodic_voronoi(9, key=4)
     mask = jnp.arange(18) < 2

@@ -36,6 +36,7 @@ def step(before, tissue):
     )
 
 
+@pytest.mark.thorough
 def test_flips_dissipate_nothing_and_translations_do():
     tissue = random_tissue(12, 3)
     for number in (4, 11):

@@ -127,6 +127,7 @@ def test_times_equal_up_to_rounding_continue(tmp_path):
 
 
 class TestErrors:
+    @pytest.mark.thorough
     def test_failed_step_leaves_the_earlier_frames(self, tmp_path):
         file = tmp_path / "run.npz"
         short_relaxation = vx.Relaxation(transitions=None, contact_range=None, max_steps=1)

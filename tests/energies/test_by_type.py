@@ -70,6 +70,7 @@ def test_energy_is_invariant_under_exchange_of_the_types():
     assert swapped(free) == pytest.approx(float(energy(free)))
 
 
+@pytest.mark.thorough
 def test_tension_follows_the_cells_of_an_edge_through_a_t1_transition():
     energy = AreaElasticity(1.0, 1.0) + by_type(100 * TABLE, TYPES)
     end = vx.equilibrate(tissue, energy, throw=False)

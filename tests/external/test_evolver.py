@@ -212,6 +212,7 @@ def test_endless_transitions_raise(monkeypatch):
         SurfaceEvolver(t1=10.0).relax(tissue, energies(PERIODIC)["foam"], None)
 
 
+@pytest.mark.thorough
 def test_program_is_killed_after_the_timeout(fake_program):
     # It starts a child process, which must be killed too.
     child = "import subprocess; subprocess.Popen(['sleep', '60']); print('working', flush=True)"
@@ -354,6 +355,7 @@ def test_flips_equal_those_of_vertax(tissue):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.thorough
 @needs_evolver
 def test_t1_transitions_of_the_program_lower_the_energy():
     tissue = vx.initialise.periodic_voronoi(9, key=jax.random.key(2))

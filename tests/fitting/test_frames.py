@@ -66,6 +66,7 @@ def test_cost_is_the_sum_over_frames_and_can_be_added_to_others():
     np.testing.assert_allclose(0.5 * jnp.sum(mixed.residuals(frames, truth) ** 2), expected)
 
 
+@pytest.mark.thorough
 def test_gradient_matches_finite_differences():
     _, _, problem = movie_problem()
     gradient = eqx.filter_jit(lambda p: p.value_and_gradient(throw=False).gradient)(problem)

@@ -59,6 +59,7 @@ def test_deviation_matches_the_scatter_of_repeated_fits(hidden):
     np.testing.assert_allclose(np.diag(estimate.covariance) ** 0.5, p0_of(estimate.deviation))
 
 
+@pytest.mark.thorough
 def test_covariance_matches_its_formula(hidden):
     tissue, truth = hidden
     target = tissue.with_vertices(

@@ -64,7 +64,8 @@ def test_t1_transition_is_recognised():
     assert sorted(map(sorted, new)) == sorted(map(sorted, gained))
 
 
-@pytest.mark.parametrize("keeps_number", [pytest.param(True, marks=pytest.mark.thorough), False])
+@pytest.mark.thorough
+@pytest.mark.parametrize("keeps_number", [True, False])
 def test_division_is_recognised(keeps_number):
     mother, start = INNER[0], STRAIGHT.with_capacity(21)
     divided = vx.transitions.divide(start, mother).tissue.without_spare()

@@ -13,6 +13,8 @@ from vertax.energies import AreaElasticity, by_type
 from vertax.inference import Movie, fit_movie, movie_from_table
 from vertax.inference._tracking_noise import tracking_noise
 
+pytestmark = pytest.mark.thorough
+
 TYPES = np.arange(16) % 2
 TABLE = jnp.array([[0.6, 0.3], [0.3, 0.5]])
 TRUTH = AreaElasticity(1.0, 1.0) + by_type(TABLE, TYPES)
@@ -70,7 +72,6 @@ def test_frames_that_are_far_apart_are_named(evolved):
     assert np.all(error > 0.3 * change)
 
 
-@pytest.mark.thorough
 def test_friction_is_fitted_with_a_known_stiffness(movie):
     fit = fit_movie(movie, GUESS, friction=1.5, fit_friction=True)
     assert float(fit.friction) == pytest.approx(FRICTION, rel=1e-4)
@@ -79,7 +80,6 @@ def test_friction_is_fitted_with_a_known_stiffness(movie):
 
 # (The frames are exact steps of the implicit Euler method.)
 @pytest.mark.filterwarnings("ignore:Frames are too far apart")
-@pytest.mark.thorough
 def test_parameters_scale_with_the_friction(movie):
     energy = AreaElasticity(jnp.array(0.8), 1.0) + by_type(0.2 * jnp.ones((2, 2)), TYPES)
     fit = fit_movie(movie, energy, friction=3 * FRICTION)
@@ -87,7 +87,6 @@ def test_parameters_scale_with_the_friction(movie):
     assert float(fit.energy.terms[0].stiffness) == pytest.approx(3, rel=1e-4)
 
 
-@pytest.mark.thorough
 def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     energy = AreaElasticity(jnp.ones(16), 1.0) + by_type(0.4 * jnp.ones((16, 16)), jnp.arange(16))
     fit = fit_movie(movie, energy, friction=FRICTION, noise=0.0)
@@ -103,7 +102,6 @@ def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     np.testing.assert_allclose(pair[apart], 0.4)
 
 
-@pytest.mark.thorough
 def test_errors_by_tracking_noise_are_covered(evolved):
     errors, deviations = [], []
     for seed in range(6):
@@ -122,7 +120,6 @@ def test_errors_by_tracking_noise_are_covered(evolved):
 
 
 @pytest.mark.filterwarnings("ignore:Frames are too far apart")
-@pytest.mark.thorough
 def test_windows_are_fitted_in_parallel(movie):
     fit = fit_movie(movie, GUESS, friction=FRICTION, windows=3)
     assert fit.energy.terms[1].tension.shape == (3, 3)
@@ -144,7 +141,6 @@ def test_wrong_arguments_are_named(movie, evolved):
         fit_movie(short, GUESS)
 
 
-@pytest.mark.thorough
 def test_corners_without_the_bulges_of_the_outline_are_named():
     types = np.arange(24) % 2
     tension = by_type([[0.28, 0.24], [0.24, 0.26]], types, outline=jnp.array(0.25))

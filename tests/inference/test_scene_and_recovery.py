@@ -29,6 +29,7 @@ def scene_of(**options):
     return shape_factor_scene(8, key=jax.random.key(0), mean=3.7, deviation=0.05, **options)
 
 
+@pytest.mark.thorough
 def test_target_and_start_are_equilibria():
     scene = scene_of()
     assert scene.converged

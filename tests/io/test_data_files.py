@@ -29,7 +29,10 @@ def made(name):
     return tissue if precision == "float64" else single(tissue)
 
 
-KINDS = [f"{b} {p}" for b in ("periodic", "free") for p in ("float32", "float64")]
+KINDS = [
+    *(pytest.param(f"{b} float32", marks=pytest.mark.thorough) for b in ("periodic", "free")),
+    *("periodic float64", "free float64"),
+]
 
 
 @pytest.fixture(scope="module", params=KINDS)

@@ -8,6 +8,8 @@ from matplotlib.collections import PolyCollection
 
 import vertax as vx
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture(scope="module")
 def tissue():

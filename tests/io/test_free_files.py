@@ -121,6 +121,7 @@ def test_labels_of_a_skeleton():
         labels_from_skeleton(image[0])
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not SKELETON.is_file(), reason=f"{SKELETON.name} is not here")
 def test_a_cluster_from_a_real_skeleton():
     pytest.importorskip("tifffile")

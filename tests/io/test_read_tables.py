@@ -316,6 +316,7 @@ def test_a_broken_vertex_file_is_refused(tmp_path, old, new, message):
         vx.io.read_force_inference(path)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not WINGS.exists(), reason="the folder shared/data/wings is not there")
 def test_wings():
     paths = sorted(WINGS.glob("*.dat"))

@@ -266,6 +266,7 @@ def test_invalid_arguments_are_rejected():
         vx.initialise.free_voronoi(3, key=jax.random.key(0), lloyd_steps=-1)
 
 
+@pytest.mark.thorough
 @few
 @given(st.sampled_from([2, 9, 60]), st.integers(0, 2**16), st.integers(0, 2))
 @example(60, 1, 0)  # before the repair its arcs overlap

@@ -107,6 +107,7 @@ def test_initial_tissues_do_not_overlap(dtype):
         assert not overlaps_of(cast).any
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("spare", [0, 3])
 def test_loop_over_side_pairs_in_pieces_agrees_with_one_loop(spare):
     tissue = cluster(30, seed=2).with_capacity(30 + spare)

@@ -51,6 +51,7 @@ def path(tmp_path):
 
 
 class TestRelaxation:
+    @pytest.mark.thorough
     def test_trajectory_begins_at_the_tissue_and_ends_at_its_equilibrium(self, relaxation):
         tissue, energy, equilibrium, trajectory = relaxation
         assert same_bits(trajectory[0], tissue)

@@ -73,7 +73,14 @@ except ImportError as error:
     assert lines[3].startswith('Reading pictures needs pillow: pip install "vertax[image]"')
 
 
-@pytest.mark.parametrize("missing", ["typer", "tomli_w", "matplotlib"])
+@pytest.mark.parametrize(
+    "missing",
+    [
+        "typer",
+        pytest.param("tomli_w", marks=pytest.mark.thorough),
+        pytest.param("matplotlib", marks=pytest.mark.thorough),
+    ],
+)
 def test_command_line_names_the_missing_extra(missing, tmp_path):
     (tmp_path / "tiny.toml").write_text('experiment = "infer_shape_factors"\n')
     code = "from vertax.__main__ import main; main()"
@@ -84,6 +91,7 @@ def test_command_line_names_the_missing_extra(missing, tmp_path):
     assert "Traceback" not in process.stderr
 
 
+@pytest.mark.thorough
 def test_run_names_the_missing_extra_of_its_experiment(tmp_path):
     (tmp_path / "image.tif").write_bytes(b"II*\0")
     (tmp_path / "image.toml").write_text('experiment = "infer_from_microscopy"\n')

@@ -74,13 +74,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[] if name == "bulge against an arc" else pytest.mark.thorough)
-        for name in CASES
-    ],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", list(CASES))
 def test_derivatives_are_finite_differences(name):
     *ends, joined = CASES[name]
     barrier = barrier_of(distance=0.15, **joined)

@@ -134,6 +134,7 @@ class _Spoiler(vx.transitions.AbstractTransitions):
         return tissue.with_vertices(tissue.vertices.at[self.vertex].add(far)), counts
 
 
+@pytest.mark.thorough
 def test_only_the_neighbourhood_of_an_overlap_is_frozen():
     tissue = vx.initialise.periodic_voronoi(60, key=jax.random.key(2), lloyd_steps=3)
     cells = np.asarray(tissue.topology.cell).reshape(-1, 3)

@@ -237,6 +237,7 @@ def test_pinned_vertices_of_a_periodic_tissue():
     assert slope == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_equilibria_turn_with_the_tissue():
     start, energy = cluster(8, 4), drops(0.8)
     run = lambda t: relax(t, energy)

@@ -298,7 +298,12 @@ def test_vmap_confines_a_nan_to_its_entry():
 
 
 @pytest.mark.parametrize(
-    ("null", "in_range"), [(0, True), pytest.param(2, True, marks=pytest.mark.thorough), (2, False)]
+    ("null", "in_range"),
+    [
+        pytest.param(0, True, marks=pytest.mark.thorough),
+        pytest.param(2, True, marks=pytest.mark.thorough),
+        (2, False),
+    ],
 )
 def test_derivatives_agree_with_finite_differences(null, in_range):
     # Every part of the system depends on t, its null space included.

@@ -216,6 +216,7 @@ def test_rounding_of_an_energy_far_below_its_unit_is_ignored():
         assert rest(start).stats["num_steps"] < 8  # evaluations
 
 
+@pytest.mark.thorough
 def test_steps_follow_a_curved_valley():
     """The floor is a circle, and falls gently around it."""
     tilt = 1e-4

@@ -67,6 +67,7 @@ bodies
 """
 
 
+@pytest.mark.thorough
 def test_labels_of_cells_differ_from_that_of_the_exterior(foam, tmp_path):
     (tmp_path / "triplet.fe").write_text(TRIPLET, encoding="utf-8")
     from_dump, from_tissue = infer_tensions(tmp_path / "triplet.fe"), infer_tensions(foam[0])
@@ -303,6 +304,7 @@ def test_foams_with_known_tensions(name, least, error):
     assert np.mean(np.abs(result.tensions[sure] - true) / true) < error
 
 
+@pytest.mark.thorough
 @needs_data
 def test_bends_are_inferred_from_an_image():
     """A foam in motion: the ends of edges determine tensions, arcs through them do not."""

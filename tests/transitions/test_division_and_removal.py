@@ -36,6 +36,7 @@ def newborn(before, after):
     return int(cell)
 
 
+@pytest.mark.thorough
 @each_kind
 @settings(max_examples=6, deadline=None)
 @given(mother=st.integers(0, 5), angle=st.one_of(st.none(), st.floats(0, 6.2)))
@@ -265,6 +266,7 @@ def test_division_without_a_spare_slot_is_rejected(without_type_checks):
         remove(random_tissue(6), 0)
 
 
+@pytest.mark.thorough
 @each_kind
 def test_neighbours_fill_the_area_of_a_removed_cell(kind):
     tissue = KINDS[kind]().with_capacity(6)

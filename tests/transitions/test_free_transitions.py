@@ -105,6 +105,7 @@ def test_threshold_applies_to_the_length_of_the_arc():
     assert sweep(bulging, OutlineLength(1.0), rule)[1].sum() == 0
 
 
+@pytest.mark.thorough
 def test_flips_that_disconnect_the_tissue_are_rejected():
     # Edges with the exterior at both ends: the interface of a doublet, a bridge between two parts.
     for tissue in (doublet(), cluster(8, 1), cluster(8, 3)):

@@ -168,7 +168,8 @@ QUICK = {"divide": 5, "remove": 3, "t1": 3, "t2": 1, "ablate": 1, "save": 0.3, "
 ALL = QUICK | {"relax": 0.4, "evolve": 0.3}
 
 
-@pytest.mark.parametrize("kind", ["periodic", pytest.param("arcs", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["periodic", "arcs"])
 def test_random_operations_give_valid_tissues(kind, tmp_path):
     player = Player(kind, 0, tmp_path)
     player.play(150, QUICK)

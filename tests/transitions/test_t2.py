@@ -16,6 +16,7 @@ def shrinking(capacity, cells, tension=0.1):
     return vx.energies.AreaElasticity(1.0, areas) + vx.energies.LineTension(tension)
 
 
+@pytest.mark.thorough
 def test_a_shrinking_cell_is_extruded():
     tissue = random_tissue(9, 1, lloyd_steps=2).with_capacity(10)
     energy = shrinking(10, [3])

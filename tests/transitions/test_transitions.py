@@ -146,7 +146,8 @@ def test_the_number_of_flips_of_an_edge_is_bounded():
     np.testing.assert_array_equal(counts, full)
 
 
-@pytest.mark.parametrize("boundary", ["periodic", pytest.param("free", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("boundary", ["periodic", "free"])
 def test_edges_of_high_tension_end_in_four_fold_vertices(boundary):
     # An edge with three times the tension of its neighbours shrinks to length 0 in both configurations (the
     # two neighbours at each end pull with at most twice their tension). It must reach equilibrium instead of
