@@ -1,6 +1,7 @@
 """Each configuration of the repository runs: here with everything as small as can be."""
 
 import shutil
+import warnings
 from pathlib import Path
 
 import pytest
@@ -150,7 +151,7 @@ SHORT = {
         "tissue.n_cells=9",
     ],
     "trained_stresses": ["trained=[1, 4]", "replicates=1", "tissue.n_cells=4", "fit.epochs=2"],
-    "wing_posteriors": ["wings=1", "draws=20", "warmup=20", "synthetic_noise=[0.01]"],
+    "wing_posteriors": ["wings=1", "draws=20", "warmup=60", "synthetic_noise=[0.01]"],
 }
 
 
@@ -181,5 +182,9 @@ def test_a_configuration_runs(name, tmp_path, micrograph):
         pytest.skip("the folder shared/data/wings is not there")
     data = {"infer_from_microscopy": f"image.path={micrograph}", "wing_posteriors": f"data={WINGS}"}
     changes = [data[name]] if name in data else []
-    _, metrics = run(CONFIGS / f"{name}.toml", tmp_path / "run", *SHORT[name], *changes)
+    with warnings.catch_warnings():
+        if name == "wing_posteriors":
+            # A wing has short edges, and proposals of a short chain include energies without a minimum.
+            warnings.filterwarnings("ignore", r"\d+ of 40 (trajectories|draws)", UserWarning)
+        _, metrics = run(CONFIGS / f"{name}.toml", tmp_path / "run", *SHORT[name], *changes)
     assert metrics

@@ -145,7 +145,8 @@ def _warn(log_posterior: LogPosterior, stats: dict[str, np.ndarray]) -> None:
     if rejected:
         texts.append(
             f"{rejected} of {n} trajectories met a tissue that did not reach equilibrium: its density counts "
-            "as 0. If that is rare, nothing is lost; otherwise raise `max_steps` of the relaxation."
+            "as 0. If that is rare, nothing is lost. Otherwise raise `max_steps` of the relaxation, or "
+            "choose a prior whose parameters have an equilibrium."
         )
     if diverging > rejected:
         texts.append(
