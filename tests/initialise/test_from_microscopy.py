@@ -210,6 +210,8 @@ def fake_cellpose(monkeypatch, small):
     class CellposeModel:
         def __init__(self, **options):
             calls.model = options
+            name = options["pretrained_model"]
+            self.pretrained_model = "models/" + (name if name != "absent" else "cpsam_v2")
 
         def eval(self, image, **options):
             calls.image, calls.evaluate = image, options
@@ -241,6 +243,11 @@ def test_cellpose_uses_its_own_model_by_default(fake_cellpose, small):
     labels = Cellpose()(small[0])
     assert fake_cellpose.model["pretrained_model"] == "cpsam"
     np.testing.assert_array_equal(labels, small[1])
+
+
+def test_a_model_that_cellpose_replaces_is_refused(fake_cellpose, small):
+    with pytest.raises(ValueError, match=r"Argument `model` must be a file .* is 'absent'"):
+        Cellpose(model="absent")(small[0])
 
 
 def test_missing_cellpose_is_named(small, monkeypatch):

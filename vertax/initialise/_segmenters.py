@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import importlib
 import importlib.metadata
+from pathlib import Path
 
 import equinox as eqx
 import numpy as np
@@ -131,7 +132,7 @@ class Cellpose(AbstractSegmenter):
 
     **Raises:**
 
-    - `ValueError` for a diameter that is not positive.
+    - `ValueError` for a diameter that is not positive, and at the call for a model that does not exist.
     - `ImportError` at the call if cellpose 4 or later is missing.
     """
 
@@ -152,6 +153,13 @@ class Cellpose(AbstractSegmenter):
         _check_version("cellpose", 4)
         pixels = check_image(image)
         network = models.CellposeModel(gpu=self.gpu, pretrained_model=self.model)
+        # (Cellpose replaces a model that does not exist by its default one.)
+        used = Path(network.pretrained_model).name
+        if used != Path(self.model).name:
+            raise ValueError(
+                f"Argument `model` must be a file or the name of a model of cellpose, but is {self.model!r}, "
+                f"which does not exist: cellpose would use {used!r}."
+            )
         labels, *_ = network.eval(
             pixels.astype(np.float32),
             diameter=self.diameter,
