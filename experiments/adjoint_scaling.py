@@ -119,7 +119,7 @@ def plot_scaling(rows: list[dict[str, Any]]) -> Any:
             time_axes.plot(column("Adj-ID", "cells"), forward, **style)
         for ax in (time_axes, memory_axes):
             ax.set(xscale="log", yscale="log", xlabel="cells", title=benchmark.TITLES[protocol])
-            ax.set_xticks(sizes, list(map(str, sizes)))
+            ax.set_xticks(sizes, list(map(str, sizes)), rotation=45)
             ax.minorticks_off()
         time_axes.set_ylabel("time of an epoch (ms)")
         memory_axes.set_ylabel("working memory (kB)")
