@@ -211,7 +211,7 @@ def fake_cellpose(monkeypatch, small):
         def __init__(self, **options):
             calls.model = options
             name = options["pretrained_model"]
-            self.pretrained_model = "models/" + (name if name != "absent" else "cpsam_v2")
+            self.pretrained_model = "models/" + (name if name in ("mine", "cpsam") else "cpsam_v2")
 
         def eval(self, image, **options):
             calls.image, calls.evaluate = image, options
@@ -245,9 +245,14 @@ def test_cellpose_uses_its_own_model_by_default(fake_cellpose, small):
     np.testing.assert_array_equal(labels, small[1])
 
 
-def test_a_model_that_cellpose_replaces_is_refused(fake_cellpose, small):
-    with pytest.raises(ValueError, match=r"Argument `model` must be a file .* is 'absent'"):
-        Cellpose(model="absent")(small[0])
+@pytest.mark.parametrize("model", ["absent", "absent/cpsam_v2"])
+def test_a_model_that_cellpose_replaces_is_refused(fake_cellpose, small, model):
+    with pytest.raises(ValueError, match=rf"Argument `model` must be a file .* is '{model}'"):
+        Cellpose(model=model)(small[0])
+
+
+def test_a_file_of_a_model_is_taken(fake_cellpose, small):
+    np.testing.assert_array_equal(Cellpose(model="models/cpsam_v2")(small[0]), small[1])
 
 
 def test_missing_cellpose_is_named(small, monkeypatch):

@@ -154,8 +154,8 @@ class Cellpose(AbstractSegmenter):
         pixels = check_image(image)
         network = models.CellposeModel(gpu=self.gpu, pretrained_model=self.model)
         # (Cellpose replaces a model that does not exist by its default one.)
-        used = Path(network.pretrained_model).name
-        if used != Path(self.model).name:
+        used = network.pretrained_model
+        if self.model not in (used, Path(used).name):
             raise ValueError(
                 f"Argument `model` must be a file or the name of a model of cellpose, but is {self.model!r}, "
                 f"which does not exist: cellpose would use {used!r}."
