@@ -15,7 +15,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-thorough test-docs test-experiments test-slow test-newest notebooks notebooks-write lint format types docs benchmark build clean
+.PHONY: help demo test test-thorough test-docs test-experiments test-slow test-newest check notebooks notebooks-write lint format types docs benchmark build clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST) | expand -t 22
@@ -45,6 +45,14 @@ test-newest: $(NEWEST)/.dev ## the core tests with the newest Python of this mac
 	else \
 	    echo "Not tested: this machine has no newer Python than $(VENV), which has $$($(BIN)/python -V)."; \
 	fi
+
+# Each part runs even if one before it fails; the last lines name the parts that failed.
+CHECKS := lint types docs test test-thorough test-docs test-experiments notebooks test-newest test-slow
+check: ## all tests, with those that take hours: before a larger change is called done
+	@failed=; for part in $(CHECKS); do \
+	    echo "=== $$part"; $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; \
+	done; \
+	if [ -n "$$failed" ]; then echo "Failed:$$failed"; exit 1; fi; echo "All parts passed: $(CHECKS)"
 
 notebooks: $(VENV)/.dev ## execute the notebooks, shortened; their outputs stay as they are
 	$(BIN)/python notebooks/execute.py --light --jobs $(WORKERS)

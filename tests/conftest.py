@@ -10,7 +10,10 @@ if version("jaxlib").startswith("0.10."):
     # (XLA exits at unknown flags.)
     FLAGS += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["VERTAX_CACHE"] = "off"  # no files of tests in the user's cache folder
-os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS])
+# The tests of `default_mode` run as users run JAX: in float32, with the normal optimisation (tests/run.py).
+DEFAULT_MODE = "VERTAX_TESTS_DEFAULT_MODE" in os.environ
+if not DEFAULT_MODE:
+    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS])
 
 import equinox as eqx
 import jax
@@ -18,7 +21,7 @@ import jaxtyping
 import matplotlib
 import pytest
 
-jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_enable_x64", not DEFAULT_MODE)
 matplotlib.use("Agg")
 
 # Tracing creates many long-lived objects: collect garbage less often.

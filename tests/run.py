@@ -29,6 +29,7 @@ CACHE = {
 # Each row is a process: folders, and single files that are taken out of their folder. A process takes seven
 # seconds to start. The longest ones come first.
 TOGETHER = (
+    ("default_mode",),
     ("_base", "mesh", "energies", "dissipations"),
     ("io", "plotting", "precondition"),
     ("project", "solvers"),
@@ -45,6 +46,8 @@ TOGETHER = (
     ("experiments",),
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
 )
+# Tests of this folder run as users run JAX: in float32, with the normal optimisation of XLA.
+DEFAULT_MODE = "default_mode"
 NOTHING_SELECTED = 5
 
 
@@ -71,10 +74,11 @@ def run(files: list[Path], options: list[str]) -> tuple[int, str]:
     """The exit code of pytest, and the line that counts its tests."""
     names = [str(file.relative_to(FOLDER.parent)) for file in files]
     command = [sys.executable, "-m", "pytest", "-p", "no:xdist", *options, *names]
+    default = any(file.parent.name == DEFAULT_MODE for file in files)
     process = subprocess.run(
         command,
         cwd=FOLDER.parent,
-        env=CACHE | os.environ,
+        env=CACHE | os.environ | ({"VERTAX_TESTS_DEFAULT_MODE": "1"} if default else {}),
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

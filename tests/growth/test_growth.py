@@ -168,3 +168,45 @@ def test_growth_rate_gradient_matches_finite_differences():
     assert slope == pytest.approx(
         float(central_difference(lambda r: size(r)[0], rate, 1.0, 1e-5)), rel=1e-5
     )
+
+
+def test_daughters_grow_before_they_divide():
+    cycle = GrowAndDivide(0.1, 1.0, variation=0.5)
+    tissue = random_tissue(12)
+    mothers = cycle.init(tissue, jax.random.key(0))
+    mothers = eqx.tree_at(lambda c: c.target_area, mothers, jnp.linspace(0.6, 1.9, 12))
+
+    def division_areas(key):
+        born = cycle.born(mothers, tissue, jnp.array([10, 11]), key)
+        return born.division_area[10:] / born.target_area[10:]
+
+    ratios = jax.vmap(division_areas)(jax.random.split(jax.random.key(1), 500))
+    assert float(ratios.min()) >= 1.2 * (1 - 1e-6)
+    # Areas of small daughters are normal, with the mean and the variation of the cycle.
+    areas = GrowAndDivide(0.1, 2.0, variation=0.1)._draw_division_areas(
+        jax.random.key(2), jnp.zeros(2000)
+    )
+    assert float(areas.mean()) == pytest.approx(2.0, rel=0.01)
+    assert float(areas.std()) == pytest.approx(0.2, rel=0.06)
+    exact = GrowAndDivide(0.1, 2.0, variation=0.0)._draw_division_areas(
+        jax.random.key(2), jnp.full(3, 0.5)
+    )
+    np.testing.assert_allclose(exact, 2.0)
+
+
+@pytest.mark.thorough
+def test_growth_ends_when_one_of_the_last_two_cells_of_a_free_tissue_dies():
+    cycle = GrowAndDivide(0.0, 1.5, death_rate=1.0, shrinking_time=0.5)
+    tissue = vx.initialise.free_voronoi(2, key=0).with_capacity(3)
+    energy = lambda cells: (
+        vx.energies.AreaElasticity(1.0, cells.target_area) + (vx.energies.LineTension(0.1))
+    )
+    times = jnp.linspace(0, 6, 13)
+    grown = grow(tissue, energy, cycle, times, key=1, relaxation=FIXED_TOPOLOGY, throw=False)
+    assert grown.result == vx.RESULTS.too_few_cells
+    assert grown.n_alive[-1] == 2
+    for frame in grown.trajectory:
+        assert not frame.overlaps.any
+        assert (np.asarray(frame.areas)[np.asarray(frame.alive)] > 1e-3).all()
+    with pytest.raises(RuntimeError, match="needs two cells"):
+        grown.checked()

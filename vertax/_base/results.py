@@ -59,6 +59,11 @@ with warnings.catch_warnings():
             "A cell could not divide: all cell slots of the tissue are alive. Add spare slots before with "
             "tissue.with_capacity(...), or pass throw=False."
         )
+        too_few_cells = (
+            "One of the last two cells of a free tissue died, but a free tissue needs two cells. The tissue "
+            "stays as it was before. Start with more cells, lower the death rate, end earlier, or pass "
+            "throw=False."
+        )
         lineage_full = "The lineage has fewer records than there were cells. Raise `records`."
         division_impossible = (
             "The cell cannot be cut in two there. Try another axis, or pass throw=False."

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.checks import as_key, as_times, check_integer, describe
 from vertax._base.results import RESULTS, checked, first_failure, result_of
-from vertax._base.tracing import is_concrete, traced
+from vertax._base.tracing import is_concrete, traced, tree_where
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
 from vertax.dynamics._incremental_potential import IncrementalPotential
@@ -22,6 +22,7 @@ from vertax.energies import AbstractEnergy
 from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, initial_lineage, record_deaths, record_division
 from vertax.mesh import Tissue, Trajectory
+from vertax.mesh._tissue import mean_area
 from vertax.relax import Relaxation
 from vertax.transitions import T1, T2
 from vertax.transitions._division import divided
@@ -48,7 +49,8 @@ class Grown(eqx.Module):
     """The mother, birth and end of each cell."""
     results: RESULTS
     """The first failure of the steps up to each frame, `successful` if there is none: a relaxation that did
-    not converge, overlaps, a division without a spare slot, a lineage with too few records."""
+    not converge, overlaps, a division without a spare slot, a lineage with too few records, or the death of one
+    of the last two cells of a free tissue, after which the tissue does not change."""
     failed_divisions: Int[Array, "*batch times"]
     """Number of failed divisions up to a frame: there was no spare slot, or the cell could not be cut in two.
     A failed division is tried again, and counted again, in each following step."""
@@ -254,6 +256,7 @@ def _grow(
         return after, due & (jnp.arange(due.size) != cell)
 
     def step(state: _State, start: Array, end: Array, key: Array) -> _State:
+        previous = state
         aging, *dividing = jax.random.split(key, 1 + divisions)
         cells, due = cycle.advance(state.cells, state.tissue, end - start, aging)
         log_likelihood = cycle.log_likelihood(state.cells, cells, state.tissue, end - start)
@@ -280,7 +283,7 @@ def _grow(
         result = RESULTS.where(failed, moved.result, state.result)
         recorded = RESULTS.where(lineage.count <= records, RESULTS.successful, RESULTS.lineage_full)
         overdue = moved.tissue.alive & cycle.overdue(state.cells, moved.tissue)
-        return _State(
+        after = _State(
             tissue=moved.tissue,
             cells=state.cells,
             number=number,
@@ -290,13 +293,23 @@ def _grow(
             failed_deaths=state.failed_deaths + jnp.sum(overdue),
             log_likelihood=state.log_likelihood,
         )
+        if not tissue.topology.exterior:
+            return after
+        # The last two cells cannot vanish: the tissue stays as it was when one of them has collapsed.
+        few = jnp.sum(after.tissue.alive) <= 2
+        small = after.tissue.areas < T2().threshold * mean_area(after.tissue)
+        collapsed = few & jnp.any(after.tissue.alive & small)
+        ended = _with_result(previous, first_failure(previous.result, RESULTS.too_few_cells))
+        return combine(tree_where(collapsed, _arrays(ended), _arrays(after)))
 
     def interval(arrays: _State, inputs: tuple) -> tuple[_State, tuple]:
         (start, end), key = inputs
         step_times = start + jnp.linspace(0, 1, substeps + 1, dtype=times.dtype) * (end - start)
 
         def substep(arrays: _State, inputs: tuple) -> tuple[_State, None]:
-            return _arrays(step(combine(arrays), *inputs)), None
+            ended = combine(arrays).result == RESULTS.too_few_cells
+            advance = lambda: _arrays(step(combine(arrays), *inputs))
+            return jax.lax.cond(ended, lambda: arrays, advance), None
 
         keys = jax.random.split(key, substeps)
         arrays, _ = jax.lax.scan(substep, arrays, (step_times[:-1], step_times[1:], keys))
@@ -338,6 +351,10 @@ def _grow(
         failed_deaths=failed[1],
         log_likelihood=last.log_likelihood,
     )
+
+
+def _with_result(state: _State, result: RESULTS) -> _State:
+    return eqx.tree_at(lambda s: s.result, state, result)
 
 
 def _arrays(tree: Any) -> Any:

@@ -84,8 +84,9 @@ class GrowAndDivide(AbstractLifeCycle):
     r"""Growth at a constant rate, division at a random size, and death at a constant rate.
 
     - Growth: the target area of a living cell obeys $\dot A^0 = g$.
-    - Division: when $A^0$ reaches the division area of the cell, drawn from a normal distribution, the cell
-        divides, and each daughter gets $A^0 / 2$.
+    - Division: when $A^0$ reaches the division area of the cell, the cell divides, and each daughter gets
+        $A^0 / 2$. The division area is drawn from a normal distribution, truncated to 0.6 to 1.9 times its
+        mean and to at least 1.2 times the target area at birth.
     - Death: at the rate $k$ a cell starts to die; then $\dot A^0 = -A^0 / \tau$, until a T2 transition
         removes the cell.
 
@@ -93,7 +94,7 @@ class GrowAndDivide(AbstractLifeCycle):
 
     - `growth_rate`: $g$, area over time.
     - `division_area`: mean target area at division.
-    - `variation`: coefficient of variation of the division area.
+    - `variation`: standard deviation of the normal distribution, relative to its mean.
     - `death_rate`: $k$, inverse time.
     - `shrinking_time`: $\tau$.
     - `orientation`: division along the `"long"` axis of the cell (Hertwig's rule) or a `"random"` one.
@@ -140,7 +141,7 @@ class GrowAndDivide(AbstractLifeCycle):
         """Cells at uniformly distributed stages between birth and division."""
         shape, dtype = (tissue.n_cells,), tissue.vertices.dtype
         area_key, stage_key = jax.random.split(key)
-        division = self._draw_division_areas(area_key, shape, dtype)
+        division = self._draw_division_areas(area_key, jnp.zeros(shape, dtype))
         fraction = 0.5 * (1 + jax.random.uniform(stage_key, shape, dtype))
         return Cells(fraction * division, division, jnp.zeros(shape, dtype), jnp.zeros(shape, bool))
 
@@ -172,9 +173,10 @@ class GrowAndDivide(AbstractLifeCycle):
 
     def born(self, cells: Cells, tissue: Tissue, pair: Int[Array, "2"], key: PRNGKeyArray) -> Cells:
         """Halve the target areas, draw division areas and reset the ages of two daughters."""
+        birth_areas = 0.5 * cells.target_area[pair]
         return Cells(
-            cells.target_area.at[pair].set(0.5 * cells.target_area[pair]),
-            cells.division_area.at[pair].set(self._draw_division_areas(key, (2,), cells.age.dtype)),
+            cells.target_area.at[pair].set(birth_areas),
+            cells.division_area.at[pair].set(self._draw_division_areas(key, birth_areas)),
             cells.age.at[pair].set(0),
             cells.dying,
         )
@@ -189,8 +191,17 @@ class GrowAndDivide(AbstractLifeCycle):
         return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def _draw_division_areas(
-        self, key: PRNGKeyArray, shape: tuple[int, ...], dtype: jnp.dtype
+        self, key: PRNGKeyArray, birth_areas: Float[Array, "*shape"]
     ) -> Float[Array, "*shape"]:
-        # A daughter is born with at most 1.9 / 2 of the mean; the lower limit keeps it from dividing at once.
-        relative = 1 + self.variation * jax.random.normal(key, shape, dtype)
-        return (self.division_area * jnp.clip(relative, 0.6, 1.9)).astype(dtype)
+        """Division areas of cells with these target areas at birth.
+
+        The distribution is normal, with a mean of `division_area`, between 0.6 and 1.9 times this mean. The
+        lower limit is raised to 1.2 times the birth area: the daughters of a large mother do not divide at
+        once.
+        """
+        shape, dtype = birth_areas.shape, birth_areas.dtype
+        lowest = jnp.clip(1.2 * birth_areas / self.division_area, 0.6, 1.8)
+        width = jnp.where(self.variation > 0, self.variation, 1)
+        limits = ((lowest - 1) / width).astype(dtype), ((1.9 - 1) / width).astype(dtype)
+        relative = 1 + self.variation * jax.random.truncated_normal(key, *limits, shape, dtype)
+        return (self.division_area * relative).astype(dtype)

@@ -1,0 +1,306 @@
+"""The main functions as users run JAX: in float32, with the normal optimisation of XLA."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from free_helpers import cluster
+from helpers import (
+    ADAM,
+    FIXED_TOPOLOGY,
+    LEAST_SQUARES,
+    central_difference,
+    random_tissue,
+    shape_factors,
+)
+
+import vertax as vx
+from vertax import mechanics
+from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity, ShapeFactorEnergy
+
+N = 12
+FRICTION = vx.dissipations.SubstrateFriction(1.0)
+TRUTH = np.asarray(3.65 + 0.1 * np.sin(np.arange(N)), np.float32)
+
+
+def floats(tree) -> set[str]:
+    """The data types of all floating-point arrays of a pytree."""
+    return {str(x.dtype) for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)}
+
+
+@pytest.fixture(scope="module")
+def rest():
+    """A tissue at rest, and its energy."""
+    energy = ShapeFactorEnergy(jnp.asarray(TRUTH))
+    return FIXED_TOPOLOGY(random_tissue(N, 1, lloyd_steps=2), energy).tissue, energy
+
+
+@pytest.fixture(scope="module")
+def hexagons():
+    energy = AreaElasticity(1.0, 1.0) + PerimeterElasticity(1.0, 3.4)
+    return vx.initialise.hexagonal(4, 4), energy
+
+
+class TestEquilibria:
+    @pytest.mark.parametrize("spare", [0, 4])
+    def test_default_relaxation_reaches_rest_without_overlaps(self, spare):
+        tissue = random_tissue(N, 3)
+        tissue = tissue.with_capacity(N + spare) if spare else tissue
+        equilibrium = vx.equilibrate(tissue, ShapeFactorEnergy(3.7))
+        assert equilibrium.converged
+        assert equilibrium.num_t1 > 0
+        assert not equilibrium.tissue.overlaps.any
+        assert floats(equilibrium) == {"float32"}
+
+    def test_free_tissue_with_arcs_reaches_rest(self):
+        tissue = cluster(6, 1)
+        energy = AreaElasticity(5.0, 1.0) + LineTension(0.5)
+        equilibrium = FIXED_TOPOLOGY(tissue, energy)
+        assert equilibrium.converged
+        assert floats(equilibrium) == {"float32"}
+
+    @pytest.mark.parametrize(
+        "solver", [vx.solvers.LBFGS(), vx.solvers.FIRE()], ids=["lbfgs", "fire"]
+    )
+    def test_other_solvers_reach_the_same_energy(self, rest, solver):
+        tissue, energy = rest
+        shaken = tissue.with_vertices(tissue.vertices.at[0].add(0.05))
+        relaxation = vx.Relaxation(solver=solver, transitions=None, contact_range=None)
+        equilibrium = relaxation(shaken, energy)
+        assert equilibrium.converged
+        assert float(equilibrium.energy) == pytest.approx(float(energy(tissue)), abs=1e-4)
+
+
+MOMENTUM = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
+ADJOINTS = {
+    "implicit": vx.ImplicitDifferentiation(),
+    "sensitivity": vx.ImplicitDifferentiation(mode="sensitivity"),
+    "propagation": vx.EquilibriumPropagation(),
+    "automatic": vx.AutomaticDifferentiation(),
+}
+
+
+@pytest.fixture(scope="module")
+def difference(rest):
+    """A loss of the shape factors, a direction, and the finite difference along it."""
+    tissue, _ = rest
+    target = tissue.with_vertices(tissue.vertices + 0.05 * jnp.sin(7 * tissue.vertices))
+    cost = 10 * vx.costs.VertexDistance(target)
+    direction = jnp.cos(jnp.arange(N, dtype=jnp.float32))
+
+    @eqx.filter_jit
+    def loss(p0, adjoint, relaxation):
+        energy = ShapeFactorEnergy(p0)
+        return cost(relaxation(tissue, energy, adjoint=adjoint).tissue, energy)
+
+    at = lambda p0: loss(p0, ADJOINTS["implicit"], FIXED_TOPOLOGY)
+    return loss, direction, central_difference(at, jnp.asarray(TRUTH), direction, 1e-2)
+
+
+class TestGradients:
+    @pytest.mark.parametrize("name", ADJOINTS)
+    def test_gradient_matches_finite_differences(self, difference, name):
+        loss, direction, expected = difference
+        relaxation = FIXED_TOPOLOGY
+        if name == "automatic":
+            relaxation = vx.Relaxation(
+                solver=MOMENTUM, transitions=None, contact_range=None, max_steps=20_000
+            )
+        gradient = jax.grad(lambda p0: loss(p0, ADJOINTS[name], relaxation))(jnp.asarray(TRUTH))
+        assert gradient.dtype == jnp.float32
+        assert float(gradient @ direction) == pytest.approx(float(expected), rel=0.03)
+
+    def test_gradients_of_a_batch_are_those_of_its_members(self, difference):
+        loss, *_ = difference
+        slope = jax.grad(lambda p0: loss(p0, ADJOINTS["implicit"], FIXED_TOPOLOGY))
+        batch = jnp.stack([jnp.asarray(TRUTH), jnp.full(N, 3.6)])
+        together = jax.vmap(slope)(batch)
+        for one, p0 in zip(together, batch, strict=True):
+            np.testing.assert_allclose(one, slope(p0), atol=2e-3 * float(jnp.abs(one).max()))
+
+
+@pytest.fixture(scope="module")
+def problem(rest):
+    target, _ = rest
+    guess = ShapeFactorEnergy(jnp.full(N, 3.65))
+    start = FIXED_TOPOLOGY(target, guess).tissue
+    cost = vx.costs.VertexDistance(target)
+    return vx.InverseProblem(start, guess, cost, response=FIXED_TOPOLOGY)
+
+
+class TestFits:
+    @pytest.mark.parametrize(
+        ("optimiser", "epochs"), [(ADAM, 80), (LEAST_SQUARES, 10)], ids=["adam", "least_squares"]
+    )
+    def test_fit_recovers_shape_factors(self, problem, optimiser, epochs):
+        fit = vx.fit(problem, optimiser, epochs, progress=False)
+        assert floats(fit.energy) == {"float32"}
+        assert fit.history.converged.all()
+        np.testing.assert_allclose(fit.energy.target_shape_factor, TRUTH, atol=0.01)
+
+    def test_uncertainty_is_finite_and_positive(self, problem, rest):
+        exact = eqx.tree_at(lambda p: p.energy, problem, rest[1])
+        fit = vx.fit(exact, optax.adam(1e-12), 1, progress=False)
+        deviations = vx.uncertainty(exact, fit, noise=0.01).deviation.target_shape_factor
+        assert (np.asarray(deviations) > 1e-4).all()
+        assert (np.asarray(deviations) < 1.0).all()
+
+
+class TestMechanics:
+    def test_moduli_of_hexagons_have_their_closed_forms(self, hexagons):
+        tissue, energy = hexagons
+        c, p0 = float(jnp.sqrt(8 * jnp.sqrt(3.0))), 3.4
+        shear = float(mechanics.shear_modulus(tissue, energy))
+        assert shear == pytest.approx(c * (c - p0) / 4, rel=5e-3)
+        bulk = float(mechanics.bulk_modulus(tissue, energy))
+        assert bulk == pytest.approx(1 + c * p0 / 4, rel=5e-3)
+
+    def test_zero_modes_are_translations(self, rest):
+        assert int(mechanics.zero_modes(*rest)) == 2
+
+    def test_zero_modes_of_a_free_tissue_are_rigid_motions(self):
+        energy = AreaElasticity(5.0, 1.0) + LineTension(0.5)
+        tissue = FIXED_TOPOLOGY(cluster(6, 1), energy).tissue
+        assert int(mechanics.zero_modes(tissue, energy)) == 3
+
+    def test_spectrum_is_that_of_the_dense_hessian(self, rest):
+        tissue, energy = rest
+        at = lambda x: energy(tissue.with_vertices(x.reshape(-1, 2)))
+        matrix = jax.jit(jax.hessian(at))(tissue.vertices.ravel())
+        expected = np.linalg.eigvalsh(np.asarray(matrix, float))
+        np.testing.assert_allclose(mechanics.spectrum(tissue, energy), expected, atol=1e-3)
+
+    def test_stress_is_the_derivative_of_the_energy_by_strain(self, rest):
+        tissue, energy = rest
+
+        @jax.jit
+        def strained(strain):
+            turn = jnp.eye(2) + strain
+            boundary = eqx.tree_at(
+                lambda b: b.lattice, tissue.boundary, tissue.boundary.lattice @ turn
+            )
+            moved = tissue.with_vertices(tissue.vertices @ turn)
+            return energy(eqx.tree_at(lambda t: t.boundary, moved, boundary))
+
+        unit = jnp.zeros((2, 2)).at[0, 0].set(1.0)
+        slope = central_difference(strained, jnp.zeros((2, 2)), unit, 1e-2) / N
+        assert float(mechanics.stress(tissue, energy)[0, 0]) == pytest.approx(slope, abs=2e-3)
+
+
+class TestDynamics:
+    def test_energy_decreases_with_friction(self):
+        times = jnp.linspace(0, 5, 6)
+        relaxation = vx.Relaxation(contact_range=None)
+        movie = vx.evolve(
+            random_tissue(N, 4), ShapeFactorEnergy(3.6), FRICTION, times, relaxation=relaxation
+        )
+        assert floats(movie) == {"float32"}
+        assert (jnp.diff(movie.energies) < 1e-5).all()
+        assert movie.energies[-1] < 0.9 * movie.energies[0]
+
+    def test_gradient_of_an_evolution_matches_finite_differences(self, rest):
+        tissue, _ = rest
+
+        @jax.jit
+        def loss(p0):
+            energy = ShapeFactorEnergy(p0)
+            end = vx.evolve(
+                tissue, energy, FRICTION, jnp.array([0.0, 0.5]), relaxation=FIXED_TOPOLOGY
+            )
+            return jnp.sum(end.tissue.perimeters**2)
+
+        p0 = jnp.float32(3.8)
+        expected = central_difference(loss, p0, jnp.float32(1.0), 2e-2)
+        assert float(jax.grad(loss)(p0)) == pytest.approx(float(expected), rel=0.03)
+
+    def test_cells_grow_and_divide(self):
+        energy = lambda cells: (
+            AreaElasticity(1.0, cells.target_area)
+            + PerimeterElasticity(0.02, 0.0)
+            + LineTension(0.02)
+        )
+        tissue = vx.initialise.free_voronoi(4, key=0, lloyd_steps=2).with_capacity(9)
+        cycle = vx.growth.GrowAndDivide(0.2, 1.5)
+        times = jnp.linspace(0, 4, 6)
+        grown = vx.growth.grow(tissue, energy, cycle, times, key=1, relaxation=FIXED_TOPOLOGY)
+        assert grown.n_alive[-1] > 5
+        assert floats(grown.tissue) == {"float32"}
+
+
+class TestInputAndOutput:
+    def test_saved_tissue_is_the_same(self, rest, tmp_path):
+        tissue, _ = rest
+        vx.save_tissue(tmp_path / "tissue.npz", tissue)
+        loaded = vx.load_tissue(tmp_path / "tissue.npz")
+        assert loaded.vertices.dtype == jnp.float32
+        np.testing.assert_array_equal(loaded.vertices, tissue.vertices)
+
+    def test_saved_energy_is_the_same(self, rest, tmp_path):
+        vx.io.save_energy(tmp_path / "energy.npz", rest[1])
+        loaded = vx.io.load_energy(tmp_path / "energy.npz")
+        np.testing.assert_array_equal(loaded.target_shape_factor, TRUTH)
+
+    def test_tables_return_the_same_tissue(self, rest):
+        tissue, _ = rest
+        again = vx.io.from_tables(vx.io.to_tables(tissue))
+        np.testing.assert_allclose(np.sort(again.areas), np.sort(tissue.areas), atol=1e-5)
+
+    def test_tensions_of_a_foam_are_recovered(self):
+        energy = AreaElasticity(20.0, jnp.linspace(0.9, 1.2, 14))
+        tissue = cluster(14, 3, lloyd_steps=3, inner_arcs=True)
+        tension = 1 + 0.3 * jnp.sin(jnp.arange(tissue.n_edges))
+        foam = FIXED_TOPOLOGY(tissue, energy + LineTension(tension)).tissue
+        inferred = vx.tensions.infer_tensions(foam)
+        assert inferred.determined.sum() > 10
+        true = np.asarray(tension)[inferred.determined]
+        found = inferred.tensions[inferred.determined]
+        np.testing.assert_allclose(found / found.mean(), true / true.mean(), rtol=0.05)
+
+
+class TestTransitions:
+    def test_division_and_removal_keep_areas(self):
+        tissue = random_tissue(N, 1).with_capacity(N + 1)
+        divided = vx.transitions.divide(tissue, 2).tissue
+        assert int(divided.alive.sum()) == N + 1
+        assert float(divided.areas.sum()) == pytest.approx(N, rel=1e-5)
+        removed = vx.transitions.remove(divided, 5).tissue
+        assert int(removed.alive.sum()) == N
+        assert float(removed.areas.sum()) == pytest.approx(N, rel=1e-5)
+
+    @pytest.mark.parametrize(
+        "make",
+        [
+            lambda t: vx.costs.VertexDistance(t),
+            lambda t: vx.costs.CellAreas(t.areas + 0.1),
+            lambda t: vx.costs.MeanShapeFactor(3.8),
+        ],
+        ids=["vertices", "areas", "shape"],
+    )
+    def test_costs_have_finite_gradients(self, rest, make):
+        tissue, energy = rest
+        cost = make(tissue)
+        moved = tissue.vertices + 0.03 * jnp.sin(5 * tissue.vertices)
+        slope = jax.grad(lambda x: cost(tissue.with_vertices(x), energy))(moved)
+        assert np.isfinite(slope).all()
+        assert np.abs(slope).max() > 0
+
+
+def test_posterior_density_has_a_finite_gradient(rest):
+    pytest.importorskip("numpyro", reason="needs the extra bayes")
+    import numpyro.distributions as dist
+
+    tissue, energy = rest
+    target = tissue.with_vertices(tissue.vertices + 0.01 * jnp.sin(9 * tissue.vertices))
+    cost = vx.costs.VertexDistance(target)
+    problem = vx.InverseProblem(tissue, energy, cost, response=FIXED_TOPOLOGY)
+    prior = {"target_shape_factor": dist.Normal(3.65, 0.1)}
+    density = vx.bayes.LogPosterior(problem, prior, 0.01)
+    slope = jax.grad(lambda p: density({"target_shape_factor": p}))(jnp.asarray(TRUTH))
+    assert slope.dtype == jnp.float32
+    assert np.isfinite(slope).all()
+
+
+def test_shape_factors_of_helpers_are_float32():
+    assert shape_factors(N, 3.7, 0.1).dtype == jnp.float32
