@@ -185,6 +185,23 @@ def test_fitted_position_increases_the_uncertainty(hidden):
     assert float(jnp.max(p0_of(fitted_position.deviation) / p0_of(fixed.deviation))) < 3
 
 
+def test_uncertainty_does_not_depend_on_spare_slots():
+    tissue, truth = relaxed(6, 3)
+    noise = 1e-2 * np.random.default_rng(0).normal(size=tissue.vertices.shape)
+
+    def estimate(capacity):
+        start = tissue.with_capacity(capacity)
+        noisy = tissue.with_vertices(tissue.vertices + noise).with_capacity(capacity)
+        energy = vx.energies.ShapeFactorEnergy(jnp.resize(p0_of(truth), capacity))
+        return vx.uncertainty(*fitted(start, energy, VertexDistance(noisy)), prior=0.5)
+
+    plain, padded = estimate(6), estimate(9)
+    assert float(padded.noise) == pytest.approx(float(plain.noise), rel=1e-6)
+    deviation = p0_of(padded.deviation)
+    np.testing.assert_allclose(deviation[:6], p0_of(plain.deviation), rtol=1e-5)
+    np.testing.assert_allclose(deviation[6:], 0.5)
+
+
 def test_invalid_arguments_are_rejected(hidden, without_type_checks):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, VertexDistance(tissue))

@@ -8,11 +8,11 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import check_number
-from vertax._base.tracing import traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._history import Fit
 from vertax.fitting._inverse import InverseProblem
@@ -46,7 +46,7 @@ def uncertainty(
     r"""Uncertainty of the fitted parameters from the curvature of the cost (Laplace approximation).
 
     With residuals $r(\theta)$ of a least-squares cost, their Jacobian $J$ through the equilibrium, and
-    $\sigma^2 = r^T r / (M - K)$ of $M$ residuals and $K$ parameters,
+    $\sigma^2 = r^T r / (M - K)$ of $M$ residuals and $K$ parameters (without those of spare slots),
 
     $$\mathrm{Cov}(\theta) = \bigl(J^T J / \sigma^2 + I / s^2\bigr)^{-1}$$
 
@@ -88,10 +88,11 @@ def uncertainty(
     primal = problem.primal(eqx.combine(parameters, constants), tissue, shift)
     gram, squares, n_residuals = _gram(problem, primal, tissue, flat, unravel, constants, shift)
     n_free = n_residuals if n_independent is None else n_independent
-    n_fitted = len(gram)
-    if not n_free > n_fitted:
+    # No residual depends on a parameter of a spare slot.
+    n_fitted = len(gram) - jnp.sum(jnp.diag(gram)[: len(flat)] == 0)
+    if is_concrete(n_fitted) and not n_free > n_fitted:
         raise ValueError(
-            f"There must be more independent residuals than parameters, but there are {n_free:g} "
+            f"There must be more independent residuals than parameters, but there are {float(n_free):g} "
             f"residuals and {n_fitted} parameters. Fit fewer parameters, or raise `n_independent`."
         )
     variance = squares / (n_residuals * (1 - n_fitted / n_free))
@@ -136,17 +137,19 @@ def _gram(
     unravel: Callable[[Array], PyTree[Array]],
     constants: PyTree,
     shift: Float[Array, "2"] | None,
-) -> tuple[Float[Array, "n n"], Float[Array, ""], int]:
-    """JᵀJ, rᵀr and the number of residuals."""
+) -> tuple[Float[Array, "n n"], Float[Array, ""], Int[Array, ""]]:
+    """JᵀJ, rᵀr and the number of residuals that are measurements."""
     n = len(flat)
 
-    def residuals(x: Float[Array, " n"]) -> Float[Array, " residuals"]:
+    def residuals(x: Float[Array, " n"]) -> tuple[Float[Array, " residuals"], Int[Array, ""]]:
         energy = eqx.combine(unravel(x[:n]), constants)
-        return problem.residuals(energy, tissue, None if shift is None else x[n:], primal)[0]
+        position = None if shift is None else x[n:]
+        values, equilibrium, _ = problem.residuals(energy, tissue, position, primal)
+        return values, jnp.sum(problem.is_measurement(energy, equilibrium))
 
     at = flat if shift is None else jnp.concatenate([flat, shift])
-    values, forward = jax.linearize(residuals, at)
+    values, forward, n_residuals = jax.linearize(residuals, at, has_aux=True)
     backward = jax.linear_transpose(forward, at)
     # One column at a time: an image has many residuals.
     gram = jax.lax.map(lambda e: backward(forward(e))[0], jnp.eye(len(at), dtype=at.dtype))
-    return gram, jnp.sum(values**2), len(values)
+    return gram, jnp.sum(values**2), n_residuals
