@@ -114,6 +114,17 @@ def test_interrupted_run_continues_bit_for_bit(linear, tmp_path):
         draw(other, 40, checkpoint=tmp_path / "chains.npz")
 
 
+@pytest.mark.thorough
+def test_checkpoint_of_a_density_with_another_function_is_rejected(linear, tmp_path):
+    def run(factor):
+        density = bayes.LogPosterior(linear, {NAME: PRIOR[NAME]}, lambda p: factor * 1e-3)
+        draw(density, 1, warmup=20, chains=1, checkpoint=tmp_path / "chains.npz")
+
+    run(1.0)
+    with pytest.raises(ValueError, match=r"another density \(what its functions compute"):
+        run(2.0)
+
+
 def test_proposals_without_equilibrium_are_rejected_and_counted(linear):
     density = density_of(linear, 0.2, MEAN + 0.5 * SPREAD)
     start = {NAME: jnp.full(N_CELLS, MEAN)}

@@ -126,6 +126,31 @@ def test_times_equal_up_to_rounding_continue(tmp_path):
         _check_times(np.asarray([0, 1e-3, 2e-3]), np.asarray([0, 1e-3 + 1e-11, 2e-3]))
 
 
+@pytest.mark.parametrize("changed", ["energy", "boundary"])
+def test_checkpoint_of_another_function_is_rejected(changed, tmp_path):
+    tissue = random_tissue(9, 0)
+
+    def run(times=(0.0, 0.1), **factors):
+        factors = {"energy": 1.0, "boundary": 0.1} | factors
+        return vx.evolve(
+            tissue,
+            lambda time: ShapeFactorEnergy(factors["energy"] * ENERGY.target_shape_factor),
+            FRICTION,
+            times,
+            boundary=lambda time: vx.Periodic(
+                tissue.boundary.lattice * (1 + factors["boundary"] * time)
+            ),
+            relaxation=FIXED_TOPOLOGY,
+            checkpoint=tmp_path / "run.npz",
+        )
+
+    run()
+    for times in ((0.0, 0.1), (0.0, 0.1, 0.2)):
+        with pytest.raises(ValueError, match=r"energy or setting \(what its functions compute"):
+            run(times, **{changed: 1.1})
+    assert run((0.0, 0.1, 0.2)).times.shape == (3,)
+
+
 class TestErrors:
     @pytest.mark.thorough
     def test_failed_step_leaves_the_earlier_frames(self, tmp_path):

@@ -1,8 +1,13 @@
 """Interrupted fits that are resumed from checkpoints."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +16,7 @@ import pytest
 from helpers import ADAM, FIXED_TOPOLOGY, LEAST_SQUARES, random_like, relaxed, rewritten
 
 import vertax as vx
+from vertax._base.fingerprint import fingerprint
 from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
 from vertax.fitting import _descent, stack
@@ -155,6 +161,108 @@ def test_checkpoint_of_another_fit_is_rejected(message, path):
     with pytest.raises(ValueError, match=f"{message}.*elete the file to start"):
         vx.fit(epochs=3, progress=False, checkpoint=path, **arguments)
     assert path.read_bytes() == before
+
+
+class Scaled(vx.AbstractEnergy):
+    """An energy with a function of the user."""
+
+    energy: ShapeFactorEnergy
+    scale: Callable = eqx.field(static=True)
+
+    def __call__(self, tissue):
+        return self.scale(self.energy(tissue))
+
+
+def scaled_by(factor):
+    return lambda energy: factor * energy
+
+
+def test_checkpoint_of_an_energy_with_another_function_is_rejected(path):
+    fit = lambda factor: vx.fit(
+        dataclasses.replace(PROBLEM, energy=Scaled(PROBLEM.energy, scaled_by(factor))),
+        ADAM,
+        2,
+        progress=False,
+        checkpoint=path,
+    )
+    first = fit(2.0)
+    assert bits(fit(2.0)) == bits(first)
+    with pytest.raises(ValueError, match=r"another problem \(what its functions compute"):
+        fit(3.0)
+
+
+def edited(factor):
+    """A class of the same name with another constant."""
+
+    class Edited(vx.AbstractEnergy):
+        p0: jax.Array
+
+        def __call__(self, tissue):
+            return factor * ShapeFactorEnergy(self.p0)(tissue)
+
+    return Edited(jnp.full(10, 3.7))
+
+
+def test_checkpoint_of_an_edited_class_is_rejected(path):
+    fit = lambda factor: vx.fit(
+        dataclasses.replace(PROBLEM, energy=edited(factor)),
+        ADAM,
+        2,
+        progress=False,
+        checkpoint=path,
+    )
+    fit(1.0)
+    with pytest.raises(ValueError, match=r"another problem \(what its functions compute"):
+        fit(1.5)
+
+
+def test_checkpoint_of_an_optimiser_with_another_schedule_is_rejected(path):
+    def fit(rates):
+        schedule = lambda step: jnp.asarray(rates)[step]
+        vx.fit(PROBLEM, optax.sgd(schedule), 2, progress=False, checkpoint=path)
+
+    fit([1e-2, 1e-2, 1e-2])
+    with pytest.raises(ValueError, match="another optimiser"):
+        fit([1e-2, 2e-2, 1e-2])
+
+
+_FINGERPRINT = """
+import jax, jax.numpy as jnp, optax
+import vertax as vx
+from vertax._base.fingerprint import fingerprint
+tissue = vx.initialise.periodic_voronoi(6, key=jax.random.key(0))
+relax = vx.Relaxation(transitions=None, contact_range=None)
+weights = jnp.arange(6.0)
+energy = lambda p: vx.energies.ShapeFactorEnergy(p + weights)
+loss = lambda p: relax(tissue, energy(p)).tissue.vertices.sum()
+print(fingerprint(jax.grad(loss), jnp.full(6, 3.6)))
+"""
+
+
+def test_fingerprint_is_equal_in_all_processes():
+    hashes = set()
+    for seed in ("1", "2"):
+        result = subprocess.run(
+            [sys.executable, "-c", _FINGERPRINT],
+            env=os.environ | {"PYTHONHASHSEED": seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        hashes.add(result.stdout)
+    assert len(hashes) == 1
+
+
+def test_fingerprint_depends_on_constants_and_not_on_names():
+    def times(x):
+        return 2 * x
+
+    table = lambda values: fingerprint(lambda x: jnp.asarray(values) * x, 1.0 * jnp.ones(2))
+    assert fingerprint(times, jnp.ones(2)) == fingerprint(lambda y: 2 * y, jnp.zeros(2))
+    assert fingerprint(times, jnp.ones(2)) != fingerprint(lambda y: 3 * y, jnp.ones(2))
+    assert table([1.0, 2.0]) == table([1.0, 2.0]) != table([1.0, 3.0])
+    inner = lambda values: fingerprint(jax.jit(lambda x: np.asarray(values) * x), jnp.ones(2))
+    assert inner([1.0, 2.0]) == inner([1.0, 2.0]) != inner([1.0, 3.0])
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])

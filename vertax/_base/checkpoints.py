@@ -22,6 +22,9 @@ _VERSION = 1
 # Largest fraction of the run time that is spent on writing.
 _WRITING_FRACTION = 0.02
 
+COMPUTATION = "what its functions compute, or the version of vertax or JAX"
+"""The part of a run that a fingerprint identifies, for messages."""
+
 Row = Mapping[str, Any]
 
 
@@ -34,7 +37,9 @@ class Checkpoint(eqx.Module):
 
     If the file exists, the same call continues from it and returns the same result as an uninterrupted run
     (on the same machine, bit for bit); a finished fit is not repeated. Delete the file to start again. A
-    larger number of `epochs` continues a finished fit, and more `times` a finished evolution.
+    larger number of `epochs` continues a finished fit, and more `times` a finished evolution. A file of
+    another run is refused: other numbers, or functions that compute something else, also by another version
+    of vertax or JAX. (An external program is compared by its name and settings only.)
 
     The file is a NumPy `.npz` archive without pickles. For a fit it holds the state of the optimiser, the
     parameters, the tissue, the recycled Hessian, the best point so far and the history; for an evolution all

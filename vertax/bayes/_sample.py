@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.checkpoints import (
+    COMPUTATION,
     Checkpoint,
     CheckpointFile,
     Progress,
@@ -27,6 +28,7 @@ from vertax._base.checkpoints import (
     without_addresses,
 )
 from vertax._base.checks import as_key, check_integer
+from vertax._base.fingerprint import fingerprint
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import tree_where
 from vertax.bayes._laplace import Laplace, evaluate
@@ -105,6 +107,9 @@ def sample(
                 eqx.tree_pformat(log_posterior, short_arrays=True, width=100)
             ),
             "density (numbers in its arrays)": digest((log_posterior, start)),
+            f"density ({COMPUTATION})": fingerprint(
+                lambda density: evaluate(density, density.start()), log_posterior
+            ),
             "`key`, `warmup` or `chains`": f"{digest(key)} {warmup} {chains}",
         }
 

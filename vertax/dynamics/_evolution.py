@@ -176,12 +176,12 @@ class Evolution(AbstractResponse):
         response._check(tissue)
         response._check_drive(tissue)
         warn_of_memory_maps()
-        args = (*traced((tissue, energy), tissue.vertices.dtype), response.traced(), adjoint)
+        args = (*traced((tissue, energy), tissue.vertices.dtype), response.traced())
         with announce_compilations(f"the evolution of {tissue.n_cells} cells"):
             if progress or checkpoint is not None:
                 evolved = evolve_by_frames(*args, checkpoint, progress=progress, throw=throw)
             else:
-                evolved = evolve_at_once(*args)
+                evolved = evolve_at_once(*args, adjoint)
         return evolved.checked() if throw else evolved
 
     def check_compatible(

@@ -10,10 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike, Shaped
 from tqdm import tqdm
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import (
+    COMPUTATION,
     Checkpoint,
     CheckpointFile,
     Progress,
@@ -21,9 +23,10 @@ from vertax._base.checkpoints import (
     digest,
     without_addresses,
 )
+from vertax._base.fingerprint import fingerprint
 from vertax._base.results import RESULTS
 from vertax._base.tracing import is_concrete
-from vertax.adjoints import AbstractAdjoint
+from vertax.adjoints import ImplicitDifferentiation
 from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._time_integration import (
     Frames,
@@ -40,7 +43,6 @@ def evolve_by_frames(
     tissue: Tissue,
     energy: Any,
     evolution: Any,
-    adjoint: AbstractAdjoint,
     checkpoint: str | os.PathLike[str] | Checkpoint | None,
     *,
     progress: bool,
@@ -79,7 +81,7 @@ def evolve_by_frames(
     try:
         while len(reached.rows) < len(times):
             ends = times[len(reached.rows) - 1 : len(reached.rows) + 1]
-            state, frame = _advance(reached.state, energy, _for_one_frame(evolution, ends), adjoint)
+            state, frame = _advance(reached.state, energy, _for_one_frame(evolution, ends))
             rows = (*reached.rows, _row(ends[1], frame))
             if throw and bool(state.result != RESULTS.successful):
                 _joined_frames(times[: len(rows)], state, rows, first).checked()  # raises the error
@@ -138,13 +140,19 @@ def _initial_state_and_frame(tissue: Tissue, energy: Any, evolution: Any) -> tup
 
 
 @announced_jit
-def _advance(
-    state: State, energy: Any, evolution: Any, adjoint: AbstractAdjoint
-) -> tuple[State, Frames]:
-    return integrate(state, energy, evolution, adjoint)
+def _advance(state: State, energy: Any, evolution: Any) -> tuple[State, Frames]:
+    # Nothing is differentiated: one program serves all adjoints.
+    return integrate(state, energy, evolution, ImplicitDifferentiation())
 
 
-def _for_one_frame(evolution: Any, ends: np.ndarray) -> Any:
+def _first_step(tissue: Tissue, energy: Any, evolution: Any) -> tuple[Frames, Frames]:
+    """The first two frames of an evolution, to compare evolutions."""
+    start, first = _initial_state_and_frame(tissue, energy, evolution)
+    _, second = _advance(start, energy, _for_one_frame(evolution, evolution.times))
+    return first, second
+
+
+def _for_one_frame(evolution: Any, ends: Shaped[ArrayLike, "2"]) -> Any:
     """The evolution over one frame; without its key and first drive, which the state replaces."""
     parts: Callable = lambda e: (e.times, e.key, e.drive)
     return eqx.tree_at(parts, evolution, (jnp.asarray(ends), None, None), is_leaf=_is_none)
@@ -169,9 +177,13 @@ def _identity(tissue: Tissue, energy: Any, evolution: Any) -> dict[str, str]:
     # The times are left out: `_check_times` compares the stored ones, and further times may follow.
     without_times = eqx.tree_at(lambda e: e.times, evolution, None)
     parts = (tissue, energy, without_times)
+    two_times = eqx.tree_at(lambda e: e.times, evolution, evolution.times[:2])
     return {
         "tissue, energy or setting": without_addresses(
             eqx.tree_pformat(parts, short_arrays=True, width=100)
         ),
         "tissue, energy or setting (numbers in its arrays)": digest(parts),
+        f"tissue, energy or setting ({COMPUTATION})": fingerprint(
+            _first_step, tissue, energy, two_times
+        ),
     }

@@ -7,14 +7,13 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
-from vertax._base.checkpoints import without_addresses
+from vertax._base.fingerprint import fingerprint
 from vertax._base.results import RESULTS
 from vertax._base.tracing import traced, tree_where
 from vertax.fitting._epoch import (
@@ -107,18 +106,21 @@ class Descent(AbstractMethod):
         state, record = _update(self.optimiser, arguments, epoch_index, *settings)
         return dataclasses.replace(state, hessian=hessian), record
 
+    def first_epoch(self) -> Evaluation:
+        # (Of the guidance a checkpoint holds the strength in each epoch.)
+        return self._evaluation(self._without_throw(), self.start())
+
     def description(self) -> str:
-        # An Optax optimiser consists of closures, which do not print their constants. The jaxpr of an update
-        # contains them.
+        # An Optax optimiser consists of closures, which do not print their constants.
         fitted = cast(optax.Params, (self.parameters, no_shift(self.problem)))
-        value = jax.ShapeDtypeStruct((), self.problem.tissue.vertices.dtype)
+        value = jnp.zeros((), self.problem.tissue.vertices.dtype)
         update = optax.with_extra_args_support(self.optimiser).update
 
         def calculation(fitted: optax.Params, value: Array) -> optax.Params:
             state = self.optimiser.init(fitted)
             return update(fitted, state, fitted, value=value, grad=fitted)[0]
 
-        return without_addresses(str(jax.make_jaxpr(calculation)(fitted, value)))
+        return fingerprint(calculation, fitted, value)
 
     def strength(self, epoch: int) -> float:
         if self.guidance is None:

@@ -46,6 +46,10 @@ class AbstractMethod(eqx.Module):
         """The state after an epoch, and the record of the epoch."""
 
     @abc.abstractmethod
+    def first_epoch(self) -> Any:
+        """What the first epoch computes for the tissue; traceable, to compare fits."""
+
+    @abc.abstractmethod
     def description(self) -> str:
         """A text that identifies the optimiser and its settings, for checkpoints."""
 

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import (
+    COMPUTATION,
     Checkpoint,
     CheckpointFile,
     Progress,
@@ -27,6 +28,7 @@ from vertax._base.checkpoints import (
     digest,
     without_addresses,
 )
+from vertax._base.fingerprint import fingerprint
 from vertax._base.results import RESULTS, index_of, result_of
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
@@ -134,9 +136,7 @@ def fit(
         method = LeastSquares(optimiser, problem, parameters, constants, true, batched)
     else:
         method = Descent(optimiser, problem, parameters, constants, true, batched, guidance)
-    file = CheckpointFile(
-        checkpoint, lambda: _identity_of(given, true, method.description(), batched)
-    )
+    file = CheckpointFile(checkpoint, lambda: _identity_of(given, true, method, batched))
     done, stopped, result = _run(method, file, epochs, progress, callback)
     response_error = given.response.last_error_message()
     if stopped is not None and response_error is not None:
@@ -192,14 +192,17 @@ def _with_numbers_as_data(
     return jax.tree.map(expand, data, old)
 
 
-def _identity_of(problem: PyTree, truth: PyTree, optimiser: str, batched: bool) -> dict[str, str]:
+def _identity_of(
+    problem: PyTree, truth: PyTree, method: AbstractMethod, batched: bool
+) -> dict[str, str]:
     """Texts and digests that identify a fit, by their names in messages."""
     layout = eqx.tree_pformat((problem, truth), short_arrays=True, width=100)
     return {
         "problem (sizes, classes or settings)": without_addresses(layout),
         "problem (numbers in its arrays)": digest((problem, truth)),
-        "optimiser": optimiser,
+        "optimiser": method.description(),
         "setting of `batched`": str(batched),
+        f"problem ({COMPUTATION})": fingerprint(lambda m: m.first_epoch(), method),
     }
 
 

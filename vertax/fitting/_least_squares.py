@@ -87,6 +87,9 @@ class LeastSquares(AbstractMethod):
             self.batched,
         )
 
+    def first_epoch(self) -> tuple[State, Record]:
+        return self.advance(self.start(), 0)
+
     def description(self) -> str:
         return without_addresses(eqx.tree_pformat(self.solver, short_arrays=False))
 
