@@ -76,7 +76,7 @@ def test_edge_table_omits_spare_slots():
             st.floats(allow_nan=True, allow_infinity=True),
             st.integers(-(2**63), 2**63 - 1),
             st.booleans(),
-            st.text("ab,\"'ä\n", min_size=1),
+            st.text("ab ;\t,\"'ä\n", min_size=1),
         ),
         min_size=1,
         max_size=5,

@@ -28,7 +28,7 @@ def read_geojson(
     inner_arcs: bool = False,
     softening: float | None = None,
 ) -> tuple[PolygonTissue, dict[str, Shaped[np.ndarray, " cells"]]]:
-    """Read a tissue from a GeoJSON file with a polygon for each cell (RFC 7946), or with a list of such features.
+    """Read a tissue from a GeoJSON file with a polygon for each cell (RFC 7946), or from a list of features.
 
     ```python
     polygons, table = vx.io.read_geojson("cells.geojson")
@@ -50,8 +50,8 @@ def read_geojson(
     - `tolerance`: in units of length; by default 10⁻⁶ of the root mean cell area.
     - `inner_arcs`, `softening`: as of [`from_polygons`][vertax.initialise.from_polygons].
 
-    Features without a geometry, and collections of geometries without exactly one polygon, are left out with a
-    warning.
+    Features without a geometry, and collections of geometries without exactly one polygon, are left out
+    with a warning.
 
     **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], with points numbered in the order of
     the file, and the properties of the features as columns with one row for each cell.

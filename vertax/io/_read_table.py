@@ -161,7 +161,8 @@ def _header_rows(rows: Sequence[Sequence[str]]) -> int:
 
 
 def _from_text(given: Sequence[str]) -> np.ndarray:
-    fields = [field.strip() for field in given]
+    # (A field of spaces alone is text.)
+    fields = [field.strip(" ") or field for field in given]
     if fields and all(field in ("True", "False") for field in fields):
         return np.array([field == "True" for field in fields])
     if fields and all(_INTEGER.fullmatch(field) for field in fields):
