@@ -76,7 +76,7 @@ def test_edge_table_omits_spare_slots():
             st.floats(allow_nan=True, allow_infinity=True),
             st.integers(-(2**63), 2**63 - 1),
             st.booleans(),
-            st.text("ab,\"'ä\n", min_size=1),
+            st.text("ab ;\t,\"'ä\n", min_size=1),
         ),
         min_size=1,
         max_size=5,
@@ -115,10 +115,55 @@ def test_missing_values(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "x, y ,label\n1.5, 2,a;b\n,3,c\n",
+        "x;y;label\n1,5;2;a;b\n;3;c\n".replace("a;b", '"a;b"'),
+        "x\ty\tlabel\n1.5\t2\ta;b\n\t3\tc\n",
+        'x;y;label\n1.5;2;"a;b"\n;3;c\n',
+    ],
+)
+def test_separators_and_decimal_commas_are_recognised(tmp_path, text):
+    path = tmp_path / "table.csv"
+    path.write_text(text, encoding="utf-8")
+    table = vx.io.read_table(path)
+    assert list(table) == ["x", "y", "label"]
+    np.testing.assert_array_equal(table["x"], [1.5, np.nan])
+    np.testing.assert_array_equal(table["y"], [2, 3])
+    np.testing.assert_array_equal(table["label"], ["a;b", "c"])
+
+
+def test_lists_of_features_and_nested_properties_are_read(tmp_path):
+    path = tmp_path / "cells.geojson"
+    vx.io.write_geojson(path, FREE)
+    features = json.loads(path.read_text(encoding="utf-8"))["features"]
+    for number, feature in enumerate(features):
+        feature["properties"] = {
+            "id": number,
+            "classification": {"name": "a", "colour": [1, 2, 3]},
+        }
+    polygon = features[3]["geometry"]
+    point = {"type": "Point", "coordinates": [0, 0]}
+    features[3]["geometry"] = {"type": "GeometryCollection", "geometries": [point, polygon]}
+    features.insert(2, {"type": "Feature", "geometry": None, "properties": None})
+    path.write_text(json.dumps(features), encoding="utf-8")
+    lists = pytest.warns(UserWarning, match=r"hold lists are left out: `classification\.colour`")
+    with lists, pytest.warns(UserWarning, match=r"without a polygon, .* are left out: 2\."):
+        polygons, table = vx.io.read_geojson(path)
+    np.testing.assert_allclose(polygons.tissue.areas, FREE.areas, rtol=1e-2)
+    np.testing.assert_array_equal(table["id"], np.arange(FREE.n_cells))
+    assert set(table) == {"id", "classification.name"}
+    with pytest.warns(UserWarning, match="hold lists"):
+        rows = vx.io.read_table(path)
+    assert np.isnan(rows["id"][2])
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "it is empty"),
-        ("a,a\n1,2\n", "two columns have the same name"),
+        ("a,a\n1,2\n", "two columns have the same name, `a`"),
+        ("x,y,name\n(µm),(µm),\nX,Y,\n1,2,a\n", "row 2 below the names .* delete further rows"),
         ("a,b\n1,2\n3\n", "row 2 has 1 fields, and there are 2 columns"),
     ],
 )

@@ -77,6 +77,18 @@ def test_finished_masks_are_read_from_the_cache(mask, tmp_path, monkeypatch):
     assert len(calls) == 3
 
 
+@pytest.mark.parametrize("damage", [lambda entry: entry[: len(entry) // 2], lambda entry: b""])
+def test_a_damaged_entry_of_the_cache_is_computed_anew(mask, tmp_path, damage):
+    options = {"cache": tmp_path, "progress": False}
+    first = infer_tensions_of_masks([mask], **options)
+    (entry,) = tmp_path.iterdir()
+    entry.write_bytes(damage(entry.read_bytes()))
+    with pytest.warns(UserWarning, match=r"entry of the cache for 0 is computed anew: .* is "):
+        second = infer_tensions_of_masks([mask], **options)
+    np.testing.assert_array_equal(second.results[0].tensions, first.results[0].tensions)
+    infer_tensions_of_masks([mask], **options)  # without a warning
+
+
 def test_the_noise_of_a_mask_is_in_pixels(mask):
     one, other = (infer_tensions(mask, noise=0.3, pixel_size=size) for size in (1.0, 5.0))
     assert other.noise == pytest.approx(5 * one.noise)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ def read_geojson(
     inner_arcs: bool = False,
     softening: float | None = None,
 ) -> tuple[PolygonTissue, dict[str, Shaped[np.ndarray, " cells"]]]:
-    """Read a tissue from a GeoJSON file with a polygon for each cell (RFC 7946).
+    """Read a tissue from a GeoJSON file with a polygon for each cell (RFC 7946), or from a list of features.
 
     ```python
     polygons, table = vx.io.read_geojson("cells.geojson")
@@ -49,6 +50,9 @@ def read_geojson(
     - `tolerance`: in units of length; by default 10⁻⁶ of the root mean cell area.
     - `inner_arcs`, `softening`: as of [`from_polygons`][vertax.initialise.from_polygons].
 
+    Features without a geometry, and collections of geometries without exactly one polygon, are left out
+    with a warning.
+
     **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], with points numbered in the order of
     the file, and the properties of the features as columns with one row for each cell.
 
@@ -59,8 +63,8 @@ def read_geojson(
         [`from_polygons`][vertax.initialise.from_polygons].
     """
     path = Path(path)
-    features = read_features(path)
-    rings = [_ring(feature, number, path) for number, feature in enumerate(features)]
+    features = _with_polygons(read_features(path), path)
+    rings = [_ring(feature, feature["number"], path) for feature in features]
     lattice = None if box is None else checked_lattice(box)
     if tolerance is None:
         tolerance = 1e-6 * float(np.sqrt(np.mean([abs(_area(ring)) for ring in rings])))
@@ -80,7 +84,11 @@ def read_geojson(
         kept = np.any(both != np.roll(both, 1, axis=0), axis=1)
         cells.append(cell[kept])
         places.append(image[kept])
-    names = Names(f"The polygons of {path}", _at(corner[first]), "feature {}".format)
+    names = Names(
+        f"The polygons of {path}",
+        _at(corner[first]),
+        lambda cell: f"feature {features[cell]['number']}",
+    )
     polygons = tissue_from_corners(
         corner[first],
         cells,
@@ -91,6 +99,30 @@ def read_geojson(
         softening=softening,
     )
     return polygons, properties(features, path)
+
+
+def _with_polygons(features: list[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
+    """The features with a geometry, and the polygon of each collection of geometries that has one."""
+    kept, skipped = [], []
+    for number, feature in enumerate(features):
+        geometry = feature["geometry"]
+        if isinstance(geometry, dict) and geometry.get("type") == "GeometryCollection":
+            parts = [part for part in geometry.get("geometries") or [] if isinstance(part, dict)]
+            polygons = [part for part in parts if str(part.get("type")).endswith("Polygon")]
+            geometry = polygons[0] if len(polygons) == 1 else None
+        if isinstance(geometry, dict):
+            kept.append(feature | {"geometry": geometry, "number": number})
+        else:
+            skipped.append(number)
+    if not kept:
+        raise ValueError(f"{path} must hold polygons, but no feature has one.")
+    if skipped:
+        numbers = ", ".join(map(str, skipped[:10])) + (", …" if len(skipped) > 10 else "")
+        warnings.warn(
+            f"{path}: features without a polygon, or with several, are left out: {numbers}.",
+            stacklevel=3,
+        )
+    return kept
 
 
 def _at(points: Float[np.ndarray, "points 2"]) -> Any:

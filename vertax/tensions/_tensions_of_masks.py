@@ -6,6 +6,7 @@ import concurrent.futures
 import hashlib
 import inspect
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -129,7 +130,8 @@ def infer_tensions_of_masks(
     - `masks`: a folder, a pattern, a movie or a list, see [`find_masks`][vertax.tensions.find_masks].
     - `plane`: of files with several planes, the one to take; by default a single file is a movie.
     - `cache`: a folder where the result of each mask is stored as soon as it is computed. A later call, such
-        as after an interrupt, reads the results of the same pixels and options from it.
+        as after an interrupt, reads the results of the same pixels and options from it. An entry that cannot
+        be read is computed anew, with a warning.
     - `threads`: number of threads, by default the environment variable `VERTAX_THREADS` or one per core.
     - `progress`: show a progress bar with the name of the last mask (only on a terminal).
     - `options`: as of [`infer_tensions`][vertax.tensions.infer_tensions], the same for all masks.
@@ -203,9 +205,14 @@ def _infer(
     given = f"{sorted(options.items())} {jnp.result_type(float)} {frame.file}"
     digest = hashlib.sha256(pixels + given.encode()).hexdigest()
     file = Path(cache) / f"{digest[:32]}.npz"
-    if not file.exists():
-        result = frame.infer(**options)
-        save_module(file, "tensions", result, InferredTensions, _CLASSES)
+    if file.exists():
+        try:
+            return load_module(file, "tensions", InferredTensions, _CLASSES)
+        except ValueError as error:  # truncated, damaged, or of another version
+            warnings.warn(
+                f"The entry of the cache for {frame.name} is computed anew: {error}", stacklevel=2
+            )
+    save_module(file, "tensions", frame.infer(**options), InferredTensions, _CLASSES)
     return load_module(file, "tensions", InferredTensions, _CLASSES)
 
 
