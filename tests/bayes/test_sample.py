@@ -115,6 +115,7 @@ def test_interrupted_run_continues_bit_for_bit(linear, tmp_path):
 
 
 @pytest.mark.thorough
+@pytest.mark.filterwarnings("ignore::UserWarning")  # one draw is not enough
 def test_checkpoint_of_a_density_with_another_function_is_rejected(linear, tmp_path):
     def run(factor):
         density = bayes.LogPosterior(linear, {NAME: PRIOR[NAME]}, lambda p: factor * 1e-3)
