@@ -49,8 +49,8 @@ class Grown(eqx.Module):
     """The mother, birth and end of each cell."""
     results: RESULTS
     """The first failure of the steps up to each frame, `successful` if there is none: a relaxation that did
-    not converge, overlaps, a division without a spare slot, a lineage with too few records, or the death of one
-    of the last two cells of a free tissue, after which the tissue does not change."""
+    not converge, overlaps, a division without a spare slot, a lineage with too few records, or the death of
+    one of the last two cells of a free tissue, after which the tissue does not change."""
     failed_divisions: Int[Array, "*batch times"]
     """Number of failed divisions up to a frame: there was no spare slot, or the cell could not be cut in two.
     A failed division is tried again, and counted again, in each following step."""

@@ -24,11 +24,22 @@ _BATCH = 64
 
 
 def movable(tissue: Tissue) -> PyTree[Bool[Array, "..."]]:
-    """A mask of the entries of the configuration that can move: not pinned vertices, not straight edges."""
+    """A mask of the entries of the configuration that move: not pinned or spare vertices, not straight edges."""
     free = jnp.ones(tissue.vertices.shape, bool)
-    if tissue.pinned is not None:
-        free &= ~tissue.pinned[:, None]
+    if tissue.held is not None:
+        free &= ~tissue.held[:, None]
     return free if tissue.arcs is None else (free, tissue.is_arc)
+
+
+def zero_threshold(values: np.ndarray, tolerance: float | None, default: float) -> float:
+    """Up to which absolute value a number counts as 0, as a fraction `tolerance` of the largest one.
+
+    By default the fraction is `default`, or 100 times the rounding of the data type if that is larger.
+    """
+    rounding = 100 * float(np.finfo(values.dtype).eps)
+    return (max(default, rounding) if tolerance is None else tolerance) * np.abs(values).max(
+        initial=0
+    )
 
 
 def flat_hessian(landscape: Landscape) -> Callable[[Float[Array, " dofs"]], Float[Array, " dofs"]]:

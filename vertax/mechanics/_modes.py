@@ -24,6 +24,7 @@ from vertax.mechanics._hessian import (
     flat_hessian,
     movable,
     sparse_hessian,
+    zero_threshold,
 )
 from vertax.mechanics._landscape import Landscape, stationary
 from vertax.mesh import Tissue
@@ -136,7 +137,7 @@ def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
     return jnp.asarray(np.linalg.eigvalsh(matrix[np.ix_(free, free)]))
 
 
-def zero_modes(tissue: Tissue, energy: AbstractEnergy, *, tolerance: float = 1e-8) -> int:
+def zero_modes(tissue: Tissue, energy: AbstractEnergy, *, tolerance: float | None = None) -> int:
     """Number of modes without stiffness, rigid motions included.
 
     A rigid periodic tissue has 2, the translations.
@@ -145,15 +146,17 @@ def zero_modes(tissue: Tissue, energy: AbstractEnergy, *, tolerance: float = 1e-
 
     - `tissue`: a tissue at rest.
     - `energy`: the energy of which the tissue is at a minimum.
-    - `tolerance`: an eigenvalue counts as 0 if it is at most this fraction of the largest one.
+    - `tolerance`: an eigenvalue counts as 0 if it is at most this fraction of the largest one; by default
+        1e-8, or 100 times the rounding of the data type if that is larger.
 
     **Returns:** their number.
 
     **Raises:** as `spectrum`.
     """
-    check_number("tolerance", tolerance, above=0)
+    if tolerance is not None:
+        check_number("tolerance", tolerance, above=0)
     values = np.abs(np.asarray(spectrum(tissue, energy)))
-    return int(np.sum(values <= tolerance * values.max()))
+    return int(np.sum(values <= zero_threshold(values, tolerance, 1e-8)))
 
 
 def density_of_states(

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from vertax._base.checks import check_concrete, check_number
 from vertax.mechanics._arguments import check_tissue
-from vertax.mechanics._hessian import movable
+from vertax.mechanics._hessian import movable, zero_threshold
 from vertax.mesh import Tissue
 
 _CONSTRAINTS = ("areas", "perimeters", "edge_lengths")
@@ -79,7 +79,7 @@ def self_stresses(
     tissue: Tissue,
     constraints: Sequence[Literal["areas", "perimeters", "edge_lengths"]] = ("areas", "perimeters"),
     *,
-    tolerance: float = 1e-9,
+    tolerance: float | None = None,
 ) -> SelfStress:
     r"""States of self-stress: null vectors of the transposed compatibility matrix.
 
@@ -92,7 +92,8 @@ def self_stresses(
 
     - `tissue`: the tissue; its arrays must not be traced.
     - `constraints`: see [`compatibility`][vertax.mechanics.compatibility].
-    - `tolerance`: singular values of at most this fraction of the largest one count as 0.
+    - `tolerance`: singular values of at most this fraction of the largest one count as 0; by default 1e-9,
+        or 100 times the rounding of the data type if that is larger.
 
     **Returns:** a [`SelfStress`][vertax.mechanics.SelfStress].
 
@@ -103,9 +104,10 @@ def self_stresses(
     """
     check_tissue(tissue)
     check_concrete("self_stresses", tissue)
-    check_number("tolerance", tolerance, above=0)
+    if tolerance is not None:
+        check_number("tolerance", tolerance, above=0)
     free = np.asarray(ravel_pytree(movable(tissue))[0])
     matrix = np.asarray(compatibility(tissue, constraints))[:, free]
     left, singular, _ = np.linalg.svd(matrix)
-    rank = int(np.sum(singular > tolerance * singular.max(initial=0)))
+    rank = int(np.sum(singular > zero_threshold(singular, tolerance, 1e-9)))
     return SelfStress(jnp.asarray(left[:, rank:].T), int(free.sum()) - rank, int(free.sum()))
