@@ -33,38 +33,38 @@ def fingerprint(function: Callable[..., Any], *args: Any) -> str:
     return _hash(jax.make_jaxpr(of_arrays)(arrays), {})
 
 
-def _hash(value: Any, known: dict[int, str]) -> str:
-    """Hash of a value in a jaxpr; `known` has the hashes of jaxprs, of which many occur several times."""
+def _hash(value: Any, visited: dict[int, str]) -> str:
+    """Hash of a value in a jaxpr; `visited` has the hashes of jaxprs, of which many occur several times."""
     if isinstance(value, Jaxpr):
-        if id(value) not in known:
-            known[id(value)] = _sha(_lines(value, known))
-        return known[id(value)]
+        if id(value) not in visited:
+            visited[id(value)] = _sha(_lines(value, visited))
+        return visited[id(value)]
     if isinstance(value, ClosedJaxpr):
-        return _hash((value.jaxpr, *value.consts), known)
+        return _hash((value.jaxpr, *value.consts), visited)
     if isinstance(value, tuple | list):
-        return _sha([_hash(item, known) for item in value])
+        return _sha([_hash(item, visited) for item in value])
     if isinstance(value, set | frozenset):  # their order differs between processes
-        return _sha(sorted(_hash(item, known) for item in value))
+        return _sha(sorted(_hash(item, visited) for item in value))
     if isinstance(value, dict):
-        return _hash(list(value.items()), known)
+        return _hash(list(value.items()), visited)
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         return _sha([str(value.dtype), str(value.shape), digest(value)])
     return _sha([without_addresses(repr(value))])
 
 
-def _lines(jaxpr: Jaxpr, known: dict[int, str]) -> list[str]:
+def _lines(jaxpr: Jaxpr, visited: dict[int, str]) -> list[str]:
     numbers: dict[Any, int] = {}
 
     def atom(x: Any) -> str:
         if isinstance(x, Literal):
-            return _hash(x.val, known)
+            return _hash(x.val, visited)
         return f"{numbers.setdefault(x, len(numbers))}:{x.aval}"
 
     lines = [" ".join(map(atom, (*jaxpr.constvars, *jaxpr.invars)))]
     for equation in jaxpr.eqns:
         parameters = {k: v for k, v in equation.params.items() if k != "name"}
         ends = [atom(x) for x in (*equation.invars, *equation.outvars)]
-        lines.append(" ".join([equation.primitive.name, _hash(parameters, known), *ends]))
+        lines.append(" ".join([equation.primitive.name, _hash(parameters, visited), *ends]))
     return [*lines, " ".join(map(atom, jaxpr.outvars))]
 
 

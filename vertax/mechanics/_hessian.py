@@ -24,7 +24,7 @@ _BATCH = 64
 
 
 def movable(tissue: Tissue) -> PyTree[Bool[Array, "..."]]:
-    """A mask of the entries of the configuration that move: not pinned or spare vertices, not straight edges."""
+    """A mask of the entries of the configuration that move: no pinned or spare vertex, no straight edge."""
     free = jnp.ones(tissue.vertices.shape, bool)
     if tissue.held is not None:
         free &= ~tissue.held[:, None]
