@@ -37,9 +37,8 @@ def zero_threshold(values: np.ndarray, tolerance: float | None, default: float) 
     By default the fraction is `default`, or 100 times the rounding of the data type if that is larger.
     """
     rounding = 100 * float(np.finfo(values.dtype).eps)
-    return (max(default, rounding) if tolerance is None else tolerance) * np.abs(values).max(
-        initial=0
-    )
+    fraction = max(default, rounding) if tolerance is None else tolerance
+    return fraction * float(np.abs(values).max(initial=0))
 
 
 def flat_hessian(landscape: Landscape) -> Callable[[Float[Array, " dofs"]], Float[Array, " dofs"]]:
