@@ -23,7 +23,7 @@ def fingerprint(function: Callable[..., Any], *args: Any) -> str:
     **Arguments:**
 
     - `function`: the function. Compiled functions that it calls are traced once for this and later calls.
-    - `args`: its arguments. Their arrays are variables, with the numbers are not part of the hash.
+    - `args`: its arguments. Their arrays are variables; the numbers in them are not part of the hash.
     """
     arrays, static = eqx.partition(args, eqx.is_array)
 
