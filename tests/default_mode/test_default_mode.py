@@ -13,7 +13,6 @@ from helpers import (
     LEAST_SQUARES,
     central_difference,
     random_tissue,
-    shape_factors,
 )
 
 import vertax as vx
@@ -282,7 +281,3 @@ def test_posterior_density_has_a_finite_gradient(rest):
     slope = jax.grad(lambda p: density({"target_shape_factor": p}))(jnp.asarray(TRUTH))
     assert slope.dtype == jnp.float32
     assert np.isfinite(slope).all()
-
-
-def test_shape_factors_of_helpers_are_float32():
-    assert shape_factors(N, 3.7, 0.1).dtype == jnp.float32

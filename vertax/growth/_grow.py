@@ -299,7 +299,8 @@ def _grow(
         few = jnp.sum(after.tissue.alive) <= 2
         small = after.tissue.areas < T2().threshold * mean_area(after.tissue)
         collapsed = few & jnp.any(after.tissue.alive & small)
-        ended = _with_result(previous, first_failure(previous.result, RESULTS.too_few_cells))
+        result = first_failure(previous.result, RESULTS.too_few_cells)
+        ended = eqx.tree_at(lambda s: s.result, previous, result)
         return combine(tree_where(collapsed, _arrays(ended), _arrays(after)))
 
     def interval(arrays: _State, inputs: tuple) -> tuple[_State, tuple]:
@@ -351,10 +352,6 @@ def _grow(
         failed_deaths=failed[1],
         log_likelihood=last.log_likelihood,
     )
-
-
-def _with_result(state: _State, result: RESULTS) -> _State:
-    return eqx.tree_at(lambda s: s.result, state, result)
 
 
 def _arrays(tree: Any) -> Any:
