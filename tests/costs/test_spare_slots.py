@@ -8,12 +8,15 @@ import pytest
 from helpers import random_tissue
 
 import vertax as vx
+from vertax._base.batch import stack
 from vertax.costs import (
+    AbstractLeastSquaresCost,
     AspectRatio,
     CellAreas,
     CellStress,
     CentroidDistance,
     EdgeDistance,
+    Frames,
     HomotypicLength,
     IndexAwareStructural,
     MeanShapeFactor,
@@ -42,10 +45,11 @@ COSTS = {
     "image": lambda target, n: MeshImage(np.eye(8), 1.5),
     "stress": lambda target, n: Stress(jnp.eye(2)),
     "cell stress": lambda target, n: CellStress(jnp.eye(2), cells=[0, 2]),
+    "all cell stresses": lambda target, n: CellStress(jnp.eye(2)),
     "moments": lambda target, n: AspectRatio(1.2),
     "farthest": lambda target, n: AspectRatio(1.2, "farthest"),
 }
-QUICK = ("structure", "areas", "vertices by cells", "moments")
+QUICK = ("structure", "areas", "vertices by cells", "moments", "all cell stresses")
 each_cost = pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=() if name in QUICK else (pytest.mark.slow,)) for name in COSTS],
@@ -80,6 +84,49 @@ def test_costs_do_not_depend_on_spare_slots(name):
     assert other == pytest.approx(float(value), rel=1e-9)
     np.testing.assert_allclose(other_slope[: len(slope)], slope, atol=1e-9)
     np.testing.assert_allclose(other_slope[len(slope) :], 0, atol=1e-15)
+
+
+def test_measurements_are_the_residuals_without_spare_slots():
+    tissue, target = pair("areas")
+    weight = np.arange(64.0).reshape(8, 8) % 4
+
+    @eqx.filter_jit
+    def evaluate(cost, tissue):
+        return cost.residuals(tissue, ENERGY), cost.is_measurement(tissue, ENERGY)
+
+    def measured(tissue, target):
+        n = tissue.n_cells
+        costs = {name: make(target, n) for name, make in COSTS.items()}
+        costs: dict[str, vx.AbstractCost] = {
+            name: cost
+            for name, cost in costs.items()
+            if isinstance(cost, AbstractLeastSquaresCost) and not isinstance(cost, AspectRatio)
+        }
+        costs["weighted image"] = MeshImage(np.eye(8), 1.5, weight=weight)
+        costs["sum"] = costs["areas"] + 0.0 * costs["edges"] + 2.0 * costs["centroids"]
+        return {name: evaluate(cost, tissue) for name, cost in costs.items()}
+
+    plain = measured(tissue, target)
+    padded = measured(*(t.with_capacity(CAPACITY) for t in (tissue, target)))
+    for name, (residuals, mask) in padded.items():
+        others, of_others = plain[name]
+        assert mask.shape == residuals.shape, name
+        np.testing.assert_array_equal(residuals[~mask], 0, err_msg=name)
+        np.testing.assert_allclose(residuals[mask], others[of_others], atol=1e-12, err_msg=name)
+    n = CELLS
+    counts = {name: int(jnp.sum(mask)) for name, (_, mask) in padded.items()}
+    expected = {"areas": n, "vertices": 4 * n, "edges": 30 * n, "all cell stresses": 3 * n}
+    expected |= {"stress": 3, "weighted image": np.sum(weight > 0), "sum": 3 * n}
+    assert {name: counts[name] for name in expected} == expected
+
+
+def test_measurements_of_frames_are_those_of_each_frame():
+    tissue, target = (t.with_capacity(CAPACITY) for t in pair("areas"))
+    frames = stack([tissue, target, tissue])
+    cost = Frames([CentroidDistance(target)] * 2)
+    mask = eqx.filter_jit(cost.is_measurement)(frames, ENERGY)
+    assert mask.shape == (4 * CAPACITY,)
+    assert int(jnp.sum(mask)) == 4 * CELLS
 
 
 @pytest.mark.thorough

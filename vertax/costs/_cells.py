@@ -6,7 +6,7 @@ from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from vertax._base.checks import as_real, check_number
 from vertax.costs._cost import AbstractLeastSquaresCost
@@ -65,6 +65,10 @@ class CellAreas(AbstractLeastSquaresCost):
             differences = jnp.where(tissue.alive, differences, 0)
             return differences / jnp.sqrt(1.0 * jnp.sum(tissue.alive))
         return differences / jnp.sqrt(1.0 * tissue.n_cells)
+
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which cells exist."""
+        return tissue.alive
 
 
 def _mean(tissue: Tissue, values: Float[Array, " cells"]) -> Float[Array, ""]:

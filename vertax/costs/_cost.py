@@ -6,7 +6,7 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from vertax._base.batch import member
 from vertax._base.checks import check_number
@@ -50,6 +50,15 @@ class AbstractCost(eqx.Module):
             f"{type(self).__name__} is not. Subclass vertax.costs.AbstractLeastSquaresCost, or fit with an "
             "Optax optimiser."
         )
+
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which residuals are measurements; by default all.
+
+        The others have no data and are 0 for every parameter, as those of spare slots and of pixels of
+        weight 0. [`uncertainty`][vertax.uncertainty] and [`LogPosterior`][vertax.bayes.LogPosterior] do not
+        count them.
+        """
+        return jnp.ones(eqx.filter_eval_shape(self.residuals, tissue, energy).shape, bool)
 
     def __add__(self, other: AbstractCost) -> AbstractCost:
         """The sum of two costs."""
@@ -124,6 +133,15 @@ class WeightedSum(AbstractCost):
         roots = jnp.sqrt(weights)
         parts = [cost.residuals(self._argument_of(cost, tissue), energy) for cost in self.costs]
         return jnp.concatenate([root * part for root, part in zip(roots, parts, strict=True)])
+
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which residuals are measurements; none of a term of weight 0."""
+        parts = [
+            cost.is_measurement(self._argument_of(cost, tissue), energy) for cost in self.costs
+        ]
+        return jnp.concatenate(
+            [(weight > 0) & part for weight, part in zip(self.weights, parts, strict=True)]
+        )
 
     def _argument_of(self, cost: AbstractCost, tissue: Tissue) -> Tissue:
         """The frame or frames of which a term is evaluated."""

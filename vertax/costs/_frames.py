@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from vertax._base.batch import stack
 from vertax._base.checks import describe
@@ -76,9 +76,13 @@ class Frames(AbstractCost):
         """
         return self._each(tissue, energy, "residuals").ravel()
 
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which residuals of all frames are measurements."""
+        return self._each(tissue, energy, "is_measurement").ravel()
+
     def _each(
         self, tissue: Tissue, energy: AbstractEnergy, method: str
-    ) -> Float[Array, "frames *n"]:
+    ) -> Shaped[Array, "frames *n"]:
         """A method of each cost at its frame."""
         n_costs = jax.tree.leaves(eqx.filter(self.costs, eqx.is_array))[0].shape[0]
         if tissue.vertices.ndim != 3 or len(tissue.vertices) != n_costs + 1:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.checks import as_float64, as_real, check_integer, check_number
 from vertax._base.tracing import is_concrete
@@ -238,6 +238,10 @@ class MeshImage(AbstractLeastSquaresCost):
             scale = jnp.maximum(mean(model * self.image), 0) / mean(model**2)
             model = scale * model
         return (jnp.sqrt(self.weight) * (model - self.image)).ravel()
+
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which pixels have a positive weight."""
+        return self.weight.ravel() > 0
 
 
 def mirror(image: np.ndarray) -> np.ndarray:

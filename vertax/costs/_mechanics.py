@@ -8,7 +8,7 @@ from functools import partial
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vertax import mechanics
 from vertax._base.checks import as_real, check_integer, check_number, describe
@@ -92,7 +92,22 @@ class CellStress(AbstractLeastSquaresCost):
                 "The target of CellStress must have the shape (2, 2) or one entry for each selected cell, "
                 f"{selected.shape}, but its shape is {self.target.shape}."
             )
-        return _components(selected - self.target) / jnp.sqrt(1.0 * selected.shape[0])
+        differences = selected - self.target
+        if not tissue.topology.spare:
+            return _components(differences) / jnp.sqrt(1.0 * len(differences))
+        living = self._living(tissue)
+        differences = jnp.where(living[:, None, None], differences, 0)
+        return _components(differences) / jnp.sqrt(1.0 * jnp.sum(living))
+
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which components are those of a cell that exists."""
+        return jnp.tile(self._living(tissue), 3)
+
+    def _living(self, tissue: Tissue) -> Bool[Array, " chosen"]:
+        """Which of the selected cells exist."""
+        if self.cells is None:
+            return tissue.alive
+        return tissue.alive.at[self.cells].get(mode="fill", fill_value=True)
 
 
 class ShearModulus(AbstractLeastSquaresCost):

@@ -63,6 +63,13 @@ class VertexDistance(AbstractLeastSquaresCost):
         displacement = tissue.boundary.shortest(tissue.vertices - target_vertices)
         return _root_of_mean(displacement, tissue.topology.alive_vertices, tissue)
 
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which coordinates are those of a vertex that exists and has a match."""
+        compared = tissue.topology.alive_vertices
+        if self.match == "cells":
+            compared &= matching_vertices(tissue, self.target)[1]
+        return jnp.repeat(compared, 2)
+
 
 class EdgeDistance(AbstractLeastSquaresCost):
     r"""Mean squared distance of the edges, arcs included, to those of a target tissue.
@@ -104,6 +111,10 @@ class EdgeDistance(AbstractLeastSquaresCost):
         share = lengths / (jnp.sum(lengths) * self.points_per_edge)
         return (jnp.sqrt(share)[:, None, None] * displacement).ravel()
 
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which coordinates are those of an edge that exists in the target."""
+        return jnp.repeat(self.target.topology.alive_edges, 2 * self.points_per_edge)
+
 
 class CentroidDistance(AbstractLeastSquaresCost):
     r"""Mean squared distance of the centroids of cells to those of a target tissue.
@@ -132,6 +143,10 @@ class CentroidDistance(AbstractLeastSquaresCost):
         check_equal(type(self).__name__, tissue, self.target, "cells", same_boundary=True)
         displacement = tissue.boundary.shortest(tissue.centroids - self.target.centroids)
         return _root_of_mean(displacement, tissue.alive & self.target.alive, tissue)
+
+    def is_measurement(self, tissue: Tissue, energy: AbstractEnergy) -> Bool[Array, " residuals"]:
+        """Which coordinates are those of a cell that exists in the tissue and in the target."""
+        return jnp.repeat(tissue.alive & self.target.alive, 2)
 
 
 def _root_of_mean(
