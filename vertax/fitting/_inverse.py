@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
@@ -190,6 +190,12 @@ class InverseProblem(eqx.Module, Generic[Energy]):
         equilibrium = self.relax(tissue, energy, shift, adjoint=self.adjoint, primal=primal)
         placed = _placed(equilibrium, shift)
         return self.cost.residuals(self._cost_argument(placed), energy), equilibrium, placed.tissue
+
+    def is_measurement(
+        self, energy: AbstractEnergy, equilibrium: Equilibrium
+    ) -> Bool[Array, " residuals"]:
+        """Which residuals are measurements, see [`AbstractCost`][vertax.costs.AbstractCost]."""
+        return self.cost.is_measurement(self._cost_argument(equilibrium), energy)
 
     def _cost_argument(self, equilibrium: Equilibrium) -> Tissue:
         """The tissue, or the frames, of which the cost is evaluated."""
