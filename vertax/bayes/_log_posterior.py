@@ -200,8 +200,9 @@ class LogPosterior(eqx.Module):
         if isinstance(noise, Distribution):
             terms = noise.log_prob(residuals)
         else:
-            positive = jnp.asarray(noise) > 0
-            terms = Normal(0.0, jnp.where(positive, noise, 1)).log_prob(residuals)
+            deviation: Any = noise
+            positive = jnp.asarray(deviation) > 0
+            terms = Normal(0.0, jnp.where(positive, deviation, 1)).log_prob(residuals)
             terms = jnp.where(positive, terms, -jnp.inf)
         return jnp.where(outcome.measured, terms, 0), outcome
 
