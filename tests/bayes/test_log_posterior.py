@@ -78,7 +78,7 @@ def test_any_distribution_serves_as_noise(problem):
 
 @pytest.fixture(scope="module")
 def exact():
-    """A problem whose residuals are exactly 0 at its parameters."""
+    """A problem with residuals that are exactly 0 at its parameters."""
     return noisy_problem(0.0, truth=jnp.full(N_CELLS, MEAN))[0]
 
 

@@ -369,7 +369,7 @@ def _check_inside(
     entries = np.asarray(value)[~inside] if inside.shape == value.shape else np.asarray(value)
     raise ValueError(
         "Argument `start` (by default the parameters of the problem) must be inside the prior, but "
-        f"{entries.flat[0]:g} of {name!r} lies outside its prior, whose support is {support}. Choose "
+        f"{entries.flat[0]:g} of {name!r} lies outside its prior, which has the support {support}. Choose "
         "another start, or a wider prior."
     )
 
