@@ -76,6 +76,80 @@ def test_any_distribution_serves_as_noise(problem):
     assert float(jnp.sum(density.likelihood(parameters)[0])) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.fixture(scope="module")
+def exact():
+    """A problem with residuals that are exactly 0 at its parameters."""
+    return noisy_problem(0.0, truth=jnp.full(N_CELLS, MEAN))[0]
+
+
+def test_residuals_of_zero_are_measurements(exact):
+    parameters = {"target_shape_factor": jnp.full(N_CELLS, MEAN)}
+    n = 2 * exact.tissue.n_vertices
+    density = bayes.LogPosterior(exact, PRIOR, 0.01)
+    terms, outcome = density.likelihood(parameters)
+    assert outcome.measured.all()
+    assert float(jnp.sum(terms)) == pytest.approx(n * stats.norm(0, 0.01).logpdf(0))
+    # The same tissue with spare slots has the same measurements.
+    roomy = padded(exact, N_CELLS + 2)
+    terms, outcome = bayes.LogPosterior(roomy, PRIOR, 0.01).likelihood(
+        {"target_shape_factor": jnp.full(N_CELLS + 2, MEAN)}
+    )
+    assert int(jnp.sum(outcome.measured)) == n
+    assert float(jnp.sum(terms)) == pytest.approx(n * stats.norm(0, 0.01).logpdf(0))
+
+
+def test_marginal_density_of_an_exact_fit_is_finite(exact):
+    density = bayes.LogPosterior(exact, PRIOR, None)
+    value = lambda p: density.likelihood({"target_shape_factor": p})[0]
+    at, slope = eqx.filter_jit(eqx.filter_value_and_grad(value))(jnp.full(N_CELLS, MEAN))
+    assert jnp.isfinite(at)
+    assert jnp.isfinite(slope).all()
+    assert at > value(jnp.full(N_CELLS, MEAN + 1e-3))
+
+
+def test_parameters_outside_the_prior_have_density_zero(problem):
+    limited = {"target_shape_factor": dist.Uniform(3.0, 3.6)}
+    density = bayes.LogPosterior(problem, limited, 0.01)
+    outside = {"target_shape_factor": jnp.full(N_CELLS, MEAN)}
+    inside = {"target_shape_factor": jnp.full(N_CELLS, 3.59)}
+    assert density(outside) == eqx.filter_jit(density)(outside) == -np.inf
+    assert jnp.isfinite(density(inside))
+    for start in (None, outside):
+        with pytest.raises(
+            ValueError, match=r"3\.65 of 'target_shape_factor' lies outside its prior"
+        ):
+            bayes.Laplace(density, start)
+
+
+@pytest.mark.parametrize("prior", [dist.HalfNormal(1.0), dist.Normal(0.0, 1.0)])
+def test_noise_that_is_not_positive_has_density_zero(problem, prior):
+    density = bayes.LogPosterior(problem, PRIOR | {"noise": prior}, lambda p: p["noise"])
+    parameters = {"target_shape_factor": jnp.full(N_CELLS, MEAN), "noise": jnp.array(-0.1)}
+    assert density(parameters) == -np.inf
+
+
+def test_noise_of_another_shape_than_the_residuals_is_rejected(problem):
+    n = 2 * problem.tissue.n_vertices
+    parameters = {"target_shape_factor": jnp.full(N_CELLS, MEAN)}
+    at = lambda noise: jnp.sum(bayes.LogPosterior(problem, PRIOR, noise).likelihood(parameters)[0])
+    single = dist.Normal(0.0, 0.01).expand([n])
+    expected = at(0.01)
+    for noise in (jnp.full(n, 0.01), jnp.full(1, 0.01), single):
+        np.testing.assert_allclose(at(noise), expected, rtol=1e-12)
+    column = jnp.full((n, 1), 0.01)
+    for noise in (column, lambda p: column, jnp.full(3, 0.01), dist.Normal(0.0, column)):
+        with pytest.raises(
+            ValueError, match=rf"one for each residual, shape \({n},\), but its shape"
+        ):
+            at(noise)
+    joint = dist.MultivariateNormal(jnp.zeros(n), 1e-4 * jnp.eye(n))
+    for noise in (single.to_event(1), joint):
+        with pytest.raises(
+            ValueError, match=r"distribution of one residual, .* Leave out `to_event`"
+        ):
+            at(noise)
+
+
 def test_failed_relaxation_has_density_zero(problem):
     response = dataclasses.replace(problem.response, max_steps=1)
     density = bayes.LogPosterior(dataclasses.replace(problem, response=response), PRIOR, 0.01)

@@ -1,6 +1,7 @@
 # pyright: reportArgumentType=false
 """Arguments and fields that energies reject."""
 
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from helpers import random_tissue
 
+import vertax as vx
 from vertax.energies import (
     AbstractEnergy,
     AreaElasticity,
@@ -17,6 +19,7 @@ from vertax.energies import (
     LineTension,
     PerimeterElasticity,
     ShapeFactorEnergy,
+    foam_energy,
 )
 
 
@@ -45,6 +48,14 @@ from vertax.energies import (
         (lambda: AreaElasticity(np.inf, 1.0), ValueError, "`stiffness` must be finite"),
         (lambda: AreaElasticity(1.0, np.nan), ValueError, "`target_area` must be finite"),
         (lambda: PerimeterElasticity("a", 1.0), TypeError, "`stiffness` must hold real numbers"),
+        (lambda: AreaElasticity(-1.0, 1.0), ValueError, "`stiffness` must be at least 0"),
+        (
+            lambda: AreaElasticity(jnp.array([1.0, -2.0]), 1.0),
+            ValueError,
+            "`stiffness` must be at least 0, but is from -2.0 to 1.0",
+        ),
+        (lambda: PerimeterElasticity(-0.1, 1.0), ValueError, "`stiffness` must be at least 0"),
+        (lambda: foam_energy(0.1, stiffness=-1.0), ValueError, "`stiffness` must be at least 0"),
         (lambda: LineTension("a"), TypeError, "`tension` must hold real numbers, but is 'a'"),
         (lambda: BoundedTension(np.ones(3), -np.inf, 2.0), ValueError, "`low` must be finite"),
         (lambda: BoundedTension(np.ones(3), 0.0, "2"), TypeError, "`high` must be one real number"),
@@ -121,3 +132,53 @@ def test_energies_with_unusual_fields_can_be_evaluated_twice():
         eqx.nn.MLP(2, 2, 4, 1, key=jax.random.key(0)),
     ):
         assert value(Odd(odd, ("a", 1))) == value(Odd(odd, ("a", 1)))
+
+
+class Contractility(AbstractEnergy):
+    strength: Any
+
+    def __call__(self, tissue):
+        return jnp.sum(self.strength * tissue.perimeters**2)
+
+
+class Springs(AbstractEnergy):
+    """A column that is not expanded: one stiffness for both coordinates of a vertex."""
+
+    stiffness: Any
+
+    def __call__(self, tissue):
+        return 0.5 * jnp.sum(self.stiffness * (tissue.vertices - 1) ** 2)
+
+
+class PerimeterCost(vx.costs.AbstractLeastSquaresCost):
+    target: Any
+
+    def residuals(self, tissue, energy):
+        return (tissue.perimeters - self.target).ravel()
+
+
+def test_column_that_becomes_a_matrix_causes_a_warning():
+    tissue, energy = random_tissue(6), ShapeFactorEnergy(jnp.full(6, 3.7))
+    match = r"Field `strength` of Contractility has the shape \(6, 1\).* 6 × 6 entries.*\(6,\)"
+    column = Contractility(jnp.ones((6, 1)))
+    for wrong in (column, energy + column):
+        with pytest.warns(UserWarning, match=match):
+            vx.Relaxation().check(tissue, wrong, vx.ImplicitDifferentiation())
+        with pytest.warns(UserWarning, match=match):
+            vx.InverseProblem(tissue, wrong, vx.costs.VertexDistance(tissue))
+    with pytest.warns(UserWarning, match=r"`target` of PerimeterCost has the shape \(6, 1\)"):
+        vx.InverseProblem(tissue, energy, 2.0 * PerimeterCost(np.ones((6, 1))))
+
+
+def test_columns_that_make_no_matrix_cause_no_warning():
+    tissue = random_tissue(6)
+    network = eqx.nn.MLP(6, 6, 1, 1, key=jax.random.key(0))  # Weights of shapes (1, 6) and (6, 1).
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for energy in (
+            Springs(jnp.ones((12, 1))),
+            Contractility(jnp.ones(6)),
+            Odd(network),
+            lambda tissue: jnp.sum(tissue.areas),
+        ):
+            vx.Relaxation().check(tissue, energy, vx.ImplicitDifferentiation())

@@ -20,7 +20,7 @@ from helpers import (
     random_tissue,
     relaxed,
 )
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 import vertax as vx
 from vertax.costs import MeshImage, VertexDistance, render
@@ -430,6 +430,131 @@ def test_fit_from_a_tissue_with_overlaps_names_them(hidden):
     problem = inverse_problem(inside_out, guess, VertexDistance(target), response=response)
     with pytest.raises(vx.FitError, match="tissue of the problem has overlaps: cell 1,"):
         vx.fit(problem, ADAM, 2, progress=False)
+
+
+def test_error_of_a_fit_names_an_invalid_gradient_and_not_the_relaxation(hidden):
+    target, _, guess, start = hidden
+
+    class Root(vx.AbstractCost):
+        def __call__(self, tissue, energy):
+            return jnp.sum(jnp.sqrt(jnp.abs(energy.target_shape_factor - 3.7)))
+
+    few_steps = vx.ImplicitDifferentiation(linear_solver=vx.MINRES(max_steps=2))
+    for cost, adjoint, reason in (
+        (VertexDistance(target), few_steps, "gradient of epoch 0 cannot be trusted .*: the linear"),
+        (Root(), vx.ImplicitDifferentiation(), "no finite derivative with respect to a parameter"),
+    ):
+        problem = inverse_problem(start, guess, cost, adjoint=adjoint)
+        with pytest.raises(vx.FitError, match=f"^The fit stopped: .*{reason}") as error:
+            vx.fit(problem, ADAM, 2, progress=False)
+        assert "No epoch" not in str(error.value)
+
+
+def test_error_of_a_fit_names_parameters_and_forces_that_are_not_finite(hidden):
+    target, _, guess, start = hidden
+
+    class Root(vx.AbstractEnergy):
+        strength: Float[Array, ""]
+
+        def __call__(self, tissue):
+            perimeter = tissue.perimeters[0]
+            return self.strength * jnp.sqrt(jnp.abs(perimeter - perimeter)) + guess(tissue)
+
+    fit = lambda energy: vx.fit(
+        inverse_problem(start, energy, VertexDistance(target)), ADAM, 2, progress=False
+    )
+    with pytest.raises(vx.FitError, match=r"the forces are not finite. .* has a derivative"):
+        fit(Root(jnp.array(0.1)))
+    broken = eqx.tree_at(
+        lambda e: e.target_shape_factor, guess, replace_fn=lambda p: p.at[2].set(jnp.nan)
+    )
+    with pytest.raises(ValueError, match=r"finite parameters, but `target_shape_factor` .* nan"):
+        fit(broken)
+
+
+def test_energy_with_integer_arrays_alone_is_rejected_with_the_remedy(hidden):
+    target, _, _, start = hidden
+
+    class Contractility(vx.AbstractEnergy):
+        strength: Shaped[Array, " cells"]
+
+        def __call__(self, tissue):
+            return jnp.sum(self.strength * tissue.perimeters**2)
+
+    problem = inverse_problem(start, Contractility(jnp.ones(10, int)), VertexDistance(target))
+    with pytest.raises(
+        ValueError, match=r"`strength` has the type int64\. Convert it: jnp\.asarray"
+    ):
+        vx.fit(problem, ADAM, 2)
+
+
+OPTIMISERS = {
+    "steps of two epochs": lambda energy: optax.MultiSteps(ADAM, 2),
+    "random key": lambda energy: optax.noisy_sgd(1e-2, key=jax.random.key(0)),
+    "mask": lambda energy: optax.masked(ADAM, jax.tree.map(lambda _: True, energy)),
+    "labels": lambda energy: optax.partition(
+        {"a": ADAM, "b": optax.sgd(1e-2)}, lambda _: jax.tree.map(lambda _: "a", energy)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMISERS)
+def test_optimisers_with_keys_masks_and_several_steps(hidden, name, tmp_path):
+    target, _, guess, start = hidden
+    problem, optimiser = (
+        inverse_problem(start, guess, VertexDistance(target)),
+        OPTIMISERS[name](guess),
+    )
+    fit = lambda epochs, optimiser=optimiser, **options: vx.fit(
+        problem, optimiser, epochs, progress=False, **options
+    )
+    complete = fit(4)
+    if name == "steps of two epochs":
+        np.testing.assert_allclose(complete.history.cost[::2], complete.history.cost[1::2])
+        assert complete.history.cost[2] < complete.history.cost[0]
+    if name in ("mask", "labels"):
+        np.testing.assert_allclose(complete.history.cost, fit(4, ADAM).history.cost, rtol=1e-9)
+    fit(2, checkpoint=tmp_path / "fit.npz")
+    resumed = fit(4, checkpoint=tmp_path / "fit.npz")
+    np.testing.assert_array_equal(resumed.history.cost, complete.history.cost)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda _: optax.lbfgs(), r"'value_fn'\. A line search .*linesearch=None"),
+        (
+            lambda energy: optax.partition({"a": ADAM}, jax.tree.map(lambda _: "a", energy)),
+            "Give labels as a function",
+        ),
+        (lambda _: optax.contrib.sam(ADAM, ADAM), "needs parameters, gradient and cost alone"),
+    ],
+)
+def test_optimisers_that_need_more_than_the_gradient_are_rejected(hidden, make, message):
+    target, _, guess, start = hidden
+    problem = inverse_problem(start, guess, VertexDistance(target))
+    with pytest.raises(TypeError, match=rf"`optimiser` must be an Optax optimiser .*{message}"):
+        vx.fit(problem, make(guess), 2, progress=False)
+    stacked = stack([problem, problem])
+    with pytest.raises(TypeError, match=message):
+        vx.fit(stacked, make(guess), 2, batched=True, progress=False)
+
+
+def test_members_without_a_valid_epoch_have_failed(hidden):
+    target, _, guess, start = hidden
+    one_step = dataclasses.replace(FIXED_TOPOLOGY, max_steps=1)
+    problem = lambda start, target: inverse_problem(
+        start, guess, VertexDistance(target), response=one_step
+    )
+    invalid = target.with_vertices(target.vertices * jnp.nan)
+    members = [problem(start, target), problem(random_tissue(10, 8), target)]
+    batch = stack([*members, problem(start, invalid)])
+    noisy = optax.noisy_sgd(1e-4, key=jax.random.key(0))  # (An optimiser with a random key.)
+    fit = vx.fit(batch, noisy, 2, batched=True, progress=False)
+    np.testing.assert_array_equal(fit.best_epoch < 0, [False, True, True])
+    expected = ("successful", "nonlinear_max_steps_reached", "not_finite_cost")
+    for k, name in enumerate(expected):
+        assert vx.fitting.member(fit.result, k) == getattr(vx.RESULTS, name)
 
 
 def test_invalid_problems_are_rejected(hidden):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -38,6 +40,43 @@ def check_fields(module: eqx.Module) -> None:
                     f"Field {what} must hold numbers, but holds {describe(leaf)}. Give text as a tuple: "
                     "tuple(array.tolist())."
                 )
+
+
+def warn_of_outer_products(module: Any, counts: Mapping[str, int], *arguments: Any) -> None:
+    """Warn of a field of shape (n, 1) or (1, n) with which a module computes an array of shape (n, n).
+
+    A column times an array of one entry per cell is an outer product, and its sum is a wrong number.
+
+    **Arguments:**
+
+    - `module`: the module, called with the `arguments`; other functions have no fields.
+    - `counts`: numbers of cells, edges and vertices by the name of one of them.
+    """
+    for name, shape in _matrices(module):
+        n = max(shape)
+        items = [item for item, count in counts.items() if count == n]
+        if not items or shape not in ((n, 1), (1, n)):
+            continue
+        # (The trace takes longer than the rest, but it is rare.)
+        trace, *_ = eqx.filter_make_jaxpr(lambda f, *x: f(*x))(module, *arguments)
+        if f"[{n},{n}]" in str(trace):
+            warnings.warn(
+                f"Field {name} has the shape {shape}, and its product with an array of one entry per "
+                f"{items[0]} has {n} × {n} entries. Give it the shape ({n},): reshape(-1).",
+                stacklevel=4,
+            )
+
+
+def _matrices(module: Any) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Names and shapes of the fields of a module, and of nested modules, that are matrices."""
+    if not isinstance(module, eqx.Module):
+        return
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name, None)
+        for leaf in jax.tree.leaves(value, is_leaf=lambda x: isinstance(x, eqx.Module)):
+            yield from _matrices(leaf)
+        if isinstance(value, np.ndarray | jax.Array) and value.ndim == 2 and max(value.shape) > 2:
+            yield f"`{field.name}` of {type(module).__name__}", value.shape
 
 
 def _check_static(what: str, value: Any) -> None:

@@ -50,7 +50,15 @@ def zeros_of(shapes: Any) -> Any:
 
 def tree_where(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
     """`jnp.where` for pytrees, with the dtypes of `old`; leaves that are not arrays are those of `new`."""
-    pick = lambda x, y: jnp.where(condition, x, y).astype(y.dtype) if eqx.is_array(x) else x
+
+    def pick(x: Any, y: Any) -> Any:
+        if not eqx.is_array(x):
+            return x
+        chosen = jnp.where(condition, x, y)
+        return (
+            chosen if chosen.dtype == y.dtype else chosen.astype(y.dtype)
+        )  # (Keys have no `astype`.)
+
     return jax.tree.map(pick, new, old)
 
 
@@ -73,7 +81,8 @@ def traced(tree: Tree, dtype: Any = None, *, integers: bool = False) -> Tree:
             return jnp.asarray(x, dtype)
         if integers and isinstance(x, int) and not isinstance(x, bool):
             return jnp.asarray(x, None if dtype is None else jnp.result_type(int))
-        if dtype is not None and isinstance(x, jax.Array) and x.weak_type:
+        # (Random keys have no `weak_type`.)
+        if dtype is not None and isinstance(x, jax.Array) and getattr(x, "weak_type", False):
             strong = dtype if jnp.issubdtype(x.dtype, jnp.floating) else x.dtype
             return jax.lax.convert_element_type(x, strong)
         return x

@@ -42,7 +42,8 @@ class Laplace(eqx.Module):
     **Raises:**
 
     - `TypeError` for a density that is no `LogPosterior`.
-    - `ValueError` if the density at the start is not finite, or the data determine no parameter.
+    - `ValueError` if the start lies outside the prior or has no finite density, or the data determine no
+        parameter.
     """
 
     log_posterior: LogPosterior
@@ -58,11 +59,14 @@ class Laplace(eqx.Module):
     def __init__(self, log_posterior: LogPosterior, start: Parameters | None = None):
         check_log_posterior(log_posterior)
         z = log_posterior.start() if start is None else log_posterior.coordinates_of(start)
-        density = float(evaluate(log_posterior, z).log_density)
-        if not np.isfinite(density):
+        first = evaluate(log_posterior, z)
+        if not np.isfinite(first.log_density):
+            reason = "prior or noise have no finite density there"
+            if not first.outcome.converged:
+                reason = "the tissue does not reach equilibrium there, or a parameter is not finite"
             raise ValueError(
-                f"Argument `start` must have a finite log density, but it is {density}: the tissue does not "
-                "reach equilibrium there, or a parameter is not finite. Start at the parameters of a fit."
+                f"Argument `start` must have a finite log density, but it is {first.log_density}: {reason}. "
+                "Start at the parameters of a fit."
             )
         scale = np.asarray(jnp.std(log_posterior.prior_draws(), axis=0))
         u, density, prior, data, num_gradients = _mode(log_posterior, z, scale)

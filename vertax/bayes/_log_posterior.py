@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from numpyro.distributions import Distribution, Normal
@@ -16,7 +17,7 @@ from numpyro.distributions.transforms import biject_to
 
 from vertax._base.checks import check_number, describe
 from vertax._base.results import RESULTS
-from vertax._base.tracing import traced
+from vertax._base.tracing import is_concrete, traced
 from vertax.dynamics import Evolution
 from vertax.energies._units import cell_size
 from vertax.fitting import InverseProblem
@@ -35,6 +36,8 @@ class Outcome(eqx.Module):
     """T1 transitions of the relaxations."""
     shortest_edge: Float[Array, ""]
     """Length of the shortest edge, in units of the size of a cell."""
+    measured: Bool[Array, "..."]
+    """Which residuals are measurements, in the shape of the residuals."""
 
 
 class LogPosterior(eqx.Module):
@@ -50,8 +53,8 @@ class LogPosterior(eqx.Module):
 
     Residuals are in the units of the cost. The costs of vertax are means; multiplied by a number they have
     residuals in units of the data: `n_vertices * VertexDistance(target)` displacements of vertices,
-    `n_pixels * MeshImage(image, width)` differences of pixels, with all weights equal. Residuals that are
-    exactly 0 (spare slots, pixels of weight 0) are not measurements.
+    `n_pixels * MeshImage(image, width)` differences of pixels, with all weights equal. Residuals without data
+    (spare slots, pixels of weight 0) do not count: `is_measurement` of the cost leaves them out.
 
     ```python
     import numpyro.distributions as dist
@@ -66,11 +69,12 @@ class LogPosterior(eqx.Module):
     - `prior`: distributions of NumPyro by name of the parameter. Without `energy`, names are those of arrays
         of the energy of the problem, e.g. `"target_shape_factor"` or `"terms.0.stiffness"`, and a
         distribution of one number is that of each entry; other arrays are constants.
-    - `noise`: standard deviation of Gaussian noise of a residual; or the distribution of residuals, e.g.
-        `dist.StudentT(4.0, 0.0, 0.01)`; or a function of the parameters that returns one of these, to fit
-        the noise: `lambda p: p["noise"]`. None integrates over the standard deviation $\sigma$ of Gaussian
-        noise with the prior $1/\sigma$, in closed form for $m$ residuals:
-        $\log \tfrac12\Gamma(\tfrac m2) - \tfrac m2 \log (\pi \sum_i r_i^2)$.
+    - `noise`: standard deviation of Gaussian noise of a residual; or the distribution of a residual, e.g.
+        `dist.StudentT(4.0, 0.0, 0.01)`; one, or one for each residual; or a function of the parameters that
+        returns one of these, to fit the noise: `lambda p: p["noise"]`. None integrates over the standard
+        deviation $\sigma$ of Gaussian noise with the prior $1/\sigma$, in closed form for $m$ residuals:
+        $\log \tfrac12\Gamma(\tfrac m2) - \tfrac m2 \log (\pi \sum_i r_i^2)$. (It has no upper bound, so a sum
+        of exactly 0 counts as a tiny positive number.)
     - `energy`: a function of the parameters, a dictionary of arrays, that returns the energy: for
         parameters by type or position, and hierarchies. For a batch, every array of the energy has the
         leading axis of the replicates. With `fit_position` it returns a tuple of energy and displacement.
@@ -82,7 +86,8 @@ class LogPosterior(eqx.Module):
 
     - `TypeError` for arguments of a wrong type.
     - `ValueError` for an improper or discrete prior, a prior of another shape than its parameter, a name that
-        is no array of the energy, and a response that cannot keep the topology.
+        is no array of the energy, a response that cannot keep the topology, and in an evaluation for noise
+        of another shape than the residuals.
     """
 
     problem: InverseProblem
@@ -138,16 +143,26 @@ class LogPosterior(eqx.Module):
 
         - `parameters`: arrays by name, as in the prior.
 
-        **Returns:** the log density, without the constant; $-\\infty$ without an equilibrium.
+        **Returns:** the log density, without the constant; $-\\infty$ without an equilibrium, outside the
+        support of a prior, and for a standard deviation of the noise that is not positive.
 
         **Raises:**
 
         - `ValueError` for other names or shapes than those of the prior.
         """
         self._check_parameters("parameters", parameters)
+        supports: dict[str, Any] = {name: d.support for name, d in self.prior.items()}
+        values = {name: jnp.asarray(parameters[name]) for name in supports}
+        each = [jnp.all(supports[name](value)) for name, value in values.items()]
+        inside = jnp.all(jnp.stack(each))
+        # Outside the support evaluate at parameters inside, where all terms and derivatives are finite.
+        parameters = {
+            name: jnp.where(inside, value, supports[name].feasible_like(value))
+            for name, value in values.items()
+        }
         log_prior = sum(jnp.sum(d.log_prob(parameters[n])) for n, d in self.prior.items())
         terms, outcome = self.likelihood(parameters)
-        return log_prior + jnp.where(outcome.converged, jnp.sum(terms), -jnp.inf)
+        return log_prior + jnp.where(inside & outcome.converged, jnp.sum(terms), -jnp.inf)
 
     def draw(self, key: PRNGKeyArray) -> dict[str, Array]:
         """Draw parameters from the prior."""
@@ -166,21 +181,30 @@ class LogPosterior(eqx.Module):
         finite = jnp.all(jnp.isfinite(residuals))
         converged = jnp.all(outcome.converged) & finite
         edge = jnp.min(outcome.shortest_edge)
-        return residuals, Outcome(converged, jnp.sum(outcome.num_t1), edge)
+        return residuals, Outcome(converged, jnp.sum(outcome.num_t1), edge, outcome.measured)
 
     def likelihood(self, parameters: Parameters) -> tuple[Float[Array, "..."], Outcome]:
         """Log likelihood of each residual (with `noise=None` of all, one number), and the outcome."""
         residuals, outcome = self.residuals(parameters)
-        measured = residuals != 0
         if self.noise is None:
-            n = jnp.sum(measured)
-            log_sum = jnp.log(jnp.pi * jnp.sum(residuals**2))
+            n = jnp.sum(outcome.measured)
+            limits = jnp.finfo(residuals.dtype)
+            # At an exact fit the density has no bound. Above this limit its derivative does not overflow.
+            squares = jnp.maximum(jnp.sum(residuals**2), limits.tiny / limits.eps)
+            log_sum = jnp.log(jnp.pi * squares)
             return jax.lax.lgamma(n / 2) - jnp.log(2.0) - n / 2 * log_sum, outcome
         noise = self.noise
         if callable(noise) and not isinstance(noise, Distribution):
             noise = noise(parameters)
-        noise = noise if isinstance(noise, Distribution) else Normal(0.0, noise)
-        return jnp.where(measured, noise.log_prob(residuals), 0), outcome
+        _check_noise(noise, residuals.shape)
+        if isinstance(noise, Distribution):
+            terms = noise.log_prob(residuals)
+        else:
+            deviation: Any = noise
+            positive = jnp.asarray(deviation) > 0
+            terms = Normal(0.0, jnp.where(positive, deviation, 1)).log_prob(residuals)
+            terms = jnp.where(positive, terms, -jnp.inf)
+        return jnp.where(outcome.measured, terms, 0), outcome
 
     # Samplers move in coordinates z of all real numbers: θ = b(z) with the bijections b to the supports of
     # the priors, log p(z) = log p(b(z)) + log |det ∂b/∂z|.
@@ -212,8 +236,11 @@ class LogPosterior(eqx.Module):
     def coordinates_of(self, parameters: Parameters) -> Float[Array, " coordinates"]:
         """The real coordinates of parameters."""
         self._check_parameters("start", parameters)
-        transforms = {name: biject_to(d.support) for name, d in self.prior.items()}
-        parts = {n: t.inv(jnp.asarray(parameters[n])) for n, t in transforms.items()}
+        parts = {}
+        for name, d in self.prior.items():
+            value = jnp.asarray(parameters[name])
+            parts[name] = biject_to(d.support).inv(value)
+            _check_inside(name, d, value, parts[name])
         return ravel_pytree(parts)[0].astype(self.problem.tissue.vertices.dtype)
 
     def start(self) -> Float[Array, " coordinates"]:
@@ -259,7 +286,8 @@ def _observe(
     lengths = jnp.where(tissue.topology.alive_edges, tissue.edge_lengths, jnp.inf)
     converged = jnp.all(equilibrium.result == RESULTS.successful)
     shortest = jnp.min(lengths) / cell_size(tissue)
-    return residuals, Outcome(converged, jnp.sum(equilibrium.num_t1), shortest)
+    measured = problem.is_measurement(energy, equilibrium)
+    return residuals, Outcome(converged, jnp.sum(equilibrium.num_t1), shortest, measured)
 
 
 _is_real = eqx.is_inexact_array
@@ -321,6 +349,46 @@ def _check_proper(name: str, distribution: Any) -> None:
         raise ValueError(
             f"The prior of {name!r} must be a proper distribution of real numbers, but is "
             f"{type(distribution).__name__}. Take a wide one, such as dist.Normal(mean, 10 * deviation)."
+        )
+
+
+def _check_inside(
+    name: str, distribution: Distribution, value: Array, coordinates: Float[Array, "..."]
+) -> None:
+    """Raise an error for a concrete value at which a prior has no density, or no real coordinates."""
+    if not is_concrete(coordinates):
+        return
+    support: Any = distribution.support
+    inside = np.asarray(support(value))
+    if inside.shape == np.shape(coordinates):
+        inside = inside & np.isfinite(
+            coordinates
+        )  # (The end of an interval has no real coordinate.)
+    if inside.all() and np.isfinite(coordinates).all():
+        return
+    entries = np.asarray(value)[~inside] if inside.shape == value.shape else np.asarray(value)
+    raise ValueError(
+        "Argument `start` (by default the parameters of the problem) must be inside the prior, but "
+        f"{entries.flat[0]:g} of {name!r} lies outside its prior, which has the support {support}. Choose "
+        "another start, or a wider prior."
+    )
+
+
+def _check_noise(noise: Any, shape: tuple[int, ...]) -> None:
+    """Raise an error unless noise has one entry, or one for each residual."""
+    event = noise.event_shape if isinstance(noise, Distribution) else ()
+    if event:
+        raise ValueError(
+            f"Argument `noise` must be the distribution of one residual, but is joint, of shape {event}. "
+            "Leave out `to_event`. For correlated residuals r with covariance L Lᵀ, take a cost with the "
+            "residuals L⁻¹ r, and noise=1.0."
+        )
+    given = noise.batch_shape if isinstance(noise, Distribution) else jnp.shape(noise)
+    missing = len(shape) - len(given)
+    if missing < 0 or any(n not in (1, m) for n, m in zip(given, shape[missing:], strict=True)):
+        raise ValueError(
+            f"Argument `noise` must be one number or distribution, or one for each residual, shape {shape}, "
+            f"but its shape is {given}. Give it this shape."
         )
 
 

@@ -107,11 +107,10 @@ class Posterior(eqx.Module):
                 "single residuals have no likelihood. Fit the noise, see LogPosterior."
             )
         draws = {name: jnp.asarray(self.draws(name)) for name in log_posterior.prior}
-        terms = np.asarray(_terms(log_posterior, draws))
-        terms = terms.reshape(*terms.shape[:2], -1)
+        terms, measured = map(np.asarray, _terms(log_posterior, draws))
         groups = {
             "posterior": jax.tree.map(np.asarray, draws),
-            "log_likelihood": {"residuals": terms[..., np.any(terms != 0, axis=(0, 1))]},
+            "log_likelihood": {"residuals": terms[:, :, measured[0, 0]]},
         }
         return arviz.loo(_inference_data(groups))
 
@@ -128,10 +127,14 @@ def _parameters(log_posterior: LogPosterior, z: Array) -> dict[str, Array]:
 
 
 @announced_jit
-def _terms(log_posterior: LogPosterior, draws: dict[str, Array]) -> Array:
-    return jax.lax.map(
-        lambda chain: jax.lax.map(lambda draw: log_posterior.likelihood(draw)[0], chain), draws
-    )
+def _terms(log_posterior: LogPosterior, draws: dict[str, Array]) -> tuple[Array, Array]:
+    """The log likelihood of each residual, and which are measurements, of all draws."""
+
+    def one(draw: dict[str, Array]) -> tuple[Array, Array]:
+        terms, outcome = log_posterior.likelihood(draw)
+        return terms, outcome.measured
+
+    return jax.lax.map(lambda chain: jax.lax.map(one, chain), draws)
 
 
 def _warn(log_posterior: LogPosterior, stats: dict[str, np.ndarray]) -> None:

@@ -55,7 +55,8 @@ class AbstractCost(eqx.Module):
         """Which residuals are measurements; by default all.
 
         The others have no data and are 0 for every parameter, as those of spare slots and of pixels of
-        weight 0. [`uncertainty`][vertax.uncertainty] does not count them.
+        weight 0. [`uncertainty`][vertax.uncertainty] and [`LogPosterior`][vertax.bayes.LogPosterior] do not
+        count them.
         """
         return jnp.ones(eqx.filter_eval_shape(self.residuals, tissue, energy).shape, bool)
 

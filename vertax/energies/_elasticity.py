@@ -57,6 +57,10 @@ class AreaElasticity(AbstractLocalEnergy):
 
     - `stiffness`: $K$, energy per area squared; scalar or one per cell.
     - `target_area`: $A^0$; scalar or one per cell.
+
+    **Raises:**
+
+    - `ValueError` for a negative stiffness, for which the energy has no minimum.
     """
 
     stiffness: float | Float[Array, "*cells"] = eqx.field(
@@ -65,6 +69,9 @@ class AreaElasticity(AbstractLocalEnergy):
     target_area: float | Float[Array, "*cells"] = eqx.field(
         converter=partial(as_parameter, "target_area")
     )
+
+    def __check_init__(self):
+        check_number("stiffness", self.stiffness, at_least=0, many=True)
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""
@@ -87,6 +94,10 @@ class PerimeterElasticity(AbstractLocalEnergy):
 
     - `stiffness`: $K$, energy per length squared; scalar or one per cell.
     - `target_perimeter`: $P^0$; scalar or one per cell.
+
+    **Raises:**
+
+    - `ValueError` for a negative stiffness, for which the energy has no minimum.
     """
 
     stiffness: float | Float[Array, "*cells"] = eqx.field(
@@ -95,6 +106,9 @@ class PerimeterElasticity(AbstractLocalEnergy):
     target_perimeter: float | Float[Array, "*cells"] = eqx.field(
         converter=partial(as_parameter, "target_perimeter")
     )
+
+    def __check_init__(self):
+        check_number("stiffness", self.stiffness, at_least=0, many=True)
 
     def cell_terms(self, tissue: Tissue) -> Float[Array, " cells"]:
         """Energy of each cell."""

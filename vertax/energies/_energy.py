@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.checks import as_real, describe
-from vertax._base.field_checks import check_fields
+from vertax._base.field_checks import check_fields, warn_of_outer_products
 from vertax.mesh import Tissue
 
 
@@ -127,6 +127,13 @@ def check_energy(energy: Any, name: str = "energy") -> None:
         f"Argument `{name}` must be an energy, e.g. vertax.energies.ShapeFactorEnergy(3.8), but is "
         f"{describe(energy)}.{instance_hint(energy)}"
     )
+
+
+def warn_of_columns(function: Any, tissue: Tissue, *arguments: Any) -> None:
+    """Warn of a column in an energy or cost that makes a matrix of one entry per cell, edge or vertex."""
+    if tissue.vertices.ndim == 2:
+        counts = {"cell": tissue.n_cells, "edge": tissue.n_edges, "vertex": tissue.n_vertices}
+        warn_of_outer_products(function, counts, tissue, *arguments)
 
 
 def instance_hint(value: Any) -> str:

@@ -40,7 +40,10 @@ def check_arguments(
 
 
 def _check_optimiser(optimiser: Any) -> None:
-    if isinstance(optimiser, optax.GradientTransformation | optx.AbstractLeastSquaresSolver):
+    if isinstance(
+        optimiser,
+        optax.GradientTransformation | optax.MultiSteps | optx.AbstractLeastSquaresSolver,
+    ):
         return
     remedy = (
         "Pass an Optax optimiser, such as optax.adam(1e-2), or a least-squares solver, such as "

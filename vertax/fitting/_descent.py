@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -14,12 +15,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.fingerprint import fingerprint
-from vertax._base.results import RESULTS
+from vertax._base.results import RESULTS, first_failure, result_of
 from vertax._base.tracing import traced, tree_where
 from vertax.fitting._epoch import (
     AbstractMethod,
     Best,
     better,
+    first_line,
     guidance_of,
     no_shift,
     over_members,
@@ -44,14 +46,19 @@ class State(eqx.Module):
     optimiser: PyTree
     tissue: Tissue
     best: Best
-    active: Bool[Array, "*batch"]
-    """False after an epoch with an invalid cost or gradient."""
+    result: RESULTS
+    """The first failure: an invalid cost or gradient."""
     hessian: RecycledHessian | None
     """Hessian at the equilibrium of an earlier epoch."""
     hessian_epoch: Int[Array, "*batch"]
     """Epoch of that Hessian; 0 if there is none."""
     stale: Bool[Array, "*batch"]
     """Whether the Hessian no longer applies to the current tissue."""
+
+    @property
+    def active(self) -> Bool[Array, "*batch"]:
+        """False after an epoch with an invalid cost or gradient."""
+        return self.result == RESULTS.successful
 
 
 class Descent(AbstractMethod):
@@ -66,6 +73,16 @@ class Descent(AbstractMethod):
     guidance: Callable[[Int[Array, ""]], ArrayLike] | None
     recent: list[Any] = eqx.field(default_factory=list)
     """Cache: the problem, the Hessian and the compiled problem of the last epoch."""
+
+    def __check_init__(self):
+        calculation, arguments = self._one_update()
+        try:
+            jax.eval_shape(calculation, *arguments)
+        except Exception as error:
+            raise TypeError(
+                "Argument `optimiser` must be an Optax optimiser that needs parameters, gradient and cost "
+                f"alone, but its update raises {type(error).__name__}: {first_line(error)}. {_remedy(error)}"
+            ) from error
 
     def _evaluation(self, problem: InverseProblem, state: State) -> Evaluation:
         if self.batched:
@@ -112,15 +129,24 @@ class Descent(AbstractMethod):
 
     def description(self) -> str:
         # An Optax optimiser consists of closures, which do not print their constants.
-        fitted = cast(optax.Params, (self.parameters, no_shift(self.problem)))
-        value = jnp.zeros((), self.problem.tissue.vertices.dtype)
+        calculation, shapes = self._one_update()
+        return fingerprint(
+            calculation, *jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        )
+
+    def _one_update(self) -> tuple[Callable[[optax.Params, Array], optax.Params], tuple]:
+        """The first update of the optimiser as a function, and the shapes of its arguments."""
         update = optax.with_extra_args_support(self.optimiser).update
 
         def calculation(fitted: optax.Params, value: Array) -> optax.Params:
             state = self.optimiser.init(fitted)
             return update(fitted, state, fitted, value=value, grad=fitted)[0]
 
-        return fingerprint(calculation, fitted, value)
+        shape_of = lambda x: jax.ShapeDtypeStruct(x.shape[1:] if self.batched else x.shape, x.dtype)
+        parameters = jax.tree.map(shape_of, self.parameters)
+        dtype = self.problem.tissue.vertices.dtype
+        shift = jax.ShapeDtypeStruct((2,), dtype) if self.problem.fit_position else None
+        return calculation, (_fitted(parameters, shift), jax.ShapeDtypeStruct((), dtype))
 
     def strength(self, epoch: int) -> float:
         if self.guidance is None:
@@ -145,6 +171,25 @@ class Descent(AbstractMethod):
         return eqx.tree_at(lambda p: p.guidance, problem, strength, is_leaf=lambda x: x is None)
 
 
+def _fitted(parameters: PyTree, shift: Any) -> optax.Params:
+    """The arrays that the optimiser changes: the parameters, and the displacement if it is fitted."""
+    return cast(optax.Params, parameters if shift is None else (parameters, shift))
+
+
+def _remedy(error: Exception) -> str:
+    if "value_fn" in str(error):
+        return (
+            "A line search would relax the tissue many times in an epoch. Pass an optimiser without "
+            "one, such as optax.lbfgs(0.1, linesearch=None), or a least-squares solver, such as "
+            "optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)."
+        )
+    return (
+        "Give labels as a function of the fitted arrays, optax.partition(optimisers, lambda parameters: "
+        "labels); with `fit_position` these are a pair of parameters and displacement. Or pass another "
+        "optimiser, such as optax.adam(1e-2)."
+    )
+
+
 @announced_jit
 def _start(
     problem: InverseProblem,
@@ -153,17 +198,13 @@ def _start(
     batched: bool,
 ) -> State:
     def start(problem: InverseProblem, parameters: PyTree[Array]) -> State:
-        fitted = cast(optax.Params, (parameters, no_shift(problem)))
+        fitted = _fitted(parameters, no_shift(problem))
         best = unbeaten(problem, parameters)
         no_hessian = problem.response.preconditioner_at(problem.tissue, None)
-        state, true_array = (
-            traced(optimiser.init(fitted), problem.tissue.vertices.dtype),
-            jnp.array(True),
-        )
+        state = traced(optimiser.init(fitted), problem.tissue.vertices.dtype)
         zero = jnp.zeros((), jnp.result_type(int))
-        return State(
-            parameters, state, problem.tissue, best, true_array, no_hessian, zero, stale=true_array
-        )
+        result, stale = result_of(zero), jnp.array(True)
+        return State(parameters, state, problem.tissue, best, result, no_hessian, zero, stale)
 
     return (eqx.filter_vmap(start) if batched else start)(problem, parameters)
 
@@ -203,20 +244,22 @@ def _update(
         shift = (
             None if evaluation.shift_gradient is None else jnp.zeros_like(evaluation.shift_gradient)
         )
-        gradient = (evaluation.gradient, evaluation.shift_gradient)
+        gradient = _fitted(evaluation.gradient, evaluation.shift_gradient)
         equilibrium = evaluation.equilibrium
         record = _record(state.parameters, evaluation, gradient, true, throw)
-        active = state.active & (record.result == RESULTS.successful)
-        fitted = (state.parameters, shift)
+        result = first_failure(state.result, record.result)
+        active = result == RESULTS.successful
+        fitted = _fitted(state.parameters, shift)
         updates, optimiser_state = optax.with_extra_args_support(optimiser).update(
             cast(optax.Updates, gradient),
             state.optimiser,
-            cast(optax.Params, fitted),
+            fitted,
             value=evaluation.cost,
             grad=gradient,
         )
-        parameters, shift = eqx.apply_updates(fitted, updates)
+        parameters = eqx.apply_updates(fitted, updates)
         if shift is not None:
+            parameters, shift = parameters
             next_tissue = next_tissue.with_vertices(next_tissue.vertices + shift)
         best = better(
             state.best,
@@ -231,10 +274,10 @@ def _update(
         if hessian is not None:
             stale = ~hessian.near(next_tissue.configuration).ready
         updated = State(
-            parameters, optimiser_state, next_tissue, best, active, None, state.hessian_epoch, stale
+            parameters, optimiser_state, next_tissue, best, result, None, state.hessian_epoch, stale
         )
         # After a failed epoch keep the previous state, so that no relaxation starts from an invalid tissue.
-        return tree_where(active, updated, eqx.tree_at(lambda s: s.active, state, active)), record
+        return tree_where(active, updated, eqx.tree_at(lambda s: s.result, state, result)), record
 
     return (eqx.filter_vmap(one) if batched else one)(*arguments)
 

@@ -28,6 +28,12 @@ class Best(eqx.Module):
     epoch: Int[Array, ""]
 
 
+def first_line(error: Exception) -> str:
+    """The first line of the message of an error, without a full stop; its type if it has none."""
+    lines = (line.strip(" .") for line in str(error).splitlines())
+    return next((line for line in lines if line), type(error).__name__)
+
+
 def over_members(function: Callable[..., Any], problem: InverseProblem) -> Callable[..., Any]:
     """Map a function that takes derivatives over the members of a batch of problems."""
     batched = problem.response.prefers_batching
@@ -39,7 +45,7 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def start(self) -> Any:
-        """The initial state: a pytree with the fields `best` and `active` (False when the fit has ended)."""
+        """The initial state: a pytree with `best`, `active` (False when the fit has ended) and `result`."""
 
     @abc.abstractmethod
     def advance(self, state: Any, epoch: int) -> tuple[Any, Record]:

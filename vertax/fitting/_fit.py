@@ -34,7 +34,7 @@ from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._arguments import check_arguments
 from vertax.fitting._descent import Descent
-from vertax.fitting._epoch import AbstractMethod
+from vertax.fitting._epoch import AbstractMethod, first_line
 from vertax.fitting._history import Fit, FitError, History, Record
 from vertax.fitting._inverse import Energy, InverseProblem
 from vertax.fitting._least_squares import LeastSquares
@@ -45,7 +45,9 @@ Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
 @announce_compilations("a fit")
 def fit(
     problem: InverseProblem[Energy],
-    optimiser: optax.GradientTransformation | optx.AbstractLeastSquaresSolver[Any, Any, Any, Any],
+    optimiser: optax.GradientTransformation
+    | optax.MultiSteps
+    | optx.AbstractLeastSquaresSolver[Any, Any, Any, Any],
     epochs: int,
     *,
     truth: AbstractEnergy | None = None,
@@ -78,7 +80,10 @@ def fit(
 
     - `problem`: the inverse problem.
     - `optimiser`: an Optax optimiser, e.g. `optax.adam(1e-2)`, or `optax.nadam(1e-3)` as in the paper;
-        or a least-squares solver of Optimistix.
+        or a least-squares solver of Optimistix. Optax receives the energy with None for its constants; with
+        `fit_position` a pair of it and the displacement. Labels and masks have this structure, and must be
+        functions (`lambda parameters: labels`), because energies are callable. Optimisers with a line search
+        are rejected.
     - `epochs`: number of updates.
     - `truth`: the energy with the true parameters if available, to record the error.
     - `guidance`: strength $\kappa$ as a function of the epoch, e.g. an Optax schedule, which replaces that of
@@ -99,12 +104,12 @@ def fit(
 
     **Raises:**
 
-    - `ValueError` if there is nothing to fit, for less than one epoch, for a batch with different leading
-        axes, for `guidance` with a least-squares solver, for a `callback` that returns changing names, and
-        for a checkpoint that is broken or belongs to another fit.
+    - `ValueError` if there is nothing to fit, for parameters that are not finite, for less than one epoch,
+        for a batch with different leading axes, for `guidance` with a least-squares solver, for a `callback`
+        that returns changing names, and for a checkpoint that is broken or belongs to another fit.
     - `FileNotFoundError` if the folder of the checkpoint does not exist.
-    - `TypeError` for a least-squares solver with a cost that is not a sum of squares, and for arguments of a
-        wrong type.
+    - `TypeError` for a least-squares solver with a cost that is not a sum of squares, for an optimiser that
+        needs more than parameters, gradient and cost, and for arguments of a wrong type.
     - [`FitError`][vertax.FitError] if cost or gradient are not finite, if the adjoint did not converge, or if
         no epoch reached equilibrium; it holds the fit so far.
     """
@@ -112,11 +117,15 @@ def fit(
     parameters, fixed = eqx.partition(problem.energy, problem.trainable)
     if not jax.tree.leaves(parameters):
         raise ValueError(
-            "There is nothing to fit: no leaf of the energy is selected by `trainable`. Parameters are "
-            "arrays, as in LineTension(jnp.full(n_edges, 1.0)); Python floats are constants."
+            "There is nothing to fit: no leaf of the energy is selected by `trainable`. "
+            + _nothing_to_fit(problem.energy)
         )
     if batched:
         _check_batch((problem, truth))
+    else:  # (In a batch the other members continue.)
+        _check_finite(parameters)
+    if isinstance(optimiser, optax.MultiSteps):
+        optimiser = optimiser.gradient_transformation()
     dtype = problem.tissue.vertices.dtype
     parameters = traced(parameters, dtype)
     true = None if truth is None else traced(eqx.filter(truth, problem.trainable), dtype)
@@ -147,13 +156,15 @@ def fit(
     history = History(**columns_of(done.rows))
     if not np.isfinite(best.facts.cost).any():
         overlaps = "" if batched else given.tissue.overlaps.describe()
-        raise FitError(
-            "No epoch of the fit reached equilibrium: raise `max_steps`, loosen `tolerance`, or use the "
-            f"default solver (largest force: {history.max_force.min():.1e}). Stopped because "
-            f"{stopped or 'all epochs were done'}."
-            + (f" The tissue of the problem has overlaps: {overlaps}." if overlaps else ""),
-            None,
-        )
+        raise FitError(_without_best(history, stopped, overlaps), None)
+    # A member without valid epochs has failed, although the fit continued. The first failure counts.
+    unrelaxed = np.isfinite(history.max_force).any(axis=0)
+    codes = [RESULTS.successful, result, RESULTS.nonlinear_max_steps_reached, RESULTS.nonfinite]
+    successful, ended, no_equilibrium, broken = (np.asarray(index_of(code)) for code in codes)
+    failure = np.where(unrelaxed, no_equilibrium, broken)
+    code = np.asarray(index_of(done.state.result))
+    for later in (ended, np.where(np.asarray(best.epoch) < 0, failure, successful)):
+        code = np.where(code == successful, later, code)
     fit_result = Fit(
         eqx.combine(best.parameters, fixed),  # `fixed` keeps the Python numbers of the given energy
         best.tissue,
@@ -162,13 +173,54 @@ def fit(
         np.asarray(best.epoch),
         history,
         columns_of(done.notes),
-        result_of(jnp.full(np.shape(best.epoch), index_of(result))),
+        result_of(jnp.asarray(code)),
     )
     if stopped is not None:
         raise FitError(
             f"The fit stopped: {stopped}. Try a smaller step of the optimiser.", fit_result
         )
     return fit_result
+
+
+def _nothing_to_fit(energy: PyTree) -> str:
+    """Why the energy has no parameters, with the remedy."""
+    for path, x in jax.tree_util.tree_leaves_with_path(energy):
+        if isinstance(x, np.ndarray | jax.Array) and x.dtype.kind in "iu":
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            return (
+                f"Parameters are arrays of floating-point numbers, but `{name}` has the type {x.dtype}. "
+                f"Convert it: jnp.asarray({name}, float)."
+            )
+    return "Parameters are arrays, as in LineTension(jnp.full(n_edges, 1.0)); Python floats are constants."
+
+
+def _check_finite(parameters: PyTree[Array]) -> None:
+    for path, x in jax.tree_util.tree_leaves_with_path(parameters):
+        wrong = np.argwhere(~np.isfinite(x))  # (one row for each entry, also of a number)
+        if len(wrong):
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise ValueError(
+                f"Argument `problem` must hold finite parameters, but `{name}` of its energy holds "
+                f"{float(x[tuple(wrong[0])])}. Replace it."
+            )
+
+
+def _without_best(history: History, stopped: str | None, overlaps: str) -> str:
+    """Why no epoch has a valid cost, with the remedy."""
+    if history.converged.any():
+        return f"The fit stopped: {stopped}."
+    text = (
+        "raise `max_steps`, loosen `tolerance`, or use the default solver (largest force: "
+        f"{history.max_force.min():.1e})"
+    )
+    if not np.isfinite(history.max_force).any():
+        text = (
+            "the forces are not finite. Check the numbers of the energy, and whether its formula has a "
+            "derivative: that of sqrt(x) is infinite at 0"
+        )
+    text = f"No epoch of the fit reached equilibrium: {text}. Stopped because "
+    text += f"{stopped or 'all epochs were done'}."
+    return text + (f" The tissue of the problem has overlaps: {overlaps}." if overlaps else "")
 
 
 def _with_numbers_as_data(
@@ -266,7 +318,7 @@ def _run(
         file.save(done)
         return done, None, RESULTS.interrupted
     except eqx.EquinoxRuntimeError as error:
-        return done, f"epoch {len(done.rows)} broke down ({_first_line(error)})", RESULTS.nonfinite
+        return done, f"epoch {len(done.rows)} broke down ({first_line(error)})", RESULTS.nonfinite
     file.save(done)
     return done, None, RESULTS.successful
 
@@ -313,12 +365,15 @@ def _failure(record: Record, epoch: int) -> str:
     cost, gradient_norm = np.asarray(record.cost), np.asarray(record.gradient_norm)
     if np.isfinite(cost).all() and np.isfinite(gradient_norm).all():
         residual = np.max(record.gradient_residual)
+        message = RESULTS._index_to_message[int(np.max(index_of(record.result)))]
+        reason = message.partition("cannot be trusted: ")[2].rstrip(".")
         return (
-            f"the gradient of epoch {epoch} cannot be trusted (residual {residual:.1e}; to continue anyway "
-            "pass an adjoint with throw=False)"
+            f"the gradient of epoch {epoch} cannot be trusted (residual {residual:.1e}): {reason}"
         )
-    return f"cost ({cost}) or gradient ({gradient_norm}) is not finite in epoch {epoch}"
-
-
-def _first_line(error: Exception) -> str:
-    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    text = f"cost ({cost}) or gradient ({gradient_norm}) is not finite in epoch {epoch}"
+    if np.isfinite(cost).all() and np.asarray(record.converged).all():
+        text += (
+            ". The formula of the energy or the cost has no finite derivative with respect to a parameter, "
+            "such as sqrt(x) at 0"
+        )
+    return text

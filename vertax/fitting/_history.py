@@ -74,7 +74,8 @@ class Fit(eqx.Module, Generic[Energy]):
     notes: dict[str, Shaped[np.ndarray, "epochs ..."]] = eqx.field(default_factory=dict)
     """Values returned by the callback, by name; the first axis is that of the epochs."""
     result: RESULTS = eqx.field(default_factory=lambda: RESULTS.successful)
-    """How the fit ended, for each member of a batch; `interrupted` after a keyboard interrupt."""
+    """How the fit ended, for each member of a batch; `interrupted` after a keyboard interrupt. A member
+    without a valid epoch has failed."""
 
 
 class FitError(RuntimeError):

@@ -27,7 +27,7 @@ from vertax.adjoints._propagation import AbstractNudgedSystem, nudged_cost
 from vertax.costs import AbstractCost
 from vertax.dynamics import Evolved
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import check_energy, instance_hint
+from vertax.energies._energy import check_energy, instance_hint, warn_of_columns
 from vertax.energies._units import mean_stiffness, units_of
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Equilibrium, Relaxation
@@ -115,6 +115,10 @@ class InverseProblem(eqx.Module, Generic[Energy]):
                 "Argument `cost` must be a cost of a single tissue for a relaxation, but is one of several "
                 "frames. Pass response=vertax.Evolution(dissipation, times)."
             )
+        if isinstance(self.energy, AbstractEnergy):
+            warn_of_columns(self.energy, self.tissue)
+            if not self.cost.of_frames:
+                warn_of_columns(self.cost, self.tissue, self.energy)
 
     def __call__(
         self,

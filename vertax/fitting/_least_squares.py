@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.checkpoints import without_addresses
-from vertax._base.results import RESULTS
+from vertax._base.results import RESULTS, result_of
 from vertax._base.tracing import tree_where
 from vertax.adjoints import ImplicitDifferentiation
 from vertax.fitting._epoch import (
@@ -56,6 +56,11 @@ class State(eqx.Module):
     """Number of consecutive rejected steps."""
     active: Bool[Array, "*batch"]
     """False when the solver has ended."""
+
+    @property
+    def result(self) -> RESULTS:
+        """Successful: the solver shortens steps that fail."""
+        return result_of(jnp.zeros_like(self.n_rejected))
 
 
 class LeastSquares(AbstractMethod):

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from vertax._base.checks import as_real, describe
 from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
-from vertax.energies._energy import check_energy
+from vertax.energies._energy import check_energy, warn_of_columns
 from vertax.mesh import Periodic, Tissue
 from vertax.relax import Relaxation
 
@@ -32,6 +32,7 @@ def check_system(tissue: Any, energy: Any, *, box: str | None = None) -> None:
     """
     check_tissue(tissue, box=box)
     check_energy(energy)
+    warn_of_columns(energy, tissue)
 
 
 def check_tissue(tissue: Any, *, box: str | None = None) -> None:

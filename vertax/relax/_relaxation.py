@@ -21,7 +21,7 @@ from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import check_energy
+from vertax.energies._energy import check_energy, warn_of_columns
 from vertax.energies._units import cell_size, units_of
 from vertax.mesh import Tissue
 from vertax.precondition._elastic_medium import ElasticMedium
@@ -153,6 +153,7 @@ class Relaxation(AbstractResponse):
             `jax.shard_map` with checks.
         """
         check_energy(energy)
+        warn_of_columns(energy, tissue)
         recycled, size = (
             self.preconditioner,
             sum(map(jnp.size, jax.tree.leaves(tissue.configuration))),
