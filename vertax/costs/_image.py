@@ -210,7 +210,8 @@ class MeshImage(AbstractLeastSquaresCost):
         if fit_intensity:
             mean = (weights * pixels).sum()
             deviation = xp.sqrt((weights * (pixels - mean) ** 2).sum())
-            if concrete and not deviation > 1e-12 * np.abs(pixels).max():
+            rounding = 100 * float(jnp.finfo(pixels.dtype).eps)
+            if concrete and not deviation > rounding * np.abs(pixels).max():
                 raise ValueError("Argument `image` must not be constant, but is constant.")
             pixels = (pixels - mean) / deviation
         self.image = jnp.asarray(pixels)

@@ -107,8 +107,10 @@ def uncertainty(
         information = information - cross @ jnp.linalg.pinv(position, hermitian=True) @ cross.T
     values, vectors = jnp.linalg.eigh((information + information.T) / 2)
     # Directions that the data do not determine, judged before the prior is added. The Jacobian through the
-    # equilibrium has a relative error of about 1e-6, so eigenvalues of JᵀJ below 1e-10 of the largest are 0.
-    undetermined = (values <= 1e-10 * values[-1]) | (values <= 0)
+    # equilibrium has a relative error of about 1e-6 (in float32 1e-3), so eigenvalues of JᵀJ below 1e-10 (in
+    # float32 1e-5) of the largest are 0.
+    rounding = float(jnp.finfo(dtype).eps)
+    undetermined = (values <= max(1e-10, 100 * rounding) * values[-1]) | (values <= 0)
     # With n_free independent of n_residuals residuals, JᵀJ counts each independent one n_residuals / n_free
     # times.
     spread = variance * n_residuals / n_free
@@ -122,7 +124,8 @@ def uncertainty(
         jnp.isfinite(undetermined_variance), undetermined_variance, 0
     )
     covariance = (vectors * inverse) @ vectors.T
-    infinite = jnp.sum(jnp.where(jnp.isinf(undetermined_variance), vectors**2, 0), axis=1) > 1e-9
+    share = jnp.sum(jnp.where(jnp.isinf(undetermined_variance), vectors**2, 0), axis=1)
+    infinite = share > max(1e-9, 10 * rounding)
     deviation = jnp.where(infinite, jnp.inf, jnp.sqrt(jnp.diag(covariance)))
     deviations = jnp.sqrt(determined_variance + undetermined_variance)
     return Uncertainty(unravel(deviation), covariance, vectors.T, deviations, jnp.sqrt(variance))

@@ -117,7 +117,7 @@ def scaled_inverse(
     """The pseudoinverse of ZᵀWG, scaled, and which parameters are determined."""
     size = jnp.sqrt(jnp.where(scales > 0, scales, 1))
     scaled = slopes / size[0][:, None] / size[1]
-    inverse = jnp.linalg.pinv(scaled, rtol=1e-8)
+    inverse = jnp.linalg.pinv(scaled, rtol=max(1e-8, 100 * float(jnp.finfo(scaled.dtype).eps)))
     determined = jnp.diag(inverse @ scaled) > 0.99
     return inverse / size[1][:, None] / size[0], determined
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
@@ -29,6 +29,9 @@ from vertax.mechanics._hessian import (
 from vertax.mechanics._landscape import Landscape, stationary
 from vertax.mesh import Tissue
 
+# Eigenvalues up to this fraction of the largest one count as 0, see `zero_threshold`.
+_ZERO = 1e-8
+
 
 class Modes(eqx.Module):
     """Modes of a tissue at rest, the softest first."""
@@ -37,6 +40,8 @@ class Modes(eqx.Module):
     """Eigenvalues of the Hessian, energy per length squared. Differentiable, if they are distinct."""
     vectors: PyTree[Float[Array, "modes ..."]]
     """Unit eigenvectors as changes of the configuration (with arcs a pair); not differentiated."""
+    n_movable: Int[Array, ""]
+    """Number of vertices that move: neither pinned nor spare."""
 
     @property
     def displacements(self) -> Float[Array, "modes vertices 2"]:
@@ -48,10 +53,11 @@ class Modes(eqx.Module):
         r"""Participation ratio of each mode, $(\sum_v |u_v|^2)^2 / (V \sum_v |u_v|^4)$ (Bell & Dean 1970,
         doi:10.1039/DF9705000055).
 
-        It is 1 if all $V$ vertices move by the same distance, and $1/V$ if one vertex moves alone.
+        It is 1 if all $V$ vertices that are neither pinned nor spare move by the same distance, and $1/V$ if
+        one vertex moves alone.
         """
         squared = jnp.sum(self.displacements**2, axis=-1)
-        return jnp.sum(squared, axis=-1) ** 2 / (squared.shape[-1] * jnp.sum(squared**2, axis=-1))
+        return jnp.sum(squared, axis=-1) ** 2 / (self.n_movable * jnp.sum(squared**2, axis=-1))
 
 
 def modes(
@@ -80,7 +86,7 @@ def modes(
 
     **Raises:**
 
-    - `ValueError` for more modes than degrees of freedom, or another method.
+    - `ValueError` for more modes than degrees of freedom that move, or another method.
     - `TypeError` if `tissue` or `energy` is an object of another class, and for `"sparse"` with an energy
         that is not local, or inside `jax.jit`.
     """
@@ -89,11 +95,12 @@ def modes(
     if method not in (None, "dense", "sparse"):
         raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
     size = ravel_pytree(tissue.configuration)[0].size
-    if k > size:
-        raise ValueError(
-            f"Argument `k` must be at most the number of degrees of freedom, {size}, but is {k}."
-        )
     is_eager = all(map(is_concrete, jax.tree.leaves((tissue, energy))))
+    n_free = int(ravel_pytree(movable(tissue))[0].sum()) if is_eager else size
+    if k > n_free:
+        raise ValueError(
+            f"Argument `k` must be at most the number of degrees of freedom that move, {n_free}, but is {k}."
+        )
     can_be_sparse = is_eager and isinstance(energy, AbstractLocalEnergy)
     if method == "sparse" and not can_be_sparse:
         raise TypeError(
@@ -156,11 +163,11 @@ def zero_modes(tissue: Tissue, energy: AbstractEnergy, *, tolerance: float | Non
     if tolerance is not None:
         check_number("tolerance", tolerance, above=0)
     values = np.abs(np.asarray(spectrum(tissue, energy)))
-    return int(np.sum(values <= zero_threshold(values, tolerance, 1e-8)))
+    return int(np.sum(values <= zero_threshold(values, tolerance, _ZERO)))
 
 
 def density_of_states(
-    values: Float[Array, " modes"], bins: int = 40, *, tolerance: float = 1e-8
+    values: Float[Array, " modes"], bins: int = 40, *, tolerance: float | None = None
 ) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]]:
     r"""Density of states $D(\omega)$ over the frequencies $\omega = \sqrt\lambda$.
 
@@ -168,7 +175,8 @@ def density_of_states(
 
     - `values`: all eigenvalues, see [`spectrum`][vertax.mechanics.spectrum].
     - `bins`: number of bins, from 0 to the largest frequency.
-    - `tolerance`: eigenvalues of at most this fraction of the largest one are zero modes, and left out.
+    - `tolerance`: eigenvalues of at most this fraction of the largest one are zero modes, and left out; by
+        default as for [`zero_modes`][vertax.mechanics.zero_modes].
 
     **Returns:** the centre of each bin, and the fraction of all modes per unit of frequency in it. Its
         integral is the fraction of modes that are not zero modes.
@@ -183,8 +191,10 @@ def density_of_states(
         raise ValueError(
             f"Argument `values` must be one list of eigenvalues, but its shape is {eigenvalues.shape}."
         )
-    check_number("tolerance", tolerance, above=0)
-    frequencies = np.sqrt(eigenvalues[eigenvalues > tolerance * np.abs(eigenvalues).max()])
+    if tolerance is not None:
+        check_number("tolerance", tolerance, above=0)
+    threshold = zero_threshold(np.asarray(values), tolerance, _ZERO)
+    frequencies = np.sqrt(eigenvalues[eigenvalues > threshold])
     counts, edges = np.histogram(frequencies, bins, (0, frequencies.max(initial=0) or 1))
     return 0.5 * (edges[1:] + edges[:-1]), counts / (eigenvalues.size * np.diff(edges))
 
@@ -224,14 +234,19 @@ def _dense_modes(tissue: Tissue, energy: AbstractEnergy, k: int) -> Modes:
     system = _Spectrum(k)
     args = (tissue, energy)
     vectors = jax.lax.stop_gradient(system.solve(_constant(args)))
-    return Modes(stationary(args, system), _unravelled(tissue, vectors))
+    return Modes(stationary(args, system), _unravelled(tissue, vectors), _n_movable(tissue))
 
 
 @eqx.filter_jit
 def _modes_along(
     tissue: Tissue, energy: AbstractEnergy, vectors: Float[Array, "modes dofs"]
 ) -> Modes:
-    return Modes(_quotients(tissue, energy, vectors), _unravelled(tissue, vectors))
+    values = _quotients(tissue, energy, vectors)
+    return Modes(values, _unravelled(tissue, vectors), _n_movable(tissue))
+
+
+def _n_movable(tissue: Tissue) -> Int[Array, ""]:
+    return jnp.sum(jax.tree.leaves(movable(tissue))[0][:, 0])
 
 
 def _constant(tree: PyTree) -> PyTree:

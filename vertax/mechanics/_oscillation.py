@@ -181,12 +181,13 @@ def _sparse_motions(args: _Args) -> PyTree[Array] | None:
     elastic_loads, viscous_loads = (
         np.asarray(_affine_loads(landscape), float)[:, free] for landscape in landscapes
     )
-    # A support of 1e-10 of the mean diagonal makes the matrix regular. Moduli are stationary in the motions,
-    # so the error is of second order.
+    # A support of 1e-10 of the mean diagonal (in float32, of the rounding) makes the matrix regular. Moduli
+    # are stationary in the motions, so the error is of second order.
     sizes = [float(np.abs(matrix.diagonal()).mean()) for matrix in (stiff, viscous)]
+    share = max(1e-10, 10 * float(jnp.finfo(tissue.vertices.dtype).eps))
     parts = np.zeros((omegas.size, 3, 2, ravel_pytree(tissue.configuration)[0].size))
     for i, omega in enumerate(np.asarray(omegas, float)):
-        support = diags_array(np.full(free.size, 1e-10 * (sizes[0] + omega * sizes[1])))
+        support = diags_array(np.full(free.size, share * (sizes[0] + omega * sizes[1])))
         # At zero frequency the system is real.
         rate = 1j * omega if omega else 0.0
         loads = elastic_loads + rate * viscous_loads
@@ -230,7 +231,7 @@ def _diagonalise(
     h_scale, g_scale = scale(hessian), scale(viscosity)
     sizes, vectors = jnp.linalg.eigh(hessian / h_scale + viscosity / g_scale)
     nonzero = sizes > _rounding(sizes.dtype) * sizes[-1]
-    unstable = sizes[0] < -_NEGATIVE * sizes[-1]
+    unstable = sizes[0] < -max(_NEGATIVE, _rounding(sizes.dtype)) * sizes[-1]
     whitening = vectors * jnp.where(nonzero, 1 / jnp.sqrt(jnp.where(nonzero, sizes, 1)), 0)
     g, rotation = jnp.linalg.eigh(whitening.T @ (viscosity / g_scale) @ whitening)
     x = jnp.where(unstable, jnp.nan, whitening @ rotation)

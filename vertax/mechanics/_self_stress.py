@@ -63,7 +63,8 @@ class SelfStress(eqx.Module):
     """States of self-stress and the Maxwell-Calladine count."""
 
     states: Float[Array, "states constraints"]
-    """Orthonormal generalised tensions (minus pressures for areas, tensions for lengths) in equilibrium."""
+    """Orthonormal generalised tensions (minus pressures for areas, tensions for lengths) in equilibrium; 0 in
+    spare slots."""
     zero_modes: int
     """Number of motions that change no constraint to first order, rigid motions included."""
     degrees_of_freedom: int
@@ -108,6 +109,13 @@ def self_stresses(
         check_number("tolerance", tolerance, above=0)
     free = np.asarray(ravel_pytree(movable(tissue))[0])
     matrix = np.asarray(compatibility(tissue, constraints))[:, free]
-    left, singular, _ = np.linalg.svd(matrix)
+    m = tissue.topology
+    of_edges = np.asarray(m.alive_edges)
+    alive = np.concatenate(
+        [of_edges if name == "edge_lengths" else np.asarray(m.alive) for name in constraints]
+    )
+    left, singular, _ = np.linalg.svd(matrix[alive])
     rank = int(np.sum(singular > zero_threshold(singular, tolerance, 1e-9)))
-    return SelfStress(jnp.asarray(left[:, rank:].T), int(free.sum()) - rank, int(free.sum()))
+    states = np.zeros((alive.sum() - rank, alive.size), matrix.dtype)
+    states[:, alive] = left[:, rank:].T
+    return SelfStress(jnp.asarray(states), int(free.sum()) - rank, int(free.sum()))

@@ -84,8 +84,9 @@ def plot_mode(
     """
     places = np.asarray(single(tissue).vertices, float)
     moves = _shaped("displacements", displacements, places.shape)
-    unit = _unit(np.linalg.norm(moves, axis=1), scale)
-    size = float(np.sqrt(np.mean(np.abs(tissue.areas))))
+    alive = np.asarray(tissue.topology.alive_vertices)
+    unit = _unit(np.linalg.norm(moves[alive], axis=1), scale)
+    size = float(np.sqrt(np.mean(np.abs(tissue.areas), where=np.asarray(tissue.alive))))
     if isinstance(tissue.boundary, Periodic):
         lattice = np.asarray(tissue.boundary.lattice, float)
         fractions = places @ np.linalg.inv(lattice)
@@ -93,8 +94,8 @@ def plot_mode(
     ax = plot_tissue(tissue, **options)
     arrows = size * moves / unit
     ax.quiver(
-        *places.T,
-        *arrows.T,
+        *places[alive].T,
+        *arrows[alive].T,
         angles="xy",
         scale_units="xy",
         scale=1,

@@ -250,8 +250,9 @@ def _of_foam(source: Foam, noise: float | None) -> _Course:
 
 
 def _of_tissue(tissue: Tissue, noise: float | None) -> _Course:
+    labels = np.flatnonzero(tissue.alive) + 1  # 0 is the label of the exterior
+    tissue = tissue.without_spare()
     geometry = observed_geometry(tissue)
-    labels = np.arange(1, tissue.n_cells + 1)  # 0 is the label of the exterior
     if not tissue.inner_arcs:
         points = Points(np.zeros(0, int), np.zeros((0, 2)))
         return _Course(tissue, labels, points, _VERTEX * geometry.size, None, noise, None)
