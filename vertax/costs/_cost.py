@@ -114,7 +114,7 @@ class WeightedSum(AbstractCost):
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Weighted sum of the costs."""
         values = [cost(self._argument_of(cost, tissue), energy) for cost in self.costs]
-        return jnp.sum(self.weights * jnp.stack(values))
+        return jnp.sum(self.weights.astype(tissue.vertices.dtype) * jnp.stack(values))
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         """The residuals of all terms, times the square roots of the weights.
@@ -130,7 +130,7 @@ class WeightedSum(AbstractCost):
             "A weighted sum of costs must be a sum of squares for a least-squares solver, but has a negative "
             "weight. Make the weight positive, or fit with an Optax optimiser.",
         )
-        roots = jnp.sqrt(weights)
+        roots = jnp.sqrt(weights).astype(tissue.vertices.dtype)
         parts = [cost.residuals(self._argument_of(cost, tissue), energy) for cost in self.costs]
         return jnp.concatenate([root * part for root, part in zip(roots, parts, strict=True)])
 

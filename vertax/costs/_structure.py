@@ -146,7 +146,9 @@ def adjacency(
 
 def structure(adjacency: Float[Array, "cells cells"]) -> Float[Array, "cells cells"]:
     r"""The structure $2I - A - \tfrac12 A^2$ of an adjacency: first and second neighbours."""
-    return 2 * jnp.eye(len(adjacency)) - adjacency - 0.5 * adjacency @ adjacency
+    return (
+        2 * jnp.eye(len(adjacency), dtype=adjacency.dtype) - adjacency - 0.5 * adjacency @ adjacency
+    )
 
 
 def mismatched_neighbours(tissue: Tissue, target: Tissue) -> int:

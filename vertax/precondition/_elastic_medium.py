@@ -115,7 +115,7 @@ class ElasticMedium(AbstractCoarseLevel):
         long, short = 1, max(2, self.size // 8)
 
         def waves(number: int, polarisations: Float[Array, "2 2"]) -> Float[Array, "vertices 2"]:
-            phases = number * self.places + jnp.array([0.05, 0.18])
+            phases = number * self.places + jnp.array([0.05, 0.18], self.places.dtype)
             return free * total(_wave(phases[:, i, None]) * polarisations[i] for i in (0, 1))
 
         # Both wave lengths of one polarisation in one product: they are nearly orthogonal.
