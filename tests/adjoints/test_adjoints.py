@@ -582,3 +582,22 @@ def test_invalid_arguments_raise():
         vx.AutomaticDifferentiation(checkpoints=0)
     with pytest.raises(ValueError, match="`rtol` must be positive"):
         vx.AutomaticDifferentiation(rtol=-1.0)
+
+
+@adjoints("implicit", "propagation")
+def test_broken_member_of_a_batch_leaves_the_gradients_of_the_others(adjoint, response, rtol):
+    tissue = random_tissue(N_CELLS)
+
+    def loss(shift, offset):
+        energy = ShapeFactorEnergy(jnp.full(N_CELLS, 3.6) + shift + offset)
+        relaxed = response(tissue, energy, adjoint=adjoint, throw=False)
+        return jnp.where(relaxed.converged, jnp.sum(relaxed.tissue.perimeters**2), 0)
+
+    total = lambda shift, offsets: jnp.sum(jax.vmap(loss, (None, 0))(shift, offsets))
+    valid, broken = jnp.array([0.0, 0.05]), jnp.array([0.0, jnp.nan, 0.05])
+    zero = jnp.zeros(())
+    members = jax.vmap(jax.grad(loss), (None, 0))(zero, broken)
+    alone = jax.vmap(jax.grad(loss), (None, 0))(zero, valid)
+    np.testing.assert_allclose(members[jnp.array([0, 2])], alone, rtol=10 * rtol)
+    # The parameter that all members share.
+    np.testing.assert_allclose(jax.grad(total)(zero, broken), jnp.sum(alone), rtol=10 * rtol)

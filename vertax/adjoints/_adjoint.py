@@ -71,8 +71,9 @@ class AbstractAdjoint(optx.AbstractAdjoint):
     2. The adjoint differentiates a minimisation in this topology that starts and ends at this equilibrium.
 
     The options of the minimisation are: `relaxation`, the minimiser of the first step; `start`, its
-    configuration after the last T1 transition; and the units `stiffness` and `length_scale`. An adjoint
-    with `unrolls = True` needs a solver with `unrollable = True`.
+    configuration after the last T1 transition; the units `stiffness` and `length_scale`; and `exists`,
+    false if energy or forces became NaN, so that there is no minimum to differentiate. An adjoint with
+    `unrolls = True` needs a solver with `unrollable = True`.
 
     **Arguments:**
 
@@ -112,10 +113,16 @@ def finish_gradient(
     outcome: GradientOutcome,
     throw: bool,
     like: GradientOutcome | None,
+    options: dict[str, Any] | None = None,
 ) -> tuple[PyTree, GradientOutcome | None]:
-    """Raise an error for an unreliable gradient if `throw`, and cast the outcome to the dtypes of `like`."""
+    """Raise an error for an unreliable gradient if `throw`, and cast the outcome to the dtypes of `like`.
+
+    `options` are those of the minimisation: no error if there is no minimum.
+    """
     if throw:
-        gradient = checked(gradient, outcome.result)
+        minimum = jnp.asarray((options or {}).get("exists", True))
+        result = RESULTS.where(minimum, outcome.result, RESULTS.successful)
+        gradient = checked(gradient, result)
     if like is None:
         return gradient, None
     return gradient, jax.tree.map(lambda x, slot: jnp.asarray(x, slot.dtype), outcome, like)

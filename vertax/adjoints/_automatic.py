@@ -200,5 +200,7 @@ def _(
     *_, slot = vjp_arg
     vjp, outcome = residuals
     (gradient,) = vjp(materialise(cotangent, root))
-    (d_fn, d_args), outcome = finish_gradient(gradient, outcome, adjoint.throw, slot)
+    (d_fn, d_args), outcome = finish_gradient(
+        gradient, outcome, adjoint.throw, slot, others.options
+    )
     return d_fn, d_args, outcome

@@ -94,7 +94,12 @@ class ImplicitDifferentiation(AbstractAdjoint):
             solver = PreconditionedMINRES(self.linear_solver, preconditioner, options["stiffness"])
             adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
         system = _System(
-            adjoint, rewrite_fn, residual, tags | {lx.symmetric_tag}, _min_stiffness(options, root)
+            adjoint,
+            rewrite_fn,
+            residual,
+            tags | {lx.symmetric_tag},
+            _min_stiffness(options, root),
+            ~jnp.asarray(options.get("exists", True)),
         )
         if self.outcome is None:
             return _follow(inputs, root, system), residual
@@ -109,6 +114,8 @@ class _System(eqx.Module):
     residual: PyTree
     tags: frozenset[object] = eqx.field(static=True)
     min_stiffness: Array
+    broken: Array
+    """Whether the relaxation ended with NaN, so that there is no root."""
 
     def force(self, root: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
         return self.rewrite_fn(root, self.residual, inputs)
@@ -117,7 +124,8 @@ class _System(eqx.Module):
         self, root: PyTree[Array], inputs: PyTree, rhs: PyTree[Array], *, strict: bool = False
     ) -> tuple[PyTree[Array], GradientOutcome]:
         operator = lx.JacobianLinearOperator(self.force, root, inputs, tags=self.tags)
-        solver = _ReportingSolver(self.adjoint.linear_solver, self.min_stiffness, strict)
+        settings = (self.adjoint.linear_solver, self.min_stiffness, self.broken)
+        solver = _ReportingSolver(*settings, strict)
         solution = lx.linear_solve(operator, rhs, solver, throw=False)
         return solution.value, solution.stats["outcome"]
 
@@ -150,11 +158,13 @@ class _ReportingSolver(lx.AbstractLinearSolver):
     """A linear solver that returns a `GradientOutcome` in its statistics, and always reports success.
 
     If `strict`, it raises an error for an unreliable outcome. (Lineax raises errors in transposed solves
-    even with `throw=False`, and its messages do not mention the equilibrium.)
+    even with `throw=False`, and its messages do not mention the equilibrium.) If the relaxation ended
+    with NaN, the solution is 0: Lineax raises an error for NaN, and the other members of a batch are right.
     """
 
     solver: lx.AbstractLinearSolver
     min_stiffness: Array
+    broken: Array
     strict: bool = eqx.field(static=True)
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
@@ -184,7 +194,8 @@ class _ReportingSolver(lx.AbstractLinearSolver):
         )
         outcome = jax.tree.map(lambda x: x.astype(float), outcome)
         if self.strict:
-            solution = outcome.result.error_if(solution, ~outcome.converged)
+            solution = outcome.result.error_if(solution, ~outcome.converged & ~self.broken)
+        solution = jax.tree.map(lambda x: jnp.where(self.broken, 0, x), solution)
         return solution, lx.RESULTS.successful, stats | {"outcome": outcome}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:

@@ -183,7 +183,9 @@ def _(
     cotangent = materialise(cotangent, root)
     at_rest = None if adjoint.centred else slope(root)
     gradient, outcome = gradient_from_phases(adjoint, cotangent, options, phase, at_rest)
-    (d_fn, d_args), outcome = finish_gradient(gradient, outcome, adjoint.throw, slot)
+    (d_fn, d_args), outcome = finish_gradient(
+        gradient, outcome, adjoint.throw, slot, others.options
+    )
     return d_fn, d_args, outcome
 
 
@@ -352,7 +354,7 @@ def _(
     outcome = _gradient_outcome(
         jnp.max(max_forces) / force, jnp.sum(num_steps), jnp.full_like(force, jnp.nan)
     )
-    return finish_gradient(gradient, outcome, adjoint.throw, slot)
+    return finish_gradient(gradient, outcome, adjoint.throw, slot, others.options)
 
 
 def _gradient_outcome(

@@ -9,6 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.results import RESULTS
+from vertax._base.tracing import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
@@ -71,6 +72,10 @@ def conclude(
     `minimiser`, `max_steps` and `preconditioner` are for adjoints that relax the tissue again.
     """
     relaxed, units = end.tissue, end.units
+    # Without an equilibrium the derivatives are 0. In a batch NaN would reach the parameters that all members
+    # share, also through a cost that masks this member.
+    exists = end.result != RESULTS.nonfinite
+    tissue, energy = (_constant_unless(exists, part) for part in (tissue, energy))
     free = free_motions(relaxed, frozen(energy), units)
     # Rigid motions of the relaxation depend on its path: undo them, unless the energy depends on them.
     settled = _choose(
@@ -82,6 +87,7 @@ def conclude(
         "length_scale": units.length,
         "stiffness": units.stiffness,
         "tolerance": end.tolerance,
+        "exists": exists,
         "relaxation": minimiser,
         "start": end.origin,
         "max_steps": jnp.asarray(max_steps),
@@ -138,6 +144,13 @@ def _recentred(relaxed: Tissue, start: Tissue, free: Bool[Array, " modes"]) -> T
     if start.pinned is not None:
         drift = jnp.where(jnp.any(start.pinned), 0, drift)
     return relaxed.with_vertices(relaxed.vertices + drift)
+
+
+def _constant_unless(condition: Bool[Array, ""], tree: PyTree) -> PyTree:
+    """The same values; derivatives through them are 0 unless the condition holds."""
+    numbers, rest = eqx.partition(tree, lambda x: eqx.is_inexact_array(x) and not is_concrete(x))
+    mask = lambda x: jnp.where(condition, x, jax.lax.stop_gradient(x))
+    return eqx.combine(jax.tree.map(mask, numbers), rest)
 
 
 def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
