@@ -281,3 +281,11 @@ def test_posterior_density_has_a_finite_gradient(rest):
     slope = jax.grad(lambda p: density({"target_shape_factor": p}))(jnp.asarray(TRUTH))
     assert slope.dtype == jnp.float32
     assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("make", [vx.initialise.hexagonal, vx.initialise.free_voronoi])
+def test_tissue_far_from_the_origin_is_rejected(make):
+    tissue = make(4, 4) if make is vx.initialise.hexagonal else make(N, key=0)
+    energy = AreaElasticity(1.0, 1.0)
+    with pytest.raises(ValueError, match="Subtract the mean of the vertices"):
+        vx.equilibrate(tissue.with_vertices(tissue.vertices + 1e4), energy)

@@ -2,6 +2,7 @@
 """Arguments and fields that energies reject."""
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -182,3 +183,34 @@ def test_columns_that_make_no_matrix_cause_no_warning():
             lambda tissue: jnp.sum(tissue.areas),
         ):
             vx.Relaxation().check(tissue, energy, vx.ImplicitDifferentiation())
+
+
+@pytest.mark.parametrize("transform", [jax.grad, jax.vmap, jax.jit])
+@pytest.mark.parametrize("kind", ["function", "class", "sum", "field"])
+def test_energies_that_close_over_traced_values_are_named(transform, kind, without_type_checks):
+    tissue = random_tissue(6)
+
+    class Holder(vx.AbstractEnergy):
+        function: Callable
+
+        def __call__(self, tissue):
+            return self.function(tissue)
+
+    def relaxed_area(strength):
+        def function(tissue):
+            return strength * jnp.sum(tissue.perimeters**2)
+
+        class Local(vx.AbstractEnergy):
+            def __call__(self, tissue):
+                return strength * jnp.sum(tissue.perimeters**2)
+
+        energies = {
+            "function": function,
+            "class": Local(),
+            "sum": vx.energies.AreaElasticity(1.0, 1.0) + Local(),
+            "field": Holder(function),
+        }
+        return vx.equilibrate(tissue, energies[kind]).energy
+
+    with pytest.raises(TypeError, match="closes over `strength`, a value that"):
+        transform(relaxed_area)(jnp.ones(2 if transform is jax.vmap else ()))

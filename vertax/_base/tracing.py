@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import inspect
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
@@ -33,6 +35,28 @@ else:
 def is_concrete(value: Any) -> bool:
     """Whether a value is not a tracer of `jax.jit`, `jax.vmap` or `jax.grad`."""
     return not isinstance(value, jax.core.Tracer)
+
+
+def closed_over_tracers(function: Any) -> Iterator[str]:
+    """Names of the traced variables that a function, or the methods and fields of a module, close over."""
+    if isinstance(function, eqx.Module):
+        for kind in type(function).__mro__:
+            # (Only classes that are defined in a function.)
+            if "<locals>" in kind.__qualname__:
+                for method in vars(kind).values():
+                    yield from closed_over_tracers(
+                        inspect.unwrap(getattr(method, "method", method))
+                    )
+        for field in vars(function).values():
+            for leaf in jax.tree.leaves(field, is_leaf=lambda x: isinstance(x, eqx.Module)):
+                yield from closed_over_tracers(leaf)
+    elif inspect.isfunction(function):
+        for name, cell in zip(
+            function.__code__.co_freevars, function.__closure__ or (), strict=True
+        ):
+            with contextlib.suppress(ValueError):  # an empty cell
+                if not all(map(is_concrete, jax.tree.leaves(cell.cell_contents))):
+                    yield name
 
 
 def differs_between_devices(array: jax.typing.ArrayLike) -> bool:

@@ -17,7 +17,7 @@ from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.results import RESULTS
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
-from vertax._base.tracing import is_concrete, traced
+from vertax._base.tracing import closed_over_tracers, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
@@ -133,6 +133,11 @@ class Relaxation(AbstractResponse):
         **Raises:** as [`equilibrate`][vertax.equilibrate].
         """
         self.check(tissue, energy, adjoint)
+        for name in closed_over_tracers(energy):
+            raise TypeError(
+                f"Argument `energy` must hold traced values in its fields, but closes over `{name}`, a value "
+                "that jax.grad, jax.vmap or jax.jit traces. Make it a field of an AbstractEnergy."
+            )
         warn_of_memory_maps()
         tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
         if all(map(is_concrete, jax.tree.leaves((tissue, energy, self, adjoint)))):
@@ -149,11 +154,12 @@ class Relaxation(AbstractResponse):
         **Raises:**
 
         - `TypeError` for an energy that is no function, or an adjoint that is none.
-        - `ValueError` for an adjoint that the solver excludes, a preconditioner of another size, or a
-            `jax.shard_map` with checks.
+        - `ValueError` for an adjoint that the solver excludes, a preconditioner of another size, a
+            `jax.shard_map` with checks, or a tissue far from the origin in float32.
         """
         check_energy(energy)
         warn_of_columns(energy, tissue)
+        _check_position(tissue)
         recycled, size = (
             self.preconditioner,
             sum(map(jnp.size, jax.tree.leaves(tissue.configuration))),
@@ -272,6 +278,25 @@ class Relaxation(AbstractResponse):
         )
 
 
+def _check_position(tissue: Tissue) -> None:
+    """Raise a `ValueError` for a tissue so far from the origin that rounded coordinates distort its cells."""
+    if not is_concrete(tissue.vertices):
+        return
+    positions = np.asarray(tissue.vertices, float).reshape(-1, 2)
+    middle = positions.mean(axis=0)
+    extent = np.abs(positions - middle).max()
+    rounding = float(jnp.finfo(tissue.vertices.dtype).eps) * np.abs(middle).max()
+    # (A tissue of n cells is about √n cells wide.)
+    distortion = rounding * tissue.n_cells**0.5 / extent
+    if np.abs(middle).max() > 10 * extent and distortion > _MAX_DISTORTION:
+        raise ValueError(
+            f"Argument `tissue` must be near the origin in {tissue.vertices.dtype}, but its centre is at "
+            f"({middle[0]:.4g}, {middle[1]:.4g}), where coordinates are rounded by {distortion:.1g} of a cell. "
+            "Subtract the mean of the vertices: tissue.with_vertices(tissue.vertices - "
+            "tissue.vertices.mean(axis=0))."
+        )
+
+
 def _precision(tissue: Tissue, size: Float[Array, ""]) -> Float[Array, ""]:
     """The default tolerance, in the unit of force.
 
@@ -282,6 +307,8 @@ def _precision(tissue: Tissue, size: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.maximum(1e-10 if x.dtype == jnp.float64 else 1e-5, rounding)
 
 
+_MAX_DISTORTION = 1e-5
+"""Largest rounding of coordinates in units of a cell, for tissues far from the origin."""
 _ROUNDING = 4
 """Factor of the force of rounded coordinates. (Relaxations of 1000 and 10 000 cells in float32 reach 0.6 and
 1.5.)"""
@@ -325,10 +352,12 @@ def equilibrate(
 
     **Raises:**
 
-    - `ValueError` for a tolerance or number of steps that is not positive.
+    - `ValueError` for a tolerance or number of steps that is not positive, and for a tissue so far from the
+        origin that rounded coordinates distort its cells (in float32, 100 times the size of a cell).
     - `ValueError` within `jax.shard_map` that checks which values differ between devices: pass
         `check_vma=False`.
-    - `TypeError` for an adjoint that is none of `vertax.adjoints`, or a solver that is no minimiser.
+    - `TypeError` for an adjoint that is none of `vertax.adjoints`, a solver that is no minimiser, or an
+        energy that closes over a traced value.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge, or
         its cells overlap, as they already did in `tissue`.
     """
