@@ -354,7 +354,7 @@ def _(
     outcome = _gradient_outcome(
         jnp.max(max_forces) / force, jnp.sum(num_steps), jnp.full_like(force, jnp.nan)
     )
-    return finish_gradient(gradient, outcome, adjoint.throw, slot, others.options)
+    return finish_gradient(gradient, outcome, adjoint.throw, slot)
 
 
 def _gradient_outcome(

@@ -291,8 +291,8 @@ def _check_position(tissue: Tissue) -> None:
     if np.abs(middle).max() > 10 * extent and distortion > _MAX_DISTORTION:
         raise ValueError(
             f"Argument `tissue` must be near the origin in {tissue.vertices.dtype}, but its centre is at "
-            f"({middle[0]:.4g}, {middle[1]:.4g}), where coordinates are rounded by {distortion:.1g} of a cell. "
-            "Subtract the mean of the vertices: tissue.with_vertices(tissue.vertices - "
+            f"({middle[0]:.4g}, {middle[1]:.4g}), where coordinates are rounded by {distortion:.1g} of a "
+            "cell. Subtract the mean of the vertices: tissue.with_vertices(tissue.vertices - "
             "tissue.vertices.mean(axis=0))."
         )
 
