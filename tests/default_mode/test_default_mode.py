@@ -283,6 +283,32 @@ def test_posterior_density_has_a_finite_gradient(rest):
     assert np.isfinite(slope).all()
 
 
+def test_free_tissue_grows_and_divides():
+    tissue = vx.initialise.free_voronoi(4, key=0, lloyd_steps=2).with_capacity(9)
+
+    def energy(cells):
+        elasticity = AreaElasticity(1.0, cells.target_area) + PerimeterElasticity(0.02, 0.0)
+        return elasticity + LineTension(0.02)
+
+    cycle, times = vx.growth.GrowAndDivide(0.2, 1.5), jnp.linspace(0, 4, 6)
+    grown = vx.growth.grow(tissue, energy, cycle, times, key=1, relaxation=FIXED_TOPOLOGY)
+    assert grown.converged
+    assert grown.n_alive[-1] > 5
+    assert floats(grown.tissue) == {"float32"}
+
+
+def test_standard_deviations_are_as_large_as_the_errors(rest):
+    tissue, energy = rest
+    noise = 0.01 * jax.random.normal(jax.random.key(1), tissue.vertices.shape)
+    cost = vx.costs.VertexDistance(tissue.with_vertices(tissue.vertices + noise))
+    start = ShapeFactorEnergy(jnp.full(N, 3.7))
+    problem = vx.InverseProblem(tissue, start, cost, response=FIXED_TOPOLOGY)
+    fit = vx.fit(problem, LEAST_SQUARES, epochs=30)
+    deviation = vx.uncertainty(problem, fit).deviation.target_shape_factor
+    score = (fit.energy.target_shape_factor - energy.target_shape_factor) / deviation
+    assert 0.3 < jnp.sqrt(jnp.mean(score**2)) < 2
+
+
 @pytest.mark.parametrize("make", [vx.initialise.hexagonal, vx.initialise.free_voronoi])
 def test_tissue_far_from_the_origin_is_rejected(make):
     tissue = make(4, 4) if make is vx.initialise.hexagonal else make(N, key=0)

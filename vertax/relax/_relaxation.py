@@ -55,8 +55,8 @@ class Relaxation(AbstractResponse):
         by default, which reaches true equilibria.
     - `transitions`: the rule for topology changes, or None to keep the topology.
     - `tolerance`: largest force (component of $\nabla_X E$) that counts as equilibrium, in units of
-        energy per length; by default $10^{-10}\,k \ell$ in float64 and $10^{-5}\,k \ell$ in float32, or
-        the force of rounded coordinates, $4 \epsilon\,k \max |x|$, where that is larger (in float32, above
+        energy per length; by default $10^{-10}\,k \ell$ in float64 and $10^{-5}\,k \ell$ in float32
+        ($10^{-4}\,k \ell$ with arcs), or the force of rounded coordinates, $4 \epsilon\,k \max |x|$, where that is larger (in float32, above
         some hundred cells).
     - `consecutive_steps`: number of consecutive steps for which the force must stay below the tolerance.
     - `max_steps`: most steps of the minimiser.
@@ -300,11 +300,13 @@ def _check_position(tissue: Tissue) -> None:
 def _precision(tissue: Tissue, size: Float[Array, ""]) -> Float[Array, ""]:
     """The default tolerance, in the unit of force.
 
-    Rounded coordinates change forces by about $\\epsilon k \\max |x|$.
+    Rounded coordinates change forces by about $\\epsilon k \\max |x|$. Rounding errors of arcs are ten times
+    larger: their lengths are quotients that are nearly singular for large angles.
     """
     x = tissue.vertices
     rounding = _ROUNDING * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x)) / size
-    return jnp.maximum(1e-10 if x.dtype == jnp.float64 else 1e-5, rounding)
+    single = 1e-5 if tissue.arcs is None else 1e-4
+    return jnp.maximum(1e-10 if x.dtype == jnp.float64 else single, rounding)
 
 
 _MAX_DISTORTION = 1e-5
