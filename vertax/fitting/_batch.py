@@ -22,7 +22,7 @@ def member(tree: Tree, index: int) -> Tree:
     **Arguments:**
 
     - `tree`: the batch: each of its arrays has a leading axis. A [`Fit`][vertax.Fit] has the members on the
-        second axis of its history, and of those notes whose second axis has their number.
+        second axis of its history, and of notes if that axis has their number.
     - `index`: the index of the member, from 0.
 
     **Returns:** its member.

@@ -50,8 +50,8 @@ def read_geojson(
     Features without a geometry, and collections of geometries without exactly one polygon, are left out
     with a warning.
 
-    **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], whose points are the corners in
-    the order of the file, and the properties of the features as columns with one row for each cell.
+    **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], with the corners in
+    the order of the file as points, and the properties of the features as columns with one row for each cell.
 
     **Raises:**
 
