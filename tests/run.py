@@ -30,6 +30,7 @@ CACHE = {
 # seconds to start. The longest ones come first.
 TOGETHER = (
     ("default_mode",),
+    ("debug_modes",),
     ("_base", "mesh", "energies", "dissipations"),
     ("io", "plotting", "precondition"),
     ("project", "solvers"),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("blackjax", reason='needs the extra: pip install "vertax[bayes]"')
+pytest.importorskip("blackjax", reason='needs the extra: pip install -e ".[bayes]"')
 
 import equinox as eqx
 import numpyro.distributions as dist

@@ -1,5 +1,7 @@
 """Batches of tissues, energies and problems, and their members."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -51,6 +53,25 @@ def test_stack_rejects_different_trees():
 def test_member_rejects_an_index_out_of_range():
     with pytest.raises(IndexError, match="0 … 1"):
         member(stack([jnp.zeros(2), jnp.ones(2)]), 2)
+
+
+def test_members_of_a_fit_have_their_histories():
+    def fit(k: int) -> vx.Fit:
+        numbers = 10.0 * k + np.arange(3)
+        columns = {field.name: numbers for field in dataclasses.fields(vx.fitting.History)}
+        columns |= {"converged": numbers > 0, "num_steps": np.arange(3), "num_t1": np.arange(3)}
+        columns |= {"guidance": np.zeros(3), "seconds": np.arange(3.0)}
+        energy = vx.energies.ShapeFactorEnergy(jnp.full(6, 3.7 + k))
+        number, history = jnp.array(1.0 * k), vx.fitting.History(**columns)
+        notes = {"mean": numbers}
+        return vx.Fit(energy, random_tissue(6), number, number, np.array(k), history, notes)
+
+    fits = [fit(k) for k in range(4)]
+    batch = vx.fitting.stack_fits(fits, at_once=4)
+    for k, single in enumerate(fits):
+        assert eqx.tree_equal(member(batch, k), single)
+    with pytest.raises(IndexError, match="0 … 3"):
+        member(batch, 4)
 
 
 @pytest.mark.thorough

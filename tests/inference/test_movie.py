@@ -159,6 +159,18 @@ def test_polygons_that_overlap_are_named():
         movie_from_table(table_of(rows))
 
 
+def test_rounded_corners_need_a_tolerance():
+    rows = rows_of(STRAIGHT, 0) + rows_of(STRAIGHT, 1)
+    away = 1e-4 * np.sin(np.arange(len(rows)))
+    table = table_of(rows)
+    table = table | {"x": table["x"] + away, "y": table["y"] + away}
+    with pytest.raises(ValueError, match=r"Frame 0 .* share corners .*Pass `tolerance=0\.0005`"):
+        movie_from_table(table)
+    movie = movie_from_table(table, tolerance=5e-4)
+    assert movie.events == ()
+    np.testing.assert_allclose(movie.frame(1).areas, STRAIGHT.areas, atol=1e-2)
+
+
 def test_wrong_times_and_numbers_are_named():
     with pytest.raises(ValueError, match="`times` must"):
         Movie([STRAIGHT, STRAIGHT], [1, 0])

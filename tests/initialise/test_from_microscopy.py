@@ -195,7 +195,7 @@ def test_missing_scikit_image_is_named(small, monkeypatch):
     for module in ("skimage", "skimage.measure", "skimage.morphology", "skimage.segmentation"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(
-        ImportError, match=re.escape('needs scikit-image: pip install "vertax[image]"')
+        ImportError, match=re.escape('needs scikit-image: pip install -e ".[image]"')
     ):
         from_microscopy(small[0])
 
@@ -258,7 +258,7 @@ def test_a_file_of_a_model_is_taken(fake_cellpose, small):
 def test_missing_cellpose_is_named(small, monkeypatch):
     monkeypatch.setitem(sys.modules, "cellpose", None)
     monkeypatch.setitem(sys.modules, "cellpose.models", None)
-    with pytest.raises(ImportError, match=re.escape('pip install "vertax[cellpose]"')):
+    with pytest.raises(ImportError, match=re.escape('pip install -e ".[cellpose]"')):
         from_microscopy(small[0], segmenter=Cellpose())
 
 

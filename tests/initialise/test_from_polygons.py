@@ -257,8 +257,65 @@ def test_cells_apart_are_refused():
         vx.initialise.from_polygons(far, both)
     # No corner is shared.
     doubled = POINTS[np.concatenate(CELLS)]
-    with pytest.raises(ValueError, match="point 1 and point 4 are two points at one place"):
+    with pytest.raises(ValueError, match=r"share corners .*`tolerance=1e-06`"):
         vx.initialise.from_polygons(doubled, [[0, 1, 2, 3], [4, 5, 6, 7]])
+
+
+@pytest.mark.parametrize("digits", [2, 3, 5])
+@pytest.mark.parametrize("periodic", [False, True])
+def test_error_names_the_tolerance_within_which_cells_share_corners(digits, periodic):
+    make = vx.initialise.periodic_voronoi if periodic else vx.initialise.free_voronoi
+    tissue = make(30, key=5, lloyd_steps=3)
+    cells, images = corners_of(tissue)
+    lattice = np.asarray(tissue.boundary.lattice) if periodic else None
+    # Each cell has rounded corners, and its number of a corner is not that of its neighbours.
+    corner = np.asarray(tissue.vertices)[np.concatenate(cells)]
+    shift = np.concatenate(images) @ lattice if lattice is not None else 0
+    corner = np.round(corner + shift + np.pi, digits) + 0.3 * 10.0**-digits * np.sin(
+        np.arange(2 * len(corner)).reshape(-1, 2)
+    )
+    apart = np.split(np.arange(len(corner)), np.cumsum([len(cell) for cell in cells])[:-1])
+    with pytest.raises(ValueError, match=r"share corners .* Pass `tolerance=") as error:
+        vx.initialise.from_polygons(corner, apart, box=lattice)
+    tolerance = float(str(error.value).partition("`tolerance=")[2].partition("`")[0])
+    assert 10.0**-digits <= tolerance <= 20 * 10.0**-digits
+    result = vx.initialise.from_polygons(corner, apart, tolerance=tolerance, box=lattice)
+    again = result.tissue
+    if 3 * tolerance < np.min(tissue.edge_lengths):
+        assert neighbours(again) == neighbours(tissue)
+    x, y = np.split(corner, 2, axis=1)
+    areas = [0.5 * abs(np.sum(x[c] * np.roll(y[c], -1) - y[c] * np.roll(x[c], -1))) for c in apart]
+    np.testing.assert_allclose(again.areas, areas, atol=3 * tolerance)
+    # Points and sides have the numbers of the given ones.
+    np.testing.assert_array_equal(corner[result.points], again.vertices)
+    assert len(result.side_edges) == len(corner)
+    ends = np.asarray(again.topology.edge_cells)[result.side_edges]
+    owner = np.repeat(np.arange(30), [len(cell) for cell in apart])
+    has_length = result.side_edges >= 0
+    assert np.any(ends == owner[:, None], axis=1)[has_length].all()
+    assert np.count_nonzero(~has_length) <= 4
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+def test_corners_on_the_side_of_a_neighbour_are_added_to_it(periodic):
+    # Rows of bricks: a brick has the corners of its neighbours in the middle of two sides.
+    rows, columns = 4, 4
+    bricks = [
+        [[x, y], [x + 2, y], [x + 2, y + 1], [x, y + 1]]
+        for y in range(rows)
+        for x in range(y % 2, 2 * columns + y % 2, 2)
+    ]
+    points = np.reshape(bricks, (-1, 2)) + 1e-4 * np.sin(np.arange(8 * len(bricks))).reshape(-1, 2)
+    cells = np.arange(len(points)).reshape(-1, 4)
+    box = (2 * columns, rows) if periodic else None
+    with pytest.raises(ValueError, match=r"Pass `tolerance=0\.000"):
+        vx.initialise.from_polygons(points, cells, box=box)
+    tissue = vx.initialise.from_polygons(points, cells, box=box, tolerance=1e-3).tissue
+    np.testing.assert_allclose(tissue.areas, 2, rtol=1e-3)
+    if periodic:
+        np.testing.assert_array_equal(tissue.neighbour_counts, 6)
+    else:
+        np.testing.assert_array_equal(tissue.neighbour_counts[5:7], 6)
 
 
 def test_cells_that_touch_in_a_point_are_refused():

@@ -242,7 +242,7 @@ class TestVTK:
 
     def test_meshio_is_optional(self, periodic, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "meshio", None)
-        with pytest.raises(ImportError, match=r'needs meshio: pip install "vertax\[files\]"'):
+        with pytest.raises(ImportError, match=r'needs meshio: pip install -e "\.\[files\]"'):
             write_vtk(tmp_path / "a.vtu", periodic)
 
 

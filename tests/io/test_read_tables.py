@@ -210,6 +210,21 @@ def test_polygons_of_a_geojson_file(tmp_path, tissue):
     np.testing.assert_allclose(np.sort(again.edge_lengths), np.sort(tissue.edge_lengths), rtol=1e-3)
 
 
+def test_rounded_polygons_of_a_geojson_file_need_a_tolerance(tmp_path):
+    path = tmp_path / "cells.geojson"
+    vx.io.write_geojson(path, PERIODIC)
+    content = json.loads(path.read_text())
+    for number, feature in enumerate(content["features"]):
+        ring = np.array(feature["geometry"]["coordinates"][0]) + 1e-4 * np.sin(number)
+        feature["geometry"]["coordinates"] = [np.round(ring, 4).tolist()]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"polygons of .* Pass `tolerance=0\.0005`"):
+        vx.io.read_geojson(path, box=BOX)
+    again = vx.io.read_geojson(path, box=BOX, tolerance=5e-4)[0].tissue
+    np.testing.assert_array_equal(again.neighbour_counts, PERIODIC.neighbour_counts)
+    np.testing.assert_allclose(again.areas, PERIODIC.areas, atol=1e-2)
+
+
 def test_features_that_are_no_cells_are_refused(tmp_path):
     path = tmp_path / "cells.geojson"
     vx.io.write_geojson(path, FREE, edges={})

@@ -103,9 +103,7 @@ def test_the_widget_runs_in_napari(tmp_path):
     # Another interpreter may have napari: the tests do not depend on it.
     interpreter = os.environ.get("NAPARI_PYTHON", sys.executable)
     if interpreter == sys.executable and importlib.util.find_spec("napari") is None:
-        pytest.skip(
-            "napari is not installed: pip install 'vertax[napari]', or name a NAPARI_PYTHON"
-        )
+        pytest.skip("napari is not installed: pip install -e '.[napari]', or name a NAPARI_PYTHON")
     if not os.environ.get("DISPLAY") and sys.platform == "linux":
         pytest.skip("colours of labels in napari need a display with OpenGL: run under xvfb-run")
     np.save(tmp_path / "mask.npy", bricks())

@@ -9,11 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from vertax.relax._feasibility import Feasibility
+from vertax.solvers import NewtonCG, TruncatedCG, VertexTrustRegion
+
 ROOT = Path(__file__).parents[2]
 ANY = "…"  # any text, in a quotation and for the fields of an f-string
 PAGE = (ROOT / "docs/errors.md").read_text(encoding="utf-8")
 HEADINGS = re.findall(r'^\?\?\? failure "(.*)"$', PAGE, re.MULTILINE)
-QUOTED = [message for heading in HEADINGS for message in heading.split('" and "')]
+QUOTED = [message for heading in HEADINGS for message in heading.strip("“”").split("” and “")]
 
 
 def templates(source: str) -> Iterator[str]:
@@ -109,6 +112,27 @@ def test_quoted_messages_exist_in_the_program(quoted):
 )
 def test_invented_messages_do_not_exist_in_the_program(quoted):
     assert best_agreement(quoted) < 0.6
+
+
+def test_headings_keep_their_quotation_marks():
+    # Markdown removes the outer ones and keeps others of the same kind.
+    assert not [heading for heading in HEADINGS if '"' in heading]
+
+
+def test_table_of_constants_is_that_of_the_code():
+    owners: dict[str, object] = {
+        owner.__name__: owner() for owner in (NewtonCG, TruncatedCG, VertexTrustRegion)
+    }
+    owners["relaxation"] = Feasibility(None)
+    table = (ROOT / "docs/solvers.md").read_text(encoding="utf-8").partition("| class | field |")[2]
+    owner, compared = None, 0
+    for row in table.partition("\n\n")[0].splitlines()[2:]:
+        name, fields, values = (entry.strip() for entry in row.split("|")[1:4])
+        owner = owners[name.strip("[`").partition("`")[0]] if name else owner
+        for field, value in zip(fields.split(", "), values.split(", "), strict=True):
+            assert getattr(owner, field.strip("`")) == float(value), field
+            compared += 1
+    assert compared >= 25
 
 
 NUMBERS = [

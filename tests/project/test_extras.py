@@ -66,11 +66,10 @@ except ImportError as error:
     lines = process.stdout.splitlines()
     assert len(lines) == 4
     assert all(
-        line.startswith('Drawing needs matplotlib: pip install "vertax[plot]"')
-        for line in lines[:2]
+        line.startswith('Drawing needs matplotlib: pip install -e ".[plot]"') for line in lines[:2]
     )
-    assert lines[2].startswith('Sampling a posterior needs blackjax: pip install "vertax[bayes]"')
-    assert lines[3].startswith('Reading pictures needs pillow: pip install "vertax[image]"')
+    assert lines[2].startswith('Sampling a posterior needs blackjax: pip install -e ".[bayes]"')
+    assert lines[3].startswith('Reading pictures needs pillow: pip install -e ".[image]"')
 
 
 @pytest.mark.parametrize(
@@ -86,7 +85,7 @@ def test_command_line_names_the_missing_extra(missing, tmp_path):
     code = "from vertax.__main__ import main; main()"
     process = python(code, "run", str(tmp_path / "tiny.toml"), hide=[missing])
     assert process.returncode == 1
-    assert f'needs {missing.replace("_", "-")}: pip install "vertax[run]"' in process.stderr
+    assert f'needs {missing.replace("_", "-")}: pip install -e ".[run]"' in process.stderr
     assert process.stderr.startswith("Error: ")
     assert "Traceback" not in process.stderr
 
@@ -107,7 +106,7 @@ def test_run_names_the_missing_extra_of_its_experiment(tmp_path):
     ]
     process = python(code, *arguments, hide=["skimage", "tifffile"])
     assert process.returncode == 1
-    assert 'pip install "vertax[image]"' in process.stderr
+    assert 'pip install -e ".[image]"' in process.stderr
     assert "Traceback" not in process.stderr
 
 

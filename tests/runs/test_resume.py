@@ -171,3 +171,11 @@ def test_parts_are_computed_once(tmp_path):
         folder = RunFolder(tmp_path)
     again = folder.part("p0 3.8", lambda: pytest.fail("computed twice"))
     np.testing.assert_array_equal(again["energy"], [0.0, 1.0, 2.0])
+
+
+def test_values_of_a_scan_are_told_apart_in_all_digits(tmp_path):
+    values = [3.8, 3.8 + 1e-9]
+    scanned = RunFolder(tmp_path).scan(
+        "p0", values, lambda p0: {"p0": np.array(p0)}, progress=False
+    )
+    np.testing.assert_array_equal(scanned["p0"], values)

@@ -48,26 +48,14 @@ def stack(trees: Sequence[Tree]) -> Tree:
 
 
 def member(tree: Tree, index: int) -> Tree:
-    """Take one member of a batch.
-
-    **Arguments:**
-
-    - `tree`: the batch: each of its arrays has a leading axis.
-    - `index`: the index of the member, from 0.
-
-    **Returns:** its member.
-
-    **Raises:**
-
-    - `IndexError` for an index out of range.
-    """
+    """Take one member of a batch, in which each array has a leading axis; see `vertax.fitting.member`."""
     sizes = {x.shape[0] if x.ndim else 0 for x in jax.tree.leaves(tree) if _is_array(x)}
     # JAX clamps an index out of range.
     if sizes and not -min(sizes) <= index < min(sizes):
         raise IndexError(
             f"Argument `index` must lie in 0 … {min(sizes) - 1}, the members of the batch, but is {index}."
         )
-    return jax.tree.map(lambda x: x[index] if _is_array(x) else x, tree)
+    return jax.tree.map(lambda x: x[index, ...] if _is_array(x) else x, tree)
 
 
 def _is_array(x: Any) -> bool:

@@ -38,5 +38,7 @@ def requires_extra(extra: str, feature: str) -> Iterator[None]:
             raise
         package = _PACKAGES.get(module, module) or f"what the extra [{extra}] brings"
         raise ImportError(
-            f'{feature} needs {package}: pip install "vertax[{extra}]" ({error}).', name=error.name
+            f'{feature} needs {package}: pip install -e ".[{extra}]" in a copy of the repository of vertax '
+            f"({error}).",
+            name=error.name,
         ) from error

@@ -40,12 +40,13 @@ class GradientOutcome(eqx.Module):
     """
 
     residual: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """Norm of the residual of the linear system, relative to its right-hand side."""
+    """Norm of the residual of the linear system, relative to its right-hand side; -1 if not available."""
     num_steps: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """Steps of the linear solver, of the nudged relaxations, or of the unrolled relaxation."""
+    """Steps of the linear solver, of the nudged relaxations, or of the unrolled relaxation; -1 if not
+    available."""
     negative_curvature: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
-    """1 if the method detected a negative eigenvalue of the Hessian, so that the equilibrium is a saddle; NaN
-    if the method does not compute this."""
+    """1 if the method detected a negative eigenvalue of the Hessian, so that the equilibrium is a saddle; -1
+    if the method does not compute this. (A NaN would end each gradient with `jax_debug_nans`.)"""
     code: Float[Array, "*batch"] = eqx.field(default=0.0, converter=_floating)
     """The index of `result`: gradients are floating-point arrays."""
 

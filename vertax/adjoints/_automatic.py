@@ -134,7 +134,7 @@ class AutomaticDifferentiation(AbstractAdjoint):
         return GradientOutcome(
             final / jnp.where(initial > 0, initial, 1),
             jnp.asarray(state.num_steps, final.dtype),
-            jnp.nan,
+            -1.0,
             index_of(RESULTS.where(final <= rtol * initial, RESULTS.successful, failed)),
         )
 

@@ -174,7 +174,7 @@ class _ReportingSolver(lx.AbstractLinearSolver):
         self, state: Any, vector: PyTree[Array], options: dict[str, Any]
     ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
         solution, result, stats = self.solver.compute(state, vector, options)
-        stat = lambda name: jnp.asarray(stats.get(name, jnp.nan), float)
+        stat = lambda name: jnp.asarray(stats.get(name, -1.0), float)
         residual, failed = stat("residual_norm"), result != lx.RESULTS.successful
         rhs, response = optx.two_norm(vector), optx.two_norm(solution)
         soft = (rhs > 0) & (rhs < self.min_stiffness * response)

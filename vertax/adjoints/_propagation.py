@@ -352,7 +352,7 @@ def _(
     gradient = jax.tree.map(lambda s: cotangent * (s[0] - s[1]) / beta, slopes)
     # (A nudge by the cost may be strong, and flip edges, so linearity is not checked.)
     outcome = _gradient_outcome(
-        jnp.max(max_forces) / force, jnp.sum(num_steps), jnp.full_like(force, jnp.nan)
+        jnp.max(max_forces) / force, jnp.sum(num_steps), jnp.zeros_like(force)
     )
     return finish_gradient(gradient, outcome, adjoint.throw, slot)
 
@@ -363,4 +363,4 @@ def _gradient_outcome(
     at_rest = residual < MAX_RELATIVE_RESIDUAL
     result = RESULTS.where(at_rest, RESULTS.successful, RESULTS.nudge_not_at_rest)
     result = RESULTS.where(nonlinearity >= _MAX_NONLINEARITY, RESULTS.nudge_not_linear, result)
-    return GradientOutcome(residual, num_steps, jnp.nan, index_of(result))
+    return GradientOutcome(residual, num_steps, -1.0, index_of(result))

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import real_scalar
 from vertax.energies._units import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._topology import edge_neighbourhood, source, take
@@ -40,7 +41,7 @@ class IncrementalPotential(AbstractEnergy):
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The incremental potential."""
         before = with_flips_of(self.before, tissue) if self.may_flip else self.before
-        value = self.energy(tissue)
+        value = real_scalar(self.energy(tissue))
         if self.max_driving_force is not None:
             reach = REACH * cell_size(self.before)
             value += inversion_energy_of_all(tissue, reach, self.max_driving_force)

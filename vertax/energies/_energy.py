@@ -129,6 +129,27 @@ def check_energy(energy: Any, name: str = "energy") -> None:
     )
 
 
+def real_scalar(value: Any, name: str = "energy") -> Float[Array, ""]:
+    """The value of an energy or cost; an error unless it can be differentiated.
+
+    Only its type is checked, which costs nothing in a compiled function.
+
+    **Raises:**
+
+    - `TypeError` for a value that is no floating-point number, or not one number.
+    """
+    if jnp.issubdtype(getattr(value, "dtype", float), jnp.floating) and jnp.shape(value) == ():
+        return value
+    what = describe(value)
+    if hasattr(value, "dtype"):
+        what = f"{value.dtype} of shape {jnp.shape(value)}"
+    raise TypeError(
+        f"Argument `{name}` must return one floating-point number, but returns {what}. Compute it from "
+        "vertices, areas, lengths or other geometry (integers such as numbers of neighbours have no "
+        "derivative), sum over cells or edges, and return jnp.asarray(…, float) of a constant."
+    )
+
+
 def warn_of_columns(function: Any, tissue: Tissue, *arguments: Any) -> None:
     """Warn of a column in an energy or cost that makes a matrix of one entry per cell, edge or vertex."""
     if tissue.vertices.ndim == 2:

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from vertax._base.probe_vector import probe_vector
+from vertax.energies._energy import real_scalar
 from vertax.mesh import Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._tissue import mean_area
@@ -54,7 +55,7 @@ def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[A
     # The Rayleigh quotient of an unstructured vector approximates the mean eigenvalue.
     y, unravel = ravel_pytree(tissue.configuration)
     at = lambda x: MeasuredTissue(tissue.with_configuration(unravel(x)))
-    gradient = jax.grad(lambda x: energy(at(x)))
+    gradient = jax.grad(lambda x: real_scalar(energy(at(x))))
     direction = probe_vector(y)
     if (
         tissue.topology.spare

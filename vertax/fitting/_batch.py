@@ -1,16 +1,47 @@
-"""Stack single fits to the fit of a batch."""
+"""Stack single fits to the fit of a batch, and take them from it."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import jax.numpy as jnp
 import numpy as np
 
+from vertax._base import batch
 from vertax._base.batch import stack
 from vertax.fitting._history import Fit, History
+
+Tree = TypeVar("Tree")
+
+
+def member(tree: Tree, index: int) -> Tree:
+    """Take one member of a batch.
+
+    **Arguments:**
+
+    - `tree`: the batch: each of its arrays has a leading axis. A [`Fit`][vertax.Fit] has the members on the
+        second axis of its history, and of notes if that axis has their number.
+    - `index`: the index of the member, from 0.
+
+    **Returns:** its member.
+
+    **Raises:**
+
+    - `IndexError` for an index out of range.
+    """
+    if not isinstance(tree, Fit):
+        return batch.member(tree, index)
+    parts = {
+        field.name: batch.member(getattr(tree, field.name), index)
+        for field in dataclasses.fields(Fit)
+        if field.name not in ("history", "notes")
+    }
+    of_member = lambda x: x[:, index] if x.shape[1:2] == tree.cost.shape else x
+    columns = {name: of_member(np.asarray(x)) for name, x in vars(tree.history).items()}
+    notes = {name: of_member(x) for name, x in tree.notes.items()}
+    return cast(Tree, Fit(**parts, history=History(**columns), notes=notes))
 
 
 def stack_fits(fits: Sequence[Fit[Any]], *, at_once: int = 1) -> Fit[Any]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import tree_where
-from vertax.fitting._history import Facts, Record
+from vertax.fitting._history import MISSING, Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
 
@@ -73,17 +73,17 @@ def no_shift(problem: InverseProblem) -> Float[Array, "2"] | None:
 def nothing_known(problem: InverseProblem) -> Facts:
     """Placeholder facts before the first epoch, with infinite cost."""
     dtype = problem.tissue.vertices.dtype
-    nan, zero = jnp.full((), jnp.nan, dtype), jnp.zeros((), int)
+    missing, zero = jnp.full((), MISSING, dtype), jnp.zeros((), int)
     return Facts(
         cost=jnp.full((), jnp.inf, dtype),
         max_force=jnp.full((), jnp.inf, dtype),
         converged=jnp.array(False),
         num_steps=zero,
         num_t1=zero,
-        gradient_norm=nan,
-        gradient_residual=nan,
-        gradient_steps=nan,
-        relative_error=nan,
+        gradient_norm=missing,
+        gradient_residual=missing,
+        gradient_steps=missing,
+        relative_error=missing,
     )
 
 
@@ -121,8 +121,8 @@ def guidance_of(problem: InverseProblem) -> Float[Array, "*batch"]:
 
 
 def relative_error(parameters: PyTree[Array], true: PyTree[Array] | None) -> Float[Array, ""]:
-    """Mean of |inferred - true| / |true|; NaN if the true parameters are not given."""
+    """Mean of |inferred - true| / |true|; `MISSING` if the true parameters are not given."""
     if true is None:
-        return jnp.full_like(jax.tree.leaves(parameters)[0].ravel()[0], jnp.nan)
+        return jnp.full_like(jax.tree.leaves(parameters)[0].ravel()[0], MISSING)
     errors = jax.tree.map(lambda p, q: jnp.ravel(jnp.abs(p - q) / jnp.abs(q)), parameters, true)
     return jnp.mean(jnp.concatenate(jax.tree.leaves(errors)))

@@ -295,6 +295,7 @@ def _run(
                 epoch, start = len(done.rows), time.perf_counter()
                 state, record = method.advance(done.state, epoch)
                 failed = np.asarray(record.result != RESULTS.successful)  # blocks until it is done
+                record = record.with_nan()
                 row = _row(record, time.perf_counter() - start, method.strength(epoch))
                 if failed.all():
                     return (

@@ -105,3 +105,14 @@ class Record(Facts):
     """The equilibrium of these parameters."""
     result: RESULTS
     """Whether cost and gradient are finite, and how the adjoint ended."""
+
+    def with_nan(self) -> Record:
+        """A copy with NaN for numbers that are not available."""
+        facts = {name: getattr(self, name) for name in _OPTIONAL}
+        new = {name: np.where(np.asarray(x) == MISSING, np.nan, x) for name, x in facts.items()}
+        return dataclasses.replace(self, **new)
+
+
+MISSING = -1.0
+"""A number that is not available. (A NaN from a compiled function would end a fit with `jax_debug_nans`.)"""
+_OPTIONAL = ("gradient_norm", "gradient_residual", "gradient_steps", "relative_error")

@@ -27,7 +27,7 @@ from vertax.adjoints._propagation import AbstractNudgedSystem, nudged_cost
 from vertax.costs import AbstractCost
 from vertax.dynamics import Evolved
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import check_energy, instance_hint, warn_of_columns
+from vertax.energies._energy import check_energy, instance_hint, real_scalar, warn_of_columns
 from vertax.energies._units import mean_stiffness, units_of
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Equilibrium, Relaxation
@@ -176,7 +176,8 @@ class InverseProblem(eqx.Module, Generic[Energy]):
             tissue, energy, shift, adjoint=self.adjoint, primal=primal, throw=throw
         )
         equilibrium = _placed(relaxed, shift)
-        return self.cost(self._cost_argument(equilibrium), energy), equilibrium
+        value = self.cost(self._cost_argument(equilibrium), energy)
+        return real_scalar(value, "cost"), equilibrium
 
     @property
     def _nudged_by_cost(self) -> bool:
@@ -369,7 +370,8 @@ class _GuidedEnergy(AbstractEnergy):
         # Evaluate the cost with the centroid fixed at its start: for a cost that depends on absolute
         # positions, E + κ C would otherwise translate the tissue, without bound for one sign of κ.
         placed = _displaced(tissue.settled(self.start), self.shift)
-        return self.energy(tissue) + self.strength * self.cost(placed, self.energy)
+        cost = real_scalar(self.cost(placed, self.energy), "cost")
+        return self.energy(tissue) + self.strength * cost
 
 
 class _Nudging(AbstractNudgedSystem):
@@ -380,7 +382,7 @@ class _Nudging(AbstractNudgedSystem):
 
     def cost(self, parameters: PyTree) -> Float[Array, ""]:
         energy, shift = parameters
-        return self.problem.cost(_displaced(self.settled, shift), energy)
+        return real_scalar(self.problem.cost(_displaced(self.settled, shift), energy), "cost")
 
     def sizes(self, parameters: PyTree) -> tuple[Float[Array, ""], Float[Array, ""]]:
         energy, shift = parameters

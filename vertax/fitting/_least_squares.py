@@ -27,7 +27,7 @@ from vertax.fitting._epoch import (
     relative_error,
     unbeaten,
 )
-from vertax.fitting._history import Facts, Record
+from vertax.fitting._history import MISSING, Facts, Record
 from vertax.fitting._inverse import InverseProblem
 from vertax.mesh import Tissue
 
@@ -167,16 +167,16 @@ def _residuals(
         worst = jnp.asarray(jnp.finfo(residuals.dtype).max ** 0.25, residuals.dtype)
         valid = relaxed.converged & jnp.all(jnp.isfinite(residuals))
         residuals = jnp.where(valid, scale * residuals, worst)
-        nan = jnp.full_like(scale, jnp.nan)
+        missing = jnp.full_like(scale, MISSING)
         facts = Facts(
             cost=0.5 * jnp.sum((residuals / scale) ** 2),
             max_force=relaxed.max_force,
             converged=valid,
             num_steps=relaxed.num_steps,
             num_t1=relaxed.num_t1,
-            gradient_norm=nan,
-            gradient_residual=nan,
-            gradient_steps=nan,
+            gradient_norm=missing,
+            gradient_residual=missing,
+            gradient_steps=missing,
             relative_error=relative_error(parameters, true),
         )
         tissues = (problem.next_start(relaxed.tissue), placed)

@@ -7,16 +7,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from vertax._base.checks import as_float64
+from vertax._base.checks import as_float64, check_number
 from vertax.inference._movie import Movie
-from vertax.initialise._polygons import checked_lattice, tissue_from_corners
+from vertax.initialise._nearby_corners import build_within, share_corners, size_of_cells
+from vertax.initialise._polygons import checked_lattice, corner_images, tissue_from_corners
 from vertax.io._read_table import column, whole_numbers
 from vertax.mesh import Tissue
 from vertax.mesh._faces import Names
 
 
 def movie_from_table(
-    table: Any, *, box: ArrayLike | None = None, largest_jump: float = 1.0
+    table: Any,
+    *,
+    box: ArrayLike | None = None,
+    tolerance: float | None = None,
+    largest_jump: float = 1.0,
 ) -> Movie:
     """A movie from a table of the corners of tracked cells.
 
@@ -25,10 +30,10 @@ def movie_from_table(
     movie.events
     ```
 
-    Cells that touch must have the same coordinates at common corners, in a periodic box up to a lattice
-    vector. Include points along curved sides on the outline: such a side becomes an arc that keeps the area
-    of its cell. A frame may lack cells: a hole between cells becomes the missing cell that was last seen
-    closest to it, if there is one, so that its neighbours keep their places. Frames may be missing
+    Cells that touch must have the same coordinates at common corners within `tolerance`, in a periodic box up
+    to a lattice vector. Include points along curved sides on the outline: such a side becomes an arc that
+    keeps the area of its cell. A frame may lack cells: a hole between cells becomes the missing cell that was
+    last seen closest to it, if there is one, so that its neighbours keep their places. Frames may be missing
     altogether.
 
     **Arguments:**
@@ -38,6 +43,8 @@ def movie_from_table(
         another in order. Optional: `time` of the frame, by default its number; `type` of the cell, an
         integer.
     - `box`: of a periodic tissue, as in [`from_polygons`][vertax.initialise.from_polygons].
+    - `tolerance`: as of [`from_polygons`][vertax.initialise.from_polygons], by default 10⁻⁶ of the root mean
+        cell area of each frame. Increase it for rounded coordinates and simplified outlines.
     - `largest_jump`: as in [`Movie`][vertax.inference.Movie].
 
     **Returns:** a [`Movie`][vertax.inference.Movie].
@@ -48,6 +55,8 @@ def movie_from_table(
         appears twice in a frame or has two types, polygons that overlap, and as
         [`Movie`][vertax.inference.Movie] and [`from_polygons`][vertax.initialise.from_polygons].
     """
+    if tolerance is not None:
+        check_number("tolerance", tolerance, at_least=0)
     frame, cell = (whole_numbers(table, name, "table") for name in ("frame", "cell"))
     places = np.stack([as_float64("table", column(table, name, "table")) for name in "xy"], axis=1)
     if (np.diff(frame) < 0).any():
@@ -66,7 +75,9 @@ def movie_from_table(
             raise ValueError(
                 f"Argument `table` must have one time per frame, but frame {number} has several."
             )
-        tissue, cells, added = _one_frame(int(number), cell[rows], places[rows], box, last_seen)
+        tissue, cells, added = _one_frame(
+            int(number), cell[rows], places[rows], box, tolerance, last_seen
+        )
         filled.append(added)
         tissues.append(tissue)
         numbers.append(cells)
@@ -82,6 +93,7 @@ def _one_frame(
     cell: Int[np.ndarray, " rows"],
     places: Float[np.ndarray, "rows 2"],
     box: ArrayLike | None,
+    tolerance: float | None,
     last_seen: dict[int, np.ndarray],
 ) -> tuple[Tissue, Int[np.ndarray, " cells"], list[int]]:
     """The tissue of a frame, the numbers of its cells, and those of cells that fill holes."""
@@ -93,37 +105,43 @@ def _one_frame(
             f"Argument `table` must have each cell once per frame, but cell {unique[counts > 1][0]} appears "
             f"twice in frame {number}. Give the other one another number, or put its corners together."
         )
-    # Equal coordinates are one point, also across a periodic boundary.
-    if box is None:
-        grid = np.rint((places - places.min(axis=0)) / np.ptp(places, axis=0).max() * _GRID)
-    else:
-        grid = np.rint(places @ np.linalg.inv(checked_lattice(box)) * _GRID) % _GRID
-    _, first, point = np.unique(
-        grid.astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    corners = [part.tolist() for part in np.split(point.ravel(), starts[1:])]
-    points, added = places[first], []
-    if box is None:
-        for hole in _holes(corners, points):
-            middle = points[hole].mean(axis=0)
-            lost = {c: np.linalg.norm(p - middle) for c, p in last_seen.items() if c not in numbers}
-            lost = {c: away for c, away in lost.items() if c not in added}
-            if lost:
-                added.append(min(lost, key=lambda c: lost[c]))
-                corners.append(hole)
-    numbers = np.append(numbers, np.array(added, int))
-    named = Names(
+    lattice = None if box is None else checked_lattice(box)
+    corners = np.split(np.arange(len(places)), starts[1:])
+    names = Names(
         f"Frame {number} of argument `table`",
-        lambda k: f"the point ({points[k, 0]:.4g}, {points[k, 1]:.4g})",
+        lambda k: f"the point ({places[k, 0]:.4g}, {places[k, 1]:.4g})",
         lambda k: f"cell {numbers[k]}",
     )
-    result = tissue_from_corners(points, corners, named, box=box)
-    last_seen.update(zip(numbers.tolist(), np.asarray(result.tissue.centroids), strict=True))
-    return result.tissue, numbers, added
+    images = corner_images(None, corners, places, lattice, names)
+    size = size_of_cells(places, corners, images, lattice)
 
+    def build(within: float) -> tuple[Tissue, list[int]]:
+        shared = share_corners(places, corners, images, lattice, within)
+        cells, added = shared.cells, []
+        if box is None:
+            for hole in _holes([cell.tolist() for cell in cells], shared.points):
+                middle = shared.points[hole].mean(axis=0)
+                lost = {
+                    c: np.linalg.norm(p - middle) for c, p in last_seen.items() if c not in numbers
+                }
+                lost = {c: away for c, away in lost.items() if c not in added}
+                if lost:
+                    added.append(min(lost, key=lambda c: lost[c]))
+                    cells.append(np.array(hole))
+        every = [*numbers, *added]
+        named = Names(
+            names.subject, lambda k: names.point(int(shared.first[k])), lambda k: f"cell {every[k]}"
+        )
+        images_of = None if box is None else shared.images
+        result = tissue_from_corners(shared.points, cells, named, box=box, images=images_of)
+        return result.tissue, added
 
-_GRID = 1e9
-"""Points closer than 1 / _GRID of the extent, or of the box, are one point."""
+    tissue, added = build_within(
+        build, 1e-6 * size if tolerance is None else tolerance, size, names.subject
+    )
+    numbers = np.append(numbers, np.array(added, int))
+    last_seen.update(zip(numbers.tolist(), np.asarray(tissue.centroids), strict=True))
+    return tissue, numbers, added
 
 
 def _holes(corners: list[list[int]], points: Float[np.ndarray, "points 2"]) -> list[list[int]]:

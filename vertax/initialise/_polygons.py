@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
-from vertax._base.checks import as_float64, check_concrete, describe
+from vertax._base.checks import as_float64, check_concrete, check_number, describe
+from vertax.initialise._nearby_corners import build_within, share_corners, size_of_cells
 from vertax.initialise._overlap_repair import crossed_by, repair_overlaps
 from vertax.mesh import Free, Periodic, Tissue
 from vertax.mesh._arcs import angle_of_area
@@ -53,6 +54,7 @@ def from_polygons(
     *,
     box: ArrayLike | Sequence[Any] | None = None,
     images: Sequence[Any] | None = None,
+    tolerance: float | None = None,
     open_cells: ArrayLike | Sequence[Any] | None = None,
     keep_open: bool = True,
     inner_arcs: bool = False,
@@ -66,7 +68,8 @@ def from_polygons(
     ```
 
     The corners of a cell may run clockwise or counter-clockwise: the sign of the area of its polygon shows
-    which. Cells that touch must share the corner numbers at both ends of each common side.
+    which. Cells that touch must share the corner numbers at both ends of each common side. Where they do not,
+    `tolerance` merges points, and adds corners to sides on which those of other cells are.
 
     - Three edges meet: the point is a vertex.
     - Two edges meet: the point is inside an edge, and is removed (`removed_points`). An edge between two
@@ -91,6 +94,9 @@ def from_polygons(
     - `images`: of a periodic tissue, for each cell, integers of shape `(corners, 2)`: its corner k is at
         `points[cell[k]] + images[k] @ lattice`. By default each side takes the shortest way, which is
         right where all sides are shorter than half the box.
+    - `tolerance`: points closer together than this are one, the first of them; a point closer than this to a
+        side of another cell is a corner of that cell too. In units of length; smaller than the sides of the
+        cells. By default points are what `cells` says.
     - `open_cells`: numbers of open cells, or a boolean for each cell.
     - `keep_open`: keep open cells, or leave them out with the points that only they have.
     - `inner_arcs`: make every edge an arc, and not only those on the outline of a free tissue.
@@ -107,16 +113,65 @@ def from_polygons(
     - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`.
     """
     names = Names("Argument `cells`", "point {}".format, "cell {}".format)
-    return tissue_from_corners(
+    return tissue_from_near_corners(
         points,
         cells,
         names,
+        tolerance,
         box=box,
         images=images,
         open_cells=open_cells,
         keep_open=keep_open,
         inner_arcs=inner_arcs,
         softening=softening,
+    )
+
+
+def tissue_from_near_corners(
+    points: ArrayLike | Sequence[Any],
+    cells: Sequence[Any] | Shaped[np.ndarray | Array, "cells corners"],
+    names: Names,
+    tolerance: float | None,
+    *,
+    box: ArrayLike | Sequence[Any] | None,
+    images: Sequence[Any] | None = None,
+    **settings: Any,
+) -> PolygonTissue:
+    """`from_polygons`, with other names for points and cells in messages."""
+    check_concrete("from_polygons", points, box, tolerance)
+    if tolerance is not None:
+        check_number("tolerance", tolerance, at_least=0)
+    position = _checked_points(points, names)
+    corners = _checked_cells(cells, position, names)
+    lattice = _checked_box(box, images)
+    image = corner_images(images, corners, position, lattice, names)
+
+    def build(within: float) -> PolygonTissue:
+        shared = share_corners(position, corners, image, lattice, within)
+        result = tissue_from_corners(
+            shared.points,
+            shared.cells,
+            names._replace(point=lambda point: names.point(int(shared.first[point]))),
+            box=box,
+            images=None if lattice is None else shared.images,
+            **settings,
+        )
+        return dataclasses.replace(
+            result,
+            points=shared.first[result.points],
+            removed_points=shared.first[result.removed_points],
+            split_points=shared.first[result.split_points],
+            side_edges=np.append(result.side_edges, -1)[shared.side],
+        )
+
+    as_given = lambda: tissue_from_corners(
+        position, corners, names, box=box, images=images, **settings
+    )
+    return build_within(
+        lambda within: as_given() if within < 0 else build(within),
+        -1.0 if tolerance is None else tolerance,
+        size_of_cells(position, corners, image, lattice),
+        names.subject,
     )
 
 
@@ -132,16 +187,12 @@ def tissue_from_corners(
     inner_arcs: bool = False,
     softening: float | None = None,
 ) -> PolygonTissue:
-    """`from_polygons`, with other names for points and cells in messages."""
+    """`from_polygons` without `tolerance`, with other names for points and cells in messages."""
     check_concrete("from_polygons", points, box, open_cells, softening)
     position = _checked_points(points, names)
     corners = _checked_cells(cells, position, names)
-    lattice = None if box is None else checked_lattice(box)
+    lattice = _checked_box(box, images)
     is_open = _checked_open(open_cells, len(corners))
-    if lattice is None and images is not None:
-        raise ValueError(
-            "Argument `images` must come with `box`, but there is none. Pass the box of the periodic tissue."
-        )
     if lattice is not None and is_open.any():
         raise ValueError(
             "Argument `open_cells` must name no cells of a periodic tissue, which has no border, but it "
@@ -167,7 +218,9 @@ def tissue_from_corners(
     of_kept = Names(names.subject, names.point, lambda cell: names.cell(int(kept[cell])))
     sides = Sides(
         np.concatenate([corners[cell] for cell in kept]),
-        _checked_images(images, [corners[cell] for cell in kept], position, lattice, of_kept),
+        np.concatenate(
+            corner_images(images, [corners[cell] for cell in kept], position, lattice, of_kept)
+        ),
         np.repeat(np.arange(len(kept)), sizes),
     )
     sides, given = _counter_clockwise(sides, position, lattice, of_kept)
@@ -319,6 +372,16 @@ def _checked_cells(
     return corners
 
 
+def _checked_box(
+    box: ArrayLike | Sequence[Any] | None, images: Sequence[Any] | None
+) -> Float[np.ndarray, "2 2"] | None:
+    if box is None and images is not None:
+        raise ValueError(
+            "Argument `images` must come with `box`, but there is none. Pass the box of the periodic tissue."
+        )
+    return None if box is None else checked_lattice(box)
+
+
 def checked_lattice(box: ArrayLike | Sequence[Any]) -> Float[np.ndarray, "2 2"]:
     """The two lattice vectors of a box."""
     lattice = as_float64("box", box)
@@ -356,14 +419,14 @@ def _checked_open(
     return is_open
 
 
-def _checked_images(
+def corner_images(
     images: Sequence[Any] | None,
     corners: list[Int[np.ndarray, " _"]],
     position: Float[np.ndarray, "points 2"],
     lattice: Float[np.ndarray, "2 2"] | None,
     names: Names,
-) -> Int[np.ndarray, "sides 2"]:
-    """Lattice image of each corner, one cell after the other; corners repeated in a cell are refused."""
+) -> list[Int[np.ndarray, "_ 2"]]:
+    """Lattice images of the corners of each cell; corners repeated in a cell are refused."""
     if lattice is None:
         arrays = [np.zeros((len(corner), 2), int) for corner in corners]
     elif images is None:
@@ -395,7 +458,7 @@ def _checked_images(
                     else "If they are different lattice images, give the `images` of the corners."
                 )
             )
-    return np.concatenate(arrays).astype(int)
+    return [array.astype(int) for array in arrays]
 
 
 def _nearest_images(

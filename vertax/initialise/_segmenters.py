@@ -245,5 +245,5 @@ def _check_version(package: str, least: int) -> None:
     if int(version.split(".")[0]) < least:
         raise ImportError(
             f"Cellpose needs {package} {least} or later, but {version} is installed: "
-            f'pip install --upgrade "vertax[{package}]".'
+            f'pip install --upgrade "{package}>={least}".'
         )

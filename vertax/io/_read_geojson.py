@@ -9,13 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int, Shaped
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
+from jaxtyping import ArrayLike, Float, Shaped
 
-from vertax._base.checks import check_number
-from vertax.initialise._polygons import PolygonTissue, checked_lattice, tissue_from_corners
+from vertax.initialise._nearby_corners import size_of_cells
+from vertax.initialise._polygons import PolygonTissue, tissue_from_near_corners
 from vertax.io._read_table import properties, read_features
 from vertax.mesh._faces import Names
 
@@ -35,8 +32,7 @@ def read_geojson(
     tissue, pressure = polygons.tissue, table["pressure"]
     ```
 
-    Corners of different polygons that are closer together than `tolerance` are one point. The points and
-    cells then make a tissue as in [`from_polygons`][vertax.initialise.from_polygons].
+    The corners of the polygons make a tissue as in [`from_polygons`][vertax.initialise.from_polygons].
 
     [`write_geojson`][vertax.io.write_geojson] draws an arc as a chain of straight pieces, so an arc read from
     polygons has the area of that chain. For exactly the same tissue write the edges too (`edges={}`), and
@@ -47,14 +43,15 @@ def read_geojson(
     - `path`: the file.
     - `box`: of a periodic tissue, width and height, or two lattice vectors as rows. Polygons must be whole;
         they may stick out of the box.
-    - `tolerance`: in units of length; by default 10⁻⁶ of the root mean cell area.
+    - `tolerance`: as of [`from_polygons`][vertax.initialise.from_polygons], by default 10⁻⁶ of the root mean
+        cell area. Increase it for rounded coordinates and simplified outlines.
     - `inner_arcs`, `softening`: as of [`from_polygons`][vertax.initialise.from_polygons].
 
     Features without a geometry, and collections of geometries without exactly one polygon, are left out
     with a warning.
 
-    **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], with points numbered in the order of
-    the file, and the properties of the features as columns with one row for each cell.
+    **Returns:** the [`PolygonTissue`][vertax.initialise.PolygonTissue], with the corners in
+    the order of the file as points, and the properties of the features as columns with one row for each cell.
 
     **Raises:**
 
@@ -65,36 +62,23 @@ def read_geojson(
     path = Path(path)
     features = _with_polygons(read_features(path), path)
     rings = [_ring(feature, feature["number"], path) for feature in features]
-    lattice = None if box is None else checked_lattice(box)
-    if tolerance is None:
-        tolerance = 1e-6 * float(np.sqrt(np.mean([abs(_area(ring)) for ring in rings])))
-    check_number("tolerance", tolerance, at_least=0)
     corner = np.concatenate(rings)
-    point = _merged(corner, lattice, tolerance)
-    first = np.unique(point, return_index=True)[1]
-    images = np.zeros((len(corner), 2), int)
-    if lattice is not None:
-        way = (corner - corner[first][point]) @ np.linalg.inv(lattice)
-        images = np.rint(way).astype(int)
-    splits = np.cumsum([len(ring) for ring in rings])[:-1]
-    cells, places = [], []
-    for cell, image in zip(np.split(point, splits), np.split(images, splits), strict=True):
-        # Corners within the tolerance of the one before are the same corner.
-        both = np.column_stack([cell, image])
-        kept = np.any(both != np.roll(both, 1, axis=0), axis=1)
-        cells.append(cell[kept])
-        places.append(image[kept])
+    cells = np.split(np.arange(len(corner)), np.cumsum([len(ring) for ring in rings])[:-1])
+    images = [np.zeros((len(ring), 2), int) for ring in rings]
+    if tolerance is None:
+        tolerance = 1e-6 * size_of_cells(corner, cells, images, None)
     names = Names(
         f"The polygons of {path}",
-        _at(corner[first]),
+        _at(corner),
         lambda cell: f"feature {features[cell]['number']}",
     )
-    polygons = tissue_from_corners(
-        corner[first],
+    polygons = tissue_from_near_corners(
+        corner,
         cells,
         names,
+        tolerance,
         box=box,
-        images=None if box is None else places,
+        images=None if box is None else images,
         inner_arcs=inner_arcs,
         softening=softening,
     )
@@ -167,35 +151,3 @@ def _ring(feature: dict[str, Any], number: int, path: Path) -> Float[np.ndarray,
             "Remove it."
         )
     return ring
-
-
-def _area(ring: Float[np.ndarray, "corners 2"]) -> float:
-    x, y = (ring - ring[0]).T
-    return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-
-
-def _merged(
-    corner: Float[np.ndarray, "corners 2"],
-    lattice: Float[np.ndarray, "2 2"] | None,
-    tolerance: float,
-) -> Int[np.ndarray, " corners"]:
-    """One number for all corners at one place, in order of appearance."""
-    place, source = corner, np.arange(len(corner))
-    if lattice is not None:
-        # In the box, with a rim of images, so that corners on both sides of its border meet.
-        fraction = (corner @ np.linalg.inv(lattice)) % 1.0
-        rim = 2 * tolerance * np.linalg.norm(np.linalg.inv(lattice), axis=0)
-        images, origins = [fraction @ lattice], [source]
-        for step in np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]):
-            shifted = fraction + step
-            near = np.flatnonzero(np.all((shifted > -rim) & (shifted < 1 + rim), axis=1))
-            images.append(shifted[near] @ lattice)
-            origins.append(near)
-        place, source = np.concatenate(images), np.concatenate(origins)
-    pairs = KDTree(place).query_pairs(tolerance, output_type="ndarray")
-    links = source[pairs]
-    n = len(corner)
-    graph = coo_array((np.ones(len(links), bool), (links[:, 0], links[:, 1])), shape=(n, n))
-    group = connected_components(graph, directed=False)[1]
-    first = np.unique(group, return_index=True)[1]
-    return np.argsort(np.argsort(first))[group]

@@ -53,7 +53,7 @@ def write_vtk(
 
     **Raises:**
 
-    - `ImportError` if meshio is not installed: `pip install "vertax[files]"`.
+    - `ImportError` if meshio is not installed: `pip install -e ".[files]"`.
     - `ValueError` for another ending, values that are not numbers, a batch of tissues, `points_per_arc`
         below 1, and as [`cell_table`][vertax.io.cell_table].
     """

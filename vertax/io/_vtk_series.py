@@ -43,7 +43,7 @@ def write_vtk_series(
 
     - `ValueError` for another ending, no frame, values with another number of rows, and as
         [`write_vtk`][vertax.io.write_vtk].
-    - `ImportError` if meshio is not installed: `pip install "vertax[files]"`.
+    - `ImportError` if meshio is not installed: `pip install -e ".[files]"`.
     """
     path = Path(path)
     if path.suffix != ".pvd":

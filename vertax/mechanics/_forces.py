@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import check_system
 from vertax.mesh import Tissue
 from vertax.mesh._tissue import Measurements
@@ -87,5 +88,6 @@ def _pressures_and_tensions(
 ) -> tuple[Float[Array, " cells"], Float[Array, " edges"]]:
     dtype = tissue.vertices.dtype
     zeros = (jnp.zeros(tissue.n_cells, dtype), jnp.zeros(tissue.n_edges, dtype))
-    by_area, by_length = jax.grad(lambda offsets: energy(_OffsetTissue(tissue, *offsets)))(zeros)
+    at = lambda offsets: real_scalar(energy(_OffsetTissue(tissue, *offsets)))
+    by_area, by_length = jax.grad(at)(zeros)
     return -by_area, by_length

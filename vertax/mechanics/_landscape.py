@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
+from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import as_matrix, check_tissue
 from vertax.mesh import Periodic, Tissue
 
@@ -74,7 +75,8 @@ class Landscape(eqx.Module):
         strain, change = motion
         configuration = jax.tree.map(jnp.add, self.tissue.configuration, change)
         gradient = jnp.eye(2, dtype=strain.dtype) + strain + 0.5 * strain @ strain
-        return self.potential(deformed(self.tissue.with_configuration(configuration), gradient))
+        trial = deformed(self.tissue.with_configuration(configuration), gradient)
+        return real_scalar(self.potential(trial))
 
     @property
     def zero(self) -> Motion:

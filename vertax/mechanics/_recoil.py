@@ -13,6 +13,7 @@ from vertax._base.checks import check_integer
 from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import check_dissipation, check_linear_solver, check_system
 from vertax.mechanics._forces import tensions
 from vertax.mechanics._landscape import checked, dissipation_landscape, solve
@@ -70,7 +71,7 @@ def _velocities(
     dissipation: AbstractDissipation,
     solver: lx.AbstractLinearSolver,
 ) -> Float[Array, "vertices 2"]:
-    gradient = jax.grad(lambda configuration: energy(tissue.with_configuration(configuration)))
+    gradient = jax.grad(lambda y: real_scalar(energy(tissue.with_configuration(y))))
     forces = jax.tree.map(jnp.negative, gradient(tissue.configuration))
     viscosity = dissipation_landscape(tissue, dissipation).hessian_product()
     no_strain = jnp.zeros((2, 2), tissue.vertices.dtype)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from vertax._base.checks import as_real
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import check_system
 from vertax.mechanics._forces import pressures_and_tensions
 from vertax.mechanics._landscape import area_of, deformed
@@ -48,7 +49,8 @@ def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
 @eqx.filter_jit
 def _stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
     identity = jnp.eye(2, dtype=tissue.vertices.dtype)
-    return jax.grad(lambda gradient: energy(deformed(tissue, gradient)))(identity) / area_of(tissue)
+    at = lambda gradient: real_scalar(energy(deformed(tissue, gradient)))
+    return jax.grad(at)(identity) / area_of(tissue)
 
 
 def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2 2"]:

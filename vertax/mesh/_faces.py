@@ -144,7 +144,7 @@ def build_faces(
 
     previous = np.argsort(following)
     turned = twin[previous]  # counter-clockwise around the point
-    _check_pieces(points, start, cell, twin, n_cells, names)
+    _check_pieces(n_points, start, cell, twin, n_cells, names)
     _check_orbits(points, start, cell, following, turned, n_cells, names)
 
     degree = np.bincount(start, minlength=n_points)
@@ -303,7 +303,7 @@ def _refuse_pinch(
 
 
 def _check_pieces(
-    points: Float[np.ndarray, "points 2"],
+    n_points: int,
     start: Int[np.ndarray, " sides"],
     cell: Int[np.ndarray, " sides"],
     twin: Int[np.ndarray, " sides"],
@@ -311,25 +311,15 @@ def _check_pieces(
     names: Names,
 ) -> None:
     """Refuse cells in several pieces that do not touch."""
-    n_points = len(points)
     n_pieces, piece = _components(n_points, start, start[twin])
     counts = np.bincount(piece[start], minlength=n_pieces)
     if np.count_nonzero(counts) <= 1:
         return
     apart = (piece[start] != np.argmax(counts)) & (cell < n_cells)
-    unique, code = np.unique(points, axis=0, return_inverse=True)
-    remedy = "Leave them out, or make a tissue of each piece."
-    if len(unique) < n_points:
-        code = np.ravel(code)
-        same = np.flatnonzero(code == np.argmax(np.bincount(code)))[:2]
-        remedy = (
-            f"Cells that touch must share corners, but {names.points(same)} are two points at one place: "
-            "use one number for both."
-        )
     names.refuse(
         "be in one piece",
         f"{names.cells(cell[apart])} have no side in common with the rest",
-        remedy,
+        "Leave them out, or make a tissue of each piece.",
     )
 
 

@@ -6,6 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float, PyTree
 
 from vertax.energies import AbstractEnergy
+from vertax.energies._energy import real_scalar
 from vertax.mesh import Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.precondition._edge_blocks import EdgeBlocks
@@ -25,7 +26,7 @@ def objective(
     """The energy of a configuration and of its contacts, as Optimistix wants it."""
     tissue, energy, contacts = args
     trial = tissue.with_configuration(configuration)
-    value = energy(MeasuredTissue(trial))
+    value = real_scalar(energy(MeasuredTissue(trial)))
     return value if contacts is None else value + contacts(trial), None
 
 

@@ -56,8 +56,8 @@ class Relaxation(AbstractResponse):
     - `transitions`: the rule for topology changes, or None to keep the topology.
     - `tolerance`: largest force (component of $\nabla_X E$) that counts as equilibrium, in units of
         energy per length; by default $10^{-10}\,k \ell$ in float64 and $10^{-5}\,k \ell$ in float32
-        ($10^{-4}\,k \ell$ with arcs), or the force of rounded coordinates, $4 \epsilon\,k \max |x|$, where that is larger (in float32, above
-        some hundred cells).
+        ($10^{-4}\,k \ell$ with arcs), or the force of rounded coordinates, $4 \epsilon\,k \max |x|$, where
+        that is larger (in float32, above some hundred cells).
     - `consecutive_steps`: number of consecutive steps for which the force must stay below the tolerance.
     - `max_steps`: most steps of the minimiser.
     - `contact_range`: how near a corner comes to a side of the same cell (or of the outline) before a

@@ -268,7 +268,7 @@ class RunFolder:
 
         def compute_one(index: int) -> dict[str, np.ndarray]:
             value = float(values[index])
-            return self.part(f"{name} {value:g}", lambda: compute(value))
+            return self.part(f"{name} {value}", lambda: compute(value))
 
         results = self.map_in_threads(compute_one, len(values), progress=progress, unit="value")
         return {key: np.stack([result[key] for result in results]) for key in results[0]}
@@ -277,6 +277,9 @@ class RunFolder:
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
     ) -> dict[str, Shaped[np.ndarray, "..."]]:
         """Arrays that are stored for a resumed run.
+
+        A resumed run compares its configuration, not the code of `compute`: after a change of the code run
+        with `--overwrite`, or delete the file of the part.
 
         **Arguments:**
 

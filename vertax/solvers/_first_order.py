@@ -183,7 +183,7 @@ class FIRE(AbstractSolver):
     - `time_step`: initial time step, for unit mass and a mean stiffness of 12 (of the paper's first
         energy); scaled with the period of oscillation for other stiffnesses.
     - `max_time_step`: largest time step, scaled likewise.
-    - `max_displacement`: largest displacement of a vertex in one step, in units of the length scale (in
+    - `max_displacement`: largest change of a coordinate in one step, in units of the length scale (in
         [`equilibrate`][vertax.equilibrate] the square root of the mean cell area; otherwise 1).
 
     **Raises:**

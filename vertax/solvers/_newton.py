@@ -101,7 +101,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
 
     **Arguments:**
 
-    - `max_displacement`: largest radius, in units of the length scale (in
+    - `max_displacement`: first radius, in units of the length scale (in
         [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
     - `max_products`: most Hessian-vector products in one step.
     - `max_corrections`: most second-order corrections of one step; 0 for none.

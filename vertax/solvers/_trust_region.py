@@ -23,9 +23,9 @@ class VertexTrustRegion(eqx.Module):
     - Rejected: radii of vertices with an error that is not small shrink by `shrink`; the other radii
       halve, unless fewer than the fraction `few` of the vertices shrink.
 
-    All radii start at the largest displacement, and return there if all of them have become shorter than
-    `collapsed` times that. (Nocedal & Wright 2006, alg. 4.1, doi:10.1007/978-0-387-40065-5, one region for
-    each vertex.)
+    All radii start at `max_displacement` of the solver, and return there if all of them have become shorter
+    than `collapsed` times that. (Nocedal & Wright 2006, alg. 4.1, doi:10.1007/978-0-387-40065-5, one region
+    for each vertex.)
     """
 
     good_gain: float = 0.75
@@ -38,7 +38,7 @@ class VertexTrustRegion(eqx.Module):
     min_radius: float = 1e-10
     collapsed: float = 1e-9
     shortest: float = 1e-5
-    """A radius that steps cut short have made shorter than this, in units of the largest one, begins anew."""
+    """A radius that steps cut short have made shorter than this, in units of the first one, begins anew."""
 
     def error(
         self,
