@@ -283,6 +283,7 @@ def test_posterior_density_has_a_finite_gradient(rest):
     assert np.isfinite(slope).all()
 
 
+@pytest.mark.thorough
 def test_free_tissue_grows_and_divides():
     tissue = vx.initialise.free_voronoi(4, key=0, lloyd_steps=2).with_capacity(9)
 
