@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Integer, Shaped
 
 from vertax._base.checks import check_integer
 from vertax._base.extras import requires_extra
@@ -162,6 +162,25 @@ def _read_picture(file: Path) -> tuple[np.ndarray, str]:
     if transparent:
         pixels = _without_transparency(pixels)
     return pixels, "YX" if pixels.ndim == 2 else "YXS"
+
+
+def palette_indices(file: Path) -> Integer[np.ndarray, "rows columns"] | None:
+    """The indices of a picture with a palette, where they are labels: where index 0 is black, or two indices
+    have one colour. None for another file."""
+    if file.suffix.lower() in _TIFF:  # its indices are its pixels
+        return None
+    with requires_extra("image", "Reading pictures"):
+        from PIL import Image, UnidentifiedImageError
+    try:
+        with Image.open(file) as picture:
+            if picture.mode != "P":
+                return None
+            indices, palette = np.asarray(picture), picture.getpalette("RGB") or []
+    except (UnidentifiedImageError, OSError):
+        return None
+    colours = np.reshape(palette, (-1, 3))[np.unique(indices)]
+    repeat = len(np.unique(colours, axis=0)) < len(colours)
+    return indices if repeat or not any(palette[:3]) else None
 
 
 def _without_transparency(

@@ -24,6 +24,8 @@ from vertax.tensions._pixel_aspect import pixel_aspect_warning
 _CELL_ERROR = 0.1
 # Number of places that a warning names.
 _PLACES = 5
+# Smallest number of stray regions of a mask that was resized. (There are also more than cells.)
+_STRAY = 20
 
 
 class InferredTensions(eqx.Module):
@@ -275,6 +277,12 @@ def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
             places = "; ".join(map(str, changes[:_PLACES]))
             more = f"; and {len(changes) - _PLACES} more" if len(changes) > _PLACES else ""
             warnings.append(f"{text}: {places}{more}")
+    stray = len(report.of_kind("piece", "absorbed", "left out"))
+    if stray > max(_STRAY, len(report.cell_pixels)):
+        warnings.append(
+            f"{stray} stray regions were joined to cells or left out, as in a mask that was resized with "
+            "interpolation, whose outlines are wrong: resize masks with order 0 (nearest neighbour)"
+        )
     closed = report.closed & np.isfinite(report.shown) & ~result.four_fold
     closed &= np.all(
         np.append(result.labels, 0)[np.asarray(result.tissue.topology.edge_cells)] > 0, axis=1
