@@ -151,8 +151,8 @@ def from_labels(
 
     - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
         labels, is a picture, or has a cell that reaches around the (mirrored) image or around all other
-        cells; for a mask with a label 0 that may be that of a cell, because it has negative ones too; for an unknown
-        `boundary` or `holes`, a `pixel_size` that is not positive, a `gap_width` that is negative or
+        cells; for a mask with a label 0 that may be that of a cell, because it has negative ones too; for an
+        unknown `boundary` or `holes`, a `pixel_size` that is not positive, a `gap_width` that is negative or
         larger than the image, or a `background` that no pixel has.
     - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`.
     """

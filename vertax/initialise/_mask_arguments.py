@@ -12,9 +12,9 @@ from vertax._base.checks import check_integer
 from vertax._base.pixels import PixelSize, check_pixel_size
 from vertax.initialise._pieces import connected_pieces
 
-# A picture has at least this number of connected regions, half of its pixels in regions smaller than
-# `_PICTURE_PIXELS` (no polygon can stand for them), and half of its regions smaller than `_STRAY_PIXELS`.
-_PICTURE_PIECES, _PICTURE_PIXELS, _STRAY_PIXELS = 100, 25, 4
+# A picture has at least this number of connected regions, more than half of its pixels in regions of fewer
+# pixels than this, and less than this share of its pixels in the largest region of each label.
+_PICTURE_PIECES, _SMALL_PIXELS, _PICTURE_SHARE = 100, 25, 0.25
 # Lines have at least this share of all sides between pixels of different labels, and are thinner than this,
 # relative to the root of the median area of the regions between them.
 _LINE_SHARE, _LINE_WIDTH = 0.75, 0.3
@@ -103,17 +103,25 @@ def check_bits(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:
 def check_no_picture(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:
     """Raise a `ValueError` for a picture, whose grey values are no labels of cells."""
     pieces = connected_pieces(mask, periodic=False)
-    labelled = pieces.value > 0
-    size = pieces.size[labelled]
-    small = size[size < _PICTURE_PIXELS].sum()
-    if len(size) < _PICTURE_PIECES or small <= size.sum() / 2 or np.median(size) >= _STRAY_PIXELS:
+    is_label = pieces.value > 0
+    size = pieces.size[is_label]
+    labels, index = np.unique(pieces.value[is_label], return_inverse=True)
+    largest = np.zeros(len(labels), int)
+    np.maximum.at(largest, index, size)
+    # Of 16 bits, most labels of a picture have one pixel.
+    in_cells = largest[largest > 3].sum()
+    small = size[size < _SMALL_PIXELS].sum()
+    if (
+        len(size) < _PICTURE_PIECES
+        or 2 * small < size.sum()
+        or in_cells > _PICTURE_SHARE * size.sum()
+    ):
         return
     raise ValueError(
-        f"Argument `{name}` must hold a label for each cell, but has "
-        f"{len(np.unique(pieces.value[labelled]))} labels in {len(size)} pieces of median "
-        f"{np.median(size):.0f} pixel: a picture, not a mask. Segment the picture first; or, if this is a "
-        "mask that was resized, resize it without interpolation (order 0). Grey outlines on 0: pass "
-        "vx.initialise.labels_from_skeleton(mask), or kind='outlines' to vx.tensions."
+        f"Argument `{name}` must hold a label for each cell, but has {len(labels)} labels in {len(size)} "
+        f"pieces of median {np.median(size):.0f} pixel: a picture, not a mask. Segment the picture first; or, "
+        "if this is a mask that was resized, resize it without interpolation (order 0). Grey outlines on 0: "
+        "pass vx.initialise.labels_from_skeleton(mask), or kind='outlines' to vx.tensions."
     )
 
 
