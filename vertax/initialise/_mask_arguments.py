@@ -119,9 +119,9 @@ def check_no_picture(name: str, mask: Integer[np.ndarray, "rows columns"]) -> No
         return
     raise ValueError(
         f"Argument `{name}` must hold a label for each cell, but has {len(labels)} labels in {len(size)} "
-        f"pieces of median {np.median(size):.0f} pixel: a picture, not a mask. Segment the picture first; or, "
-        "if this is a mask that was resized, resize it without interpolation (order 0). Grey outlines on 0: "
-        "pass vx.initialise.labels_from_skeleton(mask), or kind='outlines' to vx.tensions."
+        f"pieces of median {np.median(size):.0f} pixel: a picture, not a mask. Segment the picture first; "
+        "or, if this is a mask that was resized, resize it without interpolation (order 0). Grey outlines on "
+        "0: pass vx.initialise.labels_from_skeleton(mask), or kind='outlines' to vx.tensions."
     )
 
 

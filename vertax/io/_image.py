@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Integer, Shaped
@@ -144,11 +145,36 @@ def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
         import tifffile
     with tifffile.TiffFile(file) as tiff:
         series = tiff.series[0]
-        pixels, axes = series.asarray(), series.axes
+        axes = series.axes
+        try:
+            pixels = series.asarray()
+        except (
+            ValueError,
+            ImportError,
+        ) as error:  # a compression that tifffile leaves to imagecodecs
+            try:
+                pixels = _decoded_by_pillow(file, series)
+            except Exception:
+                raise ValueError(str(error)) from error
         extra = len(getattr(series.keyframe, "extrasamples", ()))
     if axes.endswith("S") and extra == 1:
         pixels = _without_transparency(pixels)
     return pixels, axes
+
+
+def _decoded_by_pillow(file: Path, series: Any) -> np.ndarray:
+    """The pixels of a series of a TIFF file, decompressed by Pillow (LZW, JPEG, CCITT)."""
+    from PIL import Image
+
+    pages = []
+    with Image.open(file) as picture:
+        for page in series.pages:
+            picture.seek(page.index)
+            pages.append(np.asarray(picture))
+            # Pillow reduces colours of 16 bits to 8, and inverts grey values of which 0 is white.
+            if pages[-1].itemsize < series.dtype.itemsize or page.photometric == 0:
+                raise ValueError("Pillow changes the pixels")
+    return np.reshape(pages, series.shape).astype(series.dtype)
 
 
 def _read_picture(file: Path) -> tuple[np.ndarray, str]:
