@@ -144,14 +144,18 @@ def test_pixels_that_are_not_square_have_a_height_and_a_width(foam, mask, tmp_pa
     assert agree(narrow, foam)
     areas = np.asarray(narrow.tissue.areas)[np.argsort(narrow.labels)]
     np.testing.assert_allclose(areas, np.bincount(mask.ravel())[1:], rtol=0.02)
-    # From the resolution of a file: pixels per length along x and along y.
-    file = tmp_path / "narrow.tif"
-    tifffile.imwrite(file, mask[:, ::2].astype(np.uint16), resolution=(1.0, 2.0))
-    read = infer(file)
-    height, width = read.pixel_size
-    assert width == pytest.approx(2 * height)
-    np.testing.assert_allclose(read.tensions, narrow.tensions, rtol=1e-3)
-    assert np.mean(read.tissue.areas) == pytest.approx(1, rel=0.01)
+    # From the metadata of a file: pixels per length along x and along y, or lengths.
+    sizes = {"PhysicalSizeX": 0.4, "PhysicalSizeY": 0.2}
+    for name, options in (
+        ("narrow.tif", {"resolution": (1.0, 2.0)}),
+        ("narrow.ome.tif", {"metadata": {"axes": "YX"} | sizes}),
+    ):
+        tifffile.imwrite(tmp_path / name, mask[:, ::2].astype(np.uint16), **options)
+        read = infer(tmp_path / name)
+        height, width = read.pixel_size
+        assert width == pytest.approx(2 * height)
+        np.testing.assert_allclose(read.tensions, narrow.tensions, rtol=1e-3)
+        assert np.mean(read.tissue.areas) == pytest.approx(1, rel=0.01)
 
 
 def test_a_stack_needs_the_choice_of_a_plane(mask, tmp_path):

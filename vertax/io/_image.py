@@ -12,7 +12,7 @@ from jaxtyping import Integer, Shaped
 from vertax._base.checks import check_integer
 from vertax._base.extras import requires_extra
 
-_TIFF = (".tif", ".tiff")
+TIFF_ENDINGS = (".tif", ".tiff")
 
 
 def read_image(
@@ -101,32 +101,10 @@ def _one_channel(
     return pixels[:, _choose("channel", channel, pixels.shape[1], file)]
 
 
-def pixel_aspect(path: str | os.PathLike[str]) -> float:
-    """Height over width of the pixels of a TIFF file, from its resolution; 1 where the file has none.
-
-    **Arguments:**
-
-    - `path`: the file; of another format the ratio is 1.
-
-    **Returns:** the ratio.
-    """
-    file = Path(path)
-    if file.suffix.lower() not in _TIFF:
-        return 1.0
-    with requires_extra("image", "Reading TIFF files"):
-        import tifffile
-    with tifffile.TiffFile(file) as tiff:
-        tags = tiff.pages.first.tags
-        # Pixels per unit of length along x and y, as fractions.
-        entries = [tags.get(name) for name in ("XResolution", "YResolution")]
-    (a, b), (c, d) = ((0, 1) if tag is None else tag.value for tag in entries)
-    return float(a * d / (b * c)) if a * b * c * d else 1.0
-
-
 def _read(file: Path) -> tuple[np.ndarray, str]:
     """All pixels of the file, and a letter for each axis."""
     try:
-        pixels, axes = (_read_tiff if file.suffix.lower() in _TIFF else _read_picture)(file)
+        pixels, axes = (_read_tiff if file.suffix.lower() in TIFF_ENDINGS else _read_picture)(file)
         if pixels.ndim != len(axes) or not {"Y", "X"} <= set(axes):
             raise ValueError(f"its axes are {axes} with shape {pixels.shape}")
     except ImportError:
@@ -193,7 +171,7 @@ def _read_picture(file: Path) -> tuple[np.ndarray, str]:
 def palette_indices(file: Path) -> Integer[np.ndarray, "rows columns"] | None:
     """The indices of a picture with a palette, where they are labels: where index 0 is black, or two indices
     have one colour. None for another file."""
-    if file.suffix.lower() in _TIFF:  # its indices are its pixels
+    if file.suffix.lower() in TIFF_ENDINGS:  # its indices are its pixels
         return None
     with requires_extra("image", "Reading pictures"):
         from PIL import Image, UnidentifiedImageError
