@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from test_damaged_masks import mask as mask
 
+import vertax as vx
 from vertax.io import read_table
 from vertax.tensions import MaskFrame, find_masks, infer_tensions, infer_tensions_of_masks
 
@@ -75,6 +76,20 @@ def test_finished_masks_are_read_from_the_cache(mask, tmp_path, monkeypatch):
     assert len(calls) == 1
     infer_tensions_of_masks(masks, **options, holes="close")
     assert len(calls) == 3
+    monkeypatch.setattr(vx, "__version__", "another", raising=False)
+    infer_tensions_of_masks(masks, **options)
+    assert len(calls) == 5
+
+
+def test_masks_in_subfolders_are_found_with_a_pattern(tmp_path):
+    for name in ("a/1.npy", "a/b/1.npy", "2.npy"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    names = [frame.name for frame in find_masks(tmp_path / "**" / "*.npy")]
+    assert names == [(tmp_path / name).as_posix() for name in ("2.npy", "a/1.npy", "a/b/1.npy")]
+    (tmp_path / "2.npy").unlink()
+    with pytest.raises(FileNotFoundError, match=r"has none \(with subfolders: .*\*\*.\*\.tif\)"):
+        find_masks(tmp_path)
 
 
 @pytest.mark.parametrize("damage", [lambda entry: entry[: len(entry) // 2], lambda entry: b""])
