@@ -1,5 +1,6 @@
 """Masks as segmentation programs leave them: holes, repeated labels, lines between cells, other pixels."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -224,6 +225,26 @@ def test_cells_have_the_areas_and_outlines_of_their_pixels(mask, step):
     table = result.cell_table()
     np.testing.assert_array_equal(table["area_error"], result.area_errors)
     np.testing.assert_array_equal(table["outline_error"], result.outline_errors)
+
+
+def test_a_cell_smaller_than_its_pixels_is_named(mask):
+    result = infer(mask)
+    assert not any("areas of" in text for text in result.warnings)
+    report = result.mask_report
+    pixels = report.cell_pixels * np.where(result.labels == 3, 1.09, 1)
+    smaller = dataclasses.replace(
+        result, mask_report=dataclasses.replace(report, cell_pixels=pixels.astype(int))
+    )
+    (text,) = [text for text in smaller.warnings if "areas of" in text]
+    assert "areas of 1 cells differ by more than 5 % from those of their pixels: label 3" in text
+
+
+def test_overlaps_on_the_outline_cost_little_area():
+    mask = random_cells(np.random.default_rng(8))
+    result = segment(mask, boundary="free", inner_arcs=True)
+    pixels = result.report.cell_pixels * float(result.pixel_size) ** 2
+    assert not result.tissue.overlaps.any
+    assert np.max(np.abs(np.asarray(result.tissue.areas) / pixels - 1)) < 0.02
 
 
 def test_a_resized_mask_with_new_labels_at_its_outlines_is_named(mask):

@@ -19,9 +19,9 @@ from vertax.tensions._columns import with_pixels
 from vertax.tensions._mean_stress import MeanStress
 from vertax.tensions._pixel_aspect import pixel_aspect_warning
 
-# Cells with a larger error of the area, or distance of the outline from arcs over the root of the area, are
-# named.
-_CELL_ERROR = 0.1
+# Cells with a larger error of the area (vertices that moved far give area to a neighbour), or distance of the
+# outline from arcs over the root of the area, are named.
+_AREA_ERROR, _OUTLINE_ERROR = 0.05, 0.1
 # Number of places that a warning names.
 _PLACES = 5
 # Smallest number of stray regions of a mask that was resized. (There are also more than cells.)
@@ -294,19 +294,21 @@ def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
         )
     outline = result.outline_errors
     distance = np.zeros(0) if outline is None else outline / np.sqrt(report.cell_pixels)
-    for errors, text, unit in (
+    for errors, limit, text, unit in (
         (
             result.area_errors,
-            "areas of {} cells differ by more than 10 % from those of their pixels",
+            _AREA_ERROR,
+            "areas of {} cells differ by more than 5 % from those of their pixels",
             "+",
         ),
         (
             distance,
+            _OUTLINE_ERROR,
             "outlines of {} cells are more than 10 % of the root of their area from arcs",
             "",
         ),
     ):
-        off = np.flatnonzero((np.abs(errors) > _CELL_ERROR) & (result.labels[: len(errors)] > 0))
+        off = np.flatnonzero((np.abs(errors) > limit) & (result.labels[: len(errors)] > 0))
         if len(off):
             worst = off[np.argsort(-np.abs(errors[off]))][:_PLACES]
             cells = ", ".join(f"label {result.labels[k]} ({errors[k]:{unit}.0%})" for k in worst)
