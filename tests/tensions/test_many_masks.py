@@ -14,10 +14,13 @@ def test_one_table_of_a_folder_with_a_file_that_cannot_be_read(mask, tmp_path):
     for name in ("m10", "m2"):
         np.save(tmp_path / f"{name}.npy", mask)
     (tmp_path / "m3.tif").write_text("no image")
-    assert [frame.name for frame in find_masks(tmp_path)] == ["m2.npy", "m3.tif", "m10.npy"]
+    np.save(tmp_path / "m9.npy", np.random.default_rng(0).integers(0, 255, mask.shape))
+    names = [frame.name for frame in find_masks(tmp_path)]
+    assert names == ["m2.npy", "m3.tif", "m9.npy", "m10.npy"]
     tensions = infer_tensions_of_masks(tmp_path, progress=False)
     assert list(tensions.results) == ["m2.npy", "m10.npy"]
     assert "cannot be read" in tensions.failures["m3.tif"]
+    assert "a picture, not a mask" in tensions.failures["m9.npy"]
     alone = infer_tensions(mask)
     table = tensions.edge_table()
     second = table["frame"] == "m10.npy"

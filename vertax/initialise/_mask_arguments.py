@@ -101,7 +101,7 @@ def check_bits(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:
 
 
 def check_no_picture(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:
-    """Raise a `ValueError` for a picture, whose grey values are no labels of cells."""
+    """Raise a `ValueError` for a picture: its grey values are no labels of cells."""
     pieces = connected_pieces(mask, periodic=False)
     is_label = pieces.value > 0
     size = pieces.size[is_label]

@@ -168,20 +168,39 @@ def _read_picture(file: Path) -> tuple[np.ndarray, str]:
     return pixels, "YX" if pixels.ndim == 2 else "YXS"
 
 
-def palette_indices(file: Path) -> Integer[np.ndarray, "rows columns"] | None:
+def read_colours(file: Path, plane: int | None) -> Shaped[np.ndarray, "rows columns *colours"]:
+    """One plane of an image of labels, with three colours if it has several channels.
+
+    Of a picture with a palette the indices, if they are labels.
+
+    **Raises:** as [`read_image`][vertax.io.read_image], and `ValueError` for two channels.
+    """
+    pixels = _planes_and_channels(file, plane=plane)
+    channels = pixels[_choose("plane", plane, len(pixels), file)]
+    indices = _palette_indices(file)
+    if indices is not None:
+        return indices
+    if all(np.array_equal(channel, channels[0]) for channel in channels[1:]):
+        return channels[0]
+    if len(channels) == 2:
+        raise ValueError(
+            f"Argument `path` must name a file of labels or colours, but {file} has two channels. Pass one: "
+            "vx.io.read_image(file, channel=0)."
+        )
+    return np.moveaxis(channels[:3], 0, -1)
+
+
+def _palette_indices(file: Path) -> Integer[np.ndarray, "rows columns"] | None:
     """The indices of a picture with a palette, where they are labels: where index 0 is black, or two indices
     have one colour. None for another file."""
     if file.suffix.lower() in TIFF_ENDINGS:  # its indices are its pixels
         return None
-    with requires_extra("image", "Reading pictures"):
-        from PIL import Image, UnidentifiedImageError
-    try:
-        with Image.open(file) as picture:
-            if picture.mode != "P":
-                return None
-            indices, palette = np.asarray(picture), picture.getpalette("RGB") or []
-    except (UnidentifiedImageError, OSError):
-        return None
+    from PIL import Image
+
+    with Image.open(file) as picture:
+        if picture.mode != "P":
+            return None
+        indices, palette = np.asarray(picture), picture.getpalette("RGB") or []
     colours = np.reshape(palette, (-1, 3))[np.unique(indices)]
     repeat = len(np.unique(colours, axis=0)) < len(colours)
     return indices if repeat or not any(palette[:3]) else None

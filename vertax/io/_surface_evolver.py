@@ -159,8 +159,8 @@ def _parsed(path: Path) -> _Pieces:
     where = np.array(list(points.values()))
     areas = np.array([_area_of(loop, ends, where, broken) for loop in loops])
     pressures, volumes = np.array([body[1:] for body in bodies]).T[::-1]
-    # The area of a body whose face is clockwise is negative, and so are its volume and the derivative of the
-    # energy by its area. A fresh data file may have a positive volume all the same.
+    # A body with a clockwise face has a negative area and volume, and its Lagrange multiplier the opposite
+    # sign. A data file that was written by hand may have a positive volume all the same.
     negative = np.where(np.isnan(volumes), areas, volumes) < 0
     return _Pieces(
         points=where,

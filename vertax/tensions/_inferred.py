@@ -281,7 +281,7 @@ def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
     if stray > max(_STRAY, len(report.cell_pixels)):
         warnings.append(
             f"{stray} stray regions were joined to cells or left out, as in a mask that was resized with "
-            "interpolation, whose outlines are wrong: resize masks with order 0 (nearest neighbour)"
+            "interpolation: its outlines are wrong; resize masks with order 0 (nearest neighbour)"
         )
     closed = report.closed & np.isfinite(report.shown) & ~result.four_fold
     closed &= np.all(

@@ -19,8 +19,7 @@ from vertax.initialise._mask_arguments import (
     without_single_axes,
 )
 from vertax.initialise._pieces import connected_pieces
-from vertax.io import read_image
-from vertax.io._image import palette_indices
+from vertax.io._image import read_colours
 
 _KINDS = ("auto", "labels", "outlines")
 # A region at the border of the image that is larger than this, relative to the median cell, is no cell.
@@ -160,24 +159,10 @@ def _loaded(file: Path, plane: int | None) -> np.ndarray:
         return one_plane(np.asarray(content["masks"]), plane)
     if file.suffix.lower() == ".npy":
         return one_plane(load_array(file), plane)
-    palette = palette_indices(file)
-    if palette is not None:
-        return one_plane(palette, plane)
     try:
-        return read_image(file, plane=plane)
+        return read_colours(file, plane)
     except ValueError as error:
-        message = str(error)
-    if "`channel`" not in message:
-        raise ValueError(message.replace("`path`", "`mask`"))
-    try:
-        return np.stack([read_image(file, channel=k, plane=plane) for k in range(3)], axis=-1)
-    except ValueError as error:
-        if "`channel`" not in str(error):
-            raise
-        raise ValueError(
-            f"Argument `mask` must name a file of labels or colours, but {file} has two channels. Pass one: "
-            "vx.io.read_image(file, channel=0)."
-        ) from None
+        raise ValueError(str(error).replace("`path`", "`mask`")) from error
 
 
 def load_array(file: Path) -> np.ndarray:
