@@ -1,5 +1,7 @@
 """All planes of image files."""
 
+import importlib.util
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -54,3 +56,24 @@ def test_files_without_an_image_are_refused(tmp_path):
     (tmp_path / "text.tif").write_text("no image")
     with pytest.raises(ValueError, match=r"text\.tif cannot be read as one"):
         read_stack(tmp_path / "text.tif")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.float32])
+def test_compressed_pages_are_read(tmp_path, dtype):
+    first, *more = [Image.fromarray(plane.astype(dtype)) for plane in MOVIE]
+    file = tmp_path / "movie.tif"
+    first.save(file, compression="tiff_lzw", save_all=True, append_images=more)
+    stack = read_stack(file)
+    assert stack.dtype == dtype
+    np.testing.assert_array_equal(stack, MOVIE)
+
+
+def test_compressed_pages_that_pillow_changes_need_imagecodecs(tmp_path):
+    file = tmp_path / "inverted.tif"
+    Image.fromarray(MOVIE[0].astype(np.uint8)).save(file, compression="tiff_lzw")
+    with tifffile.TiffFile(file, mode="r+b") as tiff:
+        tiff.pages[0].tags["PhotometricInterpretation"].overwrite(0)
+    if importlib.util.find_spec("imagecodecs"):
+        pytest.skip("imagecodecs is installed")
+    with pytest.raises(ValueError, match=r"inverted\.tif cannot be read as one.*'imagecodecs'"):
+        read_stack(file)

@@ -183,3 +183,27 @@ def test_foams_with_known_areas(name):
     assert (np.asarray(foam.tension_spreads)[~outline] == 0).all()
     assert not foam.tissue.overlaps.any
     assert (np.asarray(foam.pressures) > 0).all()
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="the folder shared/data is not there")
+@pytest.mark.parametrize("volume", [True, False])
+def test_pressures_of_bodies_listed_clockwise_have_the_sign_of_the_others(tmp_path, volume):
+    path = DATA / "movie_3.dmp"
+    text = path.read_text(encoding="utf-8")
+    original = vx.io.read_surface_evolver(path)
+    start = text.index("bodies  /*")
+    stop = text.index("read", start)
+    turn = lambda row: re.sub(
+        r"^( *\d+ +)(-?\d+)( .*volume )(\S+)(.*multiplier )",
+        lambda m: f"{m[1]}{-int(m[2])}{m[3]}-{m[4]}{m[5]}-",
+        row,
+    )
+    rows = text[start:stop].splitlines()
+    rows = [turn(row) if k % 2 else row for k, row in enumerate(rows)]
+    if not volume:
+        rows = [re.sub(r"volume \S+", "", row) for row in rows]
+    turned = tmp_path / "turned.dmp"
+    turned.write_text(text[:start] + "\n".join(rows) + "\n" + text[stop:], encoding="utf-8")
+    foam = vx.io.read_surface_evolver(turned)
+    np.testing.assert_array_equal(foam.pressures, original.pressures)
+    np.testing.assert_allclose(foam.target_areas, original.target_areas, rtol=1e-4)

@@ -304,6 +304,17 @@ def test_foams_with_known_tensions(name, least, error):
     assert np.mean(np.abs(result.tensions[sure] - true) / true) < error
 
 
+@needs_data
+@pytest.mark.parametrize("ending", [".fe.txt", ""])
+def test_dumps_are_recognised_by_their_content(tmp_path, ending):
+    dump = DATA / "surface_evolver" / "movie_0.dmp"
+    copy = tmp_path / f"foam{ending}"
+    copy.write_text(
+        dump.read_text(encoding="utf-8").replace("vertices", "Vertices"), encoding="utf-8"
+    )
+    np.testing.assert_array_equal(infer_tensions(copy).tensions, infer_tensions(dump).tensions)
+
+
 @pytest.mark.thorough
 @needs_data
 def test_bends_are_inferred_from_an_image():

@@ -1,5 +1,6 @@
 """Masks as segmentation programs leave them: holes, repeated labels, lines between cells, other pixels."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import pytest
 from damage_helpers import contacts, damaged, random_cells, with_gaps
 from foam_helpers import against_truth, invented
 from label_helpers import honeycomb
+from scipy.ndimage import gaussian_filter, zoom
 
 from vertax.inference import label_image, pearson
 from vertax.initialise import free_voronoi, from_labels
@@ -143,14 +145,18 @@ def test_pixels_that_are_not_square_have_a_height_and_a_width(foam, mask, tmp_pa
     assert agree(narrow, foam)
     areas = np.asarray(narrow.tissue.areas)[np.argsort(narrow.labels)]
     np.testing.assert_allclose(areas, np.bincount(mask.ravel())[1:], rtol=0.02)
-    # From the resolution of a file: pixels per length along x and along y.
-    file = tmp_path / "narrow.tif"
-    tifffile.imwrite(file, mask[:, ::2].astype(np.uint16), resolution=(1.0, 2.0))
-    read = infer(file)
-    height, width = read.pixel_size
-    assert width == pytest.approx(2 * height)
-    np.testing.assert_allclose(read.tensions, narrow.tensions, rtol=1e-3)
-    assert np.mean(read.tissue.areas) == pytest.approx(1, rel=0.01)
+    # From the metadata of a file: pixels per length along x and along y, or lengths.
+    sizes = {"PhysicalSizeX": 0.4, "PhysicalSizeY": 0.2}
+    for name, options in (
+        ("narrow.tif", {"resolution": (1.0, 2.0)}),
+        ("narrow.ome.tif", {"metadata": {"axes": "YX"} | sizes}),
+    ):
+        tifffile.imwrite(tmp_path / name, mask[:, ::2].astype(np.uint16), **options)
+        read = infer(tmp_path / name)
+        height, width = read.pixel_size
+        assert width == pytest.approx(2 * height)
+        np.testing.assert_allclose(read.tensions, narrow.tensions, rtol=1e-3)
+        assert np.mean(read.tissue.areas) == pytest.approx(1, rel=0.01)
 
 
 def test_a_stack_needs_the_choice_of_a_plane(mask, tmp_path):
@@ -219,6 +225,118 @@ def test_cells_have_the_areas_and_outlines_of_their_pixels(mask, step):
     table = result.cell_table()
     np.testing.assert_array_equal(table["area_error"], result.area_errors)
     np.testing.assert_array_equal(table["outline_error"], result.outline_errors)
+
+
+def test_a_cell_smaller_than_its_pixels_is_named(mask):
+    result = infer(mask)
+    assert not any("areas of" in text for text in result.warnings)
+    report = result.mask_report
+    pixels = report.cell_pixels * np.where(result.labels == 3, 1.09, 1)
+    smaller = dataclasses.replace(
+        result, mask_report=dataclasses.replace(report, cell_pixels=pixels.astype(int))
+    )
+    (text,) = [text for text in smaller.warnings if "areas of" in text]
+    assert "areas of 1 cells differ by more than 5 % from those of their pixels: label 3" in text
+
+
+def test_overlaps_on_the_outline_cost_little_area():
+    mask = random_cells(np.random.default_rng(8))
+    result = segment(mask, boundary="free", inner_arcs=True)
+    pixels = result.report.cell_pixels * float(result.pixel_size) ** 2
+    assert not result.tissue.overlaps.any
+    assert np.max(np.abs(np.asarray(result.tissue.areas) / pixels - 1)) < 0.02
+
+
+def test_a_resized_mask_with_new_labels_at_its_outlines_is_named(mask):
+    large = zoom(mask.astype(float), 1.3, order=1).astype(np.int64)
+    (text,) = [text for text in infer(large).warnings if "stray regions" in text]
+    assert "resize masks with order 0" in text
+    nearest = zoom(mask, 1.3, order=0)
+    assert not any("stray regions" in text for text in infer(nearest).warnings)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("smooth", [0, 1.5])
+def test_a_picture_is_no_mask(tmp_path, dtype, smooth):
+    noise = gaussian_filter(np.random.default_rng(0).random((100, 100)), smooth)
+    picture = (np.iinfo(dtype).max * (noise - noise.min()) / np.ptp(noise)).astype(dtype)
+    with pytest.raises(
+        ValueError, match=r"labels in \d{4} pieces of median 1 pixel: a picture, not"
+    ):
+        infer(picture)
+    with pytest.raises(ValueError, match="a picture, not a mask"):
+        segment(picture, boundary="mirrored")
+    np.save(tmp_path / "picture.npy", picture)
+    with pytest.raises(ValueError, match="a picture, not a mask"):
+        read_mask(tmp_path / "picture.npy")
+
+
+def coloured(mask, n_colours):
+    """Labels 1, 2, …, of which no two at adjacent cells are the same (Brélaz 1979)."""
+    colour, near = {}, {cell: set() for cell in range(1, int(mask.max()) + 1)}
+    for one, other in contacts(mask):
+        near[one].add(other)
+        near[other].add(one)
+    used = lambda cell: {colour[k] for k in near[cell] if k in colour}
+    while len(colour) < len(near):
+        cell = max(near.keys() - colour, key=lambda k: (len(used(k)), len(near[k])))
+        free = set(range(1, n_colours + 1)) - used(cell)
+        colour[cell] = min(free, key=lambda k: n_colours > 4 and list(colour.values()).count(k))
+    return np.array([0, *(colour[k] for k in sorted(colour))])[mask]
+
+
+@pytest.mark.parametrize("n_colours", [4, 6])
+@pytest.mark.parametrize("lines", [False, True])
+def test_repeating_colours_are_as_many_cells_as_pieces(n_colours, lines):
+    clean = np.asarray(label_image(voronoi_of_60_cells(), 400))
+    colours = np.random.default_rng(0).integers(1, 255, (n_colours + 1, 3))
+    colours[0] = 0
+    picture = colours[coloured(clean, n_colours)].astype(np.uint8)
+    if lines:
+        picture[thin_lines(clean)] = 255
+    repeated = segment(read_mask(picture), boundary="free")
+    assert np.sum(repeated.labels > 0) == 60
+    assert repeated.tissue.n_edges == segment(clean, boundary="free").tissue.n_edges
+
+
+def thin_lines(mask):
+    """Lines of one pixel between cells and around all."""
+    line = np.zeros(mask.shape, bool)
+    line[:, 1:] |= mask[:, 1:] != mask[:, :-1]
+    line[1:] |= mask[1:] != mask[:-1]
+    return line
+
+
+@pytest.mark.parametrize("line", [65535, 15, 1])
+@pytest.mark.parametrize("width", [1, 2, 5])
+def test_lines_with_a_label_are_no_cell(mask, line, width):
+    cells = np.where(mask > 0, mask + 1, 0) if line == 1 else mask
+    drawn = thin_lines(cells) if width == 1 else with_gaps(cells, width) != cells
+    result = segment(np.where(drawn, line, cells), boundary="free", inner_arcs=True)
+    assert result.background == line
+    same = segment(np.where(drawn, 0, cells), boundary="free", inner_arcs=True)
+    np.testing.assert_array_equal(result.labels, same.labels)
+    np.testing.assert_array_equal(
+        result.tissue.topology.edge_cells, same.tissue.topology.edge_cells
+    )
+
+
+def test_lines_beside_a_background_with_a_label_are_no_cell(mask):
+    cells = np.where(mask > 0, mask, 99)
+    result = segment(np.where(thin_lines(mask), 65535, cells), boundary="free")
+    same = segment(np.where(thin_lines(mask), 0, mask), boundary="free")
+    assert result.background == 99
+    np.testing.assert_array_equal(result.labels, same.labels)
+
+
+def test_indices_of_a_palette_are_labels(mask, tmp_path):
+    image_module = pytest.importorskip("PIL.Image")
+    picture = image_module.fromarray(mask.astype(np.uint8), mode="P")
+    palette = np.random.default_rng(1).integers(1, 255, (256, 3))
+    palette[0], palette[5] = 0, palette[9]
+    picture.putpalette(palette.astype(np.uint8).ravel().tolist())
+    picture.save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
 
 
 def three_meet(clean, mask):

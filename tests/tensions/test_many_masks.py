@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from test_damaged_masks import mask as mask
 
+import vertax as vx
 from vertax.io import read_table
 from vertax.tensions import MaskFrame, find_masks, infer_tensions, infer_tensions_of_masks
 
@@ -13,10 +14,13 @@ def test_one_table_of_a_folder_with_a_file_that_cannot_be_read(mask, tmp_path):
     for name in ("m10", "m2"):
         np.save(tmp_path / f"{name}.npy", mask)
     (tmp_path / "m3.tif").write_text("no image")
-    assert [frame.name for frame in find_masks(tmp_path)] == ["m2.npy", "m3.tif", "m10.npy"]
+    np.save(tmp_path / "m9.npy", np.random.default_rng(0).integers(0, 255, mask.shape))
+    names = [frame.name for frame in find_masks(tmp_path)]
+    assert names == ["m2.npy", "m3.tif", "m9.npy", "m10.npy"]
     tensions = infer_tensions_of_masks(tmp_path, progress=False)
     assert list(tensions.results) == ["m2.npy", "m10.npy"]
     assert "cannot be read" in tensions.failures["m3.tif"]
+    assert "a picture, not a mask" in tensions.failures["m9.npy"]
     alone = infer_tensions(mask)
     table = tensions.edge_table()
     second = table["frame"] == "m10.npy"
@@ -75,6 +79,20 @@ def test_finished_masks_are_read_from_the_cache(mask, tmp_path, monkeypatch):
     assert len(calls) == 1
     infer_tensions_of_masks(masks, **options, holes="close")
     assert len(calls) == 3
+    monkeypatch.setattr(vx, "__version__", "another", raising=False)
+    infer_tensions_of_masks(masks, **options)
+    assert len(calls) == 5
+
+
+def test_masks_in_subfolders_are_found_with_a_pattern(tmp_path):
+    for name in ("a/1.npy", "a/b/1.npy", "2.npy"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    names = [frame.name for frame in find_masks(tmp_path / "**" / "*.npy")]
+    assert names == [(tmp_path / name).as_posix() for name in ("2.npy", "a/1.npy", "a/b/1.npy")]
+    (tmp_path / "2.npy").unlink()
+    with pytest.raises(FileNotFoundError, match=r"has none \(with subfolders: .*\*\*.\*\.tif\)"):
+        find_masks(tmp_path)
 
 
 @pytest.mark.parametrize("damage", [lambda entry: entry[: len(entry) // 2], lambda entry: b""])

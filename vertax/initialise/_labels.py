@@ -72,7 +72,7 @@ class Segmentation(eqx.Module):
     image_shape: tuple[int, int] = eqx.field(static=True)
     """Rows and columns of the given mask."""
     background: int | None = eqx.field(static=True, default=None)
-    """The positive label in the mask that was taken for the background, if there is one."""
+    """The positive label in the mask that was taken for the background, or for lines between cells."""
     courses: Courses | None = None
     """The points of the edges, pixel by pixel."""
     report: MaskReport | None = None
@@ -101,7 +101,8 @@ def from_labels(
 
     - pixels with label 0 or less, and of the background, are gaps, and go to the nearest label (where 0 may
         be a cell, because there are negative labels too, `background=0` states that it is none). One label
-        all along the border of the image, which so surrounds all others, is the background;
+        all along the border of the image, which so surrounds all others, is the background. A label of lines
+        thinner than 0.3 cells between all cells is a gap too;
     - of a label in several pieces the largest stays (pixels are connected by their sides, not by
         their corners). Every other piece of at least a quarter of the median cell (and 25 pixels) becomes a
         cell with a new label; a smaller one goes to the neighbour with the longest common interface;
@@ -149,9 +150,9 @@ def from_labels(
     **Raises:**
 
     - `ValueError` for a mask that is not a 2-D array of integers, or is empty, holds fewer than two
-        labels, or has a cell that reaches around the (mirrored) image or around all other cells;
-        for a mask with a label 0 that may be that of a cell, because it has negative ones too; for an unknown
-        `boundary` or `holes`, a `pixel_size` that is not positive, a `gap_width` that is negative or
+        labels, is a picture, or has a cell that reaches around the (mirrored) image or around all other
+        cells; for a mask with a label 0 that may be that of a cell, because it has negative ones too; for an
+        unknown `boundary` or `holes`, a `pixel_size` that is not positive, a `gap_width` that is negative or
         larger than the image, or a `background` that no pixel has.
     - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`.
     """

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Array, Int, Integer, Shaped
+from scipy.ndimage import label as connected_regions
 
 from vertax._base.checks import check_integer
 from vertax._base.pixels import PixelSize, check_pixel_size
+from vertax.initialise._pieces import connected_pieces
+
+# A picture has at least this number of connected regions, more than half of its pixels in regions of fewer
+# pixels than this, and less than this share of its pixels in the largest region of each label.
+_PICTURE_PIECES, _SMALL_PIXELS, _PICTURE_SHARE = 100, 25, 0.25
+# Lines have at least this share of all sides between pixels of different labels, and are thinner than this,
+# relative to the root of the median area of the regions between them.
+_LINE_SHARE, _LINE_WIDTH = 0.75, 0.3
+# Smallest number of regions between lines.
+_LINE_CELLS = 6
 
 _BOUNDARIES = ("mirrored", "periodic", "free")
 
@@ -51,6 +64,11 @@ def checked_mask(
     background = _background(mask, background)
     if background is not None:
         mask = np.where(mask == background, 0, mask)
+    check_no_picture("mask", mask)
+    lines = _label_of_lines(mask)
+    if lines is not None:
+        mask = np.where(mask == lines, 0, mask)
+        background = lines if background is None else background
     values, image = np.unique(mask, return_inverse=True)
     n_gaps = int(np.count_nonzero(values <= 0))
     values = values[n_gaps:]
@@ -80,6 +98,31 @@ def check_bits(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:
             f"Argument `{name}` must hold labels of at most 63 bits, but its largest is "
             f"{mask.max()}. Number the cells anew: numpy.unique({name}, return_inverse=True)[1]."
         )
+
+
+def check_no_picture(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:
+    """Raise a `ValueError` for a picture: its grey values are no labels of cells."""
+    pieces = connected_pieces(mask, periodic=False)
+    is_label = pieces.value > 0
+    size = pieces.size[is_label]
+    labels, index = np.unique(pieces.value[is_label], return_inverse=True)
+    largest = np.zeros(len(labels), int)
+    np.maximum.at(largest, index, size)
+    # Of 16 bits, most labels of a picture have one pixel.
+    in_cells = largest[largest > 3].sum()
+    small = size[size < _SMALL_PIXELS].sum()
+    if (
+        len(size) < _PICTURE_PIECES
+        or 2 * small < size.sum()
+        or in_cells > _PICTURE_SHARE * size.sum()
+    ):
+        return
+    raise ValueError(
+        f"Argument `{name}` must hold a label for each cell, but has {len(labels)} labels in {len(size)} "
+        f"pieces of median {np.median(size):.0f} pixel: a picture, not a mask. Segment the picture first; "
+        "or, if this is a mask that was resized, resize it without interpolation (order 0). Grey outlines on "
+        "0: pass vx.initialise.labels_from_skeleton(mask), or kind='outlines' to vx.tensions."
+    )
 
 
 def check_zero(
@@ -126,3 +169,23 @@ def _background(mask: Integer[np.ndarray, "rows columns"], given: int | None) ->
     label = int(border[0])
     alone = label <= 0 or np.any(border != label) or np.all((mask == label) | (mask <= 0))
     return None if alone else label
+
+
+def _label_of_lines(mask: Integer[np.ndarray, "rows columns"]) -> int | None:
+    """The positive label of lines that separate all cells."""
+    pairs = [(mask[:, 1:], mask[:, :-1]), (mask[1:], mask[:-1])]
+    first, second = np.concatenate(
+        [np.stack([a, b])[:, (a != b) & (a > 0) & (b > 0)] for a, b in pairs], axis=1
+    )
+    labels, n_sides = np.unique(np.append(first, second), return_counts=True)
+    if not len(labels) or n_sides.max() < _LINE_SHARE * len(first):
+        return None
+    line = labels[np.argmax(n_sides)]
+    regions = np.zeros(mask.shape, np.int32)
+    n_cells: Any = connected_regions((mask != line) & (mask > 0), output=regions)
+    if n_cells < _LINE_CELLS:
+        return None
+    # A line of width w has two sides for w pixels.
+    width = 2 * np.count_nonzero(mask == line) / n_sides.max()
+    cell = np.sqrt(np.median(np.bincount(regions.ravel())[1:]))
+    return int(line) if width < _LINE_WIDTH * cell else None

@@ -13,6 +13,8 @@ from vertax.mesh._overlaps import crossed_sides
 
 # Largest number of rounds of flattening, and of bending back.
 _ROUNDS = 60
+# Number of bisections for the largest angles without overlaps.
+_BISECTIONS = 6
 
 
 def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
@@ -70,19 +72,32 @@ def _bent_back(
     assert tissue.arcs is not None
     flat = np.asarray(tissue.arcs.angles)
     faces = geometry_of(tissue).edge_cells
-    fraction = np.ones(len(flat))
+    fraction, limit = np.ones(len(flat)), np.ones(len(flat))
     for attempt in range(_ROUNDS):
         trial = tissue.with_angles(jnp.asarray(flat + fraction * (angles - flat), flat.dtype))
         crossed = _crossed(trial, following, cell)
         if not crossed.any():
-            return trial
+            tissue = trial
+            break
         # First the arcs that cross another side, then all arcs of these cells.
         touched = np.zeros(len(flat), bool)
         touched[edge[crossed]] = True
         if attempt >= _ROUNDS // 3:
             bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
             touched |= np.any(np.append(bad, False)[faces], axis=1)
+        limit = np.where(touched, fraction, limit)
         fraction = np.where(touched, np.where(fraction > 0.05, 0.6 * fraction, 0.0), fraction)
+    else:
+        return tissue
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (fraction + limit)
+        trial = tissue.with_angles(jnp.asarray(flat + middle * (angles - flat), flat.dtype))
+        crossed = _crossed(trial, following, cell)
+        touched = np.zeros(len(flat), bool)
+        touched[edge[crossed]] = True
+        limit = np.where(touched, middle, limit)
+        fraction = np.where(touched, fraction, middle)
+        tissue = tissue if crossed.any() else trial
     return tissue
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Integer
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -28,7 +28,7 @@ class Pieces(NamedTuple):
     """Its number of pixels."""
 
 
-def connected_pieces(image: Int[np.ndarray, "rows columns"], periodic: bool) -> Pieces:
+def connected_pieces(image: Integer[np.ndarray, "rows columns"], periodic: bool) -> Pieces:
     """The connected regions of equal pixels."""
     # The nodes are runs of equal pixels along a row, far fewer than pixels. Two runs in adjacent
     # rows overlap where one of them starts.
@@ -51,6 +51,18 @@ def connected_pieces(image: Int[np.ndarray, "rows columns"], periodic: bool) -> 
     return Pieces(piece, value_of_piece, np.bincount(piece.ravel(), minlength=n_pieces))
 
 
+def cell_size(pieces: Pieces) -> float:
+    """Pixels of the median cell: the median over the labels, or, where labels repeat, over their pieces.
+
+    The median over pieces is weighted by their pixels, so that stray pixels do not count.
+    """
+    is_label = pieces.value >= 0
+    sizes = np.sort(pieces.size[is_label])
+    labelled = np.bincount(pieces.value[is_label], pieces.size[is_label])
+    of_pieces = sizes[np.searchsorted(np.cumsum(sizes), sizes.sum() / 2)]
+    return float(min(np.median(labelled[labelled > 0]), of_pieces))
+
+
 def without_specks(
     image: Int[np.ndarray, "rows columns"], spacing: tuple[float, float]
 ) -> tuple[Int[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
@@ -60,7 +72,7 @@ def without_specks(
     they become exterior, so that no contact is added between their neighbours.
     """
     sizes = np.bincount(image[image >= 0])
-    specks = (sizes > 0) & (sizes < _SPECK * np.median(sizes[sizes > 0]))
+    specks = (sizes > 0) & (sizes < _SPECK * cell_size(connected_pieces(image, periodic=False)))
     if not specks.any():
         return image, np.zeros(image.shape, bool)
     border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
@@ -96,8 +108,7 @@ def join_pieces(
         return image, np.zeros(0, int)
     value = value.copy()
     is_label = value >= 0
-    labelled = np.bincount(value[is_label], size[is_label])
-    median = float(np.median(labelled[labelled > 0]))
+    median = cell_size(pieces)
     new = np.flatnonzero(~kept & is_label & (size >= max(_CELL * median, _CELL_PIXELS)))
     parents = value[new]
     value[new] = n_labels + np.arange(len(new))

@@ -10,17 +10,14 @@ from vertax.io._data_tables import (
 from vertax.io._edge_table import from_edge_table as from_edge_table
 from vertax.io._force_inference import read_force_inference as read_force_inference
 from vertax.io._geojson import write_geojson as write_geojson
-from vertax.io._image import (
-    pixel_aspect as pixel_aspect,
-    read_image as read_image,
-    read_stack as read_stack,
-)
+from vertax.io._image import read_image as read_image, read_stack as read_stack
 from vertax.io._module_file import (
     load_energy as load_energy,
     load_problem as load_problem,
     save_energy as save_energy,
     save_problem as save_problem,
 )
+from vertax.io._pixel_size import pixel_aspect as pixel_aspect, pixel_size as pixel_size
 from vertax.io._read_geojson import read_geojson as read_geojson
 from vertax.io._read_table import read_table as read_table
 from vertax.io._surface_evolver import (

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Integer, Shaped
 
 from vertax._base.checks import check_integer
 from vertax._base.extras import requires_extra
 
-_TIFF = (".tif", ".tiff")
+TIFF_ENDINGS = (".tif", ".tiff")
 
 
 def read_image(
@@ -100,32 +101,10 @@ def _one_channel(
     return pixels[:, _choose("channel", channel, pixels.shape[1], file)]
 
 
-def pixel_aspect(path: str | os.PathLike[str]) -> float:
-    """Height over width of the pixels of a TIFF file, from its resolution; 1 where the file has none.
-
-    **Arguments:**
-
-    - `path`: the file; of another format the ratio is 1.
-
-    **Returns:** the ratio.
-    """
-    file = Path(path)
-    if file.suffix.lower() not in _TIFF:
-        return 1.0
-    with requires_extra("image", "Reading TIFF files"):
-        import tifffile
-    with tifffile.TiffFile(file) as tiff:
-        tags = tiff.pages.first.tags
-        # Pixels per unit of length along x and y, as fractions.
-        entries = [tags.get(name) for name in ("XResolution", "YResolution")]
-    (a, b), (c, d) = ((0, 1) if tag is None else tag.value for tag in entries)
-    return float(a * d / (b * c)) if a * b * c * d else 1.0
-
-
 def _read(file: Path) -> tuple[np.ndarray, str]:
     """All pixels of the file, and a letter for each axis."""
     try:
-        pixels, axes = (_read_tiff if file.suffix.lower() in _TIFF else _read_picture)(file)
+        pixels, axes = (_read_tiff if file.suffix.lower() in TIFF_ENDINGS else _read_picture)(file)
         if pixels.ndim != len(axes) or not {"Y", "X"} <= set(axes):
             raise ValueError(f"its axes are {axes} with shape {pixels.shape}")
     except ImportError:
@@ -144,11 +123,36 @@ def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
         import tifffile
     with tifffile.TiffFile(file) as tiff:
         series = tiff.series[0]
-        pixels, axes = series.asarray(), series.axes
+        axes = series.axes
+        try:
+            pixels = series.asarray()
+        except (
+            ValueError,
+            ImportError,
+        ) as error:  # a compression that tifffile leaves to imagecodecs
+            try:
+                pixels = _decoded_by_pillow(file, series)
+            except Exception:
+                raise ValueError(str(error)) from error
         extra = len(getattr(series.keyframe, "extrasamples", ()))
     if axes.endswith("S") and extra == 1:
         pixels = _without_transparency(pixels)
     return pixels, axes
+
+
+def _decoded_by_pillow(file: Path, series: Any) -> np.ndarray:
+    """The pixels of a series of a TIFF file, decompressed by Pillow (LZW, JPEG, CCITT)."""
+    from PIL import Image
+
+    pages = []
+    with Image.open(file) as picture:
+        for page in series.pages:
+            picture.seek(page.index)
+            pages.append(np.asarray(picture))
+            # Pillow reduces colours of 16 bits to 8, and inverts grey values of which 0 is white.
+            if pages[-1].itemsize < series.dtype.itemsize or page.photometric == 0:
+                raise ValueError("Pillow changes the pixels")
+    return np.reshape(pages, series.shape).astype(series.dtype)
 
 
 def _read_picture(file: Path) -> tuple[np.ndarray, str]:
@@ -162,6 +166,44 @@ def _read_picture(file: Path) -> tuple[np.ndarray, str]:
     if transparent:
         pixels = _without_transparency(pixels)
     return pixels, "YX" if pixels.ndim == 2 else "YXS"
+
+
+def read_colours(file: Path, plane: int | None) -> Shaped[np.ndarray, "rows columns *colours"]:
+    """One plane of an image of labels, with three colours if it has several channels.
+
+    Of a picture with a palette the indices, if they are labels.
+
+    **Raises:** as [`read_image`][vertax.io.read_image], and `ValueError` for two channels.
+    """
+    pixels = _planes_and_channels(file, plane=plane)
+    channels = pixels[_choose("plane", plane, len(pixels), file)]
+    indices = _palette_indices(file)
+    if indices is not None:
+        return indices
+    if all(np.array_equal(channel, channels[0]) for channel in channels[1:]):
+        return channels[0]
+    if len(channels) == 2:
+        raise ValueError(
+            f"Argument `path` must name a file of labels or colours, but {file} has two channels. Pass one: "
+            "vx.io.read_image(file, channel=0)."
+        )
+    return np.moveaxis(channels[:3], 0, -1)
+
+
+def _palette_indices(file: Path) -> Integer[np.ndarray, "rows columns"] | None:
+    """The indices of a picture with a palette, where they are labels: where index 0 is black, or two indices
+    have one colour. None for another file."""
+    if file.suffix.lower() in TIFF_ENDINGS:  # its indices are its pixels
+        return None
+    from PIL import Image
+
+    with Image.open(file) as picture:
+        if picture.mode != "P":
+            return None
+        indices, palette = np.asarray(picture), picture.getpalette("RGB") or []
+    colours = np.reshape(palette, (-1, 3))[np.unique(indices)]
+    repeat = len(np.unique(colours, axis=0)) < len(colours)
+    return indices if repeat or not any(palette[:3]) else None
 
 
 def _without_transparency(

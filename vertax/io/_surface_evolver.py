@@ -31,9 +31,10 @@ class Foam(eqx.Module):
     tension_spreads: Float[Array, " edges"]
     """The largest difference between pieces of an edge; 0 where they agree."""
     pressures: Float[Array, " cells"]
-    """Lagrange multipliers of the areas, energy per area; 0 for cells without."""
+    """Lagrange multipliers of the areas, energy per area; 0 for cells without. Positive in compressed cells,
+    also for bodies that the file lists clockwise, with a negative area and the opposite sign."""
     target_areas: Float[Array, " cells"]
-    """Fixed areas (`volume`) of the cells; the area where a cell has none."""
+    """Fixed areas (`volume`) of the cells, positive; the area where a cell has none."""
     time: float
     """`TOTAL_TIME`."""
     chains: tuple[Float[np.ndarray, "_ 2"], ...]
@@ -67,6 +68,19 @@ def read_surface_evolver(path: str | os.PathLike[str]) -> Foam:
     path = Path(path)
     pieces = _parsed(path)
     return _foam(pieces, path)
+
+
+def is_surface_evolver(path: Path) -> bool:
+    """Whether a file has an ending of Surface Evolver, or is a text with a section `vertices`."""
+    if path.suffix.lower() in (".fe", ".dmp"):
+        return True
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        if b"\0" in file.read(4096):  # an image, or an array
+            return False
+        file.seek(0)
+        return re.search(rb"^\s*vertices\b", file.read(), re.MULTILINE | re.IGNORECASE) is not None
 
 
 class _Pieces(NamedTuple):
@@ -143,14 +157,18 @@ def _parsed(path: Path) -> _Pieces:
     except KeyError as error:
         raise broken(f"element {error} is used but missing; the file may be truncated") from error
     where = np.array(list(points.values()))
-    loops = [_counter_clockwise(loop, ends, where, broken) for loop in loops]
+    areas = np.array([_area_of(loop, ends, where, broken) for loop in loops])
+    pressures, volumes = np.array([body[1:] for body in bodies]).T[::-1]
+    # A body with a clockwise face has a negative area and volume, and its Lagrange multiplier the opposite
+    # sign. A data file that was written by hand may have a positive volume all the same.
+    negative = np.where(np.isnan(volumes), areas, volumes) < 0
     return _Pieces(
         points=where,
         edges=ends,
         density=np.array([density for *_, density in edges.values()]),
-        loops=loops,
-        pressures=np.array([pressure for *_, pressure in bodies]),
-        volumes=np.array([volume for _, volume, _ in bodies]),
+        loops=[loop if area > 0 else -loop[::-1] for loop, area in zip(loops, areas, strict=True)],
+        pressures=np.where(negative, -pressures, pressures),
+        volumes=np.abs(volumes),
         bodies=bodies_in_file,
         time=float(time[1]) if time else 0.0,
     )
@@ -180,20 +198,19 @@ def _turned(faces: dict[int, list[int]], body: list[int]) -> list[int]:
     return loop if body[0] > 0 else [-edge for edge in reversed(loop)]
 
 
-def _counter_clockwise(
+def _area_of(
     loop: Int[np.ndarray, " pieces"],
     ends: Int[np.ndarray, "edges 2"],
     points: Float[np.ndarray, "points 2"],
     broken: Callable[[str], ValueError],
-) -> Int[np.ndarray, " pieces"]:
-    """The edges around a face, such that it lies on their left."""
+) -> float:
+    """The area within the edges around a face, negative if they are clockwise."""
     start = np.where(loop > 0, ends[np.abs(loop) - 1, 0], ends[np.abs(loop) - 1, 1])
     stop = np.where(loop > 0, ends[np.abs(loop) - 1, 1], ends[np.abs(loop) - 1, 0])
     if not np.array_equal(stop, np.roll(start, -1)):
         raise broken("the edges of a face are not a closed loop")
     x, y = points[start].T
-    area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-    return loop if area > 0 else -loop[::-1]
+    return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def _foam(pieces: _Pieces, path: Path) -> Foam:

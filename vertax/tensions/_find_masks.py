@@ -67,9 +67,9 @@ def find_masks(
 
     **Arguments:**
 
-    - `masks`: a folder (its files .tif, .tiff, .png and .npy), a pattern such as `"masks/*.tif"`, one file,
-        an array of shape (rows, columns) or (frames, rows, columns), or a list of files, arrays and
-        frames. A single file with several planes is a movie.
+    - `masks`: a folder (its files .tif, .tiff, .png and .npy), a pattern such as `"masks/*.tif"` or, with
+        subfolders, `"masks/**/*.tif"`, one file, an array of shape (rows, columns) or (frames, rows,
+        columns), or a list of files, arrays and frames. A single file with several planes is a movie.
     - `plane`: of files with several planes, the one to take; then no file is a movie.
 
     **Returns:** the masks, files in natural order (2 before 10). Names are file names, with folders where
@@ -115,6 +115,7 @@ def _files(path: str) -> list[Path]:
     if os.path.isdir(path):
         files = [file for file in Path(path).iterdir() if file.suffix.lower() in _ENDINGS]
         what = f"files {', '.join(_ENDINGS)} in the folder {path}, but it has none"
+        what += f" (with subfolders: {os.path.join(path, '**', '*.tif')})"
     elif os.path.exists(path) or not glob.has_magic(path):
         files = [Path(path)] if os.path.exists(path) else []
         what = f"a file, but {path} does not exist"

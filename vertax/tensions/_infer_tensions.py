@@ -19,6 +19,7 @@ from vertax._base.pixels import PixelSize, pixel_length
 from vertax.initialise import MaskReport, Segmentation, from_labels
 from vertax.initialise._report import LEAST_LENGTH
 from vertax.io import Foam, pixel_aspect, read_surface_evolver
+from vertax.io._surface_evolver import is_surface_evolver
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 from vertax.tensions._balance import equations
@@ -35,7 +36,6 @@ from vertax.tensions._resampling import resampled_deviations
 _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 # Initial noise of the vertices of a tissue with straight edges, relative to the cell diameter.
 _VERTEX = 0.01
-_EVOLVER = (".dmp", ".fe")
 
 
 @announce_compilations("measurements of a tissue")
@@ -116,7 +116,7 @@ def infer_tensions(
             f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
         )
     source = mask
-    if isinstance(source, str | os.PathLike) and Path(source).suffix.lower() in _EVOLVER:
+    if isinstance(source, str | os.PathLike) and is_surface_evolver(Path(source)):
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
         labels, line_width = labels_and_lines(source, kind, background, plane)

@@ -19,11 +19,13 @@ from vertax.tensions._columns import with_pixels
 from vertax.tensions._mean_stress import MeanStress
 from vertax.tensions._pixel_aspect import pixel_aspect_warning
 
-# Cells with a larger error of the area, or distance of the outline from arcs over the root of the area, are
-# named.
-_CELL_ERROR = 0.1
+# Cells with a larger error of the area (vertices that moved far give area to a neighbour), or distance of the
+# outline from arcs over the root of the area, are named.
+_AREA_ERROR, _OUTLINE_ERROR = 0.05, 0.1
 # Number of places that a warning names.
 _PLACES = 5
+# Smallest number of stray regions of a mask that was resized. (There are also more than cells.)
+_STRAY = 20
 
 
 class InferredTensions(eqx.Module):
@@ -275,6 +277,12 @@ def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
             places = "; ".join(map(str, changes[:_PLACES]))
             more = f"; and {len(changes) - _PLACES} more" if len(changes) > _PLACES else ""
             warnings.append(f"{text}: {places}{more}")
+    stray = len(report.of_kind("piece", "absorbed", "left out"))
+    if stray > max(_STRAY, len(report.cell_pixels)):
+        warnings.append(
+            f"{stray} stray regions were joined to cells or left out, as in a mask that was resized with "
+            "interpolation: its outlines are wrong; resize masks with order 0 (nearest neighbour)"
+        )
     closed = report.closed & np.isfinite(report.shown) & ~result.four_fold
     closed &= np.all(
         np.append(result.labels, 0)[np.asarray(result.tissue.topology.edge_cells)] > 0, axis=1
@@ -286,19 +294,21 @@ def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
         )
     outline = result.outline_errors
     distance = np.zeros(0) if outline is None else outline / np.sqrt(report.cell_pixels)
-    for errors, text, unit in (
+    for errors, limit, text, unit in (
         (
             result.area_errors,
-            "areas of {} cells differ by more than 10 % from those of their pixels",
+            _AREA_ERROR,
+            "areas of {} cells differ by more than 5 % from those of their pixels",
             "+",
         ),
         (
             distance,
+            _OUTLINE_ERROR,
             "outlines of {} cells are more than 10 % of the root of their area from arcs",
             "",
         ),
     ):
-        off = np.flatnonzero((np.abs(errors) > _CELL_ERROR) & (result.labels[: len(errors)] > 0))
+        off = np.flatnonzero((np.abs(errors) > limit) & (result.labels[: len(errors)] > 0))
         if len(off):
             worst = off[np.argsort(-np.abs(errors[off]))][:_PLACES]
             cells = ", ".join(f"label {result.labels[k]} ({errors[k]:{unit}.0%})" for k in worst)

@@ -12,9 +12,14 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label
 
 from vertax._base.checks import check_integer
-from vertax.initialise._mask_arguments import check_bits, check_zero, without_single_axes
+from vertax.initialise._mask_arguments import (
+    check_bits,
+    check_no_picture,
+    check_zero,
+    without_single_axes,
+)
 from vertax.initialise._pieces import connected_pieces
-from vertax.io import read_image
+from vertax.io._image import read_colours
 
 _KINDS = ("auto", "labels", "outlines")
 # A region at the border of the image that is larger than this, relative to the median cell, is no cell.
@@ -34,7 +39,8 @@ def read_mask(
 ) -> Int[np.ndarray, "rows columns"]:
     """A label for each pixel, from a label image or an image of outlines.
 
-    - **Labels**: integers, or a colour for each cell; also `NAME_seg.npy` of Cellpose.
+    - **Labels**: integers, or a colour for each cell; also `NAME_seg.npy` of Cellpose. In a file with a
+        palette the indices are the labels, if index 0 is black or colours repeat.
     - **Outlines**: two values, as of Tissue Analyzer, EPySeg and skeletons, and of boolean masks of cells
         with lines between them; grey or in colours, of any thickness, connected by sides or by corners of
         pixels. The rarer value is the line, or the other one where that makes no cells. Each region within
@@ -57,8 +63,9 @@ def read_mask(
     - `FileNotFoundError` if there is no such file.
     - `ValueError` for an unknown `kind`, pixels of another shape, labels that are not whole numbers or too
         large for their type, a stack without `plane`, a `background` that no pixel has, labels of which 0 may
-        be that of a cell (0 and negative ones), outlines that enclose less than two cells, and two values of
-        which neither is a line thinner than a third of a cell, unless `kind` is `"outlines"`.
+        be that of a cell (0 and negative ones), a picture in place of labels, outlines that enclose less than
+        two cells, and two values of which neither is a line thinner than a third of a cell, unless `kind` is
+        `"outlines"`.
     """
     return labels_and_lines(mask, kind, background, plane)[0]
 
@@ -102,6 +109,7 @@ def labels_and_lines(
             return outlined.labels, outlined.line_width
     if pixels.ndim == 2 and pixels.dtype.kind in "iu":
         check_zero("mask", pixels, background)
+    check_no_picture("mask", values)
     return np.maximum(values, 0), 0.0
 
 
@@ -152,20 +160,9 @@ def _loaded(file: Path, plane: int | None) -> np.ndarray:
     if file.suffix.lower() == ".npy":
         return one_plane(load_array(file), plane)
     try:
-        return read_image(file, plane=plane)
+        return read_colours(file, plane)
     except ValueError as error:
-        message = str(error)
-    if "`channel`" not in message:
-        raise ValueError(message.replace("`path`", "`mask`"))
-    try:
-        return np.stack([read_image(file, channel=k, plane=plane) for k in range(3)], axis=-1)
-    except ValueError as error:
-        if "`channel`" not in str(error):
-            raise
-        raise ValueError(
-            f"Argument `mask` must name a file of labels or colours, but {file} has two channels. Pass one: "
-            "vx.io.read_image(file, channel=0)."
-        ) from None
+        raise ValueError(str(error).replace("`path`", "`mask`")) from error
 
 
 def load_array(file: Path) -> np.ndarray:
@@ -183,16 +180,15 @@ def _numbered(pixels: Shaped[np.ndarray, "..."]) -> Int[np.ndarray, "rows column
     """Integers, one for each colour; black is 0."""
     if pixels.ndim == 3:
         pixels = pixels[..., :3]
-        colours, index = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
-        if _are_frames(pixels, len(colours)):
+        planes = [_ranks(plane) for plane in np.moveaxis(pixels, -1, 0)]
+        number = _ranks(np.ravel_multi_index(planes, [int(plane.max()) + 1 for plane in planes]))
+        if _are_frames(planes, int(number.max()) + 1):
             raise ValueError(
                 "Argument `mask` must have shape (rows, columns), or a third axis of colours, but its last "
                 f"axis holds {pixels.shape[2]} label images that differ. Label planes are not colours: pass "
                 "one, such as mask[..., 0]."
             )
-        number = np.arange(1, len(colours) + 1)
-        number[np.all(colours == 0, axis=1)] = 0
-        return number[index.ravel()].reshape(pixels.shape[:2])
+        return np.where(np.any(pixels, axis=-1), number + 1, 0)
     if pixels.ndim != 2 or pixels.size == 0:
         raise ValueError(
             "Argument `mask` must have shape (rows, columns), or a third axis of colours, but its shape is "
@@ -208,16 +204,19 @@ def _numbered(pixels: Shaped[np.ndarray, "..."]) -> Int[np.ndarray, "rows column
     return pixels.astype(np.int64)
 
 
-def _are_frames(pixels: Shaped[np.ndarray, "rows columns planes"], n_colours: int) -> bool:
+def _ranks(pixels: Shaped[np.ndarray, "rows columns"]) -> Int[np.ndarray, "rows columns"]:
+    """The index of each pixel among the different values."""
+    return np.unique(pixels, return_inverse=True)[1].reshape(pixels.shape)
+
+
+def _are_frames(planes: Sequence[Int[np.ndarray, "rows columns"]], n_colours: int) -> bool:
     """Whether each plane is a label image, and together they divide the image into many more regions."""
-    n_values = []
-    for plane in np.moveaxis(pixels, -1, 0):
-        values, index = np.unique(plane, return_inverse=True)
-        sizes = connected_pieces(index.reshape(plane.shape), periodic=False).size
+    n_values = [int(plane.max()) + 1 for plane in planes]
+    for plane, n in zip(planes, n_values, strict=True):
+        sizes = connected_pieces(plane, periodic=False).size
         # (Stray pixels are no regions.)
-        if len(values) < 3 or np.sum(sizes > _SPECK * np.median(sizes)) > 1.5 * len(values):
+        if n < 3 or np.sum(sizes > _SPECK * np.median(sizes)) > 1.5 * n:
             return False
-        n_values.append(len(values))
     return n_colours > 1.5 * max(n_values)
 
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+import vertax
 from vertax._base.announce import announce_compilations
 from vertax._base.blas import one_blas_thread
 from vertax._base.checks import check_integer
@@ -130,8 +131,8 @@ def infer_tensions_of_masks(
     - `masks`: a folder, a pattern, a movie or a list, see [`find_masks`][vertax.tensions.find_masks].
     - `plane`: of files with several planes, the one to take; by default a single file is a movie.
     - `cache`: a folder where the result of each mask is stored as soon as it is computed. A later call, such
-        as after an interrupt, reads the results of the same pixels and options from it. An entry that cannot
-        be read is computed anew, with a warning.
+        as after an interrupt, reads the results of the same pixels, options and version of vertax from it. An
+        entry that cannot be read is computed anew, with a warning.
     - `threads`: number of threads, by default the environment variable `VERTAX_THREADS` or one per core.
     - `progress`: show a progress bar with the name of the last mask (only on a terminal).
     - `options`: as of [`infer_tensions`][vertax.tensions.infer_tensions], the same for all masks.
@@ -202,7 +203,7 @@ def _infer(
         source = np.ascontiguousarray(source)
         pixels = source.tobytes() + f"{source.shape} {source.dtype}".encode()
     # The precision of JAX is part of the result, and the file has the size of the pixels.
-    given = f"{sorted(options.items())} {jnp.result_type(float)} {frame.file}"
+    given = f"{sorted(options.items())} {jnp.result_type(float)} {frame.file} {vertax.__version__}"
     digest = hashlib.sha256(pixels + given.encode()).hexdigest()
     file = Path(cache) / f"{digest[:32]}.npz"
     if file.exists():
