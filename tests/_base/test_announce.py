@@ -52,6 +52,15 @@ def test_nested_functions_are_announced_once(slow, capsys):
     assert "a sum" not in capsys.readouterr().err
 
 
+def test_function_without_a_job_is_named(slow, capsys, monkeypatch):
+    monkeypatch.setattr(announce, "_label_of_process", [])
+    monkeypatch.setattr(announce, "_is_watched", lambda: True)
+    slow(jnp.ones(6))
+    assert "Compiling `slow_to_trace` (once" in capsys.readouterr().err
+    announced_jit(lambda x: slow(x) * 2, label="a product")(jnp.ones(7))
+    assert "Compiling a product" in capsys.readouterr().err
+
+
 def test_nothing_is_printed_without_a_terminal(slow, capsys, monkeypatch):
     monkeypatch.setattr(announce, "_label_of_process", [])
     slow(jnp.ones(3))

@@ -39,8 +39,12 @@ _thread = _Thread()
 _label_of_process: list[str] = []
 
 
-def announced_jit(function: Function, *, inline: bool = False) -> Function:
-    """`equinox.filter_jit` with the messages of `announce_compilations`."""
+def announced_jit(function: Function, *, inline: bool = False, label: str = "") -> Function:
+    """`equinox.filter_jit` with a message on a terminal while the function compiles.
+
+    The message names the job of `announce_compilations`, or else `label`, by default the function.
+    """
+    label = label or f"`{function.__name__.strip('_')}`"
 
     # JAX calls this only to trace it: a compiled function does not start the timer.
     @functools.wraps(function)
@@ -58,8 +62,8 @@ def announced_jit(function: Function, *, inline: bool = False) -> Function:
     def call(*args: Any, **kwargs: Any) -> Any:
         compiled = fast if compiles_fast((args, kwargs)) else optimised
         job = _thread.job
-        if job is None and _label_of_process:
-            job = _Job(_label_of_process[0])
+        if job is None and (_label_of_process or _is_watched()):
+            job = _Job(_label_of_process[0] if _label_of_process else label)
         if job is None or job.announced or _thread.timer is not None:
             return compiled(*args, **kwargs)
         _thread.timer = threading.Timer(DELAY, _print_message, (job,))
@@ -81,12 +85,16 @@ def announce_compilations(label: str) -> Iterator[None]:
     """
     before = _thread.job
     # The outermost context names the job that the user started.
-    if before is None and (sys.stderr.isatty() or "ipykernel" in sys.modules or _label_of_process):
+    if before is None and (_is_watched() or _label_of_process):
         _thread.job = _Job(label)
     try:
         yield
     finally:
         _thread.job = before
+
+
+def _is_watched() -> bool:
+    return sys.stderr.isatty() or "ipykernel" in sys.modules
 
 
 def announce_in_this_process(label: str) -> None:

@@ -388,5 +388,5 @@ def attached(
     return conclude(end, tissue, energy, adjoint, *parts)
 
 
-_search = announced_jit(sequential_vmap_on_cpu(search))
-_compiled_attachment = announced_jit(attached)
+_search = announced_jit(sequential_vmap_on_cpu(search), label="a relaxation")
+_compiled_attachment = announced_jit(attached, label="the derivatives of an equilibrium")
