@@ -298,6 +298,7 @@ def test_free_tissue_grows_and_divides():
     assert floats(grown.tissue) == {"float32"}
 
 
+@pytest.mark.thorough
 def test_standard_deviations_are_as_large_as_the_errors(rest):
     tissue, energy = rest
     noise = 0.01 * jax.random.normal(jax.random.key(1), tissue.vertices.shape)

@@ -284,6 +284,8 @@ def without_spare(result):
 # These compile for longer, and use the functions of the others.
 THOROUGH = (
     "growth.grow",
+    "relax.record_relaxation",
+    "transitions.T1",
     "transitions.T2",
     "mechanics.bulk_modulus",
     "mechanics.shear_modulus",

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import as_real, check_integer, check_number
 from vertax._base.results import RESULTS
 from vertax._base.tracing import traced
@@ -163,7 +164,7 @@ class _State(eqx.Module):
     num_box_steps: Int[Array, ""]
 
 
-@eqx.filter_jit
+@announced_jit
 def _relax_box(
     tissue: Tissue, energy: AbstractEnergy, response: BoxRelaxation, adjoint: AbstractAdjoint
 ) -> Equilibrium:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from vertax._base.announce import announced_jit
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import as_angle, check_linear_solver, check_system
@@ -225,7 +226,7 @@ class _Elasticity(eqx.Module):
         return (products - 0.5 * (prestress + prestress.T)) / area_of(tissue)
 
 
-@eqx.filter_jit
+@announced_jit
 def _elastic_tensor(
     tissue: Tissue, energy: AbstractEnergy, system: _Elasticity
 ) -> Float[Array, "3 3"]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vertax._base.announce import announced_jit
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import real_scalar
@@ -82,7 +82,7 @@ def pressures_and_tensions(
     return _pressures_and_tensions(*traced((tissue, energy), tissue.vertices.dtype))
 
 
-@eqx.filter_jit
+@announced_jit
 def _pressures_and_tensions(
     tissue: Tissue, energy: AbstractEnergy
 ) -> tuple[Float[Array, " cells"], Float[Array, " edges"]]:

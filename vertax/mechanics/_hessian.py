@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from vertax._base.announce import announced_jit
 from vertax.mechanics._landscape import Landscape
 from vertax.mesh import Tissue
 
@@ -103,7 +103,7 @@ def factorised(matrix: sparse.sparray) -> Any:
     )
 
 
-_products = eqx.filter_jit(hessian_products)
+_products = announced_jit(hessian_products)
 
 
 def _degrees_of_freedom(

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import as_float64, check_concrete, check_integer, check_number
 from vertax._base.tracing import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
@@ -226,10 +227,10 @@ def _quotients(
     return jax.vmap(lambda v: jnp.sum(v * product(v)))(vectors)
 
 
-_dense = eqx.filter_jit(dense_hessian)
+_dense = announced_jit(dense_hessian)
 
 
-@eqx.filter_jit
+@announced_jit
 def _dense_modes(tissue: Tissue, energy: AbstractEnergy, k: int) -> Modes:
     system = _Spectrum(k)
     args = (tissue, energy)
@@ -237,7 +238,7 @@ def _dense_modes(tissue: Tissue, energy: AbstractEnergy, k: int) -> Modes:
     return Modes(stationary(args, system), _unravelled(tissue, vectors), _n_movable(tissue))
 
 
-@eqx.filter_jit
+@announced_jit
 def _modes_along(
     tissue: Tissue, energy: AbstractEnergy, vectors: Float[Array, "modes dofs"]
 ) -> Modes:

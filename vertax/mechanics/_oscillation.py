@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 from scipy.sparse import diags_array
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import as_real, check_number
 from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
@@ -197,14 +198,14 @@ def _sparse_motions(args: _Args) -> PyTree[Array] | None:
     return jax.vmap(jax.vmap(jax.vmap(unravel)))(jnp.asarray(parts, tissue.vertices.dtype))
 
 
-@eqx.filter_jit
+@announced_jit
 def _affine_loads(landscape: Landscape) -> Float[Array, "3 dofs"]:
     """Mixed second derivatives by displacements and by each of the affine strains, or strain rates."""
     loads = jax.vmap(landscape.hessian_product())(voigt_basis(landscape.tissue))[1]
     return jax.vmap(lambda x: ravel_pytree(x)[0])(loads)
 
 
-@eqx.filter_jit
+@announced_jit
 def _tensors_along(args: _Args, motions: PyTree[Array]) -> Float[Array, "2 frequencies 3 3"]:
     return _Oscillation().value(args, motions)
 
@@ -240,7 +241,7 @@ def _diagonalise(
     return h, g_scale * g, x
 
 
-@eqx.filter_jit
+@announced_jit
 def _tensors(
     tissue: Tissue,
     energy: AbstractEnergy,

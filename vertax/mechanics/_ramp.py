@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from vertax._base.announce import announced_jit
 from vertax._base.batch import member
 from vertax._base.checks import as_real, describe
 from vertax._base.results import RESULTS, checked, first_of
@@ -162,7 +163,7 @@ def ramp(
     return result.checked() if throw else result
 
 
-@eqx.filter_jit
+@announced_jit
 def _ramp(
     tissue: Tissue,
     energy: AbstractEnergy,

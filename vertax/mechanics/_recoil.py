@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import check_integer
 from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
@@ -64,7 +64,7 @@ def velocities(
     return checked(velocity, _REASON) if throw else velocity
 
 
-@eqx.filter_jit
+@announced_jit
 def _velocities(
     tissue: Tissue,
     energy: AbstractEnergy,
@@ -128,7 +128,7 @@ def recoil(
     return checked(velocity, _REASON) if throw else velocity
 
 
-@eqx.filter_jit
+@announced_jit
 def _recoil(
     tissue: Tissue,
     energy: AbstractEnergy,

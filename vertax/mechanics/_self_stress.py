@@ -12,6 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import check_concrete, check_number
 from vertax.mechanics._arguments import check_tissue
 from vertax.mechanics._hessian import movable, zero_threshold
@@ -48,7 +49,7 @@ def compatibility(
     return _compatibility(tissue, names)
 
 
-@eqx.filter_jit
+@announced_jit
 def _compatibility(tissue: Tissue, names: tuple[str, ...]) -> Float[Array, "constraints dofs"]:
     y, unravel = ravel_pytree(tissue.configuration)
 

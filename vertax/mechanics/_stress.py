@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import as_real
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
@@ -46,7 +46,7 @@ def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
     return _stress(*traced((tissue, energy), tissue.vertices.dtype))
 
 
-@eqx.filter_jit
+@announced_jit
 def _stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
     identity = jnp.eye(2, dtype=tissue.vertices.dtype)
     at = lambda gradient: real_scalar(energy(deformed(tissue, gradient)))
@@ -75,7 +75,7 @@ def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2
     return _cell_stress(*traced((tissue, energy), tissue.vertices.dtype))
 
 
-@eqx.filter_jit
+@announced_jit
 def _cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2 2"]:
     pressure, tension = pressures_and_tensions(tissue, energy)
     cells = tissue.topology.edge_cells

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.energies import Ablated, AbstractEnergy, AbstractLocalEnergy
@@ -91,7 +92,7 @@ def ablate(
     return eqx.error_if(merged, separate, reason), ablated
 
 
-@eqx.filter_jit
+@announced_jit
 def _merged(tissue: Tissue, holes: Bool[Array, " cells"]) -> tuple[Tissue, Bool[Array, ""]]:
     """Merge holes that touch; also return whether some could not be merged."""
     hole = jnp.append(holes, jnp.zeros(2, bool))  # neither the exterior nor spare slots

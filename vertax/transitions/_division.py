@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from vertax._base.announce import announced_jit
 from vertax._base.checks import as_real, check_integer
 from vertax._base.results import RESULTS, checked
 from vertax._base.tracing import is_concrete, tree_where
@@ -82,7 +82,7 @@ def check_cell(tissue: Tissue, cell: int | Int[Array, ""]) -> None:
         raise ValueError(f"Argument `cell` must be the number of a living cell, but is {cell}.")
 
 
-@eqx.filter_jit
+@announced_jit
 def _divide(
     tissue: Tissue, cell: Int[Array, ""], axis: Float[Array, "2"] | None, do: bool | Array = True
 ) -> Change:

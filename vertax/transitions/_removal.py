@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from vertax._base.announce import announced_jit
 from vertax._base.results import RESULTS, checked
 from vertax._base.tracing import tree_where
 from vertax.mesh import Tissue
@@ -52,7 +52,7 @@ def remove(tissue: Tissue, cell: int | Int[Array, ""], *, throw: bool = True) ->
     return checked(change, change.result) if throw else change
 
 
-@eqx.filter_jit
+@announced_jit
 def _remove(tissue: Tissue, cell: Int[Array, ""]) -> Change:
     return removed(tissue, cell, jnp.array(True))
 
