@@ -194,6 +194,7 @@ class TestDynamics:
         assert (jnp.diff(movie.energies) < 1e-5).all()
         assert movie.energies[-1] < 0.9 * movie.energies[0]
 
+    @pytest.mark.thorough
     def test_gradient_of_an_evolution_matches_finite_differences(self, rest):
         tissue, _ = rest
 
@@ -268,6 +269,7 @@ class TestTransitions:
         assert np.abs(slope).max() > 0
 
 
+@pytest.mark.thorough
 def test_posterior_density_has_a_finite_gradient(rest):
     pytest.importorskip("numpyro", reason="needs the extra bayes")
     import numpyro.distributions as dist
