@@ -284,6 +284,7 @@ def without_spare(result):
 # These compile for longer, and use the functions of the others.
 THOROUGH = (
     "growth.grow",
+    "mechanics.BoxRelaxation",
     "relax.record_relaxation",
     "transitions.T1",
     "transitions.T2",
