@@ -34,6 +34,7 @@ TOGETHER = (
     ("_base", "mesh", "energies", "dissipations"),
     ("io", "plotting", "precondition"),
     ("project", "solvers"),
+    ("project/test_spare_slots.py",),
     ("inference", "tensions"),
     ("transitions", "growth"),
     ("adjoints", "external"),
