@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.optimize import minimize
 
 
@@ -28,28 +28,32 @@ class Errors(NamedTuple):
     """Prior of pressures about 0, in mean tensions over a cell diameter."""
 
 
+class Patch(NamedTuple):
+    """The residual forces of a tissue, or of a part of a large one, and their covariances."""
+
+    residual: Float[np.ndarray, " rows"]
+    """Forces at the prior mean."""
+    parts: Errors
+    """Covariance for each standard deviation of 1."""
+    unknown: Float[np.ndarray, "rows rows"]
+    """Covariance of unknown forces."""
+
+
 # With residual forces r = A x̄ - J d at the prior mean x̄, the evidence is the density of r,
 #
 #     r ~ N(0, K),   K = U + Σ_k s_k² V_k,   -2 ln p = rᵀ K⁻¹ r + ln det K,
 #
 # where V_k are the covariances of the forces, for noise, errors of the model and priors of standard deviation
-# 1, and U is that of unknown forces. Derivative: 2 s_k² [tr(K⁻¹ V_k) - rᵀ K⁻¹ V_k K⁻¹ r] for ln s_k.
+# 1, and U is that of unknown forces. Derivative: 2 s_k² [tr(K⁻¹ V_k) - rᵀ K⁻¹ V_k K⁻¹ r] for ln s_k. Parts of a
+# large tissue count as independent.
 def most_evident(
-    residual: Float[np.ndarray, " rows"],
-    parts: Errors,
-    unknown: Float[np.ndarray, "rows rows"],
-    guess: Errors,
-    bounds: dict[str, tuple[float, float]],
-    *,
-    steps: int,
+    patches: list[Patch], guess: Errors, bounds: dict[str, tuple[float, float]], *, steps: int
 ) -> tuple[Errors, float]:
     """The standard deviations of the largest marginal likelihood (evidence), and its logarithm.
 
     **Arguments:**
 
-    - `residual`: r, the forces at the prior mean.
-    - `parts`: covariance of the forces for each standard deviation of 1.
-    - `unknown`: covariance of unknown forces.
+    - `patches`: residual forces and their covariances.
     - `guess`: initial standard deviations.
     - `bounds`: smallest and largest standard deviation by name; others keep the guess.
     - `steps`: largest number of iterations (L-BFGS-B).
@@ -58,27 +62,34 @@ def most_evident(
     """
     free = [k for k, name in enumerate(Errors._fields) if name in bounds]
     noise = Errors._fields.index("noise")
-    constant = unknown + sum(
-        (guess[k] ** 2 * parts[k] for k in range(len(guess)) if k not in free and guess[k]),
-        np.zeros_like(unknown),
-    )
+    held = [k for k in range(len(guess)) if k not in free and guess[k]]
+    constants = [
+        patch.unknown + sum((guess[k] ** 2 * patch.parts[k] for k in held), 0.0) for patch in patches
+    ]
 
     def loss(logs: np.ndarray) -> tuple[float, np.ndarray]:
         ratio = np.exp(2 * logs)
-        total = constant + sum(s * parts[k] for s, k in zip(ratio, free, strict=True))
-        root = cho_factor(total, lower=True, check_finite=False)
-        inverse = cho_solve(root, np.eye(len(total)), check_finite=False)
-        force = inverse @ residual
-        value = residual @ force + 2 * np.sum(np.log(np.diag(root[0])))
-        slope = [
-            2 * s * (np.vdot(inverse, parts[k]) - force @ parts[k] @ force)
-            for s, k in zip(ratio, free, strict=True)
-        ]
+        value, slope = 0.0, np.zeros(len(free))
+        for patch, constant in zip(patches, constants, strict=True):
+            total = constant + sum(s * patch.parts[k] for s, k in zip(ratio, free, strict=True))
+            root, failed = dpotrf(total.T, lower=True, overwrite_a=True, clean=True)
+            if failed:
+                raise np.linalg.LinAlgError("The covariance of the forces is not positive definite.")
+            value += 2 * float(np.sum(np.log(np.diag(root))))
+            inverse = dpotri(root, lower=True, overwrite_c=True)[0]
+            # Below the diagonal twice, in place of above it.
+            inverse *= 2
+            np.fill_diagonal(inverse, 0.5 * np.diag(inverse))
+            force = 0.5 * (inverse @ patch.residual + patch.residual @ inverse)
+            value += float(patch.residual @ force)
+            for number, (s, k) in enumerate(zip(ratio, free, strict=True)):
+                part = patch.parts[k]
+                slope[number] += 2 * s * (np.vdot(inverse.T, part) - force @ part @ force)
         if noise in free:
             at = free.index(noise)
             value += logs[at] ** 2
             slope[at] += 2 * logs[at]
-        return float(value), np.array(slope)
+        return value, slope
 
     if not free:
         return guess, -0.5 * loss(np.zeros(0))[0]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 from vertax.tensions._balance import equations
 from vertax.tensions._curves import Points
-from vertax.tensions._edges import fit, more_evident, solution
+from vertax.tensions._edges import fit, solution
 from vertax.tensions._inferred import InferredTensions
 from vertax.tensions._mask import labels_and_lines
 from vertax.tensions._observed_geometry import observed_geometry
@@ -160,23 +159,23 @@ def infer_tensions(
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
     curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
-    solve_as = partial(
-        solution, geometry, curves, uncertain, known_noise=course.noise is not None, prior=prior
+    straight = None if edges is None and tissue.inner_arcs else edges != "arcs"
+    fitted, system, balance = solution(
+        geometry,
+        curves,
+        uncertain,
+        straight=straight,
+        known_noise=course.noise is not None,
+        prior=prior,
     )
-    solved = solve_as(straight=edges == "straight" or not tissue.inner_arcs)
-    if edges is None and tissue.inner_arcs:
-        solved = more_evident(solved, solve_as(straight=True))
-    fitted, which, shape, balance = solved
     resampled = None
     if resamples:
-        observed = fitted, curves, points, which, shape
-        resampled = resampled_deviations(
-            *observed, balance, prior=prior, times=resamples, seed=seed
-        )
+        observed = fitted, curves, points, system, balance
+        resampled = resampled_deviations(*observed, times=resamples, seed=seed)
     # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
     source = course.labels, course.pixel_size, four_fold, report
-    return outcome(tissue, course.points, curves, which, balance, source, resampled)
+    return outcome(tissue, course.points, curves, system.which, balance, source, resampled)
 
 
 class _Course(NamedTuple):
