@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import minimize_scalar
-from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
 from vertax.tensions._observed_geometry import ObservedGeometry
+from vertax.tensions._sparse_normal import SparseNormal, factorised
 
 # Prior standard deviations, for parameters that no point determines, such as the angle of an edge of two
 # pixels: of a vertex in grains (its initial position is the corner of a pixel) and of an angle in radians.
@@ -177,7 +177,7 @@ def fit_curves(
         )
         weighted = jacobian.T * weight
         normal = csc_array(weighted @ jacobian + diags_array(held))
-        step = splu(normal).solve(weighted @ rest + held * change)
+        step = factorised(normal).solve(weighted @ rest + held * change)
         change = change - step
         change[angles:bends] = np.clip(tissue.angle + change[angles:bends], -3, 3) - tissue.angle
         if np.max(np.abs(step[angles:])) < 1e-4:
@@ -223,9 +223,9 @@ def _bending(
         return _BENDINGS[0]
     first = 2 * tissue.n_vertices + len(tissue.angle)
     place = np.concatenate([first + 2 * edges, first + 2 * edges + 1])
-    unit = np.zeros((tissue.n_geometry, len(place)))
-    unit[place, np.arange(len(place))] = 1.0
-    variance = noise**2 * np.sum(unit * splu(flat.precision).solve(unit), axis=0)
+    unit = (np.ones(len(place)), place, np.arange(len(place) + 1))
+    rows = csr_array(unit, shape=(len(place), tissue.n_geometry))
+    variance = noise**2 * SparseNormal(flat.precision, tissue.places).variances(rows)
     # The estimates without that prior.
     fraction = np.minimum(variance / _BENDINGS[1] ** 2, 0.95)
     bend, variance = flat.change[place] / (1 - fraction), variance / (1 - fraction)

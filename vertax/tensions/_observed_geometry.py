@@ -38,6 +38,13 @@ class ObservedGeometry(NamedTuple):
     """Root of the mean area of a cell."""
 
     @property
+    def places(self) -> Float[np.ndarray, "geometry 2"]:
+        """Position of each unknown."""
+        middle = self.place[self.ends[:, 0]] + 0.5 * self.chord
+        at_edges = np.concatenate([middle, np.repeat(middle, 2, axis=0)])
+        return np.concatenate([np.repeat(self.place, 2, axis=0), at_edges])
+
+    @property
     def n_vertices(self) -> int:
         """Number of vertices."""
         return len(self.inner)
