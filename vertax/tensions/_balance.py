@@ -151,7 +151,10 @@ def force_slopes(
     pull = tension[which.half_edge].ravel()
     row, column = np.repeat(2 * np.arange(n_junctions), 3), np.arange(which.n_directions)
     arcs = np.arange(which.n_arcs)
-    entries = [(row, column, -pull * np.sin(direction)), (row + 1, column, pull * np.cos(direction))]
+    entries = [
+        (row, column, -pull * np.sin(direction)),
+        (row + 1, column, pull * np.cos(direction)),
+    ]
     stretch = 2 * tension[: which.n_arcs] * np.cos(arc)
     entries.append((2 * n_junctions + arcs, which.n_directions + arcs, stretch))
     return _matrix(entries, (which.n_rows, len(angle)))

@@ -105,7 +105,7 @@ def solution(
 def _density_of_arcs(arcs: System, noise: float) -> float:
     """Logarithm of the density of the angles of arcs if they are noise."""
     n = arcs.which.n_directions
-    covariance = arcs.shape.covariance()[n:, n:] * noise**2
+    covariance = arcs.covariance[n:, n:] * noise**2
     root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(covariance)))
     white = np.linalg.solve(root, arcs.shape.angle[n:])
     return float(-0.5 * white @ white - np.sum(np.log(np.diag(root))))

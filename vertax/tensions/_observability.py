@@ -32,8 +32,9 @@ _VERTICES = (0.01, 50.0)
 _SHORTEST = 0.25
 # Effect of the half-angle and the two bends on the directions at the two ends, and on the angle of the arc.
 _ENDS = np.array([[-1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, 0.0, 0.0]])
-# Largest number of junctions of a tissue that is a single patch, and number of patches of larger ones.
-_PATCH, _PATCHES = 320, 4
+# Largest number of junctions of a tissue that is a single patch; that of the patches of a larger one, and their
+# number.
+_WHOLE, _PATCH, _PATCHES = 320, 120, 4
 
 
 class Observability(NamedTuple):
@@ -91,7 +92,9 @@ class Observability(NamedTuple):
         blocks[self.edge, self.slot, self.slot] += self.model_deviations(errors) ** 2
         blocks = np.linalg.inv(blocks)
         pair = here[:, :, None] & here[:, None, :]
-        row, column = (np.broadcast_to(x, pair.shape)[pair] for x in (angle[:, :, None], angle[:, None]))
+        row, column = (
+            np.broadcast_to(x, pair.shape)[pair] for x in (angle[:, :, None], angle[:, None])
+        )
         return csr_array(coo_array((blocks[pair], (row, column)), shape=2 * (len(self.edge),)))
 
     def covariance(self) -> Float[np.ndarray, "angles angles"]:
@@ -99,7 +102,9 @@ class Observability(NamedTuple):
         dense = self.slopes.toarray()
         covariance = dense @ SparseNormal(self.vertices, self.place[0]).covariances(dense.T)
         same = self.edge[:, None] == self.edge
-        return covariance + np.where(same, self.own[self.edge[:, None], self.slot[:, None], self.slot], 0)
+        return covariance + np.where(
+            same, self.own[self.edge[:, None], self.slot[:, None], self.slot], 0
+        )
 
 
 def observability(
@@ -149,7 +154,10 @@ def observability(
     ends = fitted.ends[which.edges]
     middle = fitted.place[ends[:, 0]] + 0.5 * fitted.chord[which.edges]
     count = np.maximum(np.bincount(which.sides.ravel(), minlength=len(which.cells)), 1)
-    cells = [np.bincount(which.sides.ravel(), np.repeat(x, 2), len(which.cells)) / count for x in middle.T]
+    cells = [
+        np.bincount(which.sides.ravel(), np.repeat(x, 2), len(which.cells)) / count
+        for x in middle.T
+    ]
     at_vertices = np.repeat(fitted.place[corners], 2, axis=0)
     place = at_vertices, fitted.place[which.junctions], middle, np.stack(cells, axis=1)
 
@@ -188,7 +196,8 @@ def observability(
 
 def patches(fitted: ObservedGeometry, which: Equations) -> list[ObservedGeometry]:
     """The geometry with the balance of the junctions in a few compact parts of a large tissue only."""
-    parts = bisected(fitted.place[which.junctions], _PATCH)
+    place = fitted.place[which.junctions]
+    parts = bisected(place, _PATCH if len(place) > _WHOLE else _WHOLE)
     chosen = np.unique(np.linspace(0, len(parts) - 1, _PATCHES).round().astype(int))
     inner = []
     for number in chosen:

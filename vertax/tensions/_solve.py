@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -132,6 +133,11 @@ class System:
         )
         self.first, self.n_rotations = first, n_junctions
 
+    @cached_property
+    def covariance(self) -> Float[np.ndarray, "angles angles"]:
+        """Covariance of the angles due to noise, a dense matrix, of a patch."""
+        return self.shape.covariance()
+
     def linearised(self, last: _Iterate) -> tuple[csr_array, csr_array]:
         """The matrix of the forces, and their slopes by the angles."""
         angle = self.shape.angle + last.change
@@ -247,7 +253,7 @@ class System:
         parts = Errors(
             junction=direction,
             arc=arc,
-            noise=slope @ (slope @ self.shape.covariance()).T,
+            noise=slope @ (slope @ self.covariance).T,
             tension=centred @ centred.T,
             region=region,
             pressure=push @ push.T,
@@ -323,9 +329,7 @@ def solve(system: System, errors: Errors, *, rounds: int = 8) -> Balance:
     )
 
 
-def _regions(
-    which: Equations, place: Float[np.ndarray, "edges 2"]
-) -> tuple[csr_array, float]:
+def _regions(which: Equations, place: Float[np.ndarray, "edges 2"]) -> tuple[csr_array, float]:
     """The root of the precision of tensions that are similar in regions, and its factor for a mean variance
     of 1."""
     n = len(which.edges)

@@ -52,7 +52,9 @@ class SparseNormal:
         """
         rows = csr_array(rows)
         if rows.shape[1] <= _EXACT:
-            return np.asarray(rows.multiply(self._factor.solve(rows.T.toarray()).T).sum(axis=1)).ravel()
+            return np.asarray(
+                rows.multiply(self._factor.solve(rows.T.toarray()).T).sum(axis=1)
+            ).ravel()
         samples = self._samples()
         pushed = self.precision @ samples
         counts = np.maximum(np.diff(rows.indptr), 1)
