@@ -7,13 +7,14 @@ import pytest
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import nnls
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
+
 from vertax.inference import label_image
 from vertax.initialise import from_labels
 from vertax.io import read_surface_evolver
 from vertax.tensions._balance import equations, force_slopes, forces
+from vertax.tensions._curves import Points
 from vertax.tensions._edges import fit, solution
 from vertax.tensions._infer_tensions import _of_foam, _of_mask
-from vertax.tensions._curves import Points
 from vertax.tensions._observed_geometry import observed_geometry
 from vertax.tensions._solve import HIDDEN, System, solve
 from vertax.tensions._sparse_normal import SparseNormal

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
-
 # The search of the optimum ends at derivatives, or a decrease, below these; largest step of a logarithm.
 _SLOPE, _DECREASE, _STEP = 0.1, 1e-3, 1.5
 
@@ -47,9 +46,10 @@ class Patch(NamedTuple):
 #     r ~ N(0, K),   K = U + Σ_k s_k² V_k,   -2 ln p = rᵀ K⁻¹ r + ln det K,
 #
 # where V_k are the covariances of the forces, for noise, errors of the model and priors of standard deviation
-# 1, and U is that of unknown forces. Derivatives for ln s_k are 2 s_k² [tr(K⁻¹ V_k) - rᵀ K⁻¹ V_k K⁻¹ r], and the
-# second ones, in the mean of observed and expected ones, 4 s_j² s_k² rᵀ K⁻¹ V_j K⁻¹ V_k K⁻¹ r (average information:
-# Gilmour, Thompson & Cullis 1995, doi:10.2307/2533274). Parts of a large tissue count as independent.
+# 1, and U is that of unknown forces. Derivatives for ln s_k are 2 s_k² [tr(K⁻¹ V_k) - rᵀ K⁻¹ V_k K⁻¹ r], and
+# the second ones, in the mean of observed and expected ones, 4 s_j² s_k² rᵀ K⁻¹ V_j K⁻¹ V_k K⁻¹ r (average
+# information: Gilmour, Thompson & Cullis 1995, doi:10.2307/2533274). Parts of a large tissue count as
+# independent.
 def most_evident(
     patches: list[Patch], guess: Errors, bounds: dict[str, tuple[float, float]], *, steps: int
 ) -> tuple[Errors, float]:

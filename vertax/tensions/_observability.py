@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import block_array, bsr_array, coo_array, csc_array, csr_array
+from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
 
-from vertax.tensions._balance import Equations, angle_slopes, angles, equations, pulls
+from vertax.tensions._balance import Equations, angle_slopes, angles, pulls
 from vertax.tensions._curves import Fitted
 from vertax.tensions._errors import Errors
 from vertax.tensions._observed_geometry import ObservedGeometry
@@ -17,8 +17,8 @@ from vertax.tensions._sparse_normal import SparseNormal, bisected
 # An edge is loose if the standard deviation of its direction, in radians, is larger than the first, or if it
 # is shorter than the second times the noise, or the third times the size of a cell.
 _LOOSE, _SHORT, _TINY = 0.2, 8.0, 0.02
-# Smallest and largest standard deviations: of directions and arcs in radians, of pressures, and of tensions in
-# mean tensions. Tensions that are not negative and uniform about a mean of 1 have 0.58. Of arcs in noise, the
+# Smallest and largest standard deviations: of directions and arcs in radians, of pressures, and of tensions
+# in mean tensions. Tensions that are not negative and uniform about a mean of 1 have 0.58. Of arcs in noise, the
 # evidence underestimates the independent part.
 _JUNCTIONS, _ARCS, _PRESSURES = (5e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
 _STRAIGHT_JUNCTIONS = (1e-3, 1.5)
@@ -32,8 +32,8 @@ _VERTICES = (0.01, 50.0)
 _SHORTEST = 0.25
 # Effect of the half-angle and the two bends on the directions at the two ends, and on the angle of the arc.
 _ENDS = np.array([[-1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, 0.0, 0.0]])
-# Largest number of junctions of a tissue that is a single patch; that of the patches of a larger one, and their
-# number.
+# Largest number of junctions of a tissue that is a single patch; that of the patches of a larger one, and
+# the number of these.
 _WHOLE, _PATCH, _PATCHES = 320, 120, 4
 
 

@@ -95,8 +95,9 @@ class _Iterate(NamedTuple):
 #
 #     J d = J d₀ - A x - B f,      d = J⁺ (J d₀ - A x - B f) + N ω,
 #
-# with one rotation ω for each junction, which changes no force. The coordinates v of vertices have the inverse
-# covariance V / ν², and angles that follow them, d = M v + e, the covariance Σ of e: a block for each edge. So
+# with one rotation ω for each junction, which changes no force. The coordinates v of vertices have the
+# inverse covariance V / ν², and angles that follow them, d = M v + e, the covariance Σ of e: a block for each
+# edge. So
 #
 #     -2 ln p = (d - M v)ᵀ Σ⁻¹ (d - M v) + vᵀ V v / ν² + |f|² / 10² + prior of x
 #
