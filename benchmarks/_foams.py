@@ -40,11 +40,10 @@ def grouped(tissue: vx.Tissue, spread: float, seed: int, patches: bool) -> np.nd
 
 
 def restless(tissue: vx.Tissue, seed: int) -> np.ndarray:
-    """Tensions from 0.1 to 2.5 before they are scaled to mean 1: log-uniform, or of three classes."""
+    """Tensions of five classes, a few of them weak, before they are scaled to mean 1."""
     random = np.random.default_rng(seed)
-    tension = np.exp(random.uniform(np.log(0.1), np.log(2.5), tissue.n_edges))
-    if seed % 2:
-        tension = random.choice([0.1, 1.0, 2.0], tissue.n_edges)
+    classes, weights = [0.1, 0.67, 0.93, 1.46, 1.62], [0.06, 0.22, 0.24, 0.24, 0.24]
+    tension = random.choice(classes, tissue.n_edges, p=weights)
     return tension / tension.mean()
 
 

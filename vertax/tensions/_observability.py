@@ -12,14 +12,14 @@ from vertax.tensions._balance import Equations, angle_slopes, angles, pulls
 from vertax.tensions._curves import Fitted
 from vertax.tensions._errors import Errors
 from vertax.tensions._observed_geometry import ObservedGeometry
-from vertax.tensions._sparse_normal import SparseNormal, bisected
+from vertax.tensions._sparse_normal import SparseNormal, spread_parts
 
 # An edge is loose if the standard deviation of its direction, in radians, is larger than the first, or if it
 # is shorter than the second times the noise, or the third times the size of a cell.
 _LOOSE, _SHORT, _TINY = 0.2, 8.0, 0.02
 # Smallest and largest standard deviations: of directions and arcs in radians, of pressures, and of tensions
-# in mean tensions. Tensions that are not negative and uniform about a mean of 1 have 0.58. Of arcs in noise, the
-# evidence underestimates the independent part.
+# in mean tensions. Tensions that are not negative and uniform about a mean of 1 have 0.58. Of arcs in noise,
+# the evidence underestimates the independent part.
 _JUNCTIONS, _ARCS, _PRESSURES = (5e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
 _STRAIGHT_JUNCTIONS = (1e-3, 1.5)
 _TENSIONS, _ARC_TENSIONS = (0.03, 0.6), (0.3, 0.6)
@@ -32,9 +32,8 @@ _VERTICES = (0.01, 50.0)
 _SHORTEST = 0.25
 # Effect of the half-angle and the two bends on the directions at the two ends, and on the angle of the arc.
 _ENDS = np.array([[-1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, 0.0, 0.0]])
-# Largest number of junctions of a tissue that is a single patch; that of the patches of a larger one, and
-# the number of these.
-_WHOLE, _PATCH, _PATCHES = 320, 120, 4
+# Largest number of junctions of a tissue that is a single patch, and that of the patches of a larger one.
+_WHOLE, _PATCH = 320, 120
 
 
 class Observability(NamedTuple):
@@ -196,12 +195,9 @@ def observability(
 
 def patches(fitted: ObservedGeometry, which: Equations) -> list[ObservedGeometry]:
     """The geometry with the balance of the junctions in a few compact parts of a large tissue only."""
-    place = fitted.place[which.junctions]
-    parts = bisected(place, _PATCH if len(place) > _WHOLE else _WHOLE)
-    chosen = np.unique(np.linspace(0, len(parts) - 1, _PATCHES).round().astype(int))
     inner = []
-    for number in chosen:
+    for part in spread_parts(fitted.place[which.junctions], _WHOLE, _PATCH):
         mine = np.zeros(fitted.n_vertices, bool)
-        mine[which.junctions[parts[number]]] = True
+        mine[which.junctions[part]] = True
         inner.append(mine)
     return [fitted._replace(inner=mine) for mine in inner]

@@ -9,6 +9,8 @@ from scipy.sparse.linalg import splu
 
 # Largest number of unknowns whose variances are computed without samples, and of those of a window.
 _EXACT, _WINDOW = 2500, 800
+# Number of parts that stand for a large system.
+_PARTS = 4
 # Number of samples for the variances of larger systems.
 _SAMPLES = 64
 
@@ -108,3 +110,14 @@ def bisected(place: Float[np.ndarray, "points 2"], size: int) -> list[Int[np.nda
         order = part[np.argsort(place[part, axis], kind="stable")]
         waiting += [order[len(order) // 2 :], order[: len(order) // 2]]
     return parts
+
+
+def spread_parts(
+    place: Float[np.ndarray, "points 2"], whole: int, size: int
+) -> list[Int[np.ndarray, " some"]]:
+    """All points, or, of more than `whole`, a few parts of at most `size` points that are far apart."""
+    if len(place) <= whole:
+        return [np.arange(len(place))]
+    parts = bisected(place, size)
+    chosen = np.unique(np.linspace(0, len(parts) - 1, _PARTS).round().astype(int))
+    return [parts[number] for number in chosen]
