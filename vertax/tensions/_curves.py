@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -292,7 +291,7 @@ def _most_evident(
     total = float(np.sum(weight / curves.factor[points.edge[some]]))
     constant = float(weight @ distance**2)
 
-    def loss(logs: Sequence[float]) -> float:
+    def loss(logs: np.ndarray | tuple[float, float]) -> float:
         log_noise, log_bend = logs
         variance = np.exp(2 * log_noise)
         prior = np.where(bends, np.exp(-2 * log_bend), held)

@@ -28,7 +28,15 @@ def vertices_only(geometry: ObservedGeometry, noise: float) -> Fitted:
     """The vertices as they are, with independent noise, of straight edges without points."""
     n = geometry.n_geometry
     precision = np.where(np.arange(n) < 2 * geometry.n_vertices, 1.0, 1e12)
-    none = np.zeros(0), csc_array((n, 0)), np.ones(len(geometry.angle)), 0.0, 0.0, noise
+    none = (
+        np.zeros(0),
+        csc_array((n, 0)),
+        np.zeros(0),
+        np.ones(len(geometry.angle)),
+        0.0,
+        0.0,
+        noise,
+    )
     return Fitted(np.zeros(n), csc_array(diags_array(precision)), noise, *none, crisp=True)
 
 
