@@ -130,6 +130,7 @@ def outcome(
         pixel_size=pixel_size,
         four_fold=four_fold,
         mask_report=report,
+        short=spread(*edges, balance.loose, False),
         outline_errors=_outline_errors(tissue, points, curves.change)
         / pixel_length(pixel_size or 1.0),
         resampled_deviations=None if resampled is None else spread(*edges, resampled, nan),
