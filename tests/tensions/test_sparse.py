@@ -11,6 +11,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 from vertax.inference import label_image
 from vertax.initialise import from_labels
 from vertax.io import read_surface_evolver
+from vertax.tensions import _infer_tensions, infer_tensions
 from vertax.tensions._balance import equations, force_slopes, forces
 from vertax.tensions._curves import Points
 from vertax.tensions._edges import fit, solution
@@ -118,3 +119,16 @@ def test_variances_of_windows_are_those_of_the_inverse():
     variances = SparseNormal(precision, place.reshape(-1, 2).astype(float)).variances(rows)
     exact = np.diag(rows @ np.linalg.inv(precision.toarray()) @ rows.T.toarray())
     assert np.sqrt(np.mean((variances / exact - 1) ** 2)) < 0.02
+
+
+def test_a_mask_too_large_for_the_memory_is_refused(monkeypatch):
+    monkeypatch.setattr("vertax._base.available_memory.available_memory", lambda: 10**8)
+    with pytest.raises(MemoryError, match=r"takes about 0\.4 GB and 0\.1 GB are available"):
+        infer_tensions(np.kron(np.arange(1, 10).reshape(3, 3), np.ones((20, 20), int)))
+
+
+def test_phases_are_named_on_a_terminal(monkeypatch, foam):
+    names = []
+    monkeypatch.setattr(_infer_tensions, "start_phase", names.append)
+    infer_tensions(label_image(foam[0], 200))
+    assert names == ["reading", "outlines", "geometry", "balance", "errors"]
