@@ -106,14 +106,16 @@ def read_courses(
         if crisp or apart is not None:
             break
     assert first is not None
-    off, bending, factor = noise or first.noise, start, None
+    off, bending, factor, change = noise or first.noise, start, None, None
     if start == _BENDING:
-        curves = fit(apart=alike, bending=bending, noise=off)
+        curves = fit(apart=alike, bending=bending, noise=off, change=first.change)
         for _ in range(_PASSES):
             factor = _reliability(curves, points, off)
-            curves = fit(apart=alike, bending=bending, noise=off, factor=factor)
+            options = {"factor": factor, "change": curves.change}
+            curves = fit(apart=alike, bending=bending, noise=off, **options)
             off, bending = _most_evident(tissue, points, curves, grain, noise)
-    curves = fit(apart=alike, bending=bending, noise=off, factor=factor)
+        change = curves.change
+    curves = fit(apart=alike, bending=bending, noise=off, factor=factor, change=change)
     if start != _BENDING:
         off = noise or curves.noise
     return curves._replace(noise=off, crisp=crisp)
@@ -128,6 +130,7 @@ def fit_curves(
     bending: float,
     noise: float,
     factor: Float[np.ndarray, " edges"] | None = None,
+    change: Float[np.ndarray, " geometry"] | None = None,
     rounds: int = 6,
 ) -> Fitted:
     r"""Vertices, angles and bends of the curves that fit the points best (weighted least squares).
@@ -150,6 +153,7 @@ def fit_curves(
     - `bending`: prior standard deviation of the bends.
     - `noise`: standard deviation of the points, relative to which the prior is weighted.
     - `factor`: factors of the weights of edges.
+    - `change`: initial change of the geometry.
     - `rounds`: largest number of Gauss–Newton steps.
 
     **Returns:** the [`Fitted`][vertax.tensions._curves.Fitted] curves.
@@ -171,7 +175,7 @@ def fit_curves(
         (2 * start, 2 * start + 1, 2 * end, 2 * end + 1, angles + edge, *bent), axis=1
     )
     rows = np.repeat(np.arange(len(edge)), columns.shape[1])
-    change = np.zeros(n)
+    change = np.zeros(n) if change is None else change
     rest = np.zeros(len(edge))
     normal, weighted = csc_array(diags_array(held)), csc_array((n, len(edge)))
     for _ in range(rounds):
