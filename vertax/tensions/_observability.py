@@ -33,7 +33,7 @@ _SHORTEST = 0.25
 # Effect of the half-angle and the two bends on the directions at the two ends, and on the angle of the arc.
 _ENDS = np.array([[-1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, 0.0, 0.0]])
 # Largest number of junctions of a tissue that is a single patch, and that of the patches of a larger one.
-_WHOLE, _PATCH = 320, 120
+_WHOLE, _PATCH = 320, 160
 
 
 class Observability(NamedTuple):
