@@ -8,6 +8,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import nnls
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 
+from vertax._base.sparse_normal import SparseNormal
 from vertax.inference import label_image
 from vertax.initialise import from_labels
 from vertax.io import read_surface_evolver
@@ -18,7 +19,6 @@ from vertax.tensions._edges import fit, solution
 from vertax.tensions._infer_tensions import _of_foam, _of_mask
 from vertax.tensions._observed_geometry import observed_geometry
 from vertax.tensions._solve import HIDDEN, System, solve
-from vertax.tensions._sparse_normal import SparseNormal
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "surface_evolver"
 needs_data = pytest.mark.skipif(
@@ -40,7 +40,7 @@ def dense(system, errors, rounds):
     mean = np.append(np.full(n, 1 / n), np.zeros(cells))
     model = shape.model_deviations(errors._replace(arc=HIDDEN * errors.arc))
     spread = errors.noise**2 * shape.covariance() + np.diag(model**2)
-    x, change, inverse = expected, np.zeros(len(shape.angle)), None
+    x, change, inverse = expected, np.zeros(len(shape.angle)), prior
     for _ in range(rounds):
         matrix = forces(shape.angle + change, which, shape.loose).toarray()
         slope = force_slopes(shape.angle + change, which, np.maximum(x[:n], 0.2)).toarray()
@@ -110,7 +110,9 @@ def test_the_sparse_solution_is_the_dense_one(name, pixels, straight, prior):
 
 def test_variances_of_windows_are_those_of_the_inverse():
     n = 60
-    line = diags_array([-np.ones(n - 1), np.full(n, 2.0), -np.ones(n - 1)], offsets=[-1, 0, 1])
+    line = diags_array(
+        [-np.ones(n - 1), np.full(n, 2.0), -np.ones(n - 1)], offsets=np.array([-1, 0, 1])  # pyright: ignore[reportArgumentType]
+    )
     precision = csc_array(
         kron(line, eye_array(n)) + kron(eye_array(n), line) + 0.05 * eye_array(n**2)
     )

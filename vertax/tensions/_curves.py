@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import minimize, minimize_scalar
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
+from vertax._base.sparse_normal import factorised, spread_parts
 from vertax.tensions._observed_geometry import ObservedGeometry
-from vertax.tensions._sparse_normal import factorised, spread_parts
 
 # Prior standard deviations, for parameters that no point determines, such as the angle of an edge of two
 # pixels: of a vertex in grains (its initial position is the corner of a pixel) and of an angle in radians.
@@ -175,12 +175,12 @@ def fit_curves(
         (2 * start, 2 * start + 1, 2 * end, 2 * end + 1, angles + edge, *bent), axis=1
     )
     rows = np.repeat(np.arange(len(edge)), columns.shape[1])
-    change = np.zeros(n) if change is None else change
+    moved = np.zeros(n) if change is None else change
     rest = np.zeros(len(edge))
     normal, weighted = csc_array(diags_array(held)), csc_array((n, len(edge)))
     for _ in range(rounds):
-        current = tissue.moved(change)
-        p = away - change[:angles].reshape(-1, 2)[start]
+        current = tissue.moved(moved)
+        p = away - moved[:angles].reshape(-1, 2)[start]
         c, angle = current.chord[edge], current.angle[edge]
         chord = np.maximum(np.linalg.norm(c, axis=1), 0.1 * grain)
         q, sine, cosine = p - c, -np.sin(angle), np.cos(angle)
@@ -197,15 +197,15 @@ def fit_curves(
         )
         weighted = jacobian.T * weight
         normal = csc_array(weighted @ jacobian + diags_array(held))
-        step = factorised(normal).solve(weighted @ rest + held * change)
-        change = change - step
-        change[angles:bends] = np.clip(tissue.angle + change[angles:bends], -3, 3) - tissue.angle
+        step = factorised(normal).solve(weighted @ rest + held * moved)
+        moved = moved - step
+        moved[angles:bends] = np.clip(tissue.angle + moved[angles:bends], -3, 3) - tissue.angle
         if np.max(np.abs(step[angles:])) < 1e-4:
             break
     spread = float(np.sqrt(np.sum(weight * rest**2) / max(np.sum(weight), 1e-300)))
     spread = max(spread, 1e-12 * tissue.size)
     parts = rest, csc_array(weighted), weight, factor, apart, bending, noise
-    return Fitted(change, normal, spread, *parts)
+    return Fitted(moved, normal, spread, *parts)
 
 
 def arc_distances(
@@ -310,16 +310,16 @@ def _most_evident(
     if known is None:
         options = {"xatol": 0.03}
         one = lambda log: loss((log, limits[0]))
-        optimum = minimize_scalar(one, bounds=around, method="bounded", options=options)
+        optimum: Any = minimize_scalar(one, bounds=around, method="bounded", options=options)
         straight = float(optimum.x), limits[0]
         corners = [bent, (bent[0] - 0.7, bent[1]), (bent[0], bent[1] + 0.7)]
         options = {"xatol": 0.03, "fatol": 0.03, "initial_simplex": corners}
         bounds = [around, tuple(limits)]
-        optimum = minimize(loss, bent, method="Nelder-Mead", bounds=bounds, options=options)
+        optimum: Any = minimize(loss, bent, method="Nelder-Mead", bounds=bounds, options=options)
         bent = tuple(optimum.x)
     else:
         one = lambda log: loss((noise, log))
-        optimum = minimize_scalar(one, bounds=tuple(limits), method="bounded")
+        optimum: Any = minimize_scalar(one, bounds=tuple(limits), method="bounded")
         bent = noise, float(optimum.x)
     best = min(straight, bent, key=loss)
     return float(np.exp(best[0])), float(np.exp(best[1]))

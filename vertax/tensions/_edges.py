@@ -96,7 +96,7 @@ def solution(
         systems = [system(part, flat=flat) for part in parts]
         errors, evidence = choose_errors(systems, prior)
         for each in arcs:
-            evidence += _density_of_arcs(each, errors.noise)
+            evidence += _density_of_arcs(each, float(errors.noise))
         if not flat:
             arcs, evidence = systems, evidence + sum(s.which.n_arcs for s in systems) * np.log(2)
         if best is None or evidence > best[0]:

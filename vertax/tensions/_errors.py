@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs  # pyright: ignore[reportAttributeAccessIssue]
 
 # The search of the optimum ends at derivatives, or a decrease, below these; largest step of a logarithm.
 _SLOPE, _DECREASE, _STEP = 0.1, 1e-3, 1.5

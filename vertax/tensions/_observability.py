@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
 
+from vertax._base.sparse_normal import SparseNormal, spread_parts
 from vertax.tensions._balance import Equations, angle_slopes, angles, pulls
 from vertax.tensions._curves import Fitted
 from vertax.tensions._errors import Errors
 from vertax.tensions._observed_geometry import ObservedGeometry
-from vertax.tensions._sparse_normal import SparseNormal, spread_parts
 
 # An edge is loose if the standard deviation of its direction, in radians, is larger than the first, or if it
 # is shorter than the second times the noise, or the third times the size of a cell.
@@ -132,7 +132,7 @@ def observability(
     bends = first + len(fitted.angle) + 2 * which.edges
     inner = np.stack([first + which.edges, bends, bends + 1], axis=1).ravel()
     # Half-angles and bends of an edge depend on each other and on its ends only.
-    precision = csr_array(curves.precision) / curves.noise**2
+    precision: Any = csr_array(curves.precision) / curves.noise**2
     of_edges = precision[inner]
     local = coo_array(of_edges[:, inner])
     blocks = np.zeros((n, 3, 3))
@@ -142,7 +142,7 @@ def observability(
     indices = np.arange(n), np.arange(n + 1)
     follow = -csr_array(bsr_array((blocks, *indices)) @ through)
     vertices = csc_array(precision[coordinates][:, coordinates] + through.T @ follow)
-    slopes = csr_array(angle_slopes(fitted, which))
+    slopes: Any = angle_slopes(fitted, which)
     slopes = csr_array(slopes[:, coordinates] + slopes[:, inner] @ follow)
     forward = fitted.forward[which.junctions].ravel()
     arcs = np.arange(which.n_arcs)

@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csc_array
 
+from vertax._base.sparse_normal import factorised
 from vertax.tensions._balance import angle_slopes
 from vertax.tensions._curves import Fitted, Points
 from vertax.tensions._observed_geometry import ObservedGeometry
 from vertax.tensions._outcome import relative
 from vertax.tensions._solve import HIDDEN, Balance, System, solve
-from vertax.tensions._sparse_normal import factorised
 
 
 # The truth of the bootstrap are the angles with which all forces balance at the inferred tensions. Added are

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import block_diag, coo_array, csc_array, csr_array, diags_array, eye_array, hstack
 
+from vertax._base.sparse_normal import SparseNormal
 from vertax.tensions._balance import Equations, force_slopes, forces
 from vertax.tensions._errors import Errors, Patch, most_evident
 from vertax.tensions._observability import Observability
-from vertax.tensions._sparse_normal import SparseNormal
 
 # Smallest tension in the covariance of the forces, and standard deviation of the unknown force of an edge
 # without a direction, in mean tensions.
@@ -154,7 +154,7 @@ class System:
         matrix, slope = self.linearised(last)
         inverse, rotation = self._inverse(slope)
         offset = inverse @ (slope @ last.change)
-        n = shape.slopes.shape[1]
+        n = len(shape.place[0])
         empty = csr_array((len(offset), self.n_edges if self.regional else 0))
         # Changes of the angles by all unknowns but the vertices.
         changes = hstack([rotation, -inverse @ shape.loose_forces, -inverse @ matrix, empty])
@@ -164,7 +164,7 @@ class System:
         prior, expected = self._prior(errors)
         normal = csc_array(weighted @ rows + prior)
         right = expected - weighted @ offset
-        zero = last.zero
+        zero, z = last.zero, right
         for _ in range(_CONSTRAINTS):
             # Tensions that would be negative are held at 0 (active set, a semi-smooth Newton method).
             stiff = np.zeros(len(right))
@@ -190,7 +190,7 @@ class System:
 
     def _inverse(self, slope: csr_array) -> tuple[csr_array, csr_array]:
         """Changes of angles that change the forces by 1, the smallest; and those that change none."""
-        n, n_angles = self.n_rotations, slope.shape[1]
+        n, n_angles = self.n_rotations, len(self.shape.angle)
         entries = coo_array(slope[: 2 * n])
         block = np.zeros((n, 2, 3))
         block[entries.row // 2, entries.row % 2, entries.col % 3] = entries.data
@@ -208,7 +208,7 @@ class System:
         column = (2 * junction[:, None] + [0, 1]).ravel()
         column = np.concatenate([column, 2 * n + arcs])
         values = np.concatenate([inverse.ravel(), 1 / arc_slope])
-        shape = (n_angles, slope.shape[0])
+        shape = (n_angles, self.which.n_rows)
         return (
             csr_array(coo_array((values, (row, column)), shape=shape)),
             csr_array(coo_array((free.ravel(), (angle, junction)), shape=(n_angles, n))),
@@ -230,12 +230,12 @@ class System:
             # Tensions are 1, plus an independent part, plus one that is similar in regions.
             smooth = self.root.T @ self.root / (errors.region * self.scale) ** 2
             matrix = block_diag([matrix, smooth + weight * eye_array(n)], format="csr")
-            first = matrix.shape[0] - n
+            first = len(self.place) - n
             each = np.arange(n)
             row, column = first + each, self.tensions.start + each
             cross = coo_array((np.full(n, -weight), (row, column)), shape=matrix.shape)
             matrix = matrix + cross + cross.T
-        right = np.zeros(matrix.shape[0])
+        right = np.zeros(len(self.place))
         right[self.tensions] = weight
         if self.regional:
             right[-n:] = -weight

@@ -53,19 +53,19 @@ class SparseNormal:
         **Returns:** the variances.
         """
         rows = csr_array(rows)
-        if rows.shape[1] <= _EXACT:
+        if len(self.place) <= _EXACT:
             return np.asarray(
                 rows.multiply(self._factor.solve(rows.T.toarray()).T).sum(axis=1)
             ).ravel()
         samples = self._samples()
         pushed = self.precision @ samples
         counts = np.maximum(np.diff(rows.indptr), 1)
-        block = np.zeros(rows.shape[1], int)
+        block = np.zeros(len(self.place), int)
         parts = bisected(self.place, _WINDOW)
         for number, part in enumerate(parts):
             block[part] = number
         of_row = block[rows.indices[np.minimum(rows.indptr[:-1], rows.nnz - 1)]]
-        variance = np.zeros(rows.shape[0])
+        variance = np.zeros(len(counts))
         pattern = csr_array(self.precision)
         for number, part in enumerate(parts):
             mine = np.flatnonzero((of_row == number) & (counts > 0))
@@ -83,7 +83,7 @@ class SparseNormal:
 
     def _samples(self) -> Float[np.ndarray, "unknowns samples"]:
         # With Q = Pᵀ L D Lᵀ P, Q x = Pᵀ L D^(1/2) z for a standard normal z.
-        z = np.random.default_rng(0).normal(size=(self.precision.shape[0], _SAMPLES))
+        z = np.random.default_rng(0).normal(size=(len(self.place), _SAMPLES))
         lower, scale = self._factor.L, np.sqrt(np.abs(self._factor.U.diagonal()))
         return self._factor.solve((lower @ (scale[:, None] * z))[self._factor.perm_r])
 
