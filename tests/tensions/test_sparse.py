@@ -1,6 +1,7 @@
 """The sparse solution of the balance of forces, compared with a dense one."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,8 +111,10 @@ def test_the_sparse_solution_is_the_dense_one(name, pixels, straight, prior):
 
 def test_variances_of_windows_are_those_of_the_inverse():
     n = 60
+    offsets: Any = [-1, 0, 1]
     line = diags_array(
-        [-np.ones(n - 1), np.full(n, 2.0), -np.ones(n - 1)], offsets=np.array([-1, 0, 1])  # pyright: ignore[reportArgumentType]
+        [-np.ones(n - 1), np.full(n, 2.0), -np.ones(n - 1)],
+        offsets=np.array([-1, 0, 1]),  # pyright: ignore[reportArgumentType]
     )
     precision = csc_array(
         kron(line, eye_array(n)) + kron(eye_array(n), line) + 0.05 * eye_array(n**2)
