@@ -36,7 +36,7 @@ def label_image(n_cells: int, side: int, rng: np.random.Generator) -> np.ndarray
     return labels.reshape(side, side)
 
 
-# Run in a new process, whose peak memory is that of the inference.
+# Run in a new process: its peak memory is that of the inference.
 LARGE = """
 import resource, sys, time
 import numpy as np

@@ -1,7 +1,6 @@
 """The sparse solution of the balance of forces, compared with a dense one."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def available_memory() -> int:
-    """Bytes of memory that processes can still use; of the whole machine where the system does not tell."""
+    """Bytes that processes can still use; all of the machine where the system does not report them."""
     information = Path("/proc/meminfo")
     if information.exists():
         for line in information.read_text(encoding="ascii").splitlines():

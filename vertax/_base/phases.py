@@ -23,7 +23,7 @@ _thread = _Thread()
 def phases(number: int) -> Iterator[None]:
     """Show names of phases, of the given number, after 2 s: a context manager or a decorator.
 
-    Only on a terminal and in the main thread: several computations in threads have a bar of their own.
+    Only on a terminal and in the main thread: computations in several threads have another bar.
     """
     elsewhere = threading.current_thread() is not threading.main_thread()
     options = {"disable": True if elsewhere else None, "delay": _DELAY, "leave": False}

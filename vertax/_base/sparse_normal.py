@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-# Largest number of unknowns whose variances are computed without samples, and of those of a window.
+# Largest number of unknowns, of which the variances are computed without samples, and of those of a window.
 _EXACT, _WINDOW = 2500, 800
 # Number of parts that stand for a large system.
 _PARTS = 4
@@ -113,10 +113,10 @@ def bisected(place: Float[np.ndarray, "points 2"], size: int) -> list[Int[np.nda
 
 
 def spread_parts(
-    place: Float[np.ndarray, "points 2"], whole: int, size: int
+    place: Float[np.ndarray, "points 2"], complete: int, size: int
 ) -> list[Int[np.ndarray, " some"]]:
-    """All points, or, of more than `whole`, a few parts of at most `size` points that are far apart."""
-    if len(place) <= whole:
+    """All points, or, of more than `complete`, a few parts of at most `size` points that are far apart."""
+    if len(place) <= complete:
         return [np.arange(len(place))]
     parts = bisected(place, size)
     chosen = np.unique(np.linspace(0, len(parts) - 1, _PARTS).round().astype(int))

@@ -237,8 +237,8 @@ def _reliability(curves: Fitted, points: Points, noise: float) -> Float[np.ndarr
     for k in range(n):
         for j in range(n):
             blocks[:, k, j] = np.add.reduceat(weight * values[:, k] * values[:, j], first)
-    own = columns[first]
-    places = np.repeat(own, n, axis=1), np.tile(own, n)
+    block_columns = columns[first]
+    places = np.repeat(block_columns, n, axis=1), np.tile(block_columns, n)
     normal = csr_array(curves.precision)[places].toarray().reshape(blocks.shape)
     followed = np.trace(np.linalg.solve(normal, blocks), axis1=1, axis2=2)
     count = np.add.reduceat(weight / curves.factor[edge], first)
@@ -277,10 +277,10 @@ def _modes(
 #
 # Bends that follow the noise decrease the last term and increase the first determinant.
 def _most_evident(
-    tissue: ObservedGeometry, points: Points, curves: Fitted, grain: float, known: float | None
+    tissue: ObservedGeometry, points: Points, curves: Fitted, grain: float, given: float | None
 ) -> tuple[float, float]:
     """Noise of the points, and standard deviation of the bends, of the largest marginal likelihood in a few
-    parts of the tissue; for a `known` noise only that of the bends."""
+    parts of the tissue; for a `given` noise only that of the bends."""
     held = _prior(tissue, grain, 1.0)
     bends = np.arange(len(held)) >= len(held) - 2 * len(tissue.angle)
     edges = np.unique(points.edge)
@@ -304,17 +304,19 @@ def _most_evident(
         value += np.sum(np.log(np.abs(factor.U.diagonal())))
         return float(value + (constant - push @ factor.solve(push)) / variance)
 
-    noise = np.log(max(curves.noise, 1e-9 * grain) if known is None else known)
-    around, limits = (noise - 4.0, noise + 2.0), np.log(_BENDINGS)
+    noise = np.log(max(curves.noise, 1e-9 * grain) if given is None else given)
+    range_of_noise, limits = (noise - 4.0, noise + 2.0), np.log(_BENDINGS)
     straight, bent = (noise, limits[0]), (noise, np.log(max(curves.bending, 0.02)))
-    if known is None:
+    if given is None:
         options = {"xatol": 0.03}
         one = lambda log: loss((log, limits[0]))
-        optimum: Any = minimize_scalar(one, bounds=around, method="bounded", options=options)
+        optimum: Any = minimize_scalar(
+            one, bounds=range_of_noise, method="bounded", options=options
+        )
         straight = float(optimum.x), limits[0]
         corners = [bent, (bent[0] - 0.7, bent[1]), (bent[0], bent[1] + 0.7)]
         options = {"xatol": 0.03, "fatol": 0.03, "initial_simplex": corners}
-        bounds = [around, tuple(limits)]
+        bounds = [range_of_noise, tuple(limits)]
         optimum: Any = minimize(loss, bent, method="Nelder-Mead", bounds=bounds, options=options)
         bent = tuple(optimum.x)
     else:

@@ -28,7 +28,7 @@ def vertices_only(geometry: ObservedGeometry, noise: float) -> Fitted:
     """The vertices as they are, with independent noise, of straight edges without points."""
     n = geometry.n_geometry
     precision = np.where(np.arange(n) < 2 * geometry.n_vertices, 1.0, 1e12)
-    none = (
+    empty = (
         np.zeros(0),
         csc_array((n, 0)),
         np.zeros(0),
@@ -37,7 +37,7 @@ def vertices_only(geometry: ObservedGeometry, noise: float) -> Fitted:
         0.0,
         noise,
     )
-    return Fitted(np.zeros(n), csc_array(diags_array(precision)), noise, *none, crisp=True)
+    return Fitted(np.zeros(n), csc_array(diags_array(precision)), noise, *empty, crisp=True)
 
 
 def fit(
@@ -103,8 +103,8 @@ def solution(
             best = evidence, errors, flat, systems
     assert best is not None
     _, errors, flat, systems = best
-    whole = systems[0] if len(parts) == 1 else system(fitted, flat=flat)
-    return Solution(fitted, whole, solve(whole, errors))
+    tissue = systems[0] if len(parts) == 1 else system(fitted, flat=flat)
+    return Solution(fitted, tissue, solve(tissue, errors))
 
 
 def _density_of_arcs(arcs: System, noise: float) -> float:

@@ -53,7 +53,7 @@ class Observability(NamedTuple):
     """Inverse covariance of the coordinates of vertices, due to the noise of points."""
     slopes: csr_array
     """Slopes of the angles by these coordinates, if each edge follows its points."""
-    own: Float[np.ndarray, "edges 3 3"]
+    edge_covariance: Float[np.ndarray, "edges 3 3"]
     """Covariance of the angles of each edge at given vertices."""
     length: Float[np.ndarray, " edges"]
     """Lengths of chords, in cell diameters."""
@@ -81,16 +81,16 @@ class Observability(NamedTuple):
 
     def precision(self, errors: Errors) -> csr_array:
         """Inverse covariance of the angles at given vertices, due to noise and errors of the model."""
-        angle = np.full(self.own.shape[:2], -1)
+        angle = np.full(self.edge_covariance.shape[:2], -1)
         angle[self.edge, self.slot] = np.arange(len(self.edge))
-        blocks, here = errors.noise**2 * self.own, angle >= 0
-        blocks[~here] = 0
-        blocks.transpose(0, 2, 1)[~here] = 0
+        blocks, present = errors.noise**2 * self.edge_covariance, angle >= 0
+        blocks[~present] = 0
+        blocks.transpose(0, 2, 1)[~present] = 0
         each = np.arange(3)
-        blocks[:, each, each] += ~here
+        blocks[:, each, each] += ~present
         blocks[self.edge, self.slot, self.slot] += self.model_deviations(errors) ** 2
         blocks = np.linalg.inv(blocks)
-        pair = here[:, :, None] & here[:, None, :]
+        pair = present[:, :, None] & present[:, None, :]
         row, column = (
             np.broadcast_to(x, pair.shape)[pair] for x in (angle[:, :, None], angle[:, None])
         )
@@ -102,7 +102,7 @@ class Observability(NamedTuple):
         covariance = dense @ SparseNormal(self.vertices, self.place[0]).covariances(dense.T)
         same = self.edge[:, None] == self.edge
         return covariance + np.where(
-            same, self.own[self.edge[:, None], self.slot[:, None], self.slot], 0
+            same, self.edge_covariance[self.edge[:, None], self.slot[:, None], self.slot], 0
         )
 
 
@@ -148,7 +148,7 @@ def observability(
     arcs = np.arange(which.n_arcs)
     edge = np.concatenate([which.half_edge.ravel(), arcs])
     slot = np.concatenate([np.where(forward, 0, 1), np.full(len(arcs), 2)])
-    own = np.zeros((n, 3, 3)) if which.lever is not None else _ENDS @ blocks @ _ENDS.T
+    edge_covariance = np.zeros((n, 3, 3)) if which.lever is not None else _ENDS @ blocks @ _ENDS.T
 
     ends = fitted.ends[which.edges]
     middle = fitted.place[ends[:, 0]] + 0.5 * fitted.chord[which.edges]
@@ -162,7 +162,7 @@ def observability(
 
     directions = csr_array(slopes[: which.n_directions])
     each = SparseNormal(vertices, at_vertices).variances(directions)
-    each += own[edge, slot, slot][: which.n_directions]
+    each += edge_covariance[edge, slot, slot][: which.n_directions]
     variance = np.zeros(n)
     np.maximum.at(variance, which.half_edge.ravel(), each)
     least = max(_SHORT * curves.noise, _TINY * fitted.size)
@@ -183,7 +183,7 @@ def observability(
         slot=slot,
         vertices=vertices,
         slopes=slopes,
-        own=own,
+        edge_covariance=edge_covariance,
         length=which.chord / fitted.size,
         loose=loose,
         loose_forces=pulls(fitted, which, loose),

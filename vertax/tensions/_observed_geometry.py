@@ -30,7 +30,7 @@ class ObservedGeometry(NamedTuple):
     """Angles by which the tangents of the curve are turned from those of its arc: symmetric and antisymmetric
     part of its two ends."""
     place: Float[np.ndarray, "vertices 2"]
-    """Positions of the vertices in the tissue, which tell neighbours from distant ones; not moved."""
+    """Positions of the vertices in the tissue, which distinguish neighbours from distant ones; not moved."""
     n_cells: int
     inner: Bool[np.ndarray, " vertices"]
     """Vertices where three cells meet and forces balance."""
