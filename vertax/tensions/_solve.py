@@ -321,7 +321,7 @@ def solve(system: System, errors: Errors, *, rounds: int = 12) -> Balance:
         new = system.step(last, errors)
         moved = float(np.quantile(np.abs(new.x - last.x)[:n], 0.99))
         # Half steps where full ones go back and forth.
-        part = 0.5 if attempt > 1 and moved > 0.5 * before else 1.0
+        part = 0.5 if attempt > 3 and moved > 0.5 * before else 1.0
         x, change = (
             old + part * (to - old) for old, to in ((last.x, new.x), (last.change, new.change))
         )
