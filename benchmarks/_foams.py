@@ -39,6 +39,14 @@ def grouped(tissue: vx.Tissue, spread: float, seed: int, patches: bool) -> np.nd
     return tension / tension.mean()
 
 
+def restless(tissue: vx.Tissue, seed: int) -> np.ndarray:
+    """Tensions of five classes, a few of them weak, before they are scaled to mean 1."""
+    random = np.random.default_rng(seed)
+    classes, weights = [0.1, 0.67, 0.93, 1.46, 1.62], [0.06, 0.22, 0.24, 0.24, 0.24]
+    tension = random.choice(classes, tissue.n_edges, p=weights)
+    return tension / tension.mean()
+
+
 def furrow(tissue: vx.Tissue, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Tensions that are high along a line, and areas, of a cluster that bends strongly."""
     random = np.random.default_rng(seed)
@@ -84,7 +92,11 @@ def voronoi(n_cells: int, seed: int, noise: float = 0.0) -> tuple[vx.Tissue, np.
 
 
 def write_evolver(
-    path: Path, tissue: vx.Tissue, tension: np.ndarray, areas: np.ndarray | None = None
+    path: Path,
+    tissue: vx.Tissue,
+    tension: np.ndarray,
+    areas: np.ndarray | None = None,
+    pieces: int = PIECES,
 ) -> None:
     """Write a tissue of arcs as a file of Surface Evolver, each edge a chain of straight pieces.
 
@@ -93,13 +105,13 @@ def write_evolver(
     m, n = tissue.topology, tissue.n_vertices
     cell, edge, forward, twin = (np.asarray(x) for x in (m.cell, m.edge, m.forward, m.twin))
     areas = np.asarray(tissue.areas) if areas is None else areas
-    inner = np.asarray(tissue.edge_points(jnp.arange(1, PIECES) / PIECES), float)
+    inner = np.asarray(tissue.edge_points(jnp.arange(1, pieces) / pieces), float)
     points = np.concatenate([np.asarray(tissue.vertices, float), inner.reshape(-1, 2)])
     half = np.flatnonzero(forward)
     half = half[np.argsort(edge[half])]
-    between = n + np.arange(tissue.n_edges * (PIECES - 1)).reshape(tissue.n_edges, -1)
+    between = n + np.arange(tissue.n_edges * (pieces - 1)).reshape(tissue.n_edges, -1)
     chain = np.column_stack([half // 3, between, twin[half] // 3]) + 1
-    number = np.arange(1, tissue.n_edges * PIECES + 1).reshape(tissue.n_edges, PIECES)
+    number = np.arange(1, tissue.n_edges * pieces + 1).reshape(tissue.n_edges, pieces)
     lines = ["SPACE_DIMENSION 2", "STRING", "vertices"]
     lines += [f"{k} {x:.12g} {y:.12g}" for k, (x, y) in enumerate(points, 1)]
     lines.append("edges")

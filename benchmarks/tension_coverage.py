@@ -1,7 +1,9 @@
 """Error and coverage of inferred tensions and pressures, on tissues of known forces.
 
 A row for each kind of tissue: foams of Surface Evolver at rest, strongly bent ones, foams that were stopped
-on the way to rest, and Voronoi tissues with straight edges; exact and as label images. With
+on the way to rest, restless ones with weak edges and few points for each edge, and Voronoi tissues with
+straight edges; exact and as label images. Last columns: correlation and error of the bare balance (see
+`inference.py`) with the same tangents. With
 `--forsys PYTHON`, an interpreter that has ForSys, its static inference of the same dumps.
 """
 
@@ -15,8 +17,8 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from _foams import furrow, grouped, on_the_way, start, to_rest, voronoi, write_evolver
-from inference import FORSYS, Truth, compare, foam, forsys
+from _foams import furrow, grouped, on_the_way, restless, start, to_rest, voronoi, write_evolver
+from inference import FORSYS, Truth, bare, compare, foam, forsys
 
 from vertax.inference import label_image, pearson
 from vertax.tensions import infer_tensions
@@ -38,6 +40,15 @@ def make_foams(folder: Path, seed: int) -> dict[str, list[Path]]:
                 dumps = on_the_way(file)
             for share, dump in zip((20, 50, 80), sorted(dumps), strict=True):
                 kinds[f"{layout} {spread}, {share} % of the way"] = [dump]
+    for pieces in (4, 8):
+        file = folder / f"{seed}-restless-{pieces}.fe"
+        shares = (0.5, 0.8, 0.93, 0.98)
+        dumps = [file.with_name(f"{file.stem}-{share:.0%}.dmp") for share in shares]
+        if not all(dump.exists() for dump in dumps):
+            write_evolver(file, tissue, restless(tissue, seed), pieces=pieces)
+            on_the_way(file, shares)
+        for share, dump in zip(shares, dumps, strict=True):
+            kinds[f"restless, {pieces} pieces, {share:.0%}"] = [dump]
     for number in range(3):
         small = start(30, 10 * seed + number)
         options = {
@@ -75,7 +86,7 @@ def cases(folder: Path, seed: int) -> Iterator[tuple[str, list[tuple[Truth, obje
 def row(name: str, members: list[tuple[Truth, object]]) -> None:
     """Print correlations, errors and coverage of one kind of tissue."""
     parts: list[tuple[np.ndarray, ...]] = []
-    determined, seconds, edges = [], [], []
+    determined, seconds, edges, plain = [], [], [], []
     for truth, source in members:
         began = time.perf_counter()
         try:
@@ -87,6 +98,7 @@ def row(name: str, members: list[tuple[Truth, object]]) -> None:
         determined.append(result.determined.sum() / np.isfinite(result.tensions).sum())
         edges.append(result.edges)
         parts.append(compare(truth, result))
+        plain.append(compare(truth, bare(result)))
     r = np.mean([pearson(p[0], p[1]) for p in parts])
     error = np.mean([np.mean(np.abs(p[1] - p[0]) / p[0]) for p in parts])
     flat = [np.ptp(p[3]) < 1e-9 for p in parts]
@@ -99,7 +111,9 @@ def row(name: str, members: list[tuple[Truth, object]]) -> None:
     ]
     print(
         f"{name:>30} | {np.mean(determined):4.0%} | {r:6.3f} {error:6.1%} {cover[0]} | "
-        f"{by_pressure:6.3f} {cover[1]} | {np.median(seconds):4.1f} | {'/'.join(sorted(set(edges)))}",
+        f"{by_pressure:6.3f} {cover[1]} | {np.median(seconds):4.1f} | {'/'.join(sorted(set(edges)))} | "
+        f"{np.mean([pearson(p[0], p[1]) for p in plain]):6.3f} "
+        f"{np.mean([np.mean(np.abs(p[1] - p[0]) / p[0]) for p in plain]):6.1%}",
         flush=True,
     )
 
@@ -113,7 +127,7 @@ def main() -> None:
     arguments = parser.parse_args()
     folder = arguments.folder or Path(tempfile.mkdtemp())
     print(
-        f"{'tissue':>30} | det. | tensions: r, error, within 1, 2 s.d., rms z | pressures | s | edges"
+        f"{'tissue':>30} | det. | tensions: r, error, within 1, 2 s.d., rms z | pressures | s | edges | bare"
     )
     for name, members in cases(folder, arguments.seed):
         row(name, members)

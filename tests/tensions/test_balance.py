@@ -177,7 +177,7 @@ def test_results_are_written_as_tables_and_shapes(foam, tmp_path):
         for path in result.write(tmp_path / name):
             assert path.stat().st_size > 500
     header = (tmp_path / "cells-edges.csv").read_text().splitlines()[0]
-    assert {"tension", "tension_deviation", "determined"} <= set(header.split(","))
+    assert {"tension", "tension_deviation", "determined", "reason"} <= set(header.split(","))
     with pytest.raises(ValueError, match=r"must end in \.csv"):
         result.write(tmp_path / "cells.xlsx")
 
@@ -377,3 +377,14 @@ def test_a_segmented_wing_cut_out_of_a_tissue():
     # Outlines are so rough that most are not determined.
     assert 0 < result.determined.sum() < np.isfinite(result.tensions).sum()
     assert result.warnings
+
+
+def test_the_mean_tension_is_the_unit_and_the_rest_has_a_reason(foam):
+    result = infer_tensions(label_image(foam[0], 50))
+    assert 0 < result.determined.sum() < np.isfinite(result.tensions).sum()
+    assert np.nanmean(result.tensions) == pytest.approx(1)
+    assert np.nanmean(result.pressures) == pytest.approx(0, abs=1e-9)
+    for table in (result.edge_table(), result.cell_table()):
+        np.testing.assert_array_equal(table["reason"] == "", table["determined"])
+    assert sum(result.reason_counts.values()) == result.tissue.n_edges
+    assert result.reason_counts["too short for a direction"] > 0

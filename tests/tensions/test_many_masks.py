@@ -110,7 +110,7 @@ def test_a_damaged_entry_of_the_cache_is_computed_anew(mask, tmp_path, damage):
 def test_the_noise_of_a_mask_is_in_pixels(mask):
     one, other = (infer_tensions(mask, noise=0.3, pixel_size=size) for size in (1.0, 5.0))
     assert other.noise == pytest.approx(5 * one.noise)
-    assert one.noise == pytest.approx(0.3, rel=0.5)
+    assert 0.1 < one.noise <= 0.3
     np.testing.assert_allclose(one.tension_deviations, other.tension_deviations, rtol=1e-3)
 
 

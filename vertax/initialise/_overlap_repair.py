@@ -31,8 +31,9 @@ def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
     m = tissue.topology
     cell, twin = np.asarray(m.cell), np.asarray(m.twin)
     following = np.where(twin % 3 == 0, twin + 2, twin - 1)
+    changed = np.ones(m.n_faces, bool)
     for attempt in range(_ROUNDS):
-        crossed = _crossed(tissue, following, cell)
+        crossed = _crossed(tissue, following, cell, changed)
         bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
         if not crossed.any():
             if angles is None or not bend_back or attempt == 0:
@@ -42,6 +43,8 @@ def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
         ends, faces = geometry.edge_vertices, geometry.edge_cells
         touched = np.any(np.append(bad, False)[faces], axis=1)
         touched[np.asarray(m.edge)[crossed]] = True
+        changed = np.zeros(m.n_faces, bool)
+        changed[cell.reshape(-1, 3)[np.unique(ends[touched])]] = True
         if tissue.arcs is not None:
             tissue = tissue.with_angles(jnp.where(touched, 0.7, 1) * tissue.arcs.angles)
         if tissue.arcs is None or attempt >= _ROUNDS // 4:
@@ -73,9 +76,10 @@ def _bent_back(
     flat = np.asarray(tissue.arcs.angles)
     faces = geometry_of(tissue).edge_cells
     fraction, limit = np.ones(len(flat)), np.ones(len(flat))
+    changed = np.ones(m.n_faces, bool)
     for attempt in range(_ROUNDS):
         trial = tissue.with_angles(jnp.asarray(flat + fraction * (angles - flat), flat.dtype))
-        crossed = _crossed(trial, following, cell)
+        crossed = _crossed(trial, following, cell, changed)
         if not crossed.any():
             tissue = trial
             break
@@ -86,13 +90,17 @@ def _bent_back(
             bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
             touched |= np.any(np.append(bad, False)[faces], axis=1)
         limit = np.where(touched, fraction, limit)
+        changed = np.zeros(m.n_faces, bool)
+        changed[faces[touched]] = True
         fraction = np.where(touched, np.where(fraction > 0.05, 0.6 * fraction, 0.0), fraction)
     else:
         return tissue
+    changed = np.zeros(m.n_faces, bool)
+    changed[faces[fraction < limit]] = True
     for _ in range(_BISECTIONS):
         middle = 0.5 * (fraction + limit)
         trial = tissue.with_angles(jnp.asarray(flat + middle * (angles - flat), flat.dtype))
-        crossed = _crossed(trial, following, cell)
+        crossed = _crossed(trial, following, cell, changed)
         touched = np.zeros(len(flat), bool)
         touched[edge[crossed]] = True
         limit = np.where(touched, middle, limit)
@@ -102,9 +110,12 @@ def _bent_back(
 
 
 def _crossed(
-    tissue: Tissue, following: Int[np.ndarray, " halfedges"], cell: Int[np.ndarray, " halfedges"]
+    tissue: Tissue,
+    following: Int[np.ndarray, " halfedges"],
+    cell: Int[np.ndarray, " halfedges"],
+    changed: Bool[np.ndarray, " faces"],
 ) -> Bool[np.ndarray, " halfedges"]:
-    """Which half-edges cross another side of their face."""
+    """Which half-edges cross another side of their face; only faces that `changed` are compared."""
     n = following.size
     start = np.repeat(np.asarray(tissue.vertices), 3, axis=0)
     if isinstance(tissue.boundary, Periodic):
@@ -119,7 +130,14 @@ def _crossed(
             )
         forward = half_edge[edge] == np.arange(n)
         sides = np.column_stack([sides, np.where(forward, 1, -1) * angles[edge]])
-    return crossed_by(sides, following, cell) != np.arange(n)
+    some = np.flatnonzero(changed[cell])
+    number = np.zeros(n, int)
+    number[some] = np.arange(len(some))
+    crossed = np.zeros(n, bool)
+    if len(some):
+        other = crossed_by(sides[some], number[following[some]], cell[some])
+        crossed[some] = other != np.arange(len(some))
+    return crossed
 
 
 def crossed_by(

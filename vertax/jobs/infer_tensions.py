@@ -219,12 +219,14 @@ def compare(result: InferredTensions, energy: Any, tissue: Any) -> dict[str, dic
     values = [by_pair.get(tuple(pair), []) for pair in pairs.tolist()]
     tension = np.array([v[0] if len(v) == 1 else np.nan for v in values])
     compared = result.determined & np.isfinite(tension)
-    mean = tension[compared].mean() if compared.any() else 1.0
+    # The unit is the mean of all tensions that have an equation.
+    unit = np.isfinite(result.tensions) & np.isfinite(tension)
+    mean = tension[unit].mean() if unit.any() else 1.0
     sizes = [np.mean(np.asarray(each.areas)) for each in (tissue, result.tissue)]
     pressure = np.asarray(area.pressures(tissue))[np.asarray(result.labels) - 1]
     pressure = pressure / mean * np.sqrt(sizes[0] / sizes[1])
     determined = result.pressures_determined
-    pressure = pressure - np.sum(pressure[determined]) / max(1, determined.sum())
+    pressure = pressure - np.nanmean(np.where(np.isnan(result.pressures), np.nan, pressure))
     return {
         "tension": {
             "edge": np.flatnonzero(compared),
@@ -279,6 +281,7 @@ def measure(result: InferredTensions) -> dict[str, Any]:
         "bending_degrees": np.degrees(result.bending),
         "edges": result.edges,
         "warnings": list(result.warnings),
+        "tension_reasons": result.reason_counts,
         "area_error_max": float(np.max(np.abs(result.area_errors[is_cell]))),
         "stress_anisotropy": result.mean_stress.anisotropy,
         "stress_anisotropy_deviation": result.mean_stress.anisotropy_deviation,

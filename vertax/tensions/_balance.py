@@ -107,14 +107,12 @@ def angle_slopes(geometry: ObservedGeometry, which: Equations) -> csr_array:
     if which.lever is None:
         arcs = which.n_directions + np.arange(which.n_arcs)
         entries.append((arcs, first + which.edges, np.ones(len(arcs))))
-    rows, columns, values = (np.concatenate(x) for x in zip(*entries, strict=True))
-    shape = (which.n_directions + which.n_arcs, geometry.n_geometry)
-    return csr_array(coo_array((values, (rows, columns)), shape=shape))
+    return _matrix(entries, (which.n_directions + which.n_arcs, geometry.n_geometry))
 
 
 def forces(
     angle: Float[np.ndarray, " angles"], which: Equations, loose: Bool[np.ndarray, " edges"]
-) -> Float[np.ndarray, "rows unknowns"]:
+) -> csr_array:
     """The matrix of the forces, which are linear in tensions and pressures.
 
     **Arguments:**
@@ -126,23 +124,22 @@ def forces(
     **Returns:** the matrix.
     """
     n_junctions, n_edges = len(which.junctions), len(which.edges)
-    matrix = np.zeros((which.n_rows, n_edges + len(which.cells)))
     direction, arc = angle[: which.n_directions].reshape(-1, 3), angle[which.n_directions :]
-    row = 2 * np.arange(n_junctions)[:, None]
-    for component, part in enumerate((np.cos(direction), np.sin(direction))):
-        np.add.at(matrix, (row + component, which.half_edge), part)
-    matrix[:, :n_edges][:, loose] = 0
+    row, firm = 2 * np.arange(n_junctions)[:, None], np.where(loose, 0.0, 1.0)
+    entries = [
+        (row + component, which.half_edge, part * firm[which.half_edge])
+        for component, part in enumerate((np.cos(direction), np.sin(direction)))
+    ]
     if which.lever is not None:
         for side, sign in enumerate((0.5, -0.5)):
             for component, part in enumerate((which.lever[..., 1], -which.lever[..., 0])):
-                place = row + component, n_edges + which.beside[..., side]
-                np.add.at(matrix, place, sign * part)
-        return matrix
-    row = 2 * n_junctions + np.arange(n_edges)
-    matrix[row, np.arange(n_edges)] = 2 * np.sin(arc)
-    for side, sign in enumerate((-1.0, 1.0)):
-        np.add.at(matrix, (row, n_edges + which.sides[:, side]), sign * which.chord)
-    return matrix
+                entries.append((row + component, n_edges + which.beside[..., side], sign * part))
+    else:
+        row = 2 * n_junctions + np.arange(n_edges)
+        entries.append((row, np.arange(n_edges), 2 * np.sin(arc)))
+        for side, sign in enumerate((-1.0, 1.0)):
+            entries.append((row, n_edges + which.sides[:, side], sign * which.chord))
+    return _matrix(entries, (which.n_rows, n_edges + len(which.cells)))
 
 
 def force_slopes(
@@ -154,25 +151,37 @@ def force_slopes(
     pull = tension[which.half_edge].ravel()
     row, column = np.repeat(2 * np.arange(n_junctions), 3), np.arange(which.n_directions)
     arcs = np.arange(which.n_arcs)
-    rows = np.concatenate([row, row + 1, 2 * n_junctions + arcs])
-    columns = np.concatenate([column, column, which.n_directions + arcs])
-    values = [-pull * np.sin(direction), pull * np.cos(direction)]
-    values.append(2 * tension[: which.n_arcs] * np.cos(arc))
-    shape = (which.n_rows, len(angle))
-    return csr_array(coo_array((np.concatenate(values), (rows, columns)), shape=shape))
+    entries = [
+        (row, column, -pull * np.sin(direction)),
+        (row + 1, column, pull * np.cos(direction)),
+    ]
+    stretch = 2 * tension[: which.n_arcs] * np.cos(arc)
+    entries.append((2 * n_junctions + arcs, which.n_directions + arcs, stretch))
+    return _matrix(entries, (which.n_rows, len(angle)))
 
 
 def pulls(
     geometry: ObservedGeometry, which: Equations, chosen: Bool[np.ndarray, " edges"]
-) -> Float[np.ndarray, "rows forces"]:
+) -> csr_array:
     """Coefficients of forces of the chosen edges in the equations, two components each."""
     edges = np.flatnonzero(chosen)
-    matrix = np.zeros((which.n_rows, len(edges), 2))
     place = np.full(geometry.n_vertices, -1)
     place[which.junctions] = np.arange(len(which.junctions))
+    entries = []
     for end, sign in ((0, 1.0), (1, -1.0)):
         at = place[geometry.ends[which.edges[edges], end]]
         inner = np.flatnonzero(at >= 0)
         for axis in range(2):
-            matrix[2 * at[inner] + axis, inner, axis] = sign
-    return matrix.reshape(which.n_rows, -1)
+            entries.append((2 * at[inner] + axis, 2 * inner + axis, np.full(len(inner), sign)))
+    return _matrix(entries, (which.n_rows, 2 * len(edges)))
+
+
+def _matrix(
+    entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]
+) -> csr_array:
+    """The sparse matrix of rows, columns and values, added where they repeat."""
+    rows, columns, values = (
+        np.concatenate([np.broadcast_to(entry[k], entry[2].shape).ravel() for entry in entries])
+        for k in range(3)
+    )
+    return csr_array(coo_array((values, (rows, columns)), shape=shape))

@@ -28,6 +28,7 @@ _COLUMNS = {
     "pressure": ("mean tension / L", "pressure less the mean; empty: no equation contains it"),
     "pressure_deviation": ("mean tension / L", "standard deviation of the pressure"),
     "determined": ("", "whether the shape determines the tension or pressure"),
+    "reason": ("", "why it is not determined; empty if it is"),
     "stress_xx": ("mean tension / L", "stress, tension positive"),
     "stress_xy": ("mean tension / L", f"stress; {_Y}"),
     "stress_yy": ("mean tension / L", "stress"),

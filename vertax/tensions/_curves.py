@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import minimize_scalar
-from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.optimize import minimize, minimize_scalar
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
+from vertax._base.sparse_normal import factorised, spread_parts
 from vertax.tensions._observed_geometry import ObservedGeometry
 
 # Prior standard deviations, for parameters that no point determines, such as the angle of an edge of two
@@ -21,8 +21,12 @@ _BENDING, _BENDINGS = 0.1, (1e-4, 0.3)
 # Largest noise and correlation length, in grains, of edges with the grain of the pixels as their only error.
 # (For middles of the sides of pixels along a smooth curve: 0.24 and 1.45.)
 _CRISP = 0.26, 1.6
-# Edges shorter than this, in grains, have no weight; edges shorter than the second do not determine bends.
-_SHORT, _STRAIGHT = 3.0, 6.0
+# Degrees of freedom of the distribution of the noise of an edge; number of estimates of noise and bends.
+_FREEDOM, _PASSES = 4.0, 3
+# Largest number of edges that are all used for these, and of those of each part of a larger tissue.
+_WHOLE, _PART = 480, 120
+# Edges shorter than this, in grains, have no weight.
+_SHORT = 3.0
 # Smallest mean length of edges, in grains, at which bends are fitted.
 _LONG = 25.0
 
@@ -49,10 +53,16 @@ class Fitted(NamedTuple):
     """The distance of each."""
     weighted: csc_array
     """The slopes of the distances, transposed, times the weights of the points."""
+    weight: Float[np.ndarray, " points"]
+    """The weights: an edge counts as its length over the correlation length, times its factor."""
+    factor: Float[np.ndarray, " edges"]
+    """Factors of the weights of edges, small for edges of other shapes than arcs with bends."""
     apart: float
     """Distance along an edge at which the errors of two points are independent, a length."""
     bending: float
     """Standard deviation of the bends, in radians."""
+    prior_noise: float
+    """Noise relative to which the prior was weighted."""
     crisp: bool = False
     """Whether the grain is the only error of the points."""
 
@@ -96,12 +106,19 @@ def read_courses(
         if crisp or apart is not None:
             break
     assert first is not None
-    off, bending = noise or first.noise, start
+    off, bending, factor, change = noise or first.noise, start, None, None
     if start == _BENDING:
-        flat = fit(apart=alike, bending=_BENDINGS[1], noise=off)
-        bending = _bending(tissue, flat, used[length[used] > _STRAIGHT * grain], off)
-    curves = fit(apart=alike, bending=bending, noise=off)
-    return curves._replace(noise=curves.noise if noise is None else noise, crisp=crisp)
+        curves = fit(apart=alike, bending=bending, noise=off, change=first.change)
+        for _ in range(_PASSES):
+            factor = _reliability(curves, points, off)
+            options = {"factor": factor, "change": curves.change}
+            curves = fit(apart=alike, bending=bending, noise=off, **options)
+            off, bending = _most_evident(tissue, points, curves, grain, noise)
+        change = curves.change
+    curves = fit(apart=alike, bending=bending, noise=off, factor=factor, change=change)
+    if start != _BENDING:
+        off = noise or curves.noise
+    return curves._replace(noise=off, crisp=crisp)
 
 
 def fit_curves(
@@ -112,6 +129,8 @@ def fit_curves(
     apart: float,
     bending: float,
     noise: float,
+    factor: Float[np.ndarray, " edges"] | None = None,
+    change: Float[np.ndarray, " geometry"] | None = None,
     rounds: int = 6,
 ) -> Fitted:
     r"""Vertices, angles and bends of the curves that fit the points best (weighted least squares).
@@ -133,6 +152,8 @@ def fit_curves(
     - `apart`: distance along an edge at which the errors of two points are independent.
     - `bending`: prior standard deviation of the bends.
     - `noise`: standard deviation of the points, relative to which the prior is weighted.
+    - `factor`: factors of the weights of edges.
+    - `change`: initial change of the geometry.
     - `rounds`: largest number of Gauss–Newton steps.
 
     **Returns:** the [`Fitted`][vertax.tensions._curves.Fitted] curves.
@@ -145,22 +166,21 @@ def fit_curves(
     length = np.linalg.norm(tissue.chord, axis=1)
     # Each edge has the weight of length / apart independent points.
     weight = length / apart / np.maximum(n_points, 1)
-    weight = np.where(length > _SHORT * grain, weight, 0.0)[edge]
+    factor = np.ones(n_edges) if factor is None else factor
+    weight = np.where(length > _SHORT * grain, factor * weight, 0.0)[edge]
     # Prior: parameters that the points do not determine stay at their initial values.
-    held = (
-        noise / np.repeat([_VERTEX * grain, _ANGLE, bending], [angles, n_edges, 2 * n_edges])
-    ) ** 2
+    held = noise**2 * _prior(tissue, grain, bending)
     bent = bends + 2 * edge, bends + 2 * edge + 1
     columns = np.stack(
         (2 * start, 2 * start + 1, 2 * end, 2 * end + 1, angles + edge, *bent), axis=1
     )
     rows = np.repeat(np.arange(len(edge)), columns.shape[1])
-    change = np.zeros(n)
+    moved = np.zeros(n) if change is None else change
     rest = np.zeros(len(edge))
     normal, weighted = csc_array(diags_array(held)), csc_array((n, len(edge)))
     for _ in range(rounds):
-        current = tissue.moved(change)
-        p = away - change[:angles].reshape(-1, 2)[start]
+        current = tissue.moved(moved)
+        p = away - moved[:angles].reshape(-1, 2)[start]
         c, angle = current.chord[edge], current.angle[edge]
         chord = np.maximum(np.linalg.norm(c, axis=1), 0.1 * grain)
         q, sine, cosine = p - c, -np.sin(angle), np.cos(angle)
@@ -177,14 +197,15 @@ def fit_curves(
         )
         weighted = jacobian.T * weight
         normal = csc_array(weighted @ jacobian + diags_array(held))
-        step = splu(normal).solve(weighted @ rest + held * change)
-        change = change - step
-        change[angles:bends] = np.clip(tissue.angle + change[angles:bends], -3, 3) - tissue.angle
+        step = factorised(normal).solve(weighted @ rest + held * moved)
+        moved = moved - step
+        moved[angles:bends] = np.clip(tissue.angle + moved[angles:bends], -3, 3) - tissue.angle
         if np.max(np.abs(step[angles:])) < 1e-4:
             break
-    noise = float(np.sqrt(np.sum(weight * rest**2) / max(np.sum(weight), 1e-300)))
-    noise = max(noise, 1e-12 * tissue.size)
-    return Fitted(change, normal, noise, rest, csc_array(weighted), apart, bending)
+    spread = float(np.sqrt(np.sum(weight * rest**2) / max(np.sum(weight), 1e-300)))
+    spread = max(spread, 1e-12 * tissue.size)
+    parts = rest, csc_array(weighted), weight, factor, apart, bending, noise
+    return Fitted(moved, normal, spread, *parts)
 
 
 def arc_distances(
@@ -196,6 +217,39 @@ def arc_distances(
     length = np.maximum(np.linalg.norm(chord, axis=1), 1e-300)
     cross = chord[:, 0] * p[:, 1] - chord[:, 1] * p[:, 0]
     return (cross * np.cos(angle) - np.sum(p * (p - chord), axis=1) * np.sin(angle)) / length
+
+
+# A few edges have other shapes than all others. So the points of an edge have the noise σ / √τ with τ from a
+# gamma distribution of mean 1, together a Student distribution (Lange, Little & Taylor 1989,
+# doi:10.1080/01621459.1989.10478852). Of an edge with the number m of points, their sum q of squares, and the
+# number h of parameters that follow them, the expectation-maximisation algorithm has the steps
+#
+#     τ = (n + m) / (n + q / σ² + h),      σ² = Σ τ (q + σ² h) / Σ m.
+def _reliability(curves: Fitted, points: Points, noise: float) -> Float[np.ndarray, " edges"]:
+    """The factors τ of the weights of edges."""
+    edge, weight = points.edge, curves.weight
+    jacobian = csr_array(curves.weighted.T)
+    columns = jacobian.indices.reshape(len(edge), -1)
+    values = jacobian.data.reshape(columns.shape) / np.maximum(weight, 1e-300)[:, None]
+    first = np.flatnonzero(np.diff(edge, prepend=-1))
+    n = columns.shape[1]
+    blocks = np.empty((len(first), n, n))
+    for k in range(n):
+        for j in range(n):
+            blocks[:, k, j] = np.add.reduceat(weight * values[:, k] * values[:, j], first)
+    block_columns = columns[first]
+    places = np.repeat(block_columns, n, axis=1), np.tile(block_columns, n)
+    normal = csr_array(curves.precision)[places].toarray().reshape(blocks.shape)
+    followed = np.trace(np.linalg.solve(normal, blocks), axis1=1, axis2=2)
+    count = np.add.reduceat(weight / curves.factor[edge], first)
+    squares = np.add.reduceat(weight / curves.factor[edge] * curves.rest**2, first)
+    factor, variance = np.ones(len(first)), noise**2
+    for _ in range(50):
+        factor = (_FREEDOM + count) / (_FREEDOM + squares / variance + followed)
+        variance = float(factor @ (squares + variance * followed)) / float(np.sum(count))
+    all_edges = np.ones(len(curves.factor))
+    all_edges[edge[first]] = factor
+    return all_edges
 
 
 def _modes(
@@ -215,27 +269,70 @@ def _modes(
     return (wide / scale)[:, None] * shapes
 
 
-def _bending(
-    tissue: ObservedGeometry, flat: Fitted, edges: Int[np.ndarray, " some"], noise: float
-) -> float:
-    """Standard deviation of the bends, by maximum likelihood from bends fitted with a wide prior."""
-    if len(edges) < 3:
-        return _BENDINGS[0]
-    first = 2 * tissue.n_vertices + len(tissue.angle)
-    place = np.concatenate([first + 2 * edges, first + 2 * edges + 1])
-    unit = np.zeros((tissue.n_geometry, len(place)))
-    unit[place, np.arange(len(place))] = 1.0
-    variance = noise**2 * np.sum(unit * splu(flat.precision).solve(unit), axis=0)
-    # The estimates without that prior.
-    fraction = np.minimum(variance / _BENDINGS[1] ** 2, 0.95)
-    bend, variance = flat.change[place] / (1 - fraction), variance / (1 - fraction)
+# With the linearised distances y + J g of the points, of weights w and noise σ, and the prior precision Λ of
+# vertices, angles and bends g, the density of the points with all g integrated out is
+#
+#     -2 ln p = Σ w ln σ² + ln det(A / σ²) - ln det Λ + (yᵀ w y - vᵀ A⁻¹ v) / σ²,
+#     A = Jᵀ w J + σ² Λ,    v = Jᵀ w y.
+#
+# Bends that follow the noise decrease the last term and increase the first determinant.
+def _most_evident(
+    tissue: ObservedGeometry, points: Points, curves: Fitted, grain: float, given: float | None
+) -> tuple[float, float]:
+    """Noise of the points, and standard deviation of the bends, of the largest marginal likelihood in a few
+    parts of the tissue; for a `given` noise only that of the bends."""
+    held = _prior(tissue, grain, 1.0)
+    bends = np.arange(len(held)) >= len(held) - 2 * len(tissue.angle)
+    edges = np.unique(points.edge)
+    parts = spread_parts(tissue.places[2 * tissue.n_vertices :][edges], _WHOLE, _PART)
+    some = np.isin(points.edge, edges[np.concatenate(parts)])
+    weight, weighted = curves.weight[some], curves.weighted[:, some]
+    jacobian = csr_array(diags_array(1 / np.maximum(weight, 1e-300)) @ weighted.T)
+    distance = curves.rest[some] - jacobian @ curves.change
+    square, push = csc_array(weighted @ jacobian), weighted @ distance
+    used = np.flatnonzero(square.diagonal() > 0)
+    square, push, held, bends = square[used][:, used], push[used], held[used], bends[used]
+    total = float(np.sum(weight / curves.factor[points.edge[some]]))
+    constant = float(weight @ distance**2)
 
-    def loss(log: float) -> float:
-        total = variance + np.exp(2 * log)
-        return float(np.sum(np.log(total) + bend**2 / total))
+    def loss(logs: np.ndarray | tuple[float, float]) -> float:
+        log_noise, log_bend = logs
+        variance = np.exp(2 * log_noise)
+        prior = np.where(bends, np.exp(-2 * log_bend), held)
+        factor = factorised(csc_array(square + diags_array(variance * prior)))
+        value = (total - len(used)) * 2 * log_noise - np.sum(np.log(prior))
+        value += np.sum(np.log(np.abs(factor.U.diagonal())))
+        return float(value + (constant - push @ factor.solve(push)) / variance)
 
-    optimum = minimize_scalar(loss, bounds=np.log(_BENDINGS).tolist(), method="bounded")
-    return float(np.exp(optimum.x))
+    noise = np.log(max(curves.noise, 1e-9 * grain) if given is None else given)
+    range_of_noise, limits = (noise - 4.0, noise + 2.0), np.log(_BENDINGS)
+    straight, bent = (noise, limits[0]), (noise, np.log(max(curves.bending, 0.02)))
+    if given is None:
+        options = {"xatol": 0.03}
+        one = lambda log: loss((log, limits[0]))
+        optimum: Any = minimize_scalar(
+            one, bounds=range_of_noise, method="bounded", options=options
+        )
+        straight = float(optimum.x), limits[0]
+        corners = [bent, (bent[0] - 0.7, bent[1]), (bent[0], bent[1] + 0.7)]
+        options = {"xatol": 0.03, "fatol": 0.03, "initial_simplex": corners}
+        bounds = [range_of_noise, tuple(limits)]
+        optimum: Any = minimize(loss, bent, method="Nelder-Mead", bounds=bounds, options=options)
+        bent = tuple(optimum.x)
+    else:
+        one = lambda log: loss((noise, log))
+        optimum: Any = minimize_scalar(one, bounds=tuple(limits), method="bounded")
+        bent = noise, float(optimum.x)
+    best = min(straight, bent, key=loss)
+    return float(np.exp(best[0])), float(np.exp(best[1]))
+
+
+def _prior(
+    tissue: ObservedGeometry, grain: float, bending: float
+) -> Float[np.ndarray, " geometry"]:
+    """Precision of parameters that the points do not determine, which stay at their initial values."""
+    n, n_edges = 2 * tissue.n_vertices, len(tissue.angle)
+    return np.repeat([_VERTEX * grain, _ANGLE, bending], [n, n_edges, 2 * n_edges]) ** -2.0
 
 
 def correlation_length(points: Points, rest: Float[np.ndarray, " points"]) -> float:

@@ -8,18 +8,19 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.sparse import csc_array, diags_array
 
-from vertax.tensions._balance import Equations, equations
+from vertax.tensions._balance import equations
 from vertax.tensions._curves import Fitted, Points, read_courses
+from vertax.tensions._errors import Errors
+from vertax.tensions._observability import observability, patches
 from vertax.tensions._observed_geometry import ObservedGeometry
-from vertax.tensions._solve import Balance, Observability, observability, solve
+from vertax.tensions._solve import Balance, System, choose_errors, solve
 
 
 class Solution(NamedTuple):
     """A balance of forces in a fitted geometry."""
 
     fitted: ObservedGeometry
-    which: Equations
-    shape: Observability
+    system: System
     balance: Balance
 
 
@@ -27,11 +28,16 @@ def vertices_only(geometry: ObservedGeometry, noise: float) -> Fitted:
     """The vertices as they are, with independent noise, of straight edges without points."""
     n = geometry.n_geometry
     precision = np.where(np.arange(n) < 2 * geometry.n_vertices, 1.0, 1e12)
-    empty = csc_array((n, 0))
-    change = np.zeros(n)
-    return Fitted(
-        change, csc_array(diags_array(precision)), noise, np.zeros(0), empty, 0.0, 0.0, True
+    empty = (
+        np.zeros(0),
+        csc_array((n, 0)),
+        np.zeros(0),
+        np.ones(len(geometry.angle)),
+        0.0,
+        0.0,
+        noise,
     )
+    return Fitted(np.zeros(n), csc_array(diags_array(precision)), noise, *empty, crisp=True)
 
 
 def fit(
@@ -49,42 +55,62 @@ def fit(
     return read_courses(geometry, points, grain, apart=apart, noise=noise)
 
 
+# Both describe the same angles. With straight edges, the angles of arcs are noise, α ~ N(0, ν² C); with arcs
+# they are unknowns of the balance; its forces 2 γ sin α change by 2 for a change of α by 1.
 def solution(
     geometry: ObservedGeometry,
     curves: Fitted,
     uncertain: Bool[np.ndarray, " edges"],
     *,
-    straight: bool,
+    straight: bool | None,
     known_noise: bool,
     prior: float | None,
 ) -> Solution:
     """The balance of forces with arcs or with straight edges.
 
+    Errors of the model, widths of the priors, and the choice between arcs and straight edges are those of
+    the larger evidence in the whole tissue, or in a few parts of a large one.
+
     **Arguments:**
 
     - `geometry`, `curves`: the initial geometry and the fit.
     - `uncertain`: contacts that may be between other cells.
-    - `straight`: whether edges are straight.
+    - `straight`: whether edges are straight; None: by the evidence.
     - `known_noise`: whether the noise is at most that of the points.
     - `prior`: standard deviation of tensions about 1.
 
     **Returns:** the [`Solution`][vertax.tensions._edges.Solution].
     """
     fitted = geometry.moved(curves.change)
-    which = equations(fitted, straight=straight)
-    shape = observability(fitted, curves, which, uncertain, prior=prior, known_noise=known_noise)
-    return Solution(fitted, which, shape, solve(shape, which, prior=prior))
+
+    def system(part: ObservedGeometry, *, flat: bool) -> System:
+        which = equations(part, straight=flat)
+        options = {"prior": prior, "known_noise": known_noise}
+        shape = observability(part, curves, which, uncertain, **options)
+        return System(shape, which, regional=prior is None)
+
+    parts = patches(fitted, equations(fitted))
+    best: tuple[float, Errors, bool, list[System]] | None = None
+    arcs: list[System] = []
+    for flat in (False, True) if straight is None else (straight,):
+        systems = [system(part, flat=flat) for part in parts]
+        errors, evidence = choose_errors(systems, prior)
+        for each in arcs:
+            evidence += _density_of_arcs(each, float(errors.noise))
+        if not flat:
+            arcs, evidence = systems, evidence + sum(s.which.n_arcs for s in systems) * np.log(2)
+        if best is None or evidence > best[0]:
+            best = evidence, errors, flat, systems
+    assert best is not None
+    _, errors, flat, systems = best
+    tissue = systems[0] if len(parts) == 1 else system(fitted, flat=flat)
+    return Solution(fitted, tissue, solve(tissue, errors))
 
 
-# Both describe the same angles. With straight edges, the angles of arcs are noise, α ~ N(0, ν² C); with arcs
-# they are unknowns of the balance; its forces 2 γ sin α change by 2 for a change of α by 1.
-def more_evident(arcs: Solution, straight: Solution) -> Solution:
-    """The solution of the larger evidence."""
+def _density_of_arcs(arcs: System, noise: float) -> float:
+    """Logarithm of the density of the angles of arcs if they are noise."""
     n = arcs.which.n_directions
-    angle = arcs.shape.angle[n:]
-    covariance = arcs.shape.covariance[n:, n:] * straight.balance.errors.noise**2
-    root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(angle)))
-    white = np.linalg.solve(root, angle)
-    density = -0.5 * white @ white - np.sum(np.log(np.diag(root)))
-    with_arcs = arcs.balance.evidence + len(angle) * np.log(2)
-    return arcs if with_arcs >= straight.balance.evidence + density else straight
+    covariance = arcs.covariance[n:, n:] * noise**2
+    root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(covariance)))
+    white = np.linalg.solve(root, arcs.shape.angle[n:])
+    return float(-0.5 * white @ white - np.sum(np.log(np.diag(root))))

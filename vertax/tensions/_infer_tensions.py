@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +12,10 @@ import numpy as np
 from jaxtyping import Array, Int, Shaped
 
 from vertax._base.announce import announce_compilations
+from vertax._base.available_memory import check_memory
 from vertax._base.blas import one_blas_thread
 from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.phases import phases, start_phase
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.initialise import MaskReport, Segmentation, from_labels
 from vertax.initialise._report import LEAST_LENGTH
@@ -24,7 +25,7 @@ from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 from vertax.tensions._balance import equations
 from vertax.tensions._curves import Points
-from vertax.tensions._edges import fit, more_evident, solution
+from vertax.tensions._edges import fit, solution
 from vertax.tensions._inferred import InferredTensions
 from vertax.tensions._mask import labels_and_lines
 from vertax.tensions._observed_geometry import observed_geometry
@@ -36,10 +37,13 @@ from vertax.tensions._resampling import resampled_deviations
 _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 # Initial noise of the vertices of a tissue with straight edges, relative to the cell diameter.
 _VERTEX = 0.01
+# Bytes of memory: of any tissue, of a pixel and of a cell, measured; labels above the last are counted.
+_BASE, _PIXEL, _CELL, _MANY = 4e8, 80, 1.2e5, 10**6
 
 
 @announce_compilations("measurements of a tissue")
 @one_blas_thread()
+@phases(5)
 def infer_tensions(
     mask: Segmentation | Foam | Tissue | Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str],
     *,
@@ -101,9 +105,12 @@ def infer_tensions(
 
     **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions]; read its `warnings`.
 
+    On a terminal the present phase is shown: reading, outlines, geometry, balance, errors.
+
     **Raises:**
 
     - `TypeError` for a source of another type.
+    - `MemoryError` for a mask that takes more memory than is available.
     - `ValueError` for a tissue without a junction of three cells, `edges="arcs"` for straight inner edges,
         a mirrored tissue, a `noise` or `prior` that is not positive, and as the readers.
     """
@@ -115,6 +122,7 @@ def infer_tensions(
         raise ValueError(
             f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
         )
+    start_phase("reading")
     source = mask
     if isinstance(source, str | os.PathLike) and is_surface_evolver(Path(source)):
         source = read_surface_evolver(source)
@@ -122,6 +130,9 @@ def infer_tensions(
         labels, line_width = labels_and_lines(source, kind, background, plane)
         if pixel_size is None and isinstance(source, str | os.PathLike):
             pixel_size = pixels_of_file(Path(source), labels)
+        start_phase("outlines")
+        cells = len(np.unique(labels)) if labels.max() > _MANY else int(labels.max())
+        check_memory("mask", _BASE + _PIXEL * labels.size + _CELL * cells, "Cut it into parts.")
         source = from_labels(
             labels,
             boundary="free",
@@ -159,24 +170,27 @@ def infer_tensions(
     uncertain = np.full(tissue.n_edges, False) if report is None else report.uncertain
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
+    start_phase("geometry")
     curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
-    solve_as = partial(
-        solution, geometry, curves, uncertain, known_noise=course.noise is not None, prior=prior
+    start_phase("balance")
+    straight = None if edges is None and tissue.inner_arcs else edges != "arcs"
+    fitted, system, balance = solution(
+        geometry,
+        curves,
+        uncertain,
+        straight=straight,
+        known_noise=course.noise is not None,
+        prior=prior,
     )
-    solved = solve_as(straight=edges == "straight" or not tissue.inner_arcs)
-    if edges is None and tissue.inner_arcs:
-        solved = more_evident(solved, solve_as(straight=True))
-    fitted, which, shape, balance = solved
+    start_phase("errors")
     resampled = None
     if resamples:
-        observed = fitted, curves, points, which, shape
-        resampled = resampled_deviations(
-            *observed, balance, prior=prior, times=resamples, seed=seed
-        )
+        observed = fitted, curves, points, system, balance
+        resampled = resampled_deviations(*observed, times=resamples, seed=seed)
     # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
     source = course.labels, course.pixel_size, four_fold, report
-    return outcome(tissue, course.points, curves, which, balance, source, resampled)
+    return outcome(tissue, course.points, curves, system.which, balance, source, resampled)
 
 
 class _Course(NamedTuple):

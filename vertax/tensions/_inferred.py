@@ -8,7 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from vertax._base.pixels import PixelSize, pixel_sides
 from vertax.initialise import MaskReport
@@ -31,8 +31,9 @@ _STRAY = 20
 class InferredTensions(eqx.Module):
     """Relative tensions and pressures of a tissue, with their standard deviations.
 
-    A shape determines them except for two numbers: tensions are relative to their mean, and pressures are
-    differences from their mean, in units of the mean tension over the unit of length of the tissue.
+    A shape determines them except for two numbers. The unit of tensions, and of pressures and stresses times
+    the unit of length, is the mean tension of all edges that have an equation: the mean of `tensions` that
+    are not NaN is 1. Pressures are differences from the mean of all cells that have an equation.
     """
 
     tissue: Tissue
@@ -80,6 +81,8 @@ class InferredTensions(eqx.Module):
     positions. Four cells meet in a point, and which two of them share the edge depends on their numbers."""
     resampled_deviations: Float[np.ndarray, " edges"] | None = None
     """Standard deviations of the tensions by resampling, with `resamples`."""
+    short: Bool[np.ndarray, " edges"] | None = None
+    """Whether the edge is too short for a direction, or may be between other cells."""
     mask_report: MaskReport | None = None
     """What became of each label of the mask, and which contacts the mask shows."""
 
@@ -95,6 +98,38 @@ class InferredTensions(eqx.Module):
         return geometry_of(self.tissue).areas / pixels - 1
 
     @property
+    def reasons(self) -> Shaped[np.ndarray, " edges"]:
+        """Why each tension is not determined; empty if it is."""
+        short = np.zeros(len(self.determined), bool) if self.short is None else self.short
+        faces = np.append(self.labels > 0, False)[np.asarray(self.tissue.topology.edge_cells)]
+        cases = [(~np.all(faces, axis=1), "outline or hole"), (self.four_fold, "four cells meet")]
+        if self.mask_report is not None:
+            cases.append((self.mask_report.closed, "contact not shown"))
+            cases.append((self.mask_report.uncertain, "contact uncertain"))
+        cases.append((np.isnan(self.tensions), "no junction of three cells"))
+        cases += [
+            (short, "too short for a direction"),
+            (~self.determined, "standard deviation above 0.3"),
+        ]
+        conditions, names = zip(
+            *[(case & ~self.determined, name) for case, name in cases], strict=True
+        )
+        return np.select(conditions, names, "")
+
+    @property
+    def pressure_reasons(self) -> Shaped[np.ndarray, " cells"]:
+        """Why each pressure is not determined; empty if it is."""
+        cases = [self.pressures_determined, self.labels == 0, np.isnan(self.pressures)]
+        return np.select(cases, ["", "hole", "no junction of three cells"], "no determined tension")
+
+    @property
+    def reason_counts(self) -> dict[str, int]:
+        """Number of tensions of each of the `reasons`, and of those that are determined."""
+        names, counts = np.unique(self.reasons, return_counts=True)
+        named = zip(names.tolist(), counts.tolist(), strict=True)
+        return {name or "determined": count for name, count in named}
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons to distrust parts of the result, as sentences; empty if there are none."""
         warnings = [] if self.mask_report is None else mask_warnings(self.mask_report, self)
@@ -106,7 +141,9 @@ class InferredTensions(eqx.Module):
         if share < 0.5:
             warnings.append(
                 f"of {unknowns.sum()} tensions only {share:.0%} are determined: edges are too short for "
-                "their pixels, or outlines too rough; take a finer image or a larger tissue"
+                "their pixels, or outlines too rough; take a finer image or a larger tissue. The unit, the "
+                "mean of all, is uncertain "
+                f"({', '.join(f'{count} {name}' for name, count in self.reason_counts.items())})"
             )
         junction, arc = self.errors["junction"], self.errors["arc"]
         if share > 0 and np.nanmedian(self.tension_deviations[self.determined]) > 0.15:
@@ -148,23 +185,26 @@ class InferredTensions(eqx.Module):
         """The edges as a table, see [`edge_table`][vertax.io.edge_table].
 
         **Returns:** its columns, and `left_label`, `right_label` (0: the exterior or a hole; -1: no pair of
-        cells, for an edge that is four-fold), `four_fold`, `tension`, `tension_deviation` and `determined`;
-        for a mask also `shown`, the share of the edge along which the mask shows the contact,
-        `contact_closed`, where that is less than a half, and `contact_uncertain`, for an edge across a gap so
-        wide that other cells may touch there; and in pixels, from the top left corner of the image,
-        `start_column`, `start_row`, `end_column`, `end_row` and `length_pixels`.
+        cells, for an edge that is four-fold), `four_fold`, `tension`, `tension_deviation`, `determined` and
+        `reason` (see `reasons`); for a mask also `shown`, the share of the edge along which the mask shows
+        the contact, `contact_closed`, where that is less than a half, and `contact_uncertain`, for an edge
+        across a gap so wide that other cells may touch there; and in pixels, from the top left corner of the
+        image, `start_column`, `start_row`, `end_column`, `end_row` and `length_pixels`.
         """
-        return with_pixels(edge_table(self.tissue, **self._edge_columns), self.pixel_size)
+        table = edge_table(self.tissue, **self._edge_columns) | {"reason": self.reasons}
+        return with_pixels(table, self.pixel_size)
 
     def cell_table(self) -> dict[str, np.ndarray]:
         """The cells as a table, see [`cell_table`][vertax.io.cell_table].
 
-        **Returns:** its columns, and `label`, `pressure`, `pressure_deviation`, `determined` and the stress
-        as `stress_xx`, `stress_xy` and `stress_yy`; for a mask also `hole`, `pixels`, `area_error` (the area
-        of the cell over that of its pixels, less 1), `outline_error` (in pixels, see `outline_errors`), and
-        in pixels, from the top left corner of the image, `column`, `row` and `area_pixels`.
+        **Returns:** its columns, and `label`, `pressure`, `pressure_deviation`, `determined`, `reason` (see
+        `pressure_reasons`) and the stress as `stress_xx`, `stress_xy` and `stress_yy`; for a mask also
+        `hole`, `pixels`, `area_error` (the area of the cell over that of its pixels, less 1),
+        `outline_error` (in pixels, see `outline_errors`), and in pixels, from the top left corner of the
+        image, `column`, `row` and `area_pixels`.
         """
-        return with_pixels(cell_table(self.tissue, **self._cell_columns), self.pixel_size)
+        table = cell_table(self.tissue, **self._cell_columns) | {"reason": self.pressure_reasons}
+        return with_pixels(table, self.pixel_size)
 
     def write(self, path: str | os.PathLike[str]) -> list[Path]:
         """Write cells and edges to two files: `NAME.csv` and `NAME-edges.csv`, and so on.

@@ -29,11 +29,20 @@ class ObservedGeometry(NamedTuple):
     bend: Float[np.ndarray, "edges 2"]
     """Angles by which the tangents of the curve are turned from those of its arc: symmetric and antisymmetric
     part of its two ends."""
+    place: Float[np.ndarray, "vertices 2"]
+    """Positions of the vertices in the tissue, which distinguish neighbours from distant ones; not moved."""
     n_cells: int
     inner: Bool[np.ndarray, " vertices"]
     """Vertices where three cells meet and forces balance."""
     size: float
     """Root of the mean area of a cell."""
+
+    @property
+    def places(self) -> Float[np.ndarray, "geometry 2"]:
+        """Position of each unknown."""
+        middle = self.place[self.ends[:, 0]] + 0.5 * self.chord
+        at_edges = np.concatenate([middle, np.repeat(middle, 2, axis=0)])
+        return np.concatenate([np.repeat(self.place, 2, axis=0), at_edges])
 
     @property
     def n_vertices(self) -> int:
@@ -82,6 +91,7 @@ def observed_geometry(
         chord=geometry.edge_vectors,
         angle=geometry.edge_angles,
         bend=np.zeros((tissue.n_edges, 2)),
+        place=np.asarray(tissue.vertices, float),
         n_cells=tissue.n_cells,
         inner=inner,
         size=float(np.sqrt(np.mean(np.abs(geometry.areas[: tissue.n_cells][is_cell[:-1]])))),

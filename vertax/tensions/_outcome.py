@@ -24,7 +24,7 @@ _UNKNOWN = 0.3
 
 
 class Relative(NamedTuple):
-    """Tensions relative to their mean over determined edges, and pressures relative to theirs."""
+    """Tensions of mean 1, and pressures of mean 0."""
 
     tension: Float[np.ndarray, " tensions"]
     pressure: Float[np.ndarray, " pressures"]
@@ -34,46 +34,34 @@ class Relative(NamedTuple):
     """Whether a cell has an edge of determined tension."""
     sure: Bool[np.ndarray, " tensions"]
     """Whether a tension is determined, up to the error of the contrast of all."""
-    covariance: Float[np.ndarray, "unknowns unknowns"]
-    """Covariance of these numbers."""
+    lag: Float[np.ndarray, " unknowns"]
+    """Standard deviations due to the contrast, an error that all tensions have in common."""
 
 
 def relative(balance: Balance, which: Equations) -> Relative:
-    """Tensions and pressures in units of the mean tension.
+    """Tensions and pressures relative to their means over all edges and cells that have an equation.
 
     **Arguments:**
 
-    - `balance`: the solution of the balance of forces.
+    - `balance`: the solution of the balance of forces, in which the mean of the tensions is 1.
     - `which`: the equations.
 
     **Returns:** the [`Relative`][vertax.tensions._outcome.Relative] numbers.
     """
-    n = len(which.edges)
-    deviation = np.sqrt(np.diag(balance.covariance)[:n])
-    sure = ~balance.loose & (deviation < _UNKNOWN)
-    if np.sum(balance.tension[sure]) < 0.1 * np.sum(sure) + 1e-9:
-        sure = ~balance.loose
-    # The mean has an error too.
-    scale = float(np.mean(balance.tension[sure])) if sure.any() else 1.0
-    values = np.concatenate([balance.tension, balance.pressure]) / scale
-    slope = np.eye(len(values))
-    if sure.any():
-        slope[:, :n] -= np.outer(values, sure / np.sum(sure))
-    beside = np.isin(np.arange(len(which.cells)), which.sides[sure])
-    if beside.any():
-        values[n:] -= np.mean(values[n:][beside])
-        slope[n:] -= slope[n:][beside].mean(axis=0)
-    slope /= scale
-    covariance = slope @ balance.covariance @ slope.T
-    sure = ~balance.loose & (np.diag(covariance)[:n] < _UNKNOWN**2)
+    n, n_cells = len(which.edges), len(which.cells)
+    variance = balance.posterior.variances()
+    sure = ~balance.loose & (variance[:n] < _UNKNOWN**2)
+    beside = np.isin(np.arange(n_cells), which.sides[sure])
+    # The mean of the pressures has an error too.
+    mean = np.append(np.zeros(n), np.full(n_cells, 1 / n_cells))
+    spread = balance.posterior.covariances(mean[:, None])[:, 0]
+    variance[n:] += mean @ spread - 2 * spread[n:]
     # Friction along edges, which is the error of arcs, hides a part of the contrast of tensions from all
     # junctions alike: their angles follow the tensions late. As a force it is 2 γ times this error.
-    lag = HIDDEN * balance.errors.arc * np.append(values[:n] - 1, np.zeros(len(values) - n))
-    covariance += np.outer(lag, lag)
-    deviations = np.sqrt(np.maximum(np.diag(covariance), 0))
-    return Relative(
-        values[:n], values[n:], deviations[:n], deviations[n:], beside, sure, covariance
-    )
+    lag = HIDDEN * balance.errors.arc * np.append(balance.tension - 1, np.zeros(n_cells))
+    deviation = np.sqrt(np.maximum(variance + lag**2, 0))
+    pressure = balance.pressure - np.mean(balance.pressure)
+    return Relative(balance.tension, pressure, deviation[:n], deviation[n:], beside, sure, lag)
 
 
 def outcome(
@@ -106,11 +94,12 @@ def outcome(
         tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
     result = relative(balance, which)
     weights, included = stress_weights(tissue, which.edges, which.cells)
-    stress = mean_stress(
-        weights @ np.concatenate([result.tension, result.pressure]),
-        weights @ result.covariance @ weights.T,
-        int(included.sum()),
-    )
+    values = weights @ np.concatenate([result.tension, result.pressure])
+    # Pressures are less their mean.
+    n, lag = len(which.edges), weights @ result.lag
+    weights[:, n:] -= weights[:, n:].mean(axis=1, keepdims=True)
+    covariance = weights @ balance.posterior.covariances(weights.T)
+    stress = mean_stress(values, covariance + np.outer(lag, lag), int(included.sum()))
 
     def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
         array = np.full(size, fill)
@@ -141,6 +130,7 @@ def outcome(
         pixel_size=pixel_size,
         four_fold=four_fold,
         mask_report=report,
+        short=spread(*edges, balance.loose, False),
         outline_errors=_outline_errors(tissue, points, curves.change)
         / pixel_length(pixel_size or 1.0),
         resampled_deviations=None if resampled is None else spread(*edges, resampled, nan),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_array
 
-from vertax.tensions._balance import Equations, angle_slopes
+from vertax._base.sparse_normal import factorised
+from vertax.tensions._balance import angle_slopes
 from vertax.tensions._curves import Fitted, Points
 from vertax.tensions._observed_geometry import ObservedGeometry
 from vertax.tensions._outcome import relative
-from vertax.tensions._solve import Balance, Observability, model_deviations, solve
+from vertax.tensions._solve import HIDDEN, Balance, System, solve
 
 
 # The truth of the bootstrap are the angles with which all forces balance at the inferred tensions. Added are
@@ -20,11 +21,9 @@ def resampled_deviations(
     fitted: ObservedGeometry,
     curves: Fitted,
     points: Points,
-    which: Equations,
-    shape: Observability,
+    system: System,
     balance: Balance,
     *,
-    prior: float | None,
     times: int,
     seed: int,
 ) -> Float[np.ndarray, " tensions"]:
@@ -32,9 +31,8 @@ def resampled_deviations(
 
     **Arguments:**
 
-    - `fitted`, `curves`, `points`, `which`, `shape`: the observed geometry and its equations.
+    - `fitted`, `curves`, `points`, `system`: the observed geometry and its equations.
     - `balance`: the inferred tensions and pressures.
-    - `prior`: standard deviation of the prior of tensions.
     - `times`: number of resampled shapes.
     - `seed`: seed of the random numbers.
 
@@ -42,20 +40,19 @@ def resampled_deviations(
     """
     random = np.random.default_rng(seed)
     stretch = _stretches(points, 2 * curves.apart)
-    # Effect of the distances of each stretch on the angles.
-    by_point = angle_slopes(fitted, which) @ splu(curves.precision).solve(
-        (curves.weighted * curves.rest).toarray()
-    )
-    by_stretch = np.add.reduceat(by_point, np.flatnonzero(np.diff(stretch, prepend=-1)), axis=1)
-    model = model_deviations(balance.errors, shape, which)
+    slopes, factor = angle_slopes(fitted, system.which), factorised(csc_array(curves.precision))
+    errors, shape = balance.errors, system.shape
+    model = shape.model_deviations(errors._replace(arc=HIDDEN * errors.arc))
     samples = []
     for _ in range(times):
-        sign = random.choice([-1.0, 1.0], size=by_stretch.shape[1])
-        chance = by_stretch @ sign + model * random.normal(size=len(model))
-        again = shape._replace(angle=balance.angle + chance)
-        samples.append(
-            relative(solve(again, which, prior=prior, errors=balance.errors), which).tension
+        sign = random.choice([-1.0, 1.0], size=stretch.max(initial=-1) + 1)
+        # Effect of the distances of each stretch on the angles.
+        moved = factor.solve(curves.weighted @ (curves.rest * sign[stretch]))
+        chance = slopes @ moved + model * random.normal(size=len(model))
+        again = System(
+            shape._replace(angle=balance.angle + chance), system.which, regional=system.regional
         )
+        samples.append(relative(solve(again, errors), system.which).tension)
     return np.std(samples, axis=0, ddof=1)
 
 
