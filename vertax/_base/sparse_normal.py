@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csc_array, csr_array, sparray
 from scipy.sparse.linalg import splu
 
 # Largest number of unknowns, of which the variances are computed without samples, and of those of a window.
@@ -73,7 +75,7 @@ class SparseNormal:
             window = np.union1d(part, some.indices)
             for _ in range(2):
                 window = np.unique(pattern[window].indices)
-            factor = factorised(csc_array(pattern[window][:, window]))
+            factor = factorised(pattern[window][:, window])
             local = some[:, window]
             towards = factor.solve(local.T.toarray())
             mean = local @ samples[window] - towards.T @ pushed[window]
@@ -88,10 +90,10 @@ class SparseNormal:
         return self._factor.solve((lower @ (scale[:, None] * z))[self._factor.perm_r])
 
 
-def factorised(precision: csc_array):
-    """The factors of a sparse matrix that is symmetric and positive definite."""
+def factorised(matrix: sparray) -> Any:
+    """The factors of a sparse symmetric matrix; their method `solve` takes right-hand sides."""
     return splu(
-        precision,
+        csc_array(matrix),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},

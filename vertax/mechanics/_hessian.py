@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from vertax._base.announce import announced_jit
 from vertax.mechanics._landscape import Landscape
@@ -91,16 +89,6 @@ def sparse_hessian(landscape: Landscape) -> sparse.csr_array | None:
     if np.abs(matrix @ probe - expected).max() > rounding * size.max(initial=0):
         return None
     return 0.5 * (matrix + matrix.T)
-
-
-def factorised(matrix: sparse.sparray) -> Any:
-    """A sparse factorisation of a symmetric matrix; its method `solve` takes right-hand sides."""
-    return splu(
-        sparse.csc_array(matrix),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
 
 
 _products = announced_jit(hessian_products)

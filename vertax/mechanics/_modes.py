@@ -15,13 +15,13 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_float64, check_concrete, check_integer, check_number
+from vertax._base.sparse_normal import factorised
 from vertax._base.tracing import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mechanics._arguments import check_system
 from vertax.mechanics._hessian import (
     MAX_DENSE_SIZE,
     dense_hessian,
-    factorised,
     flat_hessian,
     movable,
     sparse_hessian,

@@ -15,6 +15,7 @@ from scipy.sparse import diags_array
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_real, check_number
+from vertax._base.sparse_normal import factorised
 from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
@@ -23,7 +24,6 @@ from vertax.mechanics._elasticity import shear_part
 from vertax.mechanics._hessian import (
     MAX_DENSE_SIZE,
     dense_hessian,
-    factorised,
     movable,
     sparse_hessian,
 )
