@@ -29,8 +29,8 @@ CACHE = {
 # Each row is a process: folders, and single files that are taken out of their folder. A process takes seven
 # seconds to start. The longest ones come first.
 TOGETHER = (
+    ("fitting",),
     ("default_mode",),
-    ("debug_modes",),
     ("_base", "mesh", "energies", "dissipations"),
     ("io", "plotting", "precondition"),
     ("project", "solvers"),
@@ -41,9 +41,9 @@ TOGETHER = (
     ("dynamics", "activities"),
     ("costs", "mechanics"),
     ("relax",),
-    ("fitting",),
     ("relax/test_free_equilibrium.py", "relax/test_relaxation.py"),
     ("bayes", "initialise"),
+    ("debug_modes",),
     ("runs",),
     ("experiments",),
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),

@@ -584,7 +584,7 @@ def test_invalid_arguments_raise():
         vx.AutomaticDifferentiation(rtol=-1.0)
 
 
-@adjoints("implicit", "propagation")
+@adjoints("implicit")
 def test_broken_member_of_a_batch_leaves_the_gradients_of_the_others(adjoint, response, rtol):
     tissue = random_tissue(N_CELLS)
 

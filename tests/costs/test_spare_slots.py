@@ -86,6 +86,7 @@ def test_costs_do_not_depend_on_spare_slots(name):
     np.testing.assert_allclose(other_slope[len(slope) :], 0, atol=1e-15)
 
 
+@pytest.mark.thorough
 def test_measurements_are_the_residuals_without_spare_slots():
     tissue, target = pair("areas")
     weight = np.arange(64.0).reshape(8, 8) % 4

@@ -110,6 +110,7 @@ def test_resumed_fit_with_recycled_hessian_matches_uninterrupted_fit(path, monke
     assert bits(run("adam", callback=interrupt_at(None), checkpoint=path)) == bits(uninterrupted)
 
 
+@pytest.mark.thorough
 def test_finished_fit_is_not_repeated_and_can_be_extended(path):
     finished = run("adam", checkpoint=path)
     fail = lambda *_: pytest.fail("an epoch was repeated")
@@ -203,6 +204,7 @@ def edited(factor):
     return Edited(jnp.full(10, 3.7))
 
 
+@pytest.mark.thorough
 def test_checkpoint_of_an_edited_class_is_rejected(path):
     fit = lambda factor: vx.fit(
         dataclasses.replace(PROBLEM, energy=edited(factor)),
@@ -239,6 +241,7 @@ print(fingerprint(jax.grad(loss), jnp.full(6, 3.6)))
 """
 
 
+@pytest.mark.thorough
 def test_fingerprint_is_equal_in_all_processes():
     hashes = set()
     for seed in ("1", "2"):

@@ -185,6 +185,7 @@ def test_fitted_position_increases_the_uncertainty(hidden):
     assert float(jnp.max(p0_of(fitted_position.deviation) / p0_of(fixed.deviation))) < 3
 
 
+@pytest.mark.thorough
 def test_uncertainty_does_not_depend_on_spare_slots():
     tissue, truth = relaxed(6, 3)
     noise = 1e-2 * np.random.default_rng(0).normal(size=tissue.vertices.shape)
