@@ -216,6 +216,7 @@ def test_structural_cost_hypergradient_is_accurate_with_all_adjoints(adjoint, ac
     assert error < accuracy
 
 
+@pytest.mark.thorough
 def test_t1_changes_two_neighbour_pairs():
     tissue = random_tissue(20, 6)
     assert mismatched_neighbours(tissue, tissue) == 0

@@ -43,7 +43,7 @@ def hexagons():
 
 
 class TestEquilibria:
-    @pytest.mark.parametrize("spare", [0, 4])
+    @pytest.mark.parametrize("spare", [0, pytest.param(4, marks=pytest.mark.thorough)])
     def test_default_relaxation_reaches_rest_without_overlaps(self, spare):
         tissue = random_tissue(N, 3)
         tissue = tissue.with_capacity(N + spare) if spare else tissue
@@ -113,6 +113,7 @@ class TestGradients:
         accuracy = 0.15 if name == "automatic" else 0.03
         assert float(gradient @ direction) == pytest.approx(float(expected), rel=accuracy)
 
+    @pytest.mark.thorough
     def test_gradients_of_a_batch_are_those_of_its_members(self, difference):
         loss, *_ = difference
         slope = jax.grad(lambda p0: loss(p0, ADJOINTS["implicit"], FIXED_TOPOLOGY))

@@ -203,6 +203,7 @@ def test_uncertainty_does_not_depend_on_spare_slots():
     np.testing.assert_allclose(deviation[6:], 0.5)
 
 
+@pytest.mark.thorough
 def test_invalid_arguments_are_rejected(hidden, without_type_checks):
     tissue, truth = hidden
     problem, fit = fitted(tissue, truth, VertexDistance(tissue))

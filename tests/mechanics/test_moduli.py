@@ -28,6 +28,7 @@ def elastic(k_a, k_p, p0):
     return AreaElasticity(jnp.array(k_a), jnp.array(1.0)) + perimeters
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("p0", [3.2, 3.6])
 def test_moduli_of_the_hexagonal_lattice(lattice, p0):
     k_a, k_p = 2.0, 1.7

@@ -248,6 +248,7 @@ def test_equilibria_turn_with_the_tissue():
     )
 
 
+@pytest.mark.thorough
 def test_the_gauge_makes_the_hessian_regular():
     tissue = relax(cluster(8, 4), drops(0.8))
     y, unravel = ravel_pytree(tissue.configuration)

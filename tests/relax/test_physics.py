@@ -28,6 +28,7 @@ def lattice():
     return vx.initialise.hexagonal(4, 4, softening=0.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("p0", [3.3, 3.6, 3.7])
 @pytest.mark.parametrize("epsilon", [0.02, 0.1])
 def test_perimeter_of_the_sheared_hexagonal_lattice(lattice, p0, epsilon):
@@ -177,6 +178,7 @@ def forces(tissue, energy):
     return jax.grad(lambda x: energy(tissue.with_configuration(x)))(tissue.vertices)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(3))
 def test_forces_sum_to_zero_and_areas_to_the_box(seed):
     energy = ShapeFactorEnergy(shape_factors(16, 3.7, 0.2, seed))
