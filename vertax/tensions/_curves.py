@@ -299,7 +299,7 @@ def _most_evident(
         log_noise, log_bend = logs
         variance = np.exp(2 * log_noise)
         prior = np.where(bends, np.exp(-2 * log_bend), held)
-        factor = factorised(csc_array(square + diags_array(variance * prior)))
+        factor = factorised(square + diags_array(variance * prior))
         value = (total - len(used)) * 2 * log_noise - np.sum(np.log(prior))
         value += np.sum(np.log(np.abs(factor.U.diagonal())))
         return float(value + (constant - push @ factor.solve(push)) / variance)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import csc_array
 
 from vertax._base.sparse_normal import factorised
 from vertax.tensions._balance import angle_slopes
@@ -40,7 +39,7 @@ def resampled_deviations(
     """
     random = np.random.default_rng(seed)
     stretch = _stretches(points, 2 * curves.apart)
-    slopes, factor = angle_slopes(fitted, system.which), factorised(csc_array(curves.precision))
+    slopes, factor = angle_slopes(fitted, system.which), factorised(curves.precision)
     errors, shape = balance.errors, system.shape
     model = shape.model_deviations(errors._replace(arc=HIDDEN * errors.arc))
     samples = []
