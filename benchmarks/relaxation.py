@@ -1,13 +1,19 @@
-"""Relaxations of many kinds: fraction converged, overlaps (brute force), steps, time, kernels, compile time.
+"""Relaxations and fits of many kinds; with `--against FOLDER`, another checkout beside this one.
 
-To compare with another version run this file again with PYTHONPATH set to its folder. Kernels are the
-fusions of the compiled program, as in `compilation.py`. Seconds of tracing and compilation are 0 where an
-earlier case has compiled the same program.
+A row for each case and checkout: members at rest, overlaps (brute force, up to 400 cells), means of steps, of
+Hessian-vector products (where the checkout counts them) and of energies, the mean and the median processor
+time of a relaxation, kernels (fusions of the compiled program), and processor time of tracing and
+compilation. Cases called "epochs" are fits: the time is that of an epoch.
+
+Each checkout runs in a process of its own; the processes take turns, seed by seed.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -18,6 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 import vertax as vx
 
@@ -67,6 +74,7 @@ def cluster(n_cells: int) -> Case:
 
 
 CASES: dict[str, tuple[Case, int]] = {
+    "20 cells, p0 = 3.7": (shapes(20, 3.7), 20),
     **{f"100 cells, p0 = {p0}": (shapes(100, p0), 10) for p0 in (3.5, 3.7, 3.8, 3.9)},
     **{f"64 cells, p0 = {p0}": (shapes(64, p0), 10) for p0 in (4.1, 4.5)},
     **{f"100 cells, tensions 1 : {r}": (tensions(100, r), 10) for r in (3, 10)},
@@ -75,8 +83,10 @@ CASES: dict[str, tuple[Case, int]] = {
     "400 cells, tensions 1 : 10": (tensions(400, 10), 3),
     **{f"1000 cells, p0 = {p0}": (shapes(1000, p0), 2) for p0 in (3.7, 3.9)},
     "10000 cells, p0 = 3.7": (shapes(10_000, 3.7), 1),
+    **{f"epochs, {n} cells": (shapes(n, 3.7), 3) for n in (20, 100)},
 }
 """Cases with their numbers of seeds."""
+N_EPOCHS = 60
 
 
 def equilibrium(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.Equilibrium:
@@ -84,50 +94,162 @@ def equilibrium(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.Equilibrium:
     return vx.equilibrate(tissue, energy, throw=False)
 
 
-relax: Any = eqx.filter_jit(equilibrium)
+def products(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> jax.Array:
+    """Hessian-vector products of a relaxation."""
+    relaxation: Any = vx.Relaxation().traced()
+    search = relaxation.search(tissue, energy)
+    end = search.advance(search.begin(tissue, energy), energy, relaxation.max_steps)
+    return end.iteration.num_products
 
 
-def row(name: str, case: Case, n_seeds: int) -> str:
-    """The results of one case."""
-    given = jax.block_until_ready(case(0))
-    began = time.perf_counter()
-    lowered = relax.lower(*given)
-    traced = time.perf_counter()
-    program = lowered.compile()
-    compiled = time.perf_counter()
-    kernels = (program.compiled.as_text() or "").count(" fusion(")
-    ends, seconds = [], []
-    for seed in range(n_seeds):
-        given = jax.block_until_ready(case(seed))
-        start = time.perf_counter()
-        ends.append(jax.block_until_ready(program(*given)))
-        seconds.append(time.perf_counter() - start)
-    at_rest = np.mean([bool(e.converged) for e in ends])
-    # The check by brute force takes too long for large tissues.
-    checked = [e for e in ends if e.tissue.n_cells <= 400]
-    overlap = sum(bool(faces_that_overlap(e.tissue)) for e in checked)
-    steps = np.mean([int(e.num_steps) for e in ends])
-    energy = np.mean([float(e.energy) for e in ends])
-    median, mean = 1e3 * np.median(seconds), 1e3 * np.mean(seconds)
+class Program:
+    """The compiled program of a case in this process."""
+
+    def __init__(self, name: str):
+        self.case, _ = CASES[name]
+        given = self.case(0)
+        start = time.process_time()
+        jitted: Any = eqx.filter_jit(equilibrium)
+        self.run = jitted.lower(*given).compile()
+        self.compile_seconds = time.process_time() - start
+        self.kernels = (self.run.compiled.as_text() or "").count(" fusion(")
+        self.count: Any = eqx.filter_jit(products)
+        jax.block_until_ready(self.run(*given))
+
+    def row(self, seed: int) -> dict[str, float]:
+        """One relaxation."""
+        given = jax.block_until_ready(self.case(seed))
+        start = time.process_time()
+        end = jax.block_until_ready(self.run(*given))
+        seconds = time.process_time() - start
+        few = end.tissue.n_cells <= 400
+        try:
+            n_products = float(self.count(*given)) if few else np.nan
+        except AttributeError:
+            n_products = np.nan
+        return {
+            "at rest": float(end.converged),
+            "overlaps": float(bool(faces_that_overlap(end.tissue))) if few else np.nan,
+            "steps": float(end.num_steps),
+            "products": n_products,
+            "energy": float(end.energy),
+            "ms": 1e3 * seconds,
+            "kernels": self.kernels,
+            "compile s": self.compile_seconds,
+        }
+
+
+class Epochs:
+    """A fit in this process."""
+
+    optimiser = optax.adam(1e-2)
+
+    def __init__(self, name: str):
+        self.case, _ = CASES[name]
+        start = time.process_time()
+        self.fit(0, 2)
+        self.compile_seconds = time.process_time() - start
+
+    def fit(self, seed: int, n_epochs: int) -> vx.fitting.Fit:
+        """A fit of shape factors to the vertices of a relaxed tissue."""
+        tissue, truth = self.case(seed)
+        target = vx.equilibrate(tissue, truth).tissue
+        energy = vx.energies.ShapeFactorEnergy(jnp.full(tissue.n_cells, 3.7))
+        problem = vx.InverseProblem(target, energy, vx.costs.VertexDistance(target))
+        return vx.fit(problem, self.optimiser, n_epochs, progress=False)
+
+    def row(self, seed: int) -> dict[str, float]:
+        """One fit."""
+        start = time.process_time()
+        self.fit(seed, 2)
+        middle = time.process_time()
+        history = self.fit(seed, 2 + N_EPOCHS).history
+        seconds = time.process_time() - middle - (middle - start)
+        return {
+            "at rest": np.nan,
+            "overlaps": np.nan,
+            "steps": float(np.mean(history.num_steps[1:])),
+            "products": np.nan,
+            "energy": np.nan,
+            "ms": 1e3 * seconds / N_EPOCHS,
+            "kernels": np.nan,
+            "compile s": self.compile_seconds,
+        }
+
+
+def serve() -> None:
+    """Answer requests, each a line with the name of a case and a seed."""
+    programs: dict[str, Program | Epochs] = {}
+    for line in sys.stdin:
+        name, seed = json.loads(line)
+        if name not in programs:
+            programs.clear()
+            programs[name] = Epochs(name) if name.startswith("epochs") else Program(name)
+        print(json.dumps(programs[name].row(seed)), flush=True)
+
+
+class Checkout:
+    """A process that runs the cases with the code of a folder."""
+
+    def __init__(self, folder: Path):
+        self.name = folder.name
+        environment = os.environ | {"PYTHONPATH": str(folder), "VERTAX_CACHE": "off"}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        command = [sys.executable, __file__, "--serve"]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=folder
+        )
+
+    def row(self, name: str, seed: int) -> dict[str, float]:
+        """One relaxation of a case."""
+        asked, answered = self.process.stdin, self.process.stdout
+        assert asked is not None
+        assert answered is not None
+        print(json.dumps([name, seed]), file=asked, flush=True)
+        answer = answered.readline()
+        if not answer:
+            sys.exit(f"The process of {self.name} has ended.")
+        return json.loads(answer)
+
+
+def summary(rows: list[dict[str, float]]) -> str:
+    """The row of a case."""
+    mean = {key: np.mean([row[key] for row in rows]) for key in rows[0]}
+    median = np.median([row["ms"] for row in rows])
     return (
-        f"{name:>28} | {at_rest:5.0%} {overlap:4d} | {steps:6.1f} {median:8.1f} {mean:8.1f} "
-        f"{energy:10.4f} | {kernels:5d} {traced - began:6.1f} {compiled - traced:6.1f}"
+        f"{mean['at rest']:5.0%} {sum(row['overlaps'] for row in rows):4.0f} | {mean['steps']:6.1f} "
+        f"{mean['products']:8.0f} {mean['energy']:10.4f} | {mean['ms']:9.2f} {median:9.2f} | "
+        f"{mean['kernels']:5.0f} {mean['compile s']:6.1f}"
     )
 
 
 def main() -> None:
-    """Print a row for each case."""
+    """Print a row for each case and checkout."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", nargs="*", default=[""], help="parts of the names of cases")
+    parser.add_argument("--against", type=Path, nargs="*", default=[], help="other checkouts")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
+    if chosen.serve:
+        serve()
+        return
     for part in chosen.cases:
         if not any(part in name for name in CASES):
             parser.error(f"argument --cases: {part!r} is part of no name; there are {list(CASES)}")
-    head = "at rest, overlaps | steps, median ms, mean ms, energy | kernels, trace s, compile s"
-    print(f"{vx.__file__}\n{'case':>28} | {head}")
-    for name, (case, n_seeds) in CASES.items():
-        if any(part in name for part in chosen.cases):
-            print(row(name, case, n_seeds), flush=True)
+    for folder in chosen.against:
+        if not (folder / "vertax").is_dir():
+            parser.error(f"argument --against: {folder} has no folder vertax")
+    folders = [Path(vx.__file__).resolve().parents[1], *chosen.against]
+    checkouts = [Checkout(folder.resolve()) for folder in folders]
+    head = "at rest, overlaps | steps, products, energy | ms: mean, median | kernels, compile s"
+    print(f"{'case':>28} {'checkout':>16} | {head}", flush=True)
+    for name, (_, n_seeds) in CASES.items():
+        if not any(part in name for part in chosen.cases):
+            continue
+        rows = [[c.row(name, seed) for c in checkouts] for seed in range(n_seeds)]
+        for checkout, own in zip(checkouts, zip(*rows, strict=True), strict=True):
+            print(f"{name:>28} {checkout.name:>16} | {summary(list(own))}", flush=True)
 
 
 if __name__ == "__main__":
