@@ -19,7 +19,7 @@ import vertax as vx
 from vertax._base.fingerprint import fingerprint
 from vertax.costs import VertexDistance
 from vertax.energies import ShapeFactorEnergy
-from vertax.fitting import _descent, stack
+from vertax.fitting import stack
 
 EPOCHS = 6
 
@@ -99,15 +99,6 @@ def test_resumed_fit_matches_uninterrupted_fit(case, path):
     assert epochs_run == list(range(3, len(uninterrupted.history.cost)))
     assert bits(resumed) == bits(uninterrupted)
     np.testing.assert_array_equal(resumed.notes["cost"], uninterrupted.history.cost)
-
-
-@pytest.mark.thorough
-def test_resumed_fit_with_recycled_hessian_matches_uninterrupted_fit(path, monkeypatch):
-    monkeypatch.setattr(_descent, "_FIRST_HESSIAN_EPOCH", 2)
-    monkeypatch.setattr(_descent, "_HESSIAN_INTERVAL", 2)
-    uninterrupted = run("adam", callback=interrupt_at(None))
-    run("adam", callback=interrupt_at(4), checkpoint=path)
-    assert bits(run("adam", callback=interrupt_at(None), checkpoint=path)) == bits(uninterrupted)
 
 
 @pytest.mark.thorough

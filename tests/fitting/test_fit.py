@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Shaped
 import vertax as vx
 from vertax.costs import MeshImage, VertexDistance, render
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
-from vertax.fitting import _descent, stack
+from vertax.fitting import stack
 
 inverse_problem = functools.partial(vx.InverseProblem, response=FIXED_TOPOLOGY)
 
@@ -154,28 +154,6 @@ def test_optimiser_state_persists_over_epochs(hidden):
     )
 
 
-@pytest.fixture
-def early_hessian(monkeypatch):
-    """Fits compute a Hessian early, and again soon after it is stale."""
-    monkeypatch.setattr(_descent, "_FIRST_HESSIAN_EPOCH", 4)
-    monkeypatch.setattr(_descent, "_HESSIAN_INTERVAL", 3)
-
-
-@pytest.mark.parametrize("adjoint", [vx.ImplicitDifferentiation(), vx.EquilibriumPropagation()])
-def test_recycled_hessian_does_not_change_the_fit(hidden, adjoint, early_hessian, monkeypatch):
-    target, truth, guess, _ = hidden
-    problem = inverse_problem(target, guess, VertexDistance(target), adjoint=adjoint)
-    fit = lambda: vx.fit(problem, ADAM, 12, truth=truth, progress=False).history
-    recycled = fit()
-    monkeypatch.setattr(_descent, "_FIRST_HESSIAN_EPOCH", 1000)
-    without = fit()
-    np.testing.assert_allclose(recycled.cost, without.cost, rtol=1e-5)
-    np.testing.assert_allclose(recycled.relative_error, without.relative_error, rtol=1e-5)
-    if isinstance(adjoint, vx.ImplicitDifferentiation):
-        np.testing.assert_array_equal(recycled.gradient_steps[:4], without.gradient_steps[:4])
-        assert np.all(recycled.gradient_steps[4:8] < 0.5 * without.gradient_steps[4:8])
-
-
 def test_epochs_compile_once(hidden):
     target, _, _, start = hidden
     traces = []
@@ -264,7 +242,7 @@ def batch(hidden):
     ],
 )
 @pytest.mark.thorough
-def test_batched_fit_matches_single_fits(batch, optimiser, early_hessian):
+def test_batched_fit_matches_single_fits(batch, optimiser):
     problems, stacked, truth, truths = batch
     batched = vx.fit(stacked, optimiser, 8, truth=truths, batched=True, progress=False)
     assert batched.history.cost.shape[1:] == batched.cost.shape == (3,)

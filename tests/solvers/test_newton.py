@@ -11,7 +11,6 @@ import pytest
 
 import vertax as vx
 from vertax.solvers import _rows
-from vertax.solvers._conjugate_gradients import TruncatedCG
 
 N = 30
 PLACES = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (N, 2)))
@@ -130,25 +129,6 @@ def test_disjoint_copies_take_the_steps_of_one(n):
     np.testing.assert_allclose(together.reshape(4, N, 2), jnp.stack(4 * [alone]), atol=1e-12)
 
 
-def test_a_step_with_large_remaining_force_is_corrected():
-    """Soft springs, which vertices may not follow to their ends in one step."""
-    soft = lambda y, _: (0.5e-3 * jnp.sum((y - 2.0) ** 2), None)
-    start = jnp.zeros((N, 2))
-    assert needed(soft, start) <= 0.75 * needed(soft, start, max_corrections=0)
-
-
-def test_a_cheap_step_is_corrected_earlier():
-    """One wall that begins with the cube of the distance, as a contact, and others at rest."""
-
-    def wall(y, _):
-        others = 0.5 * jnp.sum((y[1:] - PLACES[1:]) ** 2) + 0.5 * y[0, 1] ** 2
-        return others + 0.05 * jnp.maximum(1 - y[0, 0], 0) ** 3, None
-
-    start = PLACES.at[0].set(0.0)
-    # (Newton's method halves the distance, and quarters the force.)
-    assert needed(wall, start) < 0.75 * needed(wall, start, cheap_products=0)
-
-
 def test_typical_force_ignores_outliers():
     forces = jnp.zeros((101, 2)).at[:100, 0].set(1e-3).at[0, 0].set(1.0)
     assert np.mean(_rows.sizes(forces)) > 1e-2
@@ -165,27 +145,6 @@ def test_steps_are_bounded_by_the_largest_displacement():
     far = jnp.sqrt(jnp.sum((y - start) ** 2, axis=-1))
     assert 0 < far.max() <= 2 * 0.2 * 0.5
     assert hill(y, None)[0] < hill(start, None)[0]
-
-
-def test_only_long_rows_are_clipped():
-    """A long lever: its end moves a hundred times as far as the point where the force acts."""
-    solver = vx.solvers.NewtonCG(
-        forcing=1e-6, max_corrections=0, conjugate_gradients=TruncatedCG(max_rounds=0)
-    )
-
-    def lever(y, _):
-        bent = y[1] - 100 * y[0]
-        wells = 0.5 * jnp.sum((y[2:] - PLACES[2:]) ** 2)
-        return wells + 0.1 * y[0, 0] + 0.5e-4 * jnp.sum(bent**2), None
-
-    start = jnp.zeros((N, 2))
-    y, state = steps(lever, start, None, 1, solver)
-    far = jnp.sqrt(jnp.sum(y**2, axis=-1))
-    assert 0.3 < far[1] <= 2 * 0.2 * 1.001
-    np.testing.assert_allclose(state.gradient, jax.grad(lambda y: lever(y, None)[0])(y), atol=1e-12)
-    # As far as their own damping lets them.
-    damped = PLACES[2:] / (1 + jnp.linalg.norm(PLACES[2:], axis=-1, keepdims=True) / 0.2)
-    np.testing.assert_allclose(y[2:], damped, rtol=0.05)
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
@@ -231,13 +190,12 @@ def test_steps_follow_a_curved_valley():
         valley, vx.solvers.NewtonCG(atol=1e-10), start, has_aux=True, max_steps=400
     )
     np.testing.assert_allclose(solution.value[:, 0], 1 + tilt, atol=1e-6)
-    assert needed(valley, start) < 0.75 * needed(valley, start, max_corrections=0)
 
 
 @pytest.mark.thorough
 def test_fluid_tissues_relax_without_creeping():
     relax = eqx.filter_jit(vx.Relaxation(tolerance=1e-8, max_steps=600))
-    for seed in (22, 49, 66, 71, 105, 106):  # 170 to 560 steps each without corrections
+    for seed in (22, 49, 66, 71, 105, 106):  # of the slowest of 200
         tissue = vx.initialise.periodic_voronoi(64, key=jax.random.key(1000 + seed))
         factors = 3.9 + 0.1 * jax.random.normal(jax.random.key(2000 + seed), (64,))
         assert relax(tissue, vx.energies.ShapeFactorEnergy(factors)).num_steps < 160

@@ -25,7 +25,6 @@ from vertax.adjoints._adjoint import (
     materialise,
 )
 from vertax.precondition._preconditioned_minres import PreconditionedMINRES
-from vertax.precondition._recycled_hessian import RecycledHessian
 from vertax.precondition._sum import Preconditioner
 from vertax.solvers import MINRES
 
@@ -88,9 +87,7 @@ class ImplicitDifferentiation(AbstractAdjoint):
         options = minimisation.options
         preconditioner = options.get("preconditioner", Preconditioner(None, None))
         coarse = preconditioner.coarse
-        # (A dense matrix does not pay for a batch of systems.)
-        dense = isinstance(coarse, RecycledHessian) and self.mode == "sensitivity"
-        if coarse is not None and not dense and isinstance(self.linear_solver, MINRES):
+        if coarse is not None and isinstance(self.linear_solver, MINRES):
             solver = PreconditionedMINRES(self.linear_solver, preconditioner, options["stiffness"])
             adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
         system = _System(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -11,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from vertax._base.announce import announced_jit
 from vertax._base.fingerprint import fingerprint
-from vertax._base.results import RESULTS, first_failure, result_of
+from vertax._base.results import RESULTS, first_failure, result_of, where_is
 from vertax._base.tracing import traced, tree_where
 from vertax.fitting._epoch import (
     AbstractMethod,
@@ -31,12 +30,6 @@ from vertax.fitting._epoch import (
 from vertax.fitting._history import Facts, Record
 from vertax.fitting._inverse import Evaluation, InverseProblem
 from vertax.mesh import Tissue
-from vertax.precondition._recycled_hessian import RecycledHessian
-
-# Epoch of the first Hessian, and the minimum number of epochs between two of them. A Hessian takes as long as
-# a few epochs, and its compilation as long as hundreds.
-_FIRST_HESSIAN_EPOCH = 100
-_HESSIAN_INTERVAL = 20
 
 
 class State(eqx.Module):
@@ -48,17 +41,11 @@ class State(eqx.Module):
     best: Best
     result: RESULTS
     """The first failure: an invalid cost or gradient."""
-    hessian: RecycledHessian | None
-    """Hessian at the equilibrium of an earlier epoch."""
-    hessian_epoch: Int[Array, "*batch"]
-    """Epoch of that Hessian; 0 if there is none."""
-    stale: Bool[Array, "*batch"]
-    """Whether the Hessian no longer applies to the current tissue."""
 
     @property
-    def active(self) -> Bool[Array, "*batch"]:
+    def active(self) -> np.ndarray:
         """False after an epoch with an invalid cost or gradient."""
-        return self.result == RESULTS.successful
+        return where_is(self.result, RESULTS.successful)
 
 
 class Descent(AbstractMethod):
@@ -72,7 +59,7 @@ class Descent(AbstractMethod):
     batched: bool
     guidance: Callable[[Int[Array, ""]], ArrayLike] | None
     recent: list[Any] = eqx.field(default_factory=list)
-    """Cache: the problem, the Hessian and the compiled problem of the last epoch."""
+    """Cache: the problem of the last epoch, and that of the compiled functions."""
 
     def __check_init__(self):
         calculation, arguments = self._one_update()
@@ -88,16 +75,10 @@ class Descent(AbstractMethod):
         if self.batched:
             return _evaluate_batch(problem, self.constants, state)
         # Rebuild only if something changed: that takes as long as an epoch of a small tissue.
-        if not self.recent or self.recent[0] is not problem or self.recent[1] is not state.hessian:
-            response = problem.response.with_preconditioner(state.hessian)
-            preconditioned = eqx.tree_at(lambda p: p.response, problem, response)
-            self.recent[:] = [
-                problem,
-                state.hessian,
-                preconditioned.without_parameters(state.tissue),
-            ]
+        if not self.recent or self.recent[0] is not problem:
+            self.recent[:] = [problem, problem.without_parameters(state.tissue)]
         shift = no_shift(problem)
-        return self.recent[2].evaluate(state.tissue, state.parameters, self.constants, shift)
+        return self.recent[1].evaluate(state.tissue, state.parameters, self.constants, shift)
 
     def start(self) -> State:
         return _start(self._without_throw(), self.optimiser, self.parameters, self.batched)
@@ -106,22 +87,14 @@ class Descent(AbstractMethod):
         strength = None
         if self.guidance is not None:
             strength = jnp.asarray(self.strength(epoch), self.problem.tissue.vertices.dtype)
-        problem, hessian = self._without_throw(strength), state.hessian
-        interval = _HESSIAN_INTERVAL if np.any(state.hessian_epoch) else _FIRST_HESSIAN_EPOCH
-        due = hessian is not None and epoch >= np.max(state.hessian_epoch) + interval
-        if due and np.any(state.stale & state.active):
-            hessian = _hessian_at(problem, self.constants, state, self.batched)
-            hessian_epoch = jnp.full_like(state.hessian_epoch, epoch)
-            state = dataclasses.replace(state, hessian_epoch=hessian_epoch, hessian=hessian)
+        problem = self._without_throw(strength)
         evaluation = self._evaluation(problem, state)
         next_tissue = problem.next_start(evaluation.equilibrium.tissue)
-        state_without_hessian = dataclasses.replace(state, hessian=None)
-        guidance = jnp.broadcast_to(guidance_of(problem), state.active.shape)
-        arguments = (state_without_hessian, evaluation, next_tissue, hessian, self.true, guidance)
-        epoch_index = jnp.asarray(epoch, state.hessian_epoch.dtype)
+        guidance = np.broadcast_to(guidance_of(problem), np.shape(state.result._value))
+        arguments = (state, evaluation, next_tissue, self.true, guidance)
+        epoch_index = np.asarray(epoch, jnp.result_type(int))
         settings = (self.problem.adjoint.throw, self.batched)
-        state, record = _update(self.optimiser, arguments, epoch_index, *settings)
-        return dataclasses.replace(state, hessian=hessian), record
+        return _update(self.optimiser, arguments, epoch_index, *settings)
 
     def first_epoch(self) -> Evaluation:
         # (Of the guidance a checkpoint holds the strength in each epoch.)
@@ -200,19 +173,15 @@ def _start(
     def start(problem: InverseProblem, parameters: PyTree[Array]) -> State:
         fitted = _fitted(parameters, no_shift(problem))
         best = unbeaten(problem, parameters)
-        no_hessian = problem.response.preconditioner_at(problem.tissue, None)
         state = traced(optimiser.init(fitted), problem.tissue.vertices.dtype)
         zero = jnp.zeros((), jnp.result_type(int))
-        result, stale = result_of(zero), jnp.array(True)
-        return State(parameters, state, problem.tissue, best, result, no_hessian, zero, stale)
+        return State(parameters, state, problem.tissue, best, result_of(zero))
 
     return (eqx.filter_vmap(start) if batched else start)(problem, parameters)
 
 
 def _evaluation(problem: InverseProblem, constants: PyTree, state: State) -> Evaluation:
     """Cost and gradient of an epoch, by the compiled functions of `value_and_gradient`."""
-    response = problem.response.with_preconditioner(state.hessian)
-    problem = eqx.tree_at(lambda p: p.response, problem, response)
     energy = eqx.combine(state.parameters, constants)
     return problem.value_and_gradient(energy, state.tissue, no_shift(problem), throw=False)
 
@@ -237,7 +206,6 @@ def _update(
         state: State,
         evaluation: Evaluation,
         next_tissue: Tissue,
-        hessian: RecycledHessian | None,
         true: PyTree[Array] | None,
         guidance: Float[Array, ""],
     ) -> tuple[State, Record]:
@@ -270,30 +238,11 @@ def _update(
             epoch,
             active & equilibrium.converged,
         )
-        stale = state.stale
-        if hessian is not None:
-            stale = ~hessian.near(next_tissue.configuration).ready
-        updated = State(
-            parameters, optimiser_state, next_tissue, best, result, None, state.hessian_epoch, stale
-        )
+        updated = State(parameters, optimiser_state, next_tissue, best, result)
         # After a failed epoch keep the previous state, so that no relaxation starts from an invalid tissue.
         return tree_where(active, updated, eqx.tree_at(lambda s: s.result, state, result)), record
 
     return (eqx.filter_vmap(one) if batched else one)(*arguments)
-
-
-@announced_jit
-def _hessian_at(
-    problem: InverseProblem, constants: PyTree, state: State, batched: bool
-) -> RecycledHessian | None:
-    """The Hessian at the start of an epoch, for each member of a batch."""
-
-    def one(problem: InverseProblem, constants: PyTree, state: State) -> RecycledHessian | None:
-        energy = eqx.combine(state.parameters, constants)
-        pulled = problem.guided_energy(state.tissue, energy, no_shift(problem))
-        return problem.response.preconditioner_at(state.tissue, pulled)
-
-    return (eqx.filter_vmap(one) if batched else one)(problem, constants, state)
 
 
 def _record(

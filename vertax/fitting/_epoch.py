@@ -9,6 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
@@ -113,11 +114,11 @@ def better(
     return tree_where(ok & lower, new, best)
 
 
-def guidance_of(problem: InverseProblem) -> Float[Array, "*batch"]:
+def guidance_of(problem: InverseProblem) -> Float[Array | np.ndarray, "*batch"]:
     """Strength of the guidance of a problem; 0 without guidance."""
-    return jnp.asarray(
-        0 if problem.guidance is None else problem.guidance, problem.tissue.vertices.dtype
-    )
+    dtype = problem.tissue.vertices.dtype
+    # (A NumPy array takes no time of the device.)
+    return np.zeros((), dtype) if problem.guidance is None else jnp.asarray(problem.guidance, dtype)
 
 
 def relative_error(parameters: PyTree[Array], true: PyTree[Array] | None) -> Float[Array, ""]:

@@ -29,7 +29,7 @@ from vertax._base.checkpoints import (
     without_addresses,
 )
 from vertax._base.fingerprint import fingerprint
-from vertax._base.results import RESULTS, index_of, result_of
+from vertax._base.results import RESULTS, index_of, result_of, where_is
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._arguments import check_arguments
@@ -294,7 +294,7 @@ def _run(
             while len(done.rows) < epochs and np.any(done.state.active):
                 epoch, start = len(done.rows), time.perf_counter()
                 state, record = method.advance(done.state, epoch)
-                failed = np.asarray(record.result != RESULTS.successful)  # blocks until it is done
+                failed = ~where_is(record.result, RESULTS.successful)  # blocks until it is done
                 record = record.with_nan()
                 row = _row(record, time.perf_counter() - start, method.strength(epoch))
                 if failed.all():

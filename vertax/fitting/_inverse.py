@@ -252,13 +252,10 @@ class InverseProblem(eqx.Module, Generic[Energy]):
 
         These are the tissue, the energy and, for relaxations, `throw` of the adjoint.
         """
-        response = self.response.completed(tissue)
-        problem = dataclasses.replace(
-            self.with_array_numbers(tissue.vertices.dtype), response=response
-        )
+        problem = self.with_array_numbers(tissue.vertices.dtype)
         parts = lambda p: (p.tissue, p.energy, p.trainable)
         problem = eqx.tree_at(parts, problem, (None,) * 3, is_leaf=lambda x: x is None)
-        if not isinstance(response, Relaxation):
+        if not isinstance(problem.response, Relaxation):
             return problem
         return eqx.tree_at(lambda p: p.adjoint.throw, problem, False)
 

@@ -9,20 +9,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+from jaxtyping import Array, Complex, Float, Int, PyTree
 
 from vertax._base.sums import total
 from vertax.mesh import Periodic, Tissue
 from vertax.mesh._boundary import inverse_of
 from vertax.mesh._topology import take
-from vertax.precondition._coarse import AbstractCoarseLevel
 from vertax.solvers._rows import Rows
 
 # (With one point for four cells a gradient takes a quarter more products with the Hessian.)
 _CELLS_PER_POINT = 1
 
 
-class ElasticMedium(AbstractCoarseLevel):
+class ElasticMedium(eqx.Module):
     r"""An approximate inverse of the Hessian of a tissue, for conjugate gradients and MINRES.
 
     The number of iterations of a Krylov method is proportional to the wave length of the softest mode, in
@@ -93,18 +92,22 @@ class ElasticMedium(AbstractCoarseLevel):
         )
 
     @property
-    def ready(self) -> Bool[Array, ""]:
-        return jnp.array(True)
-
-    @property
     def blank(self) -> Stiffness:
+        """A placeholder for the result of `set_up`."""
         one = jnp.ones_like(self.filled)
         return Stiffness(one, one, one)
 
     def set_up(
         self, hessian: Callable[[PyTree], PyTree], like: PyTree, stiffness: Float[Array, ""]
     ) -> Stiffness:
-        """The stiffness of waves in a tissue; bounded from below by 1e-4 of that of a vertex."""
+        """The stiffness of waves in a tissue; bounded from below by 1e-4 of that of a vertex.
+
+        **Arguments:**
+
+        - `hessian`: multiplies by the Hessian.
+        - `like`: a configuration, or its shapes.
+        - `stiffness`: the mean stiffness of a vertex.
+        """
         squares = jnp.sum(self.reciprocal**2, axis=-1)
         floor = 1e-4 * stiffness / (jnp.max(squares) * (self.size / 2) ** 2)
         directions = self.reciprocal / jnp.sqrt(squares)[:, None]

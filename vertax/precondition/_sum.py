@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from vertax.precondition._coarse import AbstractCoarseLevel
 from vertax.precondition._edge_blocks import EdgeBlocks
+from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.solvers._conjugate_gradients import AbstractInverse
 from vertax.solvers._rows import Table, point_of, rows_of, table_of, times
 
@@ -21,15 +21,14 @@ class Preconditioner(eqx.Module):
 
     1. Local: the edges, each with its two ends ([`EdgeBlocks`]), or else the diagonal
         $1 / (k + \lambda)$ with the mean stiffness $k$ and the damping $\lambda$ of a vertex.
-    2. Coarse: an elastic medium ([`ElasticMedium`]); or, in place of both, the Hessian of a nearby
-        equilibrium ([`RecycledHessian`]). It is used only near an equilibrium: elsewhere soft modes may have
-        negative curvature.
+    2. Coarse: an elastic medium ([`ElasticMedium`]). It is used only near an equilibrium: elsewhere soft
+        modes may have negative curvature.
 
     It is positive definite whatever the Hessian is: it changes the number of iterations, not the solution.
     """
 
     edges: EdgeBlocks | None
-    coarse: AbstractCoarseLevel | None
+    coarse: ElasticMedium | None
 
     @property
     def is_diagonal(self) -> bool:
@@ -42,7 +41,6 @@ class Preconditioner(eqx.Module):
         like: PyTree,
         stiffness: Float[Array, ""],
         coarse: Bool[Array, ""],
-        identity: Bool[Array, ""] | bool = False,
     ) -> TissueInverse:
         """The approximate inverse of the damped Hessian.
 
@@ -52,14 +50,13 @@ class Preconditioner(eqx.Module):
         - `like`: a gradient.
         - `stiffness`: the mean stiffness.
         - `coarse`: whether to use the coarse part.
-        - `identity`: whether to use neither.
         """
         medium: Any = None
         if self.coarse is not None:
-            level, coarse = self.coarse, coarse & self.coarse.ready
+            level = self.coarse
             measure = lambda: level.set_up(product, like, stiffness)
             medium = jax.lax.cond(coarse, measure, lambda: level.blank)
-        return TissueInverse(self, medium, stiffness, coarse, jnp.asarray(identity), like)
+        return TissueInverse(self, medium, stiffness, coarse, like)
 
 
 class TissueInverse(AbstractInverse):
@@ -69,7 +66,6 @@ class TissueInverse(AbstractInverse):
     medium: Any
     stiffness: Float[Array, ""]
     coarse: Bool[Array, ""]
-    identity: Bool[Array, ""]
     like: PyTree
 
     def factors(self, damping: Float[Array, " rows"]) -> PyTree[Array]:
@@ -93,4 +89,4 @@ class TissueInverse(AbstractInverse):
         coarse = self.preconditioner.coarse
         if coarse is not None:
             z = jax.lax.cond(self.coarse, lambda: coarse.apply(medium, z, r), lambda: z)
-        return jnp.where(self.identity, residual, table_of(z))
+        return table_of(z)

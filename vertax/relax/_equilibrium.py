@@ -15,11 +15,9 @@ from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._units import Units
 from vertax.mesh import Tissue
-from vertax.precondition._recycled_hessian import RecycledHessian
-from vertax.precondition._sum import Preconditioner
 from vertax.relax._contacts import Contacts
 from vertax.relax._loop import Search, SearchState
-from vertax.relax._objective import coarse_preconditioner, edge_preconditioner, objective
+from vertax.relax._objective import objective, preconditioner_of
 from vertax.relax._response import Equilibrium, with_overlaps
 from vertax.solvers._stop_at_rest import AtRest, StopAtRest
 
@@ -43,7 +41,7 @@ class SearchEnd(eqx.Module):
     @classmethod
     def of(cls, search: Search, state: SearchState) -> SearchEnd:
         """The end of a search."""
-        options = search.options(state)
+        options = search.options
         return cls(
             tissue=state.tissue,
             origin=state.origin,
@@ -65,11 +63,10 @@ def conclude(
     adjoint: AbstractAdjoint,
     minimiser: StopAtRest,
     max_steps: int | Int[Array, ""],
-    preconditioner: RecycledHessian | None,
 ) -> Equilibrium:
     """The equilibrium that a search from `tissue` ended at, differentiable.
 
-    `minimiser`, `max_steps` and `preconditioner` are for adjoints that relax the tissue again.
+    `minimiser` and `max_steps` are for adjoints that relax the tissue again.
     """
     relaxed, units = end.tissue, end.units
     # Without an equilibrium the derivatives are 0. In a batch NaN would reach the parameters that all members
@@ -91,10 +88,7 @@ def conclude(
         "relaxation": minimiser,
         "start": end.origin,
         "max_steps": jnp.asarray(max_steps),
-        "preconditioner": Preconditioner(
-            edge_preconditioner(settled, energy, end.contacts),
-            coarse_preconditioner(settled, preconditioner),
-        ),
+        "preconditioner": preconditioner_of(settled, energy, end.contacts),
     }
     # This solve takes no step: it is differentiated.
     solution = optx.minimise(

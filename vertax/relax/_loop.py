@@ -9,19 +9,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.probe_vector import probe_vector
 from vertax._base.reductions import any_of
 from vertax._base.results import RESULTS
 from vertax._base.tracing import tree_where, zeros_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.precondition._recycled_hessian import RecycledHessian
 from vertax.precondition._sum import Preconditioner
 from vertax.relax._contacts import Contacts, no_contacts
 from vertax.relax._feasibility import Feasibility
-from vertax.relax._objective import coarse_preconditioner, edge_preconditioner, objective
+from vertax.relax._objective import objective, preconditioner_of
 from vertax.solvers._newton import NewtonCG
-from vertax.solvers._rows import table_of
 from vertax.solvers._solver import AbstractIteration
 
 
@@ -68,25 +65,23 @@ class Search(eqx.Module):
     - `iteration`: the minimiser.
     - `feasibility`: what an accepted point must be.
     - `length`: the size of a cell.
-    - `stiffness`: see `Units`; None if the minimiser measures it in the first trip.
+    - `stiffness`: see `Units`.
     - `tolerance`: largest force at rest; None for `precision`.
     - `precision`: the default tolerance, in the unit of force.
     - `consecutive_steps`: steps in a row after which the force must be below the tolerance.
     - `contact_range`: of contacts; None to let cells overlap.
     - `max_contacts`: most contacts; None for a default by the size of the tissue.
-    - `recycled_hessian`: a preconditioner, see `RecycledHessian`.
     """
 
     iteration: AbstractIteration
     feasibility: Feasibility
     length: Float[Array, ""]
-    stiffness: Float[Array, ""] | None
+    stiffness: Float[Array, ""]
     tolerance: Float[Array, ""] | None
     precision: Float[Array, ""]
     consecutive_steps: int | Int[Array, ""]
     contact_range: float | Float[Array, ""] | None
     max_contacts: int | None = eqx.field(static=True)
-    recycled_hessian: RecycledHessian | None = None
 
     def begin(self, tissue: Tissue, energy: AbstractEnergy) -> SearchState:
         """The state before the first step."""
@@ -95,15 +90,15 @@ class Search(eqx.Module):
         contacts = None
         if self.contact_range is not None:
             contacts = no_contacts(self.contact_range, self.length, tissue, self.max_contacts)
+            contacts = contacts.with_stiffness(self.stiffness)
         args = (tissue, energy, contacts)
-        sizes = {"length_scale": self.length}
-        measured = self.stiffness is None
-        sizes |= {"probe": probe_of(tissue)} if measured else {"stiffness": self.stiffness}
         false, zero = jnp.array(False), jnp.array(0)
         return SearchState(
             tissue=tissue,
             origin=tissue.configuration,
-            iteration=self.iteration.unevaluated(objective, tissue.configuration, args, sizes),
+            iteration=self.iteration.unevaluated(
+                objective, tissue.configuration, args, self.options
+            ),
             contacts=contacts,
             preconditioner=zeros_of(eqx.filter_eval_shape(self._preconditioner, *args)),
             overlaps=false,
@@ -115,18 +110,14 @@ class Search(eqx.Module):
             finished=false,
         )
 
-    def options(self, state: SearchState) -> dict[str, Array]:
-        """Typical sizes and the tolerance; and the vector to measure the stiffness with."""
-        stiffness, measured = self.stiffness, {}
-        if stiffness is None:
-            stiffness = self.iteration.stiffness(state.iteration)
-            measured = {"probe": probe_of(state.tissue)}
+    @property
+    def options(self) -> dict[str, Array]:
+        """Typical sizes and the tolerance."""
         tolerance = self.tolerance
         if tolerance is None:
-            tolerance = self.precision * stiffness * self.length
-        tolerance = jnp.asarray(tolerance, stiffness.dtype)
-        sizes = {"length_scale": self.length, "stiffness": stiffness, "tolerance": tolerance}
-        return sizes | measured
+            tolerance = self.precision * self.stiffness * self.length
+        tolerance = jnp.asarray(tolerance, self.stiffness.dtype)
+        return {"length_scale": self.length, "stiffness": self.stiffness, "tolerance": tolerance}
 
     def advance(
         self, state: SearchState, energy: AbstractEnergy, num_steps: int | Int[Array, ""]
@@ -154,7 +145,7 @@ class Search(eqx.Module):
 
     def _step(self, state: SearchState, energy: AbstractEnergy) -> SearchState:
         """One trip of the loop."""
-        iteration, before, options = self.iteration, state.tissue, self.options(state)
+        iteration, before, options = self.iteration, state.tissue, self.options
         y, minimiser, model, _ = iteration.evaluate(
             objective,
             before.configuration,
@@ -175,17 +166,14 @@ class Search(eqx.Module):
             changed |= contacts.differ(state.contacts)
         fraction = before.by_row(feasible.fraction)
         minimiser = iteration.moved(minimiser, fraction, flipped, changed, options)
-        measures = self._measures(state)
-        below = (progress.force < options["tolerance"]) & ~changed & ~measures
+        below = (progress.force < options["tolerance"]) & ~changed
         num_below = jnp.where(below, state.num_below + 1, 0)
         num_below = jnp.where(progress.accepted | changed, num_below, state.num_below)
         finished = (num_below >= self.consecutive_steps) | jnp.isnan(progress.force)
-        active = progress.accepted & ~changed & ~finished & ~measures
+        active = progress.accepted & ~changed & ~finished
         preconditioner = self._updated(state.preconditioner, tissue, energy, contacts, active)
-        options |= {"preconditioner": self._with_recycled(preconditioner, tissue)}
+        options |= {"preconditioner": preconditioner}
         minimiser = iteration.propose(model, options, minimiser, active)
-        if contacts is not None and self.stiffness is None:
-            contacts = contacts.with_stiffness(iteration.stiffness(minimiser))
         return SearchState(
             tissue=tissue,
             origin=tree_where(flipped, tissue.configuration, state.origin),
@@ -200,10 +188,6 @@ class Search(eqx.Module):
             started=jnp.array(True),
             finished=finished,
         )
-
-    def _measures(self, state: SearchState) -> Bool[Array, ""]:
-        """Whether this trip measures the stiffness."""
-        return ~state.started if self.stiffness is None else jnp.array(False)
 
     def _updated(
         self,
@@ -223,27 +207,10 @@ class Search(eqx.Module):
     def _preconditioner(
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
     ) -> Preconditioner:
-        """The preconditioner of a step, without a recycled Hessian."""
+        """The preconditioner of a step."""
         if not isinstance(self.iteration, NewtonCG):
             return Preconditioner(None, None)
-        coarse = None if self.recycled_hessian is not None else coarse_preconditioner(tissue, None)
-        return Preconditioner(edge_preconditioner(tissue, energy, contacts), coarse)
-
-    def _with_recycled(self, preconditioner: Preconditioner, tissue: Tissue) -> Preconditioner:
-        # (Not in the state of the loop: each trip would copy the large matrix.)
-        if self.recycled_hessian is None:
-            return preconditioner
-        coarse = coarse_preconditioner(tissue, self.recycled_hessian)
-        return Preconditioner(preconditioner.edges, coarse)
-
-
-def probe_of(tissue: Tissue) -> Float[Array, "rows columns"]:
-    """A vector without pattern; zero in spare slots, which must not make the rest look soft."""
-    direction = probe_vector(table_of(tissue.configuration))
-    if tissue.topology.spare:
-        alive = tissue.by_row(tissue.topology.alive_vertices.astype(direction.dtype))
-        direction *= table_of(alive)
-    return direction
+        return preconditioner_of(tissue, energy, contacts)
 
 
 def _moved(one: Tissue, other: Tissue) -> Bool[Array, ""]:

@@ -1,4 +1,4 @@
-"""The objective of a relaxation, and its preconditioners: the only place where the energy is traced."""
+"""The objective of a relaxation, and its preconditioner: the only place where the energy is traced."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vertax.mesh import Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.precondition._edge_blocks import EdgeBlocks
 from vertax.precondition._elastic_medium import ElasticMedium
-from vertax.precondition._recycled_hessian import RecycledHessian
+from vertax.precondition._sum import Preconditioner
 from vertax.relax._contacts import Contacts
 
 MIN_CELLS_OF_EDGE_BLOCKS = 300
@@ -30,21 +30,12 @@ def objective(
     return value if contacts is None else value + contacts(trial), None
 
 
-def coarse_preconditioner(
-    tissue: Tissue, recycled_hessian: RecycledHessian | None
-) -> RecycledHessian | ElasticMedium | None:
-    """A preconditioner for long waves; None for a small tissue without a recycled Hessian."""
-    if recycled_hessian is None:
-        return ElasticMedium.of(tissue)
-    return recycled_hessian.near(tissue.configuration)
-
-
-def edge_preconditioner(
+def preconditioner_of(
     tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
-) -> EdgeBlocks | None:
-    """The stiffness of edges and contacts; None for arcs and in small tissues."""
-    if tissue.n_cells < MIN_CELLS_OF_EDGE_BLOCKS:
-        return None
-    if contacts is None or tissue.arcs is not None:
-        return EdgeBlocks.of(tissue, energy)
-    return EdgeBlocks.of(tissue, energy, contacts.resistance(tissue))
+) -> Preconditioner:
+    """The preconditioner of steps and of derivatives; its local part is diagonal in small tissues."""
+    coarse = ElasticMedium.of(tissue)
+    if tissue.n_cells < MIN_CELLS_OF_EDGE_BLOCKS or tissue.arcs is not None:
+        return Preconditioner(None, coarse)
+    more = None if contacts is None else contacts.resistance(tissue)
+    return Preconditioner(EdgeBlocks.of(tissue, energy, more), coarse)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -13,24 +14,21 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.checks import check_integer, check_number
 from vertax._base.memory_maps import warn_of_memory_maps
-from vertax._base.results import RESULTS
+from vertax._base.results import RESULTS, any_is
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import closed_over_tracers, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy, warn_of_columns
-from vertax.energies._units import cell_size, units_of
+from vertax.energies._units import units_of
 from vertax.mesh import Tissue
-from vertax.precondition._elastic_medium import ElasticMedium
-from vertax.precondition._recycled_hessian import RecycledHessian
 from vertax.relax._compatibility import check_adjoint, check_sharding
 from vertax.relax._equilibrium import SearchEnd, conclude
 from vertax.relax._feasibility import Feasibility
 from vertax.relax._loop import Search
-from vertax.relax._objective import objective
 from vertax.relax._response import AbstractResponse, Equilibrium
 from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
 from vertax.solvers._optimistix import check_solver
@@ -67,8 +65,6 @@ class Relaxation(AbstractResponse):
         the number of vertices, but at least 64, and above 2000 vertices 2000 or a quarter of their number.
         Where there are more, a call outside of `jax.jit` repeats the relaxation with more room, and otherwise
         the `result` says so.
-    - `preconditioner`: the Hessian of a nearby equilibrium, see `with_preconditioner`. It changes the time of
-        a relaxation, not its result.
 
     `tolerance`, `consecutive_steps`, `max_steps`, `contact_range`, numbers of `transitions` and numbers of an
     energy are data: another number compiles nothing. The solver and the adjoint are static.
@@ -88,7 +84,6 @@ class Relaxation(AbstractResponse):
     max_steps: int | Int[Array, ""] = 2000
     contact_range: float | Float[Array, ""] | None = 0.01
     max_contacts: int | None = eqx.field(static=True, default=None, kw_only=True)
-    preconditioner: RecycledHessian | None = eqx.field(default=None, kw_only=True, repr=False)
 
     def __check_init__(self):
         check_solver(self.solver)
@@ -104,11 +99,6 @@ class Relaxation(AbstractResponse):
             check_integer("max_contacts", self.max_contacts, at_least=1)
         if self.contact_range is not None:
             check_number("contact_range", self.contact_range, at_least=0, many=True)
-        if not isinstance(self.preconditioner, RecycledHessian | None):
-            raise TypeError(
-                "Argument `preconditioner` must be a result of `preconditioner_at`, or None, but "
-                f"is {describe(self.preconditioner)}."
-            )
 
     def __call__(
         self,
@@ -140,10 +130,12 @@ class Relaxation(AbstractResponse):
             )
         warn_of_memory_maps()
         tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
-        if all(map(is_concrete, jax.tree.leaves((tissue, energy, self, adjoint)))):
+        relaxation = self.traced()
+        if all(map(is_concrete, jax.tree.leaves((tissue, energy, relaxation, adjoint)))):
             # Nothing is differentiated: one program serves all adjoints.
-            adjoint = ImplicitDifferentiation()
-        equilibrium = self.attach(self.primal(tissue, energy), tissue, energy, adjoint)
+            adjoint = _NO_DERIVATIVES
+        end = relaxation.primal(tissue, energy)
+        equilibrium = relaxation.attach(end, tissue, energy, adjoint)
         # An error that is raised within a compiled program calls back to the host, and JAX keeps no such
         # program in its cache on disk.
         return equilibrium.checked() if throw else equilibrium
@@ -154,21 +146,12 @@ class Relaxation(AbstractResponse):
         **Raises:**
 
         - `TypeError` for an energy that is no function, or an adjoint that is none.
-        - `ValueError` for an adjoint that the solver excludes, a preconditioner of another size, a
+        - `ValueError` for an adjoint that the solver excludes, a
             `jax.shard_map` with checks, or a tissue far from the origin in float32.
         """
         check_energy(energy)
         warn_of_columns(energy, tissue)
         _check_position(tissue)
-        recycled, size = (
-            self.preconditioner,
-            sum(map(jnp.size, jax.tree.leaves(tissue.configuration))),
-        )
-        if recycled is not None and recycled.inverse.shape != (size, size):
-            raise ValueError(
-                f"Argument `preconditioner` must be of this tissue, but has {len(recycled.inverse)} "
-                f"coordinates for {size}. Take `preconditioner_at` of a tissue like it, or None."
-            )
         check_adjoint(adjoint, self._solver)
         check_sharding((tissue, energy))
 
@@ -177,19 +160,18 @@ class Relaxation(AbstractResponse):
 
         It is relaxed again, with more room for contacts, as long as there are too many.
         """
-        end = _search(*frozen((tissue, energy, self.completed(tissue))))
-        while is_concrete(end.num_steps) and end.contacts is not None:
-            if not np.any(end.result == RESULTS.too_many_contacts):
-                break
+        end = _search(*frozen((tissue, energy, self.traced())))
+        while any_is(end.result, RESULTS.too_many_contacts):
+            assert end.contacts is not None
             room = _MORE_ROOM * end.contacts.capacity
             wider = dataclasses.replace(self, max_contacts=room)
-            end = _search(*frozen((tissue, energy, wider.completed(tissue))))
+            end = _search(*frozen((tissue, energy, wider.traced())))
         return end
 
     def attach(
         self, primal: SearchEnd, tissue: Tissue, energy: AbstractEnergy, adjoint: AbstractAdjoint
     ) -> Equilibrium:
-        return _compiled_attachment(primal, tissue, energy, self.completed(tissue), adjoint)
+        return _compiled_attachment(primal, tissue, energy, self.traced(), adjoint)
 
     def solve(
         self,
@@ -213,25 +195,6 @@ class Relaxation(AbstractResponse):
             tolerance = jnp.minimum(tolerance, self.tolerance)
         return dataclasses.replace(self, tolerance=tolerance)
 
-    def preconditioner_at(
-        self, tissue: Tissue, energy: AbstractEnergy | None
-    ) -> RecycledHessian | None:
-        # (Large tissues have the elastic medium; other solvers use no preconditioner.)
-        if not self._recycles(tissue):
-            return None
-        start = tissue.configuration
-        if energy is None:
-            return RecycledHessian.unknown(start)
-        slope = jax.grad(lambda y: objective(y, (tissue, energy, None))[0])
-        product = lambda v: jax.jvp(slope, (start,), (v,))[1]
-        return RecycledHessian.at(product, start, cell_size(tissue))
-
-    def _recycles(self, tissue: Tissue) -> bool:
-        return tissue.n_cells < ElasticMedium.min_cells and isinstance(self.solver, NewtonCG)
-
-    def with_preconditioner(self, hessian: RecycledHessian | None) -> Relaxation:
-        return dataclasses.replace(self, preconditioner=hessian)
-
     @property
     def minimiser(self) -> StopAtRest:
         """The solver, stopped by the largest force."""
@@ -241,15 +204,16 @@ class Relaxation(AbstractResponse):
     def _solver(self) -> AbstractSolver:
         return self.solver if isinstance(self.solver, AbstractSolver) else Wrapped(self.solver)
 
-    def completed(self, tissue: Tissue) -> Relaxation:
-        """As `traced`, with a placeholder for a recycled Hessian: one program serves with and without."""
-        relaxation = self if eqx.is_array(self.max_steps) else self.traced()
-        if relaxation.preconditioner is not None or not self._recycles(tissue):
-            return relaxation
-        return dataclasses.replace(relaxation, preconditioner=self.preconditioner_at(tissue, None))
-
     def traced(self) -> Relaxation:
         """A copy with its numbers as arrays: another number compiles nothing."""
+        if eqx.is_array(self.max_steps):
+            return self
+        try:
+            return _prepared(self, jnp.result_type(float))
+        except TypeError:  # some numbers are arrays, which cannot be keys of a cache
+            return self._with_arrays()
+
+    def _with_arrays(self) -> Relaxation:
         names = ("transitions", "tolerance", "consecutive_steps", "max_steps", "contact_range")
         numbers = {name: traced(getattr(self, name), integers=True) for name in names}
         return dataclasses.replace(self, **numbers)
@@ -257,30 +221,27 @@ class Relaxation(AbstractResponse):
     def search(self, tissue: Tissue, energy: AbstractEnergy) -> Search:
         """The search for an equilibrium, step by step, in the units of a tissue."""
         solver = self._solver
-        native = isinstance(solver, NewtonCG)
-        # (NewtonCG measures the stiffness itself.)
-        stiffness = None if native else units_of(tissue, energy).stiffness
+        units = units_of(tissue, energy)
         tolerance = self.tolerance
         if tolerance is not None:
             tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
-        size = cell_size(tissue)
         return Search(
             solver if isinstance(solver, AbstractIteration) else Stepwise(solver),
             Feasibility(self.transitions),
-            frozen(size),
-            frozen(stiffness),
+            frozen(units.length),
+            frozen(units.stiffness),
             frozen(tolerance),
-            frozen(_precision(tissue, size)),
+            frozen(_precision(tissue, units.length)),
             self.consecutive_steps,
             self.contact_range,
             self.max_contacts,
-            frozen(self.preconditioner),
         )
 
 
 def _check_position(tissue: Tissue) -> None:
     """Raise a `ValueError` for a tissue so far from the origin that rounded coordinates distort its cells."""
-    if not is_concrete(tissue.vertices):
+    # (In float64 such a tissue is 10¹⁰ cells from the origin.)
+    if tissue.vertices.dtype == jnp.float64 or not is_concrete(tissue.vertices):
         return
     positions = np.asarray(tissue.vertices, float).reshape(-1, 2)
     middle = positions.mean(axis=0)
@@ -309,6 +270,15 @@ def _precision(tissue: Tissue, size: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.maximum(1e-10 if x.dtype == jnp.float64 else single, rounding)
 
 
+@functools.lru_cache(maxsize=64)
+def _prepared(relaxation: Relaxation, dtype: Any) -> Relaxation:
+    """A relaxation with its numbers as arrays, converted once for each precision."""
+    with jax.ensure_compile_time_eval():
+        return relaxation._with_arrays()
+
+
+_of_settings = functools.lru_cache(maxsize=64, typed=True)(Relaxation)
+_NO_DERIVATIVES = ImplicitDifferentiation()
 _MAX_DISTORTION = 1e-5
 """Largest rounding of coordinates in units of a cell, for tissues far from the origin."""
 _ROUNDING = 4
@@ -363,9 +333,11 @@ def equilibrate(
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and the relaxation did not converge, or
         its cells overlap, as they already did in `tissue`.
     """
-    response = Relaxation(
-        solver, transitions, tolerance, consecutive_steps, max_steps, contact_range
-    )
+    settings = (solver, transitions, tolerance, consecutive_steps, max_steps, contact_range)
+    try:
+        response = _of_settings(*settings)
+    except TypeError:  # as in `Relaxation.traced`, or a wrong argument
+        response = Relaxation(*settings)
     return response(tissue, energy, adjoint=adjoint, throw=throw)
 
 
@@ -384,8 +356,7 @@ def attached(
     adjoint: AbstractAdjoint,
 ) -> Equilibrium:
     """The equilibrium at the end of a search by `relaxation`, differentiable."""
-    parts = relaxation.minimiser, relaxation.max_steps, relaxation.preconditioner
-    return conclude(end, tissue, energy, adjoint, *parts)
+    return conclude(end, tissue, energy, adjoint, relaxation.minimiser, relaxation.max_steps)
 
 
 _search = announced_jit(sequential_vmap_on_cpu(search), label="a relaxation")

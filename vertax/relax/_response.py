@@ -12,7 +12,6 @@ from vertax._base.results import RESULTS, checked
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.precondition._recycled_hessian import RecycledHessian
 
 
 class Equilibrium(eqx.Module):
@@ -139,29 +138,9 @@ class AbstractResponse(eqx.Module):
         """The message of the last error, if it is kept."""
         return None
 
-    def preconditioner_at(
-        self, tissue: Tissue, energy: AbstractEnergy | None
-    ) -> RecycledHessian | None:
-        """A preconditioner for relaxations that end near this equilibrium; None where it would not help.
-
-        **Arguments:**
-
-        - `tissue`: a tissue at rest.
-        - `energy`: its energy; None for a placeholder.
-        """
-        return None
-
-    def with_preconditioner(self, hessian: RecycledHessian | None) -> AbstractResponse:
-        """A copy with a preconditioner: it changes the time, not the result."""
-        return self
-
     @abc.abstractmethod
     def traced(self) -> AbstractResponse:
         """A copy with its numbers as arrays: another number compiles nothing."""
-
-    def completed(self, tissue: Tissue) -> AbstractResponse:
-        """As `traced`, with placeholders for optional parts, so that one program serves with and without."""
-        return self.traced()
 
     @abc.abstractmethod
     def finer(self, tolerance: Float[Array, ""]) -> AbstractResponse:

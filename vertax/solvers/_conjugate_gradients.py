@@ -15,9 +15,6 @@ from vertax._base.reductions import max_of
 from vertax._base.tracing import zeros_of
 from vertax.solvers._rows import Table, inner, row_inner, sizes
 
-# The phases of the loop: conjugate gradients, a last pass that clips the step, and the end.
-_SOLVE, _CLIP, _END = range(3)
-
 
 class Proposal(NamedTuple):
     """A step within bounds."""
@@ -26,8 +23,6 @@ class Proposal(NamedTuple):
     product: Table
     """Of the step with the Hessian."""
     damping: Float[Array, " rows"]
-    curvature: Float[Array, ""]
-    """$d \\cdot (H + \\Lambda) d$ of the last direction of conjugate gradients."""
     num_products: Int[Array, ""]
 
 
@@ -71,7 +66,7 @@ class _State(NamedTuple):
     """$d \\cdot (H + \\Lambda) d$ of the last direction."""
     damping: Float[Array, " rows"]
     factors: PyTree[Array]
-    phase: Int[Array, ""]
+    done: Bool[Array, ""]
     num_products: Int[Array, ""]
     num_rounds: Int[Array, ""]
 
@@ -113,14 +108,12 @@ class TruncatedCG(eqx.Module):
     2. Where a row would become longer than `overshoot` times its bound (at the end: `overshoot_solved`), or
         the curvature along a direction is negative, increase $\Lambda$ there, and begin anew from the current
         step; at most `max_rounds` times.
-    3. Clip the rows that are longer than `clip` times their bound.
 
     (Steihaug 1983, doi:10.1137/0720042; Nocedal & Wright 2006, alg. 7.2, doi:10.1007/978-0-387-40065-5.)
     """
 
     overshoot: float = 4.0
     overshoot_solved: float = 1.5
-    clip: float = 2.0
     max_rounds: int = 8
 
     def __call__(
@@ -159,35 +152,35 @@ class TruncatedCG(eqx.Module):
             curvature=scalar,
             damping=damping,
             factors=zeros_of(jax.eval_shape(inverse.factors, damping)),
-            phase=jnp.where(active & (inner(gradient, gradient) > 0), _SOLVE, _END),
+            done=~active | (inner(gradient, gradient) == 0),
             num_products=number,
             num_rounds=number,
         )
         iterate = lambda s: self._iterate(system, s)
-        end = jax.lax.while_loop(lambda s: s.phase != _END, iterate, begin)
+        end = jax.lax.while_loop(lambda s: ~s.done, iterate, begin)
         hp = end.residual - gradient - end.damping[:, None] * end.step
-        return Proposal(end.step, hp, end.damping, end.curvature, end.num_products)
+        return Proposal(end.step, hp, end.damping, end.num_products)
 
     def _iterate(self, system: _System, s: _State) -> _State:
-        """One iteration, or the clipping of the step."""
+        """One iteration."""
         s, d = self._next_direction(system, s)
-        small, clips = d.small, s.phase == _CLIP
+        small = d.small
         curvature = inner(d.vector, d.damped)
         more = s.num_rounds < self.max_rounds
         convex = curvature > 0
-        concave = ~small & ~clips & ~convex
+        concave = ~small & ~convex
         length = jnp.where(convex & ~small, d.squared / jnp.where(convex, curvature, 1), 0)
         # (Along a negative curvature: to the bounds.)
-        length = jnp.where(clips | (concave & ~more), 1, length)
+        length = jnp.where(concave & ~more, 1, length)
         furthest = system.furthest(s.step + length * d.vector)
-        beyond = ~small & ~clips & more & (furthest > self.overshoot)
+        beyond = ~small & more & (furthest > self.overshoot)
         # (Not further than the limit: where there is hardly any curvature that may be very far.)
         tiny = jnp.finfo(furthest.dtype).tiny
         room = (self.overshoot - s.furthest) / jnp.maximum(furthest - s.furthest, tiny)
         taken = length * jnp.where(beyond, jnp.clip(room, 0, 1), 1)
         # More damping where the step is too long or the curvature negative.
         far = furthest > jnp.where(small, self.overshoot_solved, self.overshoot)
-        wants = concave | (~clips & far)
+        wants = concave | far
         again = wants & more
         after = s._replace(
             step=s.step + taken * d.vector,
@@ -195,7 +188,7 @@ class TruncatedCG(eqx.Module):
             direction=d.vector,
             last=jnp.where(again, 0, d.squared),
             furthest=jnp.where(beyond, self.overshoot, furthest),
-            curvature=jnp.where(small | clips, s.curvature, curvature),
+            curvature=jnp.where(small, s.curvature, curvature),
             num_products=s.num_products + jnp.where(small, 0, 1),
             num_rounds=s.num_rounds + again,
         )
@@ -206,31 +199,23 @@ class TruncatedCG(eqx.Module):
 
         residual, damping = jax.lax.cond(again, damp, lambda: (after.residual, s.damping))
         ends = ((small | wants) & ~again) | (after.num_products >= system.max_products)
-        clip_next = ends & (furthest > self.clip)
-        phase = jnp.where(ends, jnp.where(clip_next, _CLIP, _END), _SOLVE)
-        phase = jnp.where(clips, _END, phase)
-        return after._replace(residual=residual, damping=damping, phase=phase)
+        return after._replace(residual=residual, damping=damping, done=ends)
 
     def _next_direction(self, system: _System, s: _State) -> tuple[_State, _Direction]:
-        """The conjugate direction of the residual; or, in the last pass, that back to the bounds."""
-        fresh, clips = s.last == 0, s.phase == _CLIP
+        """The conjugate direction of the residual."""
+        fresh = s.last == 0
         inverse, factors = system.inverse, s.damping
         if not isinstance(inverse, DiagonalInverse):
             build = lambda: inverse.factors(s.damping)
-            factors = jax.lax.cond(fresh & ~clips, build, lambda: s.factors)
+            factors = jax.lax.cond(fresh, build, lambda: s.factors)
         z = inverse.apply(factors, s.residual)
         squared = inner(s.residual, z)
         # (More damping makes a residual smaller; without a step that is no progress.)
         no_step = s.furthest == 0
         first = jnp.where(no_step, squared, s.first)
-        small = ~clips & ~no_step & (squared <= system.forcing**2 * first)
+        small = ~no_step & (squared <= system.forcing**2 * first)
         beta = jnp.where(fresh, 0, squared / jnp.where(fresh, 1, s.last))
-
-        def back() -> Table:
-            longest = jnp.maximum(sizes(s.step * system.inverse_bounds), self.clip)
-            return (self.clip / longest - 1)[:, None] * s.step
-
-        vector = jax.lax.cond(clips, back, lambda: beta * s.direction - z)
+        vector = beta * s.direction - z
         product = jax.lax.cond(small, jnp.zeros_like, system.product, vector)
         damped = product + s.damping[:, None] * vector
         direction = _Direction(vector, product, damped, squared, small)

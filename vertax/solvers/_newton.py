@@ -32,9 +32,6 @@ from vertax.solvers._rows import (
 from vertax.solvers._solver import AbstractIteration, AbstractSolver, Progress, value_and_gradient
 from vertax.solvers._trust_region import VertexTrustRegion
 
-# The purpose of the next evaluation.
-_MEASURE, _EVALUATE, _STEP, _CORRECTION, _RETURN = range(5)
-
 
 class Model(NamedTuple):
     """The objective at a point: its value, its gradient and its products with the Hessian."""
@@ -49,28 +46,19 @@ class Model(NamedTuple):
 class NewtonState(eqx.Module):
     """The state of `NewtonCG`. The iterate is the last accepted point."""
 
-    phase: Int[Array, ""]
-    trial: Table
-    """The point to evaluate next, relative to the iterate."""
-    base: Table
-    """The point that a correction begins at, relative to the iterate."""
-    base_value: Float[Array, ""]
+    steps: Bool[Array, ""]
+    """Whether the next evaluation is after the step of `proposal`; otherwise it is at the iterate."""
     value: Float[Array, ""]
     gradient: Table
     proposal: Proposal
-    """The step from the iterate."""
+    """The last step."""
     predicted: Float[Array, ""]
-    """The predicted gain of the step."""
-    error: Float[Array, " rows"]
-    """The error of the predicted forces after the step."""
+    """Its predicted gain."""
     radii: Float[Array, " rows"]
-    stiffness: Float[Array, ""]
-    """A typical second derivative."""
     typical: Float[Array, ""]
     """The typical force at the iterate,"""
     previous: Float[Array, ""]
     """and at the one before it."""
-    num_corrections: Int[Array, ""]
     num_products: Int[Array, ""]
     progress: Progress
 
@@ -86,13 +74,8 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     Each trip of the loop is one evaluation of value, gradient and Hessian products, at the trial point:
 
     1. Evaluate the trial point.
-    2. *Second-order correction* (Nocedal & Wright 2006, section 15.6): if the step gained less than
-        `corrected_gain` of the prediction, or left more than `remaining_force` of the typical force, compute
-        a short step from the trial point, back to the floor of a curved valley. Evaluate again, at most
-        `max_corrections` times. A correction that does not lower the energy is undone.
-    3. Accept or reject the point, and update the radii ([`VertexTrustRegion`]
-        [vertax.solvers.VertexTrustRegion]).
-    4. Compute the next step, with the forcing term
+    2. Accept or reject it, and update the radii ([`VertexTrustRegion`][vertax.solvers.VertexTrustRegion]).
+    3. Compute the next step, with the forcing term
         $\eta = \min(0.35, \max(\sqrt{14 f / k \ell}, \min(0.1, 0.9 (f / f_\text{before})^2)))$
         of the typical force $f$ (Eisenstat & Walker 1996, doi:10.1137/0917003), the stiffness $k$ and the
         length scale $\ell$.
@@ -101,25 +84,15 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
 
     **Arguments:**
 
-    - `max_displacement`: first radius, in units of the length scale (in
+    - `max_displacement`: first and largest radius, in units of the length scale (in
         [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
     - `max_products`: most Hessian-vector products in one step.
-    - `max_corrections`: most second-order corrections of one step; 0 for none.
     """
 
     max_displacement: float = 0.2
     max_products: int = eqx.field(static=True, default=600)
-    max_corrections: int = eqx.field(static=True, default=12)
     accept: float = eqx.field(static=True, default=1e-4)
     forcing: float = eqx.field(static=True, default=0.35)
-    corrected_gain: float = eqx.field(static=True, default=0.9)
-    remaining_force: float = eqx.field(static=True, default=0.4)
-    cheap_products: int = eqx.field(static=True, default=30)
-    """Up to this number of products, `remaining_force` counts a quarter: a correction is as cheap."""
-    correction_forcing: float = eqx.field(static=True, default=0.3)
-    correction_displacement: float = eqx.field(static=True, default=0.3)
-    """The largest displacement of a correction, in units of that of a step."""
-    correction_products: int = eqx.field(static=True, default=60)
     conjugate_gradients: TruncatedCG = TruncatedCG()
     trust_region: VertexTrustRegion = VertexTrustRegion()
 
@@ -135,22 +108,15 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         table = table_of(y)
         zero, rows = jnp.zeros_like(table), jnp.zeros(len(table), table.dtype)
         number, infinite = jnp.array(0), jnp.full(struct.shape, jnp.inf, struct.dtype)
-        reach = self.max_displacement * options.get("length_scale", 1.0)
         return NewtonState(
-            phase=jnp.array(_MEASURE if "probe" in options else _EVALUATE),
-            trial=zero,
-            base=zero,
-            base_value=infinite,
+            steps=jnp.array(False),
             value=infinite,
             gradient=zero,
-            proposal=Proposal(zero, zero, rows, jnp.zeros_like(infinite), number),
+            proposal=Proposal(zero, zero, rows, number),
             predicted=jnp.zeros_like(infinite),
-            error=rows,
-            radii=rows + reach,
-            stiffness=jnp.asarray(options.get("stiffness", 1.0), table.dtype),
+            radii=rows + self._reach(options),
             typical=infinite,
             previous=infinite,
-            num_corrections=number,
             num_products=number,
             progress=Progress.initial(infinite),
         )
@@ -170,76 +136,48 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             value, gradient, aux = value_and_gradient(fn, point_of(table, y), args)
             return table_of(gradient), (value, aux)
 
-        trial = start + state.trial
+        trial = start + jnp.where(state.steps, state.proposal.step, 0)
         g, product, (value, aux) = jax.linearize(force_and_value, trial, has_aux=True)
         model = Model(value, g, product, lambda table: point_of(table, y))
         state = self._judged(model, options, state)
         return point_of(tree_where(state.progress.accepted, trial, start), y), state, model, aux
 
     def _judged(self, model: Model, options: Any, s: NewtonState) -> NewtonState:
-        """Accept or reject the trial point, or correct the step."""
-        value, g = model.value, model.gradient
-        length, unit = self._units(options, s)
+        """Accept or reject the trial point."""
+        value, g, region = model.value, model.gradient, self.trust_region
         squared = inner(g, g)
-        finite = jnp.isfinite(value) & jnp.isfinite(squared)
-        measures = s.phase == _MEASURE
-        anew, first = measures | (s.phase == _EVALUATE), s.phase == _STEP
-        corrected = s.phase == _CORRECTION
-        typical = typical_size(g)
-        gained = s.value - value
-        below_rounding = jnp.abs(s.predicted) <= rounding_error(value, unit * length)
-        # Where the gain is below rounding, the force must fall; or the gain be as predicted.
-        smaller = squared < inner(s.gradient, s.gradient)
-        as_predicted = gained > self.trust_region.good_gain * s.predicted
-        as_predicted &= gained > 20 * jnp.finfo(value.dtype).eps * jnp.abs(value)
-        enough = gained >= self.accept * s.predicted
-        falls = jnp.where(below_rounding, smaller | as_predicted, enough)
-        # (A point that is evaluated anew is the iterate, whatever its value.)
-        falls = anew | (finite & falls)
-        good = ~anew & (below_rounding | (gained > self.trust_region.good_gain * s.predicted))
-        improves = first | (corrected & finite & (value < s.base_value))
-        cheap = s.proposal.num_products < self.cheap_products
-        remaining = jnp.where(cheap, 0.25, 1) * self.remaining_force
-        near = self._finest(s.typical, unit) < self.forcing
-        wanting = (gained < self.corrected_gain * s.predicted) | (typical > remaining * s.typical)
-        corrects = near & wanting & finite & ~below_rounding & improves
-        corrects &= s.num_corrections < self.max_corrections
-        returns = corrected & ~improves
-        error = self.trust_region.error(
-            s.gradient, s.proposal.product, s.proposal.step, g, s.predicted
+        gained, predicted = s.value - value, s.predicted
+        below_rounding = jnp.abs(predicted) <= rounding_error(
+            value, self._unit(options) * self._length(options)
         )
-        error = jnp.where(first, error, s.error)
-        judged = ~anew & ~corrects & ~returns
-        accepted = falls & ~corrects & ~returns
-        reach = self.max_displacement * length
-        radii = self.trust_region.updated(s.radii, s.proposal.step, error, reach, accepted, good)
+        # Where the gain is below rounding, the force must fall; or the gain be as predicted.
+        as_predicted = gained > region.good_gain * predicted
+        falls = squared < inner(s.gradient, s.gradient)
+        falls |= as_predicted & (gained > 20 * jnp.finfo(value.dtype).eps * jnp.abs(value))
+        enough = jnp.where(below_rounding, falls, gained >= self.accept * predicted)
+        # (A point that is evaluated anew is the iterate, whatever its value.)
+        accepted = ~s.steps | (jnp.isfinite(value) & jnp.isfinite(squared) & enough)
+        stepped = s.steps & accepted
+        error = region.error(s.gradient, s.proposal.product, s.proposal.step, g, predicted)
+        reach = self._reach(options)
+        good = below_rounding | as_predicted
+        radii = region.updated(s.radii, s.proposal.step, error, reach, accepted, good)
         force = jnp.where(accepted, max_size(g), s.progress.force)
-        zero = jnp.zeros_like(g)
-        now, before = jnp.where(corrects, s.trial, s.base), jnp.where(accepted, g, s.gradient)
-        evaluate = jnp.where(measures, _MEASURE, _EVALUATE)
-        return NewtonState(
-            phase=jnp.where(corrects, _CORRECTION, jnp.where(returns, _RETURN, evaluate)),
-            trial=jnp.where(corrects | returns, now, zero),
-            base=now,
-            base_value=jnp.where(corrects, value, s.base_value),
+        return dataclasses.replace(
+            s,
+            steps=jnp.array(False),
             value=jnp.where(accepted, value, s.value),
-            gradient=before,
-            proposal=s.proposal,
-            predicted=s.predicted,
-            error=error,
-            radii=jnp.where(judged, radii, s.radii),
-            stiffness=s.stiffness,
-            typical=jnp.where(accepted, typical, s.typical),
-            previous=jnp.where(accepted & ~anew, s.typical, s.previous),
-            num_corrections=jnp.where(judged, 0, s.num_corrections + corrects),
-            num_products=s.num_products,
-            progress=Progress(accepted, judged, accepted & ~anew, force),
+            gradient=jnp.where(accepted, g, s.gradient),
+            radii=jnp.where(s.steps, radii, s.radii),
+            typical=jnp.where(accepted, typical_size(g), s.typical),
+            previous=jnp.where(stepped, s.typical, s.previous),
+            progress=Progress(accepted, s.steps, stepped, force),
         )
 
     def propose(
         self, model: Model, options: Any, state: NewtonState, active: Bool[Array, ""]
     ) -> NewtonState:
-        """The next step from the point that was evaluated, or a correction.
+        """The next step from the point that was evaluated.
 
         **Arguments:**
 
@@ -247,68 +185,37 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         - `active`: whether that point is the iterate, and a step from it is wanted.
         """
         s = state
-        length, unit = self._units(options, s)
-        reach = self.max_displacement * length
-        measures, corrects = s.phase == _MEASURE, s.phase == _CORRECTION
-        solves = active | corrects | measures
-        gradient = model.gradient
-        if "probe" in options:
-            gradient = jnp.where(measures, options["probe"], gradient)
-        damping = jnp.where(corrects, s.proposal.damping, sizes(s.gradient) / s.radii)
-        damping = jnp.where(measures, 0, damping)
-        bounds = jnp.minimum(s.radii, jnp.where(corrects, self.correction_displacement, 1) * reach)
-        bounds = jnp.where(corrects, bounds, s.radii)
-        finest = self._finest(s.typical, unit)
+        # (14: the ratio of the norm of all forces and the typical force in a tissue of a hundred cells.)
+        finest = jnp.sqrt(14.0 * s.typical / self._unit(options))
+        useful = jnp.minimum(0.1, 0.9 * (s.typical / jnp.where(s.previous > 0, s.previous, 1)) ** 2)
+        useful = jnp.where(jnp.isfinite(s.previous), useful, 0)
         near = finest < self.forcing
-        inverse = self._inverse(model, options, s.stiffness, near & active, measures)
-        max_products = jnp.where(corrects, self.correction_products, self.max_products)
         proposal = self.conjugate_gradients(
             model.product,
-            gradient,
-            damping,
-            bounds,
-            inverse,
-            jnp.where(corrects, self.correction_forcing, self._forcing(s, finest)),
-            jnp.where(measures, 1, max_products),
-            solves,
+            model.gradient,
+            sizes(model.gradient) / s.radii,
+            s.radii,
+            self._inverse(model, options, near & active),
+            jnp.minimum(self.forcing, jnp.maximum(finest, useful)),
+            self.max_products,
+            active,
         )
-        steps = active & ~corrects
-        p, hp = proposal.step, proposal.product
-        predicted = -inner(p, model.gradient + 0.5 * hp)
-        trial = jnp.where(corrects, s.base + p, jnp.where(steps, p, s.trial))
-        stiffness = jnp.abs(proposal.curvature) / inner(gradient, gradient)
-        stiffness = jnp.where(jnp.isfinite(stiffness) & (stiffness > 0), stiffness, 1)
+        predicted = -inner(proposal.step, model.gradient + 0.5 * proposal.product)
         return dataclasses.replace(
             s,
-            phase=jnp.where(steps, _STEP, jnp.where(measures, _EVALUATE, s.phase)),
-            stiffness=jnp.where(measures, stiffness, s.stiffness),
-            trial=trial,
-            proposal=tree_where(steps, proposal, s.proposal),
-            predicted=jnp.where(steps, predicted, s.predicted),
-            base=jnp.where(steps, trial, s.base),
+            steps=active,
+            proposal=tree_where(active, proposal, s.proposal),
+            predicted=jnp.where(active, predicted, s.predicted),
             num_products=s.num_products + proposal.num_products,
         )
 
-    def _forcing(self, s: NewtonState, finest: Float[Array, ""]) -> Float[Array, ""]:
-        useful = jnp.minimum(0.1, 0.9 * (s.typical / jnp.where(s.previous > 0, s.previous, 1)) ** 2)
-        useful = jnp.where(jnp.isfinite(s.previous), useful, 0)
-        return jnp.minimum(self.forcing, jnp.maximum(finest, useful))
-
-    def _inverse(
-        self,
-        model: Model,
-        options: Any,
-        stiffness: Float[Array, ""],
-        coarse: Bool[Array, ""],
-        measures: Bool[Array, ""],
-    ) -> AbstractInverse:
-        """The preconditioner; the identity to measure the stiffness."""
-        preconditioner = options.get("preconditioner")
+    def _inverse(self, model: Model, options: Any, coarse: Bool[Array, ""]) -> AbstractInverse:
+        """The preconditioner."""
+        preconditioner, stiffness = options.get("preconditioner"), self._stiffness(options)
         if preconditioner is None or preconditioner.is_diagonal:
             return DiagonalInverse(stiffness)
         product = lambda v: model.point(model.product(table_of(v)))
-        like = model.point(model.gradient)
-        return preconditioner.inverse(product, like, stiffness, coarse, measures)
+        return preconditioner.inverse(product, model.point(model.gradient), stiffness, coarse)
 
     def moved(
         self,
@@ -318,13 +225,9 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         changed: Bool[Array, ""],
         options: Any,
     ) -> NewtonState:
-        reach = self.max_displacement * options.get("length_scale", 1.0)
         rows = table_of(fraction)[:, 0]
-        radii = self.trust_region.cut(state.radii, state.proposal.step, rows, reach)
+        radii = self.trust_region.cut(state.radii, state.proposal.step, rows, self._reach(options))
         return eqx.tree_at(lambda s: s.radii, state, jnp.where(changed, radii, state.radii))
-
-    def stiffness(self, state: NewtonState) -> Float[Array, ""]:
-        return state.stiffness
 
     def gradient(self, state: NewtonState) -> Table:
         return state.gradient
@@ -338,10 +241,16 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         at_rest = state.progress.accepted & (state.progress.force < self.atol)
         return at_rest, optx.RESULTS.successful
 
-    def _units(self, options: Any, state: NewtonState) -> tuple[Any, Any]:
-        length = options.get("length_scale", 1.0)
-        return length, state.stiffness * length
+    def _length(self, options: Any) -> Any:
+        return options.get("length_scale", 1.0)
 
-    def _finest(self, typical: Float[Array, ""], unit: Any) -> Float[Array, ""]:
-        # (14: the ratio of the norm of all forces and the typical force in a tissue of a hundred cells.)
-        return jnp.sqrt(14.0 * typical / unit)
+    def _stiffness(self, options: Any) -> Any:
+        return options.get("stiffness", 1.0)
+
+    def _unit(self, options: Any) -> Any:
+        """The unit of force."""
+        return self._stiffness(options) * self._length(options)
+
+    def _reach(self, options: Any) -> Any:
+        """The largest radius."""
+        return self.max_displacement * self._length(options)

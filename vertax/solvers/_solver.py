@@ -87,13 +87,6 @@ class AbstractIteration(eqx.Module, Generic[State]):
     def progress(self, state: State) -> Progress:
         """The result of the last evaluation."""
 
-    def stiffness(self, state: State) -> Float[Array, ""]:
-        """A typical second derivative, if `unevaluated` has got no `stiffness` and the minimiser measures it.
-
-        `propose` after the first evaluation measures it along the vector `probe` of its options.
-        """
-        raise NotImplementedError
-
 
 class AbstractSolver(optx.AbstractMinimiser):
     """An Optimistix minimiser that judges convergence by the largest force.

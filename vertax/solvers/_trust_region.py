@@ -82,7 +82,7 @@ class VertexTrustRegion(eqx.Module):
         grows = (good | predicted) & ((length > 0.3 * radii) | (good & (radii < largest)))
         tiny = jnp.finfo(radii.dtype).tiny
         growth = jnp.clip(self.target_error / jnp.maximum(error, tiny), 2, self.max_growth)
-        larger = jnp.minimum(growth * radii, jnp.maximum(2 * radii, largest))
+        larger = jnp.minimum(growth * radii, largest)
         shrunk = jnp.maximum(self.shrink * radii, jnp.minimum(0.5 * length, radii))
         shrinks = ~good & ~(error <= self.large_error)
         after_success = jnp.where(grows, larger, jnp.where(shrinks, shrunk, radii))
