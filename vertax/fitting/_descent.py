@@ -196,7 +196,7 @@ def _evaluate_batch(problem: InverseProblem, constants: PyTree, state: State) ->
 def _update(
     optimiser: optax.GradientTransformation,
     arguments: tuple,
-    epoch: Int[Array, ""],
+    epoch: Int[Array | np.ndarray, ""],
     throw: bool,
     batched: bool,
 ) -> tuple[State, Record]:

@@ -101,8 +101,8 @@ def better(
     parameters: PyTree,
     tissue: Tissue,
     facts: Facts,
-    guidance: Array,
-    epoch: Array,
+    guidance: Array | np.ndarray,
+    epoch: Array | np.ndarray,
     ok: Array,
 ) -> Best:
     """The better of the previous best and a new candidate, which counts only if `ok`."""

@@ -197,7 +197,7 @@ class Search(eqx.Module):
         contacts: Contacts | None,
         active: Bool[Array, ""],
     ) -> Preconditioner:
-        """The preconditioner where a step begins; the last one for corrections."""
+        """The preconditioner where a step begins; otherwise the last one."""
         if preconditioner.is_diagonal:
             return preconditioner
         arrays, static = eqx.partition(preconditioner, eqx.is_array)

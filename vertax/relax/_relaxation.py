@@ -277,7 +277,7 @@ def _prepared(relaxation: Relaxation, dtype: Any) -> Relaxation:
         return relaxation._with_arrays()
 
 
-_of_settings = functools.lru_cache(maxsize=64, typed=True)(Relaxation)
+_of_settings: Any = functools.lru_cache(maxsize=64, typed=True)(Relaxation)
 _NO_DERIVATIVES = ImplicitDifferentiation()
 _MAX_DISTORTION = 1e-5
 """Largest rounding of coordinates in units of a cell, for tissues far from the origin."""
