@@ -25,8 +25,8 @@ class Best(eqx.Module):
     parameters: PyTree[Array]
     tissue: Tissue
     facts: Facts
-    guidance: Float[Array, ""]
-    epoch: Int[Array, ""]
+    guidance: Float[Array | np.ndarray, ""]
+    epoch: Int[Array | np.ndarray, ""]
 
 
 def first_line(error: Exception) -> str:
