@@ -32,6 +32,9 @@ from vertax.solvers._rows import (
 from vertax.solvers._solver import AbstractIteration, AbstractSolver, Progress, value_and_gradient
 from vertax.solvers._trust_region import VertexTrustRegion
 
+# The purpose of the next evaluation.
+_EVALUATE, _STEP, _CORRECTION, _RETURN = range(4)
+
 
 class Model(NamedTuple):
     """The objective at a point: its value, its gradient and its products with the Hessian."""
@@ -46,19 +49,26 @@ class Model(NamedTuple):
 class NewtonState(eqx.Module):
     """The state of `NewtonCG`. The iterate is the last accepted point."""
 
-    steps: Bool[Array, ""]
-    """Whether the next evaluation is after the step of `proposal`; otherwise it is at the iterate."""
+    phase: Int[Array, ""]
+    trial: Table
+    """The point to evaluate next, relative to the iterate."""
+    base: Table
+    """The point that a correction begins at, relative to the iterate."""
+    base_value: Float[Array, ""]
     value: Float[Array, ""]
     gradient: Table
     proposal: Proposal
-    """The last step."""
+    """The last step, without corrections."""
     predicted: Float[Array, ""]
     """Its predicted gain."""
+    error: Float[Array, " rows"]
+    """The error of the predicted forces after it."""
     radii: Float[Array, " rows"]
     typical: Float[Array, ""]
     """The typical force at the iterate,"""
     previous: Float[Array, ""]
     """and at the one before it."""
+    num_corrections: Int[Array, ""]
     num_products: Int[Array, ""]
     progress: Progress
 
@@ -74,8 +84,13 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     Each trip of the loop is one evaluation of value, gradient and Hessian products, at the trial point:
 
     1. Evaluate the trial point.
-    2. Accept or reject it, and update the radii ([`VertexTrustRegion`][vertax.solvers.VertexTrustRegion]).
-    3. Compute the next step, with the forcing term
+    2. *Second-order correction* (Nocedal & Wright 2006, section 15.6): if the step gained less than
+        `corrected_gain` of the prediction, or left more than `remaining_force` of the typical force, compute
+        a short step from the trial point, back to the floor of a curved valley. Evaluate again, at most
+        `max_corrections` times. A correction that does not lower the energy is undone.
+    3. Accept or reject the point, and update the radii ([`VertexTrustRegion`]
+        [vertax.solvers.VertexTrustRegion]).
+    4. Compute the next step, with the forcing term
         $\eta = \min(0.35, \max(\sqrt{14 f / k \ell}, \min(0.1, 0.9 (f / f_\text{before})^2)))$
         of the typical force $f$ (Eisenstat & Walker 1996, doi:10.1137/0917003), the stiffness $k$ and the
         length scale $\ell$.
@@ -87,12 +102,20 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     - `max_displacement`: first and largest radius, in units of the length scale (in
         [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
     - `max_products`: most Hessian-vector products in one step.
+    - `max_corrections`: most second-order corrections of one step; 0 for none. (They halve the steps of free
+        clusters whose arcs press on each other, and cost nothing elsewhere.)
     """
 
     max_displacement: float = 0.2
     max_products: int = eqx.field(static=True, default=600)
+    max_corrections: int = 2
     accept: float = eqx.field(static=True, default=1e-4)
     forcing: float = eqx.field(static=True, default=0.35)
+    corrected_gain: float = eqx.field(static=True, default=0.9)
+    remaining_force: float = eqx.field(static=True, default=0.4)
+    correction_displacement: float = eqx.field(static=True, default=0.3)
+    """The largest displacement of a correction, in units of that of a step."""
+    correction_products: int = eqx.field(static=True, default=60)
     conjugate_gradients: TruncatedCG = TruncatedCG()
     trust_region: VertexTrustRegion = VertexTrustRegion()
 
@@ -109,14 +132,19 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         zero, rows = jnp.zeros_like(table), jnp.zeros(len(table), table.dtype)
         number, infinite = jnp.array(0), jnp.full(struct.shape, jnp.inf, struct.dtype)
         return NewtonState(
-            steps=jnp.array(False),
+            phase=jnp.array(_EVALUATE),
+            trial=zero,
+            base=zero,
+            base_value=infinite,
             value=infinite,
             gradient=zero,
             proposal=Proposal(zero, zero, rows, number),
             predicted=jnp.zeros_like(infinite),
+            error=rows,
             radii=rows + self._reach(options),
             typical=infinite,
             previous=infinite,
+            num_corrections=number,
             num_products=number,
             progress=Progress.initial(infinite),
         )
@@ -136,76 +164,98 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             value, gradient, aux = value_and_gradient(fn, point_of(table, y), args)
             return table_of(gradient), (value, aux)
 
-        trial = start + jnp.where(state.steps, state.proposal.step, 0)
+        trial = start + state.trial
         g, product, (value, aux) = jax.linearize(force_and_value, trial, has_aux=True)
         model = Model(value, g, product, lambda table: point_of(table, y))
         state = self._judged(model, options, state)
         return point_of(tree_where(state.progress.accepted, trial, start), y), state, model, aux
 
     def _judged(self, model: Model, options: Any, s: NewtonState) -> NewtonState:
-        """Accept or reject the trial point."""
+        """Accept or reject the trial point, or correct the step."""
         value, g, region = model.value, model.gradient, self.trust_region
-        squared = inner(g, g)
+        anew, first, corrected = (s.phase == p for p in (_EVALUATE, _STEP, _CORRECTION))
+        squared, typical = inner(g, g), typical_size(g)
+        finite = jnp.isfinite(value) & jnp.isfinite(squared)
         gained, predicted = s.value - value, s.predicted
-        below_rounding = jnp.abs(predicted) <= rounding_error(
-            value, self._unit(options) * self._length(options)
-        )
+        unit = self._unit(options)
+        below_rounding = jnp.abs(predicted) <= rounding_error(value, unit * self._length(options))
         # Where the gain is below rounding, the force must fall; or the gain be as predicted.
         as_predicted = gained > region.good_gain * predicted
         falls = squared < inner(s.gradient, s.gradient)
         falls |= as_predicted & (gained > 20 * jnp.finfo(value.dtype).eps * jnp.abs(value))
         enough = jnp.where(below_rounding, falls, gained >= self.accept * predicted)
-        # (A point that is evaluated anew is the iterate, whatever its value.)
-        accepted = ~s.steps | (jnp.isfinite(value) & jnp.isfinite(squared) & enough)
-        stepped = s.steps & accepted
+        improves = first | (corrected & finite & (value < s.base_value))
+        wanting = gained < self.corrected_gain * predicted
+        wanting |= typical > self.remaining_force * s.typical
+        corrects = wanting & improves & finite & ~below_rounding & self._near(s, unit)
+        corrects &= s.num_corrections < self.max_corrections
+        returns = corrected & ~improves
         error = region.error(s.gradient, s.proposal.product, s.proposal.step, g, predicted)
-        reach = self._reach(options)
+        error = jnp.where(first, error, s.error)
+        judged = ~anew & ~corrects & ~returns
+        # (A point that is evaluated anew is the iterate, whatever its value.)
+        accepted = anew | (judged & finite & enough)
+        stepped = judged & accepted
         good = below_rounding | as_predicted
+        reach = self._reach(options)
         radii = region.updated(s.radii, s.proposal.step, error, reach, accepted, good)
+        now = jnp.where(corrects, s.trial, s.base)
+        phase = jnp.where(corrects, _CORRECTION, jnp.where(returns, _RETURN, _EVALUATE))
         force = jnp.where(accepted, max_size(g), s.progress.force)
         return dataclasses.replace(
             s,
-            steps=jnp.array(False),
+            phase=phase,
+            trial=jnp.where(corrects | returns, now, 0),
+            base=now,
+            base_value=jnp.where(corrects, value, s.base_value),
             value=jnp.where(accepted, value, s.value),
             gradient=jnp.where(accepted, g, s.gradient),
-            radii=jnp.where(s.steps, radii, s.radii),
-            typical=jnp.where(accepted, typical_size(g), s.typical),
+            error=error,
+            radii=jnp.where(judged, radii, s.radii),
+            typical=jnp.where(accepted, typical, s.typical),
             previous=jnp.where(stepped, s.typical, s.previous),
-            progress=Progress(accepted, s.steps, stepped, force),
+            num_corrections=jnp.where(judged, 0, s.num_corrections + corrects),
+            progress=Progress(accepted, judged, stepped, force),
         )
 
     def propose(
         self, model: Model, options: Any, state: NewtonState, active: Bool[Array, ""]
     ) -> NewtonState:
-        """The next step from the point that was evaluated.
+        """The next step from the point that was evaluated, or a correction.
 
         **Arguments:**
 
         - `model`: the objective there.
         - `active`: whether that point is the iterate, and a step from it is wanted.
         """
-        s = state
-        # (14: the ratio of the norm of all forces and the typical force in a tissue of a hundred cells.)
-        finest = jnp.sqrt(14.0 * s.typical / self._unit(options))
+        s, unit = state, self._unit(options)
+        corrects = s.phase == _CORRECTION
+        choose = lambda correction, step: jnp.where(corrects, correction, step)
         useful = jnp.minimum(0.1, 0.9 * (s.typical / jnp.where(s.previous > 0, s.previous, 1)) ** 2)
         useful = jnp.where(jnp.isfinite(s.previous), useful, 0)
-        near = finest < self.forcing
+        forcing = jnp.minimum(self.forcing, jnp.maximum(self._finest(s, unit), useful))
+        short = self.correction_displacement * self._reach(options)
         proposal = self.conjugate_gradients(
             model.product,
             model.gradient,
-            sizes(model.gradient) / s.radii,
-            s.radii,
-            self._inverse(model, options, near & active),
-            jnp.minimum(self.forcing, jnp.maximum(finest, useful)),
-            self.max_products,
-            active,
+            choose(s.proposal.damping, sizes(s.gradient) / s.radii),
+            choose(jnp.minimum(s.radii, short), s.radii),
+            self._inverse(model, options, self._near(s, unit) & active),
+            choose(self.forcing, forcing),
+            choose(self.correction_products, self.max_products),
+            active | corrects,
         )
-        predicted = -inner(proposal.step, model.gradient + 0.5 * proposal.product)
+        steps = active & ~corrects
+        p = proposal.step
+        predicted = -inner(p, model.gradient + 0.5 * proposal.product)
+        trial = choose(s.base + p, jnp.where(steps, p, s.trial))
         return dataclasses.replace(
             s,
-            steps=active,
-            proposal=tree_where(active, proposal, s.proposal),
-            predicted=jnp.where(active, predicted, s.predicted),
+            phase=jnp.where(steps, _STEP, s.phase),
+            trial=trial,
+            base=jnp.where(steps, trial, s.base),
+            proposal=tree_where(steps, proposal, s.proposal),
+            predicted=jnp.where(steps, predicted, s.predicted),
             num_products=s.num_products + proposal.num_products,
         )
 
@@ -240,6 +290,14 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         at_rest = state.progress.accepted & (state.progress.force < self.atol)
         return at_rest, optx.RESULTS.successful
+
+    def _finest(self, state: NewtonState, unit: Any) -> Float[Array, ""]:
+        # (14: the ratio of the norm of all forces and the typical force in a tissue of a hundred cells.)
+        return jnp.sqrt(14.0 * state.typical / unit)
+
+    def _near(self, state: NewtonState, unit: Any) -> Bool[Array, ""]:
+        """Whether the typical force is small."""
+        return self._finest(state, unit) < self.forcing
 
     def _length(self, options: Any) -> Any:
         return options.get("length_scale", 1.0)
