@@ -44,6 +44,10 @@ class SearchState(eqx.Module):
     num_below: Int[Array, ""]
     """Consecutive steps after which the force is below the tolerance."""
     num_steps: Int[Array, ""]
+    reference_value: Float[Array, ""]
+    """The energy at the last check of progress; infinite before."""
+    stalled: Bool[Array, ""]
+    """Whether that check ended the search."""
     started: Bool[Array, ""]
     finished: Bool[Array, ""]
 
@@ -62,6 +66,13 @@ class Search(eqx.Module):
     2. Make an accepted point feasible: T1 transitions, contacts, no overlaps (`feasibility`).
     3. If that has changed the point or the contacts, evaluate it anew in the next trip. Otherwise compute the
         next step (`iteration.propose`).
+
+    Every `check_every` steps of a minimiser that returns its `value` the search ends
+
+    - if the tissue overlaps (an overlap at the start that resolves does so within about 20 steps);
+    - if the energy has fallen by less than $f \\min(\\ell / 10, f / k)$ since the last check, and the largest
+        force $f$ is above $0.01\\,k \\ell$ (a single step gains about as much, unless cells obstruct it);
+    - or if it has fallen by more than $10^8\\,k \\ell^2$ per cell.
 
     **Arguments:**
 
@@ -87,6 +98,7 @@ class Search(eqx.Module):
     contact_range: float | Float[Array, ""] | None
     max_contacts: int | None = eqx.field(static=True)
     recycled_hessian: RecycledHessian | None = None
+    check_every: int = eqx.field(static=True, default=100)
 
     def begin(self, tissue: Tissue, energy: AbstractEnergy) -> SearchState:
         """The state before the first step."""
@@ -111,6 +123,8 @@ class Search(eqx.Module):
             force=jnp.full((), jnp.inf, tissue.vertices.dtype),
             num_below=zero,
             num_steps=zero,
+            reference_value=jnp.full((), jnp.inf, tissue.vertices.dtype),
+            stalled=false,
             started=false,
             finished=false,
         )
@@ -147,6 +161,8 @@ class Search(eqx.Module):
         """The result of a search that does not continue."""
         at_rest = state.num_below >= self.consecutive_steps
         result = RESULTS.where(at_rest, RESULTS.successful, RESULTS.nonlinear_max_steps_reached)
+        reason = RESULTS.where(state.overlaps, RESULTS.overlap, RESULTS.no_minimum)
+        result = RESULTS.where(state.stalled, reason, result)
         if state.contacts is not None:
             result = RESULTS.where(state.contacts.overflow, RESULTS.too_many_contacts, result)
         finite = jnp.isfinite(state.force) & jnp.all(jnp.isfinite(state.tissue.vertices))
@@ -179,7 +195,18 @@ class Search(eqx.Module):
         below = (progress.force < options["tolerance"]) & ~changed & ~measures
         num_below = jnp.where(below, state.num_below + 1, 0)
         num_below = jnp.where(progress.accepted | changed, num_below, state.num_below)
-        finished = (num_below >= self.consecutive_steps) | jnp.isnan(progress.force)
+        overlaps = jnp.where(arrives, any_of(feasible.overlapping), state.overlaps)
+        num_steps = state.num_steps + progress.stepped
+        at_rest = num_below >= self.consecutive_steps
+        value, stalled = state.reference_value, state.stalled
+        if (now := iteration.value(minimiser)) is not None:
+            checks = progress.stepped & (num_steps % self.check_every == 0)
+            no_progress = self._no_progress(
+                value - now, progress.force, options["stiffness"], before.n_cells
+            )
+            stalled = checks & ~at_rest & (overlaps | no_progress)
+            value = jnp.where(checks, now, value)
+        finished = at_rest | stalled | jnp.isnan(progress.force)
         active = progress.accepted & ~changed & ~finished & ~measures
         preconditioner = self._updated(state.preconditioner, tissue, energy, contacts, active)
         options |= {"preconditioner": self._with_recycled(preconditioner, tissue)}
@@ -192,14 +219,26 @@ class Search(eqx.Module):
             iteration=minimiser,
             contacts=contacts,
             preconditioner=preconditioner,
-            overlaps=jnp.where(arrives, any_of(feasible.overlapping), state.overlaps),
+            overlaps=overlaps,
             counts=feasible.counts,
             force=progress.force,
             num_below=num_below,
-            num_steps=state.num_steps + progress.stepped,
+            num_steps=num_steps,
+            reference_value=value,
+            stalled=stalled,
             started=jnp.array(True),
             finished=finished,
         )
+
+    def _no_progress(
+        self, gain: Array, force: Array, stiffness: Array, n_cells: int
+    ) -> Bool[Array, ""]:
+        """Whether the energy has fallen by too little for its largest force, or without limit."""
+        # (The first gain is infinite.)
+        little = gain < force * jnp.minimum(0.1 * self.length, force / stiffness)
+        little &= force > 0.01 * stiffness * self.length
+        unlimited = gain > 1e8 * n_cells * stiffness * self.length**2
+        return little | (unlimited & jnp.isfinite(gain))
 
     def _measures(self, state: SearchState) -> Bool[Array, ""]:
         """Whether this trip measures the stiffness."""

@@ -54,9 +54,9 @@ class Equilibrium(eqx.Module):
 
 
 def with_overlaps(result: RESULTS, overlaps: Bool[Array, ""]) -> RESULTS:
-    """A result, or `overlap` if there are overlaps of finite cells."""
-    finite = result != RESULTS.nonfinite
-    return RESULTS.where(overlaps & finite, RESULTS.overlap, result)
+    """A result, or `overlap` if there are overlaps of finite cells; `no_minimum` is their reason."""
+    other = (result != RESULTS.nonfinite) & (result != RESULTS.no_minimum)
+    return RESULTS.where(overlaps & other, RESULTS.overlap, result)
 
 
 class AbstractResponse(eqx.Module):

@@ -87,6 +87,13 @@ class AbstractIteration(eqx.Module, Generic[State]):
     def progress(self, state: State) -> Progress:
         """The result of the last evaluation."""
 
+    def value(self, state: State) -> Float[Array, ""] | None:
+        """The objective at the iterate, of a minimiser of which hundreds of steps without gain are useless.
+
+        None for others: a relaxation by them ends at rest or after `max_steps`.
+        """
+        return None
+
     def stiffness(self, state: State) -> Float[Array, ""]:
         """A typical second derivative, if `unevaluated` has got no `stiffness` and the minimiser measures it.
 
