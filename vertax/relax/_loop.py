@@ -46,8 +46,8 @@ class SearchState(eqx.Module):
     num_steps: Int[Array, ""]
     reference_value: Float[Array, ""]
     """The energy at the last check of progress; infinite before."""
-    stalled: Bool[Array, ""]
-    """Whether that check ended the search."""
+    num_stalls: Int[Array, ""]
+    """Consecutive checks without progress; `max_stalls` at once for a tissue that overlaps."""
     started: Bool[Array, ""]
     finished: Bool[Array, ""]
 
@@ -67,12 +67,12 @@ class Search(eqx.Module):
     3. If that has changed the point or the contacts, evaluate it anew in the next trip. Otherwise compute the
         next step (`iteration.propose`).
 
-    Every `check_every` steps of a minimiser that returns its `value` the search ends
+    Progress is checked every `check_every` steps of a minimiser that returns its `value`. The search ends
 
     - if the tissue overlaps (an overlap at the start that resolves does so within about 20 steps);
-    - if the energy has fallen by less than $f \\min(\\ell / 10, f / k)$ since the last check, and the largest
-        force $f$ is above $0.01\\,k \\ell$ (a single step gains about as much, unless cells obstruct it);
-    - or if it has fallen by more than $10^8\\,k \\ell^2$ per cell.
+    - if `max_stalls` consecutive checks show no progress: the largest force $f$ is above $0.01\\,k \\ell$, and
+        the energy has fallen by less than $f \\min(\\ell / 10, f / k)$, about the gain of a single step that
+        nothing obstructs; or it has fallen by more than $10^8\\,k \\ell^2$.
 
     **Arguments:**
 
@@ -99,6 +99,7 @@ class Search(eqx.Module):
     max_contacts: int | None = eqx.field(static=True)
     recycled_hessian: RecycledHessian | None = None
     check_every: int = eqx.field(static=True, default=100)
+    max_stalls: int = eqx.field(static=True, default=2)
 
     def begin(self, tissue: Tissue, energy: AbstractEnergy) -> SearchState:
         """The state before the first step."""
@@ -124,7 +125,7 @@ class Search(eqx.Module):
             num_below=zero,
             num_steps=zero,
             reference_value=jnp.full((), jnp.inf, tissue.vertices.dtype),
-            stalled=false,
+            num_stalls=zero,
             started=false,
             finished=false,
         )
@@ -162,7 +163,7 @@ class Search(eqx.Module):
         at_rest = state.num_below >= self.consecutive_steps
         result = RESULTS.where(at_rest, RESULTS.successful, RESULTS.nonlinear_max_steps_reached)
         reason = RESULTS.where(state.overlaps, RESULTS.overlap, RESULTS.no_minimum)
-        result = RESULTS.where(state.stalled, reason, result)
+        result = RESULTS.where(state.num_stalls >= self.max_stalls, reason, result)
         if state.contacts is not None:
             result = RESULTS.where(state.contacts.overflow, RESULTS.too_many_contacts, result)
         finite = jnp.isfinite(state.force) & jnp.all(jnp.isfinite(state.tissue.vertices))
@@ -198,15 +199,14 @@ class Search(eqx.Module):
         overlaps = jnp.where(arrives, any_of(feasible.overlapping), state.overlaps)
         num_steps = state.num_steps + progress.stepped
         at_rest = num_below >= self.consecutive_steps
-        value, stalled = state.reference_value, state.stalled
+        value, num_stalls = state.reference_value, state.num_stalls
         if (now := iteration.value(minimiser)) is not None:
             checks = progress.stepped & (num_steps % self.check_every == 0)
-            no_progress = self._no_progress(
-                value - now, progress.force, options["stiffness"], before.n_cells
-            )
-            stalled = checks & ~at_rest & (overlaps | no_progress)
+            stalls = self._stalls(value - now, progress.force, options["stiffness"])
+            after = jnp.where(overlaps, self.max_stalls, jnp.where(stalls, num_stalls + 1, 0))
+            num_stalls = jnp.where(checks & ~at_rest, after, num_stalls)
             value = jnp.where(checks, now, value)
-        finished = at_rest | stalled | jnp.isnan(progress.force)
+        finished = at_rest | (num_stalls >= self.max_stalls) | jnp.isnan(progress.force)
         active = progress.accepted & ~changed & ~finished & ~measures
         preconditioner = self._updated(state.preconditioner, tissue, energy, contacts, active)
         options |= {"preconditioner": self._with_recycled(preconditioner, tissue)}
@@ -225,20 +225,17 @@ class Search(eqx.Module):
             num_below=num_below,
             num_steps=num_steps,
             reference_value=value,
-            stalled=stalled,
+            num_stalls=num_stalls,
             started=jnp.array(True),
             finished=finished,
         )
 
-    def _no_progress(
-        self, gain: Array, force: Array, stiffness: Array, n_cells: int
-    ) -> Bool[Array, ""]:
+    def _stalls(self, gain: Array, force: Array, stiffness: Array) -> Bool[Array, ""]:
         """Whether the energy has fallen by too little for its largest force, or without limit."""
-        # (The first gain is infinite.)
         little = gain < force * jnp.minimum(0.1 * self.length, force / stiffness)
         little &= force > 0.01 * stiffness * self.length
-        unlimited = gain > 1e8 * n_cells * stiffness * self.length**2
-        return little | (unlimited & jnp.isfinite(gain))
+        # (The first gain is infinite.)
+        return little | ((gain > 1e8 * stiffness * self.length**2) & jnp.isfinite(gain))
 
     def _measures(self, state: SearchState) -> Bool[Array, ""]:
         """Whether this trip measures the stiffness."""
