@@ -70,9 +70,9 @@ class Search(eqx.Module):
     Progress is checked every `check_every` steps of a minimiser that returns its `value`. The search ends
 
     - if the tissue overlaps (an overlap at the start that resolves does so within about 20 steps);
-    - if `max_stalls` consecutive checks show no progress: the largest force $f$ is above $0.01\\,k \\ell$, and
-        the energy has fallen by less than $f \\min(\\ell / 10, f / k)$, about the gain of a single step that
-        nothing obstructs; or it has fallen by more than $10^8\\,k \\ell^2$.
+    - if `max_stalls` consecutive checks show no progress: the largest force $f$ is above $0.01\\,k \\ell$,
+        and the energy has fallen by less than $f \\min(\\ell / 10, f / k)$ since the check before, about the
+        gain of a single step without obstacles; or it has fallen by more than $10^8\\,k \\ell^2$.
 
     **Arguments:**
 
@@ -162,7 +162,7 @@ class Search(eqx.Module):
         """The result of a search that does not continue."""
         at_rest = state.num_below >= self.consecutive_steps
         result = RESULTS.where(at_rest, RESULTS.successful, RESULTS.nonlinear_max_steps_reached)
-        reason = RESULTS.where(state.overlaps, RESULTS.overlap, RESULTS.no_minimum)
+        reason = RESULTS.where(state.overlaps, RESULTS.overlap, RESULTS.no_progress)
         result = RESULTS.where(state.num_stalls >= self.max_stalls, reason, result)
         if state.contacts is not None:
             result = RESULTS.where(state.contacts.overflow, RESULTS.too_many_contacts, result)

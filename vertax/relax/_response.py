@@ -54,8 +54,8 @@ class Equilibrium(eqx.Module):
 
 
 def with_overlaps(result: RESULTS, overlaps: Bool[Array, ""]) -> RESULTS:
-    """A result, or `overlap` if there are overlaps of finite cells; `no_minimum` is their reason."""
-    other = (result != RESULTS.nonfinite) & (result != RESULTS.no_minimum)
+    """A result, or `overlap` if there are overlaps of finite cells unless it names their reason."""
+    other = (result != RESULTS.nonfinite) & (result != RESULTS.no_progress)
     return RESULTS.where(overlaps & other, RESULTS.overlap, result)
 
 
