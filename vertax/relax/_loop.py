@@ -86,6 +86,8 @@ class Search(eqx.Module):
     - `contact_range`: of contacts; None to let cells overlap.
     - `max_contacts`: most contacts; None for a default by the size of the tissue.
     - `recycled_hessian`: a preconditioner, see `RecycledHessian`.
+    - `check_every`: number of steps from one check of progress to the next.
+    - `max_stalls`: number of consecutive checks without progress that end the search.
     """
 
     iteration: AbstractIteration
