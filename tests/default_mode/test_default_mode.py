@@ -71,6 +71,13 @@ class TestEquilibria:
         assert equilibrium.converged
         assert float(equilibrium.energy) == pytest.approx(float(energy(tissue)), abs=1e-4)
 
+    def test_an_energy_without_minimum_ends_the_search(self):
+        tissue = random_tissue(9, 0)
+        energy = LineTension(jnp.full(tissue.n_edges, -1.0))
+        equilibrium = FIXED_TOPOLOGY(tissue, energy, throw=False)
+        assert equilibrium.result == vx.RESULTS.no_progress
+        assert equilibrium.num_steps <= 400
+
 
 MOMENTUM = vx.solvers.Optax(optax.sgd(3e-3, momentum=0.95, nesterov=True))
 ADJOINTS = {

@@ -319,6 +319,7 @@ def equilibrium(**outcome):
     [
         ({"result": vx.RESULTS.nonlinear_max_steps_reached}, "reached no equilibrium"),
         ({"result": vx.RESULTS.overlap}, "Cells of the tissue overlap"),
+        ({"result": vx.RESULTS.no_progress}, "made no progress"),
         ({"max_force": jnp.array(jnp.nan), "result": vx.RESULTS.nonfinite}, "must be finite"),
     ],
 )

@@ -42,6 +42,12 @@ with warnings.catch_warnings():
             "A relaxation broke down: its forces are not finite. The parameters of the energy must be "
             "finite, but may be NaN or infinity, or so extreme that the tissue collapses. Check them."
         )
+        no_progress = (
+            "A relaxation made no progress although its forces were large. Either its energy has no minimum: "
+            "line tensions must be positive or outweighed, and an AreaElasticity must resist them. Or cells "
+            "jam: lower the ratio of tensions (vertax.energies.BoundedTension), or use a positive "
+            "`contact_range`."
+        )
         overlap = (
             "Cells of the tissue overlap, or its box folds. A relaxation never makes cells overlap unless "
             "`contact_range` is None, but it may start from a tissue in which they do: look at its "

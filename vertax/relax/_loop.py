@@ -41,6 +41,10 @@ class SearchState(eqx.Module):
     num_below: Int[Array, ""]
     """Consecutive steps after which the force is below the tolerance."""
     num_steps: Int[Array, ""]
+    reference_value: Float[Array, ""]
+    """The energy at the last check of progress; infinite before."""
+    num_stalls: Int[Array, ""]
+    """Consecutive checks without progress; `max_stalls` at once for a tissue that overlaps."""
     started: Bool[Array, ""]
     finished: Bool[Array, ""]
 
@@ -60,6 +64,13 @@ class Search(eqx.Module):
     3. If that has changed the point or the contacts, evaluate it anew in the next trip. Otherwise compute the
         next step (`iteration.propose`).
 
+    Progress is checked every `check_every` steps of a minimiser that returns its `value`. The search ends
+
+    - if the tissue overlaps (an overlap at the start that resolves does so within about 20 steps);
+    - if `max_stalls` consecutive checks show no progress: the largest force $f$ is above $0.01\\,k \\ell$,
+        and the energy has fallen by less than $f \\min(\\ell / 10, f / k)$ since the check before, about the
+        gain of a single step without obstacles; or it has fallen by more than $10^8\\,k \\ell^2$.
+
     **Arguments:**
 
     - `iteration`: the minimiser.
@@ -71,6 +82,8 @@ class Search(eqx.Module):
     - `consecutive_steps`: steps in a row after which the force must be below the tolerance.
     - `contact_range`: of contacts; None to let cells overlap.
     - `max_contacts`: most contacts; None for a default by the size of the tissue.
+    - `check_every`: number of steps from one check of progress to the next.
+    - `max_stalls`: number of consecutive checks without progress that end the search.
     """
 
     iteration: AbstractIteration
@@ -82,6 +95,8 @@ class Search(eqx.Module):
     consecutive_steps: int | Int[Array, ""]
     contact_range: float | Float[Array, ""] | None
     max_contacts: int | None = eqx.field(static=True)
+    check_every: int = eqx.field(static=True, default=100)
+    max_stalls: int = eqx.field(static=True, default=2)
 
     def begin(self, tissue: Tissue, energy: AbstractEnergy) -> SearchState:
         """The state before the first step."""
@@ -106,6 +121,8 @@ class Search(eqx.Module):
             force=jnp.full((), jnp.inf, tissue.vertices.dtype),
             num_below=zero,
             num_steps=zero,
+            reference_value=jnp.full((), jnp.inf, tissue.vertices.dtype),
+            num_stalls=zero,
             started=false,
             finished=false,
         )
@@ -138,6 +155,8 @@ class Search(eqx.Module):
         """The result of a search that does not continue."""
         at_rest = state.num_below >= self.consecutive_steps
         result = RESULTS.where(at_rest, RESULTS.successful, RESULTS.nonlinear_max_steps_reached)
+        reason = RESULTS.where(state.overlaps, RESULTS.overlap, RESULTS.no_progress)
+        result = RESULTS.where(state.num_stalls >= self.max_stalls, reason, result)
         if state.contacts is not None:
             result = RESULTS.where(state.contacts.overflow, RESULTS.too_many_contacts, result)
         finite = jnp.isfinite(state.force) & jnp.all(jnp.isfinite(state.tissue.vertices))
@@ -169,7 +188,17 @@ class Search(eqx.Module):
         below = (progress.force < options["tolerance"]) & ~changed
         num_below = jnp.where(below, state.num_below + 1, 0)
         num_below = jnp.where(progress.accepted | changed, num_below, state.num_below)
-        finished = (num_below >= self.consecutive_steps) | jnp.isnan(progress.force)
+        overlaps = jnp.where(arrives, any_of(feasible.overlapping), state.overlaps)
+        num_steps = state.num_steps + progress.stepped
+        at_rest = num_below >= self.consecutive_steps
+        value, num_stalls = state.reference_value, state.num_stalls
+        if (now := iteration.value(minimiser)) is not None:
+            checks = progress.stepped & (num_steps % self.check_every == 0)
+            stalls = self._stalls(value - now, progress.force)
+            after = jnp.where(overlaps, self.max_stalls, jnp.where(stalls, num_stalls + 1, 0))
+            num_stalls = jnp.where(checks & ~at_rest, after, num_stalls)
+            value = jnp.where(checks, now, value)
+        finished = at_rest | (num_stalls >= self.max_stalls) | jnp.isnan(progress.force)
         active = progress.accepted & ~changed & ~finished
         preconditioner = self._updated(state.preconditioner, tissue, energy, contacts, active)
         options |= {"preconditioner": preconditioner}
@@ -180,14 +209,24 @@ class Search(eqx.Module):
             iteration=minimiser,
             contacts=contacts,
             preconditioner=preconditioner,
-            overlaps=jnp.where(arrives, any_of(feasible.overlapping), state.overlaps),
+            overlaps=overlaps,
             counts=feasible.counts,
             force=progress.force,
             num_below=num_below,
-            num_steps=state.num_steps + progress.stepped,
+            num_steps=num_steps,
+            reference_value=value,
+            num_stalls=num_stalls,
             started=jnp.array(True),
             finished=finished,
         )
+
+    def _stalls(self, gain: Array, force: Array) -> Bool[Array, ""]:
+        """Whether the energy has fallen by too little for its largest force, or without limit."""
+        stiffness = self.stiffness
+        little = gain < force * jnp.minimum(0.1 * self.length, force / stiffness)
+        little &= force > 0.01 * stiffness * self.length
+        # (The first gain is infinite.)
+        return little | ((gain > 1e8 * stiffness * self.length**2) & jnp.isfinite(gain))
 
     def _updated(
         self,

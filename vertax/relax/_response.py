@@ -53,9 +53,9 @@ class Equilibrium(eqx.Module):
 
 
 def with_overlaps(result: RESULTS, overlaps: Bool[Array, ""]) -> RESULTS:
-    """A result, or `overlap` if there are overlaps of finite cells."""
-    finite = result != RESULTS.nonfinite
-    return RESULTS.where(overlaps & finite, RESULTS.overlap, result)
+    """A result, or `overlap` if there are overlaps of finite cells unless it names their reason."""
+    other = (result != RESULTS.nonfinite) & (result != RESULTS.no_progress)
+    return RESULTS.where(overlaps & other, RESULTS.overlap, result)
 
 
 class AbstractResponse(eqx.Module):

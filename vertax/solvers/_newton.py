@@ -279,6 +279,9 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         radii = self.trust_region.cut(state.radii, state.proposal.step, rows, self._reach(options))
         return eqx.tree_at(lambda s: s.radii, state, jnp.where(changed, radii, state.radii))
 
+    def value(self, state: NewtonState) -> Float[Array, ""]:
+        return state.value
+
     def gradient(self, state: NewtonState) -> Table:
         return state.gradient
 

@@ -87,6 +87,13 @@ class AbstractIteration(eqx.Module, Generic[State]):
     def progress(self, state: State) -> Progress:
         """The result of the last evaluation."""
 
+    def value(self, state: State) -> Float[Array, ""] | None:
+        """The objective at the iterate, of a minimiser of which hundreds of steps without gain are useless.
+
+        None for others: a relaxation by them ends at rest or after `max_steps`.
+        """
+        return None
+
 
 class AbstractSolver(optx.AbstractMinimiser):
     """An Optimistix minimiser that judges convergence by the largest force.
