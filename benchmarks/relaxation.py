@@ -5,7 +5,7 @@ Hessian-vector products (where the checkout counts them) and of energies, the me
 time of a relaxation, kernels (fusions of the compiled program), and processor time of tracing and
 compilation. Cases called "epochs" are fits: the time is that of an epoch.
 
-Each checkout runs in a process of its own; the processes take turns, seed by seed.
+Each checkout runs in a separate process; the processes take turns, seed by seed.
 """
 
 from __future__ import annotations
@@ -248,8 +248,8 @@ def main() -> None:
         if not any(part in name for part in chosen.cases):
             continue
         rows = [[c.row(name, seed) for c in checkouts] for seed in range(n_seeds)]
-        for checkout, own in zip(checkouts, zip(*rows, strict=True), strict=True):
-            print(f"{name:>28} {checkout.name:>16} | {summary(list(own))}", flush=True)
+        for checkout, results in zip(checkouts, zip(*rows, strict=True), strict=True):
+            print(f"{name:>28} {checkout.name:>16} | {summary(list(results))}", flush=True)
 
 
 if __name__ == "__main__":

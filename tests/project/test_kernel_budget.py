@@ -55,9 +55,9 @@ def step(tissue: vx.Tissue, energy: vx.AbstractEnergy) -> vx.dynamics.Evolved:
     [
         pytest.param(relaxed, lambda: periodic(100), 600, id="equilibrate 100"),
         pytest.param(
-            slope, lambda: periodic(100), 950, id="gradient 100", marks=pytest.mark.thorough
+            slope, lambda: periodic(100), 896, id="gradient 100", marks=pytest.mark.thorough
         ),
-        pytest.param(step, lambda: periodic(100), 680, id="evolve 100", marks=pytest.mark.thorough),
+        pytest.param(step, lambda: periodic(100), 677, id="evolve 100", marks=pytest.mark.thorough),
         pytest.param(relaxed, lambda: cluster(30), 940, id="arcs 30", marks=pytest.mark.thorough),
         pytest.param(
             relaxed, lambda: periodic(400), 860, id="equilibrate 400", marks=pytest.mark.thorough

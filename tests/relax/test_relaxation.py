@@ -21,6 +21,7 @@ from helpers import (
 
 import vertax as vx
 from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
+from vertax.relax import _relaxation
 
 
 @pytest.fixture(scope="module")
@@ -407,3 +408,22 @@ def test_an_energy_may_depend_on_absolute_positions(boundary):
     # Without springs the whole stays where it was.
     stays = relax(tissue, Substrate(home, 0.0)).tissue
     np.testing.assert_allclose(jnp.mean(stays.vertices - tissue.vertices, axis=0), 0, atol=1e-9)
+
+
+def test_a_second_call_checks_no_numbers_and_traces_nothing(monkeypatch):
+    tissue, traces = random_tissue(6, 0), []
+
+    def energy(tissue: vx.Tissue) -> jax.Array:
+        traces.append(1)
+        return ShapeFactorEnergy(3.7)(tissue)
+
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise AssertionError("called in the second call")
+
+    first = vx.equilibrate(tissue, energy, tolerance=1e-7)
+    number = len(traces)
+    monkeypatch.setattr(_relaxation, "check_number", refuse)
+    monkeypatch.setattr(dataclasses, "replace", refuse)
+    second = vx.equilibrate(first.tissue, energy, tolerance=1e-7)
+    assert second.num_steps == 0
+    assert number == len(traces) > 0

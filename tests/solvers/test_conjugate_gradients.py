@@ -63,14 +63,3 @@ def test_within_wide_bounds_it_is_the_newton_step(forcing):
     proposal, _ = step(g, matrix, jnp.full(N, 1e9), forcing)
     exact = -jnp.linalg.solve(matrix, g.reshape(-1)).reshape(g.shape)
     assert jnp.max(jnp.abs(proposal.step - exact)) < forcing * jnp.max(jnp.abs(exact))
-
-
-def test_only_rows_beyond_their_bounds_are_clipped():
-    """Independent rows, one of them with a smaller bound."""
-    g, bounds = -jnp.ones((N, 2)), jnp.full(N, 10.0).at[3].set(0.05)
-    proposal, product = step(g, jnp.eye(2 * N), bounds, 1e-8, damped=False, max_rounds=0)
-    lengths = jnp.linalg.norm(proposal.step, axis=-1)
-    np.testing.assert_allclose(lengths[3], 2 * 0.05, rtol=1e-6)
-    free = jnp.arange(N) != 3
-    np.testing.assert_allclose(lengths[free], 2**0.5, rtol=1e-6)
-    np.testing.assert_allclose(proposal.product, product, atol=1e-12)

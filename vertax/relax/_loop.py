@@ -194,7 +194,7 @@ class Search(eqx.Module):
         value, num_stalls = state.reference_value, state.num_stalls
         if (now := iteration.value(minimiser)) is not None:
             checks = progress.stepped & (num_steps % self.check_every == 0)
-            stalls = self._stalls(value - now, progress.force)
+            stalls = self._stalls(value - now, progress.force, tissue.n_vertices)
             after = jnp.where(overlaps, self.max_stalls, jnp.where(stalls, num_stalls + 1, 0))
             num_stalls = jnp.where(checks & ~at_rest, after, num_stalls)
             value = jnp.where(checks, now, value)
@@ -220,13 +220,13 @@ class Search(eqx.Module):
             finished=finished,
         )
 
-    def _stalls(self, gain: Array, force: Array) -> Bool[Array, ""]:
+    def _stalls(self, gain: Array, force: Array, n_vertices: int) -> Bool[Array, ""]:
         """Whether the energy has fallen by too little for its largest force, or without limit."""
-        stiffness = self.stiffness
-        little = gain < force * jnp.minimum(0.1 * self.length, force / stiffness)
-        little &= force > 0.01 * stiffness * self.length
+        unit = self.stiffness * self.length
+        little = gain < force * jnp.minimum(0.1 * self.length, force / self.stiffness)
+        little &= force > 0.01 * unit
         # (The first gain is infinite.)
-        return little | ((gain > 1e8 * stiffness * self.length**2) & jnp.isfinite(gain))
+        return little | ((gain > n_vertices * unit * self.length) & jnp.isfinite(gain))
 
     def _updated(
         self,

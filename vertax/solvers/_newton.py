@@ -103,7 +103,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
     - `max_products`: most Hessian-vector products in one step.
     - `max_corrections`: most second-order corrections of one step; 0 for none. (They halve the steps of free
-        clusters whose arcs press on each other, and cost nothing elsewhere.)
+        clusters in which arcs press on each other, and cost nothing elsewhere.)
     """
 
     max_displacement: float = 0.2
