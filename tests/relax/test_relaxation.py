@@ -413,13 +413,15 @@ def test_an_energy_may_depend_on_absolute_positions(boundary):
 def test_a_second_call_checks_no_numbers_and_traces_nothing(monkeypatch):
     tissue, traces = random_tissue(6, 0), []
 
-    def energy(tissue: vx.Tissue) -> jax.Array:
-        traces.append(1)
-        return ShapeFactorEnergy(3.7)(tissue)
+    class Counted(vx.AbstractEnergy):
+        def __call__(self, tissue):
+            traces.append(1)
+            return ShapeFactorEnergy(3.7)(tissue)
 
     def refuse(*args: object, **kwargs: object) -> None:
         raise AssertionError("called in the second call")
 
+    energy = Counted()
     first = vx.equilibrate(tissue, energy, tolerance=1e-7)
     number = len(traces)
     monkeypatch.setattr(_relaxation, "check_number", refuse)
