@@ -19,14 +19,16 @@ from vertax.tensions._outcome import Relative, assembled, is_determined
 
 Chain = Float[np.ndarray, "_ 2"]
 
-# An edge is resolved in an interval if it is longer than this, relative to the median distance of points.
-_SHORTEST = 1.0
+# Largest relaxation rate of an edge, over that of frames, at which its motion is integrated.
+_FASTEST = 20.0
 # Distance of points, relative to the median, below which the force of a trial decreases with it, so that an
 # edge may shrink to a point.
 _SOFT = 0.005
 # Largest number of Gauss-Newton steps, and mean square of the change over the standard deviation at which
 # they end.
 _ROUNDS, _DECREASE = 30, 1e-2
+# Number of samples of the noise of points.
+_SAMPLES = 16
 # Factor of the estimated spectral radius, because lengths change within a step.
 _SAFETY = 1.2
 # Second derivatives of the area ½ (a × b) swept by a piece from a to b.
@@ -41,9 +43,11 @@ class EdgeMotion:
 
     The pressures $p_c$ change the areas at a constant rate from one frame to the next. Points on the outline
     are interpolated linearly between their observed positions, because other forces than tensions may act
-    there. In each interval the others start at their observed positions and are integrated up to the next
-    frame; a fit of the tensions minimises their distances from the curves observed there. That needs no
-    velocities, which differences between frames approximate badly where junctions are fast.
+    there. So are those of edges that shrink to a point or grow from one: edges so short that they relax more
+    than 20 times between two frames. In each interval the other points start at their observed positions and
+    are integrated up to the next frame; a fit of the tensions minimises their distances from the curves
+    observed there. That needs no velocities, which differences between frames approximate badly where
+    junctions are fast.
 
     ```python
     foams = [vx.io.read_surface_evolver(path) for path in paths]
@@ -111,37 +115,33 @@ class EdgeMotion:
         self._edge = np.repeat(np.arange(len(rows)), [len(row) - 1 for row in rows])
         # Coordinates are x and y of one point after the other; a piece has four, and two cells.
         self._place = (2 * self._pieces[:, :, None] + [0, 1]).reshape(-1, 4)
+        self._cells = np.asarray(first.topology.edge_cells)[self._edge]
+        shape = (len(self._place), 4, 4)
+        pairs = (np.broadcast_to(x, shape) for x in (self._place[..., None], self._place[:, None]))
+        self._stiffness = _Pattern(*pairs, 2 * (points[0].size,))
+        sides, places = np.broadcast_arrays(self._cells[:, :, None], self._place[:, None])
+        self._areas = _Pattern(sides, places, (first.n_cells, points[0].size))
         self._spacing = 0.0
         lengths = np.stack([self._ways(x.ravel())[1] for x in points])
-        sums = np.stack([np.bincount(self._edge, length) for length in lengths])
         self._spacing = float(np.median(lengths))
-        resolved = np.minimum(sums[1:], sums[:-1]) > _SHORTEST * self._spacing
-        resolved &= ~np.asarray(first.topology.on_outline)
-        self._free = np.ones((len(steps), points.shape[1]), bool)
+        within = ~np.asarray(first.topology.on_outline)
+        self._use(np.tile(within, (len(steps), 1)))
+        # Edges that shrink to a point, or grow from one, move as observed.
+        rate = 4 * self._pace() * steps[:, None] / np.minimum(lengths[1:], lengths[:-1])
+        mean = [np.bincount(self._edge, each) / np.bincount(self._edge) for each in rate]
+        self._use(within & (np.stack(mean) < _FASTEST))
+
+    def _use(self, resolved: Bool[np.ndarray, "intervals edges"]) -> None:
+        """Integrate the motion of these edges only."""
+        self._free = np.ones((len(resolved), self._points.shape[1]), bool)
         for free, used in zip(self._free, resolved, strict=True):
             free[self._pieces[~used[self._edge]]] = False
         moves = np.any(self._free[:, self._pieces], axis=(0, 2))
         self.inner = np.bincount(self._edge, moves) > 0
-        if not self.inner.any():
-            raise ValueError(
-                "Argument `chains` must hold edges within the cluster that are longer than the distance of "
-                "points in two successive frames, but there are none."
-            )
-        self._cells = np.asarray(first.topology.edge_cells)[self._edge]
-        n, shape = points[0].size, (len(self._place), 4, 4)
         column = np.where(self.inner, np.cumsum(self.inner) - 1, -1)[self._edge]
-        row, other = (
-            np.broadcast_to(x, shape) for x in (self._place[..., None], self._place[:, None])
-        )
-        self._stiffness = _Pattern(row, other, (n, n))
-        self._pulls = _Pattern(
-            self._place, np.stack([column] * 4, axis=1), (n, int(self.inner.sum()))
-        )
-        self._areas = _Pattern(
-            np.broadcast_to(self._cells[:, :, None], (len(self._place), 2, 4)),
-            np.broadcast_to(self._place[:, None], (len(self._place), 2, 4)),
-            (first.n_cells, n),
-        )
+        columns = np.broadcast_to(column[:, None], self._place.shape)
+        shape = self._points[0].size, int(self.inner.sum())
+        self._pulls = _Pattern(self._place, columns, shape)
 
     def residuals(
         self, tension: Float[np.ndarray, " edges"]
@@ -172,10 +172,11 @@ class EdgeMotion:
 
     @one_blas_thread()
     def tensions(self) -> InferredTensions:
-        r"""The tensions that explain the motion best, by least squares, and the pressures in the first frame.
+        r"""The tensions that explain the motion best, by least squares, and the pressures in frame 1.
 
         Their standard deviations are those of the Laplace approximation, with the residuals as noise.
-        Points of an edge within their correlation length count as one.
+        Points of an edge within their correlation length count as one. For pressures, which depend on the
+        positions of points too, the noise is also sampled.
 
         **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions], with `motion`.
 
@@ -208,13 +209,19 @@ class EdgeMotion:
         alike = self._points_alike(fit.residual)
         variance = fit.value / max(self._n_residuals / alike - n, 1.0)
         covariance = variance * np.linalg.pinv(fit.normal, hermitian=True)
-        rate = self._velocity(self._start(0, True), fit.tension, *self._drive(0))
-        mean = float(fit.tension[edges].mean())
+        rate, mean = self._at_second_frame(fit.tension, True), float(fit.tension[edges].mean())
         # Jacobian of the tensions and pressures relative to the mean tension.
         values = np.append(fit.tension[edges], rate.pressure[:, 0]) / mean
         jacobian = np.concatenate([np.eye(n), rate.pressure[:, 1:]])
         jacobian = (jacobian - np.outer(values, np.full(n, 1 / n))) / mean
         covariance = jacobian @ covariance @ jacobian.T
+        # Noise of the points of the first two frames.
+        noise, random = np.sqrt(fit.value / self._n_residuals), np.random.default_rng(0)
+        other, samples = copy.copy(self), []
+        for _ in range(_SAMPLES):
+            other._points = self._points[:2] + noise * random.normal(size=self._points[:2].shape)
+            samples.append(other._at_second_frame(fit.tension, False).pressure[:, 0] / mean)
+        covariance[n:, n:] += np.cov(samples, rowvar=False)
         deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
         sure = is_determined(deviation[:n])
         beside = np.isin(cells, np.asarray(tissue.topology.edge_cells)[edges[sure]])
@@ -227,7 +234,7 @@ class EdgeMotion:
             Relative(*np.split(values, [n]), *np.split(deviation, [n]), beside, sure, 0 * values),
             lambda vectors: covariance @ vectors,
             labels=cells + 1,
-            noise=float(np.sqrt(fit.value / self._n_residuals)),
+            noise=float(noise),
             correlation=alike * self._spacing,
             bending=0.0,
             edges="points",
@@ -236,6 +243,11 @@ class EdgeMotion:
             four_fold=np.zeros(tissue.n_edges, bool),
             motion=MotionFit(mean, rms(fit.residual), rms(ways)),
         )
+
+    def _at_second_frame(self, tension: Float[np.ndarray, " edges"], sensitive: bool) -> _Rate:
+        """Velocities and pressures predicted at the end of the first interval."""
+        end = self._end(0, tension, sensitive=sensitive)
+        return self._velocity(end, tension, *self._drive(0))
 
     def _squares(self, tension: Float[np.ndarray, " edges"]) -> _Squares:
         """The sum of squared residuals, with half its derivatives by the tensions of inner edges."""

@@ -120,7 +120,8 @@ class InferredTensions(eqx.Module):
         if self.mask_report is not None:
             cases.append((self.mask_report.closed, "contact not shown"))
             cases.append((self.mask_report.uncertain, "contact uncertain"))
-        cases.append((np.isnan(self.tensions), "no junction of three cells"))
+        junction = "no junction of three cells" if self.motion is None else "no junction that moves"
+        cases.append((np.isnan(self.tensions), junction))
         cases += [
             (short, "too short for a direction"),
             (~self.determined, "standard deviation above 0.3"),
