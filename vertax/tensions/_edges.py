@@ -19,7 +19,6 @@ from vertax.tensions._solve import Balance, System, choose_errors, solve
 class Solution(NamedTuple):
     """A balance of forces in a fitted geometry."""
 
-    fitted: ObservedGeometry
     system: System
     balance: Balance
 
@@ -104,7 +103,7 @@ def solution(
     assert best is not None
     _, errors, flat, systems = best
     tissue = systems[0] if len(parts) == 1 else system(fitted, flat=flat)
-    return Solution(fitted, tissue, solve(tissue, errors))
+    return Solution(tissue, solve(tissue, errors))
 
 
 def _density_of_arcs(arcs: System, noise: float) -> float:

@@ -91,8 +91,6 @@ class InferredTensions(eqx.Module):
     four_fold: Bool[np.ndarray, " edges"]
     """Whether the edge has length 0: it is shorter than half a pixel of the mask, or half the accuracy of the
     positions. Four cells meet in a point, and which two of them share the edge depends on their numbers."""
-    resampled_deviations: Float[np.ndarray, " edges"] | None = None
-    """Standard deviations of the tensions by resampling, with `resamples`."""
     short: Bool[np.ndarray, " edges"] | None = None
     """Whether the edge is too short for a direction, or may be between other cells."""
     mask_report: MaskReport | None = None

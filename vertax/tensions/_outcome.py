@@ -79,7 +79,6 @@ def outcome(
     source: tuple[
         Int[np.ndarray, " cells"], PixelSize | None, Bool[np.ndarray, " edges"], MaskReport | None
     ],
-    resampled: Float[np.ndarray, " tensions"] | None,
 ) -> InferredTensions:
     """The result as it is reported.
 
@@ -90,7 +89,6 @@ def outcome(
     - `curves`: its fitted edges.
     - `which`, `balance`: the equations and their solution.
     - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
-    - `resampled`: standard deviations of tensions by resampling.
 
     **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
     """
@@ -98,7 +96,6 @@ def outcome(
     tissue = _moved(tissue, curves.change)
     if report is not None:
         tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
-    spread = lambda of, fill: _spread(tissue.n_edges, which.edges, of, fill)
     return assembled(
         tissue,
         (which.edges, which.cells),
@@ -113,10 +110,9 @@ def outcome(
         errors={name: float(value) for name, value in balance.errors._asdict().items()},
         pixel_size=pixel_size,
         mask_report=report,
-        short=spread(balance.loose, False),
+        short=_spread(tissue.n_edges, which.edges, balance.loose, False),
         outline_errors=_outline_errors(tissue, points, curves.change)
         / pixel_length(pixel_size or 1.0),
-        resampled_deviations=None if resampled is None else spread(resampled, np.nan),
     )
 
 

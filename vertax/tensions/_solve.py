@@ -69,8 +69,6 @@ class Balance(NamedTuple):
     pressure: Float[np.ndarray, " cells"]
     posterior: Posterior
     """Covariances of tensions and pressures that may be negative (Laplace approximation)."""
-    angle: Float[np.ndarray, " angles"]
-    """The angles with which all forces balance."""
     errors: Errors
     """Errors of the model, noise relative to that of the points, and widths of the priors."""
     loose: Bool[np.ndarray, " edges"]
@@ -333,7 +331,6 @@ def solve(system: System, errors: Errors, *, rounds: int = 12) -> Balance:
         tension=last.x[:n],
         pressure=last.x[n:],
         posterior=system.posterior(last.normal),
-        angle=system.shape.angle + last.change,
         errors=errors,
         loose=system.shape.loose,
     )
