@@ -116,10 +116,10 @@ def cases(folder: Path, seed: int) -> Iterator[tuple[str, list[tuple[Truth, obje
 
 
 def relaxed(folder: Path, seed: int, frames: int = 0) -> list[Path]:
-    """The file of a foam of 30 cells at rest, or of frames on the way to rest.
+    """The file of a foam of 20 cells at rest, or of frames on the way to rest.
 
     Foams in which an edge shrinks to a point, where Surface Evolver keeps four edges that are not in
-    balance, are not at rest: another one takes their place.
+    balance, are not at rest: another one of less contrast takes their place.
     """
     # Contrasts from 0.15 to 0.4, at random or in patches.
     spread, patches = 0.15 + 0.25 * (seed % 5) / 4, seed % 2 == 1
@@ -129,13 +129,14 @@ def relaxed(folder: Path, seed: int, frames: int = 0) -> list[Path]:
         if dumps[-1].exists():
             break
         number = 1000 * (attempt + 1) + seed
-        tissue = start(30, number)
-        write_evolver(file, tissue, grouped(tissue, spread, number, patches))
+        tissue = start(20, number)
+        less = 0.9**attempt * spread
+        write_evolver(file, tissue, grouped(tissue, less, number, patches))
         if frames:
             steps = "".join(f'g 50\ndump "{dump}"\n' for dump in dumps)
             run_evolver(file, f"m 0.002\ng 50\n{steps}")
         else:
-            to_rest(file).rename(dumps[0])
+            to_rest(file, 80).rename(dumps[0])
             relaxed = foam(dumps[0]).tissue
             inner = ~np.asarray(relaxed.topology.on_outline)
             if np.min(np.asarray(relaxed.edge_lengths)[inner]) < 0.1:

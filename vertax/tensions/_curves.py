@@ -66,6 +66,8 @@ class Fitted(NamedTuple):
     """Noise relative to which the prior was weighted."""
     crisp: bool = False
     """Whether the grain is the only error of the points."""
+    bends: bool = False
+    """Whether bends were fitted."""
 
 
 def read_courses(
@@ -123,7 +125,7 @@ def read_courses(
         count = float(np.sum(curves.weight))
         fitted = len(used) + 2 * len(np.unique(tissue.ends[used]))
         off = curves.noise * np.sqrt(count / max(count - fitted, 0.25 * count))
-    return curves._replace(noise=off, crisp=crisp)
+    return curves._replace(noise=off, crisp=crisp, bends=start == _BENDING)
 
 
 def fit_curves(

@@ -20,7 +20,7 @@ _LOOSE, _SHORT, _TINY = 0.2, 8.0, 0.02
 # Smallest and largest standard deviations: of directions and arcs in radians, of pressures, and of tensions
 # in mean tensions. Tensions that are not negative and uniform about a mean of 1 have 0.58. Of arcs in noise,
 # the evidence underestimates the independent part.
-_JUNCTIONS, _ARCS, _PRESSURES = (5e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
+_JUNCTIONS, _ARCS, _PRESSURES = (2e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
 _STRAIGHT_JUNCTIONS = (1e-3, 1.5)
 _TENSIONS, _ARC_TENSIONS = (0.03, 0.6), (0.3, 0.6)
 # Smallest noise relative to that of the points, of smooth and of rough outlines, and the largest: pixels

@@ -39,13 +39,14 @@ class Relative(NamedTuple):
     """Standard deviations due to the contrast, an error that all tensions have in common."""
 
 
-def relative(balance: Balance, which: Equations) -> Relative:
+def relative(balance: Balance, which: Equations, curves: Fitted) -> Relative:
     """Tensions and pressures relative to their means over all edges and cells that have an equation.
 
     **Arguments:**
 
     - `balance`: the solution of the balance of forces, in which the mean of the tensions is 1.
     - `which`: the equations.
+    - `curves`: the fitted edges.
 
     **Returns:** the [`Relative`][vertax.tensions._outcome.Relative] numbers.
     """
@@ -59,7 +60,9 @@ def relative(balance: Balance, which: Equations) -> Relative:
     variance[n:] += mean @ spread - 2 * spread[n:]
     # Friction along edges, which is the error of arcs, hides a part of the contrast of tensions from all
     # junctions alike: their angles follow the tensions late. As a force it is 2 γ times this error.
-    lag = HIDDEN * balance.errors.arc * np.append(balance.tension - 1, np.zeros(n_cells))
+    # Friction bends edges too, so that it is not larger than bends where the points resolve them.
+    friction = min(balance.errors.arc, curves.bending) if curves.bends else balance.errors.arc
+    lag = HIDDEN * friction * np.append(balance.tension - 1, np.zeros(n_cells))
     deviation = np.sqrt(np.maximum(variance + lag**2, 0))
     pressure = balance.pressure - np.mean(balance.pressure)
     return Relative(balance.tension, pressure, deviation[:n], deviation[n:], beside, sure, lag)
@@ -99,7 +102,7 @@ def outcome(
     return assembled(
         tissue,
         (which.edges, which.cells),
-        relative(balance, which),
+        relative(balance, which, curves),
         balance.posterior.covariances,
         four_fold=four_fold,
         labels=np.asarray(labels),

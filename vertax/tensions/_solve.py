@@ -21,8 +21,8 @@ _SMALL, _UNKNOWN = 0.2, 10.0
 # arcs lag behind the pressures.
 _FIRST = Errors(junction=0.05, arc=0.1, noise=1.0, tension=0.3, region=0.3, pressure=1.0)
 # The errors of arcs are forces of friction along the edges. Only their sums around junctions contradict a
-# balance; the rest, which is as large or larger, changes pressures and is not in the residual.
-HIDDEN = 2.0
+# balance; the rest, of the same variance, changes pressures and is not in the residual.
+HIDDEN = 2**0.5
 # Range of the correlation of tensions: κ² in the covariance (L + κ²)⁻², with L the Laplacian of edges that
 # meet at junctions. The correlation decreases over about √8 / κ edges.
 _KAPPA = 0.2
