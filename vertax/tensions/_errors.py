@@ -8,9 +8,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs  # pyright: ignore[reportAttributeAccessIssue]
 
-# Centres of the priors of the logarithms, of standard deviation 1; without one, all values are as likely. A
-# few junctions determine the width of the part that is similar in regions within a factor of 2 or 3 only.
-_CENTRES = {"noise": 1.0, "region": 0.15}
 # The search of the optimum ends at derivatives, or a decrease, below these; largest step of a logarithm.
 _SLOPE, _DECREASE, _STEP = 0.1, 1e-3, 1.5
 
@@ -54,7 +51,12 @@ class Patch(NamedTuple):
 # information: Gilmour, Thompson & Cullis 1995, doi:10.2307/2533274). Parts of a large tissue count as
 # independent.
 def most_evident(
-    patches: list[Patch], guess: Errors, bounds: dict[str, tuple[float, float]], *, steps: int
+    patches: list[Patch],
+    guess: Errors,
+    bounds: dict[str, tuple[float, float]],
+    *,
+    steps: int,
+    centres: dict[str, float],
 ) -> tuple[Errors, float]:
     """The standard deviations of the largest marginal likelihood (evidence), and its logarithm.
 
@@ -64,11 +66,12 @@ def most_evident(
     - `guess`: initial standard deviations.
     - `bounds`: smallest and largest standard deviation by name; others keep the guess.
     - `steps`: largest number of Newton steps.
+    - `centres`: of priors of the logarithms, of standard deviation 1; of others, all values are as likely.
 
     **Returns:** the [`Errors`][vertax.tensions._errors.Errors] and the evidence.
     """
     free = [k for k, name in enumerate(Errors._fields) if name in bounds]
-    centre = np.array([np.log(_CENTRES.get(Errors._fields[k], np.nan)) for k in free])
+    centre = np.array([np.log(centres.get(Errors._fields[k], np.nan)) for k in free])
     held = [k for k in range(len(guess)) if k not in free and guess[k]]
     constants = [
         patch.unknown + sum((guess[k] ** 2 * patch.parts[k] for k in held), 0.0)

@@ -77,7 +77,12 @@ class Observability(NamedTuple):
     def model_deviations(self, errors: Errors) -> Float[np.ndarray, " angles"]:
         """Standard deviations of the angles due to errors of the model."""
         direction, arc = self.shares()
-        return np.sqrt(errors.junction**2 * direction + errors.arc**2 * arc)
+        return np.sqrt(errors.junction**2 * direction + errors.arc**2 * arc + self.unknown_arcs)
+
+    @property
+    def unknown_arcs(self) -> Float[np.ndarray, " angles"]:
+        """Variances of the arcs of loose edges, which have no angle either: 1; and 0 of other angles."""
+        return np.where((self.slot == 2) & self.loose[self.edge], 1.0, 0.0)
 
     def precision(self, errors: Errors) -> csr_array:
         """Inverse covariance of the angles at given vertices, due to noise and errors of the model."""
