@@ -396,7 +396,7 @@ class EdgeMotion:
         return int(self._free.sum() + self._free[:, : self.tissue.n_vertices].sum())
 
     def _points_alike(self, residual: Float[np.ndarray, "intervals points 2"]) -> float:
-        """Number of points of an edge whose residuals are alike."""
+        """Number of points of an edge with residuals that are alike."""
         parts = []
         for number, left in enumerate(residual):
             size = np.sum(left * self._normals(number), axis=1)
