@@ -78,6 +78,9 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     if last < 1:
         raise ValueError("movie.paths must name two frames or more.")
     inferred = [frames.motion(end, config.substeps).tensions() for end in range(1, last + 1)]
+    first, last_fit = inferred[0].motion, inferred[-1].motion
+    assert first is not None
+    assert last_fit is not None
     inner = np.isfinite(inferred[0].tensions)
     true = frames.tension / frames.tension[inner].mean()
     rows = [compare(each, true, inner) for each in inferred]
@@ -89,10 +92,10 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         edges[f"deviation_{number}_frames"] = each.tension_deviations[inner]
     folder.save_table("edges", edges)
     # The prediction of the first two frames for all later ones.
-    tension = np.where(inner, inferred[0].tensions * inferred[0].motion.mobility, 0)
+    tension = np.where(inner, inferred[0].tensions * first.mobility, 0)
     residuals = frames.motion(last, config.substeps).residuals(tension)
-    course = {"time": np.array(frames.times[1:]), "moved": inferred[-1].motion.moved}
-    course |= {"misfit_all_frames": inferred[-1].motion.misfit}
+    course = {"time": np.array(frames.times[1:]), "moved": last_fit.moved}
+    course |= {"misfit_all_frames": last_fit.misfit}
     free = np.maximum(np.count_nonzero(residuals.any(axis=2), axis=1), 1)
     course |= {"misfit_2_frames": np.sqrt(np.sum(residuals**2, axis=(1, 2)) / free)}
     folder.save_table("misfit", course)

@@ -99,6 +99,7 @@ def test_tensions_of_a_movie_agree_within_their_errors():
     result = motion.tensions()
     np.testing.assert_allclose(result.tensions[inner], true, rtol=1e-3)
     assert np.isnan(result.tensions[~inner]).all()
+    assert result.motion is not None
     np.testing.assert_allclose(result.motion.mobility, tension[inner].mean(), rtol=1e-3)
     assert (result.motion.misfit < 1e-3 * result.motion.moved).all()
     rng = np.random.default_rng(2)

@@ -114,11 +114,14 @@ class EdgeMotion:
         self._pieces = np.concatenate([np.stack([row[:-1], row[1:]], axis=1) for row in rows])
         self._edge = np.repeat(np.arange(len(rows)), [len(row) - 1 for row in rows])
         # Coordinates are x and y of one point after the other; a piece has four, and two cells.
-        self._place = (2 * self._pieces[:, :, None] + [0, 1]).reshape(-1, 4)
+        place = (2 * self._pieces[:, :, None] + np.array([0, 1])).reshape(-1, 4)
+        self._place: Int[np.ndarray, "pieces 4"] = place.astype(int)
         self._cells = np.asarray(first.topology.edge_cells)[self._edge]
         shape = (len(self._place), 4, 4)
-        pairs = (np.broadcast_to(x, shape) for x in (self._place[..., None], self._place[:, None]))
-        self._stiffness = _Pattern(*pairs, 2 * (points[0].size,))
+        row, column = (
+            np.broadcast_to(x, shape) for x in (self._place[..., None], self._place[:, None])
+        )
+        self._stiffness = _Pattern(row, column, 2 * (points[0].size,))
         sides, places = np.broadcast_arrays(self._cells[:, :, None], self._place[:, None])
         self._areas = _Pattern(sides, places, (first.n_cells, points[0].size))
         self._spacing = 0.0
@@ -231,7 +234,9 @@ class EdgeMotion:
         return assembled(
             tissue,
             (edges, cells),
-            Relative(*np.split(values, [n]), *np.split(deviation, [n]), beside, sure, 0 * values),
+            Relative(
+                values[:n], values[n:], deviation[:n], deviation[n:], beside, sure, 0 * values
+            ),
             lambda vectors: covariance @ vectors,
             labels=cells + 1,
             noise=float(noise),

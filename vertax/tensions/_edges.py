@@ -16,7 +16,7 @@ from vertax.tensions._observed_geometry import ObservedGeometry
 from vertax.tensions._solve import Balance, System, choose_errors, solve
 
 # Smallest logarithm of the ratio of the evidences at which edges are straight (very strong: Kass & Raftery
-# 1995, doi:10.1080/01621459.1995.10476572). Coarse masks do not tell arcs from straight edges.
+# 1995, doi:10.1080/01621459.1995.10476572). Coarse masks do not distinguish arcs from straight edges.
 _DECISIVE = 5.0
 
 
