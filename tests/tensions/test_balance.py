@@ -289,6 +289,8 @@ def test_foams_with_known_tensions(name, least, error):
     true = true / true.mean()
     assert pearson(true, result.tensions[sure]) > least
     assert np.mean(np.abs(result.tensions[sure] - true) / true) < error
+    # Edges too short for a direction have no arc either: only the prior and neighbours determine them.
+    assert np.all(result.tension_deviations[result.short & np.isfinite(result.tensions)] > 0.1)
 
 
 @needs_data
