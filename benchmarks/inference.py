@@ -89,7 +89,7 @@ class Truth(NamedTuple):
 
 
 def compare(truth: Truth, result: InferredTensions) -> tuple[np.ndarray, ...]:
-    """True and inferred tensions, their standard scores, and the same of pressures."""
+    """True and inferred tensions, their standard scores, the same of pressures, and standard deviations."""
     tissue = truth.tissue
     exact = result.pixel_size is None
     # An exact shape has the cells of the truth; an image labels them from 1.
@@ -113,6 +113,8 @@ def compare(truth: Truth, result: InferredTensions) -> tuple[np.ndarray, ...]:
         pressure,
         result.pressures[certain],
         away / result.pressure_deviations[certain],
+        result.tension_deviations[use],
+        result.pressure_deviations[certain],
     )
 
 

@@ -35,7 +35,7 @@ def halves(tissue: vx.Tissue, random: np.random.Generator) -> np.ndarray:
         curves = fit(part, points, 0.01 * part.size, apart=None, noise=None)
         uncertain = np.zeros(tissue.n_edges, bool)
         solved = solution(part, curves, uncertain, straight=True, known_noise=False, prior=None)
-        result = relative(solved.balance, solved.system.which)
+        result = relative(solved.balance, solved.system.which, curves)
         values = np.full((2, tissue.n_edges), np.nan)
         values[:, solved.system.which.edges] = result.tension, result.tension_deviation
         parts.append(values)

@@ -52,7 +52,7 @@ class Config(runs.ExperimentConfig):
     """The frames."""
     cluster: Cluster = Cluster()
     """The synthetic cluster, if there are no files."""
-    substeps: int = Field(default=50, ge=1)
+    substeps: int = Field(default=10, ge=1)
     """Steps of the motion between frames."""
 
 
@@ -78,22 +78,26 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     if last < 1:
         raise ValueError("movie.paths must name two frames or more.")
     inferred = [frames.motion(end, config.substeps).tensions() for end in range(1, last + 1)]
-    inner = np.isfinite(inferred[0].tension)
+    first, last_fit = inferred[0].motion, inferred[-1].motion
+    assert first is not None
+    assert last_fit is not None
+    inner = np.isfinite(inferred[0].tensions)
     true = frames.tension / frames.tension[inner].mean()
     rows = [compare(each, true, inner) for each in inferred]
     table = columns(rows)
     folder.save_table("frames", {"frames_used": np.arange(2, last + 2), **table})
     edges = {"true_tension": true[inner]}
     for number, each in ((2, inferred[0]), (last + 1, inferred[-1])):
-        edges[f"tension_{number}_frames"] = each.tension[inner]
-        edges[f"deviation_{number}_frames"] = each.deviation[inner]
+        edges[f"tension_{number}_frames"] = each.tensions[inner]
+        edges[f"deviation_{number}_frames"] = each.tension_deviations[inner]
     folder.save_table("edges", edges)
     # The prediction of the first two frames for all later ones.
-    tension = np.where(inner, inferred[0].tension * inferred[0].mobility, 0)
+    tension = np.where(inner, inferred[0].tensions * first.mobility, 0)
     residuals = frames.motion(last, config.substeps).residuals(tension)
-    course = {"time": np.array(frames.times[1:]), "moved": inferred[-1].moved}
-    course |= {"misfit_all_frames": inferred[-1].misfit}
-    course |= {"misfit_2_frames": np.sqrt(2 * np.mean(residuals**2, axis=1))}
+    course = {"time": np.array(frames.times[1:]), "moved": last_fit.moved}
+    course |= {"misfit_all_frames": last_fit.misfit}
+    free = np.maximum(np.count_nonzero(residuals.any(axis=2), axis=1), 1)
+    course |= {"misfit_2_frames": np.sqrt(np.sum(residuals**2, axis=(1, 2)) / free)}
     folder.save_table("misfit", course)
     folder.save_figure("tensions", plot_tensions(frames.tissues[0], true, inferred[0]))
     folder.save_figure("frames", plot_frames(table, course))
@@ -104,14 +108,14 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
 def compare(inferred: Any, true: np.ndarray, inner: np.ndarray) -> dict[str, float]:
     """Errors of the tensions of inner edges."""
-    tension, deviation, true = inferred.tension[inner], inferred.deviation[inner], true[inner]
+    tension, deviation, true = inferred.tensions[inner], inferred.tension_deviations[inner], true[inner]
     error = np.abs(tension - true)
     return {
         "pearson": float(pearson(true, tension)),
         "relative_error": float(np.mean(error / true)),
         "deviation_median": float(np.median(deviation)),
         "covered": float(np.mean(error < 2 * deviation)),
-        "mobility": inferred.mobility,
+        "mobility": inferred.motion.mobility,
     }
 
 
@@ -147,11 +151,11 @@ def synthetic_frames(config: Config) -> Frames:
 def plot_tensions(tissue: vx.Tissue, true: np.ndarray, inferred: Any) -> Any:
     """The cluster with the tensions of its inner edges from two frames, and those against the true ones."""
     figure, ((left, right),) = plotting.new_figure(1, 2, width=3.3, height=2.9)
-    vx.plot_tissue(tissue, None, inferred.tension, ax=left, edge_label=NAME)
+    vx.plot_tissue(tissue, None, inferred.tensions, ax=left, edge_label=NAME)
     left.set_title("from the first two frames")
-    inner = np.isfinite(inferred.tension)
-    options: Any = {"deviation": inferred.deviation[inner], "ax": right, "name": NAME}
-    plotting.plot_recovery(true[inner], inferred.tension[inner], **options)
+    inner = np.isfinite(inferred.tensions)
+    options: Any = {"deviation": inferred.tension_deviations[inner], "ax": right, "name": NAME}
+    plotting.plot_recovery(true[inner], inferred.tensions[inner], **options)
     return figure
 
 

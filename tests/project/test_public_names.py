@@ -58,7 +58,7 @@ PACKAGES = {
     "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
     "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "TruncatedCG VertexTrustRegion Wrapped",
-    "tensions": "EdgeMotion InferredTensions MaskFrame MovingTensions TensionsOfMasks find_masks "
+    "tensions": "EdgeMotion InferredTensions MaskFrame MotionFit TensionsOfMasks find_masks "
     "infer_tensions infer_tensions_of_masks read_mask",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",
 }

@@ -150,19 +150,6 @@ def test_imbalance_is_distinguished_from_noise(foam):
     assert np.nanmedian(result.tension_deviations) > 3 * np.nanmedian(at_rest.tension_deviations)
 
 
-def test_bootstrap_agrees_with_laplace_approximation(foam):
-    result = infer_tensions(label_image(foam[0], 400), resamples=24)
-    sure = result.determined
-    assert result.resampled_deviations is not None
-    ratio = result.resampled_deviations[sure] / result.tension_deviations[sure]
-    assert 0.4 < np.median(ratio) < 1.6
-    again = infer_tensions(label_image(foam[0], 400), resamples=24)
-    assert again.resampled_deviations is not None
-    np.testing.assert_array_equal(
-        result.resampled_deviations[sure], again.resampled_deviations[sure]
-    )
-
-
 def test_polygons_have_straight_edges():
     """A Voronoi tissue, which is in balance with straight edges."""
     tissue = vx.initialise.free_voronoi(30, key=jax.random.key(4), lloyd_steps=1)
@@ -302,6 +289,8 @@ def test_foams_with_known_tensions(name, least, error):
     true = true / true.mean()
     assert pearson(true, result.tensions[sure]) > least
     assert np.mean(np.abs(result.tensions[sure] - true) / true) < error
+    # Edges too short for a direction have no arc either: only the prior and neighbours determine them.
+    assert np.all(result.tension_deviations[result.short & np.isfinite(result.tensions)] > 0.1)
 
 
 @needs_data

@@ -21,6 +21,7 @@ _BENDING, _BENDINGS = 0.1, (1e-4, 0.3)
 # Largest noise and correlation length, in grains, of edges with the grain of the pixels as their only error.
 # (For middles of the sides of pixels along a smooth curve: 0.24 and 1.45.)
 _CRISP = 0.26, 1.6
+_PIXELS = 1.45
 # Degrees of freedom of the distribution of the noise of an edge; number of estimates of noise and bends.
 _FREEDOM, _PASSES = 4.0, 3
 # Largest number of edges that are all used for these, and of those of each part of a larger tissue.
@@ -65,6 +66,8 @@ class Fitted(NamedTuple):
     """Noise relative to which the prior was weighted."""
     crisp: bool = False
     """Whether the grain is the only error of the points."""
+    bends: bool = False
+    """Whether bends were fitted."""
 
 
 def read_courses(
@@ -102,6 +105,7 @@ def read_courses(
     for start in _BENDINGS[:1] if short else (_BENDING, _BENDINGS[0]):
         first = fit(apart=apart or 2 * grain, bending=start, noise=noise or 0.4 * grain)
         alike = apart or min(correlation_length(points, first.rest), longest)
+        alike = alike if apart else max(alike, _PIXELS * grain)
         crisp = first.noise < _CRISP[0] * grain and alike < _CRISP[1] * grain
         if crisp or apart is not None:
             break
@@ -116,9 +120,12 @@ def read_courses(
             off, bending = _most_evident(tissue, points, curves, grain, noise)
         change = curves.change
     curves = fit(apart=alike, bending=bending, noise=off, factor=factor, change=change)
-    if start != _BENDING:
-        off = noise or curves.noise
-    return curves._replace(noise=off, crisp=crisp)
+    if start != _BENDING and noise is None:
+        # Parameters follow the noise of as many points.
+        count = float(np.sum(curves.weight))
+        fitted = len(used) + 2 * len(np.unique(tissue.ends[used]))
+        off = curves.noise * np.sqrt(count / max(count - fitted, 0.25 * count))
+    return curves._replace(noise=off, crisp=crisp, bends=start == _BENDING)
 
 
 def fit_curves(

@@ -15,11 +15,14 @@ from vertax.tensions._observability import observability, patches
 from vertax.tensions._observed_geometry import ObservedGeometry
 from vertax.tensions._solve import Balance, System, choose_errors, solve
 
+# Smallest logarithm of the ratio of the evidences at which edges are straight (very strong: Kass & Raftery
+# 1995, doi:10.1080/01621459.1995.10476572). Coarse masks do not distinguish arcs from straight edges.
+_DECISIVE = 5.0
+
 
 class Solution(NamedTuple):
     """A balance of forces in a fitted geometry."""
 
-    fitted: ObservedGeometry
     system: System
     balance: Balance
 
@@ -99,12 +102,12 @@ def solution(
             evidence += _density_of_arcs(each, float(errors.noise))
         if not flat:
             arcs, evidence = systems, evidence + sum(s.which.n_arcs for s in systems) * np.log(2)
-        if best is None or evidence > best[0]:
+        if best is None or evidence > best[0] + _DECISIVE:
             best = evidence, errors, flat, systems
     assert best is not None
     _, errors, flat, systems = best
     tissue = systems[0] if len(parts) == 1 else system(fitted, flat=flat)
-    return Solution(fitted, tissue, solve(tissue, errors))
+    return Solution(tissue, solve(tissue, errors))
 
 
 def _density_of_arcs(arcs: System, noise: float) -> float:

@@ -51,7 +51,12 @@ class Patch(NamedTuple):
 # information: Gilmour, Thompson & Cullis 1995, doi:10.2307/2533274). Parts of a large tissue count as
 # independent.
 def most_evident(
-    patches: list[Patch], guess: Errors, bounds: dict[str, tuple[float, float]], *, steps: int
+    patches: list[Patch],
+    guess: Errors,
+    bounds: dict[str, tuple[float, float]],
+    *,
+    steps: int,
+    centres: dict[str, float],
 ) -> tuple[Errors, float]:
     """The standard deviations of the largest marginal likelihood (evidence), and its logarithm.
 
@@ -61,11 +66,12 @@ def most_evident(
     - `guess`: initial standard deviations.
     - `bounds`: smallest and largest standard deviation by name; others keep the guess.
     - `steps`: largest number of Newton steps.
+    - `centres`: of priors of the logarithms, of standard deviation 1; of others, all values are as likely.
 
     **Returns:** the [`Errors`][vertax.tensions._errors.Errors] and the evidence.
     """
     free = [k for k, name in enumerate(Errors._fields) if name in bounds]
-    noise = Errors._fields.index("noise")
+    centre = np.array([np.log(centres.get(Errors._fields[k], np.nan)) for k in free])
     held = [k for k in range(len(guess)) if k not in free and guess[k]]
     constants = [
         patch.unknown + sum((guess[k] ** 2 * patch.parts[k] for k in held), 0.0)
@@ -92,11 +98,9 @@ def most_evident(
                 part = patch.parts[k]
                 trace = 2 * np.vdot(inverse, part) - diagonal @ np.diag(part)
                 slope[number] += 2 * s * trace - pushed[number] @ force
-        if noise in free:
-            at = free.index(noise)
-            value += logs[at] ** 2
-            slope[at] += 2 * logs[at]
-            curvature[at, at] += 2
+        away = np.where(np.isnan(centre), 0.0, logs - centre)
+        value += float(away @ away)
+        slope, curvature = slope + 2 * away, curvature + 2 * np.diag(~np.isnan(centre))
         return value, slope, curvature
 
     limits = np.log([bounds[Errors._fields[k]] for k in free]).reshape(-1, 2).T

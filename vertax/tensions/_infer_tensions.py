@@ -14,7 +14,7 @@ from jaxtyping import Array, Int, Shaped
 from vertax._base.announce import announce_compilations
 from vertax._base.available_memory import check_memory
 from vertax._base.blas import one_blas_thread
-from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.checks import check_number, describe
 from vertax._base.phases import phases, start_phase
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.initialise import MaskReport, Segmentation, from_labels
@@ -30,7 +30,6 @@ from vertax.tensions._inferred import InferredTensions
 from vertax.tensions._mask import labels_and_lines
 from vertax.tensions._observed_geometry import observed_geometry
 from vertax.tensions._outcome import outcome
-from vertax.tensions._resampling import resampled_deviations
 
 # Noise of a tissue without an image, and of the points of a foam, relative to the cell diameter; and the
 # number of points of an edge without a course.
@@ -56,8 +55,6 @@ def infer_tensions(
     edges: str | None = None,
     noise: float | None = None,
     prior: float | None = None,
-    resamples: int = 0,
-    seed: int = 0,
 ) -> InferredTensions:
     r"""Tensions of edges and pressures of cells that balance in the observed shape of a tissue.
 
@@ -99,9 +96,6 @@ def infer_tensions(
     - `prior`: standard deviation of the prior of relative tensions about 1, independent of each other; by
         default chosen by the evidence (marginal likelihood), with a part that is similar in regions. A small
         one makes tensions too uniform.
-    - `resamples`: number of resampled shapes, as a check of the standard deviations (wild bootstrap: Wu 1986,
-        doi:10.1214/aos/1176350142), such as 50.
-    - `seed`: seed of the random numbers of the resampling.
 
     **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions]; read its `warnings`.
 
@@ -117,7 +111,6 @@ def infer_tensions(
     for name, value in (("noise", noise), ("prior", prior)):
         if value is not None:
             check_number(name, value, above=0)
-    check_integer("resamples", resamples, at_least=0)
     if edges not in (None, "arcs", "straight"):
         raise ValueError(
             f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
@@ -174,7 +167,7 @@ def infer_tensions(
     curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
     start_phase("balance")
     straight = None if edges is None and tissue.inner_arcs else edges != "arcs"
-    fitted, system, balance = solution(
+    system, balance = solution(
         geometry,
         curves,
         uncertain,
@@ -183,14 +176,10 @@ def infer_tensions(
         prior=prior,
     )
     start_phase("errors")
-    resampled = None
-    if resamples:
-        observed = fitted, curves, points, system, balance
-        resampled = resampled_deviations(*observed, times=resamples, seed=seed)
     # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
     source = course.labels, course.pixel_size, four_fold, report
-    return outcome(tissue, course.points, curves, system.which, balance, source, resampled)
+    return outcome(tissue, course.points, curves, system.which, balance, source)
 
 
 class _Course(NamedTuple):

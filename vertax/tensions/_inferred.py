@@ -28,6 +28,18 @@ _PLACES = 5
 _STRAY = 20
 
 
+class MotionFit(eqx.Module):
+    """How well tensions explain the motion of a cluster, see [`EdgeMotion`][vertax.tensions.EdgeMotion]."""
+
+    mobility: float
+    """Velocity of a point over the force on it, in units of the mean tension."""
+    misfit: Float[np.ndarray, " intervals"]
+    """Root mean square distance, across edges, of the points at the end of each interval from their predicted
+    positions."""
+    moved: Float[np.ndarray, " intervals"]
+    """Root mean square displacement of the points in each interval, across edges."""
+
+
 class InferredTensions(eqx.Module):
     """Relative tensions and pressures of a tissue, with their standard deviations.
 
@@ -66,12 +78,12 @@ class InferredTensions(eqx.Module):
     bending: float
     """Standard deviation of the bends of edges beyond arcs, in radians; 0 for a foam at rest."""
     edges: str
-    """`"arcs"` or `"straight"`: how edges were described."""
+    """`"arcs"`, `"straight"`, or `"points"` of `EdgeMotion`: how edges were described."""
     errors: dict[str, float]
     """Standard deviations chosen by the evidence: `junction`, of the directions at junctions beyond noise
     (radians); `arc`, of arcs of the length of a cell (radians; 0 for straight edges); `noise`, relative to
     that of the points; and of the priors: `tension`, independent; `region`, similar in regions; `pressure`,
-    in mean tensions over a cell diameter (1 for arcs)."""
+    in mean tensions over a cell diameter (1 for arcs). Empty for `EdgeMotion`."""
     mean_stress: MeanStress
     """Mean stress of the tissue and its anisotropy, with standard deviations."""
     pixel_size: PixelSize | None
@@ -79,8 +91,6 @@ class InferredTensions(eqx.Module):
     four_fold: Bool[np.ndarray, " edges"]
     """Whether the edge has length 0: it is shorter than half a pixel of the mask, or half the accuracy of the
     positions. Four cells meet in a point, and which two of them share the edge depends on their numbers."""
-    resampled_deviations: Float[np.ndarray, " edges"] | None = None
-    """Standard deviations of the tensions by resampling, with `resamples`."""
     short: Bool[np.ndarray, " edges"] | None = None
     """Whether the edge is too short for a direction, or may be between other cells."""
     mask_report: MaskReport | None = None
@@ -88,6 +98,8 @@ class InferredTensions(eqx.Module):
 
     outline_errors: Float[np.ndarray, " cells"] | None = None
     """Root mean square distance of the outline of each cell in the mask from its arcs, in pixels."""
+    motion: MotionFit | None = None
+    """The fit of `EdgeMotion`."""
 
     @property
     def area_errors(self) -> Float[np.ndarray, " cells"]:
@@ -106,7 +118,8 @@ class InferredTensions(eqx.Module):
         if self.mask_report is not None:
             cases.append((self.mask_report.closed, "contact not shown"))
             cases.append((self.mask_report.uncertain, "contact uncertain"))
-        cases.append((np.isnan(self.tensions), "no junction of three cells"))
+        junction = "no junction of three cells" if self.motion is None else "no junction that moves"
+        cases.append((np.isnan(self.tensions), junction))
         cases += [
             (short, "too short for a direction"),
             (~self.determined, "standard deviation above 0.3"),
@@ -145,7 +158,7 @@ class InferredTensions(eqx.Module):
                 "mean of all, is uncertain "
                 f"({', '.join(f'{count} {name}' for name, count in self.reason_counts.items())})"
             )
-        junction, arc = self.errors["junction"], self.errors["arc"]
+        junction, arc = self.errors.get("junction", 0.0), self.errors.get("arc", 0.0)
         if share > 0 and np.nanmedian(self.tension_deviations[self.determined]) > 0.15:
             warnings.append(
                 "half of the tensions that are determined have standard deviations above 0.15: only "

@@ -20,7 +20,7 @@ _LOOSE, _SHORT, _TINY = 0.2, 8.0, 0.02
 # Smallest and largest standard deviations: of directions and arcs in radians, of pressures, and of tensions
 # in mean tensions. Tensions that are not negative and uniform about a mean of 1 have 0.58. Of arcs in noise,
 # the evidence underestimates the independent part.
-_JUNCTIONS, _ARCS, _PRESSURES = (5e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
+_JUNCTIONS, _ARCS, _PRESSURES = (2e-3, 1.5), (1e-3, 1.5), (0.01, 10.0)
 _STRAIGHT_JUNCTIONS = (1e-3, 1.5)
 _TENSIONS, _ARC_TENSIONS = (0.03, 0.6), (0.3, 0.6)
 # Smallest noise relative to that of the points, of smooth and of rough outlines, and the largest: pixels
@@ -77,7 +77,12 @@ class Observability(NamedTuple):
     def model_deviations(self, errors: Errors) -> Float[np.ndarray, " angles"]:
         """Standard deviations of the angles due to errors of the model."""
         direction, arc = self.shares()
-        return np.sqrt(errors.junction**2 * direction + errors.arc**2 * arc)
+        return np.sqrt(errors.junction**2 * direction + errors.arc**2 * arc + self.unknown_arcs)
+
+    @property
+    def unknown_arcs(self) -> Float[np.ndarray, " angles"]:
+        """Variances of the arcs of loose edges, which have no angle either: 1; and 0 of other angles."""
+        return np.where((self.slot == 2) & self.loose[self.edge], 1.0, 0.0)
 
     def precision(self, errors: Errors) -> csr_array:
         """Inverse covariance of the angles at given vertices, due to noise and errors of the model."""

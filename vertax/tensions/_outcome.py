@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -38,19 +39,20 @@ class Relative(NamedTuple):
     """Standard deviations due to the contrast, an error that all tensions have in common."""
 
 
-def relative(balance: Balance, which: Equations) -> Relative:
+def relative(balance: Balance, which: Equations, curves: Fitted) -> Relative:
     """Tensions and pressures relative to their means over all edges and cells that have an equation.
 
     **Arguments:**
 
     - `balance`: the solution of the balance of forces, in which the mean of the tensions is 1.
     - `which`: the equations.
+    - `curves`: the fitted edges.
 
     **Returns:** the [`Relative`][vertax.tensions._outcome.Relative] numbers.
     """
     n, n_cells = len(which.edges), len(which.cells)
     variance = balance.posterior.variances()
-    sure = ~balance.loose & (variance[:n] < _UNKNOWN**2)
+    sure = ~balance.loose & is_determined(np.sqrt(variance[:n]))
     beside = np.isin(np.arange(n_cells), which.sides[sure])
     # The mean of the pressures has an error too.
     mean = np.append(np.zeros(n), np.full(n_cells, 1 / n_cells))
@@ -58,10 +60,17 @@ def relative(balance: Balance, which: Equations) -> Relative:
     variance[n:] += mean @ spread - 2 * spread[n:]
     # Friction along edges, which is the error of arcs, hides a part of the contrast of tensions from all
     # junctions alike: their angles follow the tensions late. As a force it is 2 γ times this error.
-    lag = HIDDEN * balance.errors.arc * np.append(balance.tension - 1, np.zeros(n_cells))
+    # Friction bends edges too, so that it is not larger than bends where the points resolve them.
+    friction = min(balance.errors.arc, curves.bending) if curves.bends else balance.errors.arc
+    lag = HIDDEN * friction * np.append(balance.tension - 1, np.zeros(n_cells))
     deviation = np.sqrt(np.maximum(variance + lag**2, 0))
     pressure = balance.pressure - np.mean(balance.pressure)
     return Relative(balance.tension, pressure, deviation[:n], deviation[n:], beside, sure, lag)
+
+
+def is_determined(deviation: Float[np.ndarray, " tensions"]) -> Bool[np.ndarray, " tensions"]:
+    """Whether tensions of these standard deviations are determined."""
+    return deviation < _UNKNOWN
 
 
 def outcome(
@@ -73,7 +82,6 @@ def outcome(
     source: tuple[
         Int[np.ndarray, " cells"], PixelSize | None, Bool[np.ndarray, " edges"], MaskReport | None
     ],
-    resampled: Float[np.ndarray, " tensions"] | None,
 ) -> InferredTensions:
     """The result as it is reported.
 
@@ -84,7 +92,6 @@ def outcome(
     - `curves`: its fitted edges.
     - `which`, `balance`: the equations and their solution.
     - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
-    - `resampled`: standard deviations of tensions by resampling.
 
     **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
     """
@@ -92,49 +99,78 @@ def outcome(
     tissue = _moved(tissue, curves.change)
     if report is not None:
         tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
-    result = relative(balance, which)
-    weights, included = stress_weights(tissue, which.edges, which.cells)
-    values = weights @ np.concatenate([result.tension, result.pressure])
-    # Pressures are less their mean.
-    n, lag = len(which.edges), weights @ result.lag
-    weights[:, n:] -= weights[:, n:].mean(axis=1, keepdims=True)
-    covariance = weights @ balance.posterior.covariances(weights.T)
-    stress = mean_stress(values, covariance + np.outer(lag, lag), int(included.sum()))
-
-    def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
-        array = np.full(size, fill)
-        array[place] = of
-        return array
-
-    nan, edges = float("nan"), (tissue.n_edges, which.edges)
-    tensions = spread(*edges, result.tension, nan)
-    determined = spread(*edges, result.sure, False) & ~four_fold
-    cells = (tissue.n_cells, which.cells)
-    pressures = spread(*cells, result.pressure, nan)
-    return InferredTensions(
-        tissue=tissue,
-        tensions=tensions,
-        tension_deviations=spread(*edges, result.tension_deviation, nan),
-        determined=determined,
-        pressures=pressures,
-        pressure_deviations=spread(*cells, result.pressure_deviation, nan),
-        pressures_determined=spread(*cells, result.beside, False),
-        stresses=_stresses(tissue, tensions, pressures, determined),
+    return assembled(
+        tissue,
+        (which.edges, which.cells),
+        relative(balance, which, curves),
+        balance.posterior.covariances,
+        four_fold=four_fold,
         labels=np.asarray(labels),
         noise=float(curves.noise * balance.errors.noise),
         correlation=float(curves.apart),
         bending=curves.bending,
         edges="straight" if which.n_arcs == 0 else "arcs",
         errors={name: float(value) for name, value in balance.errors._asdict().items()},
-        mean_stress=stress,
         pixel_size=pixel_size,
-        four_fold=four_fold,
         mask_report=report,
-        short=spread(*edges, balance.loose, False),
+        short=_spread(tissue.n_edges, which.edges, balance.loose, False),
         outline_errors=_outline_errors(tissue, points, curves.change)
         / pixel_length(pixel_size or 1.0),
-        resampled_deviations=None if resampled is None else spread(*edges, resampled, nan),
     )
+
+
+def assembled(
+    tissue: Tissue,
+    places: tuple[Int[np.ndarray, " tensions"], Int[np.ndarray, " pressures"]],
+    values: Relative,
+    covariances: Callable[[np.ndarray], np.ndarray],
+    *,
+    four_fold: Bool[np.ndarray, " edges"],
+    **fields: Any,
+) -> InferredTensions:
+    """The result with arrays of all edges and cells, and stresses.
+
+    **Arguments:**
+
+    - `tissue`: the tissue.
+    - `places`: the edges of the tensions, and the cells of the pressures.
+    - `values`: the tensions and pressures.
+    - `covariances`: the covariance matrix of the tensions and pressures times vectors.
+    - `four_fold`: edges of length 0.
+    - `fields`: the other fields of the result.
+
+    **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
+    """
+    weights, included = stress_weights(tissue, *places)
+    components = weights @ np.concatenate([values.tension, values.pressure])
+    # Pressures are less their mean.
+    n, lag = len(values.tension), weights @ values.lag
+    weights[:, n:] -= weights[:, n:].mean(axis=1, keepdims=True)
+    covariance = weights @ covariances(weights.T) + np.outer(lag, lag)
+    of_edges = lambda of, fill: _spread(tissue.n_edges, places[0], of, fill)
+    of_cells = lambda of, fill: _spread(tissue.n_cells, places[1], of, fill)
+    tensions, pressures = of_edges(values.tension, np.nan), of_cells(values.pressure, np.nan)
+    determined = of_edges(values.sure, False) & ~four_fold
+    return InferredTensions(
+        tissue=tissue,
+        tensions=tensions,
+        tension_deviations=of_edges(values.tension_deviation, np.nan),
+        determined=determined,
+        pressures=pressures,
+        pressure_deviations=of_cells(values.pressure_deviation, np.nan),
+        pressures_determined=of_cells(values.beside, False),
+        stresses=_stresses(tissue, tensions, pressures, determined),
+        mean_stress=mean_stress(components, covariance, int(included.sum())),
+        four_fold=four_fold,
+        **fields,
+    )
+
+
+def _spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
+    """An array with values at some places."""
+    array = np.full(size, fill)
+    array[place] = of
+    return array
 
 
 def _outline_errors(
