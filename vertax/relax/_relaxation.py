@@ -206,17 +206,20 @@ class Relaxation(AbstractResponse):
 
     def traced(self) -> Relaxation:
         """A copy with its numbers as arrays: another number compiles nothing."""
-        if eqx.is_array(self.max_steps):
+        if not any(isinstance(x, float | int) for x in jax.tree.leaves(self._numbers)):
             return self
         try:
             return _prepared(self, jnp.result_type(float))
         except TypeError:  # some numbers are arrays, which cannot be keys of a cache
             return self._with_arrays()
 
-    def _with_arrays(self) -> Relaxation:
+    @property
+    def _numbers(self) -> dict[str, Any]:
         names = ("transitions", "tolerance", "consecutive_steps", "max_steps", "contact_range")
-        numbers = {name: traced(getattr(self, name), integers=True) for name in names}
-        return dataclasses.replace(self, **numbers)
+        return {name: getattr(self, name) for name in names}
+
+    def _with_arrays(self) -> Relaxation:
+        return dataclasses.replace(self, **traced(self._numbers, integers=True))
 
     def search(self, tissue: Tissue, energy: AbstractEnergy) -> Search:
         """The search for an equilibrium, step by step, in the units of a tissue."""
