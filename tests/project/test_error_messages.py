@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from vertax.relax._feasibility import Feasibility
+from vertax.relax._loop import Search
 from vertax.solvers import NewtonCG, TruncatedCG, VertexTrustRegion
 
 ROOT = Path(__file__).parents[2]
@@ -124,6 +125,7 @@ def test_table_of_constants_is_that_of_the_code():
         owner.__name__: owner() for owner in (NewtonCG, TruncatedCG, VertexTrustRegion)
     }
     owners["relaxation"] = Feasibility(None)
+    owners["search"] = Search  # defaults of a dataclass are attributes of the class
     table = (ROOT / "docs/solvers.md").read_text(encoding="utf-8").partition("| class | field |")[2]
     owner, compared = None, 0
     for row in table.partition("\n\n")[0].splitlines()[2:]:
