@@ -42,9 +42,9 @@ class Checkpoint(eqx.Module):
     of vertax or JAX. (An external program is compared by its name and settings only.)
 
     The file is a NumPy `.npz` archive without pickles. For a fit it holds the state of the optimiser, the
-    parameters, the tissue, the best point so far and the history; for an evolution all
-    frames and the current state. It is written atomically at the end, after a keyboard interrupt, and between
-    epochs or frames: a process that is killed while it writes leaves the previous checkpoint.
+    parameters, the tissue, the best point so far and the history; for an evolution all frames and the current
+    state. It is written atomically at the end, after a keyboard interrupt, and between epochs or frames: a
+    process that is killed while it writes leaves the previous checkpoint.
 
     **Arguments:**
 

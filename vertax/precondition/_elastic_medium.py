@@ -150,6 +150,14 @@ class ElasticMedium(eqx.Module):
         damping: Float[Array, ""] | float = 0.0,
         shares: Rows | None = None,
     ) -> MediumInverse:
+        """The inverse for a damping.
+
+        **Arguments:**
+
+        - `measured`: the result of `set_up`.
+        - `damping`: the stiffness of a spring at each vertex.
+        - `shares`: the fraction of the force, and of the motion, of each row that counts; None for all.
+        """
         # Vectors are complex numbers: that halves the number of transforms. If Z(k) is a transform, its
         # longitudinal part is (Z(k) + κ/κ* Z*(-k)) / 2 with κ = k_x + i k_y; the rest is transverse.
         offset, shear, compression = measured
@@ -167,6 +175,7 @@ class ElasticMedium(eqx.Module):
         return MediumInverse(self.indices, weights, scale * (along + across), mirrored)
 
     def apply(self, inverse: MediumInverse, local: PyTree, force: PyTree) -> PyTree:
+        """The response to a force, together with that of the local part of the preconditioner."""
         first, *rest = jax.tree.leaves(local)
         first = first + inverse(jax.tree.leaves(force)[0])
         return jax.tree.unflatten(jax.tree.structure(local), [first, *rest])

@@ -181,7 +181,7 @@ def no_contacts(
         or, if that is more, a quarter of the number of vertices.
     """
     reach = jnp.maximum(jnp.asarray(reach, length.dtype), 1e-9)
-    slope, strength = SLOPE * reach, jnp.ones_like(length)
+    slope = SLOPE * reach
     inversion = InversionBarrier.empty(tissue, jnp.minimum(reach, REACH) * length, length)
     n = (
         max(64, min(tissue.n_vertices, 2000), tissue.n_vertices // 4)
@@ -191,12 +191,11 @@ def no_contacts(
     topology = tissue.topology
     false, sides = jnp.zeros(n, bool), jnp.zeros((2, n), topology.twin.dtype)
     barrier = SegmentBarrier if tissue.arcs is None else ArcBarrier
-    contacts = Contacts(
-        barrier(reach * length, slope, strength, false, false, false),
+    return Contacts(
+        barrier(reach * length, slope, 1 / slope, false, false, false),
         sides,
         GatherPlan.empty(topology, (3, n)),
         inversion,
         GatherPlan.empty(topology, (6, len(inversion.edges))),
         jnp.array(False),
     )
-    return contacts.with_stiffness(strength)

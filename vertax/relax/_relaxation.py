@@ -146,8 +146,8 @@ class Relaxation(AbstractResponse):
         **Raises:**
 
         - `TypeError` for an energy that is no function, or an adjoint that is none.
-        - `ValueError` for an adjoint that the solver excludes, a
-            `jax.shard_map` with checks, or a tissue far from the origin in float32.
+        - `ValueError` for an adjoint that the solver excludes, a `jax.shard_map` with checks, or a tissue
+            far from the origin in float32.
         """
         check_energy(energy)
         warn_of_columns(energy, tissue)

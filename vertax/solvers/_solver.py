@@ -88,9 +88,9 @@ class AbstractIteration(eqx.Module, Generic[State]):
         """The result of the last evaluation."""
 
     def value(self, state: State) -> Float[Array, ""] | None:
-        """The objective at the iterate, of a minimiser of which hundreds of steps without gain are useless.
+        """The objective at the iterate, for a relaxation that ends early if it no longer falls.
 
-        None for others: a relaxation by them ends at rest or after `max_steps`.
+        None if it must not: minimisers of first order need thousands of steps.
         """
         return None
 
