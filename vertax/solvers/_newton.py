@@ -102,13 +102,13 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     - `max_displacement`: first and largest radius, in units of the length scale (in
         [`equilibrate`][vertax.equilibrate] the root mean cell area; otherwise 1).
     - `max_products`: most Hessian-vector products in one step.
-    - `max_corrections`: most second-order corrections of one step; 0 for none. (They halve the steps of free
-        clusters in which arcs press on each other, and cost nothing elsewhere.)
+    - `max_corrections`: most second-order corrections of one step; 0 for none. (In fluid tissues and
+        in free clusters in which arcs press on each other, some relaxations creep with fewer.)
     """
 
     max_displacement: float = 0.2
     max_products: int = eqx.field(static=True, default=600)
-    max_corrections: int = 2
+    max_corrections: int = 12
     accept: float = eqx.field(static=True, default=1e-4)
     forcing: float = eqx.field(static=True, default=0.35)
     corrected_gain: float = eqx.field(static=True, default=0.9)
