@@ -12,6 +12,7 @@ from vertax.precondition._edge_blocks import EdgeBlocks
 from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.precondition._preconditioned_minres import PreconditionedMINRES
 from vertax.precondition._sum import Preconditioner
+from vertax.relax._objective import preconditioner_of
 
 pytestmark = pytest.mark.thorough
 
@@ -50,11 +51,11 @@ def test_small_tissues_have_none():
 
 def test_smallest_preconditioned_tissue_is_set_in_one_place(monkeypatch):
     # The benchmark of large tissues changes it: every user of the number has to see that.
-    tissue, relaxation = vx.initialise.hexagonal(4, 4), vx.Relaxation()
-    assert relaxation.preconditioner_at(tissue, None) is not None
+    tissue, energy = vx.initialise.hexagonal(4, 4), vx.energies.ShapeFactorEnergy(3.7)
+    assert preconditioner_of(tissue, energy, None).coarse is None
     monkeypatch.setattr(ElasticMedium, "min_cells", tissue.n_cells)
     assert ElasticMedium.of(tissue) is not None
-    assert relaxation.preconditioner_at(tissue, None) is None
+    assert preconditioner_of(tissue, energy, None).coarse is not None
 
 
 @pytest.mark.parametrize("curvature", [3.0, -3.0])

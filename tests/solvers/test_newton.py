@@ -136,6 +136,18 @@ def test_a_step_with_large_remaining_force_is_corrected():
     assert needed(soft, start) <= 0.75 * needed(soft, start, max_corrections=0)
 
 
+def test_a_cheap_step_is_corrected_earlier():
+    """One wall that begins with the cube of the distance, as a contact, and others at rest."""
+
+    def wall(y, _):
+        others = 0.5 * jnp.sum((y[1:] - PLACES[1:]) ** 2) + 0.5 * y[0, 1] ** 2
+        return others + 0.05 * jnp.maximum(1 - y[0, 0], 0) ** 3, None
+
+    start = PLACES.at[0].set(0.0)
+    # (Newton's method halves the distance, and quarters the force.)
+    assert needed(wall, start) < 0.75 * needed(wall, start, cheap_products=0)
+
+
 def test_typical_force_ignores_outliers():
     forces = jnp.zeros((101, 2)).at[:100, 0].set(1e-3).at[0, 0].set(1.0)
     assert np.mean(_rows.sizes(forces)) > 1e-2

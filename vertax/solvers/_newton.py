@@ -113,6 +113,9 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     forcing: float = eqx.field(static=True, default=0.35)
     corrected_gain: float = eqx.field(static=True, default=0.9)
     remaining_force: float = eqx.field(static=True, default=0.4)
+    cheap_products: int = eqx.field(static=True, default=30)
+    """Up to this number of products, `remaining_force` counts a quarter: a correction is as cheap."""
+    correction_forcing: float = eqx.field(static=True, default=0.3)
     correction_displacement: float = eqx.field(static=True, default=0.3)
     """The largest displacement of a correction, in units of that of a step."""
     correction_products: int = eqx.field(static=True, default=60)
@@ -186,7 +189,8 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         enough = jnp.where(below_rounding, falls, gained >= self.accept * predicted)
         improves = first | (corrected & finite & (value < s.base_value))
         wanting = gained < self.corrected_gain * predicted
-        wanting |= typical > self.remaining_force * s.typical
+        cheap = s.proposal.num_products < self.cheap_products
+        wanting |= typical > jnp.where(cheap, 0.25, 1) * self.remaining_force * s.typical
         corrects = wanting & improves & finite & ~below_rounding & self._near(s, unit)
         corrects &= s.num_corrections < self.max_corrections
         returns = corrected & ~improves
@@ -241,7 +245,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             choose(s.proposal.damping, sizes(s.gradient) / s.radii),
             choose(jnp.minimum(s.radii, short), s.radii),
             self._inverse(model, options, self._near(s, unit) & active),
-            choose(self.forcing, forcing),
+            choose(self.correction_forcing, forcing),
             choose(self.correction_products, self.max_products),
             active | corrects,
         )
