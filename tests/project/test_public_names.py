@@ -56,8 +56,8 @@ PACKAGES = {
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
     "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
-    "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
-    "TruncatedCG VertexTrustRegion Wrapped",
+    "solvers": "AbstractIteration AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
+    "Progress Scales TruncatedCG VertexTrustRegion Wrapped",
     "tensions": "EdgeMotion InferredTensions MaskFrame MotionFit TensionsOfMasks find_masks "
     "infer_tensions infer_tensions_of_masks read_mask",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",

@@ -25,9 +25,10 @@ def landscape(y, difficulty):
 NEWTON = vx.solvers.NewtonCG()
 
 
-def steps(fn, y, args, n, solver: Any = NEWTON, **options):
+def steps(fn, y, args, n, solver: Any = NEWTON, **scales):
     """The point after some steps, accepted or rejected, and the state of the solver."""
     value, aux = jax.eval_shape(fn, y, args)
+    options = {"scales": vx.solvers.Scales(**scales)}
     state = solver.init(fn, y, args, options, value, aux, frozenset())
 
     def step(carry):
@@ -100,7 +101,7 @@ def test_radii_do_not_grow_where_steps_were_shortened():
     _, after = steps(far, jnp.zeros((N, 2)), None, 3)
     fraction = jnp.where(jnp.arange(N) < 3, 0.0, 1.0)
     false, true = jnp.array(False), jnp.array(True)
-    cut = solver.moved(after, fraction, false, true, {})
+    cut = solver.moved(after, fraction, false, true, vx.solvers.Scales())
     # (Not only a quarter of the radius, which may be much longer than the step.)
     taken = jnp.minimum(after.radii, _rows.sizes(after.proposal.step))
     assert (cut.radii[:3] <= 0.25 * taken[:3]).all()
@@ -108,7 +109,7 @@ def test_radii_do_not_grow_where_steps_were_shortened():
     # If short steps do not help either, they start again with the largest radius.
     radii = []
     for _ in range(12):
-        cut = solver.moved(cut, fraction, false, true, {})
+        cut = solver.moved(cut, fraction, false, true, vx.solvers.Scales())
         radii.append(float(cut.radii[0]))
     assert min(radii) < 1e-4
     assert 0.2 in radii
@@ -160,7 +161,7 @@ def test_typical_force_ignores_outliers():
 def test_steps_are_bounded_by_the_largest_displacement():
     hill = lambda y, _: (jnp.sum(jnp.cos(y)), None)  # concave where it starts
     start = 0.05 * jnp.ones((N, 2))
-    y, _ = steps(hill, start, None, 1, length_scale=0.5)
+    y, _ = steps(hill, start, None, 1, length=0.5)
     far = jnp.sqrt(jnp.sum((y - start) ** 2, axis=-1))
     assert 0 < far.max() <= 2 * 0.2 * 0.5
     assert hill(y, None)[0] < hill(start, None)[0]
