@@ -476,6 +476,7 @@ class TestDegenerateEquilibrium:
         assert outcome.result == vx.RESULTS.successful
         assert outcome.converged
 
+    @pytest.mark.thorough
     def test_gradient_of_a_cost_of_shapes_is_exact(self):
         tissue, energy, _ = fluid()
         evaluation = evaluate(
@@ -584,6 +585,7 @@ def test_invalid_arguments_raise():
         vx.AutomaticDifferentiation(rtol=-1.0)
 
 
+@pytest.mark.thorough
 @adjoints("implicit")
 def test_broken_member_of_a_batch_leaves_the_gradients_of_the_others(adjoint, response, rtol):
     tissue = random_tissue(N_CELLS)

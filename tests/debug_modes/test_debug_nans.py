@@ -41,6 +41,7 @@ class Invalid(vx.AbstractEnergy):
         return jnp.sqrt(-jnp.sum(tissue.areas))
 
 
+@pytest.mark.thorough
 def test_nan_of_an_energy_is_an_error():
     with pytest.raises(FloatingPointError, match="nan"):
         FIXED_TOPOLOGY(TISSUE, Invalid())
@@ -66,6 +67,7 @@ def test_least_squares(cost):
     assert np.isnan(fit.history.gradient_norm).all()
 
 
+@pytest.mark.thorough
 def test_evolution_and_moduli():
     friction = vx.dissipations.SubstrateFriction(1.0)
     times = jnp.array([0.0, 0.1])

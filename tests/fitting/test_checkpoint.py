@@ -169,6 +169,7 @@ def scaled_by(factor):
     return lambda energy: factor * energy
 
 
+@pytest.mark.thorough
 def test_checkpoint_of_an_energy_with_another_function_is_rejected(path):
     fit = lambda factor: vx.fit(
         dataclasses.replace(PROBLEM, energy=Scaled(PROBLEM.energy, scaled_by(factor))),

@@ -180,6 +180,7 @@ def test_radii_of_frozen_vertices_stay_short():
         assert relax(tissue, shapes(factors)).num_steps < 100
 
 
+@pytest.mark.thorough
 def test_without_contacts_cells_overlap_and_an_error_is_raised():
     response = vx.Relaxation(contact_range=None)
     energy = shapes(np.full(N, 4.7))

@@ -168,6 +168,7 @@ def test_relaxation_does_not_drift():
     )
 
 
+@pytest.mark.thorough
 def test_equilibrium_does_not_depend_on_where_the_box_is():
     tissue = random_tissue(12, 3)
     moved = tissue.with_configuration(tissue.vertices + jnp.array([3.3, -7.1]))
@@ -253,6 +254,7 @@ def test_consecutive_steps_are_counted():
     assert run(10).num_steps == 9
 
 
+@pytest.mark.thorough
 def test_the_protocol_of_the_paper_reports_no_convergence():
     equilibrium = vx.equilibrate(
         random_tissue(12, 0),

@@ -337,6 +337,7 @@ def test_derivatives_agree_with_finite_differences(null, in_range):
     np.testing.assert_allclose(gradient, difference @ weights, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_gradient_with_respect_to_the_matrix():
     a, _ = matrix(INDEFINITE[::4])
     b, w = random_vector(10), random_vector(10, 2)

@@ -130,6 +130,7 @@ def test_disjoint_copies_take_the_steps_of_one(n):
     np.testing.assert_allclose(together.reshape(4, N, 2), jnp.stack(4 * [alone]), atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_step_with_large_remaining_force_is_corrected():
     """Soft springs, which vertices may not follow to their ends in one step."""
     soft = lambda y, _: (0.5e-3 * jnp.sum((y - 2.0) ** 2), None)
@@ -137,6 +138,7 @@ def test_a_step_with_large_remaining_force_is_corrected():
     assert needed(soft, start) <= 0.75 * needed(soft, start, max_corrections=0)
 
 
+@pytest.mark.thorough
 def test_a_cheap_step_is_corrected_earlier():
     """One wall that begins with the cube of the distance, as a contact, and others at rest."""
 

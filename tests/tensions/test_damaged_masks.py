@@ -380,6 +380,7 @@ def test_determined_contacts_of_200_damaged_masks_exist(block):
         check_contacts(seed)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("step", [1, 2])
 def test_pixels_that_are_not_square_are_named(step):
     """Angles at junctions show a mask with pixels of another shape than assumed."""
