@@ -109,6 +109,7 @@ def test_marginal_density_of_an_exact_fit_is_finite(exact):
     assert at > value(jnp.full(N_CELLS, MEAN + 1e-3))
 
 
+@pytest.mark.thorough
 def test_parameters_outside_the_prior_have_density_zero(problem):
     limited = {"target_shape_factor": dist.Uniform(3.0, 3.6)}
     density = bayes.LogPosterior(problem, limited, 0.01)

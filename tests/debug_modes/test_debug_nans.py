@@ -49,7 +49,14 @@ def test_nan_of_an_energy_is_an_error():
 
 @pytest.mark.parametrize(
     "name",
-    [*list(ADJOINTS)[:3], pytest.param("unrolling", marks=pytest.mark.thorough)],
+    [
+        "implicit",
+        *(
+            pytest.param(name, marks=pytest.mark.thorough)
+            for name in ADJOINTS
+            if name != "implicit"
+        ),
+    ],
 )
 def test_gradients_and_fits(name, cost):
     adjoint, response = ADJOINTS[name]

@@ -130,6 +130,7 @@ class TestRelaxation:
         assert again.converged
         assert len(trajectory) == 1
 
+    @pytest.mark.thorough
     def test_options_are_those_of_the_relaxation(self):
         tissue = single(random_tissue(4))
         equilibrium, trajectory = record_relaxation(

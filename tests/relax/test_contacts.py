@@ -85,6 +85,7 @@ def test_transitions_of_the_initial_tissue_make_no_overlaps():
     assert flips > 5
 
 
+@pytest.mark.thorough
 def test_flips_that_overlap_do_not_shorten_the_step():
     """The edge does not flip: the trial point itself is valid."""
     energy, relaxation, before = shapes(np.full(N, 3.7)), vx.Relaxation(), tissue_of(9)

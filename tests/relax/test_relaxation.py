@@ -61,6 +61,7 @@ def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
     assert equilibrium.energy == pytest.approx(float(energy(reference)), abs=10 * force**2 + 1e-9)
 
 
+@pytest.mark.thorough
 @each_solver("newton_cg", "lbfgs")
 def test_every_solver_works_in_float32(solver, force, disturbed):
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x

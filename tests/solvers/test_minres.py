@@ -247,6 +247,7 @@ def test_pytrees():
     assert_close(join(value), np.linalg.solve(a, b), 1e-9)
 
 
+@pytest.mark.thorough
 def test_hessian_is_linearised_once():
     energy = lambda x, _: jnp.sum(jnp.cos(x) * jnp.roll(x, 1) ** 2)
     x = jnp.asarray(random_vector(12))

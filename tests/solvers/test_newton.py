@@ -89,6 +89,7 @@ def needed(fn, start, radius=0.2, **settings):
     return n
 
 
+@pytest.mark.thorough
 def test_radii_grow_fast_where_predictions_are_right():
     fn, start = lambda y, _: landscape(y, 0.0), jnp.zeros((N, 2))
     assert needed(fn, start, 1e-4) <= needed(fn, start) + 5  # 11 doublings
@@ -115,6 +116,7 @@ def test_radii_do_not_grow_where_steps_were_shortened():
     assert 0.2 in radii
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_disjoint_copies_take_the_steps_of_one(n):
     """How far a step is solved does not depend on the size of a tissue."""

@@ -83,7 +83,7 @@ def system_of(course, straight, prior=None):
         pytest.param("movie_3", None, False, None, marks=pytest.mark.thorough),
         pytest.param("movie_6", 700, False, None, marks=pytest.mark.thorough),
         pytest.param("movie_3", 400, False, None, marks=pytest.mark.thorough),
-        ("movie_6", 700, True, None),
+        pytest.param("movie_6", 700, True, None, marks=pytest.mark.thorough),
         ("movie_4", None, False, 0.4),
     ],
 )
