@@ -307,7 +307,8 @@ def _most_evident(
         log_noise, log_bend = logs
         variance = np.exp(2 * log_noise)
         prior = np.where(bends, np.exp(-2 * log_bend), held)
-        factor = factorised(square + diags_array(variance * prior))
+        # (The last term is below rounding, unless an edge has fewer points than parameters.)
+        factor = factorised(square + diags_array(variance * prior + 1e-14 * square.diagonal()))
         value = (total - len(used)) * 2 * log_noise - np.sum(np.log(prior))
         value += np.sum(np.log(np.abs(factor.U.diagonal())))
         return float(value + (constant - push @ factor.solve(push)) / variance)
