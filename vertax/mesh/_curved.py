@@ -1,0 +1,159 @@
+"""Lengths and areas of a tissue on a curved surface."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vertax._base.announce import announced_jit
+from vertax._base.checks import describe
+from vertax._base.tracing import is_concrete
+from vertax.mesh._boundary import AbstractBoundary, Periodic
+from vertax.mesh._topology import Topology, clockwise, take
+from vertax.surfaces import AbstractSurface
+
+# An edge is the chord in space between its ends. A cell is the part of the surface above its polygon in the
+# chart: a fan of triangles (c, a, b) about a centre c, with the planar areas p,
+#
+#     A = Σ p/3 (ρ((a+b)/2) + ρ((c+a)/2) + ρ((c+b)/2)),    ρ = √det(JᵀJ),
+#
+# exact for a ρ that is quadratic in the chart (so the centre changes A by the fourth order only). Sums of
+# areas of triangles in space would have a kink where a triangle vanishes, as at a four-fold vertex.
+#
+# The centre is the mean of the midpoints of the sides, weighted by their squared lengths in the chart: a side
+# that vanishes or appears in a T1 transition does not change it, so A is continuous there.
+
+Segments = tuple[Float[Array, " edges"], ...]
+
+
+def surface_points(
+    surface: AbstractSurface, x: Float[Array, "*shape 2"]
+) -> Float[Array, "*shape 3"]:
+    """Points in space, in the precision of the chart."""
+    return surface.points(x).astype(x.dtype)
+
+
+def chord_parts(surface: AbstractSurface, segments: Segments) -> Segments:
+    """The components of the chord of each edge in space."""
+    x, y, dx, dy = segments
+    first, second = jnp.stack([x, y], axis=-1), jnp.stack([x + dx, y + dy], axis=-1)
+    chord = surface_points(surface, second) - surface_points(surface, first)
+    return tuple(chord[:, k] for k in range(3))
+
+
+def area_shares(
+    surface: AbstractSurface,
+    topology: Topology,
+    boundary: AbstractBoundary,
+    segments: Segments,
+) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
+    """Contributions of each edge to the areas of its left and right cell."""
+    m = topology
+    x, y, dx, dy = segments
+    density = lambda x, y: surface.density(jnp.stack([x, y], axis=-1)).astype(x.dtype)
+    # (The frame of the right cell: that of its corner at the first vertex, one slot clockwise.)
+    corners = (m.half_edge, clockwise(m.half_edge))
+    n_cells, cells = m.n_cells, m.edge_cells.T
+    starts = []
+    for corner in corners:
+        image = boundary.translation(take(m.frame, corner))
+        starts.append((x + image[:, 0], y + image[:, 1]))
+    weight = dx * dx + dy * dy
+    rows = [(weight, weight * (px + 0.5 * dx), weight * (py + 0.5 * dy)) for px, py in starts]
+    sums = jax.ops.segment_sum(
+        jnp.concatenate([jnp.stack(row, axis=-1) for row in rows]), cells.ravel(), n_cells
+    )
+    size = jnp.where(sums[:, 0] > 0, sums[:, 0], 1)
+    centres = sums[:, 1:] / size[:, None]
+    middle = density(x + 0.5 * dx, y + 0.5 * dy)
+    shares = []
+    for (px, py), cell, sign in zip(starts, cells, (0.5, -0.5), strict=True):
+        # (The exterior has no centre.)
+        centre = centres.at[cell].get(mode="fill", fill_value=0)
+        ax, ay = px - centre[:, 0], py - centre[:, 1]
+        planar = sign * (ax * dy - ay * dx)
+        qx, qy = centre[:, 0] + 0.5 * ax, centre[:, 1] + 0.5 * ay
+        rho = middle + density(qx, qy) + density(qx + 0.5 * dx, qy + 0.5 * dy)
+        shares.append(planar * rho / 3)
+    return shares[0], shares[1]
+
+
+def check_surface(
+    surface: AbstractSurface,
+    vertices: Float[Array, "vertices 2"],
+    boundary: AbstractBoundary,
+    arcs: bool,
+) -> None:
+    """Raise an error unless a tissue can lie on a surface. Values are checked if they are concrete.
+
+    **Raises:**
+
+    - `TypeError` for an object that is not a surface.
+    - `ValueError` for a tissue with arcs, vertices outside of the chart, points that are not finite, or a
+        surface whose period is not that of the box.
+    """
+    if not isinstance(surface, AbstractSurface):
+        raise TypeError(
+            "Argument `surface` must be a surface, e.g. vertax.surfaces.Cylinder(3.0), or None, but is "
+            f"{describe(surface)}."
+        )
+    if arcs:
+        raise ValueError(
+            "Argument `surface` must be None in a tissue with arcs: edges on a surface are straight chords. "
+            "Make the tissue without `angles`."
+        )
+    if not all(map(is_concrete, jax.tree.leaves((surface, vertices, boundary)))):
+        return
+    surface.check(vertices)
+    points, density = _sampled(surface, vertices)
+    if not (np.isfinite(points).all() and np.isfinite(density).all()):
+        raise ValueError(
+            "Argument `surface` must have finite points and tangents below all vertices, but has NaN or "
+            "infinity."
+        )
+    if not isinstance(boundary, Periodic):
+        return
+    lattice = np.asarray(boundary.lattice)
+    size = np.sqrt(np.abs(np.linalg.det(lattice)))
+    for k, vector in enumerate(boundary.lattice):
+        moved, changed = _sampled(surface, vertices + vector)
+        step = moved - points
+        unequal = np.abs(step - step[:1]).max() / size + np.abs(changed / density - 1).max()
+        if unequal > _PERIOD_TOLERANCE[vertices.dtype.itemsize > 4]:
+            raise ValueError(
+                "Argument `surface` must have the period of the box, but along lattice vector "
+                f"{k}, {lattice[k].round(6).tolist()}, its points move by different vectors (relative "
+                f"difference {unequal:.1g}). A cylinder of radius R needs a box of width 2πR, a periodic "
+                "HeightMap a box of the size of its picture."
+            )
+
+
+_PERIOD_TOLERANCE = (1e-3, 1e-6)
+"""Largest relative difference between the points of two periods, in 32 and 64 bits."""
+
+
+def _sampled(
+    surface: AbstractSurface, x: Float[Array, "vertices 2"]
+) -> tuple[np.ndarray, np.ndarray]:
+    return jax.tree.map(np.asarray, _points_and_density(surface, x))
+
+
+@announced_jit
+def _points_and_density(
+    surface: AbstractSurface, x: Float[Array, "vertices 2"]
+) -> tuple[Float[Array, "vertices 3"], Float[Array, " vertices"]]:
+    return surface.points(x), surface.density(x)
+
+
+def check_planar(what: str, tissue: Any) -> None:
+    """Raise a `ValueError` for a tissue on a surface; `what` names the calculation."""
+    surface = getattr(tissue, "surface", None)
+    if surface is not None:
+        raise ValueError(
+            f"Argument `tissue` must be planar for {what}, but lies on a surface "
+            f"({type(surface).__name__}). For the tissue in the chart call tissue.with_surface(None)."
+        )
