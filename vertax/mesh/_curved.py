@@ -40,8 +40,9 @@ def surface_points(
 def chord_parts(surface: AbstractSurface, segments: Segments) -> Segments:
     """The components of the chord of each edge in space."""
     x, y, dx, dy = segments
-    first, second = jnp.stack([x, y], axis=-1), jnp.stack([x + dx, y + dy], axis=-1)
-    chord = surface_points(surface, second) - surface_points(surface, first)
+    ends = jnp.stack([jnp.stack([x, x + dx]), jnp.stack([y, y + dy])], axis=-1)
+    first, second = surface_points(surface, ends)
+    chord = second - first
     return tuple(chord[:, k] for k in range(3))
 
 
@@ -54,32 +55,27 @@ def area_shares(
     """Contributions of each edge to the areas of its left and right cell."""
     m = topology
     x, y, dx, dy = segments
-    density = lambda x, y: surface.density(jnp.stack([x, y], axis=-1)).astype(x.dtype)
-    # (The frame of the right cell: that of its corner at the first vertex, one slot clockwise.)
-    corners = (m.half_edge, clockwise(m.half_edge))
-    n_cells, cells = m.n_cells, m.edge_cells.T
-    starts = []
-    for corner in corners:
-        image = boundary.translation(take(m.frame, corner))
-        starts.append((x + image[:, 0], y + image[:, 1]))
-    weight = dx * dx + dy * dy
-    rows = [(weight, weight * (px + 0.5 * dx), weight * (py + 0.5 * dy)) for px, py in starts]
-    sums = jax.ops.segment_sum(
-        jnp.concatenate([jnp.stack(row, axis=-1) for row in rows]), cells.ravel(), n_cells
-    )
-    size = jnp.where(sums[:, 0] > 0, sums[:, 0], 1)
-    centres = sums[:, 1:] / size[:, None]
-    middle = density(x + 0.5 * dx, y + 0.5 * dy)
-    shares = []
-    for (px, py), cell, sign in zip(starts, cells, (0.5, -0.5), strict=True):
-        # (The exterior has no centre.)
-        centre = centres.at[cell].get(mode="fill", fill_value=0)
-        ax, ay = px - centre[:, 0], py - centre[:, 1]
-        planar = sign * (ax * dy - ay * dx)
-        qx, qy = centre[:, 0] + 0.5 * ax, centre[:, 1] + 0.5 * ay
-        rho = middle + density(qx, qy) + density(qx + 0.5 * dx, qy + 0.5 * dy)
-        shares.append(planar * rho / 3)
-    return shares[0], shares[1]
+    n_edges, sides = len(x), m.edge_cells.T
+    # Both sides of each edge in one array. (The frame of the right cell is that of its corner at the first
+    # vertex, one slot clockwise.)
+    corners = jnp.concatenate([m.half_edge, clockwise(m.half_edge)])
+    vector = jnp.tile(jnp.stack([dx, dy], axis=-1), (2, 1))
+    raw = jnp.tile(jnp.stack([x, y], axis=-1), (2, 1))
+    start = raw + boundary.translation(take(m.frame, corners))
+    weight = jnp.sum(vector**2, axis=-1, keepdims=True)
+    moments = jnp.concatenate([weight, weight * (start + 0.5 * vector)], axis=-1)
+    sums = jax.ops.segment_sum(moments, sides.ravel(), m.n_cells)
+    centres = sums[:, 1:] / jnp.where(sums[:, :1] > 0, sums[:, :1], 1)
+    # (The exterior has no centre.)
+    centre = centres.at[sides.ravel()].get(mode="fill", fill_value=0)
+    arm = start - centre
+    planar = 0.5 * (arm[:, 0] * vector[:, 1] - arm[:, 1] * vector[:, 0])
+    half = centre + 0.5 * arm
+    places = [raw[:n_edges] + 0.5 * vector[:n_edges], half, half + 0.5 * vector]
+    density = surface.density(jnp.concatenate(places)).astype(x.dtype)
+    middle, first, second = jnp.split(density, [n_edges, 3 * n_edges])
+    shares = planar * (jnp.tile(middle, 2) + first + second) / 3
+    return shares[:n_edges], -shares[n_edges:]
 
 
 def check_surface(

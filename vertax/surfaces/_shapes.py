@@ -42,6 +42,10 @@ class Cylinder(AbstractSurface):
             [self.radius * jnp.cos(angle), self.radius * jnp.sin(angle), x[..., 1]], axis=-1
         )
 
+    def density(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
+        """1: the chart has the areas of the cylinder."""
+        return jnp.ones_like(x[..., 0])
+
 
 class SphericalCap(AbstractSurface):
     r"""The upper half of a sphere, $z = \sqrt{R^2 - x^2 - y^2}$.

@@ -72,8 +72,8 @@ class AbstractSurface(eqx.Module):
 
         - `x`, shape `(…, 2)`: coordinates in the chart.
         """
-        u, v = self.tangents(x)
-        return jnp.sqrt(jnp.sum(jnp.cross(u, v) ** 2, axis=-1))
+        (a, b, c), (p, q, r) = (jnp.moveaxis(each, -1, 0) for each in self.tangents(x))
+        return jnp.sqrt((b * r - c * q) ** 2 + (c * p - a * r) ** 2 + (a * q - b * p) ** 2)
 
     def tangents(
         self, x: Float[Array, "*shape 2"]
@@ -84,6 +84,6 @@ class AbstractSurface(eqx.Module):
 
         - `x`, shape `(…, 2)`: coordinates in the chart.
         """
-        unit = jnp.eye(2, dtype=x.dtype)
-        along = lambda k: jax.jvp(self.points, (x,), (jnp.broadcast_to(unit[k], x.shape),))[1]
-        return along(0), along(1)
+        along = lambda unit: jax.jvp(self.points, (x,), (jnp.broadcast_to(unit, x.shape),))[1]
+        u, v = jax.vmap(along)(jnp.eye(2, dtype=x.dtype))
+        return u, v
