@@ -37,6 +37,21 @@ def surface_points(
     return surface.points(x).astype(x.dtype)
 
 
+def tangent_frame(
+    surface: AbstractSurface, x: Float[Array, "n 2"]
+) -> tuple[Float[Array, "n 2 3"], Float[Array, "n 2 2"]]:
+    """Orthonormal tangents e as rows, the first along the first coordinate; and J = e^T R as the matrix R."""
+    u, v = (each.astype(x.dtype) for each in surface.tangents(x))
+    length = jnp.sqrt(jnp.sum(u**2, axis=-1))
+    first = u / length[:, None]
+    along = jnp.sum(v * first, axis=-1)
+    rest = v - along[:, None] * first
+    height = jnp.sqrt(jnp.sum(rest**2, axis=-1))
+    frame = jnp.stack([first, rest / height[:, None]], axis=-2)
+    upper = [jnp.stack([length, along], axis=-1), jnp.stack([0 * height, height], axis=-1)]
+    return frame, jnp.stack(upper, axis=-2)
+
+
 def chord_parts(surface: AbstractSurface, segments: Segments) -> Segments:
     """The components of the chord of each edge in space."""
     x, y, dx, dy = segments

@@ -22,6 +22,7 @@ from vertax.initialise._report import LEAST_LENGTH
 from vertax.io import Foam, pixel_aspect, read_surface_evolver
 from vertax.io._surface_evolver import is_surface_evolver
 from vertax.mesh import Tissue
+from vertax.mesh._curved import check_planar
 from vertax.mesh._geometry import geometry_of
 from vertax.tensions._balance import equations
 from vertax.tensions._curves import Points
@@ -140,6 +141,7 @@ def infer_tensions(
     elif isinstance(source, Foam):
         course = _of_foam(source, noise)
     elif isinstance(source, Tissue):
+        check_planar("infer_tensions", source)
         course = _of_tissue(source, noise)
     else:
         raise TypeError(
