@@ -13,7 +13,7 @@ GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic R
 Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate bayes costs dissipations
 dynamics enable_compilation_cache enable_fast_compilation energies equilibrate evolve external
 fit fitting growth inference initialise io load_tissue mechanics mesh plot_history plot_recovery
-plot_tissue plotting relax runs save_tissue solvers tensions transitions uncertainty
+plot_tissue plotting relax runs save_tissue solvers surfaces tensions transitions uncertainty
 """
 
 PACKAGES = {
@@ -50,7 +50,7 @@ PACKAGES = {
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology Trajectory cell_polygons pad",
     "plotting": "INK SERIES animate animate_figures cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_density_of_states plot_history plot_image "
-    "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tensions plot_tissue "
+    "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_surface plot_tensions plot_tissue "
     "plot_tissues scale_bar tension_layer",
     "dynamics": "Evolution Evolved Material PIController evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
@@ -58,6 +58,7 @@ PACKAGES = {
     "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
     "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "TruncatedCG VertexTrustRegion Wrapped",
+    "surfaces": "AbstractSurface Cylinder Graph HeightMap SphericalCap",
     "tensions": "EdgeMotion InferredTensions MaskFrame MotionFit TensionsOfMasks find_masks "
     "infer_tensions infer_tensions_of_masks read_mask",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",

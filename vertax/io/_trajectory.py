@@ -31,7 +31,8 @@ def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> Non
 
     **Raises:**
 
-    - `ValueError` if there is no frame, if frames have different surfaces, and as [`save_tissue`][vertax.io.save_tissue].
+    - `ValueError` if there is no frame, if frames have different surfaces, and as
+        [`save_tissue`][vertax.io.save_tissue].
     - `OSError` if the file cannot be written.
     """
     if len(trajectory) == 0:
@@ -49,8 +50,8 @@ def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> Non
     surfaces = [tissue.surface for tissue in tissues]
     if not all(eqx.tree_equal(surface, surfaces[0]) for surface in surfaces):
         raise ValueError(
-            "Argument `trajectory` must have one surface to be saved, but it differs between frames. Save the "
-            "frames one by one with save_tissue."
+            "Argument `trajectory` must have one surface to be saved, but it differs between frames. Save "
+            "the frames one by one with save_tissue."
         )
     for name in frames[0]:
         if _is_stored_once(name):
@@ -84,9 +85,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         raise ValueError(f"{name} is broken: `topology` must number the topologies of the frames.")
     values = {key: arrays.pop(key) for key in [*arrays] if key.startswith("value_")}
     once = {key: a for key, a in arrays.items() if _is_stored_once(key)}
-    framed = {
-        key: a for key, a in arrays.items() if key not in (*once, "format", "version")
-    }
+    framed = {key: a for key, a in arrays.items() if key not in (*once, "format", "version")}
     for key, array in (framed | values).items():
         n = number.max() + 1 if key in _TOPOLOGY else len(number)
         if array.ndim == 0 or len(array) != n:

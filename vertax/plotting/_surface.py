@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, SupportsFloat
+from typing import SupportsFloat
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Real
-from matplotlib.colors import Colormap, LightSource
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from jaxtyping import Array, Float, Real
+from matplotlib.colors import Colormap
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from vertax.mesh import Tissue
@@ -16,6 +16,7 @@ from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
 from vertax.plotting._colours import Colours, add_bar
 from vertax.plotting._tissue import checked, single
+from vertax.surfaces import AbstractSurface
 
 
 def plot_surface(
@@ -32,8 +33,8 @@ def plot_surface(
 ) -> Axes3D:
     """Draw a tissue on a surface in space, its cells coloured by values.
 
-    Each cell is drawn as triangles about its centroid with edges as they lie on the surface. A periodic cell
-    is drawn in one piece.
+    Sides are drawn as they lie on the surface. A periodic cell is drawn in one piece. Matplotlib draws cells
+    in the order of their distance, those in front last.
 
     **Arguments:**
 
@@ -58,38 +59,50 @@ def plot_surface(
         )
     drawing = Drawing(tissue)
     values = checked("cells", cells, drawing.n_cells)
-    shown = (drawing.cell < drawing.n_cells) & np.append(drawing.alive, [False] * 2)[drawing.cell]
-    cell = drawing.cell[shown]
-    sides = drawing.lines[shown][:, :1] * (1 - _FRACTIONS) + drawing.lines[shown][:, 1:] * _FRACTIONS
-    centres = np.broadcast_to(drawing.centroids[cell][:, None], sides[:, :-1].shape)
-    lift = lambda x: np.asarray(surface.points(jnp.asarray(x)), float)
-    lines, middles = lift(sides), lift(centres)
-    triangles = np.stack([middles, lines[:, :-1], lines[:, 1:]], axis=2).reshape(-1, 3, 3)
-    owner = np.repeat(cell, len(_FRACTIONS) - 1)
+    shown = np.flatnonzero(drawing.alive)
+    flat = [_sides(*drawn) for drawn in zip(*drawing.polygons(), strict=True) if drawn[1] > 0]
+    corners = np.asarray(surface.points(jnp.asarray(np.concatenate(flat))), float)
+    polygons = np.split(corners, np.cumsum([len(each) for each in flat])[:-1])
     with _style.house_style():
         if ax is None:
             import matplotlib.pyplot as plt  # imported late: it selects a window system
 
             ax = plt.figure(figsize=(4.6, 4.0)).add_subplot(projection="3d")
         assert isinstance(ax, Axes3D)
-        options: dict[str, Any] = {"linewidths": 0, "antialiased": False}
+        faces = Poly3DCollection(polygons, edgecolors=_style.INK, linewidths=0.5)
         if values is None:
-            light = LightSource(azdeg=315, altdeg=45)
-            options |= {"facecolors": _style.BLANK, "shade": True, "lightsource": light}
-        faces = Poly3DCollection(triangles, **options)
+            faces.set_facecolor(_shades(surface, drawing.centroids[shown]))
         ax.add_collection3d(faces)
-        ax.add_collection3d(Line3DCollection(_raised(lines, triangles), colors=_style.INK, lw=0.7))
         if values is not None:
             colours = Colours(cmap, vmin, vmax, label)
-            colours.apply(faces, values[owner])
-            add_bar(ax, faces, values[drawing.alive], label, shrink=0.55, pad=0.02)
-        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+            colours.apply(faces, values[shown])
+            add_bar(ax, faces, values[shown], label, shrink=0.55, pad=0.02)
+        low, high = corners.min(axis=0), corners.max(axis=0)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        ax.set_box_aspect(np.maximum(high - low, 1e-3 * (high - low).max()))
+        ax.set_box_aspect(np.maximum(high - low, 1e-3 * (high - low).max()), zoom=1.3)
         ax.view_init(elev=float(elevation), azim=float(azimuth))
         ax.set_axis_off()
     return ax
 
 
-_FRACTIONS = np.linspace(0, 1, 4)[:, None]
-"""Points of a side, in its chart: sides follow the surface."""
+def _sides(polygon: Float[np.ndarray, "corners 2"], count: int) -> Float[np.ndarray, "points 2"]:
+    """Points on the sides of a polygon in the chart, so that its sides follow the surface."""
+    corners = polygon[:count]
+    sides = np.roll(corners, -1, axis=0) - corners
+    return (corners[:, None] + _FRACTIONS * sides[:, None]).reshape(-1, 2)
+
+
+_FRACTIONS = np.arange(4)[:, None] / 4
+"""Points of a side, as fractions of its length."""
+
+
+def _shades(surface: AbstractSurface, x: Float[np.ndarray, "cells 2"]) -> list[str]:
+    """Grey values of cells by the angle between their normals and the light."""
+    normals = np.cross(*(np.asarray(each, float) for each in surface.tangents(jnp.asarray(x))))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    lit = 0.5 + 0.5 * normals @ _LIGHT
+    return [f"{0.55 + 0.42 * each:.3f}" for each in lit]
+
+
+_LIGHT = np.array([-0.36, -0.48, 0.8])
+"""Direction to the light, a unit vector."""

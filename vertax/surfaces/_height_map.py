@@ -118,14 +118,15 @@ def _check_heights(heights: Array, widths: np.ndarray, unknown: float | None) ->
         )
     if heights.dtype.kind in "iu" and widths.min() < 1:
         raise ValueError(
-            "Argument `heights` must hold floating-point numbers if `smoothing` is below one pixel, but holds "
-            f"{heights.dtype}, steps of planes without a slope. Pass `smoothing`, e.g. half the size of a cell."
+            "Argument `heights` must hold floating-point numbers if `smoothing` is below one pixel, but "
+            f"holds {heights.dtype}, steps of planes without a slope. Pass `smoothing`, e.g. half the size "
+            "of a cell."
         )
     if not is_concrete(heights):
         if unknown is not None:
             raise ValueError(
-                "Argument `unknown` must be None for traced heights: fill the unknown pixels outside of jax.jit "
-                "and jax.grad."
+                "Argument `unknown` must be None for traced heights: fill the unknown pixels outside of "
+                "jax.jit and jax.grad."
             )
         return
     bad = ~np.isfinite(heights)
@@ -134,18 +135,20 @@ def _check_heights(heights: Array, widths: np.ndarray, unknown: float | None) ->
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise ValueError(
-            f"Argument `heights` must be finite, but {bad.sum()} of its {bad.size} pixels are not, e.g. that in "
-            f"row {row} and column {column}. Pass `unknown=numpy.nan` to fill NaN from the pixels around."
+            f"Argument `heights` must be finite, but {bad.sum()} of its {bad.size} pixels are not, e.g. that "
+            f"in row {row} and column {column}. Pass `unknown=numpy.nan` to fill NaN from the pixels around."
         )
 
 
 def _filled(heights: np.ndarray, widths: np.ndarray, unknown: float) -> np.ndarray:
     """The heights, with unknown pixels filled by normalised convolution."""
-    known = ~(np.isnan(heights) | (heights == unknown))
-    if not known.any():
-        raise ValueError(f"Argument `heights` must have known pixels, but all are {unknown} or NaN.")
-    filled, weight = np.where(known, heights, 0).astype(float), known.astype(float)
-    todo, widths = ~known, np.maximum(widths, 1)
+    valid = ~(np.isnan(heights) | (heights == unknown))
+    if not valid.any():
+        raise ValueError(
+            f"Argument `heights` must have known pixels, but all are {unknown} or NaN."
+        )
+    filled, weight = np.where(valid, heights, 0).astype(float), valid.astype(float)
+    todo, widths = ~valid, np.maximum(widths, 1)
     while todo.any():
         blur = lambda image, widths=widths: gaussian_filter1d(
             gaussian_filter1d(image, widths[0], axis=0, mode="constant"),
@@ -155,7 +158,7 @@ def _filled(heights: np.ndarray, widths: np.ndarray, unknown: float) -> np.ndarr
         )
         total = blur(weight)
         near = todo & (total > _LEAST_WEIGHT)
-        filled[near] = blur(np.where(known, heights, 0).astype(float))[near] / total[near]
+        filled[near] = blur(np.where(valid, heights, 0).astype(float))[near] / total[near]
         todo, widths = todo & ~near, 2 * widths
     return filled
 
@@ -163,7 +166,7 @@ def _filled(heights: np.ndarray, widths: np.ndarray, unknown: float) -> np.ndarr
 _LEAST_WEIGHT = 0.01
 """Least sum of the weights of known pixels from which a pixel is filled."""
 _MARGIN = 24
-"""Pixels by which a picture is extended for the filter of the B-spline, whose response decays by 0.27 each."""
+"""Pixels by which a picture is extended for the filter of the B-spline, which decays by 0.27 per pixel."""
 
 
 def _operator(n: int, width: float, periodic: bool) -> np.ndarray:

@@ -84,8 +84,8 @@ class SphericalCap(AbstractSurface):
         largest = float(jnp.max(jnp.sum(x**2, axis=-1), initial=0.0))
         if largest > _RIM * float(self.radius) ** 2:
             raise ValueError(
-                f"Argument `surface` must reach below all vertices, but the distance of one from the origin is "
-                f"{largest**0.5:.4g}, and a SphericalCap of radius {self.radius:.4g} ends at "
+                "Argument `surface` must reach below all vertices, but the distance of one from the origin "
+                f"is {largest**0.5:.4g}, and a SphericalCap of radius {self.radius:.4g} ends at "
                 f"{(_RIM**0.5) * float(self.radius):.4g}. Move the tissue, or choose a larger radius."
             )
 
