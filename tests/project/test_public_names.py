@@ -50,8 +50,8 @@ PACKAGES = {
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology Trajectory cell_polygons pad",
     "plotting": "INK SERIES animate animate_figures cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_density_of_states plot_history plot_image "
-    "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_surface plot_tensions plot_tissue "
-    "plot_tissues scale_bar tension_layer",
+    "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_surface plot_tensions "
+    "plot_tissue plot_tissues scale_bar tension_layer",
     "dynamics": "Evolution Evolved Material PIController evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",

@@ -105,7 +105,7 @@ def check_surface(
 
     - `TypeError` for an object that is not a surface.
     - `ValueError` for a tissue with arcs, vertices outside of the chart, points that are not finite, or a
-        surface whose period is not that of the box.
+        surface with another period than the box.
     """
     if not isinstance(surface, AbstractSurface):
         raise TypeError(

@@ -82,7 +82,7 @@ class Tissue(eqx.Module):
     arcs: Arcs | None
     """The angles of the edges; None if all edges are straight."""
     pinned: Bool[Array, " vertices"] | None
-    surface: AbstractSurface | None = None
+    surface: AbstractSurface | None = eqx.field(default=None, kw_only=True)
     """The surface on which the tissue lies; None for the plane."""
 
     def __init__(
@@ -469,7 +469,7 @@ class Tissue(eqx.Module):
 
         **Raises:**
 
-        - `ValueError` for a tissue on a surface, whose period does not follow the box.
+        - `ValueError` for a tissue on a surface: the period of a surface is fixed.
         """
         check_planar("a deformation of the box", self)
         vertices = self.boundary.carry(self.vertices, boundary)

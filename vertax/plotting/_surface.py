@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import SupportsFloat
+from typing import Any, SupportsFloat
 
 import jax.numpy as jnp
 import numpy as np
@@ -60,7 +60,7 @@ def plot_surface(
     drawing = Drawing(tissue)
     values = checked("cells", cells, drawing.n_cells)
     shown = np.flatnonzero(drawing.alive)
-    flat = [_sides(*drawn) for drawn in zip(*drawing.polygons(), strict=True) if drawn[1] > 0]
+    flat = [_sides(polygon[:n]) for polygon, n in zip(*drawing.polygons(), strict=True) if n > 0]
     corners = np.asarray(surface.points(jnp.asarray(np.concatenate(flat))), float)
     polygons = np.split(corners, np.cumsum([len(each) for each in flat])[:-1])
     with _style.house_style():
@@ -79,15 +79,15 @@ def plot_surface(
             add_bar(ax, faces, values[shown], label, shrink=0.55, pad=0.02)
         low, high = corners.min(axis=0), corners.max(axis=0)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        ax.set_box_aspect(np.maximum(high - low, 1e-3 * (high - low).max()), zoom=1.3)
+        zoom: Any = 1.3  # (Matplotlib declares an integer.)
+        ax.set_box_aspect(np.maximum(high - low, 1e-3 * (high - low).max()), zoom=zoom)
         ax.view_init(elev=float(elevation), azim=float(azimuth))
         ax.set_axis_off()
     return ax
 
 
-def _sides(polygon: Float[np.ndarray, "corners 2"], count: int) -> Float[np.ndarray, "points 2"]:
+def _sides(corners: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "points 2"]:
     """Points on the sides of a polygon in the chart, so that its sides follow the surface."""
-    corners = polygon[:count]
     sides = np.roll(corners, -1, axis=0) - corners
     return (corners[:, None] + _FRACTIONS * sides[:, None]).reshape(-1, 2)
 
@@ -98,7 +98,8 @@ _FRACTIONS = np.arange(4)[:, None] / 4
 
 def _shades(surface: AbstractSurface, x: Float[np.ndarray, "cells 2"]) -> list[str]:
     """Grey values of cells by the angle between their normals and the light."""
-    normals = np.cross(*(np.asarray(each, float) for each in surface.tangents(jnp.asarray(x))))
+    u, v = (np.asarray(each, float) for each in surface.tangents(jnp.asarray(x)))
+    normals = np.cross(u, v)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     lit = 0.5 + 0.5 * normals @ _LIGHT
     return [f"{0.55 + 0.42 * each:.3f}" for each in lit]

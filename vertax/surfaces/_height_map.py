@@ -85,12 +85,13 @@ class HeightMap(AbstractSurface):
         _check_heights(given, widths, unknown)
         values = given if xp is jnp else given.astype(np.result_type(given, np.float32))
         if unknown is not None:
-            values = _filled(values, widths, unknown)
+            values = _filled(np.asarray(values), widths, unknown)
         down, across = (
             _operator(n, width, periodic) for n, width in zip(values.shape, widths, strict=True)
         )
         dtype = jnp.result_type(values.dtype, jnp.float32)
-        self.coefficients = jnp.asarray(down @ values @ across.T, dtype) * plane_distance
+        product = jnp.linalg.multi_dot([down, values, across.T], precision="highest")
+        self.coefficients = product.astype(dtype) * plane_distance
         self.sides = jnp.asarray(sides, dtype)
         self.periodic = periodic
 
@@ -106,7 +107,7 @@ class HeightMap(AbstractSurface):
         return jnp.concatenate([x, height[..., None]], axis=-1)
 
 
-def _check_heights(heights: Array, widths: np.ndarray, unknown: float | None) -> None:
+def _check_heights(heights: Array | np.ndarray, widths: np.ndarray, unknown: float | None) -> None:
     if heights.dtype.kind not in "fiu":
         raise TypeError(
             f"Argument `heights` must hold real numbers, but its type is {heights.dtype}."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -112,7 +113,7 @@ class Graph(AbstractSurface):
     - `TypeError` if `function` is not callable.
     """
 
-    function: Callable[[Float[Array, "2"]], Float[Array, ""]]
+    function: eqx.Module | jax.tree_util.Partial
 
     def __init__(self, function: Callable[[Float[Array, "2"]], Float[Array, ""]]):
         if not callable(function):
@@ -123,5 +124,6 @@ class Graph(AbstractSurface):
 
     def points(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape 3"]:
         """Points of the graph."""
-        height = jnp.vectorize(self.function, signature="(n)->()")(x)
+        function: Any = self.function
+        height = jnp.vectorize(function, signature="(n)->()")(x)
         return jnp.concatenate([x, height[..., None]], axis=-1)
