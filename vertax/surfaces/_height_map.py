@@ -146,7 +146,7 @@ def _filled(heights: np.ndarray, widths: np.ndarray, unknown: float) -> np.ndarr
     valid = ~(np.isnan(heights) | (heights == unknown))
     if not valid.any():
         raise ValueError(
-            f"Argument `heights` must have known pixels, but all are {unknown} or NaN."
+            f"Argument `heights` must have valid pixels, but all are {unknown} or NaN."
         )
     filled, weight = np.where(valid, heights, 0).astype(float), valid.astype(float)
     todo, widths = ~valid, np.maximum(widths, 1)
