@@ -1,0 +1,195 @@
+"""The shape of a tissue in an image, lifted to a curved surface."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vertax._base.announce import announced_jit
+from vertax.surfaces import AbstractSurface
+from vertax.tensions._observed_geometry import Lift, ObservedGeometry
+
+# A point x of the image lies at r(x). With J = ∂r/∂x and the metric g = JᵀJ, the columns of J S⁻¹, S = √g
+# (symmetric), are an orthonormal basis of the tangent plane, in which a direction t of the image is S t: at
+# small slopes it differs least from t. Balance in the tangent plane: Σ γ S t / |S t| = 0.
+#
+# Along an arc with the tangent T and the normal N in the image, d²r/ds² = D²r(T, T) + κ J N. Its components
+# in the tangent plane and along the normal n give the geodesic curvature and the normal one,
+# κ_g = (r' × r'') · n / |r'|³ and κ_n = r'' · n / |r'|². The law of Laplace is γ κ_g = Δp; tensions press on
+# what is below with the force γ κ_n per length.
+_PIECES = 8
+"""Intervals along an edge, with one sample in the middle of each."""
+_STEP = 1e-2
+"""Change of the angle of an arc, in radians, for the slope of its angle in space."""
+
+
+class SurfaceMeasures(NamedTuple):
+    """The geometry of edges and cells in space."""
+
+    lengths: Float[np.ndarray, " edges"]
+    areas: Float[np.ndarray, " cells"]
+    fabric: Float[np.ndarray, "edges 2 2"]
+    """Integral of t t along each edge, in the bases of tangent planes."""
+    bending: Float[np.ndarray, " edges"]
+    """Integral of the normal curvature along each edge."""
+    slopes: Float[np.ndarray, " cells"]
+    """√(det g - 1) at the mean corner: the slope of a height map."""
+
+
+def lifted(
+    geometry: ObservedGeometry, change: Float[np.ndarray, " geometry"], surface: AbstractSurface
+) -> tuple[Lift, SurfaceMeasures]:
+    """The map of directions and arcs to the surface after a change of the geometry, and its measures there.
+
+    **Arguments:**
+
+    - `geometry`: the geometry in the image.
+    - `change`: its change by the fit.
+    - `surface`: the surface.
+    """
+    vertex = geometry.place + change[: 2 * geometry.n_vertices].reshape(-1, 2)
+    moved = geometry.moved(change)
+    start = vertex[moved.ends[:, 0]]
+    arc = _along(surface, start, moved.chord, moved.angle)
+    other = _along(surface, start, moved.chord, moved.angle + _STEP)
+    slope = (other.angle - arc.angle) / _STEP
+    root, tangents = _roots(surface, vertex)
+    away = np.where(moved.forward, 1, -1)[..., None] * moved.chord[moved.half_edge]
+    chord = _chords(surface, start, moved.chord)[moved.half_edge]
+    chord *= np.where(moved.forward, 1, -1)[..., None]
+    projected = np.einsum("vij,vkj,vlk->vli", np.linalg.inv(root), tangents, chord)
+    lift = Lift(
+        root=root,
+        offset=projected - np.einsum("vij,vlj->vli", root, away),
+        turn=np.stack([arc.angle - slope * moved.angle, slope], axis=1),
+        chord=arc.length * np.sinc(arc.angle / np.pi),
+    )
+    areas, slopes = _areas(surface, moved, start, arc.border)
+    return lift, SurfaceMeasures(arc.length, areas, arc.fabric, arc.bending, slopes)
+
+
+class _Arc(NamedTuple):
+    length: np.ndarray
+    angle: np.ndarray
+    """Half of the geodesic turning."""
+    bending: np.ndarray
+    fabric: np.ndarray
+    border: np.ndarray
+    """Points in the image at the ends of the intervals."""
+
+
+def _along(
+    surface: AbstractSurface, start: np.ndarray, chord: np.ndarray, angle: np.ndarray
+) -> _Arc:
+    """Integrals along arcs."""
+    length = np.linalg.norm(chord, axis=1)
+    unit = chord / np.maximum(length, 1e-300)[:, None]
+    left = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+    arc = length / np.sinc(angle / np.pi)
+
+    def at(fraction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points and directions of tangents. (Chords from the start turn by α τ, with lengths sinc(α τ).)"""
+        turned = angle[:, None] * fraction
+        reach = (arc[:, None] * fraction * np.sinc(turned / np.pi))[..., None]
+        way = turned - angle[:, None]
+        along = np.cos(way)[..., None] * unit[:, None] + np.sin(way)[..., None] * left[:, None]
+        return start[:, None] + reach * along, way + turned
+
+    x, way = at((np.arange(_PIECES) + 0.5) / _PIECES)
+    rotated = lambda turn: (
+        np.cos(way + turn)[..., None] * unit[:, None]
+        + np.sin(way + turn)[..., None] * left[:, None]
+    )
+    tangent, normal = rotated(0.0), rotated(np.pi / 2)
+    curvature = 2 * angle / np.maximum(arc, 1e-300)
+    bent = curvature[:, None, None] * normal
+    points = [jnp.asarray(part.reshape(-1, 2)) for part in (x, tangent, bent)]
+    first, second, frame = (np.asarray(part) for part in _derivatives(surface, *points))
+    up = np.cross(frame[:, :, 0], frame[:, :, 1])
+    up /= np.linalg.norm(up, axis=1)[:, None]
+    speed = np.linalg.norm(first, axis=1)
+    geodesic = np.sum(np.cross(first, second) * up, axis=1) / speed**2  # per length in the image
+    pressing = np.sum(second * up, axis=1) / speed
+    metric = np.swapaxes(frame, 1, 2) @ frame
+    way3 = np.einsum("nij,nj->ni", _square_root(metric), tangent.reshape(-1, 2)) / speed[:, None]
+    total = lambda values: (
+        values.reshape(len(angle), _PIECES, *values.shape[1:]).mean(axis=1)
+        * arc.reshape(-1, *[1] * (values.ndim - 1))
+    )
+    outer = speed[:, None, None] * way3[:, :, None] * way3[:, None, :]
+    border, _ = at(np.arange(_PIECES + 1) / _PIECES)
+    return _Arc(total(speed), 0.5 * total(geodesic), total(pressing), total(outer), border)
+
+
+def _areas(
+    surface: AbstractSurface, geometry: ObservedGeometry, start: np.ndarray, border: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Areas of the cells in space, by fans of triangles in the image, and slopes at their centres."""
+    n = geometry.n_cells
+    middle = start + 0.5 * geometry.chord
+    sums = np.zeros((n + 1, 3))
+    for side in geometry.cells.T:
+        np.add.at(sums, side, np.column_stack([middle, np.ones(len(middle))]))
+    centre = sums[:, :2] / np.maximum(sums[:, 2:], 1)
+    total = np.zeros(n + 1)
+    for side, sign in zip(geometry.cells.T, (1, -1), strict=True):
+        arm = border - centre[side][:, None]
+        a, b = arm[:, :-1], arm[:, 1:]
+        planar = 0.5 * sign * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+        places = centre[side][:, None, None] + 0.5 * np.stack([a + b, a, b], axis=2)
+        density = np.asarray(_density(surface, jnp.asarray(places.reshape(-1, 2))))
+        share = planar * density.reshape(places.shape[:-1]).mean(axis=-1)
+        np.add.at(total, side, share.sum(axis=1))
+    density = np.asarray(_density(surface, jnp.asarray(centre[:-1])))
+    return total[:-1], np.sqrt(np.maximum(density**2 - 1, 0))
+
+
+def _roots(surface: AbstractSurface, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """√(JᵀJ) and Jᵀ at each vertex."""
+    frame = np.asarray(_jacobian(surface, jnp.asarray(vertex)))
+    transposed = np.swapaxes(frame, 1, 2)
+    return _square_root(transposed @ frame), frame
+
+
+def _square_root(metric: np.ndarray) -> np.ndarray:
+    """The square root of positive 2 × 2 matrices, (g + √det g) / √(tr g + 2 √det g)."""
+    root = np.sqrt(np.linalg.det(metric))
+    trace = np.trace(metric, axis1=1, axis2=2) + 2 * root
+    return (metric + root[:, None, None] * np.eye(2)) / np.sqrt(trace)[:, None, None]
+
+
+def _chords(surface: AbstractSurface, start: np.ndarray, chord: np.ndarray) -> np.ndarray:
+    ends = _points(surface, jnp.asarray(np.stack([start, start + chord])))
+    return np.asarray(ends[1] - ends[0])
+
+
+@announced_jit
+def _points(surface: AbstractSurface, x: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
+    return surface.points(x)
+
+
+@announced_jit
+def _jacobian(surface: AbstractSurface, x: Float[Array, "n 2"]) -> Float[Array, "n 3 2"]:
+    return surface.jacobian(x)
+
+
+@announced_jit
+def _density(surface: AbstractSurface, x: Float[Array, "n 2"]) -> Float[Array, " n"]:
+    return surface.density(x)
+
+
+@announced_jit
+def _derivatives(
+    surface: AbstractSurface,
+    x: Float[Array, "n 2"],
+    tangent: Float[Array, "n 2"],
+    bent: Float[Array, "n 2"],
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n 3 2"]]:
+    """J T, D²r(T, T) + J b, and J."""
+    along = lambda x: jax.jvp(surface.points, (x,), (tangent,))[1]
+    first, second = jax.jvp(along, (x,), (tangent,))
+    return first, second + jax.jvp(surface.points, (x,), (bent,))[1], surface.jacobian(x)
