@@ -39,7 +39,7 @@ _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 # Initial noise of the vertices of a tissue with straight edges, relative to the cell diameter.
 _VERTEX = 0.01
 # Smoothing of an image of heights, relative to the root of the median area of a cell.
-_SMOOTHING = 0.25
+_SMOOTHING = 0.5
 # Bytes of memory: of any tissue, of a pixel and of a cell, measured; labels above the last are counted.
 _BASE, _PIXEL, _CELL, _MANY = 4e8, 80, 1.2e5, 10**6
 
@@ -103,7 +103,7 @@ def infer_tensions(
         their ratio is taken from it.
     - `height`: of a curved tissue, the image of the height of each pixel of the mask, as an array or a file,
         NaN where it is unknown; or a surface, such as a [`HeightMap`][vertax.surfaces.HeightMap] in the unit
-        of length of the tissue. An image is smoothed by a Gaussian of a quarter of the cell diameter.
+        of length of the tissue. An image is smoothed by a Gaussian of half a cell diameter.
     - `plane_distance`: height per unit of an image of heights, in the unit of `pixel_size`; without
         `pixel_size`, in pixels.
     - `edges`: `"arcs"`, curved by pressures; `"straight"`, with the pressures acting on
@@ -188,10 +188,8 @@ def infer_tensions(
     start_phase("geometry")
     curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
     start_phase("balance")
-    measures = None
     if surface is not None:
-        lift, measures = lifted(geometry, curves.change, surface)
-        geometry = geometry._replace(lift=lift)
+        geometry = geometry._replace(lift=lifted(geometry, curves.change, surface))
     straight = None if edges is None and tissue.inner_arcs else edges != "arcs"
     system, balance = solution(
         geometry,
@@ -205,8 +203,7 @@ def infer_tensions(
     # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
     source = course.labels, course.pixel_size, four_fold, report
-    on_surface = None if surface is None or measures is None else (surface, measures)
-    return outcome(tissue, course.points, curves, system.which, balance, source, on_surface)
+    return outcome(tissue, course.points, curves, system.which, balance, source, surface)
 
 
 def _surface(

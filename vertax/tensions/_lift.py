@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vertax._base.announce import announced_jit
+from vertax.mesh import Tissue
+from vertax.mesh._geometry import geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._observed_geometry import Lift, ObservedGeometry
 
@@ -42,34 +44,39 @@ class SurfaceMeasures(NamedTuple):
 
 def lifted(
     geometry: ObservedGeometry, change: Float[np.ndarray, " geometry"], surface: AbstractSurface
-) -> tuple[Lift, SurfaceMeasures]:
-    """The map of directions and arcs to the surface after a change of the geometry, and its measures there.
-
-    **Arguments:**
-
-    - `geometry`: the geometry in the image.
-    - `change`: its change by the fit.
-    - `surface`: the surface.
-    """
+) -> Lift:
+    """The map of directions and arcs of an image to a surface, after a change by the fit."""
     vertex = geometry.place + change[: 2 * geometry.n_vertices].reshape(-1, 2)
     moved = geometry.moved(change)
     start = vertex[moved.ends[:, 0]]
     arc = _along(surface, start, moved.chord, moved.angle)
     other = _along(surface, start, moved.chord, moved.angle + _STEP)
     slope = (other.angle - arc.angle) / _STEP
-    root, tangents = _roots(surface, vertex)
-    away = np.where(moved.forward, 1, -1)[..., None] * moved.chord[moved.half_edge]
-    chord = _chords(surface, start, moved.chord)[moved.half_edge]
-    chord *= np.where(moved.forward, 1, -1)[..., None]
+    tangents = np.asarray(_jacobian(surface, jnp.asarray(vertex)))
+    root = _square_root(np.swapaxes(tangents, 1, 2) @ tangents)
+    way = np.where(moved.forward, 1, -1)[..., None]
+    away = way * moved.chord[moved.half_edge]
+    chord = way * _chords(surface, start, moved.chord)[moved.half_edge]
     projected = np.einsum("vij,vkj,vlk->vli", np.linalg.inv(root), tangents, chord)
-    lift = Lift(
+    return Lift(
         root=root,
         offset=projected - np.einsum("vij,vlj->vli", root, away),
         turn=np.stack([arc.angle - slope * moved.angle, slope], axis=1),
         chord=arc.length * np.sinc(arc.angle / np.pi),
     )
-    areas, slopes = _areas(surface, moved, start, arc.border)
-    return lift, SurfaceMeasures(arc.length, areas, arc.fabric, arc.bending, slopes)
+
+
+def measured(tissue: Tissue, surface: AbstractSurface) -> SurfaceMeasures:
+    """The geometry in space of a tissue in an image."""
+    geometry = geometry_of(tissue)
+    start = np.asarray(tissue.edge_segments[0], float)
+    arc = _along(surface, start, geometry.edge_vectors, geometry.edge_angles)
+    middle = start + 0.5 * geometry.edge_vectors
+    areas, slopes = _areas(surface, geometry.edge_cells, tissue.n_cells, middle, arc.border)
+    lengths = arc.length
+    if tissue.arcs is None:
+        lengths = np.linalg.norm(_chords(surface, start, geometry.edge_vectors), axis=1)
+    return SurfaceMeasures(lengths, areas, arc.fabric, arc.bending, slopes)
 
 
 class _Arc(NamedTuple):
@@ -126,17 +133,15 @@ def _along(
 
 
 def _areas(
-    surface: AbstractSurface, geometry: ObservedGeometry, start: np.ndarray, border: np.ndarray
+    surface: AbstractSurface, cells: np.ndarray, n: int, middle: np.ndarray, border: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Areas of the cells in space, by fans of triangles in the image, and slopes at their centres."""
-    n = geometry.n_cells
-    middle = start + 0.5 * geometry.chord
     sums = np.zeros((n + 1, 3))
-    for side in geometry.cells.T:
+    for side in cells.T:
         np.add.at(sums, side, np.column_stack([middle, np.ones(len(middle))]))
     centre = sums[:, :2] / np.maximum(sums[:, 2:], 1)
     total = np.zeros(n + 1)
-    for side, sign in zip(geometry.cells.T, (1, -1), strict=True):
+    for side, sign in zip(cells.T, (1, -1), strict=True):
         arm = border - centre[side][:, None]
         a, b = arm[:, :-1], arm[:, 1:]
         planar = 0.5 * sign * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
@@ -146,13 +151,6 @@ def _areas(
         np.add.at(total, side, share.sum(axis=1))
     density = np.asarray(_density(surface, jnp.asarray(centre[:-1])))
     return total[:-1], np.sqrt(np.maximum(density**2 - 1, 0))
-
-
-def _roots(surface: AbstractSurface, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """√(JᵀJ) and Jᵀ at each vertex."""
-    frame = np.asarray(_jacobian(surface, jnp.asarray(vertex)))
-    transposed = np.swapaxes(frame, 1, 2)
-    return _square_root(transposed @ frame), frame
 
 
 def _square_root(metric: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import Equations
 from vertax.tensions._curves import Fitted, Points, arc_distances
 from vertax.tensions._inferred import CurvedGeometry, InferredTensions
-from vertax.tensions._lift import SurfaceMeasures
+from vertax.tensions._lift import SurfaceMeasures, measured
 from vertax.tensions._mean_stress import fabric, mean_stress, stress_weights
 from vertax.tensions._solve import HIDDEN, Balance
 
@@ -84,7 +84,7 @@ def outcome(
     source: tuple[
         Int[np.ndarray, " cells"], PixelSize | None, Bool[np.ndarray, " edges"], MaskReport | None
     ],
-    surface: tuple[AbstractSurface, SurfaceMeasures] | None = None,
+    surface: AbstractSurface | None = None,
 ) -> InferredTensions:
     """The result as it is reported.
 
@@ -95,7 +95,7 @@ def outcome(
     - `curves`: its fitted edges.
     - `which`, `balance`: the equations and their solution.
     - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
-    - `surface`: the surface of the tissue, and its geometry there.
+    - `surface`: the surface of the tissue; None in the plane.
 
     **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
     """
@@ -131,7 +131,7 @@ def assembled(
     covariances: Callable[[np.ndarray], np.ndarray],
     *,
     four_fold: Bool[np.ndarray, " edges"],
-    surface: tuple[AbstractSurface, SurfaceMeasures] | None = None,
+    surface: AbstractSurface | None = None,
     **fields: Any,
 ) -> InferredTensions:
     """The result with arrays of all edges and cells, and stresses.
@@ -143,14 +143,18 @@ def assembled(
     - `values`: the tensions and pressures.
     - `covariances`: the covariance matrix of the tensions and pressures times vectors.
     - `four_fold`: edges of length 0.
-    - `surface`: the surface of the tissue, and its geometry there; None in the plane.
+    - `surface`: the surface of the tissue; None in the plane.
     - `fields`: the other fields of the result.
 
     **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
     """
     tangents, areas = fabric(tissue), geometry_of(tissue).areas
+    curved = None
     if surface is not None:
-        tangents, areas = surface[1].fabric, surface[1].areas
+        measures = measured(tissue, surface)
+        tangents, areas = measures.fabric, measures.areas
+        of_edges = _spread(tissue.n_edges, places[0], values.tension, np.nan)
+        curved = _curved(tissue, of_edges, surface, measures)
     weights, included = stress_weights(tissue, *places, tangents, areas)
     components = weights @ np.concatenate([values.tension, values.pressure])
     # Pressures are less their mean.
@@ -172,7 +176,7 @@ def assembled(
         stresses=_stresses(tissue, tensions, pressures, determined, tangents, areas),
         mean_stress=mean_stress(components, covariance, int(included.sum())),
         four_fold=four_fold,
-        curved=None if surface is None else _curved(tissue, tensions, *surface),
+        curved=curved,
         **fields,
     )
 
@@ -184,20 +188,17 @@ def _curved(
     measures: SurfaceMeasures,
 ) -> CurvedGeometry:
     """The geometry on a surface, and the normal loads of tensions."""
-    m, lengths = tissue.topology, measures.lengths
-    chords = Tissue(tissue.vertices, m, tissue.boundary, tissue.softening, surface=surface)
-    if tissue.arcs is None:
-        lengths = geometry_of(chords).edge_lengths
+    m = tissue.topology
     half = 0.5 * tensions * measures.bending
     perimeters = np.zeros(tissue.n_cells + 1)
     for side in np.asarray(m.edge_cells).T:
-        np.add.at(perimeters, side, lengths)
+        np.add.at(perimeters, side, measures.lengths)
     return CurvedGeometry(
-        tissue=chords,
+        tissue=Tissue(tissue.vertices, m, tissue.boundary, tissue.softening, surface=surface),
         areas=measures.areas,
         perimeters=perimeters[:-1],
         slopes=measures.slopes,
-        lengths=lengths,
+        lengths=measures.lengths,
         normal_loads=half[np.asarray(m.edge).reshape(-1, 3)].sum(axis=1),
     )
 
