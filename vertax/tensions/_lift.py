@@ -72,7 +72,9 @@ def measured(tissue: Tissue, surface: AbstractSurface) -> SurfaceMeasures:
     start = np.asarray(tissue.edge_segments[0], float)
     arc = _along(surface, start, geometry.edge_vectors, geometry.edge_angles)
     middle = start + 0.5 * geometry.edge_vectors
-    areas, slopes = _areas(surface, geometry.edge_cells, tissue.n_cells, middle, arc.border)
+    areas, slopes = _areas(
+        surface, geometry.edge_cells, tissue.n_cells, middle, arc.border, geometry.edge_angles
+    )
     lengths = arc.length
     if tissue.arcs is None:
         lengths = np.linalg.norm(_chords(surface, start, geometry.edge_vectors), axis=1)
@@ -133,9 +135,19 @@ def _along(
 
 
 def _areas(
-    surface: AbstractSurface, cells: np.ndarray, n: int, middle: np.ndarray, border: np.ndarray
+    surface: AbstractSurface,
+    cells: np.ndarray,
+    n: int,
+    middle: np.ndarray,
+    border: np.ndarray,
+    angle: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Areas of the cells in space, by fans of triangles in the image, and slopes at their centres."""
+    # The area between an interval, an arc of the angle β, and its chord c is c² (2β - sin 2β) / 8 sin² β.
+    part = np.where(angle == 0, 1, angle / _PIECES)
+    chord = np.linalg.norm(border[:, 1] - border[:, 0], axis=1)
+    bulge = chord**2 * (2 * part - np.sin(2 * part)) / (8 * np.sin(part) ** 2)
+    bulge = np.where(np.abs(angle) < 1e-4, 0, bulge)
     sums = np.zeros((n + 1, 3))
     for side in cells.T:
         np.add.at(sums, side, np.column_stack([middle, np.ones(len(middle))]))
@@ -147,7 +159,8 @@ def _areas(
         planar = 0.5 * sign * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
         places = centre[side][:, None, None] + 0.5 * np.stack([a + b, a, b], axis=2)
         density = np.asarray(_density(surface, jnp.asarray(places.reshape(-1, 2))))
-        share = planar * density.reshape(places.shape[:-1]).mean(axis=-1)
+        density = density.reshape(places.shape[:-1])
+        share = planar * density.mean(axis=-1) + sign * bulge[:, None] * density[:, :, 0]
         np.add.at(total, side, share.sum(axis=1))
     density = np.asarray(_density(surface, jnp.asarray(centre[:-1])))
     return total[:-1], np.sqrt(np.maximum(density**2 - 1, 0))
