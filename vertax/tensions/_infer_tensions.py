@@ -38,8 +38,9 @@ from vertax.tensions._outcome import outcome
 _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 # Initial noise of the vertices of a tissue with straight edges, relative to the cell diameter.
 _VERTEX = 0.01
-# Smoothing of an image of heights, relative to the root of the median area of a cell.
-_SMOOTHING = 0.5
+# Smoothing of an image of heights, relative to the root of the median area of a cell: of a smooth one, and of
+# steps of planes, which have fewer distinct values than this share of their pixels.
+_SMOOTHING, _SMOOTHING_OF_STEPS, _STEPS = 0.25, 0.5, 0.01
 # Bytes of memory: of any tissue, of a pixel and of a cell, measured; labels above the last are counted.
 _BASE, _PIXEL, _CELL, _MANY = 4e8, 80, 1.2e5, 10**6
 
@@ -103,7 +104,8 @@ def infer_tensions(
         their ratio is taken from it.
     - `height`: of a curved tissue, the image of the height of each pixel of the mask, as an array or a file,
         NaN where it is unknown; or a surface, such as a [`HeightMap`][vertax.surfaces.HeightMap] in the unit
-        of length of the tissue. An image is smoothed by a Gaussian of half a cell diameter.
+        of length of the tissue. An image is smoothed by a Gaussian of a quarter of the cell diameter, or
+        of half of it if its heights are steps of planes.
     - `plane_distance`: height per unit of an image of heights, in the unit of `pixel_size`; without
         `pixel_size`, in pixels.
     - `edges`: `"arcs"`, curved by pressures; `"straight"`, with the pressures acting on
@@ -231,12 +233,14 @@ def _surface(
             f"{heights.shape}. Pass the heights of the same pixels."
         )
     pixel = pixel_length(source.pixel_size)
+    stepped = len(np.unique(heights)) < _STEPS * heights.size
+    width = _SMOOTHING_OF_STEPS if stepped else _SMOOTHING
     areas = np.abs(geometry_of(source.tissue).areas)[source.labels > 0]
     return HeightMap(
         heights,
         source.pixel_size,
         plane_distance=plane_distance * (pixel if unit is None else unit),
-        smoothing=max(pixel, _SMOOTHING * float(np.sqrt(np.median(areas)))),
+        smoothing=max(pixel, width * float(np.sqrt(np.median(areas)))),
         unknown=float("nan"),
     )
 
