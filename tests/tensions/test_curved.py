@@ -155,9 +155,8 @@ def test_tensions_of_a_tissue_on_a_surface_use_its_surface():
 @needs_data
 def test_areas_of_a_real_epithelium_are_the_published_ones():
     folder = DATA / "curved"
-    heights = vx.io.read_image(folder / "heights.tif").astype(float)
-    heights[heights == 0] = np.nan
-    result = infer_tensions(folder / "outlines.tif", height=heights, pixel_size=0.183)
+    options = {"height": folder / "heights.tif", "unknown_height": 0, "pixel_size": 0.183}
+    result = infer_tensions(folder / "outlines.tif", **options)
     published = np.array(
         [
             [3.5615, 3.6656, 12.317],

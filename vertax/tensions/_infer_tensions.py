@@ -60,6 +60,7 @@ def infer_tensions(
     | os.PathLike[str]
     | None = None,
     plane_distance: float = 1.0,
+    unknown_height: float | None = None,
     background: int | None = None,
     gap_width: float | None = None,
     holes: str = "keep",
@@ -108,6 +109,7 @@ def infer_tensions(
         of half of it if its heights are steps of planes.
     - `plane_distance`: height per unit of an image of heights, in the unit of `pixel_size`; without
         `pixel_size`, in pixels.
+    - `unknown_height`: value of unknown pixels in an image of heights, such as 0, beside NaN.
     - `edges`: `"arcs"`, curved by pressures; `"straight"`, with the pressures acting on
         vertices (Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017); by default, of a tissue with
         arcs the one of the larger evidence, see `InferredTensions.edges`.
@@ -157,7 +159,7 @@ def infer_tensions(
             inner_arcs=True,
         )
         source = _across_lines(source, line_width)
-    surface = _surface(height, plane_distance, source, unit)
+    surface = _surface(height, plane_distance, unknown_height, source, unit)
     if isinstance(source, Segmentation):
         course = _of_mask(source, noise)
     elif isinstance(source, Foam):
@@ -209,13 +211,13 @@ def infer_tensions(
 
 
 def _surface(
-    height: Any, plane_distance: float, source: Any, unit: float | None
+    height: Any, plane_distance: float, unknown: float | None, source: Any, unit: float | None
 ) -> AbstractSurface | None:
     """The surface of a tissue.
 
     **Arguments:**
 
-    - `height`, `plane_distance`: as of `infer_tensions`.
+    - `height`, `plane_distance`, `unknown`: as of `infer_tensions`.
     - `source`: the segmentation of the mask, or another source.
     - `unit`: the unit of `plane_distance`; None for the side of a pixel.
     """
@@ -226,7 +228,11 @@ def _surface(
             "Argument `height` must be a surface for a source without pixels, such as a "
             f"vertax.surfaces.HeightMap, but is {describe(height)}."
         )
-    heights = read_image(height) if isinstance(height, str | os.PathLike) else np.asarray(height)
+    heights = height
+    if isinstance(height, str | os.PathLike):
+        is_array = Path(height).suffix == ".npy"
+        heights = np.load(height) if is_array else read_image(height)
+    heights = np.asarray(heights)
     if heights.shape != source.image_shape:
         raise ValueError(
             f"Argument `height` must have the shape of the mask, {source.image_shape}, but has "
@@ -241,7 +247,7 @@ def _surface(
         source.pixel_size,
         plane_distance=plane_distance * (pixel if unit is None else unit),
         smoothing=max(pixel, width * float(np.sqrt(np.median(areas)))),
-        unknown=float("nan"),
+        unknown=float("nan") if unknown is None else unknown,
     )
 
 
