@@ -19,7 +19,7 @@ from vertax.surfaces import Cylinder, Graph, HeightMap, SphericalCap
 SIDE, N_CELLS = 3.0, 9
 FRICTION = vx.dissipations.SubstrateFriction(1.0)
 MOMENTUM = vx.Relaxation(
-    vx.solvers.Optax(optax.sgd(5e-3, momentum=0.9)), None, contact_range=None, max_steps=4000
+    vx.solvers.Optax(optax.sgd(5e-3, momentum=0.9)), None, contact_range=None, max_steps=20_000
 )
 
 
