@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -105,14 +108,35 @@ class HeightMap(AbstractSurface):
         return density_of_graph(self._height, x)
 
     def _height(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
-        n_rows, n_columns = self.coefficients.shape
-        column, to_columns = _stencil(x[..., 0] / self.sides[0] - 0.5, n_columns, self.periodic)
-        row, to_rows = _stencil(x[..., 1] / self.sides[1] - 0.5, n_rows, self.periodic)
-        # (Unrolled: one loop over the points, instead of sums along short axes.)
-        place = jnp.stack([i * n_columns + j for i in row for j in column])
-        near = self.coefficients.ravel().at[place].get(mode="promise_in_bounds")
-        rows = [total(near[4 * i + j] * to_columns[j] for j in range(4)) for i in range(4)]
-        return total(values * weight for values, weight in zip(rows, to_rows, strict=True))
+        position = x / self.sides - 0.5
+        return _spline((0, 0), self.periodic, self.coefficients, position[..., 0], position[..., 1])
+
+
+# A derivative of the spline is another contraction of the same coefficients. (Without the rule each
+# Hessian-vector product would read all intermediate products of the contraction.)
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _spline(
+    orders: tuple[int, int], periodic: bool, coefficients: Array, column: Array, row: Array
+) -> Array:
+    """A derivative of the spline, of given orders along columns and rows, at positions in pixels."""
+    n_rows, n_columns = coefficients.shape
+    columns, to_columns = _stencil(column, n_columns, periodic, orders[0])
+    rows, to_rows = _stencil(row, n_rows, periodic, orders[1])
+    # (Unrolled: one loop over the points, instead of sums along short axes.)
+    place = jnp.stack([i * n_columns + j for i in rows for j in columns])
+    near = coefficients.ravel().at[place].get(mode="promise_in_bounds")
+    sums = [total(near[4 * i + j] * to_columns[j] for j in range(4)) for i in range(4)]
+    return total(values * weight for values, weight in zip(sums, to_rows, strict=True))
+
+
+@_spline.defjvp
+def _(orders: tuple[int, int], periodic: bool, primals: tuple, tangents: tuple) -> tuple:
+    _, column, row = primals
+    across, down = (orders[0] + 1, orders[1]), (orders[0], orders[1] + 1)
+    change = _spline(across, periodic, *primals) * tangents[1]
+    change += _spline(down, periodic, *primals) * tangents[2]
+    change += _spline(orders, periodic, tangents[0], column, row)
+    return _spline(orders, periodic, *primals), change
 
 
 def _check_heights(heights: Array | np.ndarray, widths: np.ndarray, unknown: float | None) -> None:
@@ -201,21 +225,28 @@ def _operator(n: int, width: float, periodic: bool) -> np.ndarray:
 
 
 def _stencil(
-    position: Float[Array, "*shape"], size: int, periodic: bool
+    position: Float[Array, "*shape"], size: int, periodic: bool, order: int
 ) -> tuple[list[Array], list[Array]]:
-    """Indices and weights of the four coefficients along one axis."""
+    """Indices of the four coefficients along one axis, and their weights in a derivative of some order."""
     first = jnp.floor(position)
     if not periodic:  # the coefficients begin one pixel before the first one
         first = jnp.clip(first, 0, size - 4)
     t = position - first
-    # (Not `jnp.clip`, which has the derivative 1/2 at 0 and 1.)
-    inside = jnp.where(t < 0, 0, jnp.where(t > 1, 1, t))
-    s = 1 - inside
-    weights = [s**3, 4 - 3 * inside**2 * (2 - inside), 4 - 3 * s**2 * (2 - s), inside**3]
+    inside = jnp.clip(t, 0, 1)
+    weights = [jnp.polyval(each.deriv(order).coeffs, inside) for each in _BASIS]
     if not periodic:
-        slopes = [-(s**2), inside * (3 * inside - 4), s * (4 - 3 * s), inside**2]
-        weights = [w + 3 * (t - inside) * v for w, v in zip(weights, slopes, strict=True)]
+        slopes = [jnp.polyval(each.deriv(order + 1).coeffs, inside) for each in _BASIS]
+        if order == 0:
+            weights = [w + (t - inside) * v for w, v in zip(weights, slopes, strict=True)]
+        if order > 1:
+            weights = [jnp.where(t == inside, weight, 0) for weight in weights]
     start = first.astype(jnp.int32) - (1 if periodic else 0)
     indices = [start + k for k in range(4)]
-    indices = [index % size for index in indices] if periodic else indices
-    return indices, [weight / 6 for weight in weights]
+    return [index % size for index in indices] if periodic else indices, weights
+
+
+_BASIS = [
+    np.poly1d(np.array(powers) / 6)
+    for powers in ([-1, 3, -3, 1], [3, -6, 0, 4], [-3, 3, 3, 1], [1, 0, 0, 0])
+]
+"""The four parts of the cubic B-spline, polynomials in t."""
