@@ -94,8 +94,8 @@ def test_lengths_on_a_cylinder_are_chords_with_an_error_of_second_order(flat):
         tube = plane.with_surface(Cylinder(radius))
         np.testing.assert_allclose(tube.areas, plane.areas, rtol=1e-12)
         # The exact chord: 2 R sin(Δu / 2 R) around, Δv along.
-        around, along = np.asarray(plane.edge_vectors).T
-        chord = np.hypot(2 * radius * np.sin(around / (2 * radius)), along)
+        azimuthal, axial = np.asarray(plane.edge_vectors).T
+        chord = np.hypot(2 * radius * np.sin(azimuthal / (2 * radius)), axial)
         np.testing.assert_allclose(tube.edge_lengths, chord, rtol=1e-12)
         narrow = vx.Tissue(flat.vertices, flat.topology, flat.boundary, 0.0)
         lengths = eqx.tree_at(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -10,8 +13,9 @@ from scipy.ndimage import gaussian_filter1d, spline_filter1d
 
 from vertax._base.checks import check_number
 from vertax._base.pixels import PixelSizeLike, check_pixel_size, pixel_sides
+from vertax._base.sums import total
 from vertax._base.tracing import is_concrete
-from vertax.surfaces._surface import AbstractSurface
+from vertax.surfaces._surface import AbstractSurface, density_of_graph
 
 # The height is a uniform cubic B-spline with the coefficients c at the centres of pixels. Along one axis,
 #
@@ -45,7 +49,7 @@ class HeightMap(AbstractSurface):
     - `pixel_size`: side of a pixel in the tissue's units of length, or (height, width).
     - `plane_distance`: height per unit of `heights`, in the tissue's units of length.
     - `smoothing`: standard deviation $\sigma$ of the Gaussian, a length. 0 interpolates the heights. Integer
-        heights are steps of planes, which have no slope: they need a smoothing of at least one pixel.
+        heights are steps of planes, which have no slope: they need at least one pixel.
     - `unknown`: value of unknown pixels, such as 0. NaN is unknown if `unknown` is NaN or a number.
     - `periodic`: whether the picture is one period of the surface: the periodic box of the tissue has the
         size of the picture.
@@ -97,14 +101,42 @@ class HeightMap(AbstractSurface):
 
     def points(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape 3"]:
         """Points of the surface."""
+        return jnp.concatenate([x, self._height(x)[..., None]], axis=-1)
+
+    def density(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
+        """Area in space per area in the chart."""
+        return density_of_graph(self._height, x)
+
+    def _height(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
         position = x / self.sides - 0.5
-        (columns, to_column), (rows, to_row) = (
-            _stencil(position[..., axis], self.coefficients.shape[1 - axis], self.periodic)
-            for axis in (0, 1)
-        )
-        near = self.coefficients[rows[..., :, None], columns[..., None, :]]
-        height = jnp.sum(near * to_row[..., :, None] * to_column[..., None, :], axis=(-2, -1))
-        return jnp.concatenate([x, height[..., None]], axis=-1)
+        return _spline((0, 0), self.periodic, self.coefficients, position[..., 0], position[..., 1])
+
+
+# A derivative of the spline is another contraction of the same coefficients. (Without the rule each
+# Hessian-vector product would read all intermediate products of the contraction.)
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _spline(
+    orders: tuple[int, int], periodic: bool, coefficients: Array, column: Array, row: Array
+) -> Array:
+    """A derivative of the spline, of given orders along columns and rows, at positions in pixels."""
+    n_rows, n_columns = coefficients.shape
+    columns, to_columns = _stencil(column, n_columns, periodic, orders[0])
+    rows, to_rows = _stencil(row, n_rows, periodic, orders[1])
+    # (Unrolled: one loop over the points, instead of sums along short axes.)
+    place = jnp.stack([i * n_columns + j for i in rows for j in columns])
+    near = coefficients.ravel().at[place].get(mode="promise_in_bounds")
+    sums = [total(near[4 * i + j] * to_columns[j] for j in range(4)) for i in range(4)]
+    return total(values * weight for values, weight in zip(sums, to_rows, strict=True))
+
+
+@_spline.defjvp
+def _(orders: tuple[int, int], periodic: bool, primals: tuple, tangents: tuple) -> tuple:
+    _, column, row = primals
+    across, down = (orders[0] + 1, orders[1]), (orders[0], orders[1] + 1)
+    change = _spline(across, periodic, *primals) * tangents[1]
+    change += _spline(down, periodic, *primals) * tangents[2]
+    change += _spline(orders, periodic, tangents[0], column, row)
+    return _spline(orders, periodic, *primals), change
 
 
 def _check_heights(heights: Array | np.ndarray, widths: np.ndarray, unknown: float | None) -> None:
@@ -117,11 +149,10 @@ def _check_heights(heights: Array | np.ndarray, widths: np.ndarray, unknown: flo
             "Argument `heights` must be a matrix of at least 4 x 4 pixels, but its shape is "
             f"{heights.shape}."
         )
-    if heights.dtype.kind in "iu" and widths.min() < 1:
+    if widths.min() < 1 and _are_planes(heights):
         raise ValueError(
-            "Argument `heights` must hold floating-point numbers if `smoothing` is below one pixel, but "
-            f"holds {heights.dtype}, steps of planes without a slope. Pass `smoothing`, e.g. half the size "
-            "of a cell."
+            "Argument `smoothing` must be at least one pixel for integer heights, which are steps of planes "
+            "without a slope. Pass e.g. half the size of a cell."
         )
     if not is_concrete(heights):
         if unknown is not None:
@@ -139,6 +170,14 @@ def _check_heights(heights: Array | np.ndarray, widths: np.ndarray, unknown: flo
             f"Argument `heights` must be finite, but {bad.sum()} of its {bad.size} pixels are not, e.g. that "
             f"in row {row} and column {column}. Pass `unknown=numpy.nan` to fill NaN from the pixels around."
         )
+
+
+def _are_planes(heights: Array | np.ndarray) -> bool:
+    """Whether heights are integers; those in floating-point numbers too, unless all are equal or traced."""
+    if heights.dtype.kind in "iu" or not is_concrete(heights):
+        return heights.dtype.kind in "iu"
+    finite = np.asarray(heights)[np.isfinite(heights)]
+    return finite.size > 0 and bool(np.all(finite == np.rint(finite)) and np.ptp(finite) > 0)
 
 
 def _filled(heights: np.ndarray, widths: np.ndarray, unknown: float) -> np.ndarray:
@@ -186,21 +225,28 @@ def _operator(n: int, width: float, periodic: bool) -> np.ndarray:
 
 
 def _stencil(
-    position: Float[Array, "*shape"], size: int, periodic: bool
-) -> tuple[Array, Float[Array, "*shape 4"]]:
-    """Indices and weights of the four coefficients along one axis."""
+    position: Float[Array, "*shape"], size: int, periodic: bool, order: int
+) -> tuple[list[Array], list[Array]]:
+    """Indices of the four coefficients along one axis, and their weights in a derivative of some order."""
     first = jnp.floor(position)
     if not periodic:  # the coefficients begin one pixel before the first one
         first = jnp.clip(first, 0, size - 4)
     t = position - first
-    # (Not `jnp.clip`, which has the derivative 1/2 at 0 and 1.)
-    inside = jnp.where(t < 0, 0, jnp.where(t > 1, 1, t))
-    s = 1 - inside
-    weights = [s**3, 4 - 3 * inside**2 * (2 - inside), 4 - 3 * s**2 * (2 - s), inside**3]
+    inside = jnp.clip(t, 0, 1)
+    weights = [jnp.polyval(each.deriv(order).coeffs, inside) for each in _BASIS]
     if not periodic:
-        slopes = [-(s**2), inside * (3 * inside - 4), s * (4 - 3 * s), inside**2]
-        weights = [w + 3 * (t - inside) * v for w, v in zip(weights, slopes, strict=True)]
+        slopes = [jnp.polyval(each.deriv(order + 1).coeffs, inside) for each in _BASIS]
+        if order == 0:
+            weights = [w + (t - inside) * v for w, v in zip(weights, slopes, strict=True)]
+        if order > 1:
+            weights = [jnp.where(t == inside, weight, 0) for weight in weights]
     start = first.astype(jnp.int32) - (1 if periodic else 0)
-    indices = start[..., None] + jnp.arange(4, dtype=jnp.int32)
-    indices = indices % size if periodic else indices
-    return indices, jnp.stack(weights, axis=-1) / 6
+    indices = [start + k for k in range(4)]
+    return [index % size for index in indices] if periodic else indices, weights
+
+
+_BASIS = [
+    np.poly1d(np.array(powers) / 6)
+    for powers in ([-1, 3, -3, 1], [3, -6, 0, 4], [-3, 3, 3, 1], [1, 0, 0, 0])
+]
+"""The four parts of the cubic B-spline, polynomials in t."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.checks import as_real, check_number
-from vertax.surfaces._surface import AbstractSurface
+from vertax.surfaces._surface import AbstractSurface, density_of_graph
 
 
 class Cylinder(AbstractSurface):
@@ -124,6 +124,12 @@ class Graph(AbstractSurface):
 
     def points(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape 3"]:
         """Points of the graph."""
+        return jnp.concatenate([x, self._height(x)[..., None]], axis=-1)
+
+    def density(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
+        """Area in space per area in the chart."""
+        return density_of_graph(self._height, x)
+
+    def _height(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
         function: Any = self.function
-        height = jnp.vectorize(function, signature="(n)->()")(x)
-        return jnp.concatenate([x, height[..., None]], axis=-1)
+        return jnp.vectorize(function, signature="(n)->()")(x)

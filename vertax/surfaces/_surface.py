@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -87,3 +88,12 @@ class AbstractSurface(eqx.Module):
         along = lambda unit: jax.jvp(self.points, (x,), (jnp.broadcast_to(unit, x.shape),))[1]
         u, v = jax.vmap(along)(jnp.eye(2, dtype=x.dtype))
         return u, v
+
+
+def density_of_graph(
+    height: Callable[[Array], Array], x: Float[Array, "*shape 2"]
+) -> Float[Array, "*shape"]:
+    """The density of the graph of a function of points, from its two slopes."""
+    along = lambda unit: jax.jvp(height, (x,), (jnp.broadcast_to(unit, x.shape),))[1]
+    p, q = jax.vmap(along)(jnp.eye(2, dtype=x.dtype))
+    return jnp.sqrt(1 + p**2 + q**2)
