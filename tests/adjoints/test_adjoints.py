@@ -42,12 +42,13 @@ ADJOINTS = [
 ]
 
 
-def adjoints(*quick):
+def adjoints(*quick, thorough=()):
     """A parametrisation by all adjoints; those that are not named are marked as slow."""
+    marks = dict.fromkeys(quick, ()) | dict.fromkeys(thorough, (pytest.mark.thorough,))
     return pytest.mark.parametrize(
         ("adjoint", "response", "rtol"),
         [
-            pytest.param(*a[1:], marks=() if a[0] in quick else (pytest.mark.slow,), id=a[0])
+            pytest.param(*a[1:], marks=marks.get(a[0], (pytest.mark.slow,)), id=a[0])
             for a in ADJOINTS
         ],
     )
@@ -103,7 +104,7 @@ def plain_gradient(tissue, energy, cost, adjoint, response):
     return eqx.filter_grad(loss)(energy)
 
 
-@adjoints("implicit", "sensitivity", "propagation", "automatic")
+@adjoints("implicit", thorough=("sensitivity", "propagation", "automatic"))
 @pytest.mark.parametrize("n_cells", [N_CELLS, pytest.param(64, marks=pytest.mark.slow)])
 def test_hypergradient_against_a_dense_reference(adjoint, response, rtol, n_cells):
     tissue, _, cost = start_and_cost(n_cells)
@@ -377,7 +378,7 @@ TRUNCATED_RELAXATION = eqx.tree_at(lambda r: r.max_steps, MOMENTUM, jnp.asarray(
 class TestOutcome:
     """The diagnostics of a gradient, and the error for an unreliable one."""
 
-    @adjoints("propagation")
+    @adjoints(thorough=("propagation",))
     def test_outcome_is_returned_as_a_gradient(self, adjoint, response, rtol):
         evaluation = evaluate(*start_and_cost(), adjoint, response)
         assert evaluation.outcome.converged
@@ -476,6 +477,7 @@ class TestDegenerateEquilibrium:
         assert outcome.result == vx.RESULTS.successful
         assert outcome.converged
 
+    @pytest.mark.thorough
     def test_gradient_of_a_cost_of_shapes_is_exact(self):
         tissue, energy, _ = fluid()
         evaluation = evaluate(
@@ -584,6 +586,7 @@ def test_invalid_arguments_raise():
         vx.AutomaticDifferentiation(rtol=-1.0)
 
 
+@pytest.mark.thorough
 @adjoints("implicit")
 def test_broken_member_of_a_batch_leaves_the_gradients_of_the_others(adjoint, response, rtol):
     tissue = random_tissue(N_CELLS)

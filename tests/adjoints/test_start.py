@@ -118,6 +118,7 @@ class Trap(vx.AbstractEnergy):
         return 0.5 * jnp.sum(self.stiffness * tissue.vertices**2)
 
 
+@pytest.mark.thorough
 def test_only_motions_that_the_energy_does_not_determine_follow_the_start():
     trapped = lambda x, y: PERIODIC_ENERGY + Trap(jnp.array([x, y]))
     np.testing.assert_array_equal(check_against_differences(PERIODIC, trapped(0.1, 0.2)), 0)

@@ -82,6 +82,7 @@ def exact():
     return noisy_problem(0.0, truth=jnp.full(N_CELLS, MEAN))[0]
 
 
+@pytest.mark.thorough
 def test_residuals_of_zero_are_measurements(exact):
     parameters = {"target_shape_factor": jnp.full(N_CELLS, MEAN)}
     n = 2 * exact.tissue.n_vertices
@@ -98,6 +99,7 @@ def test_residuals_of_zero_are_measurements(exact):
     assert float(jnp.sum(terms)) == pytest.approx(n * stats.norm(0, 0.01).logpdf(0))
 
 
+@pytest.mark.thorough
 def test_marginal_density_of_an_exact_fit_is_finite(exact):
     density = bayes.LogPosterior(exact, PRIOR, None)
     value = lambda p: density.likelihood({"target_shape_factor": p})[0]
@@ -107,6 +109,7 @@ def test_marginal_density_of_an_exact_fit_is_finite(exact):
     assert at > value(jnp.full(N_CELLS, MEAN + 1e-3))
 
 
+@pytest.mark.thorough
 def test_parameters_outside_the_prior_have_density_zero(problem):
     limited = {"target_shape_factor": dist.Uniform(3.0, 3.6)}
     density = bayes.LogPosterior(problem, limited, 0.01)

@@ -65,6 +65,7 @@ def closed_form(linear):
     return mean, np.linalg.inv(precision)
 
 
+@pytest.mark.thorough
 def test_laplace_approximation_matches_the_closed_form(linear, closed_form):
     laplace = bayes.Laplace(density_of(linear))
     mean, covariance = closed_form
@@ -74,6 +75,7 @@ def test_laplace_approximation_matches_the_closed_form(linear, closed_form):
     np.testing.assert_allclose(ours, covariance, atol=0.02 * covariance.max())
 
 
+@pytest.mark.thorough
 def test_draws_match_the_closed_form(linear, closed_form):
     posterior = draw(density_of(linear), 200)
     mean, covariance = closed_form

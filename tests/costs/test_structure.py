@@ -146,6 +146,7 @@ def test_adjacency_matches_shared_edges(seed, n_cells):
     assert ((weighted > 0) == (matrix > 0)).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("boundary", ["periodic", "free"])
 def test_cost_is_continuous_through_a_t1_with_nonzero_slope(boundary):
     tissue = random_tissue(12, 4) if boundary == "periodic" else cluster(12, 4, lloyd_steps=2)

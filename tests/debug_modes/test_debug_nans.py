@@ -41,6 +41,7 @@ class Invalid(vx.AbstractEnergy):
         return jnp.sqrt(-jnp.sum(tissue.areas))
 
 
+@pytest.mark.thorough
 def test_nan_of_an_energy_is_an_error():
     with pytest.raises(FloatingPointError, match="nan"):
         FIXED_TOPOLOGY(TISSUE, Invalid())
@@ -48,7 +49,14 @@ def test_nan_of_an_energy_is_an_error():
 
 @pytest.mark.parametrize(
     "name",
-    [*list(ADJOINTS)[:3], pytest.param("unrolling", marks=pytest.mark.thorough)],
+    [
+        "implicit",
+        *(
+            pytest.param(name, marks=pytest.mark.thorough)
+            for name in ADJOINTS
+            if name != "implicit"
+        ),
+    ],
 )
 def test_gradients_and_fits(name, cost):
     adjoint, response = ADJOINTS[name]
@@ -66,6 +74,7 @@ def test_least_squares(cost):
     assert np.isnan(fit.history.gradient_norm).all()
 
 
+@pytest.mark.thorough
 def test_evolution_and_moduli():
     friction = vx.dissipations.SubstrateFriction(1.0)
     times = jnp.array([0.0, 0.1])

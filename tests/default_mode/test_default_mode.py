@@ -302,7 +302,9 @@ def test_free_tissue_grows_and_divides():
         return elasticity + LineTension(0.02)
 
     cycle, times = vx.growth.GrowAndDivide(0.2, 1.5), jnp.linspace(0, 4, 6)
-    grown = vx.growth.grow(tissue, energy, cycle, times, key=1, relaxation=FIXED_TOPOLOGY)
+    # (Without contacts daughters may overlap.)
+    relaxation = vx.Relaxation(transitions=None)
+    grown = vx.growth.grow(tissue, energy, cycle, times, key=1, relaxation=relaxation)
     assert grown.converged
     assert grown.n_alive[-1] > 5
     assert floats(grown.tissue) == {"float32"}

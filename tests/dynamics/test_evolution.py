@@ -40,6 +40,7 @@ def solid():
 class TestDecayOfModes:
     """Small deviations decay mode by mode, at the rates of the eigenvalues of the Hessian over ζ."""
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize("order", [1, 2])
     def test_error_has_the_order_of_the_method(self, order):
         tissue, energy = solid()
@@ -310,6 +311,7 @@ def test_custom_energy_and_dissipation():
     np.testing.assert_allclose(gradient, central_difference(f, rate, jnp.array(1.0)), rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_other_values_need_no_recompilation():
     tissue, _ = solid()
     evolve_with = lambda friction, times: vx.evolve(

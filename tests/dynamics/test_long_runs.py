@@ -126,6 +126,7 @@ def test_times_equal_up_to_rounding_continue(tmp_path):
         _check_times(np.asarray([0, 1e-3, 2e-3]), np.asarray([0, 1e-3 + 1e-11, 2e-3]))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("changed", ["energy", "boundary"])
 def test_checkpoint_of_another_function_is_rejected(changed, tmp_path):
     tissue = random_tissue(9, 0)

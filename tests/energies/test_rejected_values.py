@@ -55,6 +55,7 @@ def test_energies_without_a_derivative_are_rejected(compute, energy, returned):
         compute(TISSUE, energy)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("adjoint", [vx.ImplicitDifferentiation(), vx.EquilibriumPropagation()])
 def test_integer_costs_are_rejected(adjoint):
     problem = vx.InverseProblem(TISSUE, ENERGY, IntegerCost(), adjoint=adjoint)

@@ -381,6 +381,7 @@ def test_t1_transitions_of_the_program_require_straight_edges():
         SurfaceEvolver(t1=0.1).relax(as_numpy(FOAM), as_numpy(energies(FOAM)["foam"]), None)
 
 
+@pytest.mark.thorough
 @needs_evolver
 def test_gradient_by_the_program_equals_implicit_differentiation():
     energy = energies(PERIODIC)["foam"]

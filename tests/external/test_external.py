@@ -103,6 +103,7 @@ def test_gradient_equals_implicit_differentiation(case, implicit):
     assert evaluation.outcome.converged
 
 
+@pytest.mark.thorough
 def test_one_sided_error_is_of_first_order(case, implicit):
     def gradient(beta):
         adjoint = vx.EquilibriumPropagation(jnp.array(beta), centred=False)
@@ -209,6 +210,7 @@ def test_result_that_is_not_at_rest_raises(case, set_failure):
         vx.External(FOAM)(tissue, energy)
 
 
+@pytest.mark.thorough
 def test_failure_of_a_nudged_run_makes_the_gradient_unreliable(case, set_failure):
     set_failure("when nudged")
     lenient = problem(case, adjoint=vx.EquilibriumPropagation(throw=False))
@@ -232,6 +234,7 @@ def test_fit_continues_from_a_checkpoint(case, tmp_path, set_failure):
         vx.fit(inverse, ADAM, 4, progress=False)
 
 
+@pytest.mark.thorough
 def test_members_of_a_batch_fail_independently(case):
     tissue, energy, _ = case
     tensions = energy.terms[1].tension

@@ -169,6 +169,7 @@ def scaled_by(factor):
     return lambda energy: factor * energy
 
 
+@pytest.mark.thorough
 def test_checkpoint_of_an_energy_with_another_function_is_rejected(path):
     fit = lambda factor: vx.fit(
         dataclasses.replace(PROBLEM, energy=Scaled(PROBLEM.energy, scaled_by(factor))),
@@ -209,6 +210,7 @@ def test_checkpoint_of_an_edited_class_is_rejected(path):
         fit(1.5)
 
 
+@pytest.mark.thorough
 def test_checkpoint_of_an_optimiser_with_another_schedule_is_rejected(path):
     def fit(rates):
         schedule = lambda step: jnp.asarray(rates)[step]
@@ -259,6 +261,7 @@ def test_fingerprint_depends_on_constants_and_not_on_names():
     assert inner([1.0, 2.0]) == inner([1.0, 2.0]) != inner([1.0, 3.0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
 def test_truncated_checkpoint_is_rejected(kept, path):
     run("adam", 2, checkpoint=path)
@@ -279,6 +282,7 @@ def test_files_of_another_format_are_rejected(path):
         run("adam", 3, checkpoint=path)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -44,6 +44,7 @@ def test_parameters_of_a_pinned_border(pinned):
         pinned.parameters(vx.energies.LineTension(1.0))
 
 
+@pytest.mark.thorough
 def test_correlation_and_contrast_fall_when_the_mesh_is_moved(pinned):
     tissue = pinned.segmentation.tissue
     moved = tissue.with_vertices(tissue.vertices + jnp.array([0.15, 0.1]))

@@ -38,6 +38,7 @@ def test_target_and_start_are_equilibria():
     assert not np.allclose(scene.truth.target_shape_factor, scene.guess.target_shape_factor)
 
 
+@pytest.mark.thorough
 def test_the_guess_may_be_the_mean_and_relax_from_the_first_tissue():
     scene = scene_of(guess="mean", start="first")
     np.testing.assert_allclose(scene.guess.target_shape_factor, 3.7)

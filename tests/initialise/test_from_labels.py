@@ -70,6 +70,7 @@ def test_default_pixel_size_makes_the_mean_area_one():
     assert got.image_shape == SHAPE
 
 
+@pytest.mark.thorough
 def test_pixel_size_and_softening_are_passed_on():
     mask = rasterise(clear_seeds(20, SHAPE, 0), SHAPE)
     got = from_labels(mask, boundary="periodic", pixel_size=0.25, softening=0.01)

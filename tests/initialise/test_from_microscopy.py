@@ -389,6 +389,7 @@ def real():
     return from_microscopy(read_image(REAL_IMAGE))
 
 
+@pytest.mark.thorough
 def test_real_image_shows_as_many_cells_as_the_eye_counts(real):
     # By eye: 75 cells, of which 45 do not touch the border.
     assert 72 <= len(np.unique(real.labels)) <= 78

@@ -79,6 +79,7 @@ def tensor_by_differences(energy_at, stress, area, step):
     return tensor / area - (prestress + prestress.T) / 2
 
 
+@pytest.mark.thorough
 def test_moduli_of_a_disordered_tissue_against_relaxed_energies(disordered):
     tissue, energy = disordered
 

@@ -16,6 +16,7 @@ from vertax.mechanics import velocities
 ENERGY = ShapeFactorEnergy(jnp.linspace(3.5, 3.8, 9))
 
 
+@pytest.mark.thorough
 def test_velocities_balance_forces_and_dissipation():
     tissue = random_tissue(9, 4)
     friction, viscosity = jnp.linspace(0.5, 2, 18), 0.3

@@ -36,6 +36,7 @@ def test_overlaps_of_periodic_tissues_agree_with_brute_force(seed, size, sheared
     assert faces(overlaps_of(tissue)) == faces_that_overlap(tissue)
 
 
+@pytest.mark.thorough
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), size=st.floats(0, 0.5), bend=st.floats(0, 1.2))
 @example(seed=446, size=0.0, bend=1.0486)

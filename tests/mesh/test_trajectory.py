@@ -70,6 +70,7 @@ class TestRelaxation:
             unrecorded.tissue.vertices, equilibrium.tissue.vertices, rtol=0, atol=1e-2
         )
 
+    @pytest.mark.thorough
     def test_values_agree_with_the_frames(self, relaxation):
         _, energy, equilibrium, trajectory = relaxation
         assert equilibrium.num_t1 > 0
@@ -129,6 +130,7 @@ class TestRelaxation:
         assert again.converged
         assert len(trajectory) == 1
 
+    @pytest.mark.thorough
     def test_options_are_those_of_the_relaxation(self):
         tissue = single(random_tissue(4))
         equilibrium, trajectory = record_relaxation(

@@ -67,7 +67,14 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+# These are traced for longer, and use the functions of the others.
+THOROUGH = ("adaptive", "box", "modulus", "noise", "structure", "sum")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.thorough if name in THOROUGH else ()) for name in CASES],
+)
 def test_results_in_float32_while_64_bit_types_are_enabled(name):
     result = eqx.filter_eval_shape(CASES[name], single(TISSUE))
     leaves = [x for x in jax.tree.leaves(result) if hasattr(x, "dtype")]

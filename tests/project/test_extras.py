@@ -117,6 +117,7 @@ def loaded(code: str) -> set[str]:
     return set(process.stdout.splitlines()[-1].split())
 
 
+@pytest.mark.thorough
 def test_import_does_not_load_plotting_or_experiments():
     everything = "import vertax as vx; vx.fit; vx.equilibrate; vx.io; vx.initialise"
     for code, unwanted in (("import vertax", {"jax", "matplotlib"}), (everything, {"matplotlib"})):

@@ -33,7 +33,7 @@ PACKAGES = {
     "fit_warnings limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
     "inference": "Event Micrograph Microscope Movie MovieFit PinnedEnergy Scene fit_movie label_image "
-    "micrograph_problem movie_from_table pearson relative_error same_neighbours shape_factor_scene",
+    "labels_on_sphere micrograph_problem movie_from_table pearson relative_error same_neighbours shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport PolygonTissue "
     "Segmentation Watershed "
     "free_voronoi from_labels from_microscopy from_polygons hexagonal labels_from_skeleton "
@@ -56,10 +56,10 @@ PACKAGES = {
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
     "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
-    "solvers": "AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
-    "TruncatedCG VertexTrustRegion Wrapped",
+    "solvers": "AbstractIteration AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
+    "Progress Scales TruncatedCG VertexTrustRegion Wrapped",
     "surfaces": "AbstractSurface Cylinder Graph HeightMap SphericalCap",
-    "tensions": "EdgeMotion InferredTensions MaskFrame MotionFit TensionsOfMasks find_masks "
+    "tensions": "CurvedGeometry EdgeMotion InferredTensions MaskFrame MotionFit TensionsOfMasks find_masks "
     "infer_tensions infer_tensions_of_masks read_mask",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",
 }

@@ -291,6 +291,14 @@ THOROUGH = (
     "mechanics.bulk_modulus",
     "mechanics.shear_modulus",
     "mechanics.youngs_modulus",
+    "mechanics.complex_modulus",
+    "mechanics.elastic_tensor",
+    "mechanics.modes (sparse)",
+    "mechanics.ramp",
+    "mechanics.recoil",
+    "mechanics.velocities",
+    "transitions.ablate",
+    "transitions.remove",
 )
 
 

@@ -85,6 +85,7 @@ def test_transitions_of_the_initial_tissue_make_no_overlaps():
     assert flips > 5
 
 
+@pytest.mark.thorough
 def test_flips_that_overlap_do_not_shorten_the_step():
     """The edge does not flip: the trial point itself is valid."""
     energy, relaxation, before = shapes(np.full(N, 3.7)), vx.Relaxation(), tissue_of(9)
@@ -180,6 +181,7 @@ def test_radii_of_frozen_vertices_stay_short():
         assert relax(tissue, shapes(factors)).num_steps < 100
 
 
+@pytest.mark.thorough
 def test_without_contacts_cells_overlap_and_an_error_is_raised():
     response = vx.Relaxation(contact_range=None)
     energy = shapes(np.full(N, 4.7))

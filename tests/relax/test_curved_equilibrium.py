@@ -12,7 +12,7 @@ from helpers import FIXED_TOPOLOGY, central_difference, fine_difference, random_
 
 import vertax as vx
 from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity
-from vertax.energies._units import units_of
+from vertax.energies._scales import scales_of
 from vertax.relax._equilibrium import free_motions
 from vertax.surfaces import Cylinder, Graph, HeightMap, SphericalCap
 
@@ -77,7 +77,7 @@ def test_translations_are_zero_modes_only_where_the_surface_is_homogeneous(flat,
     make, number = SURFACES[name]
     tissue, energy = flat.with_surface(make(number)), elastic(jnp.ones(2))
     relaxed = FIXED_TOPOLOGY(tissue, energy).tissue
-    assert np.all(free_motions(relaxed, energy, units_of(relaxed, energy)) == free)
+    assert np.all(free_motions(relaxed, energy, scales_of(relaxed, energy)) == free)
     drift = jnp.mean(relaxed.vertices - tissue.vertices, axis=0)
     assert (float(jnp.max(jnp.abs(drift))) < 1e-12) == free
 

@@ -55,6 +55,7 @@ def imbalance(tissue, tension, target_area):
     return jnp.maximum(jnp.abs(laplace).max(), jnp.abs(force).max())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("gamma", [0.3, 1.0])
 def test_two_cells_without_interfacial_tension_are_one_drop(gamma):
     tissue = relax(doublet(), drops([gamma, 0.0, gamma], jnp.ones(2)), transitions=None)

@@ -27,6 +27,7 @@ def overlapping(seed: int) -> vx.Tissue:
     return moved
 
 
+@pytest.mark.thorough
 def test_overlaps_of_the_start_that_remain_end_the_search():
     tissue = overlapping(2)
     equilibrium = RELAXATION(tissue, energy_of(tissue, TENSIONS[1]), throw=False)

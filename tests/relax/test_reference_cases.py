@@ -269,6 +269,7 @@ def moved_by_boxes(tissue, boxes):
 
 @needs_data
 class TestAgainstTheAuthorsResults:
+    @pytest.mark.thorough
     def test_hypergradient_at_an_unfinished_relaxation(self, load):
         # The implicit formula with a dense pseudo-inverse, at a state with forces left: the Hessian is
         # singular (translations), and nothing of our relaxation takes part.

@@ -61,6 +61,7 @@ def test_every_solver_finds_the_same_equilibrium(solver, force, disturbed):
     assert equilibrium.energy == pytest.approx(float(energy(reference)), abs=10 * force**2 + 1e-9)
 
 
+@pytest.mark.thorough
 @each_solver("newton_cg", "lbfgs")
 def test_every_solver_works_in_float32(solver, force, disturbed):
     to32 = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
@@ -168,6 +169,7 @@ def test_relaxation_does_not_drift():
     )
 
 
+@pytest.mark.thorough
 def test_equilibrium_does_not_depend_on_where_the_box_is():
     tissue = random_tissue(12, 3)
     moved = tissue.with_configuration(tissue.vertices + jnp.array([3.3, -7.1]))
@@ -253,6 +255,7 @@ def test_consecutive_steps_are_counted():
     assert run(10).num_steps == 9
 
 
+@pytest.mark.thorough
 def test_the_protocol_of_the_paper_reports_no_convergence():
     equilibrium = vx.equilibrate(
         random_tissue(12, 0),

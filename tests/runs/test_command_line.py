@@ -49,6 +49,7 @@ def vertax(*arguments):
     return CliRunner().invoke(app, list(arguments))
 
 
+@pytest.mark.thorough
 def test_run_writes_results_and_says_where(tiny):
     outcome = vertax("run", "tiny.toml", "--set", "fit.epochs=2", "--set", "seed=3")
     assert outcome.exit_code == 0, outcome.output

@@ -111,6 +111,7 @@ def stopped(finished, tmp_path):
     return tmp_path / "run"
 
 
+@pytest.mark.thorough
 def test_a_run_of_another_configuration_is_not_resumed(finished, stopped):
     outcome = vertax(
         "run",

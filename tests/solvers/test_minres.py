@@ -247,6 +247,7 @@ def test_pytrees():
     assert_close(join(value), np.linalg.solve(a, b), 1e-9)
 
 
+@pytest.mark.thorough
 def test_hessian_is_linearised_once():
     energy = lambda x, _: jnp.sum(jnp.cos(x) * jnp.roll(x, 1) ** 2)
     x = jnp.asarray(random_vector(12))
@@ -337,6 +338,7 @@ def test_derivatives_agree_with_finite_differences(null, in_range):
     np.testing.assert_allclose(gradient, difference @ weights, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_gradient_with_respect_to_the_matrix():
     a, _ = matrix(INDEFINITE[::4])
     b, w = random_vector(10), random_vector(10, 2)

@@ -25,9 +25,10 @@ def landscape(y, difficulty):
 NEWTON = vx.solvers.NewtonCG()
 
 
-def steps(fn, y, args, n, solver: Any = NEWTON, **options):
+def steps(fn, y, args, n, solver: Any = NEWTON, **scales):
     """The point after some steps, accepted or rejected, and the state of the solver."""
     value, aux = jax.eval_shape(fn, y, args)
+    options = {"scales": vx.solvers.Scales(**scales)}
     state = solver.init(fn, y, args, options, value, aux, frozenset())
 
     def step(carry):
@@ -88,6 +89,7 @@ def needed(fn, start, radius=0.2, **settings):
     return n
 
 
+@pytest.mark.thorough
 def test_radii_grow_fast_where_predictions_are_right():
     fn, start = lambda y, _: landscape(y, 0.0), jnp.zeros((N, 2))
     assert needed(fn, start, 1e-4) <= needed(fn, start) + 5  # 11 doublings
@@ -100,7 +102,7 @@ def test_radii_do_not_grow_where_steps_were_shortened():
     _, after = steps(far, jnp.zeros((N, 2)), None, 3)
     fraction = jnp.where(jnp.arange(N) < 3, 0.0, 1.0)
     false, true = jnp.array(False), jnp.array(True)
-    cut = solver.moved(after, fraction, false, true, {})
+    cut = solver.moved(after, fraction, false, true, vx.solvers.Scales())
     # (Not only a quarter of the radius, which may be much longer than the step.)
     taken = jnp.minimum(after.radii, _rows.sizes(after.proposal.step))
     assert (cut.radii[:3] <= 0.25 * taken[:3]).all()
@@ -108,12 +110,13 @@ def test_radii_do_not_grow_where_steps_were_shortened():
     # If short steps do not help either, they start again with the largest radius.
     radii = []
     for _ in range(12):
-        cut = solver.moved(cut, fraction, false, true, {})
+        cut = solver.moved(cut, fraction, false, true, vx.solvers.Scales())
         radii.append(float(cut.radii[0]))
     assert min(radii) < 1e-4
     assert 0.2 in radii
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_disjoint_copies_take_the_steps_of_one(n):
     """How far a step is solved does not depend on the size of a tissue."""
@@ -129,6 +132,7 @@ def test_disjoint_copies_take_the_steps_of_one(n):
     np.testing.assert_allclose(together.reshape(4, N, 2), jnp.stack(4 * [alone]), atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_step_with_large_remaining_force_is_corrected():
     """Soft springs, which vertices may not follow to their ends in one step."""
     soft = lambda y, _: (0.5e-3 * jnp.sum((y - 2.0) ** 2), None)
@@ -136,6 +140,7 @@ def test_a_step_with_large_remaining_force_is_corrected():
     assert needed(soft, start) <= 0.75 * needed(soft, start, max_corrections=0)
 
 
+@pytest.mark.thorough
 def test_a_cheap_step_is_corrected_earlier():
     """One wall that begins with the cube of the distance, as a contact, and others at rest."""
 
@@ -160,7 +165,7 @@ def test_typical_force_ignores_outliers():
 def test_steps_are_bounded_by_the_largest_displacement():
     hill = lambda y, _: (jnp.sum(jnp.cos(y)), None)  # concave where it starts
     start = 0.05 * jnp.ones((N, 2))
-    y, _ = steps(hill, start, None, 1, length_scale=0.5)
+    y, _ = steps(hill, start, None, 1, length=0.5)
     far = jnp.sqrt(jnp.sum((y - start) ** 2, axis=-1))
     assert 0 < far.max() <= 2 * 0.2 * 0.5
     assert hill(y, None)[0] < hill(start, None)[0]

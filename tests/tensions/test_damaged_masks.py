@@ -247,6 +247,7 @@ def test_overlaps_on_the_outline_cost_little_area():
     assert np.max(np.abs(np.asarray(result.tissue.areas) / pixels - 1)) < 0.02
 
 
+@pytest.mark.thorough
 def test_a_resized_mask_with_new_labels_at_its_outlines_is_named(mask):
     large = zoom(mask.astype(float), 1.3, order=1).astype(np.int64)
     (text,) = [text for text in infer(large).warnings if "stray regions" in text]
@@ -380,6 +381,7 @@ def test_determined_contacts_of_200_damaged_masks_exist(block):
         check_contacts(seed)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("step", [1, 2])
 def test_pixels_that_are_not_square_are_named(step):
     """Angles at junctions show a mask with pixels of another shape than assumed."""

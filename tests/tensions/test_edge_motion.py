@@ -136,6 +136,7 @@ def test_edges_may_be_numbered_otherwise_in_another_frame():
     np.testing.assert_array_equal(again.residuals(ones), motion.residuals(ones))
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not DATA.exists(), reason="the data of Surface Evolver are not here")
 @pytest.mark.parametrize("first", [1, 2])
 def test_the_movie_of_surface_evolver(first):

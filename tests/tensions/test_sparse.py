@@ -80,10 +80,10 @@ def system_of(course, straight, prior=None):
 @pytest.mark.parametrize(
     ("name", "pixels", "straight", "prior"),
     [
-        ("movie_3", None, False, None),
-        ("movie_6", 700, False, None),
-        ("movie_3", 400, False, None),
-        ("movie_6", 700, True, None),
+        pytest.param("movie_3", None, False, None, marks=pytest.mark.thorough),
+        pytest.param("movie_6", 700, False, None, marks=pytest.mark.thorough),
+        pytest.param("movie_3", 400, False, None, marks=pytest.mark.thorough),
+        pytest.param("movie_6", 700, True, None, marks=pytest.mark.thorough),
         ("movie_4", None, False, 0.4),
     ],
 )
@@ -109,6 +109,7 @@ def test_the_sparse_solution_is_the_dense_one(name, pixels, straight, prior):
     np.testing.assert_allclose(sparse, deviation, rtol=3e-2)
 
 
+@pytest.mark.thorough
 def test_variances_of_windows_are_those_of_the_inverse():
     n = 60
     line = diags_array(

@@ -36,6 +36,7 @@ def test_forces_of_straight_edges_are_the_gradient_of_the_energy():
     np.testing.assert_allclose(force.reshape(-1, 2), -gradient[which.junctions], atol=2e-3)
 
 
+@pytest.mark.thorough
 def test_tensions_and_pressures_of_straight_edges(straight):
     """Correlations and coverage are those of the posterior.
 

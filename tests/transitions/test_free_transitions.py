@@ -138,6 +138,7 @@ def test_random_flips_preserve_all_invariants(seed, inner_arcs):
     assert least_length >= 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(3))
 def test_local_and_total_energies_give_the_same_flips(seed):
     tissue = cluster(12, seed, random_angles=True)
@@ -174,6 +175,7 @@ def test_edges_at_pinned_vertices_do_not_flip():
     assert sweep(held, OutlineLength(-1.0), vx.T1())[1].sum() == 0
 
 
+@pytest.mark.thorough
 def test_sweeps_vmap_over_free_tissues():
     batch = [cluster(12, s) for s in range(4)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *batch)

@@ -68,8 +68,11 @@ def warn_of_outer_products(module: Any, counts: Mapping[str, int], *arguments: A
 
 
 def _matrices(module: Any) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Names and shapes of the fields of a module, and of nested modules, that are matrices."""
-    if not isinstance(module, eqx.Module):
+    """Names and shapes of the fields of a module, and of nested modules, that are matrices.
+
+    Layers of neural networks are left out: a layer may be as wide as there are cells.
+    """
+    if not isinstance(module, eqx.Module) or type(module).__module__.startswith("equinox.nn"):
         return
     for field in dataclasses.fields(module):
         value = getattr(module, field.name, None)

@@ -72,7 +72,7 @@ class AbstractAdjoint(optx.AbstractAdjoint):
     2. The adjoint differentiates a minimisation in this topology that starts and ends at this equilibrium.
 
     The options of the minimisation are: `relaxation`, the minimiser of the first step; `start`, its
-    configuration after the last T1 transition; the units `stiffness` and `length_scale`; and `exists`,
+    configuration after the last T1 transition; `scales`, see [`Scales`][vertax.solvers.Scales]; and `exists`,
     false if energy or forces became NaN, so that there is no minimum to differentiate. An adjoint with
     `unrolls = True` needs a solver with `unrollable = True`.
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, PyTree
 
 from vertax._base.optimistix import Minimisation
 from vertax._base.results import RESULTS, index_of
+from vertax._base.scales import Scales
 from vertax.adjoints._adjoint import (
     MAX_RELATIVE_RESIDUAL,
     AbstractAdjoint,
@@ -88,7 +89,9 @@ class ImplicitDifferentiation(AbstractAdjoint):
         preconditioner = options.get("preconditioner", Preconditioner(None, None))
         coarse = preconditioner.coarse
         if coarse is not None and isinstance(self.linear_solver, MINRES):
-            solver = PreconditionedMINRES(self.linear_solver, preconditioner, options["stiffness"])
+            solver = PreconditionedMINRES(
+                self.linear_solver, preconditioner, Scales.of(options).stiffness
+            )
             adjoint = eqx.tree_at(lambda a: a.linear_solver, adjoint, solver)
         system = _System(
             adjoint,
@@ -206,12 +209,13 @@ class _ReportingSolver(lx.AbstractLinearSolver):
 
 
 def _min_stiffness(options: dict[str, Any], root: PyTree[Array]) -> Array:
-    """The effective stiffness below which a system is degenerate, see the class; 0 without units."""
+    """The effective stiffness below which a system is degenerate, see the class; 0 without scales."""
     dtype = jnp.result_type(*jax.tree.leaves(root))
-    if not {"stiffness", "length_scale", "tolerance"} <= options.keys():
+    if "scales" not in options:
         return jnp.zeros((), dtype)
-    rounding = jnp.finfo(dtype).eps ** 0.5 * options["stiffness"]
-    positional = 10 * options["tolerance"] / options["length_scale"]
+    scales = Scales.of(options)
+    rounding = jnp.finfo(dtype).eps ** 0.5 * scales.stiffness
+    positional = jnp.where(jnp.isinf(scales.tolerance), 0, 10 * scales.tolerance / scales.length)
     return jnp.asarray(jnp.maximum(rounding, positional), dtype)
 
 

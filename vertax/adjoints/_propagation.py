@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float, PyTree
 
 from vertax._base.optimistix import Minimisation, num_steps_of
 from vertax._base.results import RESULTS, index_of
+from vertax._base.scales import Scales
 from vertax.adjoints._adjoint import (
     MAX_RELATIVE_RESIDUAL,
     AbstractAdjoint,
@@ -99,13 +101,12 @@ class EquilibriumPropagation(AbstractAdjoint):
         return _propagate(vjp_arg, root, others, self.without_outcome()), residual
 
     def strength(
-        self, beta: float | Float[Array, ""] | None, options: dict[str, Any], dtype: Any
+        self, beta: float | Float[Array, ""] | None, force: float | Float[Array, ""], dtype: Any
     ) -> Float[Array, ""]:
-        """The largest nudging force, in units of force."""
+        """The largest nudging force, for a typical force of the system."""
         if beta is None:
             beta = 1e-5 if dtype == jnp.float64 else 1e-3
-        unit = options.get("stiffness", 1.0) * options.get("length_scale", 1.0)
-        return jnp.asarray(beta * unit, dtype)
+        return jnp.asarray(beta * force, dtype)
 
     def tolerance(self, strength: Float[Array, ""]) -> Float[Array, ""]:
         """Largest force at which a nudged tissue counts as relaxed."""
@@ -157,10 +158,11 @@ def _(
     adjoint: EquilibriumPropagation,
 ) -> Any:
     fn, args, slot = vjp_arg
-    options = others.options
+    scales = Scales.of(others.options)
     # (`others.solver` may take no step, if the equilibrium is given. The nudged phases need the relaxation.)
-    nudge = others.replaced(solver=options.get("relaxation", others.solver), y0=root, args=args)
-    max_tolerance = options.get("tolerance", jnp.inf)
+    nudge = others.replaced(
+        solver=others.options.get("relaxation", others.solver), y0=root, args=args
+    )
     moving, fixed = differentiable((fn, args))
 
     def slope(y: PyTree[Array]) -> PyTree[Array]:
@@ -172,17 +174,17 @@ def _(
 
     def phase(force: PyTree[Array], strength: Float[Array, ""]) -> Phase:
         nudged = _Nudged(fn, force)
-        tolerance = jnp.minimum(max_tolerance, adjoint.tolerance(strength))
-        y, residual = nudge.replaced(
-            fn=nudged, options=options | {"tolerance": tolerance}
-        ).run_as_constant()
+        tolerance = jnp.minimum(scales.tolerance, adjoint.tolerance(strength))
+        finer = dataclasses.replace(scales, tolerance=tolerance)
+        options = others.options | {"scales": finer}
+        y, residual = nudge.replaced(fn=nudged, options=options).run_as_constant()
         restoring = RestoringForce.along(jax.grad(lambda y: fn(y, args)[0]), root, y)
         max_force = optx.max_norm(jax.tree.map(jnp.add, restoring.force, force))
         return Phase(slope(y), max_force, num_steps_of(residual), restoring.nonlinearity)
 
     cotangent = materialise(cotangent, root)
     at_rest = None if adjoint.centred else slope(root)
-    gradient, outcome = gradient_from_phases(adjoint, cotangent, options, phase, at_rest)
+    gradient, outcome = gradient_from_phases(adjoint, cotangent, scales, phase, at_rest)
     (d_fn, d_args), outcome = finish_gradient(
         gradient, outcome, adjoint.throw, slot, others.options
     )
@@ -235,7 +237,7 @@ class RestoringForce(NamedTuple):
 def gradient_from_phases(
     adjoint: EquilibriumPropagation,
     cotangent: PyTree[Array],
-    options: dict[str, Any],
+    scales: Scales,
     phase: Callable[[PyTree[Array], Float[Array, ""]], Phase],
     at_rest: PyTree[Array] | None,
 ) -> tuple[PyTree[Array], GradientOutcome]:
@@ -245,7 +247,7 @@ def gradient_from_phases(
 
     - `adjoint`: the strength and the signs of the nudges.
     - `cotangent`: derivative of the cost with respect to the configuration.
-    - `options`: the units `stiffness` and `length_scale`.
+    - `scales`: typical sizes.
     - `phase`: a function that relaxes the nudged system. Its arguments are the coefficients of the linear
         term that is added to the energy, and the largest of them.
     - `at_rest`: the derivative of the energy by the parameters without a nudge, for a one-sided difference.
@@ -254,7 +256,7 @@ def gradient_from_phases(
     """
     size = optx.max_norm(cotangent)
     direction = optax.tree.scale(1 / jnp.where(size > 0, size, 1), cotangent)
-    strength = adjoint.strength(adjoint.beta, options, size.dtype)
+    strength = adjoint.strength(adjoint.beta, scales.force, size.dtype)
     # The two signs are a batch. A one-sided difference needs no second relaxation.
     signs = jnp.asarray([s for s in adjoint.signs if s != 0], size.dtype)
     nudged = lambda sign: phase(optax.tree.scale(sign * strength, direction), strength)
@@ -332,7 +334,7 @@ def _(
     force_per_nudge, unit = system.sizes(parameters)
     dtype = force_per_nudge.dtype
     if adjoint.beta is None:
-        half_beta = adjoint.strength(None, {"stiffness": unit}, dtype) / force_per_nudge
+        half_beta = adjoint.strength(None, unit, dtype) / force_per_nudge
     else:
         half_beta = jnp.asarray(adjoint.beta, dtype) / 2
     force = half_beta * force_per_nudge

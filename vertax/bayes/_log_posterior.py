@@ -19,7 +19,7 @@ from vertax._base.checks import check_number, describe
 from vertax._base.results import RESULTS
 from vertax._base.tracing import is_concrete, traced
 from vertax.dynamics import Evolution
-from vertax.energies._units import cell_size
+from vertax.energies._scales import cell_size
 from vertax.fitting import InverseProblem
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Relaxation

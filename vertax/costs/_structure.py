@@ -14,7 +14,7 @@ from vertax.costs._cost import AbstractCost
 from vertax.costs._positions import check_equal, check_target
 from vertax.costs._transport import entropic_transport
 from vertax.energies import AbstractEnergy
-from vertax.energies._units import cell_size
+from vertax.energies._scales import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
 

@@ -27,7 +27,7 @@ from vertax.dynamics._material import Material
 from vertax.dynamics._pi_controller import PIController
 from vertax.dynamics._time_integration import evolve_at_once
 from vertax.energies import AbstractEnergy
-from vertax.energies._units import cell_size
+from vertax.energies._scales import cell_size
 from vertax.mesh import AbstractBoundary, Tissue
 from vertax.relax._relaxation import Relaxation
 from vertax.relax._response import AbstractResponse

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import real_scalar
-from vertax.energies._units import cell_size
+from vertax.energies._scales import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._topology import edge_neighbourhood, source, take
 from vertax.relax._inversion_barrier import REACH, inversion_energy_of_all

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from vertax._base.checks import check_integer, check_number
 from vertax.adjoints._adjoint import frozen
-from vertax.energies._units import cell_size
+from vertax.energies._scales import cell_size
 from vertax.mesh import Tissue
 
 # The PI controller (Söderlind 2002, doi:10.1023/A:1021160023092): with the errors ε_n in units of the

@@ -15,12 +15,13 @@ from jaxtyping import Array, Float
 
 from vertax._base.checks import check_integer, check_number, describe
 from vertax._base.results import RESULTS
+from vertax._base.scales import Scales
 from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy
-from vertax.energies._units import Units, cell_size, units_of
+from vertax.energies._scales import cell_size, scales_of
 from vertax.external._external_gradient import ExternalEquilibrium, attach_gradient, force_of
 from vertax.external._host import Job, Request, Result, run_jobs, stack_results
 from vertax.external._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
@@ -213,11 +214,11 @@ class External(AbstractResponse):
             tolerance = jnp.minimum(tolerance, self.tolerance)
         return dataclasses.replace(self, tolerance=tolerance)
 
-    def units(self, tissue: Tissue, energy: AbstractEnergy) -> Units:
-        """The units of force and length."""
+    def scales(self, tissue: Tissue, energy: AbstractEnergy) -> Scales:
+        """The typical sizes."""
         if self.slope == "energy" and self.stiffness is None:
-            return units_of(tissue, energy)
-        return Units(cell_size(tissue), jnp.asarray(self.stiffness, tissue.vertices.dtype))
+            return scales_of(tissue, energy)
+        return Scales(cell_size(tissue), jnp.asarray(self.stiffness, tissue.vertices.dtype))
 
     def run_simulator(self, request: Request, throw: bool) -> Result:
         """Run the program for one request, inside a compiled function; batches run in parallel."""
@@ -282,11 +283,11 @@ def _relax_externally(
     )
     if result.angles is not None:
         relaxed = relaxed.with_angles(result.angles)
-    units = response.units(relaxed, constant)
+    scales = response.scales(relaxed, constant)
     slope_by_energy = response.slope == "energy"
     # For a program the rigid motions without stiffness are unknown: assume all of them.
     free = (
-        free_motions(relaxed, constant, units)
+        free_motions(relaxed, constant, scales)
         if slope_by_energy
         else jnp.ones(_n_motions(relaxed), bool)
     )
@@ -297,7 +298,7 @@ def _relax_externally(
             jnp.where(jnp.all(free), settled.vertices, relaxed.vertices)
         )
     slots = (energy, tissue.boundary, adjoint.outcome)
-    equilibrium = ExternalEquilibrium(relaxed, result.slope, free, units)
+    equilibrium = ExternalEquilibrium(relaxed, result.slope, free, scales)
     configuration = attach_gradient(slots, equilibrium, response, adjoint.without_outcome())
     with_boundary = eqx.tree_at(lambda t: t.boundary, relaxed, tissue.boundary)
     final = with_boundary.with_configuration(configuration)
@@ -310,17 +311,17 @@ def _relax_externally(
         max_force=force,
         num_steps=result.num_steps,
         num_t1=result.num_t1,
-        result=_result(relaxed, force, response, units),
+        result=_result(relaxed, force, response, scales),
     )
 
 
-def _result(tissue: Tissue, force: Float[Array, ""], response: External, units: Units) -> RESULTS:
+def _result(tissue: Tissue, force: Float[Array, ""], response: External, scales: Scales) -> RESULTS:
     is_converged = jnp.array(True)
     if response.slope == "energy":
         tolerance = response.tolerance
         if tolerance is None:
             precise = tissue.vertices.dtype == jnp.float64
-            tolerance = (1e-6 if precise else 1e-3) * units.force
+            tolerance = (1e-6 if precise else 1e-3) * scales.force
         is_converged = force <= tolerance
     result = RESULTS.where(is_converged, RESULTS.successful, RESULTS.nonlinear_max_steps_reached)
     finite = jnp.all(jnp.isfinite(tissue.vertices))

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
+from vertax._base.scales import Scales
 from vertax.adjoints import EquilibriumPropagation, GradientOutcome
 from vertax.adjoints._adjoint import differentiable, finish_gradient, frozen, materialise
 from vertax.adjoints._propagation import Phase, RestoringForce, gradient_from_phases
 from vertax.energies import AbstractEnergy
-from vertax.energies._units import Units
 from vertax.external._host import Request
 from vertax.mesh import Tissue
 
@@ -25,12 +25,12 @@ def force_of(tissue: Tissue, energy: AbstractEnergy) -> PyTree[Array]:
 
 
 class ExternalEquilibrium(eqx.Module):
-    """The equilibrium of a program without a nudge, its derivatives, rigid motions and units."""
+    """The equilibrium of a program without a nudge, its derivatives, rigid motions and typical sizes."""
 
     tissue: Tissue
     slope: PyTree[Array]
     free: Bool[Array, " motions"]
-    units: Units
+    scales: Scales
 
     def without_rigid_motion(self, pull: PyTree[Array]) -> PyTree[Array]:
         """The nudge minus its components along rigid motions without stiffness."""
@@ -109,11 +109,9 @@ def _(
     slope_at_rest = None
     if not adjoint.centred:
         slope_at_rest = slope(tissue) if slope_by_energy else by_program(equilibrium.slope)
-    units_of_nudge = {
-        "stiffness": equilibrium.units.stiffness,
-        "length_scale": equilibrium.units.length,
-    }
     # (The two signs are a batch, so the program may run twice in parallel.)
-    gradient, outcome = gradient_from_phases(adjoint, pull, units_of_nudge, phase, slope_at_rest)
+    gradient, outcome = gradient_from_phases(
+        adjoint, pull, equilibrium.scales, phase, slope_at_rest
+    )
     (d_energy, d_boundary), outcome = finish_gradient(gradient, outcome, adjoint.throw, slot)
     return d_energy, d_boundary, outcome

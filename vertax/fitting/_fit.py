@@ -363,6 +363,8 @@ def _row(record: Record, seconds: float, guidance: float) -> Row:
 
 def _failure(record: Record, epoch: int) -> str:
     """Why the fit cannot continue after an epoch."""
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(record.parameters)):
+        return f"a parameter of the energy is not finite in epoch {epoch}"
     cost, gradient_norm = np.asarray(record.cost), np.asarray(record.gradient_norm)
     if np.isfinite(cost).all() and np.isfinite(gradient_norm).all():
         residual = np.max(record.gradient_residual)

@@ -28,7 +28,7 @@ from vertax.costs import AbstractCost
 from vertax.dynamics import Evolved
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy, instance_hint, real_scalar, warn_of_columns
-from vertax.energies._units import mean_stiffness, units_of
+from vertax.energies._scales import mean_stiffness, scales_of
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Equilibrium, Relaxation
 
@@ -386,15 +386,15 @@ class _Nudging(AbstractNudgedSystem):
         cost = lambda tissue: self.problem.cost(_displaced(tissue, shift), energy)
         at = lambda y: cost(self.settled.with_configuration(y))
         value, gradient = jax.value_and_grad(at)(self.settled.configuration)
-        units = units_of(self.settled, energy)
+        scales = scales_of(self.settled, energy)
         # The force scale of the cost is the maximum of three estimates. The gradient vanishes at the optimum
         # of the cost, where the curvature bounds β so that E - (β/2) C keeps its minimum. A discrete cost
         # has neither gradient nor curvature, only a value.
         cost_force = jnp.maximum(
-            optx.max_norm(gradient), mean_stiffness(self.settled, cost) * units.length
+            optx.max_norm(gradient), mean_stiffness(self.settled, cost) * scales.length
         )
-        cost_force = jnp.maximum(cost_force, 1e-8 * jnp.abs(value) / units.length)
-        return jnp.where(cost_force > 0, cost_force, 1), units.force
+        cost_force = jnp.maximum(cost_force, 1e-8 * jnp.abs(value) / scales.length)
+        return jnp.where(cost_force > 0, cost_force, 1), scales.force
 
     def relax(
         self, parameters: PyTree, nudge: Float[Array, ""], tolerance: Float[Array, ""]

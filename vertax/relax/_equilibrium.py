@@ -9,11 +9,11 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.results import RESULTS
+from vertax._base.scales import Scales
 from vertax._base.tracing import is_concrete
 from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
-from vertax.energies._units import Units
 from vertax.mesh import Tissue
 from vertax.relax._contacts import Contacts
 from vertax.relax._loop import Search, SearchState
@@ -29,8 +29,7 @@ class SearchEnd(eqx.Module):
     origin: PyTree[Array]
     """The configuration right after the last transition, or the first one."""
     contacts: Contacts | None
-    units: Units
-    tolerance: Float[Array, ""]
+    scales: Scales
     max_force: Float[Array, ""]
     num_steps: Int[Array, ""]
     num_t1: Int[Array, ""]
@@ -41,13 +40,11 @@ class SearchEnd(eqx.Module):
     @classmethod
     def of(cls, search: Search, state: SearchState) -> SearchEnd:
         """The end of a search."""
-        options = search.options
         return cls(
             tissue=state.tissue,
             origin=state.origin,
             contacts=state.contacts,
-            units=Units(options["length_scale"], options["stiffness"]),
-            tolerance=options["tolerance"],
+            scales=search.scales,
             max_force=state.force,
             num_steps=state.num_steps,
             num_t1=state.num_t1,
@@ -68,12 +65,12 @@ def conclude(
 
     `minimiser` and `max_steps` are for adjoints that relax the tissue again.
     """
-    relaxed, units = end.tissue, end.units
+    relaxed, scales = end.tissue, end.scales
     # Without an equilibrium the derivatives are 0. In a batch NaN would reach the parameters that all members
     # share, also through a cost that masks this member.
     exists = end.result != RESULTS.nonfinite
     tissue, energy = (_constant_unless(exists, part) for part in (tissue, energy))
-    free = free_motions(relaxed, frozen(energy), units)
+    free = free_motions(relaxed, frozen(energy), scales)
     # Rigid motions of the relaxation depend on its path: undo them, unless the energy depends on them.
     settled = _choose(
         jnp.all(free), relaxed.settled(frozen(tissue)), _recentred(relaxed, tissue, free)
@@ -81,9 +78,7 @@ def conclude(
     moved = settled.held_as(_choose(jnp.all(free), tissue, relaxed))
     springs = jnp.ones_like(moved.drift(settled.configuration)).at[: len(free)].set(free)
     options = {
-        "length_scale": units.length,
-        "stiffness": units.stiffness,
-        "tolerance": end.tolerance,
+        "scales": scales,
         "exists": exists,
         "relaxation": minimiser,
         "start": end.origin,
@@ -95,7 +90,7 @@ def conclude(
         _pinned_energy,
         AtRest(),
         settled.configuration,
-        (moved, energy, frozen(end.contacts), units.stiffness * springs),
+        (moved, energy, frozen(end.contacts), scales.stiffness * springs),
         frozen(options),
         max_steps=None,
         adjoint=adjoint,
@@ -154,14 +149,14 @@ def _choose(condition: Bool[Array, ""], one: Tissue, other: Tissue) -> Tissue:
     return one.with_vertices(jnp.where(condition, one.vertices, other.vertices))
 
 
-def free_motions(tissue: Tissue, energy: AbstractEnergy, units: Units) -> Bool[Array, " modes"]:
+def free_motions(tissue: Tissue, energy: AbstractEnergy, scales: Scales) -> Bool[Array, " modes"]:
     """Which rigid motions are zero modes: all, unless the energy depends on absolute positions."""
-    displaced = tissue.boundary.motions(tissue.vertices, 0.3 * units.length)
+    displaced = tissue.boundary.motions(tissue.vertices, 0.3 * scales.length)
     positions = jnp.concatenate([tissue.vertices[None], displaced])
     energies = jax.vmap(lambda vertices: energy(tissue.with_vertices(vertices)))(positions)
     value = energies[0]
     rounding = jnp.finfo(value.dtype).eps ** 0.6
-    size = jnp.abs(value) + units.stiffness * units.length**2
+    size = jnp.abs(value) + scales.force * scales.length
     return jnp.abs(energies[1:] - value) <= rounding * size
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.reductions import any_of
 from vertax._base.results import RESULTS
+from vertax._base.scales import Scales
 from vertax._base.tracing import tree_where, zeros_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -18,7 +19,6 @@ from vertax.precondition._sum import Preconditioner
 from vertax.relax._contacts import Contacts, no_contacts
 from vertax.relax._feasibility import Feasibility
 from vertax.relax._objective import objective, preconditioner_of
-from vertax.solvers._newton import NewtonCG
 from vertax.solvers._solver import AbstractIteration
 
 
@@ -75,10 +75,7 @@ class Search(eqx.Module):
 
     - `iteration`: the minimiser.
     - `feasibility`: what an accepted point must be.
-    - `length`: the size of a cell.
-    - `stiffness`: see `Units`.
-    - `tolerance`: largest force at rest; None for `precision`.
-    - `precision`: the default tolerance, in the unit of force.
+    - `scales`: typical sizes, and the largest force at rest.
     - `consecutive_steps`: steps in a row after which the force must be below the tolerance.
     - `contact_range`: of contacts; None to let cells overlap.
     - `max_contacts`: most contacts; None for a default by the size of the tissue.
@@ -88,10 +85,7 @@ class Search(eqx.Module):
 
     iteration: AbstractIteration
     feasibility: Feasibility
-    length: Float[Array, ""]
-    stiffness: Float[Array, ""]
-    tolerance: Float[Array, ""] | None
-    precision: Float[Array, ""]
+    scales: Scales
     consecutive_steps: int | Int[Array, ""]
     contact_range: float | Float[Array, ""] | None
     max_contacts: int | None = eqx.field(static=True)
@@ -104,15 +98,17 @@ class Search(eqx.Module):
         counts = jnp.zeros(tissue.n_edges, jnp.int32) if rule is None else rule.init(tissue)
         contacts = None
         if self.contact_range is not None:
-            contacts = no_contacts(self.contact_range, self.length, tissue, self.max_contacts)
-            contacts = contacts.with_stiffness(self.stiffness)
+            contacts = no_contacts(
+                self.contact_range, self.scales.length, tissue, self.max_contacts
+            )
+            contacts = contacts.with_stiffness(self.scales.stiffness)
         args = (tissue, energy, contacts)
         false, zero = jnp.array(False), jnp.array(0)
         return SearchState(
             tissue=tissue,
             origin=tissue.configuration,
             iteration=self.iteration.unevaluated(
-                objective, tissue.configuration, args, self.options
+                objective, tissue.configuration, args, self.scales
             ),
             contacts=contacts,
             preconditioner=zeros_of(eqx.filter_eval_shape(self._preconditioner, *args)),
@@ -126,15 +122,6 @@ class Search(eqx.Module):
             started=false,
             finished=false,
         )
-
-    @property
-    def options(self) -> dict[str, Array]:
-        """Typical sizes and the tolerance."""
-        tolerance = self.tolerance
-        if tolerance is None:
-            tolerance = self.precision * self.stiffness * self.length
-        tolerance = jnp.asarray(tolerance, self.stiffness.dtype)
-        return {"length_scale": self.length, "stiffness": self.stiffness, "tolerance": tolerance}
 
     def advance(
         self, state: SearchState, energy: AbstractEnergy, num_steps: int | Int[Array, ""]
@@ -164,12 +151,12 @@ class Search(eqx.Module):
 
     def _step(self, state: SearchState, energy: AbstractEnergy) -> SearchState:
         """One trip of the loop."""
-        iteration, before, options = self.iteration, state.tissue, self.options
+        iteration, before, scales = self.iteration, state.tissue, self.scales
         y, minimiser, model, _ = iteration.evaluate(
             objective,
             before.configuration,
             (before, energy, state.contacts),
-            options,
+            scales,
             state.iteration,
         )
         progress, trial = iteration.progress(minimiser), before.with_configuration(y)
@@ -184,8 +171,8 @@ class Search(eqx.Module):
         if contacts is not None and state.contacts is not None:
             changed |= contacts.differ(state.contacts)
         fraction = before.by_row(feasible.fraction)
-        minimiser = iteration.moved(minimiser, fraction, flipped, changed, options)
-        below = (progress.force < options["tolerance"]) & ~changed
+        minimiser = iteration.moved(minimiser, fraction, flipped, changed, scales)
+        below = (progress.force < scales.tolerance) & ~changed
         num_below = jnp.where(below, state.num_below + 1, 0)
         num_below = jnp.where(progress.accepted | changed, num_below, state.num_below)
         overlaps = jnp.where(arrives, any_of(feasible.overlapping), state.overlaps)
@@ -201,8 +188,7 @@ class Search(eqx.Module):
         finished = at_rest | (num_stalls >= self.max_stalls) | jnp.isnan(progress.force)
         active = progress.accepted & ~changed & ~finished
         preconditioner = self._updated(state.preconditioner, tissue, energy, contacts, active)
-        options |= {"preconditioner": preconditioner}
-        minimiser = iteration.propose(model, options, minimiser, active)
+        minimiser = iteration.propose(model, scales, minimiser, active, preconditioner)
         return SearchState(
             tissue=tissue,
             origin=tree_where(flipped, tissue.configuration, state.origin),
@@ -222,11 +208,11 @@ class Search(eqx.Module):
 
     def _stalls(self, gain: Array, force: Array, n_vertices: int) -> Bool[Array, ""]:
         """Whether the energy has fallen by too little for its largest force, or without limit."""
-        unit = self.stiffness * self.length
-        little = gain < force * jnp.minimum(0.1 * self.length, force / self.stiffness)
+        length, stiffness, unit = self.scales.length, self.scales.stiffness, self.scales.force
+        little = gain < force * jnp.minimum(0.1 * length, force / stiffness)
         little &= force > 0.01 * unit
         # (The first gain is infinite.)
-        return little | ((gain > n_vertices * unit * self.length) & jnp.isfinite(gain))
+        return little | ((gain > n_vertices * unit * length) & jnp.isfinite(gain))
 
     def _updated(
         self,
@@ -247,7 +233,7 @@ class Search(eqx.Module):
         self, tissue: Tissue, energy: AbstractEnergy, contacts: Contacts | None
     ) -> Preconditioner:
         """The preconditioner of a step."""
-        if not isinstance(self.iteration, NewtonCG):
+        if not self.iteration.uses_preconditioner:
             return Preconditioner(None, None)
         return preconditioner_of(tissue, energy, contacts)
 

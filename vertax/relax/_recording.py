@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vertax._base.tracing import traced
 from vertax.adjoints import ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
-from vertax.energies._units import units_of
+from vertax.energies._scales import scales_of
 from vertax.mesh import Tissue
 from vertax.mesh._trajectory import Trajectory
 from vertax.relax._equilibrium import SearchEnd, free_motions
@@ -83,7 +83,7 @@ def _begin(
 ) -> tuple[Search, SearchState, Bool[Array, ""]]:
     search = response.search(tissue, energy)
     # Where the energy does not mind where the tissue is, `equilibrate` moves it back.
-    adrift = jnp.all(free_motions(tissue, energy, units_of(tissue, energy)))
+    adrift = jnp.all(free_motions(tissue, energy, scales_of(tissue, energy)))
     return search, search.begin(tissue, energy), adrift
 
 

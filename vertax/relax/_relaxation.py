@@ -23,7 +23,7 @@ from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import check_energy, warn_of_columns
-from vertax.energies._units import units_of
+from vertax.energies._scales import scales_of
 from vertax.mesh import Tissue
 from vertax.relax._compatibility import check_adjoint, check_sharding
 from vertax.relax._equilibrium import SearchEnd, conclude
@@ -224,17 +224,14 @@ class Relaxation(AbstractResponse):
     def search(self, tissue: Tissue, energy: AbstractEnergy) -> Search:
         """The search for an equilibrium, step by step, in the units of a tissue."""
         solver = self._solver
-        units = units_of(tissue, energy)
-        tolerance = self.tolerance
-        if tolerance is not None:
-            tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
+        scales, tolerance = scales_of(tissue, energy), self.tolerance
+        if tolerance is None:
+            tolerance = _precision(tissue, scales.length) * scales.force
+        tolerance = jnp.asarray(tolerance, tissue.vertices.dtype)
         return Search(
             solver if isinstance(solver, AbstractIteration) else Stepwise(solver),
             Feasibility(self.transitions),
-            frozen(units.length),
-            frozen(units.stiffness),
-            frozen(tolerance),
-            frozen(_precision(tissue, units.length)),
+            frozen(dataclasses.replace(scales, tolerance=tolerance)),
             self.consecutive_steps,
             self.contact_range,
             self.max_contacts,

@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Array, Float, PyTree
 
 from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.scales import Scales
 from vertax._base.tracing import is_concrete
 from vertax.solvers._solver import AbstractSolver, value_and_gradient, with_value_and_gradient
 
@@ -243,7 +244,7 @@ class FIRE(AbstractSolver):
         speed, force_norm = optax.tree.norm(velocity), optax.tree.norm(force)
         steer = mixing * speed / jnp.where(force_norm > 0, force_norm, 1)
         velocity = jax.tree.map(lambda v, f: (1 - mixing) * v + steer * f, velocity, force)
-        max_length = self.max_displacement * options.get("length_scale", 1.0)
+        max_length = self.max_displacement * Scales.of(options).length
         length = dt * optax.tree.norm(velocity, ord=jnp.inf)
         scale = jnp.minimum(1.0, max_length / jnp.where(length > 0, length, 1))
         y = optax.tree.add_scale(y, scale * dt, velocity)
@@ -259,7 +260,7 @@ class FIRE(AbstractSolver):
 
 def _unit_of_time(options: dict[str, Any]) -> Any:
     """The period of oscillation, relative to that of a stiffness of 12."""
-    return (12 / options.get("stiffness", 12.0)) ** 0.5
+    return (12 / options["scales"].stiffness) ** 0.5 if "scales" in options else 1.0
 
 
 # Bitzek et al.: α_start = 0.1, and N_min = 5 steps with positive power before the time step grows.

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.scales import Scales
 from vertax._base.tracing import tree_where
 from vertax.solvers._conjugate_gradients import (
     AbstractInverse,
@@ -29,7 +29,7 @@ from vertax.solvers._rows import (
     table_of,
     typical_size,
 )
-from vertax.solvers._solver import AbstractIteration, AbstractSolver, Progress, value_and_gradient
+from vertax.solvers._solver import AbstractIteration, Progress, value_and_gradient
 from vertax.solvers._trust_region import VertexTrustRegion
 
 # The purpose of the next evaluation.
@@ -73,7 +73,7 @@ class NewtonState(eqx.Module):
     progress: Progress
 
 
-class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
+class NewtonCG(AbstractIteration[NewtonState]):
     r"""Newton's method, each step by conjugate gradients, with a trust region for each vertex.
 
     A step from $x$ solves $(H + \Lambda) p = -g$ by conjugate gradients, with $\Lambda$ diagonal:
@@ -122,15 +122,8 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     conjugate_gradients: TruncatedCG = TruncatedCG()
     trust_region: VertexTrustRegion = VertexTrustRegion()
 
-    def init(
-        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
-    ) -> NewtonState:
-        return self._begin(y, options, f_struct)
-
-    def unevaluated(self, fn: Any, y: Any, args: Any, options: Any) -> NewtonState:
-        return self._begin(y, options, eqx.filter_eval_shape(fn, y, args)[0])
-
-    def _begin(self, y: Any, options: Any, struct: Any) -> NewtonState:
+    def unevaluated(self, fn: Any, y: Any, args: Any, scales: Scales) -> NewtonState:
+        struct = eqx.filter_eval_shape(fn, y, args)[0]
         table = table_of(y)
         zero, rows = jnp.zeros_like(table), jnp.zeros(len(table), table.dtype)
         number, infinite = jnp.array(0), jnp.full(struct.shape, jnp.inf, struct.dtype)
@@ -144,7 +137,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             proposal=Proposal(zero, zero, rows, number),
             predicted=jnp.zeros_like(infinite),
             error=rows,
-            radii=rows + self._reach(options),
+            radii=rows + self._reach(scales),
             typical=infinite,
             previous=infinite,
             num_corrections=number,
@@ -152,14 +145,8 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             progress=Progress.initial(infinite),
         )
 
-    def step(
-        self, fn: Any, y: Any, args: Any, options: Any, state: NewtonState, tags: Any
-    ) -> tuple[Any, NewtonState, Any]:
-        y, state, model, aux = self.evaluate(fn, y, args, options, state)
-        return y, self.propose(model, options, state, state.progress.accepted), aux
-
     def evaluate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: NewtonState
+        self, fn: Any, y: Any, args: Any, scales: Scales, state: NewtonState
     ) -> tuple[Any, NewtonState, Model, Any]:
         start = table_of(y)
 
@@ -170,18 +157,18 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         trial = start + state.trial
         g, product, (value, aux) = jax.linearize(force_and_value, trial, has_aux=True)
         model = Model(value, g, product, lambda table: point_of(table, y))
-        state = self._judged(model, options, state)
+        state = self._judged(model, scales, state)
         return point_of(tree_where(state.progress.accepted, trial, start), y), state, model, aux
 
-    def _judged(self, model: Model, options: Any, s: NewtonState) -> NewtonState:
+    def _judged(self, model: Model, scales: Scales, s: NewtonState) -> NewtonState:
         """Accept or reject the trial point, or correct the step."""
         value, g, region = model.value, model.gradient, self.trust_region
         anew, first, corrected = (s.phase == p for p in (_EVALUATE, _STEP, _CORRECTION))
         squared, typical = inner(g, g), typical_size(g)
         finite = jnp.isfinite(value) & jnp.isfinite(squared)
         gained, predicted = s.value - value, s.predicted
-        unit = self._unit(options)
-        below_rounding = jnp.abs(predicted) <= rounding_error(value, unit * self._length(options))
+        unit = scales.force
+        below_rounding = jnp.abs(predicted) <= rounding_error(value, unit * scales.length)
         # Where the gain is below rounding, the force must fall; or the gain be as predicted.
         as_predicted = gained > region.good_gain * predicted
         falls = squared < inner(s.gradient, s.gradient)
@@ -201,7 +188,7 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         accepted = anew | (judged & finite & enough)
         stepped = judged & accepted
         good = below_rounding | as_predicted
-        reach = self._reach(options)
+        reach = self._reach(scales)
         radii = region.updated(s.radii, s.proposal.step, error, reach, accepted, good)
         now = jnp.where(corrects, s.trial, s.base)
         phase = jnp.where(corrects, _CORRECTION, jnp.where(returns, _RETURN, _EVALUATE))
@@ -223,28 +210,27 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         )
 
     def propose(
-        self, model: Model, options: Any, state: NewtonState, active: Bool[Array, ""]
+        self,
+        model: Model,
+        scales: Scales,
+        state: NewtonState,
+        active: Bool[Array, ""],
+        preconditioner: Any = None,
     ) -> NewtonState:
-        """The next step from the point that was evaluated, or a correction.
-
-        **Arguments:**
-
-        - `model`: the objective there.
-        - `active`: whether that point is the iterate, and a step from it is wanted.
-        """
-        s, unit = state, self._unit(options)
+        """The next step from the point that was evaluated, or a correction."""
+        s, unit = state, scales.force
         corrects = s.phase == _CORRECTION
         choose = lambda correction, step: jnp.where(corrects, correction, step)
         useful = jnp.minimum(0.1, 0.9 * (s.typical / jnp.where(s.previous > 0, s.previous, 1)) ** 2)
         useful = jnp.where(jnp.isfinite(s.previous), useful, 0)
         forcing = jnp.minimum(self.forcing, jnp.maximum(self._finest(s, unit), useful))
-        short = self.correction_displacement * self._reach(options)
+        short = self.correction_displacement * self._reach(scales)
         proposal = self.conjugate_gradients(
             model.product,
             model.gradient,
             choose(s.proposal.damping, sizes(s.gradient) / s.radii),
             choose(jnp.minimum(s.radii, short), s.radii),
-            self._inverse(model, options, self._near(s, unit) & active),
+            self._inverse(model, scales, preconditioner, self._near(s, unit) & active),
             choose(self.correction_forcing, forcing),
             choose(self.correction_products, self.max_products),
             active | corrects,
@@ -263,9 +249,11 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
             num_products=s.num_products + proposal.num_products,
         )
 
-    def _inverse(self, model: Model, options: Any, coarse: Bool[Array, ""]) -> AbstractInverse:
-        """The preconditioner."""
-        preconditioner, stiffness = options.get("preconditioner"), self._stiffness(options)
+    def _inverse(
+        self, model: Model, scales: Scales, preconditioner: Any, coarse: Bool[Array, ""]
+    ) -> AbstractInverse:
+        """The approximate inverse of the Hessian."""
+        stiffness: Any = scales.stiffness
         if preconditioner is None or preconditioner.is_diagonal:
             return DiagonalInverse(stiffness)
         product = lambda v: model.point(model.product(table_of(v)))
@@ -277,11 +265,15 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         fraction: PyTree[Array],
         flipped: Bool[Array, ""],
         changed: Bool[Array, ""],
-        options: Any,
+        scales: Scales,
     ) -> NewtonState:
         rows = table_of(fraction)[:, 0]
-        radii = self.trust_region.cut(state.radii, state.proposal.step, rows, self._reach(options))
+        radii = self.trust_region.cut(state.radii, state.proposal.step, rows, self._reach(scales))
         return eqx.tree_at(lambda s: s.radii, state, jnp.where(changed, radii, state.radii))
+
+    @property
+    def uses_preconditioner(self) -> bool:
+        return True
 
     def value(self, state: NewtonState) -> Float[Array, ""]:
         return state.value
@@ -292,12 +284,6 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
     def progress(self, state: NewtonState) -> Progress:
         return state.progress
 
-    def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: NewtonState, tags: Any
-    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        at_rest = state.progress.accepted & (state.progress.force < self.atol)
-        return at_rest, optx.RESULTS.successful
-
     def _finest(self, state: NewtonState, unit: Any) -> Float[Array, ""]:
         # (14: the ratio of the norm of all forces and the typical force in a tissue of a hundred cells.)
         return jnp.sqrt(14.0 * state.typical / unit)
@@ -306,16 +292,6 @@ class NewtonCG(AbstractSolver, AbstractIteration[NewtonState]):
         """Whether the typical force is small."""
         return self._finest(state, unit) < self.forcing
 
-    def _length(self, options: Any) -> Any:
-        return options.get("length_scale", 1.0)
-
-    def _stiffness(self, options: Any) -> Any:
-        return options.get("stiffness", 1.0)
-
-    def _unit(self, options: Any) -> Any:
-        """The unit of force."""
-        return self._stiffness(options) * self._length(options)
-
-    def _reach(self, options: Any) -> Any:
+    def _reach(self, scales: Scales) -> Any:
         """The largest radius."""
-        return self.max_displacement * self._length(options)
+        return self.max_displacement * scales.length

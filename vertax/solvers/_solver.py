@@ -13,6 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
+from vertax._base.scales import Scales
 from vertax._base.tracing import tree_where, zeros_of
 from vertax.solvers._rows import Rows
 
@@ -36,63 +37,6 @@ class Progress(eqx.Module):
         """The progress before the first evaluation."""
         false = jnp.array(False)
         return cls(false, false, false, force)
-
-
-class AbstractIteration(eqx.Module, Generic[State]):
-    """A minimiser in two halves, between which the iterate may be changed.
-
-    `evaluate` evaluates the objective at the trial point, and accepts it or not; `propose` computes the next
-    trial point. Between them a relaxation applies transitions to an accepted point.
-    """
-
-    @abc.abstractmethod
-    def unevaluated(self, fn: Any, y: Any, args: Any, options: Any) -> State:
-        """The state before the first evaluation, which is at `y`."""
-
-    @abc.abstractmethod
-    def evaluate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: State
-    ) -> tuple[Any, State, Any, Any]:
-        """Evaluate the trial point.
-
-        **Returns:** the iterate, the state, the model of the objective at the trial point, and the auxiliary
-        output.
-        """
-
-    @abc.abstractmethod
-    def propose(self, model: Any, options: Any, state: State, active: Bool[Array, ""]) -> State:
-        """The next trial point; that of a step only if `active`. Otherwise the iterate is evaluated anew."""
-
-    @abc.abstractmethod
-    def moved(
-        self,
-        state: State,
-        fraction: Rows,
-        flipped: Bool[Array, ""],
-        changed: Bool[Array, ""],
-        options: Any,
-    ) -> State:
-        """The state after the iterate was `changed`.
-
-        **Arguments:**
-
-        - `state`: the state.
-        - `fraction`: the fraction of the last step that each row has taken.
-        - `flipped`: whether the topology has changed.
-        - `changed`: whether the iterate or the objective has changed at all.
-        - `options`: typical sizes.
-        """
-
-    @abc.abstractmethod
-    def progress(self, state: State) -> Progress:
-        """The result of the last evaluation."""
-
-    def value(self, state: State) -> Float[Array, ""] | None:
-        """The objective at the iterate, for a relaxation that ends early if it no longer falls.
-
-        None if it must not: minimisers of first order need thousands of steps.
-        """
-        return None
 
 
 class AbstractSolver(optx.AbstractMinimiser):
@@ -141,6 +85,114 @@ class AbstractSolver(optx.AbstractMinimiser):
         return y, aux, {}
 
 
+class AbstractIteration(AbstractSolver, Generic[State]):
+    """A minimiser in two halves, between which the iterate may be changed.
+
+    Each trip of a relaxation evaluates the objective at the trial point (`evaluate`), applies transitions to
+    an accepted point (after which it calls `moved`), and computes the next trial point (`propose`). A
+    minimiser that is no `AbstractIteration` restarts after a transition.
+
+    `scales` are the typical sizes of the problem, see [`Scales`][vertax.solvers.Scales].
+    """
+
+    @abc.abstractmethod
+    def unevaluated(self, fn: Any, y: Any, args: Any, scales: Scales) -> State:
+        """The state before the first evaluation, which is at `y`."""
+
+    @abc.abstractmethod
+    def evaluate(
+        self, fn: Any, y: Any, args: Any, scales: Scales, state: State
+    ) -> tuple[Any, State, Any, Any]:
+        """Evaluate the trial point.
+
+        **Arguments:**
+
+        - `fn`: the objective, `fn(y, args) -> (value, aux)`.
+        - `y`: the iterate.
+        - `args`: its arguments.
+        - `scales`: typical sizes.
+        - `state`: the state.
+
+        **Returns:** the iterate, the state, the model of the objective at the trial point, and the auxiliary
+        output.
+        """
+
+    @abc.abstractmethod
+    def propose(
+        self,
+        model: Any,
+        scales: Scales,
+        state: State,
+        active: Bool[Array, ""],
+        preconditioner: Any = None,
+    ) -> State:
+        """The next trial point; that of a step only if `active`. Otherwise the iterate is evaluated anew.
+
+        **Arguments:**
+
+        - `model`: the objective at the point that was evaluated, as `evaluate` returned it.
+        - `scales`: typical sizes.
+        - `state`: the state.
+        - `active`: whether the iterate is that point, and a step from it is needed.
+        - `preconditioner`: of the Hessian at the iterate, if `uses_preconditioner`.
+        """
+
+    @abc.abstractmethod
+    def moved(
+        self,
+        state: State,
+        fraction: Rows,
+        flipped: Bool[Array, ""],
+        changed: Bool[Array, ""],
+        scales: Scales,
+    ) -> State:
+        """The state after the iterate was `changed`.
+
+        **Arguments:**
+
+        - `state`: the state.
+        - `fraction`: the fraction of the last step that each row has taken.
+        - `flipped`: whether the topology has changed.
+        - `changed`: whether the iterate or the objective has changed at all.
+        - `scales`: typical sizes.
+        """
+
+    @abc.abstractmethod
+    def progress(self, state: State) -> Progress:
+        """The result of the last evaluation."""
+
+    def init(
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> State:
+        return self.unevaluated(fn, y, args, Scales.of(options))
+
+    def step(
+        self, fn: Any, y: Any, args: Any, options: Any, state: State, tags: Any
+    ) -> tuple[Any, State, Any]:
+        scales, preconditioner = Scales.of(options), options.get("preconditioner")
+        y, state, model, aux = self.evaluate(fn, y, args, scales, state)
+        active = self.progress(state).accepted
+        return y, self.propose(model, scales, state, active, preconditioner), aux
+
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: State, tags: Any
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        progress = self.progress(state)
+        return progress.accepted & (progress.force < self.atol), optx.RESULTS.successful
+
+    @property
+    def uses_preconditioner(self) -> bool:
+        """Whether `propose` uses a preconditioner."""
+        return False
+
+    def value(self, state: State) -> Float[Array, ""] | None:
+        """The objective at the iterate, for a relaxation that ends early if it no longer falls.
+
+        None if it must not: minimisers of first order need thousands of steps.
+        """
+        return None
+
+
 def value_and_gradient(fn: Callable, y: PyTree, args: PyTree) -> tuple[Array, PyTree, PyTree]:
     """Value, gradient and auxiliary output of an Optimistix objective `fn(y, args) -> (value, aux)`."""
     (value, aux), gradient = jax.value_and_grad(fn, has_aux=True)(y, args)
@@ -168,17 +220,19 @@ class Stepwise(AbstractIteration[_StepwiseState]):
 
     solver: AbstractSolver
 
-    def unevaluated(self, fn: Any, y: Any, args: Any, options: Any) -> _StepwiseState:
+    def unevaluated(self, fn: Any, y: Any, args: Any, scales: Scales) -> _StepwiseState:
         value, aux = eqx.filter_eval_shape(fn, y, args)
+        options = {"scales": scales}
         init = lambda y, args: self.solver.init(fn, y, args, options, value, aux, frozenset())
         inner = zeros_of(eqx.filter_eval_shape(init, y, args))
         progress = Progress.initial(jnp.full(value.shape, jnp.inf, value.dtype))
         return _StepwiseState(inner, jnp.array(_FRESH), progress)
 
     def evaluate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: _StepwiseState
+        self, fn: Any, y: Any, args: Any, scales: Scales, state: _StepwiseState
     ) -> tuple[Any, _StepwiseState, None, Any]:
         value, aux = eqx.filter_eval_shape(fn, y, args)
+        options = {"scales": scales}
         arrays, static = eqx.partition(state.inner, eqx.is_array)
 
         def restart() -> tuple[Any, Any]:
@@ -203,7 +257,12 @@ class Stepwise(AbstractIteration[_StepwiseState]):
         )
 
     def propose(
-        self, model: None, options: Any, state: _StepwiseState, active: Bool[Array, ""]
+        self,
+        model: None,
+        scales: Scales,
+        state: _StepwiseState,
+        active: Bool[Array, ""],
+        preconditioner: Any = None,
     ) -> _StepwiseState:
         return state
 
@@ -213,7 +272,7 @@ class Stepwise(AbstractIteration[_StepwiseState]):
         fraction: Rows,
         flipped: Bool[Array, ""],
         changed: Bool[Array, ""],
-        options: Any,
+        scales: Scales,
     ) -> _StepwiseState:
         # After transitions and shortened steps the memory of the solver (momentum, curvature) misleads.
         fresh = flipped | (jnp.asarray(tree.min(fraction)) < 1)
@@ -222,6 +281,9 @@ class Stepwise(AbstractIteration[_StepwiseState]):
 
     def progress(self, state: _StepwiseState) -> Progress:
         return state.progress
+
+    def gradient(self, state: _StepwiseState) -> PyTree[Float[Array, "..."]]:
+        return self.solver.gradient(state.inner)
 
 
 # Whether the next evaluation restarts the solver at the iterate: not, with its old memory, or without.

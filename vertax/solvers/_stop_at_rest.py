@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.scales import Scales
 from vertax.solvers._solver import AbstractSolver
 
 
@@ -25,8 +26,8 @@ class StopAtRestState(eqx.Module):
 class StopAtRest(optx.AbstractMinimiser):
     """A solver that stops after a number of consecutive steps with the largest force below a tolerance.
 
-    It has three options in addition to those of the solver: `tolerance`, for the largest force; `max_steps`,
-    the maximum number of steps; and `num_steps`, an exact number of steps, without a test of the force.
+    It has two options in addition to those of the solver: `max_steps`, the maximum number of steps; and
+    `num_steps`, an exact number of steps, without a test of the force.
 
     **Arguments:**
 
@@ -80,7 +81,7 @@ class StopAtRest(optx.AbstractMinimiser):
         self, inner: Any, options: Any, num_below: Int[Array, ""], num_steps: Int[Array, ""]
     ) -> StopAtRestState:
         progress = self.solver.progress(inner)
-        incremented = jnp.where(progress.force < options["tolerance"], num_below + 1, 0)
+        incremented = jnp.where(progress.force < Scales.of(options).tolerance, num_below + 1, 0)
         num_below = jnp.where(progress.accepted, incremented, num_below)
         return StopAtRestState(inner, progress.force, num_below, num_steps + progress.stepped)
 

@@ -247,7 +247,8 @@ def _reliability(curves: Fitted, points: Points, noise: float) -> Float[np.ndarr
     block_columns = columns[first]
     places = np.repeat(block_columns, n, axis=1), np.tile(block_columns, n)
     normal = csr_array(curves.precision)[places].toarray().reshape(blocks.shape)
-    followed = np.trace(np.linalg.solve(normal, blocks), axis1=1, axis2=2)
+    # (Singular for an edge with too few points.)
+    followed = np.trace(np.linalg.pinv(normal, hermitian=True) @ blocks, axis1=1, axis2=2)
     count = np.add.reduceat(weight / curves.factor[edge], first)
     squares = np.add.reduceat(weight / curves.factor[edge] * curves.rest**2, first)
     factor, variance = np.ones(len(first)), noise**2

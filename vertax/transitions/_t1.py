@@ -13,7 +13,7 @@ from vertax._base.reductions import any_of
 from vertax._base.sums import total
 from vertax._base.tracing import is_concrete
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
-from vertax.energies._units import cell_size
+from vertax.energies._scales import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._overlaps import Overlaps

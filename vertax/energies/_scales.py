@@ -1,41 +1,27 @@
-"""Length, stiffness and force scales, in which solvers and adjoints express their tolerances."""
+"""Typical sizes of a tissue and its energy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from vertax._base.probe_vector import probe_vector
+from vertax._base.scales import Scales
 from vertax.energies._energy import real_scalar
 from vertax.mesh import Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._tissue import mean_area
 
 
-class Units(eqx.Module):
-    """Scales of a tissue and its energy; they make a relaxation independent of the user's units."""
-
-    length: Float[Array, ""]
-    """Square root of the mean cell area."""
-    stiffness: Float[Array, ""]
-    """A typical second derivative of the energy; 1 if that is 0 or not finite."""
-
-    @property
-    def force(self) -> Float[Array, ""]:
-        """Stiffness times length."""
-        return self.stiffness * self.length
-
-
-def units_of(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Units:
-    """The scales of a tissue and its energy."""
+def scales_of(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Scales:
+    """The scales of a tissue and its energy, without a tolerance."""
     stiffness = mean_stiffness(tissue, energy)
     valid = jnp.isfinite(stiffness) & (stiffness > 0)
-    return Units(cell_size(tissue), jnp.where(valid, stiffness, 1))
+    return Scales(cell_size(tissue), jnp.where(valid, stiffness, 1))
 
 
 def cell_size(tissue: Tissue) -> Float[Array, ""]:
