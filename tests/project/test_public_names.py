@@ -33,7 +33,8 @@ PACKAGES = {
     "fit_warnings limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
     "inference": "Event Micrograph Microscope Movie MovieFit PinnedEnergy Scene fit_movie label_image "
-    "labels_on_sphere micrograph_problem movie_from_table pearson relative_error same_neighbours shape_factor_scene",
+    "labels_on_sphere micrograph_problem movie_from_table pearson relative_error same_neighbours "
+    "shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport PolygonTissue "
     "Segmentation Watershed "
     "free_voronoi from_labels from_microscopy from_polygons hexagonal labels_from_skeleton "

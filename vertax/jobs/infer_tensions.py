@@ -165,8 +165,10 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     figure = plotting.plot_tensions(result, frames[0].mask(**reading))
     folder.save_figure("tensions", figure)
     if result.curved is not None:
-        axes = plotting.plot_surface(result.curved.tissue, result.curved.areas, label="area")
-        folder.save_figure("surface", axes.get_figure(root=True))
+        figure = Figure(figsize=(5, 4))
+        axes = figure.add_subplot(projection="3d")
+        plotting.plot_surface(result.curved.tissue, result.curved.areas, ax=axes, label="area")
+        folder.save_figure("surface", figure)
     metrics = measure(result)
     if truth is not None:
         tables = compare(result, *truth)
