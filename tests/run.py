@@ -32,6 +32,7 @@ TOGETHER = (
     ("fitting",),
     ("default_mode",),
     ("_base", "mesh", "energies", "dissipations"),
+    ("surfaces",),
     ("io", "plotting", "precondition"),
     ("project", "solvers"),
     ("project/test_spare_slots.py",),

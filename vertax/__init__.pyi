@@ -18,6 +18,7 @@ from . import (
     relax as relax,
     runs as runs,
     solvers as solvers,
+    surfaces as surfaces,
     tensions as tensions,
     transitions as transitions,
 )

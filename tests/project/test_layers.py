@@ -12,6 +12,7 @@ EXPERIMENTS = ROOT.parent / "experiments"
 # From bottom to top: a package imports from itself and from packages before it.
 LAYERS = [
     "_base",
+    "surfaces",
     "mesh",
     "energies",
     "dissipations",

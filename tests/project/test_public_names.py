@@ -13,7 +13,7 @@ GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic R
 Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate bayes costs dissipations
 dynamics enable_compilation_cache enable_fast_compilation energies equilibrate evolve external
 fit fitting growth inference initialise io load_tissue mechanics mesh plot_history plot_recovery
-plot_tissue plotting relax runs save_tissue solvers tensions transitions uncertainty
+plot_tissue plotting relax runs save_tissue solvers surfaces tensions transitions uncertainty
 """
 
 PACKAGES = {
@@ -33,7 +33,8 @@ PACKAGES = {
     "fit_warnings limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
     "inference": "Event Micrograph Microscope Movie MovieFit PinnedEnergy Scene fit_movie label_image "
-    "micrograph_problem movie_from_table pearson relative_error same_neighbours shape_factor_scene",
+    "labels_on_sphere micrograph_problem movie_from_table pearson relative_error same_neighbours "
+    "shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport PolygonTissue "
     "Segmentation Watershed "
     "free_voronoi from_labels from_microscopy from_polygons hexagonal labels_from_skeleton "
@@ -50,15 +51,16 @@ PACKAGES = {
     "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology Trajectory cell_polygons pad",
     "plotting": "INK SERIES animate animate_figures cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_density_of_states plot_history plot_image "
-    "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_tensions plot_tissue "
-    "plot_tissues scale_bar tension_layer",
+    "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_surface plot_tensions "
+    "plot_tissue plot_tissues scale_bar tension_layer",
     "dynamics": "Evolution Evolved Material PIController evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
     "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
     "solvers": "AbstractIteration AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "Progress Scales TruncatedCG VertexTrustRegion Wrapped",
-    "tensions": "EdgeMotion InferredTensions MaskFrame MotionFit TensionsOfMasks find_masks "
+    "surfaces": "AbstractSurface Cylinder Graph HeightMap SphericalCap",
+    "tensions": "CurvedGeometry EdgeMotion InferredTensions MaskFrame MotionFit TensionsOfMasks find_masks "
     "infer_tensions infer_tensions_of_masks read_mask",
     "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",
 }

@@ -14,6 +14,7 @@ from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import per_cell
 from vertax.mesh import Tissue
+from vertax.mesh._curved import check_planar
 
 
 class SelfPropulsion(AbstractActivity):
@@ -35,7 +36,8 @@ class SelfPropulsion(AbstractActivity):
 
     **Raises:**
 
-    - `ValueError` for negative numbers, and in a step for a force of the wrong shape.
+    - `ValueError` for negative numbers, and in a step for a force of the wrong shape or a tissue on a
+        surface, where directions at different places cannot be compared.
     """
 
     force: Float[Array, "*cells"]
@@ -54,6 +56,7 @@ class SelfPropulsion(AbstractActivity):
 
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
         """Uniformly distributed directions, and the positions of the vertices."""
+        check_planar("SelfPropulsion", tissue)
         angles = jax.random.uniform(key, (tissue.n_cells,), tissue.vertices.dtype, 0, 2 * jnp.pi)
         return angles, tissue.vertices
 

@@ -12,6 +12,8 @@ from vertax.mesh import Tissue
 class Push(AbstractEnergy):
     r"""Potential of constant forces on vertices, $-\sum_v f_v \cdot x_v$.
 
+    On a surface $f_v$ is the force along the coordinates of the chart, $J^T F$ for a force $F$ in space.
+
     **Arguments:**
 
     - `force`, shape `(vertices, 2)`: $f_v$, the force on each vertex.

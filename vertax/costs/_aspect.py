@@ -15,6 +15,7 @@ from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Free, Periodic, Tissue
 from vertax.mesh._arcs import arc_points, length_factor
+from vertax.mesh._curved import check_planar
 
 Measure = Literal["moments", "farthest", "box"]
 
@@ -47,9 +48,11 @@ def aspect_ratio(tissue: Tissue, measure: Measure = "moments") -> Float[Array, "
 
     **Raises:**
 
-    - `ValueError` for an unknown measure, or one that does not apply to the boundary of the tissue.
+    - `ValueError` for an unknown measure, one that does not apply to the boundary of the tissue, or a tissue
+        on a surface.
     """
     _check_measure(measure)
+    check_planar("its aspect ratio", tissue)
     boundary = tissue.boundary
     if isinstance(boundary, Periodic) and measure == "box":
         first, second = jnp.linalg.norm(boundary.lattice, axis=1)

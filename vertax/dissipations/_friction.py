@@ -12,13 +12,16 @@ from jaxtyping import Array, ArrayLike, Float
 from vertax._base.checks import as_real, check_number
 from vertax.dissipations._dissipation import AbstractViscosity
 from vertax.mesh import Tissue
+from vertax.mesh._curved import surface_points
 
 
 class SubstrateFriction(AbstractViscosity):
     r"""Friction with a substrate, $R = \tfrac12 \sum_v \zeta_v |\dot x_v|^2$, so $\zeta \dot x = -\nabla E$.
 
     If the periodic box deforms, the substrate deforms affinely with it, and velocities are relative to this
-    affine motion (Tong et al. 2022, doi:10.1371/journal.pcbi.1010135).
+    affine motion (Tong et al. 2022, doi:10.1371/journal.pcbi.1010135). On a
+    [surface][vertax.surfaces.AbstractSurface] velocities are those in space, so
+    $\zeta J^T J \dot x = -\nabla E$ in the chart.
 
     **Arguments:**
 
@@ -43,13 +46,18 @@ class SubstrateFriction(AbstractViscosity):
 
     def strains(self, tissue: Tissue, before: Tissue) -> Float[Array, " strains"]:
         """Displacements relative to the affine motion of the box, times the roots of the coefficients."""
-        reference = before.boundary.carry(before.vertices, tissue.boundary)
+        if tissue.surface is None:
+            reference = before.boundary.carry(before.vertices, tissue.boundary)
+            moved = tissue.vertices - reference
+        else:
+            moved = surface_points(tissue.surface, tissue.vertices)
+            moved -= surface_points(tissue.surface, before.vertices)
         coefficient = broadcast_coefficient(
             self.coefficient, tissue.n_vertices, "coefficient", "vertex"
         )
         if self.per == "area":
             coefficient = coefficient * _vertex_areas(before)
-        return (jnp.sqrt(coefficient)[:, None] * (tissue.vertices - reference)).ravel()
+        return (jnp.sqrt(coefficient)[:, None] * moved).ravel()
 
 
 def as_coefficient(name: str, value: ArrayLike) -> Float[Array, "*shape"]:

@@ -26,6 +26,7 @@ from vertax.external._external_gradient import ExternalEquilibrium, attach_gradi
 from vertax.external._host import Job, Request, Result, run_jobs, stack_results
 from vertax.external._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
 from vertax.mesh import Tissue
+from vertax.mesh._curved import check_planar
 from vertax.relax._equilibrium import follow_start, free_motions
 from vertax.relax._response import AbstractResponse, Equilibrium, with_overlaps
 
@@ -139,8 +140,9 @@ class External(AbstractResponse):
         - [`SimulatorError`][vertax.external.SimulatorError] if the program fails; inside `jax.jit` and
             `jax.grad` an error of JAX that quotes it.
         - `RuntimeError` if the result is not at rest, or its cells overlap.
-        - `ValueError` for another adjoint.
+        - `ValueError` for another adjoint, or a tissue on a surface.
         """
+        check_planar("another program", tissue)
         if isinstance(
             energy, type
         ):  # (Other objects are allowed: a program may need parameters only.)

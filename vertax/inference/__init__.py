@@ -18,3 +18,4 @@ from vertax.inference._scene import (
     Scene as Scene,
     shape_factor_scene as shape_factor_scene,
 )
+from vertax.inference._sphere import labels_on_sphere as labels_on_sphere

@@ -38,7 +38,7 @@ def cell_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray
     **Returns:** NumPy arrays by the name of the column: `cell`, the number, from 0; `x` and `y`, the
     centroid, in the home box of a periodic tissue; `area`, `perimeter` and `shape_factor`; `sides`, the
     number of edges; `on_outline`, whether the cell borders on the exterior; and those of `columns`. Spare
-    slots have no rows.
+    slots have no rows. On a surface `x` and `y` are coordinates in the chart; sizes are those in space.
 
     **Raises:**
 

@@ -16,6 +16,7 @@ from vertax._base.atomic import atomic_write
 from vertax._base.checks import check_integer, describe
 from vertax.io._data_tables import Column, cell_columns, check_single, edge_columns
 from vertax.mesh import Tissue
+from vertax.mesh._curved import check_planar
 from vertax.mesh._outlines import Drawing
 
 
@@ -51,9 +52,10 @@ def write_geojson(
 
     **Raises:**
 
-    - `ValueError` for a batch of tissues, positions that are not finite, `points_per_arc` below 1,
-        and as [`cell_table`][vertax.io.cell_table].
+    - `ValueError` for a batch of tissues, a tissue on a surface, positions that are not finite,
+        `points_per_arc` below 1, and as [`cell_table`][vertax.io.cell_table].
     """
+    check_planar("GeoJSON (write_vtk writes three coordinates)", tissue)
     drawing = checked_drawing(tissue, points_per_arc)
     if not np.isfinite(drawing.lines[drawing.cell < drawing.n_cells]).all():
         raise ValueError(

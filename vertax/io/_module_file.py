@@ -28,6 +28,7 @@ from vertax import (
     mechanics,
     relax,
     solvers,
+    surfaces,
 )
 from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax._base.checks import describe
@@ -228,6 +229,7 @@ def _public_classes() -> dict[str, type[eqx.Module]]:
         mechanics,
         relax,
         solvers,
+        surfaces,
     )
     for family in families:
         for name, cls in vars(family).items():

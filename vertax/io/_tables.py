@@ -13,6 +13,7 @@ from vertax._base.checks import check_number, describe
 from vertax.io._bounded_tables import BoundedTables, checked, with_exterior, without_exterior
 from vertax.io._data_tables import check_single
 from vertax.mesh import Free, Periodic, Tissue, Topology
+from vertax.mesh._curved import check_planar
 
 
 class Tables(NamedTuple):
@@ -184,10 +185,11 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
 
     **Raises:**
 
-    - `ValueError` for a batch of tissues, for arcs that tables cannot hold, if the box is sheared or
-        its first vector is not along x, or an edge reaches beyond the neighbouring box.
+    - `ValueError` for a batch of tissues, for a tissue on a surface, for arcs that tables cannot hold, if the
+        box is sheared or its first vector is not along x, or an edge reaches beyond the neighbouring box.
     """
     check_single(tissue)
+    check_planar("tables, which have two coordinates (save_tissue keeps the surface)", tissue)
     tissue = tissue.without_spare()
     if tissue.inner_arcs:
         raise ValueError(

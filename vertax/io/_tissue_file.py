@@ -13,6 +13,7 @@ import numpy as np
 from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax._base.checks import describe
 from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue, Topology
+from vertax.surfaces import AbstractSurface, Cylinder, HeightMap, SphericalCap
 
 _VERSION = 1
 _INT32 = np.iinfo(np.int32)
@@ -26,10 +27,26 @@ class _BoundaryRecord(NamedTuple):
     """Shape of each array; None is any length."""
 
 
+class _SurfaceRecord(NamedTuple):
+    """How one class of surface is stored: its arrays by field name, and its static flags."""
+
+    build: type[AbstractSurface]
+    fields: dict[str, tuple[int | None, ...]]
+    flags: tuple[str, ...] = ()
+
+
 # A new boundary class is one more entry. Names and fields are part of the file format: do not change them.
 _BOUNDARIES: dict[str, _BoundaryRecord] = {
     "periodic": _BoundaryRecord(Periodic, {"lattice": (2, 2)}),
     "free": _BoundaryRecord(Free, {}),
+}
+
+_SURFACES: dict[str, _SurfaceRecord] = {
+    "cylinder": _SurfaceRecord(Cylinder, {"radius": ()}),
+    "spherical_cap": _SurfaceRecord(SphericalCap, {"radius": ()}),
+    "height_map": _SurfaceRecord(
+        HeightMap, {"coefficients": (None, None), "sides": (2,)}, ("periodic",)
+    ),
 }
 
 
@@ -39,7 +56,8 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
     The file is a NumPy `.npz` archive without pickles, so other programs can read it. It holds
     `format`, `version` and `boundary` (the header), `vertices`, `softening`, the arrays of the
     [`Topology`][vertax.Topology] by name, and those of the boundary as `boundary_…`; where a tissue
-    has them, `angles`, `angle_length`, `inner_arcs`, `pinned` (0 or 1) and `spare` (1). It is written
+    has them, `angles`, `angle_length`, `inner_arcs`, `pinned` (0 or 1), `spare` (1), and `surface` with
+    the arrays `surface_…` of a cylinder, a spherical cap or a height map. It is written
     atomically: an interrupted save leaves the old file, if any, as it was.
 
     **Arguments:**
@@ -49,8 +67,8 @@ def save_tissue(path: str | os.PathLike[str], tissue: Tissue) -> None:
 
     **Raises:**
 
-    - `ValueError` for a batch of tissues, for number types that NumPy does not have, or for a
-        boundary class that the format does not have.
+    - `ValueError` for a batch of tissues, for number types that NumPy does not have, or for a class of
+        boundary or surface that the format does not have (a `Graph` is a function, which a file cannot hold).
     - `TypeError` if `tissue` is not a tissue.
     - `OSError` if the file cannot be written.
     """
@@ -100,6 +118,8 @@ def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
         arrays |= {"pinned": np.asarray(tissue.pinned).astype(np.int8)}
     if topology.spare:
         arrays |= {"spare": 1}
+    if tissue.surface is not None:
+        arrays |= _surface_arrays(tissue.surface)
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
     if arrays["vertices"].ndim != 2:
         raise ValueError(
@@ -108,7 +128,7 @@ def tissue_arrays(tissue: Tissue) -> dict[str, np.ndarray]:
         )
     for name, array in arrays.items():
         # NumPy would read bfloat16 and similar types as raw bytes.
-        if name != "boundary" and array.dtype.kind not in "fi":
+        if name not in ("boundary", "surface") and array.dtype.kind not in "fi":
             raise ValueError(
                 "Argument `tissue` must hold numbers of a NumPy type, but "
                 f"`{name}` is {array.dtype}."
@@ -178,6 +198,8 @@ def tissue_from(
         options["inner_arcs"] = bool(get("inner_arcs", "i"))
     if "pinned" in arrays:
         options["pinned"] = get("pinned", "i", n_half // 3) != 0
+    if "surface" in arrays:
+        options["surface"] = _surface_from(str(arrays["surface"]), get, name)
     try:
         if topology is None:
             faces = {"exterior": record.build is Free, "spare": "spare" in arrays}
@@ -186,6 +208,33 @@ def tissue_from(
         return Tissue(jnp.asarray(vertices), topology, boundary, jnp.asarray(softening), **options)
     except ValueError as error:
         raise ValueError(f"{name} is broken: {error}") from error
+
+
+def _surface_arrays(surface: AbstractSurface) -> dict[str, Any]:
+    for kind, record in _SURFACES.items():
+        if type(surface) is record.build:
+            flags = {f"surface_{name}": int(getattr(surface, name)) for name in record.flags}
+            fields = {f"surface_{name}": getattr(surface, name) for name in record.fields}
+            return {"surface": kind} | fields | flags
+    raise ValueError(
+        f"The tissue format has no surface of class {type(surface).__name__}; it has: "
+        f"{', '.join(_SURFACES)}. Save tissue.with_surface(None), and put the surface back after loading."
+    )
+
+
+def _surface_from(kind: str, get: Callable[..., np.ndarray], name: str) -> AbstractSurface:
+    if kind not in _SURFACES:
+        raise ValueError(
+            f"{name} has a surface of an unknown kind, {kind!r}; the kinds are: {', '.join(_SURFACES)}."
+        )
+    record = _SURFACES[kind]
+    surface = object.__new__(record.build)  # its fields are those of the file, bit for bit
+    for field, shape in record.fields.items():
+        value = jnp.asarray(get(f"surface_{field}", "f", *shape))
+        object.__setattr__(surface, field, value)
+    for flag in record.flags:
+        object.__setattr__(surface, flag, bool(get(f"surface_{flag}", "i")))
+    return surface
 
 
 def _topology_from(

@@ -31,7 +31,8 @@ def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> Non
 
     **Raises:**
 
-    - `ValueError` if there is no frame, and as [`save_tissue`][vertax.io.save_tissue].
+    - `ValueError` if there is no frame, if frames have different surfaces, and as
+        [`save_tissue`][vertax.io.save_tissue].
     - `OSError` if the file cannot be written.
     """
     if len(trajectory) == 0:
@@ -46,8 +47,14 @@ def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> Non
     ]
     number = np.cumsum(np.isin(np.arange(len(frames)), new)) - 1
     arrays = {"topology": number}
+    surfaces = [tissue.surface for tissue in tissues]
+    if not all(eqx.tree_equal(surface, surfaces[0]) for surface in surfaces):
+        raise ValueError(
+            "Argument `trajectory` must have one surface to be saved, but it differs between frames. Save "
+            "the frames one by one with save_tissue."
+        )
     for name in frames[0]:
-        if name in _ONCE:
+        if _is_stored_once(name):
             arrays[name] = frames[0][name]
         else:
             chosen = [frames[i] for i in new] if name in _TOPOLOGY else frames
@@ -77,7 +84,8 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     if number.ndim != 1 or number.dtype.kind != "i" or len(number) == 0:
         raise ValueError(f"{name} is broken: `topology` must number the topologies of the frames.")
     values = {key: arrays.pop(key) for key in [*arrays] if key.startswith("value_")}
-    framed = {key: a for key, a in arrays.items() if key not in (*_ONCE, "format", "version")}
+    once = {key: a for key, a in arrays.items() if _is_stored_once(key)}
+    framed = {key: a for key, a in arrays.items() if key not in (*once, "format", "version")}
     for key, array in (framed | values).items():
         n = number.max() + 1 if key in _TOPOLOGY else len(number)
         if array.ndim == 0 or len(array) != n:
@@ -88,7 +96,6 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         raise ValueError(f"{name} is broken: `topology` or the values do not match the frames.")
     topologies: dict[int, Topology] = {}
     trajectory = Trajectory()
-    once = {key: arrays[key] for key in _ONCE if key in arrays}
     for i, k in enumerate(number.tolist()):
         frame = {
             key: np.asarray(array[k if key in _TOPOLOGY else i]) for key, array in framed.items()
@@ -99,3 +106,8 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
             tissue, **{key.removeprefix("value_"): column[i] for key, column in values.items()}
         )
     return trajectory
+
+
+def _is_stored_once(name: str) -> bool:
+    """Whether an array is the same in all frames."""
+    return name in _ONCE or name.startswith("surface")

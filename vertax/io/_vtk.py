@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -17,6 +18,7 @@ from vertax.io._data_tables import Column, cell_columns, edge_columns
 from vertax.io._geojson import checked_drawing, edge_path
 from vertax.io._triangles import is_convex, triangulate
 from vertax.mesh import Tissue
+from vertax.surfaces import AbstractSurface
 
 _SUFFIXES = (".vtu", ".vtk")
 
@@ -35,7 +37,7 @@ def write_vtk(
     triangles about its first corner, which overlaps the neighbours, and some versions draw it so. Periodic
     cells are drawn in one piece, as in pictures. The data of the elements are the columns of
     [`cell_table`][vertax.io.cell_table], in its order; all triangles of a cell have the row of the cell, and
-    `cell` is its number. The file is written atomically.
+    `cell` is its number. A tissue on a surface has its points in space. The file is written atomically.
 
     ```python
     vx.io.write_vtk("tissue.vtu", tissue, cells={"pressure": pressure}, edges={"tension": tension})
@@ -67,7 +69,8 @@ def write_vtk(
     polygons, counts = drawing.polygons()
     corners = [polygon[:n] for polygon, n in zip(polygons, counts, strict=True) if n > 0]
     table = cell_columns(tissue, drawing, {} if cells is None else cells)
-    files = {Path(path): _mesh(np.concatenate(corners), _cell_blocks(corners), table)}
+    surface = tissue.surface
+    files = {Path(path): _mesh(np.concatenate(corners), _cell_blocks(corners), table, surface)}
     if edges is not None:
         lines, shown = drawing.sides(np.ones(tissue.n_cells, bool))
         table = edge_columns(tissue, drawing, edges)
@@ -77,7 +80,7 @@ def write_vtk(
         ends = np.arange(pieces.size // 2).reshape(-1, 2)
         owner = np.repeat(row[shown], pieces.shape[1])
         block = _Block("line", ends, owner)
-        files[edge_path(path)] = _mesh(pieces.reshape(-1, 2), [block], table)
+        files[edge_path(path)] = _mesh(pieces.reshape(-1, 2), [block], table, surface)
     for place, mesh in files.items():
         _write(place, meshio.Mesh(*mesh))
 
@@ -111,10 +114,15 @@ def _cell_blocks(polygons: list[Float[np.ndarray, "_ 2"]]) -> list[_Block]:
 
 
 def _mesh(
-    plane: Float[np.ndarray, "points 2"], blocks: list[_Block], table: dict[str, np.ndarray]
+    plane: Float[np.ndarray, "points 2"],
+    blocks: list[_Block],
+    table: dict[str, np.ndarray],
+    surface: AbstractSurface | None,
 ) -> tuple[np.ndarray, list[Any], None, dict[str, Any]]:
     """Points, blocks of elements, no data of points, and data of the elements by block."""
     points = np.column_stack([plane, np.zeros(len(plane))])
+    if surface is not None:
+        points = np.asarray(surface.points(jnp.asarray(plane)), float)
     data = {
         name: [_numbers(name, column)[block.row] for block in blocks]
         for name, column in table.items()

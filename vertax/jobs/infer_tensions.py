@@ -46,7 +46,15 @@ class ImageSection(runs.ImageFile):
     holes: Literal["keep", "close"] = "keep"
     """Whether holes stay faces without a cell, or are given to the cells next to them."""
     pixel_size: list[float] | None = Field(default=None, min_length=2, max_length=2)
-    """Height and width of a pixel that is not square; left out, from the resolution of a TIFF file."""
+    """Height and width of a pixel; left out, pixels are square unless the resolution of a TIFF file says
+    otherwise, and the mean area of a cell is 1."""
+    height: str | None = Field(default=None, min_length=1)
+    """Of a curved tissue, the image of the height of each pixel (TIFF or NPY); NaN where it is unknown."""
+    plane_distance: float = Field(default=1.0, gt=0)
+    """Height per unit of that image, in the unit of `pixel_size`; without that, in pixels."""
+
+    unknown_height: float | None = None
+    """Value of unknown pixels in that image, such as 0, beside NaN."""
 
     @model_validator(mode="before")
     @classmethod
@@ -79,6 +87,9 @@ class ImageSection(runs.ImageFile):
             "gap_width": self.gap_width,
             "holes": self.holes,
             "pixel_size": size,
+            "height": self.height,
+            "plane_distance": self.plane_distance,
+            "unknown_height": self.unknown_height,
         }
 
 
@@ -153,6 +164,11 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     )
     figure = plotting.plot_tensions(result, frames[0].mask(**reading))
     folder.save_figure("tensions", figure)
+    if result.curved is not None:
+        figure = Figure(figsize=(5, 4))
+        axes = figure.add_subplot(projection="3d")
+        plotting.plot_surface(result.curved.tissue, result.curved.areas, ax=axes, label="area")
+        folder.save_figure("surface", figure)
     metrics = measure(result)
     if truth is not None:
         tables = compare(result, *truth)

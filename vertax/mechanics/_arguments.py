@@ -14,6 +14,7 @@ from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
 from vertax.energies._energy import check_energy, warn_of_columns
 from vertax.mesh import Periodic, Tissue
+from vertax.mesh._curved import check_planar
 from vertax.relax import Relaxation
 
 
@@ -28,7 +29,7 @@ def check_system(tissue: Any, energy: Any, *, box: str | None = None) -> None:
     **Raises:**
 
     - `TypeError` for objects of other classes.
-    - `ValueError` for a batch of tissues, or for a free tissue if `box` is given.
+    - `ValueError` for a batch of tissues, or for a free tissue or one on a surface if `box` is given.
     """
     check_tissue(tissue, box=box)
     check_energy(energy)
@@ -48,6 +49,8 @@ def check_tissue(tissue: Any, *, box: str | None = None) -> None:
         raise ValueError(
             f"Argument `tissue` must be periodic: {box} strains the box, and a free tissue has none."
         )
+    if box is not None:
+        check_planar(box, tissue)
 
 
 def check_dissipation(dissipation: Any) -> None:

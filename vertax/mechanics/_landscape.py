@@ -17,6 +17,7 @@ from vertax.dissipations import AbstractDissipation
 from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import as_matrix, check_tissue
 from vertax.mesh import Periodic, Tissue
+from vertax.mesh._curved import check_planar
 
 Motion: TypeAlias = tuple[Float[Array, "2 2"], PyTree[Float[Array, "..."]]]
 """An affine strain of box and vertices, and an additional change of the configuration."""
@@ -37,9 +38,10 @@ def deformed(tissue: Tissue, gradient: Float[Array, "2 2"]) -> Tissue:
 
     **Raises:**
 
-    - `ValueError` for another shape, or a determinant that is not positive.
+    - `ValueError` for another shape, a determinant that is not positive, or a tissue on a surface.
     """
     check_tissue(tissue)
+    check_planar("a uniform deformation", tissue)
     gradient = as_matrix("gradient", gradient)
     if is_concrete(gradient) and not np.linalg.det(np.asarray(gradient, float)) > 0:
         raise ValueError(
@@ -64,7 +66,8 @@ def area_of(tissue: Tissue) -> Float[Array, ""]:
 class Landscape(eqx.Module):
     r"""$\Phi(\epsilon, u)$: the potential of the tissue after displacements $u$ and then a strain $\epsilon$.
 
-    The strain is logarithmic, $F = e^\epsilon$, up to second order.
+    The strain is logarithmic, $F = e^\epsilon$, up to second order. A tissue on a surface has displacements
+    only; all functions that strain a tissue reject it.
     """
 
     tissue: Tissue
@@ -74,8 +77,10 @@ class Landscape(eqx.Module):
         """The potential after a motion."""
         strain, change = motion
         configuration = jax.tree.map(jnp.add, self.tissue.configuration, change)
-        gradient = jnp.eye(2, dtype=strain.dtype) + strain + 0.5 * strain @ strain
-        trial = deformed(self.tissue.with_configuration(configuration), gradient)
+        trial = self.tissue.with_configuration(configuration)
+        if trial.surface is None:
+            gradient = jnp.eye(2, dtype=strain.dtype) + strain + 0.5 * strain @ strain
+            trial = deformed(trial, gradient)
         return real_scalar(self.potential(trial))
 
     @property

@@ -29,6 +29,7 @@ from vertax.mechanics._hessian import (
 )
 from vertax.mechanics._landscape import Landscape, stationary
 from vertax.mesh import Tissue
+from vertax.mesh._curved import check_planar
 
 # Eigenvalues up to this fraction of the largest one count as 0, see `zero_threshold`.
 _ZERO = 1e-8
@@ -87,11 +88,12 @@ def modes(
 
     **Raises:**
 
-    - `ValueError` for more modes than degrees of freedom that move, or another method.
+    - `ValueError` for more modes than degrees of freedom that move, another method, or a tissue on a surface.
     - `TypeError` if `tissue` or `energy` is an object of another class, and for `"sparse"` with an energy
         that is not local, or inside `jax.jit`.
     """
     check_system(tissue, energy)
+    check_planar("modes", tissue)
     check_integer("k", k, at_least=1)
     if method not in (None, "dense", "sparse"):
         raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
@@ -137,8 +139,10 @@ def spectrum(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " modes"]:
     **Raises:**
 
     - `TypeError` inside `jax.jit`, and if `tissue` or `energy` is an object of another class.
+    - `ValueError` for a tissue on a surface.
     """
     check_system(tissue, energy)
+    check_planar("the spectrum", tissue)
     check_concrete("spectrum", tissue, energy)
     matrix = np.asarray(_dense(Landscape(*traced((tissue, energy), tissue.vertices.dtype))))
     free = np.asarray(ravel_pytree(movable(tissue))[0])

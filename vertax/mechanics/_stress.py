@@ -16,6 +16,7 @@ from vertax.mechanics._forces import pressures_and_tensions
 from vertax.mechanics._landscape import area_of, deformed
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import area_factor, length_factor
+from vertax.mesh._curved import check_planar, chord_parts, tangent_frame
 
 
 def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
@@ -40,9 +41,10 @@ def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
     **Raises:**
 
     - `TypeError` if `tissue` or `energy` is an object of another class.
-    - `ValueError` for a batch of tissues.
+    - `ValueError` for a batch of tissues, and for a tissue on a surface, which has no uniform deformation.
     """
     check_system(tissue, energy)
+    check_planar("the stress of the whole tissue (see cell_stress)", tissue)
     return _stress(*traced((tissue, energy), tissue.vertices.dtype))
 
 
@@ -62,6 +64,11 @@ def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2
     its tension. At rest the mean over cells, weighted by their areas, is the
     [`stress`][vertax.mechanics.stress] of the tissue (if all edges are straight, also away from rest).
 
+    On a surface it is the stress in the tangent plane at the centroid of the cell (in the chart), with
+    components along the unit vectors $e_1 = \partial_x r / |\partial_x r|$ and $e_2 = n \times e_1$, where
+    $n$ is the normal. Sides are projected to this plane; the normal component of their tension is the load on
+    the surface.
+
     **Arguments:**
 
     - `tissue`: the tissue.
@@ -69,7 +76,10 @@ def cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 2
 
     **Returns:** one symmetric matrix per cell, energy per area, positive in tension.
 
-    **Raises:** as `stress`.
+    **Raises:**
+
+    - `TypeError` if `tissue` or `energy` is an object of another class.
+    - `ValueError` for a batch of tissues.
     """
     check_system(tissue, energy)
     return _cell_stress(*traced((tissue, energy), tissue.vertices.dtype))
@@ -83,11 +93,11 @@ def _cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 
     inside = cells < tissue.n_cells
     tension_per_cell = tension / jnp.maximum(jnp.sum(inside, axis=1), 1)
     moments = tension_per_cell[:, None, None] * _directed_lengths(tissue)
-    sums = jax.ops.segment_sum(
-        jnp.concatenate([moments, moments]),
-        jnp.concatenate([cells[:, 0], cells[:, 1]]),
-        tissue.n_cells,
-    )
+    sides = cells.T.ravel()
+    sums = jax.ops.segment_sum(jnp.tile(moments, (2, 1, 1)), sides, tissue.n_cells)
+    if tissue.surface is not None:
+        frame = tangent_frame(tissue.surface, tissue.centroids)[0]
+        sums = jnp.einsum("cik,ckl,cjl->cij", frame, sums, frame)
     isotropic = pressure[:, None, None] * jnp.eye(2, dtype=moments.dtype)
     areas = tissue.areas
     if tissue.topology.spare:
@@ -95,12 +105,14 @@ def _cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 
     return sums / areas[:, None, None] - isotropic
 
 
-def _directed_lengths(tissue: Tissue) -> Float[Array, "edges 2 2"]:
-    """The integral of t ⊗ t along each edge; its trace is the length of the edge."""
+def _directed_lengths(tissue: Tissue) -> Float[Array, "edges space space"]:
+    """The integral of t ⊗ t along each edge; its trace is the length of the edge. On a surface in space."""
     # For an arc with half-angle α and chord c, with R = c / (2 sin α), the principal values are
     # R (α + sin α cos α) along the chord and R (α - sin α cos α) = 2 c g sin α across it.
     chord, angle = tissue.edge_vectors, tissue.edge_angles
-    squared = chord[:, 0] ** 2 + chord[:, 1] ** 2 + tissue.softening**2
+    if tissue.surface is not None:
+        chord = jnp.stack(chord_parts(tissue.surface, tissue._segments()), axis=-1)
+    squared = jnp.sum(chord**2, axis=-1) + tissue.softening**2
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1))
     outer = lambda v: v[:, :, None] * v[:, None, :] / length[:, None, None]
     if tissue.arcs is None:

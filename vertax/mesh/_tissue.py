@@ -11,13 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from vertax._base.sums import total
 from vertax._base.tracing import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free, Periodic
 from vertax.mesh._capacity import size_class, with_slots, without_slots
+from vertax.mesh._curved import area_shares, check_planar, check_surface, chord_parts
 from vertax.mesh._edge_ends import gather_at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
+from vertax.surfaces import AbstractSurface
 
 
 class Measurements(NamedTuple):
@@ -29,7 +32,7 @@ class Measurements(NamedTuple):
 
 
 class Tissue(eqx.Module):
-    r"""A planar tissue: vertices, topology and boundary.
+    r"""A tissue in the plane or on a surface: vertices, topology and boundary.
 
     The geometry is differentiable in `vertices`, in the angles of `arcs` and in the boundary (the lattice of
     a periodic box).
@@ -59,12 +62,17 @@ class Tissue(eqx.Module):
     - `angle_length`: factor that converts an angle to a length, so that all degrees of freedom have the same
         unit; by default half the square root of the mean cell area, for which the midpoint of an arc moves
         about as far as a vertex.
+    - `surface`: the surface on which the tissue lies, of `vertax.surfaces`; None for the plane. Vertices are
+        then coordinates in its chart, while edge lengths, areas, perimeters and shape factors are those in
+        space: an edge is a straight chord, a cell the part of the surface above its polygon in the chart.
 
     **Raises:**
 
     - `ValueError` for positions, angles or pins of the wrong shape or that are not finite, a negative
         softening, an `angle_length` that is not positive, a boundary that does not match the topology
-        (free if and only if there is an exterior), or angles in a tissue without arcs.
+        (free if and only if there is an exterior), angles in a tissue without arcs or on a surface, or a
+        surface that is not finite or has another period than the box.
+    - `TypeError` for a surface that is none.
     """
 
     vertices: Float[Array, "vertices 2"]
@@ -74,6 +82,8 @@ class Tissue(eqx.Module):
     arcs: Arcs | None
     """The angles of the edges; None if all edges are straight."""
     pinned: Bool[Array, " vertices"] | None
+    surface: AbstractSurface | None = eqx.field(default=None, kw_only=True)
+    """The surface on which the tissue lies; None for the plane."""
 
     def __init__(
         self,
@@ -86,6 +96,7 @@ class Tissue(eqx.Module):
         inner_arcs: bool = False,
         pinned: ArrayLike | None = None,
         angle_length: float | Float[Array, ""] | None = None,
+        surface: AbstractSurface | None = None,
     ):
         vertices = jnp.asarray(vertices, jnp.result_type(vertices, jnp.float32))
         if vertices.shape != (topology.n_vertices, 2):
@@ -118,6 +129,9 @@ class Tissue(eqx.Module):
                 f"Argument `pinned` must have shape ({topology.n_vertices},), but has "
                 f"{self.pinned.shape}."
             )
+        if surface is not None:
+            check_surface(surface, vertices, boundary, arcs=angles is not None)
+        self.surface = surface
         self.softening = jnp.zeros((), vertices.dtype)
         if softening is None or (angles is not None and angle_length is None):
             # Padded, so that tissues of similar size share the compiled function.
@@ -355,6 +369,15 @@ class Tissue(eqx.Module):
         """The tissue with other vertices, including pinned ones."""
         return eqx.tree_at(lambda t: t.vertices, self, vertices)
 
+    def with_surface(self, surface: AbstractSurface | None) -> Tissue:
+        """The tissue on a surface, with the same coordinates in the chart; None for the plane.
+
+        **Raises:** as the constructor.
+        """
+        if surface is not None:
+            check_surface(surface, self.vertices, self.boundary, arcs=self.arcs is not None)
+        return eqx.tree_at(lambda t: t.surface, self, surface, is_leaf=lambda x: x is None)
+
     def with_angles(self, angles: Float[Array, " edges"]) -> Tissue:
         """The tissue, which must have arcs, with other angles."""
         return eqx.tree_at(lambda t: t.arcs.angles, self, angles)
@@ -429,19 +452,26 @@ class Tissue(eqx.Module):
         return self.with_vertices(self.boundary.settle(moved, reference, self.pinned))
 
     def held_as(self, start: Tissue) -> Tissue:
-        """The tissue with the boundary and the vertices of `start`.
+        """The tissue with the boundary, the surface and the vertices of `start`.
 
         Pinned vertices and the reference of `drift` are then those of `start`. The result is differentiable
-        in the boundary and the pinned vertices only.
+        in the boundary, the surface and the pinned vertices only.
         """
         vertices = jax.lax.stop_gradient(start.vertices)
         if start.pinned is not None:
             vertices = jnp.where(start.pinned[:, None], start.vertices, vertices)
-        new = (start.boundary, vertices)
-        return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, new)
+        parts = lambda t: (t.boundary, t.vertices, t.surface)
+        new = (start.boundary, vertices, start.surface)
+        return eqx.tree_at(parts, self, new, is_leaf=lambda x: x is None)
 
     def carried(self, boundary: AbstractBoundary) -> Tissue:
-        """The tissue after a uniform deformation into another boundary, including pinned vertices."""
+        """The tissue after a uniform deformation into another boundary, including pinned vertices.
+
+        **Raises:**
+
+        - `ValueError` for a tissue on a surface: the period of a surface is fixed.
+        """
+        check_planar("a deformation of the box", self)
         vertices = self.boundary.carry(self.vertices, boundary)
         return eqx.tree_at(lambda t: (t.boundary, t.vertices), self, (boundary, vertices))
 
@@ -494,8 +524,10 @@ class Tissue(eqx.Module):
 
     def _chords(self, segments: tuple[Float[Array, " edges"], ...]) -> Float[Array, " edges"]:
         """Length of the chord of each edge (softened)."""
-        _, _, dx, dy = segments
-        squared = dx * dx + dy * dy + self.softening**2
+        _, _, *chord = segments
+        if self.surface is not None:
+            chord = chord_parts(self.surface, segments)
+        squared = total(part * part for part in chord) + self.softening**2
         # At length 0 without softening the square root is not differentiable: √1 - 1 instead has value 0 and
         # derivative 0, the mean of the one-sided derivatives.
         at_zero = (squared == 0).astype(squared.dtype)
@@ -506,6 +538,8 @@ class Tissue(eqx.Module):
     ) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
         """Contributions of each edge to the areas of its left and right cell (shoelace formula)."""
         m = self.topology
+        if self.surface is not None:
+            return area_shares(self.surface, m, self.boundary, segments)
         x, y, dx, dy = segments
 
         frame = take(m.frame, m.half_edge)
@@ -563,7 +597,7 @@ def _mean_area(tissue: Tissue) -> Float[Array, ""]:
 
 def mean_area(tissue: Tissue) -> Float[Array, ""]:
     """The mean area of the living cells."""
-    if isinstance(tissue.boundary, Periodic):
+    if isinstance(tissue.boundary, Periodic) and tissue.surface is None:
         n_alive = jnp.sum(tissue.alive) if tissue.topology.spare else tissue.n_cells
         return jnp.abs(tissue.boundary.area) / n_alive
     areas = jnp.abs(tissue.areas)

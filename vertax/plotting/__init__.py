@@ -33,5 +33,6 @@ with _requires_extra("plot", "Drawing"):
         house_style as house_style,
         new_figure as new_figure,
     )
+    from vertax.plotting._surface import plot_surface as plot_surface
     from vertax.plotting._tension_map import plot_tensions as plot_tensions
     from vertax.plotting._tissue import plot_tissue as plot_tissue

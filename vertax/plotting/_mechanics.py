@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from vertax.mesh import Periodic, Tissue
+from vertax.mesh._curved import tangent_frame
 from vertax.mesh._outlines import Drawing
 from vertax.plotting import _style
 from vertax.plotting._tissue import plot_tissue, single
@@ -25,7 +26,8 @@ def plot_stress(
     """Draw the stress of each cell as a cross over it.
 
     Its two bars are parallel to the principal directions, with lengths proportional to the principal
-    stresses: red for tension (positive), blue for pressure (negative).
+    stresses: red for tension (positive), blue for pressure (negative). On a surface they are bars in space,
+    drawn in the coordinates of the chart.
 
     **Arguments:**
 
@@ -45,6 +47,9 @@ def plot_stress(
     matrices = _shaped("stresses", stresses, (drawing.n_cells, 2, 2))
     values, vectors = np.linalg.eigh(0.5 * (matrices + np.swapaxes(matrices, 1, 2)))
     half = 0.5 * drawing.cell_size * np.abs(values) / _unit(np.abs(values), scale)
+    if tissue.surface is not None:  # the bars in space, in the coordinates of the chart
+        upper = np.asarray(tangent_frame(tissue.surface, tissue.centroids)[1], float)
+        vectors = np.linalg.solve(upper, vectors)
     way = (half[:, None, :] * vectors).swapaxes(1, 2)
     centres = drawing.centroids[:, None]
     bars = np.stack([centres - way, centres + way], axis=2).reshape(-1, 2, 2)

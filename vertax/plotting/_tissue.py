@@ -53,6 +53,9 @@ def plot_tissue(
     Periodic cells are drawn in one piece, with the centroid in the box (a thin dashed outline), so edges
     across the boundary are drawn twice, once at each cell.
 
+    A tissue on a surface is drawn in the chart; [`plot_surface`][vertax.plotting.plot_surface] draws it in
+    space.
+
     Over a microscopy image the y axis points down, the membranes are drawn as lines, and a periodic tissue
     is repeated over the whole image:
 

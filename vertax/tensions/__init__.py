@@ -4,6 +4,7 @@ from vertax.tensions._edge_motion import EdgeMotion as EdgeMotion
 from vertax.tensions._find_masks import MaskFrame as MaskFrame, find_masks as find_masks
 from vertax.tensions._infer_tensions import infer_tensions as infer_tensions
 from vertax.tensions._inferred import (
+    CurvedGeometry as CurvedGeometry,
     InferredTensions as InferredTensions,
     MotionFit as MotionFit,
 )

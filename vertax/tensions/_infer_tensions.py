@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,14 +19,16 @@ from vertax._base.phases import phases, start_phase
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.initialise import MaskReport, Segmentation, from_labels
 from vertax.initialise._report import LEAST_LENGTH
-from vertax.io import Foam, pixel_aspect, read_surface_evolver
+from vertax.io import Foam, pixel_aspect, read_image, read_surface_evolver
 from vertax.io._surface_evolver import is_surface_evolver
 from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
+from vertax.surfaces import AbstractSurface, HeightMap
 from vertax.tensions._balance import equations
 from vertax.tensions._curves import Points
 from vertax.tensions._edges import fit, solution
 from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._lift import lifted
 from vertax.tensions._mask import labels_and_lines
 from vertax.tensions._observed_geometry import observed_geometry
 from vertax.tensions._outcome import outcome
@@ -36,6 +38,9 @@ from vertax.tensions._outcome import outcome
 _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 # Initial noise of the vertices of a tissue with straight edges, relative to the cell diameter.
 _VERTEX = 0.01
+# Smoothing of an image of heights, relative to the root of the median area of a cell: of a smooth one, and of
+# steps of planes, which have fewer distinct values than this share of their pixels.
+_SMOOTHING, _SMOOTHING_OF_STEPS, _STEPS = 0.25, 0.5, 0.01
 # Bytes of memory: of any tissue, of a pixel and of a cell, measured; labels above the last are counted.
 _BASE, _PIXEL, _CELL, _MANY = 4e8, 80, 1.2e5, 10**6
 
@@ -49,6 +54,13 @@ def infer_tensions(
     kind: str = "auto",
     plane: int | None = None,
     pixel_size: PixelSize | None = None,
+    height: AbstractSurface
+    | Shaped[np.ndarray | Array, "..."]
+    | str
+    | os.PathLike[str]
+    | None = None,
+    plane_distance: float = 1.0,
+    unknown_height: float | None = None,
     background: int | None = None,
     gap_width: float | None = None,
     holes: str = "keep",
@@ -75,6 +87,11 @@ def infer_tensions(
     correlations, and the geometry is adjusted within the noise (total least squares). The residual is the
     distance of the tissue from a balance, and enters the standard deviations too.
 
+    The image of a curved tissue is its projection. With `height` the curves that were fitted to the pixels
+    are lifted to the surface: tensions balance in the tangent plane of each junction, and $\kappa$ is the
+    geodesic curvature of the edge. Areas, lengths, stresses and the load on what is below the tissue are
+    those in space, see [`CurvedGeometry`][vertax.tensions.CurvedGeometry].
+
     **Arguments:**
 
     - `mask`: a label image, or an image of outlines, as an array or a file (see
@@ -86,6 +103,13 @@ def infer_tensions(
     - `pixel_size`, `background`, `gap_width`, `holes`: of a mask, see
         [`from_labels`][vertax.initialise.from_labels]. Where a TIFF file has pixels that are not square,
         their ratio is taken from it.
+    - `height`: of a curved tissue, the image of the height of each pixel of the mask, as an array or a file,
+        NaN where it is unknown; or a surface, such as a [`HeightMap`][vertax.surfaces.HeightMap] in the unit
+        of length of the tissue. An image is smoothed by a Gaussian of a quarter of the cell diameter, or
+        of half of it if its heights are steps of planes.
+    - `plane_distance`: height per unit of an image of heights, in the unit of `pixel_size`; without
+        `pixel_size`, in pixels.
+    - `unknown_height`: value of unknown pixels in an image of heights, such as 0, beside NaN.
     - `edges`: `"arcs"`, curved by pressures; `"straight"`, with the pressures acting on
         vertices (Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017); by default, of a tissue with
         arcs the one of the larger evidence, see `InferredTensions.edges`.
@@ -108,7 +132,7 @@ def infer_tensions(
     - `ValueError` for a tissue without a junction of three cells, `edges="arcs"` for straight inner edges,
         a mirrored tissue, a `noise` or `prior` that is not positive, and as the readers.
     """
-    for name, value in (("noise", noise), ("prior", prior)):
+    for name, value in (("noise", noise), ("prior", prior), ("plane_distance", plane_distance)):
         if value is not None:
             check_number(name, value, above=0)
     if edges not in (None, "arcs", "straight"):
@@ -116,7 +140,7 @@ def infer_tensions(
             f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
         )
     start_phase("reading")
-    source = mask
+    source, unit = mask, 1.0 if pixel_size is not None else None
     if isinstance(source, str | os.PathLike) and is_surface_evolver(Path(source)):
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
@@ -135,12 +159,14 @@ def infer_tensions(
             inner_arcs=True,
         )
         source = _across_lines(source, line_width)
+    surface = _surface(height, plane_distance, unknown_height, source, unit)
     if isinstance(source, Segmentation):
         course = _of_mask(source, noise)
     elif isinstance(source, Foam):
         course = _of_foam(source, noise)
     elif isinstance(source, Tissue):
-        course = _of_tissue(source, noise)
+        surface = source.surface if surface is None else surface
+        course = _of_tissue(source.with_surface(None), noise)
     else:
         raise TypeError(
             "Argument `mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
@@ -166,6 +192,8 @@ def infer_tensions(
     start_phase("geometry")
     curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
     start_phase("balance")
+    if surface is not None:
+        geometry = geometry._replace(lift=lifted(geometry, curves.change, surface))
     straight = None if edges is None and tissue.inner_arcs else edges != "arcs"
     system, balance = solution(
         geometry,
@@ -179,7 +207,48 @@ def infer_tensions(
     # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
     source = course.labels, course.pixel_size, four_fold, report
-    return outcome(tissue, course.points, curves, system.which, balance, source)
+    return outcome(tissue, course.points, curves, system.which, balance, source, surface)
+
+
+def _surface(
+    height: Any, plane_distance: float, unknown: float | None, source: Any, unit: float | None
+) -> AbstractSurface | None:
+    """The surface of a tissue.
+
+    **Arguments:**
+
+    - `height`, `plane_distance`, `unknown`: as of `infer_tensions`.
+    - `source`: the segmentation of the mask, or another source.
+    - `unit`: the unit of `plane_distance`; None for the side of a pixel.
+    """
+    if height is None or isinstance(height, AbstractSurface):
+        return height
+    if not isinstance(source, Segmentation):
+        raise TypeError(
+            "Argument `height` must be a surface for a source without pixels, such as a "
+            f"vertax.surfaces.HeightMap, but is {describe(height)}."
+        )
+    heights = height
+    if isinstance(height, str | os.PathLike):
+        is_array = Path(height).suffix == ".npy"
+        heights = np.load(height) if is_array else read_image(height)
+    heights = np.asarray(heights)
+    if heights.shape != source.image_shape:
+        raise ValueError(
+            f"Argument `height` must have the shape of the mask, {source.image_shape}, but has "
+            f"{heights.shape}. Pass the heights of the same pixels."
+        )
+    pixel = pixel_length(source.pixel_size)
+    stepped = len(np.unique(heights)) < _STEPS * heights.size
+    width = _SMOOTHING_OF_STEPS if stepped else _SMOOTHING
+    areas = np.abs(geometry_of(source.tissue).areas)[source.labels > 0]
+    return HeightMap(
+        heights,
+        source.pixel_size,
+        plane_distance=plane_distance * (pixel if unit is None else unit),
+        smoothing=max(pixel, width * float(np.sqrt(np.median(areas)))),
+        unknown=float("nan") if unknown is None else unknown,
+    )
 
 
 class _Course(NamedTuple):

@@ -40,6 +40,25 @@ class MotionFit(eqx.Module):
     """Root mean square displacement of the points in each interval, across edges."""
 
 
+class CurvedGeometry(eqx.Module):
+    """The geometry of a tissue on a curved surface, in space."""
+
+    tissue: Tissue
+    """The tissue on its surface, each edge a chord."""
+    areas: Float[np.ndarray, " cells"]
+    """Areas of the cells, with their arcs."""
+    perimeters: Float[np.ndarray, " cells"]
+    """Perimeters of the cells."""
+    slopes: Float[np.ndarray, " cells"]
+    """Slope of the surface at each cell: rise over run."""
+    lengths: Float[np.ndarray, " edges"]
+    """Lengths of the edges."""
+    normal_loads: Float[np.ndarray, " vertices"]
+    r"""Force of the tensions along the normal at each vertex, half of $\gamma \int \kappa_n\,dl$ of its
+    edges, in mean tensions; positive in the direction of increasing heights. What is below the tissue bears
+    it. NaN beside a tension without an equation."""
+
+
 class InferredTensions(eqx.Module):
     """Relative tensions and pressures of a tissue, with their standard deviations.
 
@@ -100,6 +119,8 @@ class InferredTensions(eqx.Module):
     """Root mean square distance of the outline of each cell in the mask from its arcs, in pixels."""
     motion: MotionFit | None = None
     """The fit of `EdgeMotion`."""
+    curved: CurvedGeometry | None = None
+    """The geometry in space of a tissue on a surface, `height`; `tissue` is its image."""
 
     @property
     def area_errors(self) -> Float[np.ndarray, " cells"]:
@@ -267,6 +288,7 @@ class InferredTensions(eqx.Module):
             "tension_deviation": self.tension_deviations,
             "determined": self.determined,
             **contact,
+            **({} if self.curved is None else {"length_in_space": self.curved.lengths}),
         }
 
     @property
@@ -288,6 +310,23 @@ class InferredTensions(eqx.Module):
             "stress_xy": self.stresses[:, 0, 1],
             "stress_yy": self.stresses[:, 1, 1],
             **mask,
+            **self._curved_columns,
+        }
+
+    @property
+    def _curved_columns(self) -> dict[str, np.ndarray]:
+        curved = self.curved
+        if curved is None:
+            return {}
+        m = self.tissue.topology
+        # Three cells share the load of a vertex.
+        load = np.zeros(self.tissue.n_cells + 1)
+        np.add.at(load, np.asarray(m.cell), np.repeat(curved.normal_loads / 3, 3))
+        return {
+            "area_in_space": curved.areas,
+            "perimeter_in_space": curved.perimeters,
+            "slope": curved.slopes,
+            "normal_load": load[:-1],
         }
 
 

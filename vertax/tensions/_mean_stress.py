@@ -52,19 +52,26 @@ def fabric(tissue: Tissue) -> Float[np.ndarray, "edges 2 2"]:
 
 
 def stress_weights(
-    tissue: Tissue, edges: Int[np.ndarray, " tensions"], cells: Int[np.ndarray, " pressures"]
+    tissue: Tissue,
+    edges: Int[np.ndarray, " tensions"],
+    cells: Int[np.ndarray, " pressures"],
+    tangents: Float[np.ndarray, "edges 2 2"],
+    areas: Float[np.ndarray, " cells"],
 ) -> tuple[Float[np.ndarray, "3 unknowns"], Bool[np.ndarray, " cells"]]:
-    """Mean stress xx, xy and yy per unit of each tension and pressure, and the cells in the mean."""
+    """Mean stress xx, xy and yy per unit of each tension and pressure, and the cells in the mean.
+
+    `tangents` are the integrals of t t over the edges, see `fabric`.
+    """
     geometry = geometry_of(tissue)
     missing = np.full(tissue.n_edges, True)
     missing[edges] = False
     included = np.isin(np.arange(tissue.n_cells), cells)
     included = np.append(included, False)
     included[geometry.edge_cells[missing].ravel()] = False
-    area = np.where(included[:-1], geometry.areas, 0.0)
+    area = np.where(included[:-1], areas, 0.0)
     total = max(float(np.sum(area)), 1e-300)
     half = 0.5 * included[geometry.edge_cells].sum(axis=1)
-    pull = (half[:, None, None] * fabric(tissue))[edges].reshape(-1, 4)[:, [0, 1, 3]].T
+    pull = (half[:, None, None] * tangents)[edges].reshape(-1, 4)[:, [0, 1, 3]].T
     push = -np.outer([1, 0, 1], area[cells])
     return np.concatenate([pull, push], axis=1) / total, included[:-1]
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
 
 from vertax._base.sparse_normal import SparseNormal, spread_parts
-from vertax.tensions._balance import Equations, angle_slopes, angles, pulls
+from vertax.tensions._balance import Equations, angle_slopes, angles, lifted_slopes, pulls
 from vertax.tensions._curves import Fitted
 from vertax.tensions._errors import Errors
 from vertax.tensions._observed_geometry import ObservedGeometry
@@ -153,7 +153,12 @@ def observability(
     arcs = np.arange(which.n_arcs)
     edge = np.concatenate([which.half_edge.ravel(), arcs])
     slot = np.concatenate([np.where(forward, 0, 1), np.full(len(arcs), 2)])
-    edge_covariance = np.zeros((n, 3, 3)) if which.lever is not None else _ENDS @ blocks @ _ENDS.T
+    edge_covariance = np.zeros((n, 3, 3))
+    if which.lever is None:
+        factor = np.ones((n, 3))
+        factor[edge, slot] = lifted_slopes(fitted, which)
+        ends = factor[:, :, None] * _ENDS
+        edge_covariance = ends @ blocks @ np.swapaxes(ends, 1, 2)
 
     ends = fitted.ends[which.edges]
     middle = fitted.place[ends[:, 0]] + 0.5 * fitted.chord[which.edges]

@@ -11,6 +11,36 @@ from vertax.mesh import Tissue
 from vertax.mesh._geometry import geometry_of
 
 
+class Lift(NamedTuple):
+    """The map of directions and arcs of an image to the tangent planes of a surface."""
+
+    root: Float[np.ndarray, "vertices 2 2"]
+    """Root of the metric at each vertex."""
+    offset: Float[np.ndarray, "vertices 3 2"]
+    """Of a straight edge of space, its projection on the tangent plane less the image of its chord."""
+    turn: Float[np.ndarray, "edges 2"]
+    """Half of the geodesic turning of an arc: the first plus the second times its angle."""
+    chord: Float[np.ndarray, " edges"]
+    """Length of the chord of an arc with the length and the turning in space."""
+
+    def turned(
+        self,
+        vectors: Float[np.ndarray, "junctions 3 2"],
+        junctions: Int[np.ndarray, " junctions"],
+        *,
+        straight: bool,
+    ) -> tuple[Float[np.ndarray, "junctions 3"], Float[np.ndarray, "junctions 3"]]:
+        """Directions of vectors of the image in tangent planes, and their slopes by those in the image."""
+        map_ = lambda x: np.einsum("vij,vlj->vli", self.root[junctions], x)
+        image = map_(vectors)
+        if straight:
+            image = image + self.offset[junctions]
+        rate = map_(np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1))
+        cross = image[..., 0] * rate[..., 1] - image[..., 1] * rate[..., 0]
+        squared = np.maximum(np.sum(image**2, axis=-1), 1e-300)
+        return np.arctan2(image[..., 1], image[..., 0]), cross / squared
+
+
 class ObservedGeometry(NamedTuple):
     """The geometry of a tissue as NumPy arrays, arcs in terms of chords and angles.
 
@@ -36,6 +66,8 @@ class ObservedGeometry(NamedTuple):
     """Vertices where three cells meet and forces balance."""
     size: float
     """Root of the mean area of a cell."""
+    lift: Lift | None = None
+    """The map to a curved surface; None in the plane."""
 
     @property
     def places(self) -> Float[np.ndarray, "geometry 2"]:

@@ -14,9 +14,11 @@ from vertax.initialise import MaskReport
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import angle_of_area
 from vertax.mesh._geometry import geometry_of
+from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import Equations
 from vertax.tensions._curves import Fitted, Points, arc_distances
-from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._inferred import CurvedGeometry, InferredTensions
+from vertax.tensions._lift import SurfaceMeasures, measured
 from vertax.tensions._mean_stress import fabric, mean_stress, stress_weights
 from vertax.tensions._solve import HIDDEN, Balance
 
@@ -82,6 +84,7 @@ def outcome(
     source: tuple[
         Int[np.ndarray, " cells"], PixelSize | None, Bool[np.ndarray, " edges"], MaskReport | None
     ],
+    surface: AbstractSurface | None = None,
 ) -> InferredTensions:
     """The result as it is reported.
 
@@ -92,6 +95,7 @@ def outcome(
     - `curves`: its fitted edges.
     - `which`, `balance`: the equations and their solution.
     - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
+    - `surface`: the surface of the tissue; None in the plane.
 
     **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
     """
@@ -105,6 +109,7 @@ def outcome(
         relative(balance, which, curves),
         balance.posterior.covariances,
         four_fold=four_fold,
+        surface=surface,
         labels=np.asarray(labels),
         noise=float(curves.noise * balance.errors.noise),
         correlation=float(curves.apart),
@@ -126,6 +131,7 @@ def assembled(
     covariances: Callable[[np.ndarray], np.ndarray],
     *,
     four_fold: Bool[np.ndarray, " edges"],
+    surface: AbstractSurface | None = None,
     **fields: Any,
 ) -> InferredTensions:
     """The result with arrays of all edges and cells, and stresses.
@@ -137,11 +143,19 @@ def assembled(
     - `values`: the tensions and pressures.
     - `covariances`: the covariance matrix of the tensions and pressures times vectors.
     - `four_fold`: edges of length 0.
+    - `surface`: the surface of the tissue; None in the plane.
     - `fields`: the other fields of the result.
 
     **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
     """
-    weights, included = stress_weights(tissue, *places)
+    tangents, areas = fabric(tissue), geometry_of(tissue).areas
+    curved = None
+    if surface is not None:
+        measures = measured(tissue, surface)
+        tangents, areas = measures.fabric, measures.areas
+        of_edges = _spread(tissue.n_edges, places[0], values.tension, np.nan)
+        curved = _curved(tissue, of_edges, surface, measures)
+    weights, included = stress_weights(tissue, *places, tangents, areas)
     components = weights @ np.concatenate([values.tension, values.pressure])
     # Pressures are less their mean.
     n, lag = len(values.tension), weights @ values.lag
@@ -159,10 +173,33 @@ def assembled(
         pressures=pressures,
         pressure_deviations=of_cells(values.pressure_deviation, np.nan),
         pressures_determined=of_cells(values.beside, False),
-        stresses=_stresses(tissue, tensions, pressures, determined),
+        stresses=_stresses(tissue, tensions, pressures, determined, tangents, areas),
         mean_stress=mean_stress(components, covariance, int(included.sum())),
         four_fold=four_fold,
+        curved=curved,
         **fields,
+    )
+
+
+def _curved(
+    tissue: Tissue,
+    tensions: Float[np.ndarray, " edges"],
+    surface: AbstractSurface,
+    measures: SurfaceMeasures,
+) -> CurvedGeometry:
+    """The geometry on a surface, and the normal loads of tensions."""
+    m = tissue.topology
+    half = 0.5 * tensions * measures.bending
+    perimeters = np.zeros(tissue.n_cells + 1)
+    for side in np.asarray(m.edge_cells).T:
+        np.add.at(perimeters, side, measures.lengths)
+    return CurvedGeometry(
+        tissue=Tissue(tissue.vertices, m, tissue.boundary, tissue.softening, surface=surface),
+        areas=measures.areas,
+        perimeters=perimeters[:-1],
+        slopes=measures.slopes,
+        lengths=measures.lengths,
+        normal_loads=half[np.asarray(m.edge).reshape(-1, 3)].sum(axis=1),
     )
 
 
@@ -229,6 +266,8 @@ def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
     vertices = np.asarray(tissue.vertices) + change[:n].reshape(-1, 2)
     angles = geometry_of(tissue).edge_angles + change[n : n + tissue.n_edges]
     moved = tissue.with_vertices(jnp.asarray(vertices, dtype))
+    if tissue.arcs is None:
+        return moved
     return moved.with_angles(jnp.asarray(angles, dtype))
 
 
@@ -237,14 +276,15 @@ def _stresses(
     tensions: Float[np.ndarray, " edges"],
     pressures: Float[np.ndarray, " cells"],
     determined: Bool[np.ndarray, " edges"],
+    tangents: Float[np.ndarray, "edges 2 2"],
+    areas: Float[np.ndarray, " cells"],
 ) -> Float[np.ndarray, "cells 2 2"]:
     """Stress of each cell, ½ Σ γ ∫ t t dl / A - p I over its edges (Batchelor 1970,
     doi:10.1017/S0022112070000745)."""
     geometry = geometry_of(tissue)
     certain = np.where(determined, tensions, np.nan)
-    pulled = 0.5 * certain[:, None, None] * fabric(tissue)
+    pulled = 0.5 * certain[:, None, None] * tangents
     total = np.zeros((tissue.n_cells + 1, 2, 2))
     for side in geometry.edge_cells.T:
         np.add.at(total, side, pulled)
-    areas = geometry.areas[:, None, None]
-    return total[:-1] / areas - pressures[:, None, None] * np.eye(2)
+    return total[:-1] / areas[:, None, None] - pressures[:, None, None] * np.eye(2)

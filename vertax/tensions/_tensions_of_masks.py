@@ -19,6 +19,7 @@ from tqdm import tqdm
 import vertax
 from vertax._base.announce import announce_compilations
 from vertax._base.blas import one_blas_thread
+from vertax._base.checkpoints import digest as arrays_digest
 from vertax._base.checks import check_integer
 from vertax._base.pixels import pixel_length, pixel_sides
 from vertax._base.threads import num_threads
@@ -28,10 +29,10 @@ from vertax.io._module_file import load_module, save_module
 from vertax.tensions._columns import column_descriptions
 from vertax.tensions._find_masks import MaskFrame, MaskSource, find_masks
 from vertax.tensions._infer_tensions import infer_tensions
-from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._inferred import CurvedGeometry, InferredTensions
 from vertax.tensions._mean_stress import MeanStress
 
-_CLASSES = (InferredTensions, MeanStress, MaskReport, MaskChange)
+_CLASSES = (InferredTensions, CurvedGeometry, MeanStress, MaskReport, MaskChange)
 
 
 class TensionsOfMasks(eqx.Module):
@@ -202,10 +203,15 @@ def _infer(
     else:
         source = np.ascontiguousarray(source)
         pixels = source.tobytes() + f"{source.shape} {source.dtype}".encode()
+    parts, height = dict(options), options.get("height")
+    if isinstance(height, str | os.PathLike):
+        parts["height"] = hashlib.sha256(Path(height).read_bytes()).hexdigest()
+    elif height is not None:
+        parts["height"] = arrays_digest(height)
     # The precision of JAX is part of the result, and the file has the size of the pixels.
-    given = f"{sorted(options.items())} {jnp.result_type(float)} {frame.file} {vertax.__version__}"
-    digest = hashlib.sha256(pixels + given.encode()).hexdigest()
-    file = Path(cache) / f"{digest[:32]}.npz"
+    given = f"{sorted(parts.items())} {jnp.result_type(float)} {frame.file} {vertax.__version__}"
+    name = hashlib.sha256(pixels + given.encode()).hexdigest()
+    file = Path(cache) / f"{name[:32]}.npz"
     if file.exists():
         try:
             return load_module(file, "tensions", InferredTensions, _CLASSES)

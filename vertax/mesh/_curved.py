@@ -1,0 +1,170 @@
+"""Lengths and areas of a tissue on a curved surface."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vertax._base.announce import announced_jit
+from vertax._base.checks import describe
+from vertax._base.tracing import is_concrete
+from vertax.mesh._boundary import AbstractBoundary, Periodic
+from vertax.mesh._topology import Topology, clockwise, take
+from vertax.surfaces import AbstractSurface
+
+# An edge is the chord in space between its ends. A cell is the part of the surface above its polygon in the
+# chart: a fan of triangles (c, a, b) about a centre c, with the planar areas p,
+#
+#     A = Σ p/3 (ρ((a+b)/2) + ρ((c+a)/2) + ρ((c+b)/2)),    ρ = √det(JᵀJ),
+#
+# exact for a ρ that is quadratic in the chart (so the centre changes A by the fourth order only). Sums of
+# areas of triangles in space would have a kink where a triangle vanishes, as at a four-fold vertex.
+#
+# The centre is the mean of the midpoints of the sides, weighted by their squared lengths in the chart: a side
+# that vanishes or appears in a T1 transition does not change it, so A is continuous there.
+
+Segments = tuple[Float[Array, " edges"], ...]
+
+
+def surface_points(
+    surface: AbstractSurface, x: Float[Array, "*shape 2"]
+) -> Float[Array, "*shape 3"]:
+    """Points in space, in the precision of the chart."""
+    return surface.points(x).astype(x.dtype)
+
+
+def tangent_frame(
+    surface: AbstractSurface, x: Float[Array, "n 2"]
+) -> tuple[Float[Array, "n 2 3"], Float[Array, "n 2 2"]]:
+    """Orthonormal tangents e as rows, the first along the first coordinate; and J = e^T R as the matrix R."""
+    u, v = (each.astype(x.dtype) for each in surface.tangents(x))
+    length = jnp.sqrt(jnp.sum(u**2, axis=-1))
+    first = u / length[:, None]
+    along = jnp.sum(v * first, axis=-1)
+    rest = v - along[:, None] * first
+    height = jnp.sqrt(jnp.sum(rest**2, axis=-1))
+    frame = jnp.stack([first, rest / height[:, None]], axis=-2)
+    upper = [jnp.stack([length, along], axis=-1), jnp.stack([0 * height, height], axis=-1)]
+    return frame, jnp.stack(upper, axis=-2)
+
+
+def chord_parts(surface: AbstractSurface, segments: Segments) -> Segments:
+    """The components of the chord of each edge in space."""
+    x, y, dx, dy = segments
+    ends = jnp.stack([jnp.stack([x, x + dx]), jnp.stack([y, y + dy])], axis=-1)
+    first, second = surface_points(surface, ends)
+    chord = second - first
+    return tuple(chord[:, k] for k in range(3))
+
+
+def area_shares(
+    surface: AbstractSurface,
+    topology: Topology,
+    boundary: AbstractBoundary,
+    segments: Segments,
+) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
+    """Contributions of each edge to the areas of its left and right cell."""
+    m = topology
+    x, y, dx, dy = segments
+    n_edges, sides = len(x), m.edge_cells.T
+    # Both sides of each edge in one array. (The frame of the right cell is that of its corner at the first
+    # vertex, one slot clockwise.)
+    corners = jnp.concatenate([m.half_edge, clockwise(m.half_edge)])
+    vector = jnp.tile(jnp.stack([dx, dy], axis=-1), (2, 1))
+    raw = jnp.tile(jnp.stack([x, y], axis=-1), (2, 1))
+    start = raw + boundary.translation(take(m.frame, corners))
+    weight = jnp.sum(vector**2, axis=-1, keepdims=True)
+    moments = jnp.concatenate([weight, weight * (start + 0.5 * vector)], axis=-1)
+    sums = jax.ops.segment_sum(moments, sides.ravel(), m.n_cells)
+    centres = sums[:, 1:] / jnp.where(sums[:, :1] > 0, sums[:, :1], 1)
+    # (The exterior has no centre.)
+    centre = centres.at[sides.ravel()].get(mode="fill", fill_value=0)
+    arm = start - centre
+    planar = 0.5 * (arm[:, 0] * vector[:, 1] - arm[:, 1] * vector[:, 0])
+    half = centre + 0.5 * arm
+    places = [raw[:n_edges] + 0.5 * vector[:n_edges], half, half + 0.5 * vector]
+    density = surface.density(jnp.concatenate(places)).astype(x.dtype)
+    middle, first, second = jnp.split(density, [n_edges, 3 * n_edges])
+    shares = planar * (jnp.tile(middle, 2) + first + second) / 3
+    return shares[:n_edges], -shares[n_edges:]
+
+
+def check_surface(
+    surface: AbstractSurface,
+    vertices: Float[Array, "vertices 2"],
+    boundary: AbstractBoundary,
+    arcs: bool,
+) -> None:
+    """Raise an error unless a tissue can lie on a surface. Values are checked if they are concrete.
+
+    **Raises:**
+
+    - `TypeError` for an object that is not a surface.
+    - `ValueError` for a tissue with arcs, vertices outside of the chart, points that are not finite, or a
+        surface with another period than the box.
+    """
+    if not isinstance(surface, AbstractSurface):
+        raise TypeError(
+            "Argument `surface` must be a surface, e.g. vertax.surfaces.Cylinder(3.0), or None, but is "
+            f"{describe(surface)}."
+        )
+    if arcs:
+        raise ValueError(
+            "Argument `surface` must be None in a tissue with arcs: edges on a surface are straight chords. "
+            "Make the tissue without `angles`."
+        )
+    if not all(map(is_concrete, jax.tree.leaves((surface, vertices, boundary)))):
+        return
+    surface.check(vertices)
+    points, density = _sampled(surface, vertices)
+    if not (np.isfinite(points).all() and np.isfinite(density).all()):
+        raise ValueError(
+            "Argument `surface` must have finite points and tangents below all vertices, but has NaN or "
+            "infinity."
+        )
+    if not isinstance(boundary, Periodic):
+        return
+    lattice = np.asarray(boundary.lattice)
+    size = np.sqrt(np.abs(np.linalg.det(lattice)))
+    for k, vector in enumerate(boundary.lattice):
+        moved, changed = _sampled(surface, vertices + vector)
+        step = moved - points
+        unequal = np.abs(step - step[:1]).max() / size + np.abs(changed / density - 1).max()
+        if unequal > _PERIOD_TOLERANCE[vertices.dtype.itemsize > 4]:
+            raise ValueError(
+                "Argument `surface` must have the period of the box, but along lattice vector "
+                f"{k}, {lattice[k].round(6).tolist()}, its points move by different vectors (relative "
+                f"difference {unequal:.1g}). A cylinder of radius R needs a box of width 2πR, a periodic "
+                "HeightMap a box of the size of its picture."
+            )
+
+
+_PERIOD_TOLERANCE = (1e-3, 1e-6)
+"""Largest relative difference between the points of two periods, in 32 and 64 bits."""
+
+
+def _sampled(
+    surface: AbstractSurface, x: Float[Array, "vertices 2"]
+) -> tuple[np.ndarray, np.ndarray]:
+    return jax.tree.map(np.asarray, _points_and_density(surface, x))
+
+
+@announced_jit
+def _points_and_density(
+    surface: AbstractSurface, x: Float[Array, "vertices 2"]
+) -> tuple[Float[Array, "vertices 3"], Float[Array, " vertices"]]:
+    return surface.points(x), surface.density(x)
+
+
+def check_planar(what: str, tissue: Any) -> None:
+    """Raise a `ValueError` for a tissue on a surface; `what` names the calculation."""
+    surface = getattr(tissue, "surface", None)
+    if surface is not None:
+        raise ValueError(
+            f"Argument `tissue` must be planar for {what}, but lies on a surface "
+            f"({type(surface).__name__}). For the tissue in the chart call tissue.with_surface(None)."
+        )

@@ -1,0 +1,99 @@
+"""The abstract surface: a map from the chart to space."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class AbstractSurface(eqx.Module):
+    r"""A surface in space, $r: \mathbb R^2 \to \mathbb R^3$.
+
+    The vertices of a tissue are coordinates in the chart (the plane). Subclass it, put the parameters into
+    fields and write `points`:
+
+    ```python
+    class Saddle(vx.surfaces.AbstractSurface):
+        height: float
+
+        def points(self, x):
+            return jnp.concatenate([x, self.height * x[..., :1] * x[..., 1:]], axis=-1)
+    ```
+
+    `points` must have two continuous derivatives (a relaxation uses the second ones), and act on each point
+    alone. It must not contain a `jax.custom_vjp`.
+    """
+
+    @abc.abstractmethod
+    def points(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape 3"]:
+        """Points of space, $r(x)$, in units of length.
+
+        **Arguments:**
+
+        - `x`, shape `(…, 2)`: coordinates in the chart.
+        """
+
+    def check(self, x: Float[Array, "*shape 2"]) -> None:
+        """Raise a `ValueError` for points outside of the chart; by default every point is inside.
+
+        **Arguments:**
+
+        - `x`, shape `(…, 2)`: coordinates in the chart, concrete.
+        """
+
+    def jacobian(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape 3 2"]:
+        r"""The tangents $J = \partial r / \partial x$, one column for each coordinate.
+
+        **Arguments:**
+
+        - `x`, shape `(…, 2)`: coordinates in the chart.
+        """
+        return jnp.stack(self.tangents(x), axis=-1)
+
+    def metric(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2 2"]:
+        """The metric $g = J^T J$: a step $dx$ in the chart has the squared length $dx^T g dx$ in space.
+
+        **Arguments:**
+
+        - `x`, shape `(…, 2)`: coordinates in the chart.
+        """
+        u, v = self.tangents(x)
+        uu, uv, vv = (jnp.sum(a * b, axis=-1) for a, b in ((u, u), (u, v), (v, v)))
+        return jnp.stack([jnp.stack([uu, uv], axis=-1), jnp.stack([uv, vv], axis=-1)], axis=-2)
+
+    def density(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
+        r"""Area in space per area in the chart, $\sqrt{\det g}$.
+
+        **Arguments:**
+
+        - `x`, shape `(…, 2)`: coordinates in the chart.
+        """
+        (a, b, c), (p, q, r) = (jnp.moveaxis(each, -1, 0) for each in self.tangents(x))
+        return jnp.sqrt((b * r - c * q) ** 2 + (c * p - a * r) ** 2 + (a * q - b * p) ** 2)
+
+    def tangents(
+        self, x: Float[Array, "*shape 2"]
+    ) -> tuple[Float[Array, "*shape 3"], Float[Array, "*shape 3"]]:
+        """The two columns of `jacobian`.
+
+        **Arguments:**
+
+        - `x`, shape `(…, 2)`: coordinates in the chart.
+        """
+        along = lambda unit: jax.jvp(self.points, (x,), (jnp.broadcast_to(unit, x.shape),))[1]
+        u, v = jax.vmap(along)(jnp.eye(2, dtype=x.dtype))
+        return u, v
+
+
+def density_of_graph(
+    height: Callable[[Array], Array], x: Float[Array, "*shape 2"]
+) -> Float[Array, "*shape"]:
+    """The density of the graph of a function of points, from its two slopes."""
+    along = lambda unit: jax.jvp(height, (x,), (jnp.broadcast_to(unit, x.shape),))[1]
+    p, q = jax.vmap(along)(jnp.eye(2, dtype=x.dtype))
+    return jnp.sqrt(1 + p**2 + q**2)
