@@ -22,6 +22,7 @@ LAYERS = [
     "adjoints",
     "relax",
     "dynamics",
+    "signals",
     "external",
     "mechanics",
     "costs",

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax._base.checks import check_integer, check_number
 from vertax.adjoints._adjoint import frozen
@@ -63,11 +63,29 @@ class PIController(eqx.Module):
         first = 0.1 * (times[1] - times[0]) if self.first_step is None else self.first_step
         return jnp.asarray(first, times.dtype)
 
-    def error(self, halves: Tissue, full: Tissue, order: int) -> Float[Array, ""]:
-        """The error estimate of two half steps, in units of the tolerance."""
+    def error(
+        self,
+        halves: Tissue,
+        full: Tissue,
+        order: int,
+        records: tuple[PyTree[Array], PyTree[Array]] = (None, None),
+    ) -> Float[Array, ""]:
+        """The error estimate of two half steps, in units of the tolerance.
+
+        **Arguments:**
+
+        - `halves`, `full`: the tissue after two half steps, and after the full step.
+        - `order`: the order of the method.
+        - `records`: what an activity records after both, such as concentrations. Their error is relative to
+            the largest entry of each row.
+        """
         difference = jax.tree.map(jnp.subtract, *frozen((halves.configuration, full.configuration)))
-        size = frozen(cell_size(halves)) * self.tolerance
-        return optx.max_norm(difference) / (size * (2**order - 1))
+        error = optx.max_norm(difference) / frozen(cell_size(halves))
+        for one, other in zip(*map(jax.tree.leaves, frozen(records)), strict=True):
+            scale = jnp.max(jnp.abs(one), axis=-1, keepdims=True)
+            relative = jnp.abs(one - other) / jnp.where(scale > 0, scale, 1)
+            error = jnp.maximum(error, jnp.max(relative))
+        return error / (self.tolerance * (2**order - 1))
 
     def next_step(
         self,
