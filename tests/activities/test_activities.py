@@ -146,9 +146,7 @@ class TestSelfPropulsion:
         activity = SelfPropulsion(jnp.linspace(0.1, 1.0, tissue.n_cells), 0.0)
         state = activity.init(tissue, KEY)
         angles = state.angles
-        push, after = activity.drive(
-            state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.1), KEY
-        )
+        push, after = activity.drive(state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.1), KEY)
         assert isinstance(push, Push)
         np.testing.assert_array_equal(after.angles, angles)
         direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
@@ -207,9 +205,7 @@ class TestSelfPropulsion:
         state = activity.init(tissue, KEY)
         for _ in range(40):
             state = activity.finish(state, before, tissue)
-            _, state = activity.drive(
-                state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.05), KEY
-            )
+            _, state = activity.drive(state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.05), KEY)
         np.testing.assert_allclose(jnp.sin(state.angles), 1, atol=0.05)
 
     def test_invalid_arguments_are_rejected(self):

@@ -77,9 +77,7 @@ class AbstractActivity(eqx.Module):
         """The state at the end of a step from `before` to `tissue`, such as after deaths of cells."""
         return state
 
-    def born(
-        self, state: PyTree[Array], tissue: Tissue, pair: Int[Array, "2"]
-    ) -> PyTree[Array]:
+    def born(self, state: PyTree[Array], tissue: Tissue, pair: Int[Array, "2"]) -> PyTree[Array]:
         """The state after a division into the cells `pair`, which hold the inherited state of the mother.
 
         Arrays outside of modules have one entry per cell; fields declare other axes, see
@@ -146,9 +144,7 @@ class Sum(AbstractActivity):
         pairs = zip(self.terms, state, strict=True)
         return tuple(term.finish(s, before, tissue) for term, s in pairs)
 
-    def born(
-        self, state: PyTree[Array], tissue: Tissue, pair: Int[Array, "2"]
-    ) -> PyTree[Array]:
+    def born(self, state: PyTree[Array], tissue: Tissue, pair: Int[Array, "2"]) -> PyTree[Array]:
         """The states of all terms after a division."""
         return tuple(term.born(s, tissue, pair) for term, s in zip(self.terms, state, strict=True))
 

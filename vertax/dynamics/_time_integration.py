@@ -123,9 +123,7 @@ def integrate(
         max_driving_force = None
         if active_energy is not None:
             total_energy += active_energy
-            forces = jax.grad(lambda x: active_energy(before.with_vertices(x)))(before.vertices)
-            largest = jnp.max(jnp.sum(forces**2, axis=-1))
-            max_driving_force = jnp.sqrt(jnp.maximum(largest, jnp.finfo(largest.dtype).tiny))
+            max_driving_force = max_force(active_energy, before)
         potential = IncrementalPotential(
             total_energy,
             dissipation,
@@ -311,6 +309,13 @@ def _finished(evolution: Any, before: Tissue, after: State) -> State:
     after = eqx.tree_at(lambda s: s.drive, after, (inner, key))
     result = first_failure(after.result, finite_record(_record(evolution, after)))
     return eqx.tree_at(lambda s: s.result, after, result)
+
+
+def max_force(active_energy: AbstractEnergy, tissue: Tissue) -> Float[Array, ""]:
+    """The largest force of an active energy on a vertex."""
+    forces = jax.grad(lambda x: active_energy(tissue.with_vertices(x)))(tissue.vertices)
+    largest = jnp.max(jnp.sum(forces**2, axis=-1))
+    return jnp.sqrt(jnp.maximum(largest, jnp.finfo(largest.dtype).tiny))
 
 
 def finite_record(record: PyTree[Array]) -> RESULTS:

@@ -40,6 +40,7 @@ class Exchange(NamedTuple):
     ) -> Float[Array, "species cells"]:
         """The amount that each cell gains per time; the sum over the cells is 0 to rounding."""
         ends = concentrations.at[:, self.cells].get(mode="fill", fill_value=0)
+        diffusion = diffusion.astype(concentrations.dtype)
         flux = diffusion[:, None] * self.conductance * (ends[..., 1] - ends[..., 0])
         gained = jnp.zeros_like(concentrations).at[:, self.cells[:, 0]].add(flux, mode="drop")
         return gained.at[:, self.cells[:, 1]].add(-flux, mode="drop")

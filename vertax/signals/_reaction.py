@@ -122,7 +122,7 @@ def check_rates(reaction: AbstractReaction | None) -> None:
             f"{describe(reaction)}. Write a subclass with the method `__call__`, and pass an instance."
         )
     for path, leaf in jax.tree_util.tree_flatten_with_path(reaction)[0]:
-        if eqx.is_inexact_array_like(leaf):
+        if isinstance(leaf, float) or eqx.is_inexact_array(leaf):
             as_real(f"reaction{jax.tree_util.keystr(path)}", leaf)
 
 

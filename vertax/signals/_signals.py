@@ -196,9 +196,7 @@ class Signals(AbstractActivity):
         energy: Any = material.energy
         if material.activity is not None:
             resistance: Any = dissipation if material.dissipation is None else material.dissipation
-            active, inner = material.activity.drive(
-                state.inner, tissue, resistance, time, dt, key
-            )
+            active, inner = material.activity.drive(state.inner, tissue, resistance, time, dt, key)
             state = SignalState(state.amounts, inner)
             energy = energy if active is None else energy + active
         return energy, state
@@ -309,4 +307,3 @@ def _areas(tissue: Tissue) -> Float[Array, " cells"]:
     """The areas of the cells, 1 for spare slots."""
     areas = tissue.areas
     return jnp.where(tissue.alive, areas, 1) if tissue.topology.spare else areas
-
