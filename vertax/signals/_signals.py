@@ -34,7 +34,8 @@ class SignalState(eqx.Module):
     """The state of [`Signals`][vertax.signals.Signals]."""
 
     amounts: Float[Array, "species cells"]
-    """Amounts (concentration times area) of diluted species, concentrations of the others; 0 in spare slots."""
+    """Amounts (concentration times area) of diluted species, concentrations of the others; 0 in spare slots.
+    """
     inner: PyTree[Array]
     """The state of the activity of a coupled material."""
 
@@ -45,16 +46,16 @@ class Signals(AbstractActivity):
     $$\frac{\mathrm d c_i}{\mathrm d t} = f(c_i, s_i, t)
       + \frac{1}{A_i} \sum_j D \frac{\ell_{ij}}{d_{ij}} (c_j - c_i) - c_i \frac{\dot A_i}{A_i}$$
 
-    with a reaction $f$ that may depend on the geometry $s_i$ of the cell, exchange with neighbours $j$ through
-    edges of length $\ell_{ij}$ between centroids at the distance $d_{ij}$, and dilution. Edges on the outline
-    exchange nothing. Each time step:
+    with a reaction $f$ that may depend on the geometry $s_i$ of the cell, exchange with neighbours $j$
+    through edges of length $\ell_{ij}$ between centroids at the distance $d_{ij}$, and dilution. Edges on the
+    outline exchange nothing. Each time step:
 
     1. Diffrax integrates reaction and exchange in the geometry at the start of the step, with adaptive inner
         steps.
     2. The tissue moves under its energy plus the energy of `couple`.
-    3. Amounts $c_i A_i$ of diluted species stay constant in this motion. Living neighbours share the amount of
-        a cell that vanishes, in proportion to the lengths of their edges. In a division the daughters share it
-        by area.
+    3. Amounts $c_i A_i$ of diluted species stay constant in this motion. Living neighbours share the amount
+        of a cell that vanishes, in proportion to the lengths of their edges. In a division the daughters
+        share it by area.
 
     The splitting error is of first order in the time step; a
     [`PIController`][vertax.dynamics.PIController] limits it. Exchange, dilution, T1 and T2 transitions and
@@ -80,13 +81,13 @@ class Signals(AbstractActivity):
     - `reaction`: the [`AbstractReaction`][vertax.signals.AbstractReaction]; None for exchange only.
     - `diffusion`, shape `(species,)`: $D$, length squared per time.
     - `couple`: a function of the concentrations `(species, cells)` and the tissue at the start of the step
-        (a function, or an `equinox.Module` to differentiate with respect to its fields). It returns an energy,
-        which is added to that of the tissue, or a [`Material`][vertax.dynamics.Material]: its dissipation
-        replaces that of the tissue, and its activity acts too.
+        (a function, or an `equinox.Module` to differentiate with respect to its fields). It returns an
+        energy, which is added to that of the tissue, or a [`Material`][vertax.dynamics.Material]: its
+        dissipation replaces that of the tissue, and its activity acts too.
     - `initial`, shape `(species, cells)` or `(species,)`: the initial concentrations.
-    - `diluted`: whether a change of area dilutes the species; a boolean, or one per species. False for species
-        that are bound to the membrane: their concentration stays constant in the motion of the tissue and is
-        copied in a division.
+    - `diluted`: whether a change of area dilutes the species; a boolean, or one per species. False for
+        species that are bound to the membrane: their concentration stays constant in the motion of the tissue
+        and is copied in a division.
     - `solver`: a solver of Diffrax, `diffrax.Tsit5()` by default. For stiff reactions `diffrax.Kvaerno3()`.
     - `rtol`, `atol`: tolerances of the concentrations in each step of the tissue.
     - `max_steps`: maximum number of inner steps per step of the tissue.
