@@ -15,7 +15,7 @@ import vertax as vx
 from vertax.activities import SelfPropulsion, ThermalNoise
 from vertax.dissipations import EdgeViscosity, SubstrateFriction
 from vertax.dynamics import Material, PIController
-from vertax.energies import AreaElasticity, LineTension, ShapeFactorEnergy
+from vertax.energies import AreaElasticity, LineTension, PerimeterElasticity, ShapeFactorEnergy
 from vertax.signals import AbstractReaction, Signals
 from vertax.signals._exchange import Exchange
 
@@ -319,14 +319,14 @@ class TestTransitions:
         np.testing.assert_allclose(concentrations[1, pair], 3.0, rtol=1e-14)
 
     @pytest.mark.slow
-    def test_amounts_are_constant_through_transitions_and_divisions(self):
-        # Strong noise for T1 transitions, growth for divisions, dying cells for T2 transitions.
+    def test_amounts_are_constant_through_divisions_and_deaths(self):
         def energy(cells):
-            return AreaElasticity(1.0, cells.target_area) + LineTension(0.05)
+            target = cells.target_area
+            return AreaElasticity(10.0, target) + PerimeterElasticity(1.0, 3.6 * jnp.sqrt(target))
 
-        tissue = vx.initialise.free_voronoi(12, key=0).with_capacity(60)
+        tissue = vx.initialise.free_voronoi(8, key=0).with_capacity(40)
         signals = Signals(None, [0.5, 0.0], initial=jnp.array([1.0, 2.0]))
-        cycle = vx.growth.GrowAndDivide(0.5, 1.5, death_rate=0.05, shrinking_time=0.3)
+        cycle = vx.growth.GrowAndDivide(0.5, 1.5, death_rate=0.2, shrinking_time=0.3)
         grown = vx.growth.grow(
             tissue,
             energy,
@@ -334,23 +334,26 @@ class TestTransitions:
             np.linspace(0, 3, 31),
             key=1,
             dissipation=FRICTION,
-            activity=signals + SelfPropulsion(0.6, 1.0),
+            activity=signals,
         )
         areas = jax.vmap(lambda t: t.areas)(grown.frames)
         amounts = jnp.sum(grown.signals * areas[:, None], axis=-1)
         np.testing.assert_allclose(amounts, np.tile(amounts[0], (31, 1)), rtol=1e-12)
         assert jnp.sum(grown.lineage.fate == 1) >= 20
         assert jnp.sum(grown.lineage.fate == 2) >= 1
-        assert (grown.signals[:, :, -1] == 0).all() or grown.tissue.alive[-1]
+        assert (grown.signals[:, :, -1] == 0).all()  # a spare slot
 
+    @pytest.mark.slow
+    def test_amounts_are_constant_through_a_hundred_t1_transitions(self):
+        tissue = random_tissue(30, 0)
+        lattice = tissue.boundary.lattice
         flowing = vx.evolve(
-            random_tissue(30, 0),
-            ShapeFactorEnergy(3.9),
+            tissue,
+            ENERGY,
             FRICTION,
-            np.linspace(0, 6, 31),
-            activity=Signals(None, [0.5], initial=1 + jax.random.uniform(KEY, (1, 30)))
-            + SelfPropulsion(0.6, 1.0),
-            key=0,
+            np.linspace(0, 8, 161),
+            activity=Signals(None, [0.5], initial=1 + jax.random.uniform(KEY, (1, 30))),
+            boundary=lambda time: vx.Periodic(lattice.at[1].add(time * lattice[0])),
             relaxation=NO_CONTACT,
         )
         assert flowing.num_t1 >= 100
