@@ -1,6 +1,7 @@
 """Signals: exchange, dilution, coupling, gradients, transitions and errors."""
 
 import functools
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -22,7 +23,7 @@ from vertax.signals._exchange import Exchange
 FRICTION = SubstrateFriction(1.0)
 ENERGY = ShapeFactorEnergy(3.7)
 KEY = jax.random.key(0)
-EXACT = {"rtol": 1e-10, "atol": 1e-12}
+EXACT: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}
 
 
 class Linear(AbstractReaction):
@@ -70,7 +71,7 @@ def initial_tissue():
 
 def evolve(activity, times=(0.0, 0.2, 0.4), tissue=None, energy=ENERGY, **settings):
     tissue = initial_tissue() if tissue is None else tissue
-    settings = {"relaxation": FIXED_TOPOLOGY} | settings
+    settings: dict[str, Any] = {"relaxation": FIXED_TOPOLOGY} | settings
     return vx.evolve(tissue, energy, FRICTION, list(times), activity=activity, **settings)
 
 
@@ -190,7 +191,11 @@ class TestEvolution:
         couple = lambda c, tissue: Material(
             AreaElasticity(0.0, 1.0), None, SelfPropulsion(0.2 * c[0], 0.5)
         )
-        settings = {"initial": jnp.linspace(0.5, 1, 6)[None], "couple": couple, "diluted": False}
+        settings: dict[str, Any] = {
+            "initial": jnp.linspace(0.5, 1, 6)[None],
+            "couple": couple,
+            "diluted": False,
+        }
         passive = evolve(None).tissue.vertices
         movie = evolve(Signals(None, [0.0], **settings, deterministic=False), key=1)
         assert jnp.max(jnp.abs(movie.tissue.vertices - passive)) > 1e-2
@@ -257,11 +262,11 @@ class TestEvolution:
     @pytest.mark.thorough
     def test_a_checkpoint_continues_bitwise(self, tmp_path):
         signals = Signals(Turnover(0.5), [0.1, 0.2], initial=[1.0, 0.5], couple=Contraction(0.2))
-        whole = evolve(signals, checkpoint=tmp_path / "one.npz")
+        uninterrupted = evolve(signals, checkpoint=tmp_path / "one.npz")
         evolve(signals, (0.0, 0.2), checkpoint=tmp_path / "two.npz")
         continued = evolve(signals, checkpoint=tmp_path / "two.npz")
-        np.testing.assert_array_equal(continued.signals, whole.signals)
-        np.testing.assert_array_equal(continued.tissue.vertices, whole.tissue.vertices)
+        np.testing.assert_array_equal(continued.signals, uninterrupted.signals)
+        np.testing.assert_array_equal(continued.tissue.vertices, uninterrupted.tissue.vertices)
 
     def test_concentrations_are_in_trajectories_and_files(self, tmp_path):
         movie = evolve(Signals(Turnover(0.5), [0.1, 0.2], initial=[1.0, 0.5]))
@@ -378,7 +383,7 @@ class TestErrors:
         ],
     )
     def test_invalid_values_are_rejected(self, settings, match):
-        settings = {
+        settings: dict[str, Any] = {
             "reaction": Turnover(1.0),
             "diffusion": [0.1, 0.1],
             "initial": [1.0, 1.0],
@@ -389,10 +394,10 @@ class TestErrors:
     def test_invalid_types_are_rejected(self, without_type_checks):
         for reaction in (lambda c, cells, time: -c, Turnover):
             with pytest.raises(TypeError, match="`reaction` must be"):
-                Signals(reaction, [0.1], initial=[1.0])
+                Signals(reaction, [0.1], initial=[1.0])  # pyright: ignore[reportArgumentType]
         for couple in (ENERGY, 1.0):
             with pytest.raises(TypeError, match="`couple` must be a function"):
-                Signals(None, [0.1], initial=[1.0], couple=couple)
+                Signals(None, [0.1], initial=[1.0], couple=couple)  # pyright: ignore[reportArgumentType]
         with pytest.raises(TypeError, match="`solver` must be"):
             Signals(None, [0.1], initial=[1.0], solver="stiff")
 
@@ -402,7 +407,7 @@ class TestErrors:
                 return concentrations[0]
 
         class Foreign(AbstractReaction):
-            def __call__(self, concentrations, cells, time):
+            def __call__(self, concentrations, cells, time) -> Any:
                 return np.sin(np.asarray(concentrations))
 
         with pytest.raises(ValueError, match=r"`Flat` must return .*shape \(1, 6\).*\(6,\)"):
@@ -411,8 +416,9 @@ class TestErrors:
             evolve(Signals(Foreign(), [0.1], initial=[1.0]))
         with pytest.raises(ValueError, match=r"`initial` must have one entry for each of 6 cells"):
             evolve(Signals(None, [0.1], initial=jnp.ones((1, 5))))
+        number: Any = lambda c, tissue: c
         with pytest.raises(TypeError, match="`couple` must return an energy"):
-            evolve(Signals(None, [0.1], initial=[1.0], couple=lambda c, tissue: c))
+            evolve(Signals(None, [0.1], initial=[1.0], couple=number))
 
     def test_noise_in_growth_needs_a_dissipation(self):
         cycle = vx.growth.GrowAndDivide(0.1, 2.0)

@@ -111,7 +111,7 @@ class Signals(AbstractActivity):
     rtol: float | Float[Array, ""]
     atol: float | Float[Array, ""]
     max_steps: int = eqx.field(static=True)
-    deterministic: bool = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
+    deterministic: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -159,7 +159,8 @@ class Signals(AbstractActivity):
         check_number("rtol", rtol, above=0)
         check_number("atol", atol, above=0)
         check_integer("max_steps", max_steps, at_least=1)
-        self.reaction, self.couple, self.deterministic = reaction, couple, deterministic
+        self.reaction, self.couple = reaction, couple
+        self.deterministic = deterministic  # pyright: ignore[reportIncompatibleVariableOverride]
         self.solver = diffrax.Tsit5() if solver is None else solver
         self.rtol, self.atol, self.max_steps = rtol, atol, max_steps
 
@@ -278,7 +279,7 @@ class Signals(AbstractActivity):
         exchange = Exchange.of(tissue)
         cells = None if self.reaction is None else self.reaction.sense(tissue)
 
-        def rates(local_time: Array, amounts: Array, _: None) -> Array:
+        def rates(local_time: Any, amounts: Any, _: Any) -> Array:
             c = amounts / relative_areas
             reacting = reaction_rates(self.reaction, c, cells, time + local_time, tissue)
             flux = exchange.flux(c, self.diffusion / unit)
