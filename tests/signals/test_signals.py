@@ -71,8 +71,8 @@ def initial_tissue():
 
 def evolve(activity, times=(0.0, 0.2, 0.4), tissue=None, energy=ENERGY, **settings):
     tissue = initial_tissue() if tissue is None else tissue
-    settings: dict[str, Any] = {"relaxation": FIXED_TOPOLOGY} | settings
-    return vx.evolve(tissue, energy, FRICTION, list(times), activity=activity, **settings)
+    options: dict[str, Any] = {"relaxation": FIXED_TOPOLOGY} | settings
+    return vx.evolve(tissue, energy, FRICTION, list(times), activity=activity, **options)
 
 
 class TestExchange:
@@ -128,7 +128,8 @@ class TestExchange:
             [0.0, 0.0],
             initial=jnp.array([1.0, 0.5]),
             solver=diffrax.Kvaerno3(),
-            **(EXACT | {"rtol": 1e-8}),
+            rtol=1e-8,
+            atol=1e-12,
             max_steps=2000,
         )
         exact = expm(0.5 * matrix) @ np.array([1.0, 0.5])
@@ -191,18 +192,18 @@ class TestEvolution:
         couple = lambda c, tissue: Material(
             AreaElasticity(0.0, 1.0), None, SelfPropulsion(0.2 * c[0], 0.5)
         )
-        settings: dict[str, Any] = {
+        arguments: dict[str, Any] = {
             "initial": jnp.linspace(0.5, 1, 6)[None],
             "couple": couple,
             "diluted": False,
         }
         passive = evolve(None).tissue.vertices
-        movie = evolve(Signals(None, [0.0], **settings, deterministic=False), key=1)
+        movie = evolve(Signals(None, [0.0], **arguments, deterministic=False), key=1)
         assert jnp.max(jnp.abs(movie.tissue.vertices - passive)) > 1e-2
         with pytest.raises(ValueError, match="deterministic=False"):
-            evolve(Signals(None, [0.0], **settings))
+            evolve(Signals(None, [0.0], **arguments))
         with pytest.raises(ValueError, match="`key` is missing"):
-            evolve(Signals(None, [0.0], **settings, deterministic=False))
+            evolve(Signals(None, [0.0], **arguments, deterministic=False))
 
     @pytest.mark.thorough
     def test_gradients_match_finite_differences(self):
@@ -383,13 +384,13 @@ class TestErrors:
         ],
     )
     def test_invalid_values_are_rejected(self, settings, match):
-        settings: dict[str, Any] = {
+        arguments: dict[str, Any] = {
             "reaction": Turnover(1.0),
             "diffusion": [0.1, 0.1],
             "initial": [1.0, 1.0],
         } | settings
         with pytest.raises(ValueError, match=match):
-            Signals(settings.pop("reaction"), settings.pop("diffusion"), **settings)
+            Signals(arguments.pop("reaction"), arguments.pop("diffusion"), **arguments)
 
     def test_invalid_types_are_rejected(self, without_type_checks):
         for reaction in (lambda c, cells, time: -c, Turnover):
