@@ -29,7 +29,8 @@ class PIController(eqx.Module):
     Step doubling with a PI controller (Hairer & Wanner, Solving Ordinary Differential Equations II, IV.2):
 
     1. Take one step $\Delta t$ to $x_1$, and two steps $\Delta t / 2$ to $x_2$.
-    2. Estimate the error of $x_2$ by $\max |x_2 - x_1| / (2^p - 1)$ for a method of order $p$.
+    2. Estimate the error of $x_2$ by $\max |x_2 - x_1| / (2^p - 1)$ for a method of order $p$, relative to
+        the size of a cell; of concentrations relative to the largest one.
     3. If the error exceeds the tolerance, or a relaxation does not converge, reject the step and repeat it
         with a smaller $\Delta t$. Otherwise continue from $x_2$.
     4. Compute the next $\Delta t$ from the last two errors.
@@ -72,12 +73,7 @@ class PIController(eqx.Module):
     ) -> Float[Array, ""]:
         """The error estimate of two half steps, in units of the tolerance.
 
-        **Arguments:**
-
-        - `halves`, `full`: the tissue after two half steps, and after the full step.
-        - `order`: the order of the method.
-        - `records`: what an activity records after both, such as concentrations. Their error is relative to
-            the largest entry of each row.
+        The error of the `records` of an activity is relative to the largest entry of each row.
         """
         difference = jax.tree.map(jnp.subtract, *frozen((halves.configuration, full.configuration)))
         error = optx.max_norm(difference) / frozen(cell_size(halves))

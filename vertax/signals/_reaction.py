@@ -49,13 +49,8 @@ class AbstractReaction(eqx.Module):
             return -self.rate * concentrations
     ```
 
-    For a reaction that depends on other properties of the cells, such as their stress, override `sense`. It
-    is called once in each time step:
-
-    ```python
-    def sense(self, tissue):
-        return vx.mechanics.cell_stress(tissue, self.energy)
-    ```
+    For a reaction that depends on other properties of the cells, such as their stress, override `sense`,
+    which is called once in each time step.
     """
 
     def __check_init__(self):

@@ -62,15 +62,6 @@ class Signals(AbstractActivity):
     division keep the total amount constant up to rounding.
 
     ```python
-    class Erk(vx.signals.AbstractReaction):
-        rate: float
-
-        def __call__(self, concentrations, cells, time):
-            return self.rate * (cells.areas - concentrations)
-
-    def contract(concentrations, tissue):
-        return vx.energies.AreaElasticity(1.0, 1 - 0.3 * concentrations[0])
-
     erk = vx.signals.Signals(Erk(1.0), diffusion=[0.1], couple=contract, initial=[0.5])
     movie = vx.evolve(tissue, energy, friction, times, activity=erk)
     movie.signals  # (times, species, cells)
@@ -212,13 +203,12 @@ class Signals(AbstractActivity):
 
     def finish(self, state: SignalState, before: Tissue, tissue: Tissue) -> SignalState:
         """The state after a step: the amounts of cells that vanished are in their neighbours."""
-        amounts, inner = state.amounts, state.inner
+        amounts = state.amounts
         if tissue.topology.spare:
             shared = redistributed(amounts, before, tissue)
             amounts = jnp.where(self._is_diluted, shared, jnp.where(tissue.alive, amounts, 0))
         activity = self._material(state, before).activity
-        if activity is not None:
-            inner = activity.finish(inner, before, tissue)
+        inner = None if activity is None else activity.finish(state.inner, before, tissue)
         return SignalState(amounts, inner)
 
     def born(self, state: SignalState, tissue: Tissue, pair: Int[Array, "2"]) -> SignalState:
@@ -229,9 +219,8 @@ class Signals(AbstractActivity):
         shared = jnp.where(self._is_diluted, shared, first[:, None])
         state = SignalState(state.amounts.at[:, pair].set(shared), state.inner)
         activity = self._material(state, tissue).activity
-        if activity is None:
-            return state
-        return SignalState(state.amounts, activity.born(state.inner, tissue, pair))
+        inner = None if activity is None else activity.born(state.inner, tissue, pair)
+        return SignalState(state.amounts, inner)
 
     def record(self, state: SignalState, tissue: Tissue) -> Float[Array, "species cells"]:
         """The concentrations, 0 in spare slots."""
