@@ -106,7 +106,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     table |= {"growth_of_theory": theory.real, "frequency_of_theory": -theory.imag}
     folder.save_table("modes", table)
     folder.save_figure("waves", plot_waves(table, times, erk[:, np.argsort(x)], width))
-    top = int(np.argmax(np.abs(amplitudes[:, early][:, -1])))
+    top = int(np.argmax(growth))
     return {
         "wavelength": float(width / numbers[top]),
         "wavelength_of_theory": float(width / numbers[np.argmax(theory.real)]),
