@@ -101,7 +101,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     early = times <= config.duration / 3
     logarithms = np.unwrap(np.angle(amplitudes[:, early])), np.log(np.abs(amplitudes[:, early]))
     frequency, growth = (np.polyfit(times[early], y.T, 1)[0] for y in logarithms)
-    theory = np.array(waves)
+    theory: Any = np.array(waves)
     table = {"mode": numbers, "wavelength": width / numbers, "growth": growth, "frequency": -frequency}
     table |= {"growth_of_theory": theory.real, "frequency_of_theory": -theory.imag}
     folder.save_table("modes", table)
@@ -121,6 +121,7 @@ def right_going(config: Config, modulus: float, q: float) -> tuple[complex, np.n
     elastic, active = -(q**2) * modulus / config.friction, q**2 * config.stiffness / config.friction
     decay = -1 - config.diffusion * q**2
     rows = [[elastic, 0, active], [config.activation, decay, 0], [0, -config.contraction, -1]]
+    values: Any
     values, vectors = np.linalg.eig(np.array(rows))
     best = np.argmax(np.where(values.imag <= 0, values.real, -np.inf))
     return values[best], vectors[:, best] / vectors[1, best]

@@ -29,7 +29,7 @@ class Config(runs.ExperimentConfig):
     """Largest number of cells at a time."""
     duration: float = Field(default=85.0, gt=0)
     """Duration of growth."""
-    frames: int = Field(default=34, ge=2)
+    frames: int = Field(default=34, ge=3)
     """Frames after the first one."""
     substeps: int = Field(default=5, ge=1)
     """Steps per frame."""

@@ -137,7 +137,7 @@ SHORT = {
     ],
     "proliferation": ["duration=4", "frames=4", "room=12", "divisions=2", "animation=false"],
     "erk_waves": ["columns=6", "duration=0.6", "frames=12", "substeps=1"],
-    "turing_growth": ["founders=4", "room=6", "duration=1", "frames=2", "animation=false"],
+    "turing_growth": ["founders=4", "room=8", "duration=1", "frames=3", "animation=false"],
     "tensions_from_movie": ["substeps=10", "cluster.n_cells=7", "cluster.frames=3"],
     "timed_elongation": [
         "n_cells=5",

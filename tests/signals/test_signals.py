@@ -235,6 +235,18 @@ class TestEvolution:
             assert jnp.vdot(slopes[name], direction[name]) == pytest.approx(difference, rel=1e-7)
 
     @pytest.mark.thorough
+    def test_rates_are_parameters_of_inverse_problems(self):
+        signals = Signals(
+            Turnover(jnp.array(0.5)), [0.1, 0.2], initial=[1.0, 0.5], couple=Contraction(0.2)
+        )
+        material = Material(ENERGY, FRICTION, signals)
+        cost = vx.costs.CellAreas(jnp.ones(6))
+        response = vx.Evolution(FRICTION, [0.0, 0.2], relaxation=FIXED_TOPOLOGY)
+        problem = vx.InverseProblem(initial_tissue(), material, cost, response=response)
+        evaluation = problem.value_and_gradient(material)
+        assert abs(evaluation.gradient.activity.reaction.rate) > 1e-6
+
+    @pytest.mark.thorough
     def test_a_batch_gives_the_results_of_its_members(self):
         run = lambda initial: evolve(
             Signals(Turnover(0.5), [0.1, 0.2], initial=initial, couple=Contraction(0.2)),

@@ -51,7 +51,7 @@ class AbstractActivity(eqx.Module):
         self,
         state: PyTree[Array],
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,
@@ -62,14 +62,14 @@ class AbstractActivity(eqx.Module):
 
         - `state`: the state returned by `init` or by the previous step.
         - `tissue`: the tissue at the start of the step.
-        - `dissipation`: the dissipation of the tissue.
+        - `dissipation`: the dissipation of the tissue; None in a growth without one.
         - `time`, `dt`: the start time of the step and its length.
         - `key`: the key for random numbers.
         """
 
     def step_dissipation(
-        self, state: PyTree[Array], tissue: Tissue, dissipation: AbstractDissipation
-    ) -> AbstractDissipation:
+        self, state: PyTree[Array], tissue: Tissue, dissipation: AbstractDissipation | None
+    ) -> AbstractDissipation | None:
         """The dissipation during one step, after `drive`; by default that of the tissue."""
         return dissipation
 
@@ -118,7 +118,7 @@ class Sum(AbstractActivity):
         self,
         state: PyTree[Array],
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,
@@ -132,8 +132,8 @@ class Sum(AbstractActivity):
         return energy, tuple(state for _, state in results)
 
     def step_dissipation(
-        self, state: PyTree[Array], tissue: Tissue, dissipation: AbstractDissipation
-    ) -> AbstractDissipation:
+        self, state: PyTree[Array], tissue: Tissue, dissipation: AbstractDissipation | None
+    ) -> AbstractDissipation | None:
         """The dissipation of the last term that replaces it."""
         for term, s in zip(self.terms, state, strict=True):
             dissipation = term.step_dissipation(s, tissue, dissipation)

@@ -75,7 +75,7 @@ class SelfPropulsion(AbstractActivity):
         self,
         state: PropulsionState,
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,

@@ -56,7 +56,7 @@ class FluctuatingTensions(AbstractActivity):
         self,
         state: TensionState,
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,

@@ -195,8 +195,8 @@ class Signals(AbstractActivity):
         return energy, state
 
     def step_dissipation(
-        self, state: SignalState, tissue: Tissue, dissipation: AbstractDissipation
-    ) -> AbstractDissipation:
+        self, state: SignalState, tissue: Tissue, dissipation: AbstractDissipation | None
+    ) -> AbstractDissipation | None:
         """The dissipation of a coupled material, if it has one."""
         coupled = self._material(state, tissue).dissipation
         return dissipation if coupled is None else coupled
