@@ -212,7 +212,7 @@ class TestEvolution:
         def loss(p):
             signals = Signals(
                 Turnover(p["rate"]),
-                p["diffusion"],
+                [*p["diffusion"]],
                 initial=p["initial"],
                 couple=Contraction(p["k"]),
                 **EXACT,

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.checks import as_real, check_integer, check_number, describe
 from vertax._base.extras import requires_extra
+from vertax._base.tracing import is_concrete
 from vertax.activities import AbstractActivity, Push
 from vertax.dissipations import AbstractDissipation
 from vertax.dynamics import Material
@@ -121,8 +122,8 @@ class Signals(AbstractActivity):
         with requires_extra("signals", "Signals"):
             import diffrax
         check_rates(reaction)
-        self.diffusion = as_real("diffusion", diffusion)
-        self.initial = as_real("initial", initial)
+        self.diffusion = _as_array("diffusion", diffusion)
+        self.initial = _as_array("initial", initial)
         check_number("diffusion", self.diffusion, at_least=0, many=True)
         check_number("initial", self.initial, at_least=0, many=True)
         if self.initial.ndim not in (1, 2) or self.diffusion.shape != self.initial.shape[:1]:
@@ -292,6 +293,12 @@ class Signals(AbstractActivity):
         if tissue.topology.spare:  # (NaN would mark spare slots too)
             amounts = jnp.where(tissue.alive, amounts, 0)
         return self._from_amounts(amounts, tissue)
+
+
+def _as_array(name: str, value: Any) -> Float[Array, "..."]:
+    """An array of finite real numbers, also from a sequence that contains tracers."""
+    concrete = all(map(is_concrete, jax.tree.leaves(value)))
+    return as_real(name, value if concrete else jnp.asarray(value))
 
 
 def _areas(tissue: Tissue) -> Float[Array, " cells"]:
