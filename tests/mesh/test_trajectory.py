@@ -208,7 +208,7 @@ class TestSequence:
         with pytest.raises(ValueError, match=r"values of those before it \(time\).*has: cost"):
             trajectory.append(random_tissue(4), cost=1.0)
         with pytest.raises(ValueError, match="Value `time` must hold numbers"):
-            trajectory.append(random_tissue(4), time="late")  # pyright: ignore[reportArgumentType]
+            trajectory.append(random_tissue(4), time=True)
         with pytest.raises(ValueError, match=r"`time` must have the shape .*\(\), but has \(2,\)"):
             trajectory.append(random_tissue(4), time=jnp.ones(2))
         batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_tissue(4))
