@@ -40,6 +40,7 @@ TOGETHER = (
     ("transitions", "growth"),
     ("adjoints", "external"),
     ("dynamics", "activities"),
+    ("signals",),
     ("costs", "mechanics"),
     ("relax",),
     ("relax/test_free_equilibrium.py", "relax/test_relaxation.py"),

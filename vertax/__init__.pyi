@@ -17,6 +17,7 @@ from . import (
     plotting as plotting,
     relax as relax,
     runs as runs,
+    signals as signals,
     solvers as solvers,
     surfaces as surfaces,
     tensions as tensions,

@@ -12,6 +12,7 @@ from helpers import FIXED_TOPOLOGY, central_difference, dense_hessian, relaxed
 
 import vertax as vx
 from vertax.activities import FluctuatingTensions, Push, SelfPropulsion, ThermalNoise
+from vertax.activities._tensions import TensionState
 from vertax.dissipations import PerimeterViscosity, SubstrateFriction
 from vertax.energies import ShapeFactorEnergy
 
@@ -143,12 +144,11 @@ class TestSelfPropulsion:
     def test_vertex_forces_sum_to_cell_forces(self, make):
         tissue = make()
         activity = SelfPropulsion(jnp.linspace(0.1, 1.0, tissue.n_cells), 0.0)
-        angles, _ = state = activity.init(tissue, KEY)
-        push, (after, _) = activity.drive(
-            state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.1), KEY
-        )
+        state = activity.init(tissue, KEY)
+        angles = state.angles
+        push, after = activity.drive(state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.1), KEY)
         assert isinstance(push, Push)
-        np.testing.assert_array_equal(after, angles)
+        np.testing.assert_array_equal(after.angles, angles)
         direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
         total = jnp.sum(activity.force[:, None] * direction, axis=0)
         np.testing.assert_allclose(push.force.sum(axis=0), total, atol=1e-12)
@@ -167,11 +167,11 @@ class TestSelfPropulsion:
                 _, state = activity.drive(
                     state, tissue, FRICTION, jnp.array(0.0), jnp.array(dt), key
                 )
-                return state, state[0]
+                return state, state.angles
 
             state = activity.init(tissue, first)
             _, angles = jax.lax.scan(step, state, jax.random.split(rest, n))
-            return jnp.concatenate([state[0][None], angles])
+            return jnp.concatenate([state.angles[None], angles])
 
         angles = np.asarray(jax.vmap(walk)(jax.random.split(KEY, 200)))
         correlation = np.cos(angles - angles[:, :1]).mean(axis=(0, 2))
@@ -193,7 +193,7 @@ class TestSelfPropulsion:
             key=3,
             relaxation=FIXED_TOPOLOGY,
         )
-        angles, _ = movie.drive[0]
+        angles = movie.drive[0].angles
         force = 0.3 * np.stack([np.cos(angles), np.sin(angles)], axis=-1).sum(axis=0)
         displacement = movie.tissue.vertices.mean(axis=0) - tissue.vertices.mean(axis=0)
         np.testing.assert_allclose(displacement, 0.1 * force / (2.0 * tissue.n_vertices), atol=1e-9)
@@ -201,13 +201,12 @@ class TestSelfPropulsion:
     def test_directions_align_with_velocity(self):
         tissue = solid()[0]
         activity = SelfPropulsion(0.1, 0.0, alignment=5.0)
-        angles, _ = activity.init(tissue, KEY)
-        previous = tissue.vertices - jnp.array([0.0, 0.01])
+        before = tissue.with_vertices(tissue.vertices - jnp.array([0.0, 0.01]))
+        state = activity.init(tissue, KEY)
         for _ in range(40):
-            _, (angles, _) = activity.drive(
-                (angles, previous), tissue, FRICTION, jnp.array(0.0), jnp.array(0.05), KEY
-            )
-        np.testing.assert_allclose(jnp.sin(angles), 1, atol=0.05)
+            state = activity.finish(state, before, tissue)
+            _, state = activity.drive(state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.05), KEY)
+        np.testing.assert_allclose(jnp.sin(state.angles), 1, atol=0.05)
 
     def test_invalid_arguments_are_rejected(self):
         with pytest.raises(ValueError, match="`force`"):
@@ -227,7 +226,7 @@ def test_tension_autocorrelation_decays_exponentially():
         tensions, after = activity.drive(
             state, tissue, FRICTION, jnp.array(0.0), jnp.array(0.3), second
         )
-        return state, after, tensions.tension
+        return state.relative, after.relative, tensions.tension
 
     before, after, tension = map(np.asarray, jax.vmap(pair)(jax.random.split(KEY, 600)))
     np.testing.assert_allclose(tension, 0.2 * after)
@@ -241,10 +240,10 @@ def test_tensions_have_the_right_variance_for_short_steps_in_float32():
     # 1 - exp(-dt / τ)² rounds to 0 for this step.
     short = jnp.asarray(2e-8, jnp.float32)
     activity = FluctuatingTensions(jnp.float32(1.0), jnp.float32(1.0))
-    start = jnp.zeros(500, jnp.float32)
-    _, after = activity.drive(start, solid()[0], FRICTION, 0 * short, short, KEY)
-    assert after.dtype == jnp.float32
-    assert np.std(after) == pytest.approx(np.sqrt(2 * 2e-8), rel=0.1)
+    start = TensionState(jnp.zeros(500, jnp.float32))
+    _, state = activity.drive(start, solid()[0], FRICTION, 0 * short, short, KEY)
+    assert state.relative.dtype == jnp.float32
+    assert np.std(state.relative) == pytest.approx(np.sqrt(2 * 2e-8), rel=0.1)
 
 
 @pytest.mark.thorough
@@ -259,6 +258,6 @@ def test_custom_activity_can_be_added():
     movie = evolve(Wind(0.4) + FluctuatingTensions(0.0, 1.0), [0.0, 0.5, 1.0])
     # All vertices drift with the velocity force / friction.
     np.testing.assert_allclose(movie.tissue.vertices - tissue.vertices, 0.2, atol=1e-8)
-    assert movie.drive[0][1].shape == (36,)
+    assert movie.drive[0][1].relative.shape == (36,)
     with pytest.raises(TypeError):
         _ = Wind(1.0) + 1  # pyright: ignore[reportOperatorIssue]

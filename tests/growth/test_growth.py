@@ -56,6 +56,39 @@ def test_cells_divide_and_the_tissue_stays_valid(grown):
 
 
 @pytest.mark.thorough
+def test_daughters_inherit_the_states_of_activities(without_type_checks):
+    activity = vx.activities.SelfPropulsion(0.02, 0.1, 0.5) + vx.activities.FluctuatingTensions(
+        0.01, 1
+    )
+    grown = grow(
+        founders(),
+        energy_of,
+        GrowAndDivide(0.2, 1.5),
+        jnp.linspace(0, 2, 5),
+        key=1,
+        dissipation=FRICTION,
+        activity=activity,
+        relaxation=FIXED_TOPOLOGY,
+    )
+    assert grown.n_alive[-1] > 4
+    assert grown.signals is None
+    change = vx.transitions.divide(founders(), 2)
+    state = activity.init(founders(), jax.random.key(0))
+    propulsion, tensions = change.inherited(state, axis="cells")
+    assert propulsion.angles[4] == state[0].angles[2]
+    np.testing.assert_array_equal(tensions.relative, state[1].relative[change.edges])
+    with pytest.raises(TypeError, match="`activity` must be"):
+        grow(
+            founders(),
+            energy_of,
+            GrowAndDivide(0.2, 1.5),
+            [0.0, 1.0],
+            key=1,
+            activity=energy_of,  # pyright: ignore[reportArgumentType]
+        )
+
+
+@pytest.mark.thorough
 def test_failed_divisions_and_deaths_are_counted():
     tissue, times = vx.initialise.free_voronoi(2, key=0).with_capacity(5), jnp.linspace(0, 10, 9)
     run = lambda cycle: grow(

@@ -209,7 +209,9 @@ class TestSequence:
             trajectory.append(single(random_tissue(4)), time=1.0)
         with pytest.raises(ValueError, match=r"values of those before it \(time\).*has: cost"):
             trajectory.append(random_tissue(4), cost=1.0)
-        with pytest.raises(ValueError, match="Value `time` must be one number"):
+        with pytest.raises(ValueError, match="Value `time` must hold numbers"):
+            trajectory.append(random_tissue(4), time=True)
+        with pytest.raises(ValueError, match=r"`time` must have the shape .*\(\), but has \(2,\)"):
             trajectory.append(random_tissue(4), time=jnp.ones(2))
         batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_tissue(4))
         with pytest.raises(ValueError, match="single tissue"):

@@ -66,6 +66,7 @@ SLOW = {
     "docs/performance.md",
     "docs/pictures.md",
     "docs/posteriors.md",
+    "docs/signals.md",
     "docs/topologies.md",
     "docs/tyssue.md",
 }

@@ -59,6 +59,11 @@ CASES = {
     "first order": evolved(),
     "adaptive": evolved(stepsize_controller=vx.dynamics.PIController()),
     "noise": evolved(activity=vx.activities.ThermalNoise(0.1), key=0),
+    "signals": evolved(
+        activity=vx.signals.Signals(
+            None, [0.1], initial=[1.0], couple=lambda c, tissue: AreaElasticity(1.0, c[0])
+        )
+    ),
     "modulus": lambda t: mechanics.elastic_tensor(t, ENERGY),
     "modes": lambda t: mechanics.modes(t, ENERGY, 3),
     "structure": gradient_of(costs.IndexAwareStructural(TARGET)),

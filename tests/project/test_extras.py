@@ -24,6 +24,7 @@ EXTRAS = {
     "blackjax": "bayes",
     "arviz": "bayes",
     "numpyro": "bayes",
+    "diffrax": "signals",
 }
 
 
@@ -57,6 +58,10 @@ for name in ("plot_tissue", "plotting", "bayes"):
     except ImportError as error:
         print(error)
 try:
+    vx.signals.Signals(None, [0.1], initial=[1.0])
+except ImportError as error:
+    print(error)
+try:
     vx.io.read_image("README.md")
 except ImportError as error:
     print(error)
@@ -64,12 +69,13 @@ except ImportError as error:
     process = python(code, hide=EXTRAS)
     assert process.returncode == 0, process.stderr
     lines = process.stdout.splitlines()
-    assert len(lines) == 4
+    assert len(lines) == 5
     assert all(
         line.startswith('Drawing needs matplotlib: pip install -e ".[plot]"') for line in lines[:2]
     )
     assert lines[2].startswith('Sampling a posterior needs blackjax: pip install -e ".[bayes]"')
-    assert lines[3].startswith('Reading pictures needs pillow: pip install -e ".[image]"')
+    assert lines[3].startswith('Signals needs diffrax: pip install -e ".[signals]"')
+    assert lines[4].startswith('Reading pictures needs pillow: pip install -e ".[image]"')
 
 
 @pytest.mark.parametrize(

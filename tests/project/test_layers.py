@@ -23,6 +23,7 @@ LAYERS = [
     "adjoints",
     "relax",
     "dynamics",
+    "signals",
     "external",
     "mechanics",
     "costs",

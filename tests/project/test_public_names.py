@@ -13,7 +13,7 @@ GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic R
 Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate bayes costs dissipations
 dynamics enable_compilation_cache enable_fast_compilation energies equilibrate evolve external
 fit fitting growth inference initialise io load_tissue mechanics mesh plot_history plot_recovery
-plot_tissue plotting relax runs save_tissue solvers surfaces tensions transitions uncertainty
+plot_tissue plotting relax runs save_tissue signals solvers surfaces tensions transitions uncertainty
 """
 
 PACKAGES = {
@@ -56,6 +56,7 @@ PACKAGES = {
     "dynamics": "Evolution Evolved Material PIController evolve",
     "external": "AbstractSimulator Edges External Ledger Relaxed SimulatorError SurfaceEvolver "
     "run_program",
+    "signals": "AbstractReaction CellGeometry Signals",
     "relax": "AbstractResponse Equilibrium Relaxation equilibrate record_relaxation",
     "solvers": "AbstractIteration AbstractSolver Direct FIRE GradientDescent LBFGS MINRES NewtonCG Optax "
     "Progress Scales TruncatedCG VertexTrustRegion Wrapped",

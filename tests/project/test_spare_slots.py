@@ -79,9 +79,22 @@ def driven(make):
         activity, key, dt = make(tissue), jax.random.key(3), jnp.array(0.1)
         state = activity.init(tissue, key)
         energy, state = activity.drive(state, tissue, FRICTION, jnp.array(0.0), dt, key)
+        state = activity.finish(state, tissue, tissue)
         return jax.grad(lambda y: energy(tissue.with_vertices(y)))(tissue.vertices), state
 
     return run
+
+
+class Root(vx.signals.AbstractReaction):
+    """A reaction that is not finite at the concentration 0 of spare slots."""
+
+    def __call__(self, concentrations, cells, time):
+        return cells.areas / jnp.sqrt(concentrations)
+
+
+def reacting(tissue):
+    couple = lambda c, tissue: energies.AreaElasticity(1.0, c[0])
+    return vx.signals.Signals(Root(), [0.2], initial=of_cells(tissue)[None], couple=couple)
 
 
 def evolved(tissue):
@@ -258,6 +271,7 @@ CASES = {
         lambda t: activities.Push(t.topology.alive_vertices[:, None] * of_vertices(t))
     ),
     "activities.SelfPropulsion": driven(lambda t: activities.SelfPropulsion(of_cells(t))),
+    "signals.Signals": driven(reacting),
     "activities.ThermalNoise": driven(lambda t: activities.ThermalNoise(0.1)),
 }
 

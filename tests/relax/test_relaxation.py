@@ -86,11 +86,12 @@ def test_float32_tissue_relaxes_where_float64_is_enabled():
     near = vx.equilibrate(tissue, energy)
     assert near.converged
     assert near.tissue.vertices.dtype == near.energy.dtype == jnp.float32
-    # Rounded to 1e-4, coordinates allow no smaller force than the default tolerance far from the origin.
-    far = vx.equilibrate(tissue.with_vertices(tissue.vertices + 1000), energy)
+    # Up to some hundred cells from the origin; farther away rounded coordinates distort the cells.
+    far = vx.equilibrate(tissue.with_vertices(tissue.vertices + 20), energy)
     assert far.converged
-    assert 10 * near.max_force < far.max_force
-    assert far.energy == pytest.approx(float(near.energy), rel=1e-2)
+    assert far.energy == pytest.approx(float(near.energy), rel=1e-3)
+    with pytest.raises(ValueError, match="near the origin in float32"):
+        vx.equilibrate(tissue.with_vertices(tissue.vertices + 1000), energy)
 
 
 @eqx.filter_jit

@@ -61,6 +61,11 @@ with warnings.catch_warnings():
             "The steps of an adaptive time integration did not reach the next frame. Raise `max_steps` of "
             "the `PIController`, or loosen its `tolerance`."
         )
+        signals_not_finite = (
+            "The concentrations of signals are not finite: their solver failed, or the reaction is not "
+            "finite there. Check the reaction and its rates, take shorter steps, pass a solver for stiff "
+            "equations such as diffrax.Kvaerno3(), or raise `max_steps` of Signals."
+        )
         capacity_reached = (
             "A cell could not divide: all cell slots of the tissue are alive. Add spare slots before with "
             "tissue.with_capacity(...), or pass throw=False."

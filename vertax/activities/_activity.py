@@ -5,10 +5,11 @@ from __future__ import annotations
 import abc
 import functools
 import operator
+from typing import ClassVar
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from vertax._base.field_checks import check_fields
 from vertax.dissipations import AbstractDissipation
@@ -35,6 +36,9 @@ class AbstractActivity(eqx.Module):
     Activities add with `+`.
     """
 
+    deterministic: ClassVar[bool] = False
+    """Whether the activity draws no random numbers. Then it needs no key, and step sizes may be adaptive."""
+
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
         """The initial state; by default None."""
         return None
@@ -47,21 +51,46 @@ class AbstractActivity(eqx.Module):
         self,
         state: PyTree[Array],
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,
-    ) -> tuple[AbstractEnergy, PyTree[Array]]:
-        """The energy that acts during one step, and the next state.
+    ) -> tuple[AbstractEnergy | None, PyTree[Array]]:
+        """The energy that acts during one step (None for no force), and the next state.
 
         **Arguments:**
 
         - `state`: the state returned by `init` or by the previous step.
         - `tissue`: the tissue at the start of the step.
-        - `dissipation`: the dissipation of the tissue.
+        - `dissipation`: the dissipation of the tissue; None in a growth without one.
         - `time`, `dt`: the start time of the step and its length.
         - `key`: the key for random numbers.
         """
+
+    def step_dissipation(
+        self, state: PyTree[Array], tissue: Tissue, dissipation: AbstractDissipation | None
+    ) -> AbstractDissipation | None:
+        """The dissipation during one step, after `drive`; by default that of the tissue."""
+        return dissipation
+
+    def finish(self, state: PyTree[Array], before: Tissue, tissue: Tissue) -> PyTree[Array]:
+        """The state at the end of a step from `before` to `tissue`, such as after deaths of cells."""
+        return state
+
+    def born(self, state: PyTree[Array], tissue: Tissue, pair: Int[Array, "2"]) -> PyTree[Array]:
+        """The state after a division into the cells `pair`, which hold the inherited state of the mother.
+
+        Arrays outside of modules have one entry per cell; fields declare other axes, see
+        [`Change.inherited`][vertax.transitions.Change].
+        """
+        return state
+
+    def record(self, state: PyTree[Array], tissue: Tissue) -> PyTree[Array]:
+        """Arrays to record in each frame, and to compare for adaptive step sizes; by default None.
+
+        The evolution fails if they are not finite.
+        """
+        return None
 
     def __add__(self, other: AbstractActivity) -> AbstractActivity:
         """The sum of two activities."""
@@ -75,6 +104,11 @@ class Sum(AbstractActivity):
 
     terms: tuple[AbstractActivity, ...]
 
+    @property
+    def deterministic(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether no term draws random numbers."""
+        return all(term.deterministic for term in self.terms)
+
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
         """The initial states of all terms."""
         keys = jax.random.split(key, len(self.terms))
@@ -84,17 +118,41 @@ class Sum(AbstractActivity):
         self,
         state: PyTree[Array],
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,
-    ) -> tuple[AbstractEnergy, PyTree[Array]]:
+    ) -> tuple[AbstractEnergy | None, PyTree[Array]]:
         """The sum of the energies of all terms, and their next states."""
         keys = jax.random.split(key, len(self.terms))
         parts = zip(self.terms, state, keys, strict=True)
         results = [term.drive(s, tissue, dissipation, time, dt, key) for term, s, key in parts]
-        first, *rest = (energy for energy, _ in results)
-        return functools.reduce(operator.add, rest, first), tuple(state for _, state in results)
+        energies = [energy for energy, _ in results if energy is not None]
+        energy = functools.reduce(operator.add, energies) if energies else None
+        return energy, tuple(state for _, state in results)
+
+    def step_dissipation(
+        self, state: PyTree[Array], tissue: Tissue, dissipation: AbstractDissipation | None
+    ) -> AbstractDissipation | None:
+        """The dissipation of the last term that replaces it."""
+        for term, s in zip(self.terms, state, strict=True):
+            dissipation = term.step_dissipation(s, tissue, dissipation)
+        return dissipation
+
+    def finish(self, state: PyTree[Array], before: Tissue, tissue: Tissue) -> PyTree[Array]:
+        """The states of all terms at the end of a step."""
+        pairs = zip(self.terms, state, strict=True)
+        return tuple(term.finish(s, before, tissue) for term, s in pairs)
+
+    def born(self, state: PyTree[Array], tissue: Tissue, pair: Int[Array, "2"]) -> PyTree[Array]:
+        """The states of all terms after a division."""
+        return tuple(term.born(s, tissue, pair) for term, s in zip(self.terms, state, strict=True))
+
+    def record(self, state: PyTree[Array], tissue: Tissue) -> PyTree[Array]:
+        """The record of the term that has one; of several a tuple."""
+        pairs = zip(self.terms, state, strict=True)
+        records = [r for r in (term.record(s, tissue) for term, s in pairs) if r is not None]
+        return records[0] if len(records) == 1 else tuple(records) or None
 
 
 def _terms(activity: AbstractActivity) -> tuple[AbstractActivity, ...]:

@@ -45,7 +45,7 @@ class ThermalNoise(AbstractActivity):
         self,
         state: PyTree[Array],
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from vertax._base.checks import as_real, check_number
 from vertax.activities._activity import AbstractActivity
@@ -15,6 +16,15 @@ from vertax.energies import AbstractEnergy
 from vertax.energies._energy import per_cell
 from vertax.mesh import Tissue
 from vertax.mesh._curved import check_planar
+
+
+class PropulsionState(eqx.Module):
+    """The state of [`SelfPropulsion`][vertax.activities.SelfPropulsion]."""
+
+    angles: Float[Array, " cells"]
+    """The direction of each cell, in radians."""
+    displacement: Float[Array, "vertices 2"]
+    """The motion of the vertices in the previous step."""
 
 
 class SelfPropulsion(AbstractActivity):
@@ -54,27 +64,29 @@ class SelfPropulsion(AbstractActivity):
         self.rotational_diffusion = as_real("rotational_diffusion", rotational_diffusion)
         self.alignment = as_real("alignment", alignment)
 
-    def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
-        """Uniformly distributed directions, and the positions of the vertices."""
+    def init(self, tissue: Tissue, key: PRNGKeyArray) -> PropulsionState:
+        """Uniformly distributed directions, and no previous motion."""
         check_planar("SelfPropulsion", tissue)
         angles = jax.random.uniform(key, (tissue.n_cells,), tissue.vertices.dtype, 0, 2 * jnp.pi)
-        return angles, tissue.vertices
+        return PropulsionState(angles, jnp.zeros_like(tissue.vertices))
+
+    def finish(self, state: PropulsionState, before: Tissue, tissue: Tissue) -> PropulsionState:
+        """The state with the motion of the step."""
+        return PropulsionState(state.angles, tissue.vertices - before.vertices)
 
     def drive(
         self,
-        state: PyTree[Array],
+        state: PropulsionState,
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,
-    ) -> tuple[AbstractEnergy, PyTree[Array]]:
-        """Forces on vertices; the next directions and positions."""
-        angles, previous = state
-        m = tissue.topology
+    ) -> tuple[AbstractEnergy, PropulsionState]:
+        """Forces on vertices; the next directions."""
+        angles, m = state.angles, tissue.topology
         # Sum over the half-edges of each cell; `segment_sum` drops the exterior, which has index n_cells.
-        displacement = (tissue.vertices - previous)[m.source]
-        velocity = jax.ops.segment_sum(displacement, m.cell, tissue.n_cells)
+        velocity = jax.ops.segment_sum(state.displacement[m.source], m.cell, tissue.n_cells)
         at_rest = jnp.all(velocity == 0, axis=-1)
         heading = jnp.arctan2(velocity[:, 1], jnp.where(at_rest, 1, velocity[:, 0]))
         alignment = jnp.where(at_rest, 0, self.alignment * jnp.sin(heading - angles)) * dt
@@ -88,4 +100,4 @@ class SelfPropulsion(AbstractActivity):
             (force_per_vertex[:, None] * direction).at[m.cell].get(mode="fill", fill_value=0)
         )
         force = jnp.sum(at_corners.reshape(-1, 3, 2), axis=1)
-        return Push(force), (angles, tissue.vertices)
+        return Push(force), PropulsionState(angles, state.displacement)

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from vertax._base.checks import as_real, check_number
 from vertax.activities._activity import AbstractActivity
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy, LineTension
 from vertax.mesh import Tissue
+
+
+class TensionState(eqx.Module):
+    """The state of [`FluctuatingTensions`][vertax.activities.FluctuatingTensions]."""
+
+    relative: Float[Array, " edges"]
+    """The tension of each edge, in units of the standard deviation."""
 
 
 class FluctuatingTensions(AbstractActivity):
@@ -40,23 +48,23 @@ class FluctuatingTensions(AbstractActivity):
         self.deviation = as_real("deviation", deviation)
         self.persistence = as_real("persistence", persistence)
 
-    def init(self, tissue: Tissue, key: PRNGKeyArray) -> PyTree[Array]:
-        """Stationary tensions, in units of their standard deviation."""
-        return jax.random.normal(key, (tissue.n_edges,), tissue.vertices.dtype)
+    def init(self, tissue: Tissue, key: PRNGKeyArray) -> TensionState:
+        """Stationary tensions."""
+        return TensionState(jax.random.normal(key, (tissue.n_edges,), tissue.vertices.dtype))
 
     def drive(
         self,
-        state: PyTree[Array],
+        state: TensionState,
         tissue: Tissue,
-        dissipation: AbstractDissipation,
+        dissipation: AbstractDissipation | None,
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,
-    ) -> tuple[AbstractEnergy, PyTree[Array]]:
+    ) -> tuple[AbstractEnergy, TensionState]:
         """Line tensions, and the next state."""
         decay = jnp.exp(-dt / self.persistence)
-        noise = jax.random.normal(key, state.shape, state.dtype)
+        noise = jax.random.normal(key, state.relative.shape, state.relative.dtype)
         # 1 - exp(-2 dt / τ); `expm1` avoids the cancellation for dt much smaller than τ.
         variance = -jnp.expm1(-2 * dt / self.persistence)
-        state = decay * state + jnp.sqrt(variance) * noise
-        return LineTension(self.deviation * state), state
+        relative = decay * state.relative + jnp.sqrt(variance) * noise
+        return LineTension(self.deviation * relative), TensionState(relative)

@@ -20,12 +20,12 @@ from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.tracing import is_concrete, traced
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
-from vertax.dissipations import AbstractDissipation, AbstractViscosity
+from vertax.dissipations import AbstractDissipation
 from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._long_run import evolve_by_frames
 from vertax.dynamics._material import Material
 from vertax.dynamics._pi_controller import PIController
-from vertax.dynamics._time_integration import evolve_at_once
+from vertax.dynamics._time_integration import check_order, evolve_at_once
 from vertax.energies import AbstractEnergy
 from vertax.energies._scales import cell_size
 from vertax.mesh import AbstractBoundary, Tissue
@@ -49,7 +49,8 @@ class Evolution(AbstractResponse):
     - `dissipation`: the dissipation $R$, see `vertax.dissipations`.
     - `times`: the times of the frames, increasing; the first one is the time of the initial tissue.
     - `activity`: active forces or noise, see `vertax.activities`.
-    - `key`: the random key or seed of the activity. Each step uses a new key that is split from it.
+    - `key`: the random key or seed of the activity. Each step uses a new key that is split from it. A
+        deterministic activity needs none.
     - `drive`: instead of a key, the field `drive` of an [`Evolved`][vertax.dynamics.Evolved] to continue.
     - `substeps`: steps per frame.
     - `stepsize_controller`: instead of `substeps`, a [`PIController`][vertax.dynamics.PIController]: step
@@ -105,6 +106,8 @@ class Evolution(AbstractResponse):
                 "Argument `activity` must be one of vertax.activities, e.g. ThermalNoise(0.01), but is "
                 f"{describe(activity)}."
             )
+        if activity is not None and activity.deterministic and key is None:
+            key = 0
         if activity is not None and key is None and drive is None:
             raise ValueError(
                 "Argument `key` is missing: an activity draws random numbers. Pass a seed, e.g. key=0, or "
@@ -126,23 +129,20 @@ class Evolution(AbstractResponse):
         check_integer("substeps", substeps, at_least=1)
         if order not in (1, 2):
             raise ValueError(f"Argument `order` must be 1 or 2, but is {order!r}.")
-        if order == 2 and not isinstance(dissipation, AbstractViscosity):
-            raise ValueError(
-                "Argument `order` can be 2 only for a dissipation that is half a sum of squares, an "
-                f"AbstractViscosity, which {type(dissipation).__name__} is not."
-            )
+        check_order(order, dissipation)
         if not isinstance(stepsize_controller, PIController | None):
             raise TypeError(
                 "Argument `stepsize_controller` must be a vertax.dynamics.PIController, e.g. "
                 f"PIController(1e-3), but is {describe(stepsize_controller)}."
             )
-        if stepsize_controller is not None and (substeps != 1 or activity is not None):
-            conflict = "`substeps`" if activity is None else "`activity`"
+        random = activity is not None and not activity.deterministic
+        if stepsize_controller is not None and (substeps != 1 or random):
+            conflict = "`activity`" if random else "`substeps`"
             raise ValueError(
                 f"Argument `stepsize_controller` does not go with {conflict}: "
                 + (
                     "it determines the number of steps."
-                    if activity is None
+                    if not random
                     else "random numbers must not depend on which steps are rejected. Use `substeps`."
                 )
             )

@@ -39,6 +39,9 @@ class Evolved(Equilibrium):
     """Sizes of the time steps since the previous frame, padded with 0."""
     num_rejected: Int[Array, "*batch times"]
     """Number of rejected steps since the frame before, see [`PIController`][vertax.dynamics.PIController]."""
+    signals: PyTree[Float[Array, "..."]]
+    """The concentrations in each frame, shape `(times, species, cells)`, see
+    [`Signals`][vertax.signals.Signals]; in general the record of the activity. None without a record."""
 
     @property
     def flipped(self) -> Bool[Array, "*batch times edges"]:
@@ -88,6 +91,8 @@ class Evolved(Equilibrium):
         trajectory = Trajectory()
         arrays, static = eqx.partition(self.frames, eqx.is_array)
         values = {"time": self.times, "energy": self.energies, "num_t1": self.transitions}
+        if eqx.is_array(self.signals):
+            values["signals"] = self.signals
         for number in range(len(self.times)):
             frame, frame_values = jax.tree.map(lambda x, i=number: x[i], (arrays, values))
             trajectory.append(eqx.combine(frame, static), **frame_values)

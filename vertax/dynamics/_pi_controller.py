@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax._base.checks import check_integer, check_number
 from vertax.adjoints._adjoint import frozen
@@ -29,7 +29,8 @@ class PIController(eqx.Module):
     Step doubling with a PI controller (Hairer & Wanner, Solving Ordinary Differential Equations II, IV.2):
 
     1. Take one step $\Delta t$ to $x_1$, and two steps $\Delta t / 2$ to $x_2$.
-    2. Estimate the error of $x_2$ by $\max |x_2 - x_1| / (2^p - 1)$ for a method of order $p$.
+    2. Estimate the error of $x_2$ by $\max |x_2 - x_1| / (2^p - 1)$ for a method of order $p$, relative to
+        the size of a cell; of concentrations relative to the largest one.
     3. If the error exceeds the tolerance, or a relaxation does not converge, reject the step and repeat it
         with a smaller $\Delta t$. Otherwise continue from $x_2$.
     4. Compute the next $\Delta t$ from the last two errors.
@@ -63,11 +64,24 @@ class PIController(eqx.Module):
         first = 0.1 * (times[1] - times[0]) if self.first_step is None else self.first_step
         return jnp.asarray(first, times.dtype)
 
-    def error(self, halves: Tissue, full: Tissue, order: int) -> Float[Array, ""]:
-        """The error estimate of two half steps, in units of the tolerance."""
+    def error(
+        self,
+        halves: Tissue,
+        full: Tissue,
+        order: int,
+        records: tuple[PyTree[Array], PyTree[Array]] = (None, None),
+    ) -> Float[Array, ""]:
+        """The error estimate of two half steps, in units of the tolerance.
+
+        The error of the `records` of an activity is relative to the largest entry of each row.
+        """
         difference = jax.tree.map(jnp.subtract, *frozen((halves.configuration, full.configuration)))
-        size = frozen(cell_size(halves)) * self.tolerance
-        return optx.max_norm(difference) / (size * (2**order - 1))
+        error = optx.max_norm(difference) / frozen(cell_size(halves))
+        for one, other in zip(*map(jax.tree.leaves, frozen(records)), strict=True):
+            scale = jnp.max(jnp.abs(one), axis=-1, keepdims=True)
+            relative = jnp.abs(one - other) / jnp.where(scale > 0, scale, 1)
+            error = jnp.maximum(error, jnp.max(relative))
+        return error / (self.tolerance * (2**order - 1))
 
     def next_step(
         self,

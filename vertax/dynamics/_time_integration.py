@@ -15,7 +15,7 @@ from vertax._base.results import RESULTS, first_failure, result_of
 from vertax._base.tracing import tree_where
 from vertax.adjoints import AbstractAdjoint
 from vertax.adjoints._adjoint import frozen
-from vertax.dissipations import AbstractViscosity
+from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._incremental_potential import IncrementalPotential, with_flips_of
 from vertax.energies import AbstractEnergy
@@ -66,6 +66,7 @@ class Frames(NamedTuple):
     results: RESULTS
     steps: Float[Array, "times steps"]
     num_rejected: Int[Array, " times"]
+    signals: PyTree[Array]
 
 
 def initial_state(tissue: Tissue, evolution: Any) -> State:
@@ -95,7 +96,8 @@ def first_frame(state: State, energy: Any, evolution: Any) -> Frames:
     )
     steps = jnp.zeros(n_steps, time.dtype)
     value = _energy_at(energy, time)(state.tissue)
-    row = Frames(tissue, value, jnp.array(0), _successful(), steps, jnp.array(0))
+    record = _record(evolution, state)
+    row = Frames(tissue, value, jnp.array(0), _successful(), steps, jnp.array(0), record)
     return jax.tree.map(lambda x: x[None], row)
 
 
@@ -110,6 +112,7 @@ def integrate(
         state: State,
         before: Tissue,
         active_energy: Any,
+        dissipation: AbstractDissipation,
         start: Any,
         end: Any,
         previous_strains: Any,
@@ -120,12 +123,10 @@ def integrate(
         max_driving_force = None
         if active_energy is not None:
             total_energy += active_energy
-            forces = jax.grad(lambda x: active_energy(before.with_vertices(x)))(before.vertices)
-            largest = jnp.max(jnp.sum(forces**2, axis=-1))
-            max_driving_force = jnp.sqrt(jnp.maximum(largest, jnp.finfo(largest.dtype).tiny))
+            max_driving_force = max_force(active_energy, before)
         potential = IncrementalPotential(
             total_energy,
-            evolution.dissipation,
+            dissipation,
             before,
             end - start,
             previous_strains,
@@ -138,22 +139,25 @@ def integrate(
 
     def step(state: State, start: Any, end: Any) -> State:
         before, active_energy, dt = state.tissue, None, end - start
+        dissipation = evolution.dissipation
         if evolution.activity is not None:
             inner, key = state.drive
             key, step_key = jax.random.split(key)
             active_energy, inner = evolution.activity.drive(
-                inner, before, evolution.dissipation, start, dt, step_key
+                inner, before, dissipation, start, dt, step_key
             )
+            dissipation = evolution.activity.step_dissipation(inner, before, dissipation)
             state = eqx.tree_at(lambda s: s.drive, state, (inner, key))
+        parts = (before, active_energy, dissipation)
         if evolution.order == 1:
-            return stage(state, before, active_energy, start, end, None)
-        middle = stage(state, before, active_energy, start, start + _GAMMA * dt, None)
-        assert isinstance(evolution.dissipation, AbstractViscosity)
+            return _finished(evolution, before, stage(state, *parts, start, end, None))
+        middle = stage(state, *parts, start, start + _GAMMA * dt, None)
+        check_order(evolution.order, dissipation)
+        assert isinstance(dissipation, AbstractViscosity)
         base = with_flips_of(before, middle.tissue) if may_flip else before
-        previous_strains = (
-            evolution.dissipation.strains(middle.tissue, base) * (1 - _GAMMA) / _GAMMA
-        )
-        return stage(middle, before, active_energy, end - _GAMMA * dt, end, previous_strains)
+        previous_strains = dissipation.strains(middle.tissue, base) * (1 - _GAMMA) / _GAMMA
+        after = stage(middle, *parts, end - _GAMMA * dt, end, previous_strains)
+        return _finished(evolution, before, after)
 
     def attempt(state: State, start: Any, stop: Any) -> tuple[State, Any, Array]:
         """Try one step: the state after it, its time, and the time step; 0 if the step was rejected."""
@@ -177,7 +181,8 @@ def integrate(
         now = eqx.filter(state, eqx.is_array)
         now, parts = jax.lax.scan(part, now, intervals)
         halves, full = combined(now), combined(jax.tree.map(lambda x: x[0], parts))
-        error = control.error(halves.tissue, full.tissue, evolution.order)
+        records = _record(evolution, halves), _record(evolution, full)
+        error = control.error(halves.tissue, full.tissue, evolution.order, records)
         # (After an earlier failure steps are accepted by their error alone.)
         failed_before = state.result != RESULTS.successful
         converged = (halves.result == RESULTS.successful) | failed_before
@@ -225,8 +230,9 @@ def integrate(
             arrays, _ = jax.lax.scan(substep, arrays, (times_of_steps[:-1], times_of_steps[1:]))
             steps, num_rejected = jnp.diff(times_of_steps), jnp.array(0)
         value = _energy_at(energy, ends[1])(combined(arrays).tissue)
-        transitions = arrays.num_t1 - before
-        return arrays, Frames(arrays.tissue, value, transitions, arrays.result, steps, num_rejected)
+        transitions, record = arrays.num_t1 - before, _record(evolution, combined(arrays))
+        row = (arrays.tissue, value, transitions, arrays.result, steps, num_rejected, record)
+        return arrays, Frames(*row)
 
     arrays, static = eqx.partition(state, eqx.is_array)
     combined = lambda arrays: eqx.combine(arrays, static)
@@ -252,6 +258,7 @@ def evolved(times: Float[Array, " times"], end: State, frames: Frames) -> Evolve
         results=frames.results,
         steps=frames.steps,
         num_rejected=frames.num_rejected,
+        signals=frames.signals,
     )
 
 
@@ -275,6 +282,48 @@ def _energy_at(energy: Any, time: Any) -> AbstractEnergy:
             f"{describe(value)}."
         )
     return value
+
+
+def check_order(order: int, dissipation: AbstractDissipation) -> None:
+    """Raise an error for order 2 with a dissipation that is not half a sum of squares."""
+    if order == 2 and not isinstance(dissipation, AbstractViscosity):
+        raise ValueError(
+            "Argument `order` can be 2 only for a dissipation that is half a sum of squares, an "
+            f"AbstractViscosity, which {type(dissipation).__name__} is not."
+        )
+
+
+def _record(evolution: Any, state: State) -> PyTree[Array]:
+    """The arrays that the activity records, None without an activity."""
+    if evolution.activity is None:
+        return None
+    return evolution.activity.record(state.drive[0], state.tissue)
+
+
+def _finished(evolution: Any, before: Tissue, after: State) -> State:
+    """The state at the end of a step, with the state of the activity."""
+    if evolution.activity is None:
+        return after
+    inner, key = after.drive
+    inner = evolution.activity.finish(inner, before, after.tissue)
+    after = eqx.tree_at(lambda s: s.drive, after, (inner, key))
+    result = first_failure(after.result, finite_record(_record(evolution, after)))
+    return eqx.tree_at(lambda s: s.result, after, result)
+
+
+def max_force(active_energy: AbstractEnergy, tissue: Tissue) -> Float[Array, ""]:
+    """The largest force of an active energy on a vertex."""
+    forces = jax.grad(lambda x: active_energy(tissue.with_vertices(x)))(tissue.vertices)
+    largest = jnp.max(jnp.sum(forces**2, axis=-1))
+    return jnp.sqrt(jnp.maximum(largest, jnp.finfo(largest.dtype).tiny))
+
+
+def finite_record(record: PyTree[Array]) -> RESULTS:
+    """`signals_not_finite` if an array that an activity records is not finite."""
+    finite = jnp.array(True)
+    for leaf in jax.tree.leaves(record):
+        finite &= jnp.all(jnp.isfinite(leaf))
+    return RESULTS.where(finite, RESULTS.successful, RESULTS.signals_not_finite)
 
 
 def _folded(boundary: AbstractBoundary) -> Bool[Array, ""]:

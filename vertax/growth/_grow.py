@@ -15,9 +15,11 @@ from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.checks import as_key, as_times, check_integer, describe
 from vertax._base.results import RESULTS, checked, first_failure, result_of
 from vertax._base.tracing import is_concrete, traced, tree_where
+from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
 from vertax.dynamics._incremental_potential import IncrementalPotential
+from vertax.dynamics._time_integration import finite_record, max_force
 from vertax.energies import AbstractEnergy
 from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, initial_lineage, record_deaths, record_division
@@ -61,6 +63,10 @@ class Grown(eqx.Module):
     """Log-likelihood of the discrete random choices of the life cycle, see
     [`score_function`][vertax.growth.score_function]."""
 
+    signals: PyTree[Float[Array, "..."]]
+    """The concentrations in each frame, shape `(times, species, cells)`, 0 in spare slots; see
+    [`Signals`][vertax.signals.Signals]. In general the record of the activity, None without one."""
+
     @property
     def n_alive(self) -> Int[Array, "*batch times"]:
         """Number of living cells in each frame."""
@@ -73,7 +79,8 @@ class Grown(eqx.Module):
         arrays, static = eqx.partition(self.frames, eqx.is_array)
         for i, time in enumerate(self.times):
             frame = eqx.combine(jax.tree.map(lambda x, i=i: x[i], arrays), static)
-            trajectory.append(frame, time=time, cells=self.n_alive[i])
+            record = {"signals": self.signals[i]} if eqx.is_array(self.signals) else {}
+            trajectory.append(frame, time=time, cells=self.n_alive[i], **record)
         return trajectory
 
     @property
@@ -108,6 +115,7 @@ def grow(
     divisions: int | None = None,
     records: int | None = None,
     dissipation: AbstractDissipation | None = None,
+    activity: AbstractActivity | None = None,
     relaxation: Relaxation = Relaxation(transitions=T1() + T2()),
     adjoint: AbstractAdjoint = ImplicitDifferentiation(),
     throw: bool = True,
@@ -149,6 +157,9 @@ def grow(
         for the next step.
     - `records`: capacity of the lineage, by default eight times the number of cell slots.
     - `dissipation`: friction and viscosity; by default none, and the tissue relaxes in each step.
+    - `activity`: active forces, noise or [signals][vertax.signals.Signals]. Daughters inherit its state, see
+        `born` of [`AbstractActivity`][vertax.AbstractActivity]. An activity that draws random numbers needs a
+        dissipation.
     - `relaxation`: solver and transitions of each step, by default with T1 and T2 transitions.
     - `adjoint`: how to differentiate each step.
     - `throw`: raise an error if a step does not converge or capacity is exhausted. If False, look at
@@ -158,14 +169,16 @@ def grow(
 
     **Raises:**
 
-    - `TypeError` for a cycle, an energy, a dissipation or a relaxation of a wrong type.
-    - `ValueError` for times that do not increase, or a tissue without spare slots.
+    - `TypeError` for a cycle, an energy, a dissipation, an activity or a relaxation of a wrong type.
+    - `ValueError` for times that do not increase, a tissue without spare slots, or noise without a
+        dissipation.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a step does not converge or capacity is
         exhausted.
     """
     for name, value, kind, expected in (
         ("cycle", cycle, AbstractLifeCycle, "an AbstractLifeCycle"),
         ("dissipation", dissipation, AbstractDissipation | None, "an AbstractDissipation or None"),
+        ("activity", activity, AbstractActivity | None, "an AbstractActivity or None"),
         ("relaxation", relaxation, Relaxation, "a Relaxation"),
     ):
         if not isinstance(value, kind):
@@ -177,6 +190,11 @@ def grow(
             "Argument `energy` must be a function of the cell states that returns an energy, "
             f"but is {describe(energy)}. Pass such a function, e.g. lambda cells: {name}"
             f"{'(...)' if isinstance(energy, type) else ''}."
+        )
+    if activity is not None and dissipation is None and not activity.deterministic:
+        raise ValueError(
+            "Argument `dissipation` is missing: an activity with random numbers needs one. Pass e.g. "
+            "vertax.dissipations.SubstrateFriction(1.0)."
         )
     if not tissue.topology.spare:
         raise ValueError(
@@ -192,7 +210,7 @@ def grow(
         labels = np.unique(np.asarray(tissue.topology.cell))
         check_integer("records", records, at_least=int(np.sum(labels < tissue.n_cells)))
     times = as_times(times)
-    parts = traced((tissue, energy, cycle, dissipation), tissue.vertices.dtype)
+    parts = traced((tissue, energy, cycle, dissipation, activity), tissue.vertices.dtype)
     settings = (relaxation.traced(), adjoint, times, as_key(key), (substeps, divisions, records))
     with announce_compilations(f"the growth of a tissue with {tissue.n_cells} cell slots"):
         grown = _grow(*parts, *settings)
@@ -204,6 +222,7 @@ class _State(eqx.Module):
 
     tissue: Tissue
     cells: PyTree[Array]
+    drive: PyTree[Array]
     number: Int[Array, " cells"]
     lineage: Lineage
     result: RESULTS
@@ -218,6 +237,7 @@ def _grow(
     energy: Energy,
     cycle: AbstractLifeCycle,
     dissipation: AbstractDissipation | None,
+    activity: AbstractActivity | None,
     relaxation: Relaxation,
     adjoint: AbstractAdjoint,
     times: Float[Array, " times"],
@@ -239,6 +259,10 @@ def _grow(
             change.inherited(state.cells, axis="cells"), change.tissue, pair, state_key
         )
         cells = jax.tree.map(lambda a, b: jnp.where(done, a, b), cells, state.cells)
+        drive = state.drive
+        if activity is not None:
+            drive = activity.born(change.inherited(drive, axis="cells"), change.tissue, pair)
+            drive = tree_where(done, drive, state.drive)
         lineage, number = record_division(state.lineage, state.number, pair, time, done)
         full = jnp.any(due) & jnp.all(state.tissue.alive)
         full = RESULTS.where(full, RESULTS.capacity_reached, RESULTS.successful)
@@ -246,6 +270,7 @@ def _grow(
         after = _State(
             tissue=change.tissue,
             cells=cells,
+            drive=drive,
             number=number,
             lineage=lineage,
             result=first_failure(state.result, full),
@@ -272,8 +297,20 @@ def _grow(
         (arrays, _), _ = jax.lax.scan(one, (_arrays(state), due), jnp.stack(dividing))
         state = combine(arrays)
         before, potential = state.tissue, energy(state.cells)
-        if dissipation is not None:
-            potential = IncrementalPotential(potential, dissipation, before, end - start)
+        active, drive, resistance = None, state.drive, dissipation
+        if activity is not None:
+            # (Folded in, so that the other random numbers are those of a growth without activity.)
+            drive_key = jax.random.fold_in(key, divisions + 1)
+            settings: Any = (resistance, start, end - start, drive_key)
+            active, drive = activity.drive(drive, before, *settings)
+            resistance = activity.step_dissipation(drive, before, settings[0])
+        if active is not None:
+            potential += active
+        if resistance is not None:
+            driving_force = None if active is None else max_force(active, before)
+            potential = IncrementalPotential(
+                potential, resistance, before, end - start, max_driving_force=driving_force
+            )
         moved = relaxation.solve(before, potential, adjoint, recompute=True)
         died = before.alive & ~moved.tissue.alive
         lineage, number = record_deaths(state.lineage, state.number, died, end)
@@ -282,10 +319,14 @@ def _grow(
         failed &= (state.result == RESULTS.successful) | (state.result == RESULTS.capacity_reached)
         result = RESULTS.where(failed, moved.result, state.result)
         recorded = RESULTS.where(lineage.count <= records, RESULTS.successful, RESULTS.lineage_full)
+        if activity is not None:
+            drive = activity.finish(drive, before, moved.tissue)
+            result = first_failure(result, finite_record(activity.record(drive, moved.tissue)))
         overdue = moved.tissue.alive & cycle.overdue(state.cells, moved.tissue)
         after = _State(
             tissue=moved.tissue,
             cells=state.cells,
+            drive=drive,
             number=number,
             lineage=lineage,
             result=first_failure(result, recorded),
@@ -318,13 +359,17 @@ def _grow(
 
     def frame_of(arrays: _State) -> tuple:
         failed = (arrays.failed_divisions, arrays.failed_deaths)
-        return arrays.tissue, arrays.cells, arrays.number, arrays.result, failed
+        signals = (
+            None if activity is None else activity.record(arrays.drive, combine(arrays).tissue)
+        )
+        return arrays.tissue, arrays.cells, arrays.number, arrays.result, failed, signals
 
     first, rest = jax.random.split(key)
     lineage, number = initial_lineage(tissue, times[0], records)
     begin = _State(
         tissue=tissue,
         cells=cycle.init(tissue, first),
+        drive=None if activity is None else activity.init(tissue, jax.random.fold_in(first, 1)),
         number=number,
         lineage=lineage,
         result=result_of(jnp.array(0)),
@@ -337,7 +382,8 @@ def _grow(
     keys = jax.random.split(rest, times.shape[0] - 1)
     end, frames = jax.lax.scan(interval, arrays, ((times[:-1], times[1:]), keys))
     prepend = lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest])
-    tissues, cells, numbers, results, failed = jax.tree.map(prepend, frame_of(arrays), frames)
+    rows = jax.tree.map(prepend, frame_of(arrays), frames)
+    tissues, cells, numbers, results, failed, signals = rows
     last = combine(end)
     return Grown(
         tissue=last.tissue,
@@ -351,6 +397,7 @@ def _grow(
         failed_divisions=failed[0],
         failed_deaths=failed[1],
         log_likelihood=last.log_likelihood,
+        signals=signals,
     )
 
 

@@ -92,7 +92,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
             raise ValueError(
                 f"{name} is broken: `{key}` has shape {array.shape}, but must have {n} entries."
             )
-    if number.min() < 0 or any(array.shape != number.shape for array in values.values()):
+    if number.min() < 0 or any(array.shape[:1] != number.shape for array in values.values()):
         raise ValueError(f"{name} is broken: `topology` or the values do not match the frames.")
     topologies: dict[int, Topology] = {}
     trajectory = Trajectory()

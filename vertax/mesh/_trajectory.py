@@ -25,7 +25,7 @@ class _Record(Protocol):
 
 
 class Trajectory(Sequence[Tissue]):
-    """A sequence of tissues of the same size (frames), each with named numbers.
+    """A sequence of tissues of the same size (frames), each with named numbers or arrays.
 
     T1 transitions change the topology, so each frame has its own. As the callback of a fit it records
     the equilibrium of each epoch:
@@ -57,7 +57,7 @@ class Trajectory(Sequence[Tissue]):
             raise ValueError(f"Argument `every` must be at least 1, but is {every}.")
         self.every = every
         self._frames: list[Tissue] = []
-        self._values: dict[str, list[int | float]] = {}
+        self._values: dict[str, list[int | float | np.ndarray]] = {}
 
     def append(self, tissue: Tissue, **values: ArrayLike) -> None:
         """Add a frame.
@@ -65,12 +65,13 @@ class Trajectory(Sequence[Tissue]):
         **Arguments:**
 
         - `tissue`: a single tissue of the same sizes, kind and precision as the frames before.
-        - `values`: numbers of the frame by name (such as a time or a cost); each frame has the same names.
+        - `values`: numbers of the frame by name (such as a time or a cost), or arrays of numbers (such as
+            concentrations); each frame has the same names and shapes.
 
         **Raises:**
 
-        - `ValueError` for a tissue of another size, kind or precision, for other names, or for a value that
-            is not one number.
+        - `ValueError` for a tissue of another size, kind or precision, for other names or shapes, or for a
+            value that does not hold numbers.
         """
         if tissue.vertices.ndim != 2:
             raise ValueError(
@@ -91,6 +92,12 @@ class Trajectory(Sequence[Tissue]):
                     f"A frame must have the values of those before it ({', '.join(self._values)}), but "
                     f"has: {', '.join(numbers)}."
                 )
+            for name, value in numbers.items():
+                if np.shape(value) != (shape := np.shape(self._values[name][-1])):
+                    raise ValueError(
+                        f"Value `{name}` must have the shape of the frames before it, {shape}, but has "
+                        f"{np.shape(value)}."
+                    )
             if eqx.tree_equal(frame.topology, last.topology):
                 frame = frame.with_topology(last.topology)  # share the arrays
         self._frames.append(frame)
@@ -116,8 +123,8 @@ class Trajectory(Sequence[Tissue]):
             )
 
     @property
-    def values(self) -> dict[str, Shaped[np.ndarray, " frames"]]:
-        """The numbers of all frames by name."""
+    def values(self) -> dict[str, Shaped[np.ndarray, "frames ..."]]:
+        """The numbers of all frames by name; of arrays, such as `signals`, with a first axis for frames."""
         return {name: np.asarray(values) for name, values in self._values.items()}
 
     def __len__(self) -> int:
@@ -141,11 +148,11 @@ class Trajectory(Sequence[Tissue]):
         return (self[i] for i in range(len(self)))
 
 
-def _number(name: str, value: Any) -> int | float:
+def _number(name: str, value: Any) -> int | float | np.ndarray:
     array = np.asarray(value)
-    if array.shape != () or array.dtype.kind not in "iuf":
-        raise ValueError(f"Value `{name}` must be one number, but is {value!r}.")
-    return array.item()
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"Value `{name}` must hold numbers, but is {value!r}.")
+    return array if array.shape else array.item()
 
 
 def _kind(frame: Tissue) -> tuple:
