@@ -45,7 +45,7 @@ def main() -> None:
         for lifts in (True, False):
             scores, errors = [], []
             for truth in truths:
-                fine = label_image(truth.foam, FINE * PIXELS)
+                fine = label_image(truth.foam or truth.tissue, FINE * PIXELS)
                 labels, heights = (
                     image[FINE // 2 :: FINE, FINE // 2 :: FINE]
                     for image in labels_on_sphere(fine, FINE * radius)

@@ -80,7 +80,7 @@ def test_a_broken_surface_is_rejected(tube, tmp_path):
         ({"surface_radius": np.ones(2)}, "surface_radius"),
         ({"surface_radius": np.asarray(1.0)}, "period"),
     ):
-        np.savez(tmp_path / "broken.npz", **(arrays | changes))
+        np.savez(tmp_path / "broken.npz", allow_pickle=False, **(arrays | changes))
         with pytest.raises(ValueError, match=message):
             vx.load_tissue(tmp_path / "broken.npz")
 

@@ -33,7 +33,6 @@ REJECTED = {
     "mechanics.stress",
     "mechanics.youngs_modulus",
     "mechanics.zero_modes",
-    "tensions.infer_tensions",
     "activities.SelfPropulsion",
 }
 # These show coordinates of the chart (pictures, files, images), so their results are others than those of the
@@ -134,7 +133,7 @@ def test_functions_without_a_meaning_on_a_surface_name_it(tissues, name):
 @pytest.mark.parametrize("name", sorted(set(CASES) - REJECTED))
 def test_results_on_a_tilted_plane_are_those_of_the_plane(tissues, same_displacements, name):
     if name in FREE_CALLS:
-        assert FREE_CALLS[name](free_on_surface()).max() > 0
+        assert np.nanmax(FREE_CALLS[name](free_on_surface())) > 0
         return
     if name in IN_CHART:
         assert jax.tree.leaves(CASES[name](tissues[1]))

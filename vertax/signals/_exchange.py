@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
+from vertax.mesh._curved import surface_points
 from vertax.mesh._topology import clockwise, take
 
 
@@ -22,7 +23,7 @@ class Exchange(NamedTuple):
 
     @classmethod
     def of(cls, tissue: Tissue) -> Exchange:
-        """The exchange in a tissue: edge lengths, and distances of centroids across periodic boundaries."""
+        """The exchange in a tissue: edge lengths and distances of centroids, in space on a surface."""
         m, centroids = tissue.topology, tissue.centroids
         cells = m.edge_cells
         inside = jnp.all(cells < tissue.n_cells, axis=-1)
@@ -31,7 +32,10 @@ class Exchange(NamedTuple):
         )
         # The corner of both cells at the start of an edge is in the frame of each of them.
         frames = take(m.frame, m.half_edge) - take(m.frame, clockwise(m.half_edge))
-        distances = _norm(right + tissue.boundary.translation(frames) - left)
+        right = right + tissue.boundary.translation(frames)
+        if tissue.surface is not None:
+            left, right = (surface_points(tissue.surface, x) for x in (left, right))
+        distances = _norm(right - left)
         apart = inside & (distances > 0)
         return cls(cells, jnp.where(apart, _lengths(tissue) / jnp.where(apart, distances, 1), 0))
 
@@ -76,6 +80,8 @@ def redistributed(
 def _lengths(tissue: Tissue) -> Float[Array, " edges"]:
     """The lengths of edges without softening: 0 for an edge in a T1 transition, and for spare slots."""
     lengths = _norm(tissue.edge_vectors)
+    if tissue.surface is not None:
+        lengths = tissue.edge_lengths - tissue.softening
     if tissue.arcs is not None:
         lengths = lengths * length_factor(tissue.edge_angles)
     m = tissue.topology
