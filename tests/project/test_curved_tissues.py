@@ -55,7 +55,7 @@ IN_CHART = {
     "activities.Push",
 }
 # The results of these are forces along the coordinates; of the others displacements.
-COVECTORS = ("energies.", "activities.")
+COVECTORS = ("energies.", "activities.", "signals.")
 PLACES = {"x", "y", "start_x", "start_y", "end_x", "end_y"}
 
 

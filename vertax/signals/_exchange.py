@@ -79,16 +79,17 @@ def redistributed(
 
 def _lengths(tissue: Tissue) -> Float[Array, " edges"]:
     """The lengths of edges without softening: 0 for an edge in a T1 transition, and for spare slots."""
-    lengths = _norm(tissue.edge_vectors)
+    start, vector = tissue.edge_segments
     if tissue.surface is not None:
-        lengths = tissue.edge_lengths - tissue.softening
+        vector = jnp.subtract(*(surface_points(tissue.surface, x) for x in (start + vector, start)))
+    lengths = _norm(vector)
     if tissue.arcs is not None:
         lengths = lengths * length_factor(tissue.edge_angles)
     m = tissue.topology
     return jnp.where(m.alive_edges, lengths, 0) if m.spare else lengths
 
 
-def _norm(vectors: Float[Array, "edges 2"]) -> Float[Array, " edges"]:
+def _norm(vectors: Float[Array, "edges axes"]) -> Float[Array, " edges"]:
     """The norm, with the derivative 0 at 0."""
     squared = jnp.sum(vectors**2, axis=-1)
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
