@@ -79,8 +79,10 @@ def plot_surface(
             add_bar(ax, faces, values[shown], label, shrink=0.55, pad=0.02)
         low, high = corners.min(axis=0), corners.max(axis=0)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        zoom: Any = 1.3  # (Matplotlib declares an integer.)
-        ax.set_box_aspect(np.maximum(high - low, 1e-3 * (high - low).max()), zoom=zoom)
+        # A long tissue fills the width of the figure already. (Matplotlib declares an integer.)
+        size = np.maximum(high - low, 1e-3 * (high - low).max())
+        zoom: Any = 1.3 * min(1.0, np.sort(size)[1] / size.max() + 0.15)
+        ax.set_box_aspect(size, zoom=zoom)
         ax.view_init(elev=float(elevation), azim=float(azimuth))
         ax.set_axis_off()
     return ax
