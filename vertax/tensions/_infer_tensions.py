@@ -60,7 +60,7 @@ def infer_tensions(
     | os.PathLike[str]
     | None = None,
     plane_distance: float = 1.0,
-    unknown_height: float | None = None,
+    unknown_height: float | int | None = None,
     background: int | None = None,
     gap_width: float | None = None,
     holes: str = "keep",
@@ -211,7 +211,7 @@ def infer_tensions(
 
 
 def _surface(
-    height: Any, plane_distance: float, unknown: float | None, source: Any, unit: float | None
+    height: Any, plane_distance: float, unknown: float | int | None, source: Any, unit: float | None
 ) -> AbstractSurface | None:
     """The surface of a tissue.
 
@@ -247,7 +247,7 @@ def _surface(
         source.pixel_size,
         plane_distance=plane_distance * (pixel if unit is None else unit),
         smoothing=max(pixel, width * float(np.sqrt(np.median(areas)))),
-        unknown=float("nan") if unknown is None else unknown,
+        unknown=float("nan" if unknown is None else unknown),
     )
 
 
