@@ -35,9 +35,9 @@ class Config(runs.ExperimentConfig):
     """Steps per frame."""
     growth_rate: float = Field(default=0.02, ge=0)
     """Rate of growth of target areas."""
-    production: tuple[float, float] = (0.1, 0.9)
+    production: list[float] = Field(default=[0.1, 0.9], min_length=2, max_length=2)
     """Production of the activator and of the inhibitor."""
-    diffusion: tuple[float, float] = (0.15, 3.0)
+    diffusion: list[float] = Field(default=[0.15, 3.0], min_length=2, max_length=2)
     """Diffusion of the activator and of the inhibitor, area per time."""
     animation: bool = True
     """Draw an animation."""
