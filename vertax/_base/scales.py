@@ -31,4 +31,4 @@ class Scales(eqx.Module):
     @classmethod
     def of(cls, options: dict[str, Any]) -> Scales:
         """The scales in the options of a minimisation; 1 if there are none."""
-        return options.get("scales", cls())
+        return options["scales"] if "scales" in options else cls()

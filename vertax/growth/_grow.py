@@ -301,9 +301,10 @@ def _grow(
         if activity is not None:
             # (Folded in, so that the other random numbers are those of a growth without activity.)
             drive_key = jax.random.fold_in(key, divisions + 1)
-            settings: Any = (resistance, start, end - start, drive_key)
-            active, drive = activity.drive(drive, before, *settings)
-            resistance = activity.step_dissipation(drive, before, settings[0])
+            active, drive = activity.drive(
+                drive, before, dissipation, start, end - start, drive_key
+            )
+            resistance = activity.step_dissipation(drive, before, dissipation)
         if active is not None:
             potential += active
         if resistance is not None:

@@ -52,7 +52,6 @@ class ImageSection(runs.ImageFile):
     """Of a curved tissue, the image of the height of each pixel (TIFF or NPY); NaN where it is unknown."""
     plane_distance: float = Field(default=1.0, gt=0)
     """Height per unit of that image, in the unit of `pixel_size`; without that, in pixels."""
-
     unknown_height: float | None = None
     """Value of unknown pixels in that image, such as 0, beside NaN."""
 

@@ -16,7 +16,7 @@ from vertax.mechanics._forces import pressures_and_tensions
 from vertax.mechanics._landscape import area_of, deformed
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import area_factor, length_factor
-from vertax.mesh._curved import check_planar, chord_parts, tangent_frame
+from vertax.mesh._curved import check_planar, space_chords, tangent_frame
 
 
 def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
@@ -111,7 +111,7 @@ def _directed_lengths(tissue: Tissue) -> Float[Array, "edges space space"]:
     # R (α + sin α cos α) along the chord and R (α - sin α cos α) = 2 c g sin α across it.
     chord, angle = tissue.edge_vectors, tissue.edge_angles
     if tissue.surface is not None:
-        chord = jnp.stack(chord_parts(tissue.surface, tissue._segments()), axis=-1)
+        chord = space_chords(tissue.surface, tissue._segments())
     squared = jnp.sum(chord**2, axis=-1) + tissue.softening**2
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1))
     outer = lambda v: v[:, :, None] * v[:, None, :] / length[:, None, None]

@@ -52,13 +52,12 @@ def tangent_frame(
     return frame, jnp.stack(upper, axis=-2)
 
 
-def chord_parts(surface: AbstractSurface, segments: Segments) -> Segments:
-    """The components of the chord of each edge in space."""
+def space_chords(surface: AbstractSurface, segments: Segments) -> Float[Array, "edges 3"]:
+    """The chord of each edge in space."""
     x, y, dx, dy = segments
     ends = jnp.stack([jnp.stack([x, x + dx]), jnp.stack([y, y + dy])], axis=-1)
     first, second = surface_points(surface, ends)
-    chord = second - first
-    return tuple(chord[:, k] for k in range(3))
+    return second - first
 
 
 def area_shares(

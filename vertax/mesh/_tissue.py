@@ -16,7 +16,7 @@ from vertax._base.tracing import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free, Periodic
 from vertax.mesh._capacity import size_class, with_slots, without_slots
-from vertax.mesh._curved import area_shares, check_planar, check_surface, chord_parts
+from vertax.mesh._curved import area_shares, check_planar, check_surface, space_chords
 from vertax.mesh._edge_ends import gather_at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
 from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
@@ -526,7 +526,7 @@ class Tissue(eqx.Module):
         """Length of the chord of each edge (softened)."""
         _, _, *chord = segments
         if self.surface is not None:
-            chord = chord_parts(self.surface, segments)
+            chord = space_chords(self.surface, segments).T
         squared = total(part * part for part in chord) + self.softening**2
         # At length 0 without softening the square root is not differentiable: √1 - 1 instead has value 0 and
         # derivative 0, the mean of the one-sided derivatives.

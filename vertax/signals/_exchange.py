@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
-from vertax.mesh._curved import surface_points
+from vertax.mesh._curved import space_chords, surface_points
 from vertax.mesh._topology import clockwise, take
 
 
@@ -79,10 +79,10 @@ def redistributed(
 
 def _lengths(tissue: Tissue) -> Float[Array, " edges"]:
     """The lengths of edges without softening: 0 for an edge in a T1 transition, and for spare slots."""
-    start, vector = tissue.edge_segments
+    vectors = tissue.edge_vectors
     if tissue.surface is not None:
-        vector = jnp.subtract(*(surface_points(tissue.surface, x) for x in (start + vector, start)))
-    lengths = _norm(vector)
+        vectors = space_chords(tissue.surface, tissue._segments())
+    lengths = _norm(vectors)
     if tissue.arcs is not None:
         lengths = lengths * length_factor(tissue.edge_angles)
     m = tissue.topology

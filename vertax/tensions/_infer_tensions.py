@@ -29,7 +29,7 @@ from vertax.tensions._curves import Points
 from vertax.tensions._edges import fit, solution
 from vertax.tensions._inferred import InferredTensions
 from vertax.tensions._lift import lifted
-from vertax.tensions._mask import labels_and_lines
+from vertax.tensions._mask import labels_and_lines, load_array
 from vertax.tensions._observed_geometry import observed_geometry
 from vertax.tensions._outcome import outcome
 
@@ -210,6 +210,16 @@ def infer_tensions(
     return outcome(tissue, course.points, curves, system.which, balance, source, surface)
 
 
+def _heights_of_file(file: Path) -> np.ndarray:
+    """The numbers in an image, or in a file of NumPy."""
+    if file.suffix.lower() == ".npy":
+        return load_array(file, "height")
+    try:
+        return read_image(file)
+    except ValueError as error:
+        raise ValueError(str(error).replace("`path`", "`height`")) from error
+
+
 def _surface(
     height: Any, plane_distance: float, unknown: float | int | None, source: Any, unit: float | None
 ) -> AbstractSurface | None:
@@ -230,8 +240,7 @@ def _surface(
         )
     heights = height
     if isinstance(height, str | os.PathLike):
-        is_array = Path(height).suffix == ".npy"
-        heights = np.load(height) if is_array else read_image(height)
+        heights = _heights_of_file(Path(height))
     heights = np.asarray(heights)
     if heights.shape != source.image_shape:
         raise ValueError(

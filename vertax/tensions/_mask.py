@@ -165,13 +165,13 @@ def _loaded(file: Path, plane: int | None) -> np.ndarray:
         raise ValueError(str(error).replace("`path`", "`mask`")) from error
 
 
-def load_array(file: Path) -> np.ndarray:
-    """The array in a file of NumPy; a `ValueError` for another file."""
+def load_array(file: Path, name: str = "mask") -> np.ndarray:
+    """The array in a file of NumPy; a `ValueError` that names the argument for another file."""
     try:
         return np.load(file, allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise ValueError(
-            f"Argument `mask` must name a file of `numpy.save` with an array of numbers, but {file} cannot "
+            f"Argument `{name}` must name a file of `numpy.save` with an array of numbers, but {file} cannot "
             "be read as one."
         ) from error
 

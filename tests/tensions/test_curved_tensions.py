@@ -195,6 +195,15 @@ def test_heights_that_do_not_fit_are_rejected(height, error, message):
         infer_tensions(mask, height=height)
 
 
+@pytest.mark.parametrize("name", ["heights.npy", "heights.png"])
+def test_a_file_that_holds_no_heights_is_named(tmp_path, name):
+    (tmp_path / name).write_bytes(b"no numbers")
+    corner = np.indices((60, 60))
+    mask = 1 + (corner[0] > 30) + (corner[0] > 30) * (corner[1] > 25)
+    with pytest.raises(ValueError, match="Argument `height` must name"):
+        infer_tensions(mask, height=tmp_path / name)
+
+
 def test_an_image_of_heights_needs_pixels():
     tissue = vx.initialise.free_voronoi(12, key=0)
     with pytest.raises(TypeError, match="must be a surface for a source without pixels"):
