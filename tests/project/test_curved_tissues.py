@@ -51,6 +51,7 @@ IN_CHART = {
     "transitions.divide",
     "transitions.remove",
     "mesh.cell_polygons",
+    "mesh.geometry_of",
     # Its argument is a force along the coordinates.
     "activities.Push",
 }

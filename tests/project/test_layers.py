@@ -1,4 +1,4 @@
-"""Imports point downward, and jobs and experiments import public names only."""
+"""Imports point downward; applications, jobs and experiments import public names only."""
 
 import ast
 import importlib.util
@@ -38,6 +38,10 @@ LAYERS = [
     "runs",
     "jobs",
 ]
+# What is built on the library: each could be a separate distribution.
+APPLICATIONS = LAYERS[LAYERS.index("bayes") :]
+# Names of private modules that other packages import (without those of `_base`). The number only goes down.
+PRIVATE_NAMES = 88
 # The packages with public names that jobs and experiments may import.
 PUBLIC = {"vertax", *(f"vertax.{name}" for name in LAYERS if name != "_base")}
 PUBLIC |= {f"vertax.jobs.{path.stem}" for path in (ROOT / "jobs").glob("[!_]*.py")}
@@ -130,6 +134,38 @@ def test_jobs_and_experiments_import_public_names_only(folder):
         if name not in PUBLIC
     ]
     assert not private
+
+
+def private_names(path: Path) -> set[tuple[str, str]]:
+    """The packages and names that a file imports from private modules of other packages."""
+    folder = path.relative_to(ROOT).parts[0]
+    return {
+        (module[1], alias.name)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom)
+        for module in [(node.module or "").split(".")]
+        if module[0] == "vertax" and len(module) > 1 and module[1] not in ("_base", folder)
+        for alias in node.names
+        if len(module) > 2 or alias.name.startswith("_")
+    }
+
+
+@pytest.mark.parametrize("package", APPLICATIONS)
+def test_applications_import_public_names_of_the_library_only(package):
+    private = [
+        f"{path.name} imports {name} of {other}"
+        for path in modules(package)
+        for other, name in sorted(private_names(path))
+        if other not in APPLICATIONS
+    ]
+    assert not private
+
+
+def test_private_names_that_cross_packages_become_fewer():
+    crossing = {
+        name for package in LAYERS for path in modules(package) for name in private_names(path)
+    }
+    assert len(crossing) == PRIVATE_NAMES
 
 
 def test_the_package_imports_no_experiment():

@@ -24,7 +24,7 @@ PACKAGES = {
     "costs": "AbstractCost AbstractLeastSquaresCost Anisotropy AspectRatio BulkModulus CellAreas "
     "CellStress CentroidDistance EdgeDistance Frames HomotypicLength IndexAwareStructural "
     "MeanShapeFactor MeshImage ShearModulus SpectralGap Stress VertexDistance WeightedSum "
-    "adjacency aspect_ratio mirror mismatched_neighbours render",
+    "adjacency aspect_ratio matching_vertices mirror mismatched_neighbours render",
     "dissipations": "AbstractDissipation AbstractViscosity AreaViscosity EdgeViscosity "
     "PerimeterViscosity SubstrateFriction Sum ViscositySum",
     "energies": "Ablated AbstractEnergy AbstractLocalEnergy AreaElasticity BoundedTension "
@@ -48,7 +48,8 @@ PACKAGES = {
     "complex_modulus deformed density_of_states elastic_tensor modes pressures "
     "principal pure_shear ramp recoil self_stresses shear_modulus simple_shear "
     "spectrum stress tensions velocities youngs_modulus zero_modes",
-    "mesh": "AbstractBoundary Free Overlaps Periodic Tissue Topology Trajectory cell_polygons pad",
+    "mesh": "AbstractBoundary Arcs Drawing Free Geometry Overlaps Periodic Tissue Topology Trajectory "
+    "angle_of_area cell_polygons crossed_sides geometry_of pad",
     "plotting": "INK SERIES animate animate_figures cell_polygons flipped_edges house_style label_colours "
     "new_figure plot_density_of_states plot_history plot_image "
     "plot_mode plot_moduli plot_recovery plot_stress plot_stress_strain plot_surface plot_tensions "
@@ -63,7 +64,7 @@ PACKAGES = {
     "surfaces": "AbstractSurface Cylinder Graph HeightMap SphericalCap",
     "tensions": "CurvedGeometry EdgeMotion InferredTensions MaskFrame MotionFit TensionsOfMasks find_masks "
     "infer_tensions infer_tensions_of_masks read_mask",
-    "transitions": "AbstractTransitions Change T1 T2 ablate divide remove",
+    "transitions": "AbstractTransitions Change InTurn T1 T2 ablate divide remove",
 }
 
 

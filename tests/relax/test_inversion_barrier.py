@@ -9,7 +9,8 @@ from free_helpers import cluster
 from helpers import fine_difference, random_tissue
 
 import vertax as vx
-from vertax.mesh._topology import edge_neighbourhood, take
+from vertax._base.indexing import take
+from vertax.mesh._topology import edge_neighbourhood
 from vertax.relax._barrier import profile
 from vertax.relax._contacts import Contacts, no_contacts
 from vertax.relax._inversion_barrier import _FADE, _LONG, _OFTEN, REACH, InversionBarrier

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from vertax._base.checks import as_real, check_number
+from vertax._base.model_checks import check_planar
 from vertax.activities._activity import AbstractActivity
 from vertax.activities._noise import safe_sqrt
 from vertax.activities._push import Push
@@ -15,7 +16,6 @@ from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
 from vertax.energies._energy import per_cell
 from vertax.mesh import Tissue
-from vertax.mesh._curved import check_planar
 
 
 class PropulsionState(eqx.Module):

@@ -19,7 +19,6 @@ from vertax._base.checks import check_number, describe
 from vertax._base.results import RESULTS
 from vertax._base.tracing import is_concrete, traced
 from vertax.dynamics import Evolution
-from vertax.energies._scales import cell_size
 from vertax.fitting import InverseProblem
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Relaxation
@@ -285,7 +284,7 @@ def _observe(
     tissue: Tissue = jax.lax.stop_gradient(equilibrium.tissue)
     lengths = jnp.where(tissue.topology.alive_edges, tissue.edge_lengths, jnp.inf)
     converged = jnp.all(equilibrium.result == RESULTS.successful)
-    shortest = jnp.min(lengths) / cell_size(tissue)
+    shortest = jnp.min(lengths) / tissue.cell_size
     measured = problem.is_measurement(energy, equilibrium)
     return residuals, Outcome(converged, jnp.sum(equilibrium.num_t1), shortest, measured)
 

@@ -22,6 +22,7 @@ from vertax.costs._positions import (
     CentroidDistance as CentroidDistance,
     EdgeDistance as EdgeDistance,
     VertexDistance as VertexDistance,
+    matching_vertices as matching_vertices,
 )
 from vertax.costs._structure import (
     IndexAwareStructural as IndexAwareStructural,

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vertax._base.checks import as_real, check_number
+from vertax._base.model_checks import check_planar
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Free, Periodic, Tissue
 from vertax.mesh._arcs import arc_points, length_factor
-from vertax.mesh._curved import check_planar
 
 Measure = Literal["moments", "farthest", "box"]
 

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.checks import as_float64, as_real, check_integer, check_number
+from vertax._base.plane import inverse_of
 from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Free, Periodic, Tissue
-from vertax.mesh._boundary import inverse_of
 
 
 # Non-uniform FFT of the edges, a line density on the plane, times a Gaussian transfer function:

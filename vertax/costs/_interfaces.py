@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from vertax._base.checks import as_real
+from vertax._base.indexing import take
 from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._topology import take
 
 
 def _as_types(value: ArrayLike | Sequence[int]) -> Int[Array, "..."]:

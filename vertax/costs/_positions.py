@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.checks import check_integer, describe
+from vertax._base.indexing import take
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._topology import take
 
 Matching = Literal["number", "cells"]
 

@@ -14,7 +14,6 @@ from vertax.costs._cost import AbstractCost
 from vertax.costs._positions import check_equal, check_target
 from vertax.costs._transport import entropic_transport
 from vertax.energies import AbstractEnergy
-from vertax.energies._scales import cell_size
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
 
@@ -86,7 +85,7 @@ class IndexAwareStructural(AbstractCost):
         check_equal(type(self).__name__, tissue, self.target, "cells")
         length = self.interface_length
         if length is None:
-            length = 0.1 * cell_size(self.target)
+            length = 0.1 * self.target.cell_size
         rows = structure(adjacency(tissue, length))
         columns = structure(adjacency(self.target, length))
         spare = tissue.topology.spare or self.target.topology.spare

@@ -27,10 +27,8 @@ from vertax.dynamics._material import Material
 from vertax.dynamics._pi_controller import PIController
 from vertax.dynamics._time_integration import check_order, evolve_at_once
 from vertax.energies import AbstractEnergy
-from vertax.energies._scales import cell_size
 from vertax.mesh import AbstractBoundary, Tissue
-from vertax.relax._relaxation import Relaxation
-from vertax.relax._response import AbstractResponse
+from vertax.relax import AbstractResponse, Relaxation
 
 
 class Evolution(AbstractResponse):
@@ -366,7 +364,7 @@ def evolve(
 @eqx.filter_jit
 def _resistance(tissue: Tissue, dissipation: AbstractDissipation) -> Float[Array, " vertices"]:
     """Squared resistance of each vertex to a motion of all vertices in different directions."""
-    size = 1e-3 * cell_size(tissue)
+    size = 1e-3 * tissue.cell_size
     angles = 2.4 * jnp.arange(tissue.n_vertices, dtype=tissue.vertices.dtype)
     displacements = size * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
     dissipated = lambda vertices: dissipation(tissue.with_vertices(vertices), tissue, 1.0)

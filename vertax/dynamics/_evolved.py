@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.results import RESULTS, checked
-from vertax.mesh import Tissue
-from vertax.mesh._trajectory import Trajectory
-from vertax.relax._response import Equilibrium
+from vertax.mesh import Tissue, Trajectory
+from vertax.relax import Equilibrium
 
 
 class Evolved(Equilibrium):

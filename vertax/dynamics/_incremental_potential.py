@@ -6,12 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vertax._base.indexing import take
+from vertax._base.model_checks import real_scalar
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import real_scalar
-from vertax.energies._scales import cell_size
 from vertax.mesh import Tissue
-from vertax.mesh._topology import edge_neighbourhood, source, take
+from vertax.mesh._topology import edge_neighbourhood, source
 from vertax.relax._inversion_barrier import REACH, inversion_energy_of_all
 
 
@@ -43,7 +43,7 @@ class IncrementalPotential(AbstractEnergy):
         before = with_flips_of(self.before, tissue) if self.may_flip else self.before
         value = real_scalar(self.energy(tissue))
         if self.max_driving_force is not None:
-            reach = REACH * cell_size(self.before)
+            reach = REACH * self.before.cell_size
             value += inversion_energy_of_all(tissue, reach, self.max_driving_force)
         if self.previous_strains is None or not isinstance(self.dissipation, AbstractViscosity):
             return value + self.dissipation(tissue, before, self.dt)

@@ -8,10 +8,10 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from vertax._base.checks import describe
+from vertax._base.model_checks import check_energy
 from vertax.activities import AbstractActivity
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import check_energy
 from vertax.mesh import Tissue
 
 

@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax._base.checks import check_integer, check_number
 from vertax.adjoints._adjoint import frozen
-from vertax.energies._scales import cell_size
 from vertax.mesh import Tissue
 
 # The PI controller (Söderlind 2002, doi:10.1023/A:1021160023092): with the errors ε_n in units of the
@@ -76,7 +75,7 @@ class PIController(eqx.Module):
         The error of the `records` of an activity is relative to the largest entry of each row.
         """
         difference = jax.tree.map(jnp.subtract, *frozen((halves.configuration, full.configuration)))
-        error = optx.max_norm(difference) / frozen(cell_size(halves))
+        error = optx.max_norm(difference) / frozen(halves.cell_size)
         for one, other in zip(*map(jax.tree.leaves, frozen(records)), strict=True):
             scale = jnp.max(jnp.abs(one), axis=-1, keepdims=True)
             relative = jnp.abs(one - other) / jnp.where(scale > 0, scale, 1)

@@ -9,31 +9,18 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from vertax._base.model_checks import real_scalar
 from vertax._base.probe_vector import probe_vector
 from vertax._base.scales import Scales
-from vertax.energies._energy import real_scalar
 from vertax.mesh import Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
-from vertax.mesh._tissue import mean_area
 
 
 def scales_of(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Scales:
     """The scales of a tissue and its energy, without a tolerance."""
     stiffness = mean_stiffness(tissue, energy)
     valid = jnp.isfinite(stiffness) & (stiffness > 0)
-    return Scales(cell_size(tissue), jnp.where(valid, stiffness, 1))
-
-
-def cell_size(tissue: Tissue) -> Float[Array, ""]:
-    """Square root of the mean cell area. Arc angles are clipped, so that the area stays finite."""
-    if tissue.angles is not None:
-        tissue = tissue.with_angles(jnp.clip(tissue.angles, -_LARGEST_ANGLE, _LARGEST_ANGLE))
-    return jnp.sqrt(mean_area(tissue))
-
-
-# Half of the angle that an arc spans, in radians. At this angle the area of the circular segment is 5.3
-# times that of the half disc over the same chord.
-_LARGEST_ANGLE = 2.5
+    return Scales(tissue.cell_size, jnp.where(valid, stiffness, 1))
 
 
 def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[Array, ""]:

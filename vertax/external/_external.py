@@ -14,21 +14,21 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.model_checks import check_energy, check_planar
 from vertax._base.results import RESULTS
 from vertax._base.scales import Scales
 from vertax._base.tracing import is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import check_energy
-from vertax.energies._scales import cell_size, scales_of
+from vertax.energies._scales import scales_of
 from vertax.external._external_gradient import ExternalEquilibrium, attach_gradient, force_of
 from vertax.external._host import Job, Request, Result, run_jobs, stack_results
 from vertax.external._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
 from vertax.mesh import Tissue
-from vertax.mesh._curved import check_planar
+from vertax.relax import AbstractResponse, Equilibrium
 from vertax.relax._equilibrium import follow_start, free_motions
-from vertax.relax._response import AbstractResponse, Equilibrium, with_overlaps
+from vertax.relax._response import with_overlaps
 
 
 class External(AbstractResponse):
@@ -218,7 +218,7 @@ class External(AbstractResponse):
         """The typical sizes."""
         if self.slope == "energy" and self.stiffness is None:
             return scales_of(tissue, energy)
-        return Scales(cell_size(tissue), jnp.asarray(self.stiffness, tissue.vertices.dtype))
+        return Scales(tissue.cell_size, jnp.asarray(self.stiffness, tissue.vertices.dtype))
 
     def run_simulator(self, request: Request, throw: bool) -> Result:
         """Run the program for one request, inside a compiled function; batches run in parallel."""

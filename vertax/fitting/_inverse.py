@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
 from vertax._base.memory_maps import warn_of_memory_maps
+from vertax._base.model_checks import check_energy, instance_hint, real_scalar, warn_of_columns
 from vertax._base.tracing import traced
 from vertax.adjoints import (
     AbstractAdjoint,
@@ -27,7 +28,6 @@ from vertax.adjoints._propagation import AbstractNudgedSystem, nudged_cost
 from vertax.costs import AbstractCost
 from vertax.dynamics import Evolved
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import check_energy, instance_hint, real_scalar, warn_of_columns
 from vertax.energies._scales import mean_stiffness, scales_of
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Equilibrium, Relaxation

@@ -10,8 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from vertax.costs import render
 from vertax.io import Foam
-from vertax.mesh import Free, Periodic, Tissue
-from vertax.mesh._outlines import Drawing
+from vertax.mesh import Drawing, Free, Periodic, Tissue
 
 
 class Microscope(eqx.Module):

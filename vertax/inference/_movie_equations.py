@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax.costs._positions import matching_vertices
+from vertax._base.indexing import take
+from vertax.costs import matching_vertices
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._topology import take
 
 
 class Settings(eqx.Module):

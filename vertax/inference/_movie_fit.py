@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.batch import member
 from vertax._base.checks import check_integer, check_number
+from vertax._base.model_checks import check_energy
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import check_energy
 from vertax.inference._movie import Movie
 from vertax.inference._movie_equations import (
     Settings,

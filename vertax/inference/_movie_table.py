@@ -9,11 +9,11 @@ from jaxtyping import ArrayLike, Float, Int
 
 from vertax._base.checks import as_float64, check_number
 from vertax.inference._movie import Movie
+from vertax.initialise._faces import Names
 from vertax.initialise._nearby_corners import build_within, share_corners, size_of_cells
 from vertax.initialise._polygons import checked_lattice, corner_images, tissue_from_corners
 from vertax.io._read_table import column, whole_numbers
 from vertax.mesh import Tissue
-from vertax.mesh._faces import Names
 
 
 def movie_from_table(

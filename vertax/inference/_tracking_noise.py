@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vertax._base.announce import announced_jit
-from vertax.costs._positions import matching_vertices
+from vertax._base.indexing import take
+from vertax.costs import matching_vertices
 from vertax.inference._movie_equations import frame_at
 from vertax.mesh import Tissue
-from vertax.mesh._topology import take
 
 
 @announced_jit

@@ -11,8 +11,7 @@ from vertax._base.checks import as_key, check_concrete, check_integer
 from vertax.initialise._overlap_repair import repair_overlaps
 from vertax.initialise._spatial_order import spatial_order
 from vertax.initialise._voronoi import tessellate
-from vertax.mesh import Free, Tissue, Topology
-from vertax.mesh._arcs import angle_of_area
+from vertax.mesh import Free, Tissue, Topology, angle_of_area
 
 
 def free_voronoi(

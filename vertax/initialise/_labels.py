@@ -27,9 +27,7 @@ from vertax.initialise._overlap_repair import repair_overlaps
 from vertax.initialise._pieces import join_pieces, numbered, without_specks
 from vertax.initialise._repairs import listed, mesh_or_repairs, untangle
 from vertax.initialise._report import MaskReport, Repaired, contacts_of, report_on
-from vertax.mesh import Free, Periodic, Tissue, Topology
-from vertax.mesh._arcs import angle_of_area
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Free, Periodic, Tissue, Topology, angle_of_area, geometry_of
 
 _HOLES = ("keep", "close")
 

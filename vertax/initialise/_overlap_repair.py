@@ -7,9 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vertax._base.announce import announced_jit
-from vertax.mesh import Periodic, Tissue
-from vertax.mesh._geometry import geometry_of
-from vertax.mesh._overlaps import crossed_sides
+from vertax.mesh import Periodic, Tissue, crossed_sides, geometry_of
 
 # Largest number of rounds of flattening, and of bending back.
 _ROUNDS = 60

@@ -12,12 +12,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from vertax._base.checks import as_float64, check_concrete, check_number, describe
+from vertax.initialise._faces import FaceMesh, Names, Sides, build_faces
 from vertax.initialise._nearby_corners import build_within, share_corners, size_of_cells
 from vertax.initialise._overlap_repair import crossed_by, repair_overlaps
-from vertax.mesh import Free, Periodic, Tissue
-from vertax.mesh._arcs import angle_of_area
-from vertax.mesh._faces import FaceMesh, Names, Sides, build_faces
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Free, Periodic, Tissue, angle_of_area, geometry_of
 
 
 class PolygonTissue(eqx.Module):

@@ -16,8 +16,7 @@ from jaxtyping import Array, Shaped
 
 from vertax._base.atomic import atomic_write
 from vertax._base.checks import check_concrete, describe
-from vertax.mesh import Tissue
-from vertax.mesh._outlines import Drawing
+from vertax.mesh import Drawing, Tissue
 
 Column: TypeAlias = Array | np.ndarray | Sequence[Any]
 

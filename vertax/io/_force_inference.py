@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from vertax._base.checks import check_number
-from vertax.initialise._polygons import PolygonTissue, tissue_from_corners
-from vertax.mesh._faces import Names
+from vertax.initialise import PolygonTissue
+from vertax.initialise._faces import Names
+from vertax.initialise._polygons import tissue_from_corners
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _LINES = {

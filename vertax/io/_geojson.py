@@ -14,10 +14,9 @@ import numpy as np
 
 from vertax._base.atomic import atomic_write
 from vertax._base.checks import check_integer, describe
+from vertax._base.model_checks import check_planar
 from vertax.io._data_tables import Column, cell_columns, check_single, edge_columns
-from vertax.mesh import Tissue
-from vertax.mesh._curved import check_planar
-from vertax.mesh._outlines import Drawing
+from vertax.mesh import Drawing, Tissue
 
 
 def write_geojson(

@@ -34,10 +34,8 @@ from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax._base.checks import describe
 from vertax.energies import AbstractEnergy
 from vertax.fitting import InverseProblem
-from vertax.mesh import Free, Periodic, Tissue, Topology
-from vertax.mesh._arcs import Arcs
-from vertax.transitions import T1, T2
-from vertax.transitions._transitions import InTurn
+from vertax.mesh import Arcs, Free, Periodic, Tissue, Topology
+from vertax.transitions import T1, T2, InTurn
 
 _VERSION = 1
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Float, Shaped
 
+from vertax.initialise import PolygonTissue
+from vertax.initialise._faces import Names
 from vertax.initialise._nearby_corners import size_of_cells
-from vertax.initialise._polygons import PolygonTissue, tissue_from_near_corners
+from vertax.initialise._polygons import tissue_from_near_corners
 from vertax.io._read_table import properties, read_features
-from vertax.mesh._faces import Names
 
 
 def read_geojson(

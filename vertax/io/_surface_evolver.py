@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vertax.mesh import Free, Tissue
-from vertax.mesh._arcs import angle_of_area
-from vertax.mesh._faces import Names, Sides, build_faces
+from vertax.initialise._faces import Names, Sides, build_faces
+from vertax.mesh import Free, Tissue, angle_of_area
 
 
 class Foam(eqx.Module):

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vertax._base.checks import check_number, describe
+from vertax._base.model_checks import check_planar
 from vertax.io._bounded_tables import BoundedTables, checked, with_exterior, without_exterior
 from vertax.io._data_tables import check_single
 from vertax.mesh import Free, Periodic, Tissue, Topology
-from vertax.mesh._curved import check_planar
 
 
 class Tables(NamedTuple):

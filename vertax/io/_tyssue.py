@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import ArrayLike, Int
 
 from vertax._base.checks import as_float64, describe
-from vertax.initialise._polygons import PolygonTissue, tissue_from_corners
+from vertax.initialise import PolygonTissue
+from vertax.initialise._faces import Names
+from vertax.initialise._polygons import tissue_from_corners
 from vertax.io._read_table import column, read_table, whole_numbers
-from vertax.mesh._faces import Names
 
 _TABLES = ("vert", "edge", "face")
 

@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.checks import as_real, describe
+from vertax._base.model_checks import check_energy, check_planar, warn_of_columns
 from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
-from vertax.energies._energy import check_energy, warn_of_columns
 from vertax.mesh import Periodic, Tissue
-from vertax.mesh._curved import check_planar
 from vertax.relax import Relaxation
 
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vertax._base.announce import announced_jit
+from vertax._base.model_checks import real_scalar
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import check_system
 from vertax.mesh import Tissue
 from vertax.mesh._tissue import Measurements

@@ -12,12 +12,11 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.model_checks import check_planar, real_scalar
 from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
-from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import as_matrix, check_tissue
 from vertax.mesh import Periodic, Tissue
-from vertax.mesh._curved import check_planar
 
 Motion: TypeAlias = tuple[Float[Array, "2 2"], PyTree[Float[Array, "..."]]]
 """An affine strain of box and vertices, and an additional change of the configuration."""

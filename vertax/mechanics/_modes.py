@@ -15,6 +15,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_float64, check_concrete, check_integer, check_number
+from vertax._base.model_checks import check_planar
 from vertax._base.sparse_normal import factorised
 from vertax._base.tracing import is_concrete, traced
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
@@ -29,7 +30,6 @@ from vertax.mechanics._hessian import (
 )
 from vertax.mechanics._landscape import Landscape, stationary
 from vertax.mesh import Tissue
-from vertax.mesh._curved import check_planar
 
 # Eigenvalues up to this fraction of the largest one count as 0, see `zero_threshold`.
 _ZERO = 1e-8

@@ -10,10 +10,10 @@ from jaxtyping import Array, Float, Int
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import check_integer
+from vertax._base.model_checks import real_scalar
 from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import check_dissipation, check_linear_solver, check_system
 from vertax.mechanics._forces import tensions
 from vertax.mechanics._landscape import checked, dissipation_landscape, solve

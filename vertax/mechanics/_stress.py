@@ -8,15 +8,15 @@ from jaxtyping import Array, Float
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_real
+from vertax._base.model_checks import check_planar, real_scalar
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import real_scalar
 from vertax.mechanics._arguments import check_system
 from vertax.mechanics._forces import pressures_and_tensions
 from vertax.mechanics._landscape import area_of, deformed
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import area_factor, length_factor
-from vertax.mesh._curved import check_planar, space_chords, tangent_frame
+from vertax.mesh._curved import space_chords
 
 
 def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
@@ -96,7 +96,7 @@ def _cell_stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "cells 
     sides = cells.T.ravel()
     sums = jax.ops.segment_sum(jnp.tile(moments, (2, 1, 1)), sides, tissue.n_cells)
     if tissue.surface is not None:
-        frame = tangent_frame(tissue.surface, tissue.centroids)[0]
+        frame = tissue.surface.tangent_frame(tissue.centroids)[0]
         sums = jnp.einsum("cik,ckl,cjl->cij", frame, sums, frame)
     isotropic = pressure[:, None, None] * jnp.eye(2, dtype=moments.dtype)
     areas = tissue.areas

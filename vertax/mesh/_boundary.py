@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from vertax._base.checks import describe
+from vertax._base.plane import inverse_of
 from vertax._base.tracing import is_concrete
 
 
@@ -248,9 +249,3 @@ def _translation_drift(
 ) -> Float[Array, "2"]:
     drift = jnp.mean(displacement, axis=0) * jnp.sqrt(1.0 * displacement.shape[0])
     return drift if pinned is None else jnp.where(jnp.any(pinned), 0, drift)
-
-
-def inverse_of(lattice: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
-    """The inverse of a 2 × 2 matrix by its formula, which compiles faster than `jnp.linalg.inv`."""
-    (a, b), (c, d) = lattice
-    return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +9,10 @@ from jaxtyping import Array, Float
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
+from vertax._base.indexing import take
 from vertax._base.tracing import is_concrete
 from vertax.mesh._boundary import AbstractBoundary, Periodic
-from vertax.mesh._topology import Topology, clockwise, take
+from vertax.mesh._topology import Topology, clockwise
 from vertax.surfaces import AbstractSurface
 
 # An edge is the chord in space between its ends. A cell is the part of the surface above its polygon in the
@@ -35,21 +34,6 @@ def surface_points(
 ) -> Float[Array, "*shape 3"]:
     """Points in space, in the precision of the chart."""
     return surface.points(x).astype(x.dtype)
-
-
-def tangent_frame(
-    surface: AbstractSurface, x: Float[Array, "n 2"]
-) -> tuple[Float[Array, "n 2 3"], Float[Array, "n 2 2"]]:
-    """Orthonormal tangents e as rows, the first along the first coordinate; and J = e^T R as the matrix R."""
-    u, v = (each.astype(x.dtype) for each in surface.tangents(x))
-    length = jnp.sqrt(jnp.sum(u**2, axis=-1))
-    first = u / length[:, None]
-    along = jnp.sum(v * first, axis=-1)
-    rest = v - along[:, None] * first
-    height = jnp.sqrt(jnp.sum(rest**2, axis=-1))
-    frame = jnp.stack([first, rest / height[:, None]], axis=-2)
-    upper = [jnp.stack([length, along], axis=-1), jnp.stack([0 * height, height], axis=-1)]
-    return frame, jnp.stack(upper, axis=-2)
 
 
 def space_chords(surface: AbstractSurface, segments: Segments) -> Float[Array, "edges 3"]:
@@ -157,13 +141,3 @@ def _points_and_density(
     surface: AbstractSurface, x: Float[Array, "vertices 2"]
 ) -> tuple[Float[Array, "vertices 3"], Float[Array, " vertices"]]:
     return surface.points(x), surface.density(x)
-
-
-def check_planar(what: str, tissue: Any) -> None:
-    """Raise a `ValueError` for a tissue on a surface; `what` names the calculation."""
-    surface = getattr(tissue, "surface", None)
-    if surface is not None:
-        raise ValueError(
-            f"Argument `tissue` must be planar for {what}, but lies on a surface "
-            f"({type(surface).__name__}). For the tissue in the chart call tissue.with_surface(None)."
-        )

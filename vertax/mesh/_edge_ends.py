@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vertax._base.custom_transpose import linear_with_transpose
+from vertax._base.indexing import take
 from vertax._base.sums import total
-from vertax.mesh._topology import Topology, source, take
+from vertax.mesh._topology import Topology, source
 
 
 class EdgeEnds(NamedTuple):

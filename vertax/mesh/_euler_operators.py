@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vertax.mesh._topology import Topology, clockwise, counter_clockwise, source, take
+from vertax._base.indexing import take
+from vertax.mesh._topology import Topology, clockwise, counter_clockwise, source
 
 Index = Int[Array, ""]
 Condition = Bool[Array, ""]

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.indexing import take
 from vertax.mesh._boundary import Periodic
 from vertax.mesh._tissue import Tissue
-from vertax.mesh._topology import take
 
 _POINTS_PER_ARC = 24
 

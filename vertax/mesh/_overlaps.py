@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.indexing import take
 from vertax.mesh._sides import Sides, sides_cross
-from vertax.mesh._topology import Topology, take
+from vertax.mesh._topology import Topology
 
 Carry = TypeVar("Carry")
 
@@ -82,9 +83,10 @@ def crossed_sides(
 
     **Arguments:**
 
+    - `sides`, shape `(sides, 4)` or `(sides, 5)`: start, vector, and with arcs the angle of each side.
     - `following`: for each side, the next side of its face.
     - `last`: for each side, the number of sides of its face minus two.
-    - `few_long`: as for `loop_over_side_pairs`.
+    - `few_long`: whether a small number of faces, such as the exterior, has many more sides than the others.
     """
 
     def compare(pair: Pairs, crossed: Array) -> Array:

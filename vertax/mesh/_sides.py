@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vertax._base.minimum_maximum import maximum, minimum
+from vertax._base.plane import cross, dot
 from vertax._base.reciprocal import inverse_square_root
 
 # A side is a row of an array: its start, its chord and, in tissues with arcs, its angle α, positive if it
@@ -20,16 +21,6 @@ from vertax._base.reciprocal import inverse_square_root
 # For α = 0 this is the line of the chord; no radius becomes large. The signed distance from the circle is
 # 2 F / (1 + √(1 + 2 κ F)).
 Sides = Float[Array, "sides parts"]
-
-
-def cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
-    """Cross product of vectors in the plane."""
-    return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-
-
-def dot(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
-    """Scalar product."""
-    return p[..., 0] * q[..., 0] + p[..., 1] * q[..., 1]
 
 
 def sides_cross(one: Sides, other: Sides, joined: Bool[Array, ""]) -> Bool[Array, " sides"]:

@@ -11,15 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from vertax._base.indexing import take
+from vertax._base.model_checks import check_planar
+from vertax._base.plane import cross
 from vertax._base.sums import total
 from vertax._base.tracing import compiled_property, is_concrete
 from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
 from vertax.mesh._boundary import AbstractBoundary, Free, Periodic
 from vertax.mesh._capacity import size_class, with_slots, without_slots
-from vertax.mesh._curved import area_shares, check_planar, check_surface, space_chords
+from vertax.mesh._curved import area_shares, check_surface, space_chords
 from vertax.mesh._edge_ends import gather_at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
-from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source, take
+from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source
 from vertax.surfaces import AbstractSurface
 
 
@@ -263,6 +266,17 @@ class Tissue(eqx.Module):
         return self.measured().areas
 
     @compiled_property
+    def cell_size(self) -> Float[Array, ""]:
+        """Square root of the mean area of the living cells, the unit of lengths.
+
+        Angles of arcs beyond 2.5 are clipped, so that the area stays finite.
+        """
+        tissue = self
+        if self.angles is not None:
+            tissue = self.with_angles(jnp.clip(self.angles, -_LARGEST_ANGLE, _LARGEST_ANGLE))
+        return jnp.sqrt(mean_area(tissue))
+
+    @compiled_property
     def perimeters(self) -> Float[Array, " cells"]:
         """Perimeter of each cell (softened, see the class)."""
         return self.measured().perimeters
@@ -298,7 +312,7 @@ class Tissue(eqx.Module):
         centre = over(face_sums(corners), count)
         p = corners - take(centre, m.cell)
         q = take(p, m.next)
-        area = _cross(p, q) / 2
+        area = cross(p, q) / 2
         moment = (p + q) * area[:, None] / 3
         if self.arcs is not None:
             angle = take(self.edge_angles, m.edge)
@@ -595,6 +609,11 @@ def _mean_area(tissue: Tissue) -> Float[Array, ""]:
     return mean_area(tissue)
 
 
+# Half of the angle that an arc spans, in radians. At this angle the area of the circular segment is 5.3
+# times that of the half disc over the same chord.
+_LARGEST_ANGLE = 2.5
+
+
 def mean_area(tissue: Tissue) -> Float[Array, ""]:
     """The mean area of the living cells."""
     if isinstance(tissue.boundary, Periodic) and tissue.surface is None:
@@ -602,7 +621,3 @@ def mean_area(tissue: Tissue) -> Float[Array, ""]:
         return jnp.abs(tissue.boundary.area) / n_alive
     areas = jnp.abs(tissue.areas)
     return jnp.sum(areas) / jnp.sum(tissue.alive) if tissue.topology.spare else jnp.mean(areas)
-
-
-def _cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
-    return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]

@@ -6,10 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Int, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from vertax._base.indexing import take
 from vertax._base.tracing import compiled_property, is_concrete
 from vertax.mesh._topology_checks import check_half_edge_arrays
 
@@ -418,8 +419,3 @@ def counter_clockwise(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
     """The half-edge one slot counter-clockwise around the same vertex."""
     slot = jax.lax.rem(h, jnp.asarray(3, h.dtype))
     return h + jax.lax.select(slot == 2, jnp.full_like(h, -2), jnp.full_like(h, 1))
-
-
-def take(array: Shaped[Array, "n *shape"], index: Int[Array, "..."]) -> Shaped[Array, "..."]:
-    """`array[index]` for valid, non-negative indices (not checked)."""
-    return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -17,8 +17,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
 from vertax._base.atomic import atomic_draft
-from vertax.mesh import Tissue
-from vertax.mesh._outlines import Drawing
+from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
 from vertax.plotting._colours import Colours, add_bar
 from vertax.plotting._tissue import draw, line_width, view_of

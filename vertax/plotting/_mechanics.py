@@ -9,9 +9,7 @@ from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from vertax.mesh import Periodic, Tissue
-from vertax.mesh._curved import tangent_frame
-from vertax.mesh._outlines import Drawing
+from vertax.mesh import Drawing, Periodic, Tissue
 from vertax.plotting import _style
 from vertax.plotting._tissue import plot_tissue, single
 
@@ -48,7 +46,7 @@ def plot_stress(
     values, vectors = np.linalg.eigh(0.5 * (matrices + np.swapaxes(matrices, 1, 2)))
     half = 0.5 * drawing.cell_size * np.abs(values) / _unit(np.abs(values), scale)
     if tissue.surface is not None:  # the bars in space, in the coordinates of the chart
-        upper = np.asarray(tangent_frame(tissue.surface, tissue.centroids)[1], float)
+        upper = np.asarray(tissue.surface.tangent_frame(tissue.centroids)[1], float)
         vectors = np.linalg.solve(upper, vectors)
     way = (half[:, None, :] * vectors).swapaxes(1, 2)
     centres = drawing.centroids[:, None]

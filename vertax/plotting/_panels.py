@@ -12,8 +12,7 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
 from vertax._base.pixels import PixelSizeLike
-from vertax.mesh import Tissue
-from vertax.mesh._outlines import Drawing
+from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
 from vertax.plotting._colours import EDGES_ON_DARK, EDGES_ON_PALE, Colours, add_bar
 from vertax.plotting._image import extent_of, plot_image

@@ -11,8 +11,7 @@ from matplotlib.colors import Colormap
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from vertax.mesh import Tissue
-from vertax.mesh._outlines import Drawing
+from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
 from vertax.plotting._colours import Colours, add_bar
 from vertax.plotting._tissue import checked, single

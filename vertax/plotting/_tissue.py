@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from vertax._base.pixels import PixelSizeLike
-from vertax.mesh import Tissue
-from vertax.mesh._outlines import Drawing
+from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
 from vertax.plotting._colours import EDGES_ON_DARK, EDGES_ON_PALE, Colours, bar_beside
 from vertax.plotting._image import draw_image, extent_of

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from vertax._base.indexing import take
 from vertax._base.probe_vector import probe_vector
 from vertax._base.sums import total
 from vertax.energies import AbstractEnergy
-from vertax.mesh import Tissue
+from vertax.mesh import Tissue, Topology
 from vertax.mesh._edge_ends import EdgeEnds
 from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.mesh._tissue import Measurements
-from vertax.mesh._topology import Topology, take
 
 # The least stiffness of a block, in units of the mean. (Between 0.1 and 3 times this number the number of
 # steps is the same.)

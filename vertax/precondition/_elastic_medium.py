@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, PyTree
 
+from vertax._base.indexing import take
+from vertax._base.plane import inverse_of
 from vertax._base.sums import total
 from vertax.mesh import Periodic, Tissue
-from vertax.mesh._boundary import inverse_of
-from vertax.mesh._topology import take
 from vertax.solvers._rows import Rows
 
 # (With one point for four cells a gradient takes a quarter more products with the Hessian.)

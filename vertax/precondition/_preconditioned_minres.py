@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import zeros_of
 from vertax.precondition._sum import Preconditioner, TissueInverse
-from vertax.solvers._minres import MINRES
+from vertax.solvers import MINRES
 from vertax.solvers._rows import point_of, table_of
 
 

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vertax._base.minimum_maximum import maximum, minimum
+from vertax._base.plane import cross, dot
 from vertax._base.reciprocal import inverse_square_root, reciprocal
 from vertax._base.sums import total
-from vertax.mesh._sides import Circle, Sides, circle_of, cross, dot, on_arc
+from vertax.mesh._sides import Circle, Sides, circle_of, on_arc
 from vertax.relax._barrier import Expansion, differentiated, profile
 from vertax.relax._pair_barrier import AbstractPairBarrier
 

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.indexing import take
+from vertax._base.plane import dot
 from vertax._base.reductions import any_of, count_true, indices_of_true
-from vertax.mesh import Tissue
+from vertax.mesh import Tissue, Topology
 from vertax.mesh._overlaps import overlaps_and_nearest
-from vertax.mesh._sides import dot
-from vertax.mesh._topology import Topology, take
 from vertax.precondition._edge_blocks import Symmetric
 from vertax.relax._arc_barrier import ArcBarrier
 from vertax.relax._barrier import GatherPlan, barrier_energy

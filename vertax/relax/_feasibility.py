@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.indexing import take
 from vertax._base.reductions import any_of
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._topology import take
 from vertax.relax._contacts import Contacts
 from vertax.transitions import AbstractTransitions
 

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.indexing import take
 from vertax._base.reductions import indices_of_true
 from vertax._base.sums import total
-from vertax.mesh import Tissue
-from vertax.mesh._topology import Topology, edge_neighbourhood, take
+from vertax.mesh import Tissue, Topology
+from vertax.mesh._topology import edge_neighbourhood
 from vertax.relax._barrier import (
     FLOOR,
     AbstractBarrier,

@@ -19,7 +19,7 @@ from vertax.precondition._sum import Preconditioner
 from vertax.relax._contacts import Contacts, no_contacts
 from vertax.relax._feasibility import Feasibility
 from vertax.relax._objective import objective, preconditioner_of
-from vertax.solvers._solver import AbstractIteration
+from vertax.solvers import AbstractIteration
 
 
 class SearchState(eqx.Module):

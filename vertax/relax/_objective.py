@@ -5,8 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.model_checks import real_scalar
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import real_scalar
 from vertax.mesh import Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
 from vertax.precondition._edge_blocks import EdgeBlocks

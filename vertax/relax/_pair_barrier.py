@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vertax._base.minimum_maximum import minimum
+from vertax._base.plane import dot
 from vertax._base.reciprocal import reciprocal
 from vertax._base.sums import total
-from vertax.mesh._sides import Sides, dot, squared_distance_to_segment
+from vertax.mesh._sides import Sides, squared_distance_to_segment
 from vertax.relax._barrier import (
     AbstractBarrier,
     Expansion,

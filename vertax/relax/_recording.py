@@ -12,8 +12,7 @@ from vertax._base.tracing import traced
 from vertax.adjoints import ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.energies._scales import scales_of
-from vertax.mesh import Tissue
-from vertax.mesh._trajectory import Trajectory
+from vertax.mesh import Tissue, Trajectory
 from vertax.relax._equilibrium import SearchEnd, free_motions
 from vertax.relax._loop import Search, SearchState
 from vertax.relax._relaxation import Relaxation, attached

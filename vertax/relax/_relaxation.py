@@ -16,13 +16,13 @@ from jaxtyping import Array, Float, Int
 from vertax._base.announce import announced_jit
 from vertax._base.checks import check_integer, check_number
 from vertax._base.memory_maps import warn_of_memory_maps
+from vertax._base.model_checks import check_energy, warn_of_columns
 from vertax._base.results import RESULTS, any_is
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import closed_over_tracers, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import check_energy, warn_of_columns
 from vertax.energies._scales import scales_of
 from vertax.mesh import Tissue
 from vertax.relax._compatibility import check_adjoint, check_sharding
@@ -30,9 +30,9 @@ from vertax.relax._equilibrium import SearchEnd, conclude
 from vertax.relax._feasibility import Feasibility
 from vertax.relax._loop import Search
 from vertax.relax._response import AbstractResponse, Equilibrium
-from vertax.solvers import AbstractSolver, NewtonCG, Wrapped
+from vertax.solvers import AbstractIteration, AbstractSolver, NewtonCG, Wrapped
 from vertax.solvers._optimistix import check_solver
-from vertax.solvers._solver import AbstractIteration, Stepwise
+from vertax.solvers._solver import Stepwise
 from vertax.solvers._stop_at_rest import StopAtRest
 from vertax.transitions import T1, AbstractTransitions
 

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from vertax._base.indexing import take
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
 from vertax.mesh._curved import space_chords, surface_points
-from vertax.mesh._topology import clockwise, take
+from vertax.mesh._topology import clockwise
 
 
 class Exchange(NamedTuple):

@@ -89,6 +89,28 @@ class AbstractSurface(eqx.Module):
         u, v = jax.vmap(along)(jnp.eye(2, dtype=x.dtype))
         return u, v
 
+    def tangent_frame(
+        self, x: Float[Array, "n 2"]
+    ) -> tuple[Float[Array, "n 2 3"], Float[Array, "n 2 2"]]:
+        r"""Orthonormal tangents at points, and the Jacobian in this frame.
+
+        **Arguments:**
+
+        - `x`, shape `(n, 2)`: coordinates in the chart.
+
+        **Returns:** the tangents $e$ as rows, shape `(n, 2, 3)`, the first along the first coordinate; and
+        the upper triangular $R$ of $J = e^T R$, shape `(n, 2, 2)`.
+        """
+        u, v = (each.astype(x.dtype) for each in self.tangents(x))
+        length = jnp.sqrt(jnp.sum(u**2, axis=-1))
+        first = u / length[:, None]
+        along = jnp.sum(v * first, axis=-1)
+        rest = v - along[:, None] * first
+        height = jnp.sqrt(jnp.sum(rest**2, axis=-1))
+        frame = jnp.stack([first, rest / height[:, None]], axis=-2)
+        upper = [jnp.stack([length, along], axis=-1), jnp.stack([0 * height, height], axis=-1)]
+        return frame, jnp.stack(upper, axis=-2)
+
 
 def density_of_graph(
     height: Callable[[Array], Array], x: Float[Array, "*shape 2"]

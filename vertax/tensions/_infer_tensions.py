@@ -21,8 +21,7 @@ from vertax.initialise import MaskReport, Segmentation, from_labels
 from vertax.initialise._report import LEAST_LENGTH
 from vertax.io import Foam, pixel_aspect, read_image, read_surface_evolver
 from vertax.io._surface_evolver import is_surface_evolver
-from vertax.mesh import Tissue
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Tissue, geometry_of
 from vertax.surfaces import AbstractSurface, HeightMap
 from vertax.tensions._balance import equations
 from vertax.tensions._curves import Points

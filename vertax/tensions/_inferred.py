@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from vertax._base.pixels import PixelSize, pixel_sides
 from vertax.initialise import MaskReport
 from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vtk
-from vertax.mesh import Tissue
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Tissue, geometry_of
 from vertax.tensions._columns import with_pixels
 from vertax.tensions._mean_stress import MeanStress
 from vertax.tensions._pixel_aspect import pixel_aspect_warning

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vertax._base.announce import announced_jit
-from vertax.mesh import Tissue
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Tissue, geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._observed_geometry import Lift, ObservedGeometry
 

@@ -6,8 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vertax.mesh import Tissue
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Tissue, geometry_of
 
 
 class MeanStress(eqx.Module):

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vertax.mesh import Tissue
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Tissue, geometry_of
 
 
 class Lift(NamedTuple):

@@ -11,9 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.initialise import MaskReport
-from vertax.mesh import Tissue
-from vertax.mesh._arcs import angle_of_area
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Tissue, angle_of_area, geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import Equations
 from vertax.tensions._curves import Fitted, Points, arc_distances

@@ -9,11 +9,11 @@ from jaxtyping import Array, ArrayLike, Bool
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
+from vertax._base.indexing import take
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.energies import Ablated, AbstractEnergy, AbstractLocalEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._euler_operators import merge_cells
-from vertax.mesh._topology import take
 from vertax.transitions._t1 import has_new_overlaps
 from vertax.transitions._t2 import face_sides
 

@@ -11,11 +11,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_real, check_integer
+from vertax._base.indexing import take
 from vertax._base.results import RESULTS, checked
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.mesh import Tissue, Topology
 from vertax.mesh._euler_operators import Slot, spare_slot, split_cell
-from vertax.mesh._topology import take
 from vertax.transitions._change import Change, unchanged
 from vertax.transitions._cut import Cut, find_cut, points_at
 from vertax.transitions._t1 import has_new_overlaps

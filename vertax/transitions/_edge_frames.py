@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.indexing import take
+from vertax._base.plane import cross, dot
 from vertax.mesh import Tissue
 from vertax.mesh._arcs import length_factor
-from vertax.mesh._sides import Sides, cross, dot
-from vertax.mesh._topology import edge_neighbourhood, flip_edges, source, take
+from vertax.mesh._sides import Sides
+from vertax.mesh._topology import edge_neighbourhood, flip_edges, source
 
 
 class EdgeFrames(eqx.Module):

@@ -9,16 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.indexing import take
 from vertax._base.reductions import any_of
 from vertax._base.sums import total
 from vertax._base.tracing import is_concrete
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
-from vertax.energies._scales import cell_size
-from vertax.mesh import Tissue
+from vertax.mesh import Overlaps, Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
-from vertax.mesh._overlaps import Overlaps
 from vertax.mesh._tissue import mean_area
-from vertax.mesh._topology import take
 from vertax.transitions._edge_frames import EdgeFrames
 from vertax.transitions._transitions import AbstractTransitions
 
@@ -85,7 +83,7 @@ class T1(AbstractTransitions):
         allowed: Bool[Array, " edges"] | bool = True,
     ) -> tuple[Tissue, Int[Array, " edges"]]:
         """Try every candidate once; returns the new tissue and the updated counts."""
-        threshold = self.threshold * cell_size(tissue)
+        threshold = self.threshold * tissue.cell_size
 
         # Each round tries candidates that share no cell; the others wait for the next round. A round removes
         # at least one edge from `todo`, so the loop ends.

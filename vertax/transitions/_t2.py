@@ -7,12 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.checks import check_number
+from vertax._base.indexing import take
 from vertax._base.tracing import tree_where
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.mesh._euler_operators import collapse_triangle, merge_cells
 from vertax.mesh._tissue import mean_area
-from vertax.mesh._topology import clockwise, counter_clockwise, source, take
+from vertax.mesh._topology import clockwise, counter_clockwise, source
 from vertax.transitions._t1 import has_new_overlaps
 from vertax.transitions._transitions import AbstractTransitions
 

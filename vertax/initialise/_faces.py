@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vertax.mesh._topology import Topology
+from vertax.mesh import Topology
 
 
 class Sides(NamedTuple):
