@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -146,21 +147,40 @@ def counted(monkeypatch):
     return seeds
 
 
-def test_a_run_is_executed_by_one_process_only(tiny, counted):
-    runs = sweep_runs(["tiny.toml"], {"seed": ["0", "1", "2", "3"]}, "out")
-    execute = lambda run: _sweep.execute_locked(run.config.model_dump(mode="json"), run.folder)
-    with FileLock(tiny / "out/.locks/tiny-seed_1.lock"):  # as another process does
-        errors = [execute(run) for run in runs]
-    assert errors == [None, None, None, "ValueError: It broke."]
-    assert counted == [0, 2, 3]
-    assert [run.is_finished for run in runs] == [True, False, True, False]
-    # The table has the failure also in a process that did not execute the run.
-    rows = sweep_table(runs, {})
-    assert rows["state"] == ["finished", "unfinished", "finished", "failed"]
-    assert rows["error"][-1] == "It broke."
-    # The same command again executes what is missing, and repeats the failed run.
-    assert [execute(run) for run in runs] == errors
-    assert counted == [0, 2, 3, 1, 3]
+def test_failed_runs_are_repeated_and_finished_ones_kept(tiny, counted):
+    runs = sweep_runs(["tiny.toml"], {"seed": ["0", "3"]}, "out")
+    options = {"executor": None, "progress": False}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_sweep, "LocalProcesses", ThreadPoolExecutor)
+        assert sweep(runs, tiny / "out", workers=1, **options) == {
+            "tiny-seed_3": "ValueError: It broke."
+        }
+        assert [run.is_finished for run in runs] == [True, False]
+        # The table has the failure also in a process that did not execute the run.
+        assert sweep_table(runs, {})["error"] == ["", "It broke."]
+        sweep(runs, tiny / "out", workers=1, **options)
+    assert counted == [0, 3, 3]
+
+
+def test_two_sweeps_do_not_write_to_one_folder(tiny, counted):
+    runs = sweep_runs(["tiny.toml"], {"seed": ["0"]}, "out")
+    (tiny / "out").mkdir()
+    with (
+        FileLock(tiny / "out" / ".lock"),
+        pytest.raises(RunFolderError, match="Another sweep writes to"),
+    ):
+        sweep(runs, tiny / "out", progress=False)
+    assert counted == []
+
+
+def test_files_come_back_from_other_machines(tiny, counted):
+    runs = sweep_runs(["tiny.toml"], {"seed": ["0", "3"]}, "out")
+    errors = sweep(runs, tiny / "out", executor=ThreadPoolExecutor(1), progress=False)
+    assert errors == {"tiny-seed_3": "ValueError: It broke."}
+    names = sorted(path.name for path in runs[0].folder.iterdir())
+    assert names == ["config.toml", "metrics.json", "positions.npy"]
+    assert not runs[1].folder.exists()
+    assert [row["state"] for row in table(tiny / "out")] == ["finished", "failed"]
 
 
 DIES = """
@@ -181,19 +201,14 @@ if __name__ == "__main__":
 
 @pytest.mark.thorough
 @pytest.mark.skipif(sys.platform == "win32", reason="needs signals of Unix")
-def test_two_commands_share_the_runs_and_a_dead_process_ends_one_run_only(tiny):
+def test_a_dead_process_ends_one_run_only(tiny):
     (tiny / "program.py").write_text(DIES)
     command = [sys.executable, "program.py", "sweep", "tiny.toml", "--grid", "seed=0:4"]
     path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    environment = os.environ | {"PYTHONPATH": path}
-    commands = [
-        subprocess.Popen([*command, "--workers", "1"], env=environment, **options) for _ in range(2)
-    ]
-    outputs = [process.communicate(timeout=300)[0] for process in commands]
-    assert "its process died, perhaps for lack of memory" in "".join(outputs)
-    rows = table(tiny / "runs/tiny-sweep")
-    states = {row["seed"]: row["state"] for row in rows}
-    assert [states[seed] for seed in "023"] == ["finished"] * 3
-    assert states["1"] != "finished"
-    assert sorted(process.returncode for process in commands) in ([0, 1], [1, 1])
+    done = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 1
+    assert "its process died, perhaps for lack of memory" in done.stderr
+    states = {row["seed"]: row["state"] for row in table(tiny / "runs/tiny-sweep")}
+    assert states == {"0": "finished", "1": "failed", "2": "finished", "3": "finished"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,8 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree, Shaped
 
+from vertax._base.processes import ProcessDied, ProcessKilled, run_in_process
 from vertax.external._simulator import AbstractSimulator, Relaxed, SimulatorError, ledger_of
-from vertax.external._workers import run_in_process
 from vertax.mesh import Tissue
 
 
@@ -105,9 +106,9 @@ def run_jobs(
     def one(job: Job) -> Result | None:
         try:
             with ledger_of(job.simulator).run():
-                return run_in_process(job, timeout) if processes else job()
+                return run_in_process(partial(_on_cpu, job), timeout) if processes else job()
         except Exception as error:
-            reasons.append(_as_error(error))
+            reasons.append(_as_error(error, timeout))
             return None
 
     # Requests with NaN, for example from a relaxation that failed before, are not run.
@@ -150,10 +151,27 @@ def stack_results(
     return jax.tree.unflatten(structure, columns)
 
 
-def _as_error(error: Exception) -> SimulatorError:
+def _on_cpu(job: Job) -> Result:
+    """Run a job in another process, which leaves the accelerator to the main process."""
+    jax.config.update("jax_platforms", "cpu")
+    return job()
+
+
+def _as_error(error: Exception, timeout: float | None) -> SimulatorError:
     if isinstance(error, SimulatorError):
         return error
-    wrapped = SimulatorError(f"{type(error).__name__}: {error}")
+    text = f"{type(error).__name__}: {error}"
+    if isinstance(error, ProcessDied):
+        text = (
+            "The process that ran the program died. If it died at its start: a script with a simulator in "
+            'processes needs `if __name__ == "__main__":` around its code.'
+        )
+    if isinstance(error, ProcessKilled):
+        text = (
+            f"The program was not done after {timeout:g} s, and its process was killed. If that is too "
+            "short, raise `timeout`."
+        )
+    wrapped = SimulatorError(text)
     wrapped.__cause__ = error
     return wrapped
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import json
 import os
 import sys
@@ -19,6 +20,7 @@ from vertax._base.archive import read_archive, write_archive
 from vertax._base.atomic import atomic_write
 from vertax._base.extras import requires_extra
 from vertax._base.results import RESULTS
+from vertax._base.tasks import map_tasks
 from vertax._base.threads import num_threads
 from vertax.fitting import (
     Checkpoint,
@@ -229,22 +231,21 @@ class RunFolder:
             self._check_interrupt()
             return function(index)
 
-        with (
-            tqdm(total=n, unit=unit, disable=None if progress else True) as bar,
-            concurrent.futures.ThreadPoolExecutor(num_threads()) as pool,
-        ):
-            futures: list[concurrent.futures.Future[Result]] = []
-            try:
-                for first, last in ((0, min(n, 1)), (1, n)):
-                    futures += [pool.submit(call, index) for index in range(first, last)]
-                    for future in concurrent.futures.as_completed(futures[first:]):
-                        future.result()
-                        bar.update()
-            except BaseException as error:
-                self.interrupted |= isinstance(error, KeyboardInterrupt)
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-        return [future.result() for future in futures]
+        results: dict[int, Result] = {}
+        try:
+            with concurrent.futures.ThreadPoolExecutor(num_threads()) as pool:
+                options: dict[str, Any] = {"executor": pool, "unit": unit}
+                for numbers, shown in ((range(min(n, 1)), False), (range(1, n), progress)):
+                    outcomes = map_tasks(call, numbers, progress=shown, **options)
+                    with contextlib.closing(outcomes):
+                        for number, value, error in outcomes:
+                            if error is not None:
+                                raise error
+                            results[numbers[number]] = value
+        except KeyboardInterrupt:
+            self.interrupted = True
+            raise
+        return [results[index] for index in range(n)]
 
     def scan(
         self,

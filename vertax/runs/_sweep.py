@@ -1,26 +1,24 @@
-"""Sweeps: runs of one configuration with different keys, in the processes of one or several machines."""
+"""Sweeps: runs of one configuration with different keys, in the workers of an executor."""
 
 from __future__ import annotations
 
-import concurrent.futures
 import itertools
-import multiprocessing
 import os
 import re
-import threading
+import tempfile
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from functools import reduce
+from concurrent.futures import Executor
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from filelock import FileLock, Timeout
-from tqdm import tqdm
 
+from vertax._base.atomic import atomic_write
 from vertax._base.compilation_cache import enable_compilation_cache
-from vertax._base.threads import THREADS, num_threads
+from vertax._base.processes import LocalProcesses, ProcessDied
+from vertax._base.tasks import map_tasks
 from vertax.io import write_csv
 from vertax.runs._config import ConfigError, ExperimentConfig, validate
 from vertax.runs._execution import (
@@ -122,101 +120,98 @@ def sweep(
     runs: Sequence[SweepRun],
     output: Path,
     *,
+    executor: Executor | None = None,
     workers: int | None = None,
     figures: Sequence[str] = ("png",),
     progress: bool = True,
 ) -> dict[str, str]:
     """Execute the runs that are not finished, and write the table `sweep.csv` of all.
 
-    A run that fails does not stop the others. Each run is locked while it is executed, so several calls, on
-    one machine or on several with a common file system, share the runs. After an interrupt, call it again:
-    finished runs are skipped and interrupted ones resumed.
+    A run that fails does not stop the others. After an interrupt, call it again: finished runs are skipped,
+    and interrupted ones resumed.
 
-    **Returns:** the error messages of the runs that failed in this call, by the name of the run.
+    **Arguments:**
+
+    - `runs`, `output`: the runs, and the folder of all.
+    - `executor`: runs them on other machines, which send their files back when they end; by default `workers`
+        local processes write them.
+    - `figures`, `progress`: as of `vertax run`.
+
+    **Returns:** the error messages of the runs that failed, by the name of the run.
     """
+    errors: dict[str, str] = {}
+    waiting = [run for run in runs if not run.is_finished]
     try:
-        (output / ".locks").mkdir(parents=True, exist_ok=True)
+        output.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(output / ".lock", timeout=0).acquire()
+    except Timeout:
+        raise RunFolderError(
+            f"Another sweep writes to {output}. Wait until it ends; for more processes raise its --workers, "
+            "and for more machines pass --scheduler."
+        ) from None
     except OSError as error:
         raise RunFolderError(
             f"Cannot use {output} as a folder: {error.strerror}. Choose another with --output."
         ) from None
-    errors: dict[str, str] = {}
-    waiting = [run for run in runs if not run.is_finished]
-    try:
-        with tqdm(total=len(runs), unit="run", disable=None if progress else True) as bar:
-            bar.update(len(runs) - len(waiting))
-            for run, error in _execute_all(waiting, workers or num_threads(), tuple(figures)):
-                bar.update()
-                if error is not None:
-                    errors[run.folder.name] = error
-    finally:
-        write_csv(output / "sweep.csv", sweep_table(runs, errors))
+    with lock, executor or LocalProcesses(workers) as executing:
+        elsewhere = executor is not None
+        function = partial(_execute_elsewhere if elsewhere else execute_run, figures=tuple(figures))
+        # Modules of experiments are imported in the process, by the name of the experiment.
+        tasks = [
+            (run.config.model_dump(mode="json", exclude_none=True), run.folder) for run in waiting
+        ]
+        options: dict[str, Any] = {"executor": executing, "unit": "run", "progress": progress}
+        try:
+            for number, files, error in map_tasks(function, tasks, **options):
+                run = waiting[number]
+                try:
+                    if error is not None:
+                        raise error
+                    if elsewhere:
+                        _write_files(run.folder, files)
+                except Exception as error:  # no error of a run ends the sweep
+                    errors[run.folder.name] = describe_error(error)
+        finally:
+            write_csv(output / "sweep.csv", sweep_table(runs, errors))
     return errors
 
 
-def _execute_all(
-    runs: Sequence[SweepRun], workers: int, figures: tuple[str, ...]
-) -> Iterator[tuple[SweepRun, str | None]]:
-    """The runs as they end, with the error message of a failed one."""
-    local, processes = threading.local(), list[ProcessPoolExecutor]()
-
-    def execute_in_process(run: SweepRun) -> str | None:
-        # A pool of one process for each thread: a process that dies ends one run only.
-        if getattr(local, "process", None) is None:
-            context = multiprocessing.get_context("spawn")  # a fork of JAX can deadlock
-            local.process = ProcessPoolExecutor(1, context, _start_process)
-            processes.append(local.process)
-        # Modules of experiments are imported in the process, by the name of the experiment.
-        content = run.config.model_dump(mode="json", exclude_none=True)
-        try:
-            return local.process.submit(execute_locked, content, run.folder, figures).result()
-        except BrokenProcessPool:
-            local.process = None
-            return "its process died, perhaps for lack of memory"
-
-    with concurrent.futures.ThreadPoolExecutor(workers) as threads:
-        futures = {threads.submit(execute_in_process, run): run for run in runs}
-        try:
-            for future in concurrent.futures.as_completed(futures):
-                yield futures[future], future.result()
-        finally:
-            threads.shutdown(cancel_futures=True)
-            for process in processes:
-                process.shutdown()
+def describe_error(error: Exception) -> str:
+    """The error of a run in one line."""
+    return str(error) if isinstance(error, ProcessDied) else f"{type(error).__name__}: {error}"
 
 
-def _start_process() -> None:
-    os.environ[THREADS] = "1"  # the other cores belong to the other runs
-    parent = multiprocessing.parent_process()
-    if parent is not None:  # end with the parent, also if that is killed
-        end = lambda: (parent.join(), os._exit(1))
-        threading.Thread(target=end, daemon=True).start()
+def execute_run(task: tuple[dict[str, Any], Path], figures: tuple[str, ...] = ("png",)) -> None:
+    """Execute or resume one run of a sweep in this process."""
+    content, folder = task
+    experiment = find_experiment(content["experiment"])
+    config = validate(experiment.config, content)
+    if (folder / CONFIG).is_file() and not (folder / FAILED).is_file():
+        unfinished_folder(folder, config)
+    else:
+        new_folder(folder, folder)
+    enable_compilation_cache()
+    execute(experiment, config, RunFolder(folder, figures=figures), progress=False)
 
 
-def execute_locked(
-    content: dict[str, Any], folder: Path, figures: tuple[str, ...] = ("png",)
-) -> str | None:
-    """Execute or resume one run of a sweep in this process, unless another process does or it is finished.
+def _execute_elsewhere(
+    task: tuple[dict[str, Any], Path], figures: tuple[str, ...]
+) -> dict[str, bytes]:
+    """Execute one run on another machine; return its files."""
+    content, _ = task
+    with tempfile.TemporaryDirectory() as folder:
+        execute_run((content, Path(folder)), figures)
+        files = [path for path in Path(folder).rglob("*") if path.is_file()]
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
-    **Returns:** the error message of a failed run, or None.
-    """
-    try:
-        with FileLock(folder.parent / ".locks" / f"{folder.name}.lock", timeout=0):
-            if (folder / METRICS).is_file():
-                return None
-            experiment = find_experiment(content["experiment"])
-            config = validate(experiment.config, content)
-            if (folder / CONFIG).is_file() and not (folder / FAILED).is_file():
-                unfinished_folder(folder, config)
-            else:
-                new_folder(folder, folder)
-            enable_compilation_cache()
-            execute(experiment, config, RunFolder(folder, figures=figures), progress=False)
-    except Timeout:
-        return None
-    except Exception as error:  # no error of a run ends the sweep
-        return f"{type(error).__name__}: {error}"
-    return None
+
+def _write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write the files of a run, its metrics last: a folder that has them is complete."""
+    new_folder(folder, folder, overwrite=(folder / CONFIG).is_file())
+    for name in sorted(files, key=lambda name: name == METRICS):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(folder / name, "wb") as file:
+            file.write(files[name])
 
 
 def sweep_table(runs: Sequence[SweepRun], errors: Mapping[str, str]) -> dict[str, list[Any]]:
@@ -224,7 +219,7 @@ def sweep_table(runs: Sequence[SweepRun], errors: Mapping[str, str]) -> dict[str
     rows: list[dict[str, Any]] = []
     for run in runs:
         error, failed = errors.get(run.folder.name, ""), run.folder / FAILED
-        if not error and failed.is_file():  # in another process
+        if not error and failed.is_file():  # in an earlier sweep
             error = failed.read_text(encoding="utf-8").strip()
         state = "finished" if run.is_finished else "failed" if error else "unfinished"
         row = {"run": run.folder.name, "state": state, "error": error}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import shlex
 from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -36,6 +37,10 @@ _RESUME = (
 _NO_CACHE = (
     "Do not use the folder of compiled functions in the user's cache (the environment variable "
     "VERTAX_CACHE names another folder, or is off)."
+)
+
+_SCHEDULER = (
+    "Run on the workers of a Dask cluster: the address of its scheduler, or its scheduler file."
 )
 
 Format = enum.StrEnum("Format", {name: name for name in ("png", "pdf", "svg")})
@@ -181,16 +186,15 @@ def sweep(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Number of processes; by default one per core.")
+        int | None, typer.Option(min=1, help="Number of local processes; by default one per core.")
     ] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help=_SCHEDULER)] = None,
     figures: Figures = None,
     quiet: Quiet = False,
 ) -> None:
-    """Run one configuration, or several, with different keys.
-
-    Several of these commands with one folder, on one machine or on a cluster, share the runs.
-    """
+    """Run one configuration, or several, with different keys."""
     from vertax.runs import ConfigError
+    from vertax.runs._cluster import cluster
     from vertax.runs._folder import RunFolderError
     from vertax.runs._sweep import parse_grid, sweep as execute_all, sweep_runs
 
@@ -201,13 +205,16 @@ def sweep(
             finished = sum(run.is_finished for run in runs)
             kept = f", {finished} of them finished before" if finished else ""
             typer.echo(f"{len(runs)} runs{kept} → {folder}")
-        options = {"workers": workers, "progress": not quiet}
-        errors = execute_all(runs, folder, figures=figures or ("png",), **options)
+        with nullcontext() if scheduler is None else cluster(scheduler) as executor:
+            options = {"executor": executor, "workers": workers, "progress": not quiet}
+            errors = execute_all(runs, folder, figures=figures or ("png",), **options)
     except KeyboardInterrupt:
         typer.echo("Interrupted. To continue, give the same command again.", err=True)
         raise typer.Exit(INTERRUPTED) from None
     except (ConfigError, RunFolderError) as error:
         _stop(error, USAGE)
+    except RuntimeError as error:  # of the executor
+        _stop(error, FAILURE)
     for name, error in errors.items():
         typer.secho(f"{folder / name}: {error}", err=True, fg=typer.colors.RED)
     if not quiet:

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import concurrent.futures
+import contextlib
 import hashlib
 import inspect
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 import vertax
 from vertax._base.announce import announce_compilations
 from vertax._base.blas import one_blas_thread
 from vertax._base.checkpoints import digest as arrays_digest
-from vertax._base.checks import check_integer
 from vertax._base.pixels import pixel_length, pixel_sides
+from vertax._base.tasks import map_tasks
 from vertax._base.threads import num_threads
 from vertax.initialise import MaskChange, MaskReport
 from vertax.io import write_csv
@@ -114,11 +115,11 @@ def infer_tensions_of_masks(
     *,
     plane: int | None = None,
     cache: str | os.PathLike[str] | None = None,
-    threads: int | None = None,
+    executor: Executor | None = None,
     progress: bool = True,
     **options: Any,
 ) -> TensionsOfMasks:
-    """Tensions of many masks, side by side in threads.
+    """Tensions of many masks, side by side.
 
     ```python
     movie = vx.tensions.infer_tensions_of_masks("masks/*.tif")
@@ -134,8 +135,10 @@ def infer_tensions_of_masks(
     - `cache`: a folder where the result of each mask is stored as soon as it is computed. A later call, such
         as after an interrupt, reads the results of the same pixels, options and version of vertax from it. An
         entry that cannot be read is computed anew, with a warning.
-    - `threads`: number of threads, by default the environment variable `VERTAX_THREADS` or one per core.
-    - `progress`: show a progress bar with the name of the last mask (only on a terminal).
+    - `executor`: where masks are computed, as of [`map_tasks`][vertax.map_tasks]; by default threads, as many
+        as the environment variable `VERTAX_THREADS` says or one per core. Workers on other machines need
+        access to files that are given by name; the `cache` is used by the caller alone.
+    - `progress`: show a progress bar (only on a terminal).
     - `options`: as of [`infer_tensions`][vertax.tensions.infer_tensions], the same for all masks.
 
     **Returns:** the [`TensionsOfMasks`][vertax.tensions.TensionsOfMasks].
@@ -149,8 +152,6 @@ def infer_tensions_of_masks(
         [`find_masks`][vertax.tensions.find_masks].
     """
     inspect.signature(infer_tensions).bind(None, **options)
-    if threads is not None:
-        check_integer("threads", threads, at_least=1)
     frames = find_masks(masks, plane=plane)
     if cache is not None:
         Path(cache).mkdir(parents=True, exist_ok=True)
@@ -158,25 +159,35 @@ def infer_tensions_of_masks(
         options["plane"] = plane
     results: dict[str | int, InferredTensions] = {}
     failures: dict[str | int, str] = {}
-    with (
-        concurrent.futures.ThreadPoolExecutor(threads or num_threads()) as pool,
-        tqdm(total=len(frames), unit="mask", disable=None if progress else True) as bar,
-    ):
-        waiting = {pool.submit(_infer, frame, cache, options): frame.name for frame in frames}
+    missing: list[tuple[MaskFrame, Path | None]] = []
+    for frame in frames:
+        entry = None
         try:
-            for done in concurrent.futures.as_completed(waiting):
-                name = waiting[done]
-                bar.set_postfix_str(str(name))
-                try:
-                    results[name] = done.result()
-                except Exception as error:
-                    if len(frames) == 1:
-                        raise
-                    failures[name] = str(error)
-                bar.update()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+            entry = None if cache is None else Path(cache) / _entry_name(frame, options)
+            cached = None if entry is None else _load(entry, frame)
+        except OSError:  # the file cannot be read: the error is that of its task
+            cached = None
+        if cached is None:
+            missing.append((frame, entry))
+        else:
+            results[frame.name] = cached
+    tasks = [frame for frame, _ in missing]
+    with contextlib.ExitStack() as stack:
+        if executor is None:
+            executor = stack.enter_context(ThreadPoolExecutor(num_threads()))
+        infer = partial(_infer, options=options)
+        outcomes = map_tasks(infer, tasks, executor=executor, progress=progress, unit="mask")
+        for number, result, error in stack.enter_context(contextlib.closing(outcomes)):
+            frame, entry = missing[number]
+            if error is not None:
+                if len(frames) == 1:
+                    raise error
+                failures[frame.name] = str(error)
+                continue
+            if entry is not None:
+                save_module(entry, "tensions", result, InferredTensions, _CLASSES)
+                result = load_module(entry, "tensions", InferredTensions, _CLASSES)
+            results[frame.name] = result
     # In the order of the masks, not of the threads.
     order = [frame.name for frame in frames]
     results = {name: results[name] for name in order if name in results}
@@ -191,12 +202,13 @@ def infer_tensions_of_masks(
     return TensionsOfMasks(results, failures, **unit)
 
 
-def _infer(
-    frame: MaskFrame, cache: str | os.PathLike[str] | None, options: Mapping[str, Any]
-) -> InferredTensions:
-    """The tensions of a mask, from the cache if they are there."""
-    if cache is None:
-        return frame.infer(**options)
+@one_blas_thread()
+def _infer(frame: MaskFrame, *, options: Mapping[str, Any]) -> InferredTensions:
+    return frame.infer(**options)
+
+
+def _entry_name(frame: MaskFrame, options: Mapping[str, Any]) -> str:
+    """The file in the cache: the pixels, the options, the precision and the version determine its name."""
     source = frame.source
     if isinstance(source, str | os.PathLike):
         pixels = Path(source).read_bytes()
@@ -208,19 +220,20 @@ def _infer(
         parts["height"] = hashlib.sha256(Path(height).read_bytes()).hexdigest()
     elif height is not None:
         parts["height"] = arrays_digest(height)
-    # The precision of JAX is part of the result, and the file has the size of the pixels.
     given = f"{sorted(parts.items())} {jnp.result_type(float)} {frame.file} {vertax.__version__}"
-    name = hashlib.sha256(pixels + given.encode()).hexdigest()
-    file = Path(cache) / f"{name[:32]}.npz"
-    if file.exists():
-        try:
-            return load_module(file, "tensions", InferredTensions, _CLASSES)
-        except ValueError as error:  # truncated, damaged, or of another version
-            warnings.warn(
-                f"The entry of the cache for {frame.name} is computed anew: {error}", stacklevel=2
-            )
-    save_module(file, "tensions", frame.infer(**options), InferredTensions, _CLASSES)
-    return load_module(file, "tensions", InferredTensions, _CLASSES)
+    return f"{hashlib.sha256(pixels + given.encode()).hexdigest()[:32]}.npz"
+
+
+def _load(entry: Path, frame: MaskFrame) -> InferredTensions | None:
+    """The result in the cache, if it is there and can be read."""
+    if not entry.exists():
+        return None
+    try:
+        return load_module(entry, "tensions", InferredTensions, _CLASSES)
+    except ValueError as error:  # truncated, damaged, or of another version
+        text = f"The entry of the cache for {frame.name} is computed anew: {error}"
+        warnings.warn(text, stacklevel=4)
+        return None
 
 
 def _joined(tables: Mapping[str | int, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
