@@ -51,6 +51,7 @@ def test_a_task_of_a_killed_worker_runs_again(client, tmp_path):
     tasks = [(number, str(tmp_path / "killed")) for number in range(20)]
     outcomes = list(vx.map_tasks(die_once, tasks, executor=client.get_executor()))
     assert sorted(o.value for o in outcomes) == list(range(20))
+    client.wait_for_workers(2, timeout=60)  # for the next test
 
 
 def test_a_sweep_on_a_cluster(client, tmp_path, monkeypatch):
