@@ -170,7 +170,7 @@ def infer_tensions(
             f"vertax.surfaces.HeightMap, but is {describe(height)}."
         )
     elif isinstance(source, Foam):
-        surface = height
+        surface = source.surface if height is None else height
         course = _of_foam(source, noise)
     elif isinstance(source, Tissue):
         surface = source.surface if height is None else height
