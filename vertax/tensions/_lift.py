@@ -39,7 +39,7 @@ class SurfaceMeasures(NamedTuple):
     bending: Float[np.ndarray, " edges"]
     """Integral of the normal curvature along each edge."""
     slopes: Float[np.ndarray, " cells"]
-    """√(det g - 1) at the mean corner: the slope of a height map."""
+    """√(det g - 1) at the mean of the outline: the slope of a height map."""
 
 
 def lifted(
@@ -148,10 +148,10 @@ def _areas(
     chord = np.linalg.norm(border[:, 1] - border[:, 0], axis=1)
     bulge = chord**2 * (2 * part - np.sin(2 * part)) / (8 * np.sin(part) ** 2)
     bulge = np.where(np.abs(angle) < 1e-4, 0, bulge)
-    sums = np.zeros((n + 1, 3))
+    sums, length = np.zeros((n + 1, 3)), np.linalg.norm(border[:, -1:] - border[:, :1], axis=2)
     for side in cells.T:
-        np.add.at(sums, side, np.column_stack([middle, np.ones(len(middle))]))
-    centre = sums[:, :2] / np.maximum(sums[:, 2:], 1)
+        np.add.at(sums, side, length * np.column_stack([middle, np.ones(len(middle))]))
+    centre = sums[:, :2] / np.maximum(sums[:, 2:], 1e-300)
     total = np.zeros(n + 1)
     for side, sign in zip(cells.T, (1, -1), strict=True):
         arm = border - centre[side][:, None]
