@@ -44,7 +44,7 @@ class Config(runs.ExperimentConfig):
     """Standard deviation of the tensions of a foam, of mean 1."""
     tubes: int = Field(default=3, ge=1)
     """Number of tubes."""
-    around: int = Field(default=6, ge=4)
+    circumference: int = Field(default=6, ge=4)
     """Circumference of a tube, in cell diameters; its length is a third larger."""
     tensions: list[float] = Field(default=[0.7, 1.0, 0.5], min_length=3, max_length=3)
     """Tensions between cells of type 0, of both types, and of type 1."""
@@ -183,7 +183,7 @@ def summarise(cells: dict[str, Any], edges: dict[str, Any]) -> dict[str, np.ndar
 
 def fit_tube(config: Config, seed: int) -> dict[str, np.ndarray]:
     """The tensions by cell types from shapes on a tube, and from its unrolled image."""
-    width, length = float(config.around), float(round(config.around * 4 / 3))
+    width, length = float(config.circumference), float(round(config.circumference * 4 / 3))
     keys = jax.random.split(jax.random.key(seed), 3)
     options: dict[str, Any] = {"lattice": np.diag([width, length]), "lloyd_steps": 3}
     flat = vx.initialise.periodic_voronoi(int(width * length), key=keys[0], **options)
@@ -193,10 +193,10 @@ def fit_tube(config: Config, seed: int) -> dict[str, np.ndarray]:
     rest = vx.equilibrate(tube, energy(*config.tensions)).tissue
     noise = 1 + config.noise * np.random.default_rng(seed).normal(size=(2, flat.n_cells))
     table: dict[str, np.ndarray] = {"tube": np.full(3, seed), "tension": np.array(config.tensions)}
-    for name, seen in (("on_surface", rest), ("unrolled", rest.with_surface(None))):
-        cost = CellShapes(seen.areas * noise[0], seen.perimeters * noise[1])
-        problem = vx.InverseProblem(seen, energy(0.7, 0.7, 0.7), cost)
-        fit = vx.fit(problem, LevenbergMarquardt(rtol=1e-6, atol=1e-6), 30, progress=False)
+    for name, observed in (("on_surface", rest), ("unrolled", rest.with_surface(None))):
+        cost = CellShapes(observed.areas * noise[0], observed.perimeters * noise[1])
+        problem = vx.InverseProblem(observed, energy(0.7, 0.7, 0.7), cost)
+        fit: Any = vx.fit(problem, LevenbergMarquardt(rtol=1e-6, atol=1e-6), 30, progress=False)
         table[name] = np.asarray(fit.energy.terms[1].tension)
     return table
 

@@ -142,7 +142,7 @@ SHORT = {
         "pixels=160",
         "slopes=[0.5]",
         "tubes=1",
-        "around=4",
+        "circumference=4",
     ],
     "erk_waves": ["columns=6", "duration=0.6", "frames=12", "substeps=1"],
     "turing_growth": ["founders=4", "room=8", "duration=1", "frames=3", "animation=false"],

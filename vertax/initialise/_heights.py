@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,16 +12,13 @@ from vertax.mesh import Periodic
 from vertax.mesh._geometry import geometry_of
 from vertax.surfaces import AbstractSurface, HeightMap
 
-if TYPE_CHECKING:
-    from vertax.initialise._labels import Segmentation
-
 # Smoothing of an image of heights, relative to the root of the median area of a cell: of a smooth one, and of
 # steps of planes, which have fewer distinct values than this share of their pixels.
 _SMOOTHING, _SMOOTHING_OF_STEPS, _STEPS = 0.25, 0.5, 0.01
 
 
 def surface_of(
-    source: Segmentation,
+    source: Any,
     height: Any,
     plane_distance: float,
     unknown: float | int | None,
@@ -32,7 +29,7 @@ def surface_of(
 
     **Arguments:**
 
-    - `source`: the segmentation of the mask.
+    - `source`: the `Segmentation` of the mask.
     - `height`, `plane_distance`, `unknown`: as of `from_labels`.
     - `sized`: whether `plane_distance` has the unit of the tissue, or that of the side of a pixel.
     """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -146,27 +145,10 @@ def tissue_from_near_corners(
     check_concrete("from_polygons", points, box, tolerance)
     if tolerance is not None:
         check_number("tolerance", tolerance, at_least=0)
-    build_flat = partial(
-        _from_flat_corners,
-        cells=cells,
-        names=names,
-        tolerance=tolerance,
-        box=box,
-        images=images,
-        **settings,
-    )
-    return on_surface_through(points, build_flat, names)
-
-
-def _from_flat_corners(
-    points: ArrayLike | Sequence[Any],
-    cells: Any,
-    names: Names,
-    tolerance: float | None,
-    box: ArrayLike | Sequence[Any] | None,
-    images: Sequence[Any] | None,
-    **settings: Any,
-) -> PolygonTissue:
+    if np.ndim(points) == 2 and np.shape(points)[1] == 3:
+        options = {"box": box, "images": images} | settings
+        flat = lambda xy: tissue_from_near_corners(xy, cells, names, tolerance, **options)
+        return on_surface_through(points, flat, names)
     position = _checked_points(points, names)
     corners = _checked_cells(cells, position, names)
     lattice = _checked_box(box, images)

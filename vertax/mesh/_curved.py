@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
@@ -119,7 +119,7 @@ def check_surface(
     if not all(map(is_concrete, jax.tree.leaves((surface, vertices, boundary)))):
         return
     surface.check(vertices)
-    points, density = _sampled(surface, vertices)
+    points, density = sampled(surface, vertices)
     if not (np.isfinite(points).all() and np.isfinite(density).all()):
         raise ValueError(
             "Argument `surface` must have finite points and tangents below all vertices, but has NaN or "
@@ -130,7 +130,7 @@ def check_surface(
     lattice = np.asarray(boundary.lattice)
     size = np.sqrt(np.abs(np.linalg.det(lattice)))
     for k, vector in enumerate(boundary.lattice):
-        moved, changed = _sampled(surface, vertices + vector)
+        moved, changed = sampled(surface, vertices + vector)
         step = moved - points
         unequal = np.abs(step - step[:1]).max() / size + np.abs(changed / density - 1).max()
         if unequal > _PERIOD_TOLERANCE[vertices.dtype.itemsize > 4]:
@@ -146,16 +146,17 @@ _PERIOD_TOLERANCE = (1e-3, 1e-6)
 """Largest relative difference between the points of two periods, in 32 and 64 bits."""
 
 
-def _sampled(
-    surface: AbstractSurface, x: Float[Array, "vertices 2"]
-) -> tuple[np.ndarray, np.ndarray]:
-    return jax.tree.map(np.asarray, _points_and_density(surface, x))
+def sampled(
+    surface: AbstractSurface, x: Float[ArrayLike, "*n 2"]
+) -> tuple[Float[np.ndarray, "*n 3"], Float[np.ndarray, "*n"]]:
+    """Points and densities of a surface as NumPy arrays."""
+    return jax.tree.map(np.asarray, _points_and_density(surface, jnp.asarray(x)))
 
 
 @announced_jit
 def _points_and_density(
-    surface: AbstractSurface, x: Float[Array, "vertices 2"]
-) -> tuple[Float[Array, "vertices 3"], Float[Array, " vertices"]]:
+    surface: AbstractSurface, x: Float[Array, "*n 2"]
+) -> tuple[Float[Array, "*n 3"], Float[Array, "*n"]]:
     return surface.points(x), surface.density(x)
 
 

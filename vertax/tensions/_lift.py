@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from vertax._base.announce import announced_jit
 from vertax.mesh import Tissue
+from vertax.mesh._curved import sampled
 from vertax.mesh._geometry import geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._observed_geometry import Lift, ObservedGeometry
@@ -158,11 +159,10 @@ def _areas(
         a, b = arm[:, :-1], arm[:, 1:]
         planar = 0.5 * sign * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
         places = centre[side][:, None, None] + 0.5 * np.stack([a + b, a, b], axis=2)
-        density = np.asarray(_density(surface, jnp.asarray(places.reshape(-1, 2))))
-        density = density.reshape(places.shape[:-1])
+        density = sampled(surface, places)[1]
         share = planar * density.mean(axis=-1) + sign * bulge[:, None] * density[:, :, 0]
         np.add.at(total, side, share.sum(axis=1))
-    density = np.asarray(_density(surface, jnp.asarray(centre[:-1])))
+    density = sampled(surface, centre[:-1])[1]
     return total[:-1], np.sqrt(np.maximum(density**2 - 1, 0))
 
 
@@ -174,23 +174,13 @@ def _square_root(metric: np.ndarray) -> np.ndarray:
 
 
 def _chords(surface: AbstractSurface, start: np.ndarray, chord: np.ndarray) -> np.ndarray:
-    ends = _points(surface, jnp.asarray(np.stack([start, start + chord])))
-    return np.asarray(ends[1] - ends[0])
-
-
-@announced_jit
-def _points(surface: AbstractSurface, x: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-    return surface.points(x)
+    first, second = sampled(surface, np.stack([start, start + chord]))[0]
+    return second - first
 
 
 @announced_jit
 def _jacobian(surface: AbstractSurface, x: Float[Array, "n 2"]) -> Float[Array, "n 3 2"]:
     return surface.jacobian(x)
-
-
-@announced_jit
-def _density(surface: AbstractSurface, x: Float[Array, "n 2"]) -> Float[Array, " n"]:
-    return surface.density(x)
 
 
 @announced_jit
