@@ -304,7 +304,6 @@ def test_tables_that_are_not_those_of_tyssue_are_refused():
     with pytest.raises(ValueError, match="tables vert, edge and face, but has no edge"):
         vx.io.from_tyssue({"vert": vert})
     refused("`vert` must have a column `y`", vert={"x": vert["x"]})
-    refused("planar sheet", vert=vert | {"z": vert["x"]})
     refused(
         "`srce` of table `edge` must hold numbers of rows of table `vert`, but holds 0",
         edge=edge | {"srce": 0 * edge["srce"]},

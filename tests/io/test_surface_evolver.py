@@ -75,7 +75,7 @@ def test_a_doublet(doublet):
     ("change", "message"),
     [
         (lambda t: t[: t.index("bodies")], "no section `bodies`"),
-        (lambda t: t.replace("DIMENSION 2", "DIMENSION 3"), "3 dimensions"),
+        (lambda t: t.replace("DIMENSION 2", "DIMENSION 4"), "4 dimensions"),
         (lambda t: t.replace(" 6   7 1  color red\n", ""), "element 6 is used but missing"),
         (lambda t: t.replace("1 2 5 6", "1 2 5 -6"), "not a closed loop"),
         (lambda t: t.replace(" 5   0   1", " 5   0"), "a line cannot be read"),
@@ -85,7 +85,7 @@ def test_a_doublet(doublet):
 )
 def test_a_broken_file_is_refused(doublet, change, message):
     doublet.write_text(change(DOUBLET), encoding="utf-8")
-    with pytest.raises(ValueError, match=f"doublet.fe is not a planar foam.*{message}"):
+    with pytest.raises(ValueError, match=f"doublet.fe is not a foam.*{message}"):
         vx.io.read_surface_evolver(doublet)
 
 

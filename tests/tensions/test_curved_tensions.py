@@ -80,6 +80,13 @@ def test_areas_and_perimeters_on_a_sphere(on_sphere, lifted):
     assert np.nanmax(curved(lifted).normal_loads) < 0
 
 
+def test_slopes_are_those_in_the_middle_of_a_cell(lifted):
+    away = np.asarray(lifted.tissue.centroids) / 0.5 - PIXELS / 2
+    distance = np.linalg.norm(away, axis=1)
+    expected = distance / np.sqrt(RADIUS**2 - distance**2)
+    np.testing.assert_allclose(curved(lifted).slopes, expected, atol=0.08)
+
+
 def test_normal_loads_are_those_of_a_membrane(lifted):
     """A membrane of the tension σ on a sphere of the radius R presses with 2 σ / R per area."""
     table = lifted.cell_table()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,12 +23,14 @@ from vertax.initialise._gaps import (
     line_width,
     with_exterior,
 )
+from vertax.initialise._heights import surface_of
 from vertax.initialise._mask_arguments import check_options, checked_mask
 from vertax.initialise._overlap_repair import repair_overlaps
 from vertax.initialise._pieces import join_pieces, numbered, without_specks
 from vertax.initialise._repairs import listed, mesh_or_repairs, untangle
 from vertax.initialise._report import MaskReport, Repaired, contacts_of, report_on
 from vertax.mesh import Free, Periodic, Tissue, Topology, angle_of_area, geometry_of
+from vertax.surfaces import AbstractSurface
 
 _HOLES = ("keep", "close")
 
@@ -87,6 +90,9 @@ def from_labels(
     holes: str = "keep",
     softening: float | None = None,
     inner_arcs: bool = False,
+    height: AbstractSurface | Shaped[np.ndarray | Array, "..."] | None = None,
+    plane_distance: float = 1.0,
+    unknown_height: float | int | None = None,
 ) -> Segmentation:
     """Tissue with the cells and neighbours of a label image (paper, "Mesh initialization").
 
@@ -141,6 +147,14 @@ def from_labels(
     - `inner_arcs`: make every edge an arc, with the area that its cells have over its chord in the image,
         and not only those on the outline of a free tissue. Of edges a few pixels long, the angle is
         noise.
+    - `height`: of a curved tissue, the height of each pixel of the mask, NaN where it is unknown; or a
+        surface in the unit of length of the tissue. The mask is the projection of the tissue, which gets the
+        [`HeightMap`][vertax.surfaces.HeightMap] as its surface, mirrored or periodic as the mask is, and
+        straight edges on its outline too. An image is smoothed by a Gaussian of a quarter of the cell
+        diameter, or of half of it if its heights are steps of planes.
+    - `plane_distance`: height per unit of an image of heights, in the unit of `pixel_size`; without
+        `pixel_size`, in pixels.
+    - `unknown_height`: value of unknown pixels in an image of heights, such as 0, beside NaN.
 
     **Returns:** a [`Segmentation`][vertax.initialise.Segmentation]. Cells of the original image
     come first, in the order of their labels, then the mirrored ones.
@@ -151,7 +165,8 @@ def from_labels(
         labels, is a picture, or has a cell that reaches around the (mirrored) image or around all other
         cells; for a mask with a label 0 that may be that of a cell, because it has negative ones too; for an
         unknown `boundary` or `holes`, a `pixel_size` that is not positive, a `gap_width` that is negative or
-        larger than the image, or a `background` that no pixel has.
+        larger than the image, or a `background` that no pixel has; for heights of another shape than the
+        mask, and `inner_arcs` with `height`.
     - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`.
     """
     check_concrete("from_labels", mask, pixel_size)
@@ -168,13 +183,22 @@ def from_labels(
             "Argument `gap_width` must be at most as many pixels as the image has, "
             f"{max(image.shape)}, but is {gap_width}."
         )
+    if height is not None and inner_arcs:
+        raise ValueError(
+            "Argument `inner_arcs` must be False with `height`: edges on a surface are straight chords. For "
+            "tensions of curved edges pass the mask and its heights to vx.tensions.infer_tensions."
+        )
     sides = pixel_sides(1.0 if pixel_size is None else pixel_size)
-    options = _Options(
-        sides, pixel_size is not None, gap_width, holes == "keep", softening, inner_arcs, background
-    )
+    sized, arcs = pixel_size is not None, inner_arcs if height is None else None
+    options = _Options(sides, sized, gap_width, holes == "keep", softening, arcs, background)
     if boundary == "free":
-        return _free(values, image, options)
-    return _closed(values, image, options, periodic=boundary == "periodic")
+        result = _free(values, image, options)
+    else:
+        result = _closed(values, image, options, periodic=boundary == "periodic")
+    if height is None:
+        return result
+    surface = surface_of(result, height, plane_distance, unknown_height, sized=sized)
+    return dataclasses.replace(result, tissue=result.tissue.with_surface(surface))
 
 
 class _Options(NamedTuple):
@@ -187,7 +211,8 @@ class _Options(NamedTuple):
     gap_width: float | None
     keep_holes: bool
     softening: float | None
-    inner_arcs: bool
+    inner_arcs: bool | None
+    """None for a tissue without any arc."""
     background: int | None
 
     @property
@@ -289,7 +314,8 @@ def _free(
         )
     while True:
         image = largest_cluster(image, exterior)
-        mesh = mesh_or_repairs(crack_graph(image), names, exterior, remedy)
+        arcs = options.inner_arcs is not None
+        mesh = mesh_or_repairs(crack_graph(image), names, exterior, remedy, arcs=arcs)
         if isinstance(mesh, Mesh):
             break
         # A hole with fewer than three sides is shared out among the cells next to it.
@@ -303,8 +329,8 @@ def _free(
     n_cells = len(label)
     left, right = mesh.cell, mesh.cell[mesh.twin]
     curved = (left == n_cells) | (right == n_cells)
-    if options.inner_arcs:
-        curved = np.full(len(left), True)
+    if options.inner_arcs is not False:
+        curved = np.full(len(left), options.inner_arcs is True)
     pixels = np.bincount(image.ravel(), minlength=exterior + 1)[mesh.cells]
     bulge = np.bincount(left, np.where(curved, mesh.bulge, 0.0), n_cells + 1)
     pixels[-1] = 0  # the exterior is no cell, and has no area
@@ -317,8 +343,9 @@ def _free(
     topology = Topology(mesh.twin, mesh.cell, mesh.frame, exterior=True)
     lengths = options.lengths(float(np.mean(pixels[names[label] > 0])))
     corners = jnp.asarray((vertices - margin) * lengths, jnp.result_type(float))
-    straight = Tissue(corners, topology, Free(), options.softening)
-    tissue = _with_arcs(straight, mesh, curved, lengths, inner_arcs=options.inner_arcs)
+    tissue = Tissue(corners, topology, Free(), options.softening)
+    if options.inner_arcs is not None:
+        tissue = _with_arcs(tissue, mesh, curved, lengths, inner_arcs=options.inner_arcs)
     rows, columns = given.shape
     home = image[margin : margin + rows, margin : margin + columns]
     top_bottom, left_right = _touching(home, exterior + 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Array, Int, Shaped
@@ -12,6 +12,7 @@ from vertax._base.checks import check_concrete
 from vertax.initialise._labels import Segmentation, from_labels
 from vertax.initialise._mask_arguments import check_options, check_zero
 from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
+from vertax.surfaces import AbstractSurface
 
 Segmenter: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
@@ -23,6 +24,9 @@ def from_microscopy(
     boundary: str = "mirrored",
     pixel_size: float | None = None,
     softening: float | None = None,
+    height: AbstractSurface | Shaped[np.ndarray | Array, "..."] | None = None,
+    plane_distance: float = 1.0,
+    unknown_height: float | int | None = None,
 ) -> Segmentation:
     """Tissue seen in a membrane image.
 
@@ -38,8 +42,8 @@ def from_microscopy(
         [`vertax.io.read_image`][vertax.io.read_image].
     - `segmenter`: [`Watershed`][vertax.initialise.Watershed] by default, or
         [`Cellpose`][vertax.initialise.Cellpose], or a custom one: a function from pixels to labels.
-    - `boundary`, `pixel_size`, `softening`: as for `from_labels`. With `boundary="periodic"` cells
-        are found across the border of the image.
+    - `boundary`, `pixel_size`, `softening`, `height`, `plane_distance`, `unknown_height`: as for
+        `from_labels`. With `boundary="periodic"` cells are found across the border of the image.
 
     **Returns:** a [`Segmentation`][vertax.initialise.Segmentation].
 
@@ -68,8 +72,14 @@ def from_microscopy(
             f"{n_cells}. Check that membranes are bright on dark cells, and that the segmenter "
             "knows the size of the cells."
         )
+    curved = {"height": height, "plane_distance": plane_distance, "unknown_height": unknown_height}
+    options: dict[str, Any] = {
+        "boundary": boundary,
+        "pixel_size": pixel_size,
+        "softening": softening,
+    }
     try:
-        return from_labels(labels, boundary=boundary, pixel_size=pixel_size, softening=softening)
+        return from_labels(labels, **options, **curved)
     except ValueError as error:
         raise ValueError(
             f"The labels that {_name(segmenter)} found in `image` make no tissue. {error}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +16,7 @@ from vertax.initialise._faces import FaceMesh, Names, Sides, build_faces
 from vertax.initialise._nearby_corners import build_within, share_corners, size_of_cells
 from vertax.initialise._overlap_repair import crossed_by, repair_overlaps
 from vertax.mesh import Free, Periodic, Tissue, angle_of_area, geometry_of
+from vertax.surfaces import HeightMap
 
 
 class PolygonTissue(eqx.Module):
@@ -84,7 +85,9 @@ def from_polygons(
     **Arguments:**
 
     - `points`, shape `(points, 2)`: positions x, y, in units of length. (Where y counts the rows of an image
-        downwards, change its sign, or the tissue is mirrored.)
+        downwards, change its sign, or the tissue is mirrored.) Of a curved free tissue, shape `(points, 3)`:
+        the tissue is the projection along z, on the smooth surface through the points (see
+        [`HeightMap.through`][vertax.surfaces.HeightMap.through]), with straight edges on its outline too.
     - `cells`: for each cell, the numbers of its corners in order, from 0; three at least, without the first
         one again at the end.
     - `box`: of a periodic tissue, width and height, or two lattice vectors as rows, shape `(2, 2)`. Points
@@ -107,7 +110,8 @@ def from_polygons(
     - `ValueError`, naming cells and points, for points that are not finite or are the corner of no cell;
         corners that are no number of a point, are repeated in a cell or fewer than three; cells without
         area, that overlap, share a side with two others, or touch in a point only; for cells in several
-        pieces or around a hole; for a box that is not filled; for arguments that contradict each other.
+        pieces or around a hole; for a box that is not filled; for arguments that contradict each other, as a
+        box or `inner_arcs` and points with z do; for overhangs.
     - `TypeError` for arguments of another type, and inside `jax.jit` or `jax.vmap`.
     """
     names = Names("Argument `cells`", "point {}".format, "cell {}".format)
@@ -139,6 +143,10 @@ def tissue_from_near_corners(
     check_concrete("from_polygons", points, box, tolerance)
     if tolerance is not None:
         check_number("tolerance", tolerance, at_least=0)
+    if np.ndim(points) == 2 and np.shape(points)[1] == 3:
+        options = {"box": box, "images": images} | settings
+        flat = lambda xy: tissue_from_near_corners(xy, cells, names, tolerance, **options)
+        return on_surface_through(points, flat, names)
     position = _checked_points(points, names)
     corners = _checked_cells(cells, position, names)
     lattice = _checked_box(box, images)
@@ -171,6 +179,28 @@ def tissue_from_near_corners(
         size_of_cells(position, corners, image, lattice),
         names.subject,
     )
+
+
+def on_surface_through(
+    points: ArrayLike | Sequence[Any], build: Callable[[Any], PolygonTissue], names: Names
+) -> PolygonTissue:
+    """The tissue that `build` makes of points in the plane; with z on the smooth surface through them."""
+    if np.ndim(points) != 2 or np.shape(points)[1] != 3:
+        return build(points)
+    position = as_float64("points", points)
+    result = build(position[:, :2])
+    if np.ptp(position[:, 2]) <= 1e-9 * np.ptp(position[:, :2]):
+        return result
+    flat = result.tissue
+    if not isinstance(flat.boundary, Free) or flat.inner_arcs:
+        raise ValueError(
+            "Argument `points` must have one z for a periodic tissue or one with inner arcs, but it has "
+            "several. Leave out z, or `box` and `inner_arcs`: edges on a surface are chords."
+        )
+    parts = (flat.vertices, flat.topology, flat.boundary, flat.softening)
+    chords = _without_overlaps(dataclasses.replace(result, tissue=Tissue(*parts)), names)
+    surface = HeightMap.through(position)
+    return dataclasses.replace(chords, tissue=chords.tissue.with_surface(surface))
 
 
 def tissue_from_corners(

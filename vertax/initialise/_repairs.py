@@ -19,6 +19,8 @@ def mesh_or_repairs(
     values: Int[np.ndarray, " labels"],
     exterior: int | None = None,
     remedy: str = "",
+    *,
+    arcs: bool = True,
 ) -> Mesh | Int[np.ndarray, " labels"]:
     """The mesh, or the label that replaces each label before there can be one.
 
@@ -28,6 +30,7 @@ def mesh_or_repairs(
     - `values`: the label of each number in the image; 0 for holes and the exterior.
     - `exterior`: number of the exterior.
     - `remedy`: what to do if too few labels remain.
+    - `arcs`: whether edges on the outline are arcs, so that a cell there may have two sides.
     """
     n = len(values)
     label = np.arange(n)
@@ -56,9 +59,9 @@ def mesh_or_repairs(
     mesh = build_mesh(graph, graph.left % n)
     too_small = np.bincount(mesh.cell) < 3
     if exterior is not None:
-        # Two sides are enough if one is an arc.
-        too_small[mesh.cell[mesh.cells[mesh.cell[mesh.twin]] == exterior]] = False
         too_small[-1] = False
+        if arcs:
+            too_small[mesh.cell[mesh.cells[mesh.cell[mesh.twin]] == exterior]] = False
     if not too_small.any():
         return mesh
     small = np.zeros(n, bool)

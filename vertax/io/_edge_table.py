@@ -16,6 +16,7 @@ from vertax.initialise._polygons import checked_lattice
 from vertax.io._read_table import column, whole_numbers
 from vertax.io._tables import Tables, frames_of, topology_of
 from vertax.mesh import Free, Periodic, Tissue
+from vertax.surfaces import HeightMap
 
 
 def from_edge_table(
@@ -42,7 +43,9 @@ def from_edge_table(
 
     - `table`: the columns `left_cell`, `right_cell` (-1: the exterior), `start_vertex`, `end_vertex`,
         `start_x`, `start_y`, `end_x`, `end_y`, and `angle`. A dictionary of arrays or a data frame. Edges are
-        arcs if the table has an angle other than 0: inner ones too if one of them has.
+        arcs if the table has an angle other than 0: inner ones too if one of them has. With columns `start_z`
+        and `end_z` the tissue is on the smooth surface through its vertices, see
+        [`HeightMap.through`][vertax.surfaces.HeightMap.through].
     - `box`: of a periodic tissue, width and height, or two lattice vectors as rows; the table does not have
         it.
     - `softening`: passed on to [`Tissue`][vertax.Tissue]; the table does not have it either.
@@ -52,8 +55,8 @@ def from_edge_table(
     **Raises:**
 
     - `ValueError`, naming the column, edge, cell or vertex, for a column that is missing or has the wrong
-        type, vertices that do not join three edges, cells that are not closed, and for a periodic tissue
-        without `box`.
+        type, vertices that do not join three edges, cells that are not closed, for a periodic tissue without
+        `box`, and for arcs, a box or overhangs in a table with z.
     """
     read = lambda name: whole_numbers(table, name, "table")
     cells = np.stack([read("left_cell"), read("right_cell")], axis=1)
@@ -111,6 +114,12 @@ def from_edge_table(
             f"Argument `table` must list all edges of one tissue, but does not: {error} Give the rows of all "
             "edges, with the `box` of a periodic tissue."
         ) from error
+    surface = None
+    if "start_z" in table:
+        z = [as_float64(name, column(table, name, "table")) for name in ("start_z", "end_z")]
+        heights = np.empty(len(points))
+        heights[vertex] = np.stack(z, axis=1)
+        surface = HeightMap.through(np.column_stack([points, heights]))
     dtype = jnp.result_type(float)
     inner = cells[:, 1] >= 0
     return Tissue(
@@ -120,6 +129,7 @@ def from_edge_table(
         softening,
         angles=jnp.asarray(angles, dtype) if np.any(angles != 0) else None,
         inner_arcs=bool(np.any(angles[inner] != 0)),
+        surface=surface,
     )
 
 

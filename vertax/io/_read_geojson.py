@@ -33,7 +33,8 @@ def read_geojson(
     tissue, pressure = polygons.tissue, table["pressure"]
     ```
 
-    The corners of the polygons make a tissue as in [`from_polygons`][vertax.initialise.from_polygons].
+    The corners of the polygons make a tissue as in [`from_polygons`][vertax.initialise.from_polygons], on a
+    surface if they have different z.
 
     [`write_geojson`][vertax.io.write_geojson] draws an arc as a chain of straight pieces, so an arc read from
     polygons has the area of that chain. For exactly the same tissue write the edges too (`edges={}`), and
@@ -67,7 +68,7 @@ def read_geojson(
     cells = np.split(np.arange(len(corner)), np.cumsum([len(ring) for ring in rings])[:-1])
     images = [np.zeros((len(ring), 2), int) for ring in rings]
     if tolerance is None:
-        tolerance = 1e-6 * size_of_cells(corner, cells, images, None)
+        tolerance = 1e-6 * size_of_cells(corner[:, :2], cells, images, None)
     names = Names(
         f"The polygons of {path}",
         _at(corner),
@@ -110,12 +111,12 @@ def _with_polygons(features: list[dict[str, Any]], path: Path) -> list[dict[str,
     return kept
 
 
-def _at(points: Float[np.ndarray, "points 2"]) -> Any:
-    return lambda point: f"the corner {points[point].tolist()}"
+def _at(points: Float[np.ndarray, "points 3"]) -> Any:
+    return lambda point: f"the corner {points[point, :2].tolist()}"
 
 
-def _ring(feature: dict[str, Any], number: int, path: Path) -> Float[np.ndarray, "corners 2"]:
-    """The outline of a polygon, without its first corner at the end."""
+def _ring(feature: dict[str, Any], number: int, path: Path) -> Float[np.ndarray, "corners 3"]:
+    """The outline of a polygon, z = 0 where a position has none, without its first corner at the end."""
     geometry = feature["geometry"]
     kind, coordinates = geometry.get("type"), geometry.get("coordinates")
     if kind == "LineString":
@@ -138,7 +139,10 @@ def _ring(feature: dict[str, Any], number: int, path: Path) -> Float[np.ndarray,
             "Give the cells inside it, and divide the cell around them."
         )
     try:
-        ring = np.array([[float(place[0]), float(place[1])] for place in coordinates[0]])
+        places = [
+            (place[0], place[1], place[2] if len(place) > 2 else 0) for place in coordinates[0]
+        ]
+        ring = np.array([[float(x) for x in place] for place in places])
     except (TypeError, ValueError, IndexError) as error:
         raise ValueError(
             f"{path}: the coordinates of feature {number} are no pairs of numbers."

@@ -45,7 +45,7 @@ _SURFACES: dict[str, _SurfaceRecord] = {
     "cylinder": _SurfaceRecord(Cylinder, {"radius": ()}),
     "spherical_cap": _SurfaceRecord(SphericalCap, {"radius": ()}),
     "height_map": _SurfaceRecord(
-        HeightMap, {"coefficients": (None, None), "sides": (2,)}, ("periodic",)
+        HeightMap, {"coefficients": (None, None), "sides": (2,), "origin": (2,)}, ("periodic",)
     ),
 }
 

@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, Int
 from vertax._base.checks import as_float64, describe
 from vertax.initialise import PolygonTissue
 from vertax.initialise._faces import Names
-from vertax.initialise._polygons import tissue_from_corners
+from vertax.initialise._polygons import on_surface_through, tissue_from_corners
 from vertax.io._read_table import column, read_table, whole_numbers
 
 _TABLES = ("vert", "edge", "face")
@@ -35,8 +35,8 @@ def from_tyssue(
     polygons = vx.io.from_tyssue({"vert": "vert.csv", "edge": "edge.csv", "face": "face.csv"})
     ```
 
-    Each row of the edge table is a half-edge. The sheet must be planar: columns `z` must be constant. What
-    becomes of points where two or more than three edges meet is described at
+    Each row of the edge table is a half-edge. What becomes of points where two or more than three edges meet,
+    and of columns `z` (not constant: free sheets without overhangs), is described at
     [`from_polygons`][vertax.initialise.from_polygons].
 
     Values go with the rows: `face_df["prefered_area"].to_numpy()[polygons.cells]` has one entry a cell, and
@@ -59,7 +59,7 @@ def from_tyssue(
     **Raises:**
 
     - `ValueError` for tables or columns that are missing, edges of a vertex or face that does not
-        exist, faces without a closed outline, a sheet that is not planar, and as
+        exist, faces without a closed outline, and as
         [`from_polygons`][vertax.initialise.from_polygons].
     - `TypeError` for something else than tables.
     """
@@ -84,12 +84,8 @@ def from_tyssue(
     }
     vert, edge = tables["vert"], tables["edge"]
     points = np.stack([as_float64(axis, column(vert, axis, "vert")) for axis in "xy"], axis=1)
-    if "z" in vert and np.ptp(as_float64("z", column(vert, "z", "vert"))) > 1e-9 * np.ptp(points):
-        raise ValueError(
-            "Argument `datasets` must hold a planar sheet, but its vertices have different `z`. Tissues "
-            "of vertax "
-            "are planar: project the sheet, and leave out `z`."
-        )
+    if "z" in vert:
+        points = np.column_stack([points, as_float64("z", column(vert, "z", "vert"))])
     srce, trgt, face = (whole_numbers(edge, name, "edge") for name in ("srce", "trgt", "face"))
     vert_numbers = _index(vert, "vert", len(points))
     has_faces = "face" in tables
@@ -111,9 +107,10 @@ def from_tyssue(
         lambda point: f"vertex {vert_numbers[point]}",
         lambda cell: f"face {face_numbers[cell]}",
     )
-    result = tissue_from_corners(
-        points, cells, names, box=box, inner_arcs=inner_arcs, softening=softening
+    build = lambda flat: tissue_from_corners(
+        flat, cells, names, box=box, inner_arcs=inner_arcs, softening=softening
     )
+    result = on_surface_through(points, build, names)
     side_edges = np.empty(len(order), int)
     side_edges[order] = result.side_edges
     return dataclasses.replace(result, side_edges=side_edges)

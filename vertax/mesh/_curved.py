@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
 from vertax._base.indexing import take
 from vertax._base.tracing import is_concrete
@@ -103,7 +102,7 @@ def check_surface(
     if not all(map(is_concrete, jax.tree.leaves((surface, vertices, boundary)))):
         return
     surface.check(vertices)
-    points, density = _sampled(surface, vertices)
+    points, density = surface.sampled(vertices)
     if not (np.isfinite(points).all() and np.isfinite(density).all()):
         raise ValueError(
             "Argument `surface` must have finite points and tangents below all vertices, but has NaN or "
@@ -114,7 +113,7 @@ def check_surface(
     lattice = np.asarray(boundary.lattice)
     size = np.sqrt(np.abs(np.linalg.det(lattice)))
     for k, vector in enumerate(boundary.lattice):
-        moved, changed = _sampled(surface, vertices + vector)
+        moved, changed = surface.sampled(vertices + vector)
         step = moved - points
         unequal = np.abs(step - step[:1]).max() / size + np.abs(changed / density - 1).max()
         if unequal > _PERIOD_TOLERANCE[vertices.dtype.itemsize > 4]:
@@ -128,16 +127,3 @@ def check_surface(
 
 _PERIOD_TOLERANCE = (1e-3, 1e-6)
 """Largest relative difference between the points of two periods, in 32 and 64 bits."""
-
-
-def _sampled(
-    surface: AbstractSurface, x: Float[Array, "vertices 2"]
-) -> tuple[np.ndarray, np.ndarray]:
-    return jax.tree.map(np.asarray, _points_and_density(surface, x))
-
-
-@announced_jit
-def _points_and_density(
-    surface: AbstractSurface, x: Float[Array, "vertices 2"]
-) -> tuple[Float[Array, "vertices 3"], Float[Array, " vertices"]]:
-    return surface.points(x), surface.density(x)

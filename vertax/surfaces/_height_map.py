@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.ndimage import gaussian_filter1d, spline_filter1d
+from scipy.sparse import csc_array, csr_array, eye_array, kron
+from scipy.sparse.linalg import splu
 
-from vertax._base.checks import check_number
+from vertax._base.checks import as_float64, check_number
 from vertax._base.pixels import PixelSizeLike, check_pixel_size, pixel_sides
 from vertax._base.sums import total
 from vertax._base.tracing import is_concrete
@@ -53,6 +56,7 @@ class HeightMap(AbstractSurface):
     - `unknown`: value of unknown pixels, such as 0. NaN is unknown if `unknown` is NaN or a number.
     - `periodic`: whether the picture is one period of the surface: the periodic box of the tissue has the
         size of the picture.
+    - `origin`: position of the corner of the first pixel.
 
     **Raises:**
 
@@ -67,6 +71,8 @@ class HeightMap(AbstractSurface):
     the surface is periodic."""
     sides: Float[Array, "2"]
     """Width and height of a pixel."""
+    origin: Float[Array, "2"]
+    """Position of the corner of the first pixel."""
     periodic: bool = eqx.field(static=True)
 
     def __init__(
@@ -78,6 +84,7 @@ class HeightMap(AbstractSurface):
         smoothing: float = 0.0,
         unknown: float | None = None,
         periodic: bool = False,
+        origin: tuple[float, float] | Float[ArrayLike, "2"] = (0.0, 0.0),
     ):
         check_pixel_size("pixel_size", pixel_size)
         check_number("plane_distance", plane_distance, above=0)
@@ -97,7 +104,61 @@ class HeightMap(AbstractSurface):
         product = jnp.linalg.multi_dot([down, values, across.T], precision="highest")
         self.coefficients = product.astype(dtype) * plane_distance
         self.sides = jnp.asarray(sides, dtype)
+        self.origin = jnp.asarray(origin, dtype)
         self.periodic = periodic
+
+    @classmethod
+    def through(cls, points: ArrayLike) -> HeightMap:
+        r"""The smooth height map through given points, such as the vertices of a table.
+
+        Its grid has four pixels for each point. The coefficients $c$ of the B-spline minimise the sum of
+        squares of the residuals plus $10^{-4} \sum |\nabla^3 c|^2$ (third differences, in pixels), which
+        determines the heights between the points: quadratic surfaces are reproduced.
+
+        **Arguments:**
+
+        - `points`, shape `(points, 3)`: x, y and z, in units of length.
+
+        **Raises:**
+
+        - `ValueError` for points of another shape, not finite, fewer than three or on a line in the
+            projection along z, and for overhangs: points that are no function of x and y.
+        """
+        given = as_float64("points", points)
+        if given.ndim != 2 or given.shape[1] != 3 or not np.isfinite(given).all():
+            raise ValueError(
+                "Argument `points` must hold finite x, y and z of each point, shape (points, 3), but has the "
+                f"shape {given.shape}{', and NaN or infinity' if given.shape[-1:] == (3,) else ''}."
+            )
+        place = given[:, :2]
+        plane = np.column_stack([place, np.ones(len(place))])
+        tilt, _, rank, _ = np.linalg.lstsq(plane, given[:, 2])
+        if rank < 3:
+            raise ValueError(
+                "Argument `points` must have three points that are not on a line in the projection along z, "
+                f"but its {len(given)} points have none."
+            )
+        extent = np.ptp(place, axis=0)
+        side = float(np.sqrt(np.prod(extent) / (4 * len(place))))
+        origin = place.min(axis=0) - side
+        width, height = np.maximum(np.ceil(extent / side).astype(int) + 2, 4).tolist()
+        position = (place - origin) / side - 0.5
+        rest = given[:, 2] - plane @ tilt
+        coefficients, residuals = _spline_through(position, rest, (height + 2, width + 2))
+        worst = int(np.argmax(np.abs(residuals)))
+        if np.abs(residuals[worst]) > side:
+            raise ValueError(
+                "Argument `points` must have one height at each x and y, but the smooth surface is "
+                f"{np.abs(residuals[worst]):.3g} away from point {worst}, {given[worst].round(6).tolist()}. "
+                "Overhangs are out of reach of a height map: turn the tissue, or cut it."
+            )
+        x, y = (
+            o + side * (np.arange(n + 2) - 0.5)
+            for o, n in zip(origin, (width, height), strict=True)
+        )
+        coefficients += tilt[0] * x + tilt[1] * y[:, None] + tilt[2]
+        flat = cls(np.zeros((height, width)), side, origin=origin)
+        return eqx.tree_at(lambda s: s.coefficients, flat, jnp.asarray(coefficients))
 
     def points(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape 3"]:
         """Points of the surface."""
@@ -108,8 +169,39 @@ class HeightMap(AbstractSurface):
         return density_of_graph(self._height, x)
 
     def _height(self, x: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
-        position = x / self.sides - 0.5
+        position = (x - self.origin) / self.sides - 0.5
         return _spline((0, 0), self.periodic, self.coefficients, position[..., 0], position[..., 1])
+
+
+def _spline_through(
+    position: Float[np.ndarray, "points 2"], z: Float[np.ndarray, " points"], shape: tuple[int, int]
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " points"]]:
+    """Coefficients of the B-spline through heights at positions in pixels, and the residuals."""
+    first = np.floor(position).astype(int)
+    weights = np.stack([part(position - first) for part in _BASIS], axis=-1)
+    columns, rows = (first[:, axis, None] + np.arange(4) for axis in (0, 1))
+    index = rows[:, :, None] * shape[1] + columns[:, None, :]
+    values, size = weights[:, 1, :, None] * weights[:, 0, None, :], shape[0] * shape[1]
+    row = np.repeat(np.arange(len(z)), 16)
+    spline = csr_array((values.ravel(), (row, index.ravel())), shape=(len(z), size))
+    normal = spline.T @ spline + _RIDGE * eye_array(size)
+    for order, count in enumerate((1, 3, 3, 1)):
+        bend = kron(_difference(shape[0], order), _difference(shape[1], 3 - order))
+        normal = normal + _BENDING * count * bend.T @ bend
+    coefficients = splu(csc_array(normal)).solve(spline.T @ z)
+    return coefficients.reshape(shape), spline @ coefficients - z
+
+
+_BENDING, _RIDGE = 1e-4, 1e-12
+"""Weights of the squares of third differences, and of all coefficients (for what points do not determine)."""
+
+
+def _difference(n: int, order: int) -> Any:
+    """The matrix of differences of some order of n values."""
+    matrix: Any = eye_array(n, format="csr")
+    for _ in range(order):
+        matrix = matrix[1:] - matrix[:-1]
+    return matrix
 
 
 # A derivative of the spline is another contraction of the same coefficients. (Without the rule each

@@ -8,7 +8,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from vertax._base.announce import announced_jit
 
 
 class AbstractSurface(eqx.Module):
@@ -89,6 +92,17 @@ class AbstractSurface(eqx.Module):
         u, v = jax.vmap(along)(jnp.eye(2, dtype=x.dtype))
         return u, v
 
+    def sampled(
+        self, x: Float[ArrayLike, "*n 2"]
+    ) -> tuple[Float[np.ndarray, "*n 3"], Float[np.ndarray, "*n"]]:
+        """`points` and `density` as NumPy arrays.
+
+        **Arguments:**
+
+        - `x`, shape `(…, 2)`: coordinates in the chart.
+        """
+        return jax.tree.map(np.asarray, _points_and_density(self, jnp.asarray(x)))
+
     def tangent_frame(
         self, x: Float[Array, "n 2"]
     ) -> tuple[Float[Array, "n 2 3"], Float[Array, "n 2 2"]]:
@@ -110,6 +124,13 @@ class AbstractSurface(eqx.Module):
         frame = jnp.stack([first, rest / height[:, None]], axis=-2)
         upper = [jnp.stack([length, along], axis=-1), jnp.stack([0 * height, height], axis=-1)]
         return frame, jnp.stack(upper, axis=-2)
+
+
+@announced_jit
+def _points_and_density(
+    surface: AbstractSurface, x: Float[Array, "*n 2"]
+) -> tuple[Float[Array, "*n 3"], Float[Array, "*n"]]:
+    return surface.points(x), surface.density(x)
 
 
 def density_of_graph(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,11 +18,12 @@ from vertax._base.checks import check_number, describe
 from vertax._base.phases import phases, start_phase
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.initialise import MaskReport, Segmentation, from_labels
+from vertax.initialise._heights import surface_of
 from vertax.initialise._report import LEAST_LENGTH
 from vertax.io import Foam, pixel_aspect, read_image, read_surface_evolver
 from vertax.io._surface_evolver import is_surface_evolver
 from vertax.mesh import Tissue, geometry_of
-from vertax.surfaces import AbstractSurface, HeightMap
+from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import equations
 from vertax.tensions._curves import Points
 from vertax.tensions._edges import fit, solution
@@ -37,9 +38,6 @@ from vertax.tensions._outcome import outcome
 _EXACT, _GRAIN, _POINTS = 0.002, 1e-4, 12
 # Initial noise of the vertices of a tissue with straight edges, relative to the cell diameter.
 _VERTEX = 0.01
-# Smoothing of an image of heights, relative to the root of the median area of a cell: of a smooth one, and of
-# steps of planes, which have fewer distinct values than this share of their pixels.
-_SMOOTHING, _SMOOTHING_OF_STEPS, _STEPS = 0.25, 0.5, 0.01
 # Bytes of memory: of any tissue, of a pixel and of a cell, measured; labels above the last are counted.
 _BASE, _PIXEL, _CELL, _MANY = 4e8, 80, 1.2e5, 10**6
 
@@ -139,7 +137,7 @@ def infer_tensions(
             f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
         )
     start_phase("reading")
-    source, unit = mask, 1.0 if pixel_size is not None else None
+    source, sized = mask, pixel_size is not None
     if isinstance(source, str | os.PathLike) and is_surface_evolver(Path(source)):
         source = read_surface_evolver(source)
     elif isinstance(source, str | os.PathLike | np.ndarray | Array):
@@ -158,13 +156,23 @@ def infer_tensions(
             inner_arcs=True,
         )
         source = _across_lines(source, line_width)
-    surface = _surface(height, plane_distance, unknown_height, source, unit)
+    if isinstance(height, str | os.PathLike):
+        height = _heights_of_file(Path(height))
     if isinstance(source, Segmentation):
+        surface = source.tissue.surface
+        if height is not None:
+            surface = surface_of(source, height, plane_distance, unknown_height, sized=sized)
         course = _of_mask(source, noise)
+    elif height is not None and not isinstance(height, AbstractSurface):
+        raise TypeError(
+            "Argument `height` must be a surface for a source without pixels, such as a "
+            f"vertax.surfaces.HeightMap, but is {describe(height)}."
+        )
     elif isinstance(source, Foam):
+        surface = source.surface if height is None else height
         course = _of_foam(source, noise)
     elif isinstance(source, Tissue):
-        surface = source.surface if surface is None else surface
+        surface = source.surface if height is None else height
         course = _of_tissue(source.with_surface(None), noise)
     else:
         raise TypeError(
@@ -217,46 +225,6 @@ def _heights_of_file(file: Path) -> np.ndarray:
         return read_image(file)
     except ValueError as error:
         raise ValueError(str(error).replace("`path`", "`height`")) from error
-
-
-def _surface(
-    height: Any, plane_distance: float, unknown: float | int | None, source: Any, unit: float | None
-) -> AbstractSurface | None:
-    """The surface of a tissue.
-
-    **Arguments:**
-
-    - `height`, `plane_distance`, `unknown`: as of `infer_tensions`.
-    - `source`: the segmentation of the mask, or another source.
-    - `unit`: the unit of `plane_distance`; None for the side of a pixel.
-    """
-    if height is None or isinstance(height, AbstractSurface):
-        return height
-    if not isinstance(source, Segmentation):
-        raise TypeError(
-            "Argument `height` must be a surface for a source without pixels, such as a "
-            f"vertax.surfaces.HeightMap, but is {describe(height)}."
-        )
-    heights = height
-    if isinstance(height, str | os.PathLike):
-        heights = _heights_of_file(Path(height))
-    heights = np.asarray(heights)
-    if heights.shape != source.image_shape:
-        raise ValueError(
-            f"Argument `height` must have the shape of the mask, {source.image_shape}, but has "
-            f"{heights.shape}. Pass the heights of the same pixels."
-        )
-    pixel = pixel_length(source.pixel_size)
-    stepped = len(np.unique(heights)) < _STEPS * heights.size
-    width = _SMOOTHING_OF_STEPS if stepped else _SMOOTHING
-    areas = np.abs(geometry_of(source.tissue).areas)[source.labels > 0]
-    return HeightMap(
-        heights,
-        source.pixel_size,
-        plane_distance=plane_distance * (pixel if unit is None else unit),
-        smoothing=max(pixel, width * float(np.sqrt(np.median(areas)))),
-        unknown=float("nan" if unknown is None else unknown),
-    )
 
 
 class _Course(NamedTuple):
@@ -316,6 +284,10 @@ def _of_mask(source: Segmentation, noise: float | None) -> _Course:
     pixel = pixel_length(source.pixel_size)
     noise = None if noise is None else noise * pixel
     tissue, labels, size = source.tissue, source.labels, source.pixel_size
+    if tissue.surface is not None:  # where edges are chords; their courses are in the mask
+        straight = np.zeros(tissue.n_edges)
+        parts = (tissue.vertices, tissue.topology, tissue.boundary, tissue.softening)
+        tissue = Tissue(*parts, angles=straight, inner_arcs=True)
     return _Course(tissue, labels, points, pixel, None, noise, size, source.report)
 
 

@@ -38,7 +38,7 @@ class SurfaceMeasures(NamedTuple):
     bending: Float[np.ndarray, " edges"]
     """Integral of the normal curvature along each edge."""
     slopes: Float[np.ndarray, " cells"]
-    """√(det g - 1) at the mean corner: the slope of a height map."""
+    """√(det g - 1) at the mean of the outline: the slope of a height map."""
 
 
 def lifted(
@@ -147,21 +147,20 @@ def _areas(
     chord = np.linalg.norm(border[:, 1] - border[:, 0], axis=1)
     bulge = chord**2 * (2 * part - np.sin(2 * part)) / (8 * np.sin(part) ** 2)
     bulge = np.where(np.abs(angle) < 1e-4, 0, bulge)
-    sums = np.zeros((n + 1, 3))
+    sums, length = np.zeros((n + 1, 3)), np.linalg.norm(border[:, -1:] - border[:, :1], axis=2)
     for side in cells.T:
-        np.add.at(sums, side, np.column_stack([middle, np.ones(len(middle))]))
-    centre = sums[:, :2] / np.maximum(sums[:, 2:], 1)
+        np.add.at(sums, side, length * np.column_stack([middle, np.ones(len(middle))]))
+    centre = sums[:, :2] / np.maximum(sums[:, 2:], 1e-300)
     total = np.zeros(n + 1)
     for side, sign in zip(cells.T, (1, -1), strict=True):
         arm = border - centre[side][:, None]
         a, b = arm[:, :-1], arm[:, 1:]
         planar = 0.5 * sign * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
         places = centre[side][:, None, None] + 0.5 * np.stack([a + b, a, b], axis=2)
-        density = np.asarray(_density(surface, jnp.asarray(places.reshape(-1, 2))))
-        density = density.reshape(places.shape[:-1])
+        density = surface.sampled(places)[1]
         share = planar * density.mean(axis=-1) + sign * bulge[:, None] * density[:, :, 0]
         np.add.at(total, side, share.sum(axis=1))
-    density = np.asarray(_density(surface, jnp.asarray(centre[:-1])))
+    density = surface.sampled(centre[:-1])[1]
     return total[:-1], np.sqrt(np.maximum(density**2 - 1, 0))
 
 
@@ -173,23 +172,13 @@ def _square_root(metric: np.ndarray) -> np.ndarray:
 
 
 def _chords(surface: AbstractSurface, start: np.ndarray, chord: np.ndarray) -> np.ndarray:
-    ends = _points(surface, jnp.asarray(np.stack([start, start + chord])))
-    return np.asarray(ends[1] - ends[0])
-
-
-@announced_jit
-def _points(surface: AbstractSurface, x: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-    return surface.points(x)
+    first, second = surface.sampled(np.stack([start, start + chord]))[0]
+    return second - first
 
 
 @announced_jit
 def _jacobian(surface: AbstractSurface, x: Float[Array, "n 2"]) -> Float[Array, "n 3 2"]:
     return surface.jacobian(x)
-
-
-@announced_jit
-def _density(surface: AbstractSurface, x: Float[Array, "n 2"]) -> Float[Array, " n"]:
-    return surface.density(x)
 
 
 @announced_jit
