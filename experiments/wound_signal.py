@@ -13,7 +13,7 @@ from pydantic import Field
 
 import vertax as vx
 from vertax import plotting, runs
-from vertax.energies import LineTension, ShapeFactorEnergy
+from vertax.energies import ShapeFactorEnergy
 from vertax.plotting import SERIES
 
 
@@ -51,6 +51,24 @@ class Damage(vx.signals.AbstractReaction):
         return jnp.where(self.hole, 20 * (1 - concentrations), -self.decay * concentrations)
 
 
+class PurseString(vx.AbstractLocalEnergy):
+    """A tension of the edges between the hole and other cells, which depends on the cell.
+
+    Edges that lose the hole in a T1 transition lose the tension at once. (With a `LineTension` they would
+    keep it for the rest of the time step, so no edge would flip, and the hole would never close.)
+    """
+
+    hole: Any
+    tension: Any
+
+    def edge_terms(self, tissue: vx.Tissue) -> Any:
+        """Energy of each edge."""
+        sides = tissue.topology.edge_cells
+        at_hole = self.hole.at[sides].get(mode="fill", fill_value=False)
+        tension = jnp.where(at_hole, 0, self.tension.at[sides].get(mode="fill", fill_value=0))
+        return jnp.where(at_hole.any(axis=-1), tension.sum(axis=-1), 0) * tissue.edge_lengths
+
+
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """The area of the hole in time, and the time at which 10 % of it remain, for each diffusion."""
     began, n = time.perf_counter(), config.n_cells
@@ -65,11 +83,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     relaxation = vx.Relaxation(transitions=vx.T1() + vx.T2())
 
     def couple(concentrations: Any, tissue: vx.Tissue) -> vx.AbstractEnergy:
-        sides = tissue.topology.edge_cells
-        at_hole, signal = hole.at[sides].get(mode="fill", fill_value=False), concentrations[0]
-        c = jnp.where(at_hole, 0, signal.at[sides].get(mode="fill", fill_value=0)).sum(axis=-1)
-        tension = config.tension * c / (c + config.half)
-        return LineTension(jnp.where(at_hole[:, 0] != at_hole[:, 1], tension, 0))
+        c = jnp.maximum(concentrations[0], 0)
+        return PurseString(hole, config.tension * c / (c + config.half))
 
     movies, areas, closed = [], [], []
     for diffusion in config.diffusion:
