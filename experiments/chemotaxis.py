@@ -79,7 +79,7 @@ class Sensing(vx.signals.AbstractReaction):
 
 
 def field(profile: Any, gradient: Any, x: Any) -> Any:
-    """The concentration at x: 1 at x = 0, with this gradient there; the half-normal field has its peak at 20."""
+    """The concentration at x: 1 at x = 0, with this gradient there; the half-normal has its peak at 20."""
     linear, half_normal = 1 + gradient * x, jnp.exp(gradient * (x - x**2 / 40))
     return jnp.stack([linear, half_normal, jnp.exp(gradient * x)])[profile]
 
@@ -200,7 +200,9 @@ def plot_chemotaxis(movie: Any, path: np.ndarray, fields: dict[str, Any], noisy:
     frames = list(movie.trajectory)
     vx.plot_tissue(frames[-1], np.asarray(movie.signals)[-1, 0], ax=axes[0], label="concentration sensed")
     axes[0].plot(*path.T, color=INK, lw=1)
-    axes[0].autoscale()
+    corners = np.concatenate([np.asarray(frames[k].vertices) for k in (0, -1)])
+    (left, bottom), (right, top) = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
+    axes[0].set(xlim=(left, right), ylim=(bottom, top))
     for k, profile in enumerate(PROFILES):
         axes[1].plot(fields["time"], fields[f"{profile}_theory"], color=SERIES[k], lw=1)
         axes[1].plot(fields["time"][::4], fields[profile][::4], ".", color=SERIES[k], label=profile)

@@ -248,8 +248,8 @@ class Signals(AbstractActivity):
         if self.couple is None:
             return None
         coupled = self.couple(self._concentrations(amounts, tissue), tissue)
-        if not isinstance(coupled, Material):
-            coupled = Material(coupled) if isinstance(coupled, AbstractEnergy) else coupled
+        if isinstance(coupled, AbstractEnergy) and not isinstance(coupled, Material):
+            coupled = Material(coupled)
         if not isinstance(coupled, Material) or not isinstance(coupled.energy, AbstractEnergy):
             raise TypeError(
                 "Argument `couple` must return an energy or a vertax.dynamics.Material of one, but returned "
