@@ -133,7 +133,6 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             substeps=config.substeps,
             activity=signals,
             key=key,
-            relaxation=vx.Relaxation(contact_range=None),
             throw=False,
         )
         if not movie.converged:
