@@ -87,16 +87,15 @@ def recover() -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
         tissue = vx.initialise.periodic_voronoi(9, key=seed, lloyd_steps=2)
         tissue = vx.equilibrate(tissue, vx.energies.ShapeFactorEnergy(3.6)).tissue
         rng = np.random.default_rng(seed)
-        start = 1 + 0.5 * rng.uniform(-1, 1, (1, 9))
-        exact = predict(np.log(TRUE), tissue, start)
+        start = jnp.asarray(1 + 0.5 * rng.uniform(-1, 1, (1, 9)))
+        exact = predict(jnp.log(TRUE), tissue, start)
         observed = exact + NOISE * rng.normal(size=exact.shape)
         logarithms, setting = np.full(3, -0.5), (tissue, start, observed)
-        for _ in range(20):
+        step, jacobian = np.ones(3), np.eye(3)
+        while np.abs(step).max() > 1e-6:
             residuals, jacobian = map(np.asarray, linearised(jnp.asarray(logarithms), setting))
             step = np.linalg.lstsq(jacobian, -residuals)[0]
             logarithms = logarithms + step * min(1, 1 / np.abs(step).max())
-            if np.abs(step).max() < 1e-6:
-                break
         covariance = np.linalg.inv(jacobian.T @ jacobian)
         return logarithms - np.log(TRUE), np.sqrt(np.diag(covariance))
 

@@ -147,6 +147,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         fields[f"{profile}_theory"] = odeint(
             lambda x, _, slope=slope: mobility * slope(x[0])[None], [0.0], times
         )[:, 0]
+    movie: Any
     rows, movie, path = [], None, np.zeros((1, 2))
     for factor in config.factors:
         for key in range(config.replicates):
@@ -156,7 +157,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             moved = path[-1, 0] - path[0, 0]
             rows.append((gradient, key, moved / config.duration, moved / length))
     columns = map(np.array, zip(*rows, strict=True))
-    noisy = dict(zip(("gradient", "replicate", "speed", "index"), columns, strict=True))
+    noisy: dict[str, Any] = dict(zip(("gradient", "replicate", "speed", "index"), columns, strict=True))
     noisy["speed_theory"] = mobility * noisy["gradient"]
     folder.save_table("fields", fields)
     folder.save_table("noise", noisy)
