@@ -4,10 +4,10 @@ Each cell holds the concentration that it senses, and pulls outward on its free 
 proportional to it. No cell compares its two ends, but the cluster moves up the gradient (Camley et al. 2016,
 doi:10.1103/PhysRevLett.116.098101). On a substrate with the friction ζ per area the centre of mass obeys
 
-dX/dt = (χ / ζ) m dc/dx,  m = Σ ℓ d cos² φ / A
+dX/dt = (χ / ζ) m dc/dx,  m = Σ ℓ n_x d_x / A
 
-with the traction χ per concentration, and the geometry m of the contacts: length ℓ, distance d of the two
-centroids, their direction φ to the gradient, and the area A of the cluster; m → 1 for large clusters.
+with the traction χ per concentration, and the geometry m of the contacts between cells: length ℓ, unit normal
+n, vector d between the two centroids, and the area A of the cluster; m → 1 for large clusters.
 
 Self-propulsion in random directions adds noise. The chemotactic index is the displacement of the centre of
 mass along the gradient, divided by the length of its path, with one point for each frame.
