@@ -203,6 +203,12 @@ class TestEvolution:
         state = signals.finish(state, initial_tissue(), initial_tissue())
         assert len(calls) == 2
         assert state.material is None
+        both = signals + ThermalNoise(0.1)
+        states = (state, None)
+        _, states = both.drive(states, initial_tissue(), FRICTION, now, now + 0.1, KEY)
+        assert both.step_dissipation(states, initial_tissue(), FRICTION) is FRICTION
+        states = both.finish(states, initial_tissue(), initial_tissue())
+        assert len(calls) == 3
 
     def test_order_2_rejects_a_coupled_dissipation_before_the_first_stage(self, monkeypatch):
         class Contact(vx.AbstractDissipation):

@@ -32,7 +32,7 @@ class State(eqx.Module):
     """The state of a time evolution between two steps."""
 
     tissue: Tissue
-    drive: PyTree[Array]
+    drive: PyTree
     dt: Float[Array, ""]
     """The next time step, with a `PIController`."""
     error: Float[Array, ""]
