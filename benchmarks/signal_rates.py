@@ -91,11 +91,13 @@ def recover() -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
         exact = predict(jnp.log(TRUE), tissue, start)
         observed = exact + NOISE * rng.normal(size=exact.shape)
         logarithms, setting = np.full(3, -0.5), (tissue, start, observed)
-        step, jacobian = np.ones(3), np.eye(3)
-        while np.abs(step).max() > 1e-6:
+        jacobian = np.eye(3)
+        for _ in range(20):
             residuals, jacobian = map(np.asarray, linearised(jnp.asarray(logarithms), setting))
             step = np.linalg.lstsq(jacobian, -residuals)[0]
             logarithms = logarithms + step * min(1, 1 / np.abs(step).max())
+            if np.abs(step).max() < 1e-6:
+                break
         covariance = np.linalg.inv(jacobian.T @ jacobian)
         return logarithms - np.log(TRUE), np.sqrt(np.diag(covariance))
 
