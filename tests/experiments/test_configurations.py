@@ -146,6 +146,15 @@ SHORT = {
     ],
     "erk_waves": ["columns=6", "duration=0.6", "frames=12", "substeps=1"],
     "turing_growth": ["founders=4", "room=8", "duration=1", "frames=3", "animation=false"],
+    "chemotaxis": [
+        "n_cells=3",
+        "duration=0.4",
+        "frames=3",
+        "substeps=1",
+        "factors=[0.0, 1.0]",
+        "replicates=1",
+        "animation=false",
+    ],
     "wound_signal": ["n_cells=16", "duration=0.2", "frames=3", "substeps=1", "diffusion=[1.0]"],
     "tensions_from_movie": ["substeps=10", "cluster.n_cells=7", "cluster.frames=3"],
     "timed_elongation": [

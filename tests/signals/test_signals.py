@@ -187,6 +187,41 @@ class TestEvolution:
                 )
         assert movie.converged
 
+    def test_couple_is_called_once_in_each_traced_step(self):
+        calls = []
+
+        def couple(c, tissue):
+            calls.append(None)
+            return Material(AreaElasticity(1.0, c[0]), None, SelfPropulsion(0.1))
+
+        signals = Signals(None, [0.0], initial=[1.0], couple=couple, deterministic=False)
+        state = signals.init(initial_tissue(), KEY)
+        assert len(calls) == 1
+        now = jnp.array(0.0)
+        _, state = signals.drive(state, initial_tissue(), FRICTION, now, now + 0.1, KEY)
+        assert signals.step_dissipation(state, initial_tissue(), FRICTION) is FRICTION
+        state = signals.finish(state, initial_tissue(), initial_tissue())
+        assert len(calls) == 2
+        assert state.material is None
+        both = signals + ThermalNoise(0.1)
+        states = (state, None)
+        _, states = both.drive(states, initial_tissue(), FRICTION, now, now + 0.1, KEY)
+        assert both.step_dissipation(states, initial_tissue(), FRICTION) is FRICTION
+        states = both.finish(states, initial_tissue(), initial_tissue())
+        assert len(calls) == 3
+
+    def test_order_2_rejects_a_coupled_dissipation_before_the_first_stage(self, monkeypatch):
+        class Contact(vx.AbstractDissipation):
+            def __call__(self, tissue, before, dt):
+                return jnp.sum(jnp.abs(tissue.vertices - before.vertices) ** 3)
+
+        couple = lambda c, tissue: Material(AreaElasticity(1.0, c[0]), Contact())
+        monkeypatch.setattr(
+            vx.Relaxation, "solve", lambda *args, **settings: pytest.fail("a stage")
+        )
+        with pytest.raises(ValueError, match=r"`order` can be 2 only .* which Contact is not"):
+            evolve(Signals(None, [0.0], initial=[1.0], couple=couple), order=2)
+
     @pytest.mark.thorough
     def test_a_coupled_activity_acts_and_needs_a_key(self):
         couple = lambda c, tissue: Material(

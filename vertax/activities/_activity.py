@@ -55,7 +55,7 @@ class AbstractActivity(eqx.Module):
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,
-    ) -> tuple[AbstractEnergy | None, PyTree[Array]]:
+    ) -> tuple[AbstractEnergy | None, PyTree]:
         """The energy that acts during one step (None for no force), and the next state.
 
         **Arguments:**
@@ -68,13 +68,16 @@ class AbstractActivity(eqx.Module):
         """
 
     def step_dissipation(
-        self, state: PyTree[Array], tissue: Tissue, dissipation: AbstractDissipation | None
+        self, state: PyTree, tissue: Tissue, dissipation: AbstractDissipation | None
     ) -> AbstractDissipation | None:
         """The dissipation during one step, after `drive`; by default that of the tissue."""
         return dissipation
 
-    def finish(self, state: PyTree[Array], before: Tissue, tissue: Tissue) -> PyTree[Array]:
-        """The state at the end of a step from `before` to `tissue`, such as after deaths of cells."""
+    def finish(self, state: PyTree, before: Tissue, tissue: Tissue) -> PyTree[Array]:
+        """The state at the end of a step from `before` to `tissue`, such as after deaths of cells.
+
+        It holds arrays only; that of `drive` may hold other objects for `step_dissipation` and this method.
+        """
         return state
 
     def born(self, state: PyTree[Array], tissue: Tissue, pair: Int[Array, "2"]) -> PyTree[Array]:
@@ -122,7 +125,7 @@ class Sum(AbstractActivity):
         time: Float[Array, ""],
         dt: Float[Array, ""],
         key: PRNGKeyArray,
-    ) -> tuple[AbstractEnergy | None, PyTree[Array]]:
+    ) -> tuple[AbstractEnergy | None, PyTree]:
         """The sum of the energies of all terms, and their next states."""
         keys = jax.random.split(key, len(self.terms))
         parts = zip(self.terms, state, keys, strict=True)
@@ -132,14 +135,14 @@ class Sum(AbstractActivity):
         return energy, tuple(state for _, state in results)
 
     def step_dissipation(
-        self, state: PyTree[Array], tissue: Tissue, dissipation: AbstractDissipation | None
+        self, state: PyTree, tissue: Tissue, dissipation: AbstractDissipation | None
     ) -> AbstractDissipation | None:
         """The dissipation of the last term that replaces it."""
         for term, s in zip(self.terms, state, strict=True):
             dissipation = term.step_dissipation(s, tissue, dissipation)
         return dissipation
 
-    def finish(self, state: PyTree[Array], before: Tissue, tissue: Tissue) -> PyTree[Array]:
+    def finish(self, state: PyTree, before: Tissue, tissue: Tissue) -> PyTree[Array]:
         """The states of all terms at the end of a step."""
         pairs = zip(self.terms, state, strict=True)
         return tuple(term.finish(s, before, tissue) for term, s in pairs)

@@ -32,7 +32,7 @@ class State(eqx.Module):
     """The state of a time evolution between two steps."""
 
     tissue: Tissue
-    drive: PyTree[Array]
+    drive: PyTree
     dt: Float[Array, ""]
     """The next time step, with a `PIController`."""
     error: Float[Array, ""]
@@ -148,11 +148,11 @@ def integrate(
             )
             dissipation = evolution.activity.step_dissipation(inner, before, dissipation)
             state = eqx.tree_at(lambda s: s.drive, state, (inner, key))
+            check_order(evolution.order, dissipation)
         parts = (before, active_energy, dissipation)
         if evolution.order == 1:
             return _finished(evolution, before, stage(state, *parts, start, end, None))
         middle = stage(state, *parts, start, start + _GAMMA * dt, None)
-        check_order(evolution.order, dissipation)
         assert isinstance(dissipation, AbstractViscosity)
         base = with_flips_of(before, middle.tissue) if may_flip else before
         previous_strains = dissipation.strains(middle.tissue, base) * (1 - _GAMMA) / _GAMMA

@@ -47,8 +47,8 @@ class Exchange(NamedTuple):
         ends = concentrations.at[:, self.cells].get(mode="fill", fill_value=0)
         diffusion = diffusion.astype(concentrations.dtype)
         flux = diffusion[:, None] * self.conductance * (ends[..., 1] - ends[..., 0])
-        gained = jnp.zeros_like(concentrations).at[:, self.cells[:, 0]].add(flux, mode="drop")
-        return gained.at[:, self.cells[:, 1]].add(-flux, mode="drop")
+        gains = jnp.stack([flux, -flux], axis=-1)
+        return jnp.zeros_like(concentrations).at[:, self.cells].add(gains, mode="drop")
 
 
 def redistributed(
@@ -59,22 +59,17 @@ def redistributed(
     Living former neighbours share the amount of a cell in proportion to the lengths of their edges before the
     step; without one all living cells do, in proportion to their areas.
     """
-    n, cells, lives = tissue.n_cells, before.topology.edge_cells, tissue.alive
+    cells, lives = before.topology.edge_cells, tissue.alive
     died = before.alive & ~lives
-    lengths, moved = _lengths(before), jnp.where(died, amounts, 0)
-    at = lambda mask, side: mask.at[cells[:, side]].get(mode="fill", fill_value=False)
-    weights = [jnp.where(at(died, i) & at(lives, 1 - i), lengths, 0) for i in (0, 1)]
-    totals = jnp.zeros(n, lengths.dtype)
-    for side in (0, 1):
-        totals = totals.at[cells[:, side]].add(weights[side], mode="drop")
-    alone = died & (totals == 0)
-    shares = moved / jnp.where(totals > 0, totals, 1)
-    kept = jnp.where(lives, amounts, 0)
-    for side in (0, 1):
-        share = shares.at[:, cells[:, side]].get(mode="fill", fill_value=0) * weights[side]
-        kept = kept.at[:, cells[:, 1 - side]].add(share, mode="drop")
+    source, target = jnp.concatenate([cells, cells[:, ::-1]]).T
+    some = lambda mask, index: mask.at[index].get(mode="fill", fill_value=False)
+    lengths = jnp.where(some(died, source) & some(lives, target), jnp.tile(_lengths(before), 2), 0)
+    totals = jnp.zeros(tissue.n_cells, lengths.dtype).at[source].add(lengths, mode="drop")
+    shares = jnp.where(died, amounts, 0) / jnp.where(totals > 0, totals, 1)
+    shares = shares.at[:, source].get(mode="fill", fill_value=0) * lengths
+    kept = jnp.where(lives, amounts, 0).at[:, target].add(shares, mode="drop")
     areas = jnp.where(lives, tissue.areas, 0)
-    lost = jnp.sum(jnp.where(alone, amounts, 0), axis=-1, keepdims=True)
+    lost = jnp.sum(jnp.where(died & (totals == 0), amounts, 0), axis=-1, keepdims=True)
     return kept + lost * areas / jnp.sum(areas)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 from vertax._base.checks import as_real, check_integer, check_number, describe
 from vertax._base.extras import requires_extra
 from vertax._base.tracing import is_concrete
-from vertax.activities import AbstractActivity, Push
+from vertax.activities import AbstractActivity
 from vertax.dissipations import AbstractDissipation
 from vertax.dynamics import Material
 from vertax.energies import AbstractEnergy
@@ -37,8 +37,10 @@ class SignalState(eqx.Module):
     amounts: Float[Array, "species cells"]
     """Amounts (concentration times area) of diluted species, concentrations of the others; 0 in spare slots.
     """
-    inner: PyTree[Array]
+    inner: PyTree[Array] = None
     """The state of the activity of a coupled material."""
+    material: Material | None = None
+    """The coupled material during a step; None between steps."""
 
 
 class Signals(AbstractActivity):
@@ -167,11 +169,9 @@ class Signals(AbstractActivity):
         initial = self.initial if self.initial.ndim == 2 else self.initial[:, None]
         initial = jnp.broadcast_to(initial, (len(self.diffusion), n)).astype(tissue.vertices.dtype)
         check_reaction(self.reaction, initial, tissue)
-        state = SignalState(self._from_amounts(initial * _areas(tissue), tissue), None)
-        if tissue.topology.spare:
-            state = SignalState(jnp.where(tissue.alive, state.amounts, 0), None)
-        activity = self._material(state, tissue).activity
-        return state if activity is None else SignalState(state.amounts, activity.init(tissue, key))
+        amounts = self._from_amounts(initial * _areas(tissue), tissue)
+        activity = _activity(self._material(amounts, tissue))
+        return SignalState(amounts, None if activity is None else activity.init(tissue, key))
 
     def drive(
         self,
@@ -183,23 +183,22 @@ class Signals(AbstractActivity):
         key: PRNGKeyArray,
     ) -> tuple[AbstractEnergy | None, SignalState]:
         """The energy of `couple` at the concentrations after reaction and exchange, and these."""
-        state = SignalState(self._reacted(state, tissue, time, dt), state.inner)
-        if self.couple is None:
-            return None, state
-        material = self._material(state, tissue)
+        amounts, inner = self._reacted(state, tissue, time, dt), state.inner
+        material = self._material(amounts, tissue)
+        if material is None:
+            return None, SignalState(amounts)
         energy: Any = material.energy
         if material.activity is not None:
             resistance: Any = dissipation if material.dissipation is None else material.dissipation
-            active, inner = material.activity.drive(state.inner, tissue, resistance, time, dt, key)
-            state = SignalState(state.amounts, inner)
+            active, inner = material.activity.drive(inner, tissue, resistance, time, dt, key)
             energy = energy if active is None else energy + active
-        return energy, state
+        return energy, SignalState(amounts, inner, material)
 
     def step_dissipation(
         self, state: SignalState, tissue: Tissue, dissipation: AbstractDissipation | None
     ) -> AbstractDissipation | None:
         """The dissipation of a coupled material, if it has one."""
-        coupled = self._material(state, tissue).dissipation
+        coupled = None if state.material is None else state.material.dissipation
         return dissipation if coupled is None else coupled
 
     def finish(self, state: SignalState, before: Tissue, tissue: Tissue) -> SignalState:
@@ -208,7 +207,7 @@ class Signals(AbstractActivity):
         if tissue.topology.spare:
             shared = redistributed(amounts, before, tissue)
             amounts = jnp.where(self._is_diluted, shared, jnp.where(tissue.alive, amounts, 0))
-        activity = self._material(state, before).activity
+        activity = _activity(state.material)
         inner = None if activity is None else activity.finish(state.inner, before, tissue)
         return SignalState(amounts, inner)
 
@@ -218,14 +217,20 @@ class Signals(AbstractActivity):
         part = first * second[1] / jnp.sum(second)
         shared = jnp.stack([first - part, part], axis=-1)
         shared = jnp.where(self._is_diluted, shared, first[:, None])
-        state = SignalState(state.amounts.at[:, pair].set(shared), state.inner)
-        activity = self._material(state, tissue).activity
-        inner = None if activity is None else activity.born(state.inner, tissue, pair)
-        return SignalState(state.amounts, inner)
+        amounts, inner = state.amounts.at[:, pair].set(shared), state.inner
+        if inner is not None:
+            activity: Any = _activity(self._material(amounts, tissue))
+            inner = activity.born(inner, tissue, pair)
+        return SignalState(amounts, inner)
 
     def record(self, state: SignalState, tissue: Tissue) -> Float[Array, "species cells"]:
         """The concentrations, 0 in spare slots."""
-        return jnp.where(self._is_diluted, state.amounts / _areas(tissue), state.amounts)
+        return self._concentrations(state.amounts, tissue)
+
+    def _concentrations(
+        self, amounts: Float[Array, "species cells"], tissue: Tissue
+    ) -> Float[Array, "species cells"]:
+        return jnp.where(self._is_diluted, amounts / _areas(tissue), amounts)
 
     @property
     def _is_diluted(self) -> Bool[Array, "species 1"]:
@@ -234,16 +239,17 @@ class Signals(AbstractActivity):
     def _from_amounts(
         self, amounts: Float[Array, "species cells"], tissue: Tissue
     ) -> Float[Array, "species cells"]:
-        """The values that a state stores."""
-        return jnp.where(self._is_diluted, amounts, amounts / _areas(tissue))
+        """The values that a state stores, 0 in spare slots."""
+        values = jnp.where(self._is_diluted, amounts, amounts / _areas(tissue))
+        return jnp.where(tissue.alive, values, 0) if tissue.topology.spare else values
 
-    def _material(self, state: SignalState, tissue: Tissue) -> Material:
-        """The energy, dissipation and activity at the concentrations of a state."""
+    def _material(self, amounts: Float[Array, "species cells"], tissue: Tissue) -> Material | None:
+        """The coupled energy, dissipation and activity at the values of a state; one call of `couple`."""
         if self.couple is None:
-            return Material(Push(jnp.zeros_like(tissue.vertices)))
-        coupled = self.couple(self.record(state, tissue), tissue)
-        if not isinstance(coupled, Material):
-            coupled = Material(coupled) if isinstance(coupled, AbstractEnergy) else coupled
+            return None
+        coupled = self.couple(self._concentrations(amounts, tissue), tissue)
+        if isinstance(coupled, AbstractEnergy) and not isinstance(coupled, Material):
+            coupled = Material(coupled)
         if not isinstance(coupled, Material) or not isinstance(coupled.energy, AbstractEnergy):
             raise TypeError(
                 "Argument `couple` must return an energy or a vertax.dynamics.Material of one, but returned "
@@ -290,8 +296,6 @@ class Signals(AbstractActivity):
         assert solution.ys is not None
         successful = solution.result == diffrax.RESULTS.successful
         amounts = jnp.where(successful, solution.ys[-1], jnp.nan) * unit
-        if tissue.topology.spare:  # (NaN would mark spare slots too)
-            amounts = jnp.where(tissue.alive, amounts, 0)
         return self._from_amounts(amounts, tissue)
 
 
@@ -299,6 +303,10 @@ def _as_array(name: str, value: Any) -> Float[Array, "..."]:
     """An array of finite real numbers, also from a sequence that contains tracers."""
     concrete = all(map(is_concrete, jax.tree.leaves(value)))
     return as_real(name, value if concrete else jnp.asarray(value))
+
+
+def _activity(material: Material | None) -> AbstractActivity | None:
+    return None if material is None else material.activity
 
 
 def _areas(tissue: Tissue) -> Float[Array, " cells"]:
