@@ -126,7 +126,7 @@ class Numbering:
         taken = set(follows.values())
         top = max([0, *self.number_of.values(), *numbers, *self.before])
         for k in range(len(numbers)):
-            number = follows.get(k, numbers[k])
+            number = follows[k] if k in follows else numbers[k]
             if k not in follows and (number in taken or number in numbers[:k]):
                 top += 1
                 number = top
