@@ -190,6 +190,10 @@ def test_corners_on_sides_of_neighbours_are_inserted():
     ]
     movie = movie_from_table(table_of(rows))
     assert movie.repairs == (Repair("inserted corner", 0, (0,)), Repair("inserted corner", 1, (0,)))
+    # A copy of a square, and a square that is run through twice.
+    copies = [row | {"frame": 1} for row in rows[:4] + rows[4:8]]
+    movie = movie_from_table(table_of(rows + copies))
+    assert movie.repairs[-1] == Repair("listed twice", 1, (0, 1))
     np.testing.assert_allclose(movie.frame(1).areas, [2, 1, 1], rtol=1e-12)
 
 

@@ -54,7 +54,7 @@ def test_optional_files_may_be_missing(folder, tmp_path):
     (tmp_path / "results_from_time_1").mkdir()
     written(tmp_path / "results_from_time_1", FILES)
     with pytest.raises(
-        ValueError, match=r"results of one run .* results_from_time_0, results_from"
+        ValueError, match=r"of one run .* results_from_time_0, results_from_time_1\. Choose"
     ):
         read_table(tmp_path)
 
@@ -83,19 +83,20 @@ def test_clockwise_cells_are_turned(folder):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"viznodes": "0\t0 0 1\n"}, r"Line 1 of .*viznodes must hold two coordinates"),
-        ({"viznodes": "0\t0 0 x 1\n"}, r"Line 1 of .*viznodes must hold numbers"),
+        ({"viznodes": "0\t0 0 1\n"}, r"Line 1 of .*viznodes must hold two coordinates .* has 3"),
+        ({"viznodes": "0\t0 0 x 1\n"}, r"Line 1 of .*viznodes must hold finite .* is '0\\t0 0 x"),
         ({"viznodes": f"0\t{NODES}\n0.5\tnan 0\n"}, r"Line 2 of .*viznodes must hold finite"),
         ({"viznodes": f"0\t{NODES}\n0\t{NODES}\n"}, r"Line 2 .* must be later .* time 0"),
-        ({"vizelements": "0\t4 0 1 5\n"}, r"Line 1 of .*vizelements .*4 as this number of cell 0"),
-        ({"vizelements": "0\t4 0 1 5 9\n"}, r"nodes below 8, .* cell 0 has node 9\. Write both"),
+        ({"vizelements": "0\t4 0 1 5\n"}, r"Line 1 .*vizelements .*cell 0 has 4 .* and 3 numbers"),
+        ({"vizelements": "0\t2 0 1\n"}, r"three nodes or more .*cell 0 has 2 as this number"),
+        ({"vizelements": "0\t4 0 1 5 9\n"}, r"nodes below 8, .* cell 0 has node 9\. Take the fi"),
         ({"vizelements": "0\t4 0 1 5 4.5\n"}, r"vizelements must hold integers"),
         ({"vizelements": "1\t4 0 1 5 4\n"}, r"must have the time 0 of results.viznodes, but has 1"),
-        ({"vizelements": "0\t\n"}, r"must have a cell, but has none"),
+        ({"vizelements": "0\t\n"}, r"must hold integers, the nodes of a cell at least"),
         ({"vizlabels": "0\t5 0 0.5 0.5 0 1\n"}, r"must have 4 numbers for each of 3 cells, but"),
         ({"vizcelltypes": "0\t5 0\n"}, r"celltypes must have 1 number for each of 3 cells"),
-        ({"vizboundarynodes": "0\t1 1\n"}, r"1 number for each of 8 nodes, but has 2\. .*remove"),
-        ({"viznodes": None}, r"must hold results.viznodes and .* but has no results.viznodes"),
+        ({"vizboundarynodes": "0\t1 1\n"}, r"1 number for each of 8 nodes, but has 2\. "),
+        ({"viznodes": None}, r"must hold results.viznodes and .* but holds: results.vizbou"),
         ({"viznodes": ""}, r"the lines of at least one time"),
     ],
 )

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from vertax.inference._movie import Repair
-from vertax.initialise._nearby_corners import STEPS, areas_and_centroids, with_images
+from vertax.initialise._nearby_corners import areas_and_centroids, with_images
 from vertax.initialise._polygons import corner_images
+from vertax.mesh import Periodic
 from vertax.mesh._faces import Names
 
 # The place of another cell, in cell sizes: so far is a cell from it, and from its place before.
@@ -52,10 +54,11 @@ def polygons_of(
     corners: dict[int, np.ndarray] = {}
     copies = []
     for run in runs:
-        number, n = int(cell[run[0]]), len(run) // 2
-        first = corners.get(number, run[:n])
-        other = run if number in corners else run[n:]
-        if n > 2 and {*map(tuple, places[first])} == {*map(tuple, places[other])}:
+        number = int(cell[run[0]])
+        first, other = np.split(run, 2) if len(run) % 2 == 0 else (run, run[:0])
+        if number in corners:
+            first, other = corners[number], run
+        if len(other) > 2 and {*map(tuple, places[first])} == {*map(tuple, places[other])}:
             corners[number] = first
             copies.append(number)
         elif number in corners:
@@ -121,20 +124,21 @@ class Numbering:
         frame, if this is certain for all that moved: within half a cell size, twice as close as the next one,
         and closest the other way round too. New cells take new numbers.
         """
-        numbers = [self.number_of.get(cell, cell) for cell in polygons.cells.tolist()]
+        given: list[int] = polygons.cells.tolist()
+        numbers = [self.number_of.get(cell, cell) for cell in given]
         follows = self._certain(polygons, numbers)
         taken = set(follows.values())
         top = max([0, *self.number_of.values(), *numbers, *self.before])
         for k in range(len(numbers)):
-            number = follows[k] if k in follows else numbers[k]
-            if k not in follows and (number in taken or number in numbers[:k]):
+            if k in follows:
+                numbers[k] = follows[k]
+            elif numbers[k] in taken:
                 top += 1
-                number = top
-            taken.add(number)
-            numbers[k] = number
-        self.number_of |= dict(zip(polygons.cells.tolist(), numbers, strict=True))
+                numbers[k] = top
+            taken.add(numbers[k])
+        self.number_of |= dict(zip(given, numbers, strict=True))
         self.before = dict(zip(numbers, polygons.centroids, strict=True))
-        changed = tuple(numbers[k] for k in sorted(follows) if numbers[k] != polygons.cells[k])
+        changed = tuple(numbers[k] for k in sorted(follows) if numbers[k] != given[k])
         return np.array(numbers), [Repair("renumbered", polygons.frame, changed)] if follows else []
 
     def _certain(self, polygons: Polygons, numbers: list[int]) -> dict[int, int]:
@@ -151,12 +155,11 @@ class Numbering:
         given, places = np.array([*self.before]), np.array([*self.before.values()])
         nearest, far = _nearest(now, places, self.lattice, size)
         back, _ = _nearest(places, now, self.lattice, size)
-        certain = (far[:, 0] < _CLOSE * np.minimum(size, far[:, 1])) & (
-            back[nearest] == np.arange(len(now))
-        )
-        if not certain[np.array(same)[distance > _CLOSE * size]].all():
+        mutual = back[nearest] == np.arange(len(now))
+        certain = np.flatnonzero(mutual & (far[:, 0] < _CLOSE * np.minimum(size, far[:, 1])))
+        if not np.isin(np.array(same)[distance > _CLOSE * size], certain).all():
             return {}
-        return {int(k): int(given[nearest[k]]) for k in np.flatnonzero(certain)}
+        return {int(k): int(given[nearest[k]]) for k in certain}
 
 
 def _away(
@@ -168,9 +171,7 @@ def _away(
     away = places - origins
     if lattice is None:
         return away
-    away = away - np.rint(away @ np.linalg.inv(lattice)) @ lattice
-    images = away[:, None] + STEPS @ lattice
-    return images[np.arange(len(away)), np.argmin(np.linalg.norm(images, axis=2), axis=1)]
+    return np.asarray(Periodic(jnp.asarray(lattice)).shortest(jnp.asarray(away)))
 
 
 def _nearest(
@@ -184,5 +185,5 @@ def _nearest(
     if lattice is not None:
         places = places - np.floor(places @ np.linalg.inv(lattice)) @ lattice
         origins, source, _ = with_images(origins, lattice, 2 * size)
-    distance, index = KDTree(origins).query(places, k=2)
+    distance, index = map(np.asarray, KDTree(origins).query(places, k=2))
     return source[index[:, 0]], distance

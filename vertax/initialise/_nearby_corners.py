@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 _Result = TypeVar("_Result")
-STEPS = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+_STEPS = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
 # The largest tolerance that is tried, in cell sizes.
 _LARGEST = 0.1
 
@@ -156,7 +156,7 @@ def with_images(
     """
     inverse = np.linalg.inv(lattice)
     fraction = position @ inverse
-    image = STEPS[:, None] - np.floor(fraction).astype(int)
+    image = _STEPS[:, None] - np.floor(fraction).astype(int)
     shifted = fraction + image
     width = rim * np.linalg.norm(inverse, axis=0)
     near = np.all((shifted > -width) & (shifted < 1 + width), axis=2)
