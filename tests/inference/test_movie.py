@@ -26,6 +26,21 @@ def test_cells_without_events_keep_their_places():
     np.testing.assert_allclose(movie.frame(1).centroids, moved.centroids, rtol=1e-12)
 
 
+def test_a_table_may_be_a_file(tmp_path):
+    vx.io.write_csv(tmp_path / "cells.csv", table_of(rows_of(STRAIGHT, 0) + rows_of(STRAIGHT, 1)))
+    movie = movie_from_table(str(tmp_path / "cells.csv"))
+    np.testing.assert_allclose(movie.frame(1).areas, STRAIGHT.areas, rtol=1e-12)
+
+
+def test_corners_at_whole_pixels_are_joined_across_the_box():
+    tissue = vx.initialise.periodic_voronoi(12, key=jax.random.key(2))
+    scale = 100.0
+    table = table_of(rows_of(tissue, 0) + rows_of(tissue, 1))
+    table |= {axis: np.round(scale * table[axis]) for axis in "xy"}
+    movie = movie_from_table(table, box=scale * np.asarray(tissue.boundary.lattice))
+    np.testing.assert_allclose(movie.frame(1).areas, scale**2 * tissue.areas, rtol=0.05)
+
+
 def test_cells_are_matched_by_number_in_any_order():
     numbers = 5 + 3 * np.random.default_rng(0).permutation(20)
     order = rows_of(STRAIGHT, 0, numbers)

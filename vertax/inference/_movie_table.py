@@ -181,15 +181,14 @@ def _rounding(places: Float[np.ndarray, "corners 2"]) -> float:
     """Distance of decimal numbers as precise as the coordinates; 0 for all digits of a float64."""
     values = np.abs(places)
     largest = float(values.max())
-    if largest and np.array_equal(places, places.astype(np.float32)):
-        return float(np.spacing(np.float32(largest)))
     # (Small numbers may have more digits after the point.)
     values = values[values > 0.1 * largest]
     for digits in range(1, 10):
         step = 10.0 ** (np.floor(np.log10(largest)) + 1 - digits) if largest else 0.0
         if step and np.all(np.abs(values / step - np.rint(values / step)) < 1e-5):
             return float(step)
-    return 0.0
+    single = places.astype(np.float32)
+    return float(np.spacing(np.abs(single).max())) if np.array_equal(places, single) else 0.0
 
 
 def _holes(
