@@ -128,10 +128,10 @@ def test_cells_are_followed_when_one_dies(tmp_path):
     )
     dead = min(inner)
     # It shrinks before it dies.
-    own = np.unique(np.flatnonzero(np.asarray(tissue.topology.cell) == dead) // 3)
+    inside = np.unique(np.flatnonzero(np.asarray(tissue.topology.cell) == dead) // 3)
     middle = tissue.centroids[dead]
     tissue = tissue.with_vertices(
-        tissue.vertices.at[own].set(middle + 0.1 * (tissue.vertices[own] - middle))
+        tissue.vertices.at[inside].set(middle + 0.1 * (tissue.vertices[inside] - middle))
     )
     less = vx.transitions.remove(tissue.with_capacity(20), dead).tissue.without_spare()
     for k, frame in enumerate((tissue, less, less)):

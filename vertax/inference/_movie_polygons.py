@@ -96,13 +96,13 @@ def check_given(
         centroid = np.stack([given["centroid_x"], given["centroid_y"]], axis=1)
         away = np.linalg.norm(_away(polygons.centroids, centroid, lattice), axis=1)
         facts["centroid"] = away > 0.25 * np.sqrt(areas), polygons.centroids, centroid
-    for what, (wrong, here, other) in facts.items():
+    for what, (wrong, measured, other) in facts.items():
         if wrong.any():
             k = int(np.argmax(wrong))
             text = lambda value: ", ".join(f"{x:.4g}" for x in np.atleast_1d(value))
             raise ValueError(
                 f"{polygons.names.subject} must have the corners of its cells, but those of "
-                f"{polygons.names.cell(k)} have the {what} {text(here[k])}, and the table has "
+                f"{polygons.names.cell(k)} have the {what} {text(measured[k])}, and the table has "
                 f"{text(other[k])}. Correct the corners or their units, or leave out the columns."
             )
 

@@ -131,9 +131,9 @@ def _frame(number: int, lines: dict[str, _Line]) -> dict[str, Shaped[np.ndarray,
 def _corners(line: _Line, n_nodes: int) -> list[Int[np.ndarray, " _"]]:
     """The nodes of each cell, from the number of them and then the nodes."""
     values, cells, k = line.values.astype(int), [], 0
-    whole = np.array_equal(values, line.values)
+    integral = np.array_equal(values, line.values)
     line.require(
-        whole and len(values) > 0, "hold integers, the nodes of a cell at least", "does not"
+        integral and len(values) > 0, "hold integers, the nodes of a cell at least", "does not"
     )
     while k < len(values):
         end, name = k + 1 + values[k], f"cell {len(cells)}"
