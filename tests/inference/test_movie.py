@@ -7,7 +7,7 @@ import pytest
 from movie_helpers import rows_of, table_of
 
 import vertax as vx
-from vertax.inference import Event, Movie, movie_from_table
+from vertax.inference import Event, Movie, Repair, movie_from_table
 
 CLUSTER = vx.initialise.free_voronoi(20, key=jax.random.key(4), lloyd_steps=20)
 STRAIGHT = CLUSTER.with_angles(jnp.zeros(CLUSTER.n_edges))
@@ -24,6 +24,21 @@ def test_cells_without_events_keep_their_places():
     np.testing.assert_array_equal(movie.types, np.arange(20) % 2)
     np.testing.assert_allclose(movie.frame(0).areas, STRAIGHT.areas, rtol=1e-12)
     np.testing.assert_allclose(movie.frame(1).centroids, moved.centroids, rtol=1e-12)
+
+
+def test_a_table_may_be_a_file(tmp_path):
+    vx.io.write_csv(tmp_path / "cells.csv", table_of(rows_of(STRAIGHT, 0) + rows_of(STRAIGHT, 1)))
+    movie = movie_from_table(str(tmp_path / "cells.csv"))
+    np.testing.assert_allclose(movie.frame(1).areas, STRAIGHT.areas, rtol=1e-12)
+
+
+def test_corners_at_whole_pixels_are_joined_across_the_box():
+    tissue = vx.initialise.periodic_voronoi(12, key=jax.random.key(2))
+    scale = 100.0
+    table = table_of(rows_of(tissue, 0) + rows_of(tissue, 1))
+    table |= {axis: np.round(scale * table[axis]) for axis in "xy"}
+    movie = movie_from_table(table, box=scale * np.asarray(tissue.boundary.lattice))
+    np.testing.assert_allclose(movie.frame(1).areas, scale**2 * tissue.areas, rtol=0.05)
 
 
 def test_cells_are_matched_by_number_in_any_order():
@@ -138,7 +153,11 @@ def test_bad_tables_are_named():
         movie_from_table(table_of(second + first))
     with pytest.raises(ValueError, match="cell 3 appears twice in frame 1"):
         movie_from_table(
-            table_of(first + second + [{**row, "frame": 1} for row in first if row["cell"] == 3])
+            table_of(
+                first
+                + second
+                + [{**row, "frame": 1, "x": row["x"] + 3} for row in first if row["cell"] == 3]
+            )
         )
     with pytest.raises(ValueError, match="must have a column `cell`"):
         movie_from_table({"frame": [0, 1]})
@@ -157,6 +176,96 @@ def test_polygons_that_overlap_are_named():
     ]
     with pytest.raises(ValueError, match="Frame 0 of argument `table` must"):
         movie_from_table(table_of(rows))
+
+
+def test_copies_repeated_corners_and_turned_cells_are_mended():
+    first, second = rows_of(STRAIGHT, 0), rows_of(STRAIGHT, 1)
+    of = lambda cell: [row for row in second if row["cell"] == cell]
+    kept = [row for row in second if row["cell"] not in (2, 5, 8)]
+    # Cell 2 is clockwise, cell 5 has its first corner again, cells 8 and 9 are there twice.
+    rows = kept + of(2)[::-1] + [*of(5), of(5)[0]] + 2 * of(8) + of(9)
+    movie = movie_from_table(table_of(first + rows))
+    np.testing.assert_allclose(movie.frame(1).areas, STRAIGHT.areas, rtol=1e-12)
+    expected = {"clockwise": (2,), "repeated corner": (5,), "listed twice": (8, 9)}
+    assert {repair.kind: repair.cells for repair in movie.repairs} == expected
+    assert all(repair.frame == 1 for repair in movie.repairs)
+
+
+def test_corners_on_sides_of_neighbours_are_inserted():
+    squares = {
+        0: [0, 0, 2, 0, 2, 1, 0, 1],
+        1: [0, 1, 1, 1, 1, 2, 0, 2],
+        2: [1, 1, 2, 1, 2, 2, 1, 2],
+    }
+    rows = [
+        {"frame": f, "cell": c, "x": x, "y": y}
+        for f in range(2)
+        for c, square in squares.items()
+        for x, y in np.reshape(square, (-1, 2))
+    ]
+    movie = movie_from_table(table_of(rows))
+    assert movie.repairs == (Repair("inserted corner", 0, (0,)), Repair("inserted corner", 1, (0,)))
+    # A copy of a square, and a square that is run through twice.
+    copies = [row | {"frame": 1} for row in rows[:4] + rows[4:8]]
+    movie = movie_from_table(table_of(rows + copies))
+    assert movie.repairs[-1] == Repair("listed twice", 1, (0, 1))
+    np.testing.assert_allclose(movie.frame(1).areas, [2, 1, 1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("n_cells", [12, 100])
+@pytest.mark.parametrize("digits", [6, 4, 3])
+def test_rounded_corners_of_a_periodic_box_are_joined(n_cells, digits):
+    tissue = vx.initialise.periodic_voronoi(n_cells, key=jax.random.key(2))
+    moved = tissue.with_vertices(tissue.vertices + 0.4)
+    table = table_of(rows_of(tissue, 0) + rows_of(moved, 1))
+    table |= {axis: np.round(table[axis], digits) for axis in "xy"}
+    box = np.round(np.asarray(tissue.boundary.lattice), digits)
+    movie = movie_from_table(table, box=box)
+    np.testing.assert_allclose(movie.frame(1).areas, tissue.areas, atol=10 * 10.0**-digits)
+    assert movie.frame(1).n_vertices == tissue.n_vertices
+    if digits > 3:
+        assert movie.events == ()
+
+
+def test_single_precision_is_enough():
+    tissue = vx.initialise.periodic_voronoi(12, key=jax.random.key(2))
+    rows = [row for k in range(2) for row in rows_of(tissue, k)]
+    table = table_of(rows)
+    table |= {axis: (table[axis] + 300).astype(np.float32) for axis in "xy"}
+    movie = movie_from_table(table, box=tissue.boundary.lattice)
+    np.testing.assert_allclose(movie.frame(1).areas, tissue.areas, atol=1e-3)
+
+
+def test_cells_with_other_numbers_in_the_next_frame_are_followed():
+    numbers = np.random.default_rng(0).permutation(20)
+    kind = np.arange(20) % 3
+    rows = rows_of(STRAIGHT, 0, type=kind) + rows_of(STRAIGHT, 1, numbers, type=kind)
+    moved = STRAIGHT.with_vertices(STRAIGHT.vertices + 0.2)
+    movie = movie_from_table(table_of(rows + rows_of(moved, 2, numbers, type=kind)))
+    assert movie.events == ()
+    assert [(repair.kind, repair.frame) for repair in movie.repairs] == [("renumbered", 1)]
+    np.testing.assert_array_equal(movie.types, kind)
+    np.testing.assert_allclose(movie.frame(2).centroids, moved.centroids, rtol=1e-9)
+
+
+def test_cells_that_all_jump_are_not_renumbered():
+    far = STRAIGHT.with_vertices(STRAIGHT.vertices + jnp.array([1.2, 0.3]))
+    with pytest.raises(ValueError, match="must not jump"):
+        movie_from_table(table_of(rows_of(STRAIGHT, 0) + rows_of(far, 1)))
+    assert (
+        movie_from_table(table_of(rows_of(STRAIGHT, 0) + rows_of(far, 1)), largest_jump=2.0).events
+        == ()
+    )
+
+
+def test_areas_and_centroids_are_compared():
+    areas, (x, y) = np.asarray(STRAIGHT.areas), np.asarray(STRAIGHT.centroids).T
+    rows = lambda **columns: [row for k in range(2) for row in rows_of(STRAIGHT, k, **columns)]
+    movie_from_table(table_of(rows(area=areas, centroid_x=x, centroid_y=y)))
+    with pytest.raises(ValueError, match=r"Frame 0 .* cell 0 have the area 0.*the table has 0\.00"):
+        movie_from_table(table_of(rows(area=areas / 100)))
+    with pytest.raises(ValueError, match=r"cell 0 have the centroid .* leave out the columns"):
+        movie_from_table(table_of(rows(centroid_x=x[::-1], centroid_y=y[::-1])))
 
 
 def test_rounded_corners_need_a_tolerance():

@@ -35,10 +35,11 @@ def movie(evolved):
     return Movie(list(evolved.trajectory), evolved.times)
 
 
-def noisy(evolved, noise, seed):
+def noisy(evolved, noise, seed, every=1):
     rng = np.random.default_rng(seed)
     moved = lambda t: t.with_vertices(t.vertices + noise * rng.normal(size=t.vertices.shape))
-    return Movie([moved(t) for t in evolved.trajectory], evolved.times)
+    frames = list(evolved.trajectory)[::every]
+    return Movie([moved(t) for t in frames], evolved.times[::every])
 
 
 def test_parameters_of_an_exact_movie_are_recovered_across_transitions(movie):
@@ -78,6 +79,33 @@ def test_friction_is_fitted_with_a_known_stiffness(movie):
     np.testing.assert_allclose(fit.energy.terms[1].table, TABLE, rtol=1e-4)
 
 
+FREE = AreaElasticity(jnp.array(0.8), 1.0) + by_type(0.2 * jnp.ones((2, 2)), TYPES)
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_the_scale_of_forces_is_undetermined_without_a_constant(evolved, every):
+    tracked = noisy(evolved, 0.005, 0, every)
+    tensions = [f"terms[1].tension[{k}]" for k in range(3)]
+    with pytest.warns(UserWarning, match=r"does not determine terms\[0\].*\+friction \("):
+        fit = fit_movie(tracked, FREE, friction=FRICTION, fit_friction=True, noise=0.005)
+    assert fit.undetermined == ("+".join(["terms[0].stiffness", *tensions, "friction"]),)
+    assert np.isinf(fit.friction_deviation)
+    assert np.isinf(fit.deviation.terms[0].stiffness)
+    assert np.isinf(fit.deviation.terms[1].tension).all()
+    np.testing.assert_array_equal(np.isinf(fit.covariance), np.eye(5, dtype=bool))
+
+
+@pytest.mark.filterwarnings("ignore:Frames are too far apart")
+def test_parameters_that_frames_far_apart_hardly_determine_are_named(evolved):
+    tracked = noisy(evolved, 0.005, 0, 5)
+    with pytest.warns(UserWarning, match=r"hardly determines .* terms\[0\]\.stiffness\+terms"):
+        fit = fit_movie(tracked, FREE, friction=FRICTION, noise=0.005)
+    assert fit.undetermined == ()
+    assert 0.2 < float(fit.deviation.terms[0].stiffness) < 2
+    fit = fit_movie(noisy(evolved, 0.005, 0), FREE, friction=FRICTION, noise=0.005)
+    assert float(fit.deviation.terms[0].stiffness) < 0.1
+
+
 # (The frames are exact steps of the implicit Euler method.)
 @pytest.mark.filterwarnings("ignore:Frames are too far apart")
 def test_parameters_scale_with_the_friction(movie):
@@ -89,7 +117,11 @@ def test_parameters_scale_with_the_friction(movie):
 
 def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     energy = AreaElasticity(jnp.ones(16), 1.0) + by_type(0.4 * jnp.ones((16, 16)), jnp.arange(16))
-    fit = fit_movie(movie, energy, friction=FRICTION, noise=0.0)
+    with (
+        pytest.warns(UserWarning, match=r"does not determine terms\[1\]\.tension\[\d+\], .* more"),
+        pytest.warns(UserWarning, match="Standard errors are NaN: .* more steps than parameters"),
+    ):
+        fit = fit_movie(movie, energy, friction=FRICTION, noise=0.0)
     pair = np.asarray(fit.energy.terms[1].table)
     first, second = np.asarray(movie.frame(20).topology.edge_cells).T
     expected = np.asarray(TABLE)[TYPES[first], TYPES[second]]
@@ -100,6 +132,9 @@ def test_each_cell_and_each_pair_of_cells_may_have_parameters(movie):
     apart = np.ones((16, 16), bool)
     apart[contacts[:, 0], contacts[:, 1]] = apart[contacts[:, 1], contacts[:, 0]] = False
     np.testing.assert_allclose(pair[apart], 0.4)
+    infinite = np.isinf(fit.deviation.terms[1].tension)
+    assert infinite[apart[jnp.triu_indices(16)]].all()
+    assert len(fit.undetermined) == infinite.sum() < 90
 
 
 def test_errors_by_tracking_noise_are_covered(evolved):
@@ -158,8 +193,13 @@ def test_corners_without_the_bulges_of_the_outline_are_named():
     with pytest.warns(UserWarning, match="outline are straight"):
         wrong = fit_movie(movie(1), guess).energy.terms[1]
     assert np.max(np.abs(wrong.tension - tension.tension)) > 0.015
-    inner = fit_movie(movie(1), guess, outline=False).energy.terms[1]
+    with pytest.warns(UserWarning, match=r"does not determine terms\[1\]\.outline \(`und.* known"):
+        fit = fit_movie(movie(1), guess, outline=False)
+    inner, deviation = fit.energy.terms[1], fit.deviation.terms[1]
     np.testing.assert_allclose(inner.tension, tension.tension, rtol=1e-3)
+    assert fit.undetermined == ("terms[1].outline",)
+    assert np.isinf(deviation.outline)
+    assert np.isfinite(deviation.tension).all()
     fit = fit_movie(movie(200), guess).energy.terms[1]
     np.testing.assert_allclose(fit.tension, tension.tension, rtol=1e-3)
     assert float(fit.outline) == pytest.approx(0.25, rel=1e-3)

@@ -49,6 +49,7 @@ def test_a_surface_has_the_period_of_the_mask(mask):
     assert periodic.areas.sum() > 1.001 * 144
     mirrored = from_labels(mask, boundary="mirrored", height=wave, pixel_size=0.1).tissue
     x = jnp.array([[1.5, 4.0], [24 - 1.5, 4.0], [1.5, 24 - 4.0], [25.5, 28.0]])
+    assert mirrored.surface is not None
     heights = np.asarray(mirrored.surface.points(x))[:, 2]
     np.testing.assert_allclose(heights, heights[0], atol=1e-9)
 
@@ -75,7 +76,8 @@ def test_cells_with_two_sides_on_the_outline_join_a_neighbour(mask):
 
 def test_tensions_of_a_segmentation_on_a_surface_are_those_of_its_mask(mask):
     labels = free(mask)
-    heights = 0.1 * np.hypot(*np.indices(labels.shape)) ** 1.5
+    row, column = np.indices(labels.shape)
+    heights = 0.1 * np.hypot(row, column) ** 1.5
     source = from_labels(labels, boundary="free", height=heights)
     result = vx.tensions.infer_tensions(source, edges="arcs")
     expected = vx.tensions.infer_tensions(labels, height=heights, edges="arcs")

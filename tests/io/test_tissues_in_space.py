@@ -242,16 +242,16 @@ def test_tensions_of_a_foam_on_a_cap(foam, tmp_path):
 
 
 def test_files_of_foams_in_space(foam, tmp_path):
-    path = tmp_path / "foam.fe"
-    level = evolver_file(*foam, lambda x: np.column_stack([x, np.full(len(x), 2.0)]))
+    path, (rest, tension) = tmp_path / "foam.fe", foam
+    level = evolver_file(rest, tension, lambda x: np.column_stack([x, np.full(len(x), 2.0)]))
     path.write_text(level)
     assert vx.io.read_surface_evolver(path).surface is None
     # Without a dimension, the space of Surface Evolver has three.
-    curved = evolver_file(*foam, stereographic)
+    curved = evolver_file(rest, tension, stereographic)
     path.write_text(curved.replace("SPACE_DIMENSION 3\n", ""))
     assert vx.io.read_surface_evolver(path).surface is not None
     rolled = lambda x: np.column_stack([np.sin(2 * x[:, 0]), x[:, 1], np.cos(2 * x[:, 0])])
-    path.write_text(evolver_file(*foam, rolled))
+    path.write_text(evolver_file(rest, tension, rolled))
     with pytest.raises(ValueError, match=r"foam.fe is not a foam without overhangs"):
         vx.io.read_surface_evolver(path)
     path.write_text(curved.replace("SPACE_DIMENSION 3", "SPACE_DIMENSION 4"))

@@ -63,6 +63,7 @@ SLOW = {
     "docs/index.md",
     "docs/masks.md",
     "docs/mechanics.md",
+    "docs/movies.md",
     "docs/performance.md",
     "docs/pictures.md",
     "docs/posteriors.md",

@@ -19,7 +19,7 @@ def _outputs(path: Path) -> list[dict]:
 
 
 def test_number_of_notebooks():
-    assert len(NOTEBOOKS) == 14
+    assert len(NOTEBOOKS) == 15
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/notebooks.md", "mkdocs.yml"])

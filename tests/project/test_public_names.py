@@ -32,8 +32,8 @@ PACKAGES = {
     "fitting": "Checkpoint Evaluation Fit FitError History InverseProblem Record Uncertainty fit "
     "fit_warnings limits member stack stack_fits uncertainty",
     "growth": "AbstractLifeCycle Cells GrowAndDivide Grown Lineage grow score_function",
-    "inference": "Event Micrograph Microscope Movie MovieFit PinnedEnergy Scene fit_movie label_image "
-    "labels_on_sphere micrograph_problem movie_from_table pearson relative_error same_neighbours "
+    "inference": "Event Micrograph Microscope Movie MovieFit PinnedEnergy Repair Scene fit_movie "
+    "label_image labels_on_sphere micrograph_problem movie_from_table pearson relative_error same_neighbours "
     "shape_factor_scene",
     "initialise": "AbstractSegmenter Cellpose Courses MaskChange MaskReport PolygonTissue "
     "Segmentation Watershed "
@@ -43,7 +43,7 @@ PACKAGES = {
     "from_tyssue load_energy load_problem load_tissue load_trajectory pixel_aspect pixel_sides pixel_size "
     "read_force_inference "
     "read_geojson read_image read_stack read_surface_evolver read_table save_energy save_problem save_tissue "
-    "save_trajectory to_tables write_csv write_geojson write_vtk write_vtk_series",
+    "save_trajectory to_tables write_chaste write_csv write_geojson write_vtk write_vtk_series",
     "mechanics": "BoxRelaxation Modes Ramp SelfStress bulk_modulus cell_stress compatibility "
     "complex_modulus deformed density_of_states elastic_tensor modes pressures "
     "principal pure_shear ramp recoil self_stresses shear_modulus simple_shear "

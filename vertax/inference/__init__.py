@@ -6,7 +6,7 @@ from vertax.inference._micrograph import (
     micrograph_problem as micrograph_problem,
 )
 from vertax.inference._microscope import Microscope as Microscope, label_image as label_image
-from vertax.inference._movie import Event as Event, Movie as Movie
+from vertax.inference._movie import Event as Event, Movie as Movie, Repair as Repair
 from vertax.inference._movie_fit import MovieFit as MovieFit, fit_movie as fit_movie
 from vertax.inference._movie_table import movie_from_table as movie_from_table
 from vertax.inference._recovery import (

@@ -31,6 +31,19 @@ class Event(NamedTuple):
     of a division the mother, then the daughters. -1 is the exterior."""
 
 
+class Repair(NamedTuple):
+    """What a reader mended in a frame."""
+
+    kind: str
+    """`"clockwise"`: corners that were turned round; `"repeated corner"`: a corner that was left out;
+    `"inserted corner"`: that of a neighbour in the middle of a side; `"listed twice"`: a copy that was left
+    out; `"renumbered"`: cells that have the place of a cell with another number."""
+    frame: int
+    """The frame, from 0."""
+    cells: tuple[int, ...]
+    """Numbers of the cells in the movie."""
+
+
 class Movie(eqx.Module):
     """Frames of a tissue in which cells keep their numbers while their neighbours change.
 
@@ -46,6 +59,7 @@ class Movie(eqx.Module):
     - `types`: type of each cell by number; by default there are none.
     - `filled`: for each frame the numbers of cells that were not observed but fill a hole; each is an event
         `"gap"`.
+    - `repairs`: what a reader mended.
     - `largest_jump`: largest distance that a centroid moves from one frame to the next, in units of the
         root of the mean cell area.
 
@@ -65,6 +79,8 @@ class Movie(eqx.Module):
     """Type of each cell, for [`by_type`][vertax.energies.by_type]."""
     events: tuple[Event, ...]
     """What changed between frames, in the order of frames."""
+    repairs: tuple[Repair, ...]
+    """What [`movie_from_table`][vertax.inference.movie_from_table] mended, in the order of frames."""
 
     def __init__(
         self,
@@ -74,6 +90,7 @@ class Movie(eqx.Module):
         cells: Sequence[Any] | None = None,
         types: dict[int, int] | None = None,
         filled: Sequence[Sequence[int]] | None = None,
+        repairs: Sequence[Repair] = (),
         largest_jump: float = 1.0,
     ):
         check_number("largest_jump", largest_jump, above=0)
@@ -94,6 +111,7 @@ class Movie(eqx.Module):
         gaps = [Event("gap", k, (c,)) for k, holes in enumerate(filled or ()) for c in holes]
         events = sorted([*_events(frames), *gaps], key=lambda event: event.frame)
         self.events = tuple(events)
+        self.repairs = tuple(repairs)
         self.types = None
         if types is not None:
             missing = [int(cell) for cell in self.cells if int(cell) not in types]

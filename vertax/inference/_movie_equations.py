@@ -118,8 +118,13 @@ def scaled_inverse(
     size = jnp.sqrt(jnp.where(scales > 0, scales, 1))
     scaled = slopes / size[0][:, None] / size[1]
     inverse = jnp.linalg.pinv(scaled, rtol=max(1e-8, 100 * float(jnp.finfo(scaled.dtype).eps)))
-    determined = jnp.diag(inverse @ scaled) > 0.99
+    determined = jnp.diag(inverse @ scaled) > 1 - least_share(scaled.dtype)
     return inverse / size[1][:, None] / size[0], determined
+
+
+def least_share(dtype: Any) -> float:
+    """Share of a parameter in directions without information from which on it is undetermined."""
+    return max(1e-6, 1e4 * float(jnp.finfo(dtype).eps))
 
 
 def sandwich_covariance(
@@ -138,4 +143,5 @@ def sandwich_covariance(
     )
     covariance = factor * inverse @ middle @ inverse.T
     both = determined[:, None] & determined
-    return jnp.where(both, covariance, jnp.nan)
+    infinite = jnp.where(jnp.eye(n_parameters, dtype=bool), jnp.inf, 0)
+    return jnp.where(both, covariance, infinite.astype(covariance.dtype))

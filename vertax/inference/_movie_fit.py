@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
 
 from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.batch import member
@@ -22,6 +24,7 @@ from vertax.inference._movie_equations import (
     Settings,
     equations,
     frame_at,
+    least_share,
     sandwich_covariance,
     scaled_inverse,
 )
@@ -35,7 +38,8 @@ class MovieFit(eqx.Module):
     energy: AbstractEnergy
     """The energy with the fitted parameters."""
     deviation: AbstractEnergy
-    """Standard errors in the place of the parameters; NaN for those that the movie does not determine."""
+    """Standard errors in the place of the parameters; infinite for those that the movie does not determine,
+    and NaN with fewer steps than parameters."""
     interval_error: AbstractEnergy
     """Change of the parameters with the other `implicitness`, 0.5 or 1: the order of magnitude of the error
     by the time between frames."""
@@ -44,7 +48,8 @@ class MovieFit(eqx.Module):
     friction_deviation: Float[Array, "*windows"]
     """Its standard error; 0 if it was given."""
     covariance: Float[Array, "*windows parameters parameters"]
-    """Covariance of the parameters, the friction last if it was fitted."""
+    """Covariance of the parameters, the friction last if it was fitted; infinite variances and covariances of
+    0 for those that the movie does not determine."""
     noise: Float[Array, "*windows"]
     """The tracking noise, estimated or given."""
     misfit: Float[Array, "*windows"]
@@ -53,6 +58,9 @@ class MovieFit(eqx.Module):
     """Number of force components that were used."""
     converged: Bool[Array, "*windows"]
     """Whether the parameters no longer changed in the last step."""
+    undetermined: tuple[str, ...] = eqx.field(static=True)
+    """Parameters that the movie does not determine, by name, such as `"terms[1].outline"`; several with `+`
+    if it does not determine them together. With windows, those of any window."""
 
 
 class _Solution(NamedTuple):
@@ -63,6 +71,8 @@ class _Solution(NamedTuple):
     misfit: Float[Array, " windows"]
     num_equations: Int[Array, " windows"]
     converged: Bool[Array, " windows"]
+    slopes: Float[Array, "windows parameters parameters"]
+    scales: Float[Array, "windows 2 parameters"]
 
 
 def fit_movie(
@@ -146,7 +156,9 @@ def fit_movie(
     **Returns:** a [`MovieFit`][vertax.inference.MovieFit].
 
     **Warns:** if frames are too far apart for the motion between them, and if the vertices of outer cells are
-    used but all outer sides are straight.
+    used but all outer sides are straight; naming the parameters, if the movie does not determine them, or
+    determines them together only within half of their values (as it does a stiffness or the friction from
+    frames that are far apart); and if there are fewer steps than parameters.
 
     **Raises:**
 
@@ -214,6 +226,8 @@ def fit_movie(
     deviations = jnp.sqrt(jnp.diagonal(best.covariance, axis1=1, axis2=2))
     change = compared.theta - best.theta
     n = theta.size - fit_friction
+    names = [*_names(parameters), *["friction"] * fit_friction]
+    undetermined = _undetermined(names, best)
     _warn_of_long_intervals(best.theta[:, :n], change[:, :n], deviations[:, :n])
     in_energy = eqx.filter_vmap(settings.energy, out_axes=eqx.if_array(0))
     fits = MovieFit(
@@ -227,6 +241,7 @@ def fit_movie(
         misfit=best.misfit,
         num_equations=best.num_equations,
         converged=best.converged,
+        undetermined=undetermined,
     )
     return fits if windows is not None else member(fits, 0)
 
@@ -241,6 +256,71 @@ def _warn_of_straight_outlines(frames: Tissue, outline: bool) -> None:
             "points along these sides in the table, or pass `outline=False`.",
             stacklevel=3,
         )
+
+
+def _names(parameters: AbstractEnergy) -> list[str]:
+    """The name of each entry of each parameter, in the order of the fit."""
+    names = []
+    for path, array in jax.tree_util.tree_flatten_with_path(parameters)[0]:
+        name = jax.tree_util.keystr(path).lstrip(".")
+        entries = [f"[{', '.join(map(str, index))}]" for index in np.ndindex(array.shape)]
+        names += [name + (entry if array.ndim else "") for entry in entries]
+    return names
+
+
+def _undetermined(names: list[str], solution: _Solution) -> tuple[str, ...]:
+    """Names of what the movie does not determine; a warning for that, and for what it hardly determines."""
+    free: dict[str, None] = {}
+    weak: dict[str, float] = {}
+    for slopes, scales, theta, covariance in zip(
+        *map(np.asarray, (solution.slopes, solution.scales, solution.theta, solution.covariance)),
+        strict=True,
+    ):
+        size = np.sqrt(np.where(scales > 0, scales, 1))
+        inverse, _ = scaled_inverse(jnp.asarray(slopes), jnp.asarray(scales))
+        # The projection on directions in which the scaled information is 0.
+        null = np.eye(len(theta)) - (np.asarray(inverse) @ slopes) * size[1][:, None] / size[1]
+        least = least_share(slopes.dtype)
+        group = connected_components(np.abs(null) > least, directed=False)[1]
+        for k in np.unique(group[np.diag(null) > least]):
+            free["+".join(names[i] for i in np.flatnonzero(group == k))] = None
+        # Eigenvectors of the covariance of relative errors.
+        fixed = np.flatnonzero(np.isfinite(np.diag(covariance)) & (theta != 0))
+        relative = covariance[np.ix_(fixed, fixed)] / theta[fixed] / theta[fixed, None]
+        variance, vectors = np.linalg.eigh(relative)
+        for value, vector in zip(variance, vectors.T, strict=True):
+            if value > _LARGEST_ERROR**2:
+                parts = fixed[np.abs(vector) > 0.3]
+                weak["+".join(names[i] for i in parts)] = float(np.sqrt(value))
+    if free:
+        warnings.warn(
+            f"The movie does not determine {_list(free)} (`undetermined`): these have infinite standard "
+            "errors, and depend on the guess. Give a known value as a number instead of an array, or use "
+            "more of the tissue.",
+            stacklevel=3,
+        )
+    if weak:
+        warnings.warn(
+            "The movie hardly determines these parameters together: "
+            f"{_list({f'{name} (relative error {error:.2g})': 0 for name, error in weak.items()})}. Give a "
+            "known value as a number instead of an array, or more frames in shorter intervals.",
+            stacklevel=3,
+        )
+    if np.isnan(solution.covariance).any():
+        warnings.warn(
+            f"Standard errors are NaN: they require more steps than parameters, {len(names)}.",
+            stacklevel=3,
+        )
+    return tuple(free)
+
+
+def _list(names: Iterable[str]) -> str:
+    names = list(names)
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+_LARGEST_ERROR = 0.5
+"""Standard error of a combination of parameters, relative to them, that is hardly determined."""
 
 
 def _warn_of_long_intervals(
@@ -313,6 +393,8 @@ def _solve_windows(
             misfit=jnp.sqrt(squares[:, 0].sum() / n),
             num_equations=2 * squares[:, 2].sum().astype(int),
             converged=change <= 1e-6,
+            slopes=slopes.sum(axis=0),
+            scales=scales.sum(axis=0),
         )
 
     return jax.vmap(solve)(steps, used)

@@ -8,8 +8,7 @@ import numpy as np
 
 from vertax._base.checks import check_number
 from vertax._base.pixels import pixel_length, pixel_sides
-from vertax.mesh import Periodic
-from vertax.mesh._geometry import geometry_of
+from vertax.mesh import Periodic, geometry_of
 from vertax.surfaces import AbstractSurface, HeightMap
 
 # Smoothing of an image of heights, relative to the root of the median area of a cell: of a smooth one, and of

@@ -107,12 +107,27 @@ def size_of_cells(
     lattice: Float[np.ndarray, "2 2"] | None,
 ) -> float:
     """Square root of the mean area of the polygons."""
-    areas = []
+    areas = areas_and_centroids(position, cells, images, lattice)[0]
+    return float(np.sqrt(np.mean(np.abs(areas))))
+
+
+def areas_and_centroids(
+    position: Float[np.ndarray, "points 2"],
+    cells: Sequence[Int[np.ndarray, " _"]],
+    images: Sequence[Int[np.ndarray, "_ 2"]],
+    lattice: Float[np.ndarray, "2 2"] | None,
+) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, "cells 2"]]:
+    """Area of each polygon, negative if it is clockwise, and its centroid."""
+    areas, centroids = [], []
     for cell, image in zip(cells, images, strict=True):
         ring = position[cell] if lattice is None else position[cell] + image @ lattice
-        x, y = (ring - ring[0]).T
-        areas.append(0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))))
-    return float(np.sqrt(np.mean(areas)))
+        rest = ring - ring[0]
+        following = np.roll(rest, -1, axis=0)
+        swept = rest[:, 0] * following[:, 1] - rest[:, 1] * following[:, 0]
+        areas.append(0.5 * swept.sum())
+        middle = swept @ (rest + following) / (6 * areas[-1]) if areas[-1] else rest.mean(axis=0)
+        centroids.append(ring[0] + middle)
+    return np.array(areas), np.array(centroids)
 
 
 def _merged(
@@ -123,7 +138,7 @@ def _merged(
     """One number for all points at one place, in order of appearance."""
     place, source = position, np.arange(len(position))
     if lattice is not None:
-        place, source, _ = _with_images(position, lattice, 2 * tolerance)
+        place, source, _ = with_images(position, lattice, 2 * tolerance)
     links = source[KDTree(place).query_pairs(tolerance, output_type="ndarray")]
     n = len(position)
     graph = coo_array((np.ones(len(links), bool), (links[:, 0], links[:, 1])), shape=(n, n))
@@ -132,7 +147,7 @@ def _merged(
     return np.argsort(np.argsort(first))[group]
 
 
-def _with_images(
+def with_images(
     position: Float[np.ndarray, "points 2"], lattice: Float[np.ndarray, "2 2"], rim: float
 ) -> tuple[Float[np.ndarray, "places 2"], Int[np.ndarray, " places"], Int[np.ndarray, "places 2"]]:
     """All images of points in the box with a rim around it, of at most one box.
@@ -172,7 +187,7 @@ def _corners_on_sides(
     else:
         home = np.floor(middle @ np.linalg.inv(lattice)).astype(int)
         middle = middle - home @ lattice
-        place, source, shift = _with_images(points, lattice, half.max() + tolerance)
+        place, source, shift = with_images(points, lattice, half.max() + tolerance)
     near = KDTree(place).query_ball_point(middle, half + tolerance)
     side = np.repeat(np.arange(len(owner)), [len(each) for each in near])
     candidate = np.concatenate([np.asarray(each, int) for each in near])

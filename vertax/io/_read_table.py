@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Shaped
 
 from vertax._base.checks import describe
+from vertax.io._chaste import read_chaste
+from vertax.io._read_vtk import read_vtk
 
 _INTEGER = re.compile(r"[-+]?\d+")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf(?:inity)?", re.IGNORECASE)
@@ -27,7 +29,7 @@ _HEADERS = 5
 
 
 def read_table(path: str | os.PathLike[str]) -> dict[str, Shaped[np.ndarray, " rows"]]:
-    """Read the columns of a CSV file, or the properties of the features of a GeoJSON file.
+    """Read the columns of a CSV file, the properties of a GeoJSON file, or polygons of Chaste or VTK.
 
     It reads what [`write_csv`][vertax.io.write_csv] and [`write_geojson`][vertax.io.write_geojson] write:
     numbers are the same to the last bit.
@@ -43,10 +45,15 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Shaped[np.ndarray, " r
 
     **Arguments:**
 
-    - `path`: the file. Files that end in `.geojson` or `.json` are GeoJSON, all others CSV with a comma,
-        a semicolon or a tab between fields and the names of the columns in the first line. Beside
-        semicolons and tabs a comma in a number is the decimal point. Nested properties of GeoJSON are
-        columns with both names, such as `classification.name`; lists are left out, with a warning.
+    - `path`: the file. Files that end in `.geojson` or `.json` are GeoJSON; nested properties are columns
+        with both names, such as `classification.name`, and lists are left out, with a warning. A folder holds
+        results of Chaste: `results.viznodes`, `results.vizelements` and, if there are, `results.vizlabels` or
+        `results.vizcelltypes` and `loggedcell.dat`; a last line without an end is left out, with a warning.
+        `.pvd` and `.vtu` files are polygons of VTK in a plane, read through meshio (`pip install -e
+        ".[files]"`): `cell` and `type` are their data `cell` or `Cell IDs`, and `type` or `Cell labels`.
+        The columns of such movies are those of [`movie_from_table`][vertax.inference.movie_from_table].
+        All other files are CSV with a comma, a semicolon or a tab between fields and the names of the columns
+        in the first line. Beside semicolons and tabs a comma in a number is the decimal point.
 
     **Returns:** NumPy arrays by the name of the column.
 
@@ -54,8 +61,13 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Shaped[np.ndarray, " r
 
     - `OSError` if the file cannot be read.
     - `ValueError`, naming the file and the line or feature, if it is no such table.
+    - `ImportError` for VTK files if meshio is not installed.
     """
     path = Path(path)
+    if path.is_dir():
+        return read_chaste(path)
+    if path.suffix in (".pvd", ".vtu"):
+        return read_vtk(path)
     if path.suffix.lower() in (".geojson", ".json"):
         return properties(read_features(path), path)
     return _read_csv(path)
