@@ -153,6 +153,7 @@ NUMBERS = [
     "twelve",
     "thirteen",
     "fourteen",
+    "fifteen",
 ]
 COUNTED = {
     "notebooks": len(list(ROOT.glob("notebooks/*.ipynb"))),

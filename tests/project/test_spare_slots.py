@@ -281,7 +281,7 @@ CASES = {
 # Names that need no case, and the reason.
 ELSEWHERE = {
     "Relaxation Evolution InverseProblem Material": "classes behind equilibrate, evolve, fit and grow",
-    "Sum": "a loop over terms that have cases",
+    "Sum InTurn": "loops over terms that have cases",
     "AbstractLocalEnergy": "the base class",
     "animate plot_tissues": "draw by plot_tissue",
     "save_tissue": "keeps spare slots; tests/io/test_files_with_spare_slots.py",

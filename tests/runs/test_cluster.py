@@ -75,10 +75,10 @@ def test_masks_on_a_cluster(client):
     masks = [vx.inference.label_image(free_tissue(seed), 200) for seed in range(4)]
     masks.append(np.zeros((20, 20), int))
     elsewhere = vx.tensions.infer_tensions_of_masks(masks, executor=client.get_executor())
-    here = vx.tensions.infer_tensions_of_masks(masks)
-    assert list(elsewhere.results) == list(here.results) == [0, 1, 2, 3]
-    assert elsewhere.failures == here.failures
-    for number, result in here.results.items():
+    local = vx.tensions.infer_tensions_of_masks(masks)
+    assert list(elsewhere.results) == list(local.results) == [0, 1, 2, 3]
+    assert elsewlocal.failures == local.failures
+    for number, result in local.results.items():
         np.testing.assert_allclose(elsewhere.results[number].tensions, result.tensions, rtol=1e-8)
 
 

@@ -44,16 +44,16 @@ def cluster(scheduler: str) -> Iterator[Executor]:
             "`dask scheduler`, or correct the address after --scheduler."
         ) from None
     with client:
-        here: str = _versions()
+        expected: str = _versions()
         workers: Any = client.run(_versions)
         if not workers:
             raise ConfigError(
                 f"The scheduler at {scheduler} has no workers. Start one by `dask worker {scheduler}`."
             )
         for worker, versions in workers.items():
-            if versions != here:
+            if versions != expected:
                 raise ConfigError(
-                    f"The worker {worker} has {versions}, but this process has {here}. Install the same "
+                    f"The worker {worker} has {versions}, but this process has {expected}. Install the same "
                     "versions in both."
                 )
         yield client.get_executor()
