@@ -310,11 +310,12 @@ def _without_overlaps(result: PolygonTissue, names: Names) -> PolygonTissue:
         flattened = np.asarray(flatter.angles) != np.asarray(tissue.angles)
         return dataclasses.replace(result, tissue=flatter, flattened_edges=flattened)
     bad = np.flatnonzero(np.asarray(tissue.overlaps.cells))
+    chords = isinstance(tissue.boundary, Free) and tissue.arcs is None  # on a surface
     names.refuse(
         "hold cells that do not overlap without the points where only two edges meet",
         f"there are overlaps at {names.cells(bad) if bad.size else 'the outline'}: edges without "
         f"{names.points(result.removed_points)} are straight or arcs",
-        "Pass `inner_arcs=True`, or leave out these cells.",
+        "Leave out these cells." if chords else "Pass `inner_arcs=True`, or leave out these cells.",
     )
 
 
