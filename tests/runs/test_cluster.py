@@ -77,7 +77,7 @@ def test_masks_on_a_cluster(client):
     elsewhere = vx.tensions.infer_tensions_of_masks(masks, executor=client.get_executor())
     local = vx.tensions.infer_tensions_of_masks(masks)
     assert list(elsewhere.results) == list(local.results) == [0, 1, 2, 3]
-    assert elsewlocal.failures == local.failures
+    assert elsewhere.failures == local.failures
     for number, result in local.results.items():
         np.testing.assert_allclose(elsewhere.results[number].tensions, result.tensions, rtol=1e-8)
 
