@@ -11,9 +11,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_purse_string_that_a_signal_contracts_closes_a_wound(tmp_path):
-    config = wound_signal.Config(
-        experiment="wound_signal", duration=4, frames=12, diffusion=[1.0]
-    )
+    config = wound_signal.Config(experiment="wound_signal", duration=4, frames=12, diffusion=[1.0])
     result = wound_signal.run(config, RunFolder(new_folder(tmp_path / "run")))
     assert np.isfinite(result["times_of_closure"]).all()
     assert "warnings" not in result
