@@ -1,0 +1,75 @@
+"""Lines of code per folder. The numbers only go down: who adds lines takes others away."""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+# At most so many lines of Python, with comments and docstrings.
+LINES = {
+    "_base": 2936,
+    "activities": 436,
+    "adjoints": 1012,
+    "bayes": 1092,
+    "costs": 1639,
+    "dissipations": 293,
+    "dynamics": 1245,
+    "energies": 676,
+    "external": 2093,
+    "fitting": 2026,
+    "growth": 775,
+    "inference": 2180,
+    "initialise": 4001,
+    "io": 3939,
+    "jobs": 934,
+    "mechanics": 2217,
+    "mesh": 2909,
+    "plotting": 2425,
+    "precondition": 716,
+    "relax": 2148,
+    "runs": 1924,
+    "signals": 559,
+    "solvers": 2319,
+    "surfaces": 630,
+    "tensions": 4325,
+    "tests": 31963,
+    "transitions": 1333,
+}
+# At most so many lines in one file; these have more, at most so many.
+LINES_OF_A_FILE = 400
+LONG_FILES = {
+    "bayes/_log_posterior.py": 403,
+    "fitting/_inverse.py": 417,
+    "growth/_grow.py": 406,
+    "initialise/_labels.py": 502,
+    "initialise/_polygons.py": 595,
+    "io/_module_file.py": 448,
+    "mesh/_tissue.py": 623,
+    "mesh/_topology.py": 421,
+    "solvers/_minres.py": 438,
+    "tensions/_edge_motion.py": 506,
+    "tensions/_inferred.py": 408,
+}
+
+
+def lines(path: Path) -> int:
+    return path.read_text(encoding="utf-8").count("\n")
+
+
+def folders() -> dict[str, int]:
+    parts = [path for path in (ROOT / "vertax").iterdir() if path.is_dir()]
+    sums = {p.name: sum(map(lines, p.rglob("*.py"))) for p in parts if any(p.glob("*.py"))}
+    return sums | {"tests": sum(map(lines, (ROOT / "tests").rglob("*.py")))}
+
+
+@pytest.mark.parametrize("name", folders())
+def test_a_folder_does_not_grow(name):
+    assert folders()[name] <= LINES[name]
+
+
+def test_files_are_short():
+    sizes = {
+        f"{path.parent.name}/{path.name}": lines(path) for path in (ROOT / "vertax").rglob("*.py")
+    }
+    long = {name: size for name, size in sizes.items() if size > LINES_OF_A_FILE}
+    assert not {name for name, size in long.items() if size > LONG_FILES.get(name, 0)}
