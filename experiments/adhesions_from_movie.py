@@ -5,6 +5,7 @@ transitions. The fitted energy continues the run from the last fitted frame with
 contacts between unlike cells is compared with that of the run.
 """
 
+import warnings
 from typing import Any
 
 import jax.numpy as jnp
@@ -47,7 +48,11 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     noisy = [with_noise(frames[k], config.noise, rng) for k in used]
     movie = Movie(noisy, times[used], types=dict(enumerate(types.tolist())), largest_jump=3.0)
     guess = by_type(0.1 * jnp.ones((2, 2)), types, outline=jnp.array(0.1))
-    fit = fit_movie(movie, AreaElasticity(1.0, 1.0) + guess, noise=config.noise)
+    with warnings.catch_warnings(record=True) as stated:
+        warnings.simplefilter("always", UserWarning)
+        fit = fit_movie(movie, AreaElasticity(1.0, 1.0) + guess, noise=config.noise)
+    for warning in stated:
+        folder.warn(str(warning.message).rstrip("."), "fit")
     energies: list[Any] = [fit.energy, fit.deviation]
     tensions = [energy.terms[1] for energy in energies]
     values, deviations = (np.append(each.tension, each.outline) for each in tensions)
