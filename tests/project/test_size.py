@@ -21,18 +21,18 @@ LINES = {
     "inference": 2180,
     "initialise": 4001,
     "io": 3939,
-    "jobs": 934,
+    "jobs": 935,
     "mechanics": 2217,
     "mesh": 2909,
     "plotting": 2425,
     "precondition": 716,
     "relax": 2148,
-    "runs": 1924,
+    "runs": 1931,
     "signals": 559,
     "solvers": 2319,
     "surfaces": 630,
     "tensions": 4325,
-    "tests": 31963,
+    "tests": 31980,
     "transitions": 1333,
 }
 # Largest number of lines of a file, and of the files that have more.
@@ -59,7 +59,7 @@ def lines(path: Path) -> int:
 def folders() -> dict[str, int]:
     parts = [path for path in (ROOT / "vertax").iterdir() if path.is_dir()]
     sums = {p.name: sum(map(lines, p.rglob("*.py"))) for p in parts if any(p.glob("*.py"))}
-    return sums | {"tests": sum(map(lines, (ROOT / "tests").rglob("*.py")))}
+    return sums | {"tests": 31980sum(map(lines, (ROOT / "tests").rglob("*.py")))}
 
 
 @pytest.mark.parametrize("name", folders())

@@ -82,6 +82,18 @@ def test_masks_on_a_cluster(client):
         np.testing.assert_allclose(elsewhere.results[number].tensions, result.tensions, rtol=1e-8)
 
 
+def test_the_job_of_masks_on_a_cluster(client, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for seed in range(2):
+        np.save(tmp_path / f"masks/{seed}.npy", vx.inference.label_image(free_tissue(seed), 200))
+    arguments = ["run", "infer_tensions", "--set", f"image.path={tmp_path / 'masks'}"]
+    address = client.scheduler.address
+    outcome = CliRunner().invoke(app, [*arguments, "--output", "out", "--scheduler", address])
+    assert outcome.exit_code == 0, outcome.output
+    assert (tmp_path / "out" / "frames.csv").read_text().count("\n") == 3
+
+
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY)

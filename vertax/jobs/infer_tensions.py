@@ -139,6 +139,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         noise=config.noise,
         prior=config.prior,
         cache=folder.parts,
+        executor=folder.executor,
         progress=progress,
     )
     masks.write(folder.path)

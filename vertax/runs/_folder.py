@@ -70,6 +70,8 @@ class RunFolder:
 
     interrupted: bool
     """Whether a keyboard interrupt ended a fit of this run; no other one begins."""
+    executor: concurrent.futures.Executor | None
+    """Workers of a cluster (`--scheduler`) for [`map_tasks`][vertax.map_tasks]; None without one."""
 
     def __init__(
         self,
@@ -81,6 +83,7 @@ class RunFolder:
         self.path = Path(path)
         self.figure_formats = tuple(figures)
         self.interrupted = False
+        self.executor = None
         self._print_steps = print_steps
         self._warnings: dict[str, list[str]] = {}
 

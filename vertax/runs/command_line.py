@@ -40,7 +40,8 @@ _NO_CACHE = (
 )
 
 _SCHEDULER = (
-    "Run on the workers of a Dask cluster: the address of its scheduler, or its scheduler file."
+    "Run sweeps and many masks on the workers of a Dask cluster: the address of its scheduler, or its "
+    "scheduler file."
 )
 
 Format = enum.StrEnum("Format", {name: name for name in ("png", "pdf", "svg")})
@@ -124,6 +125,7 @@ def run(
         bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
     ] = False,
     resume: Annotated[Path | None, typer.Option(metavar="RUN", help=_RESUME)] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help=_SCHEDULER)] = None,
     figures: Figures = None,
     no_cache: Annotated[bool, typer.Option("--no-cache", help=_NO_CACHE)] = False,
     quiet: Quiet = False,
@@ -133,6 +135,7 @@ def run(
     from vertax import FitError, enable_compilation_cache
     from vertax._base.announce import announce_in_this_process
     from vertax.runs import ConfigError, RunFolder, load_config
+    from vertax.runs._cluster import cluster
     from vertax.runs._execution import execute, new_folder, parts, unfinished_folder
     from vertax.runs._folder import RunFolderError
     from vertax.runs._tables import summary
@@ -157,7 +160,8 @@ def run(
             resumed = f" (resumed; kept so far: {kept})" if kept else ""
             typer.echo(f"{experiment.name}: {config} → {path}{resumed}")
             announce_in_this_process(f"functions for {experiment.name}")
-        metrics = execute(experiment, settings, folder, progress=not quiet)
+        with nullcontext() if scheduler is None else cluster(scheduler) as folder.executor:
+            metrics = execute(experiment, settings, folder, progress=not quiet)
     except KeyboardInterrupt:
         typer.echo(_interrupted(config, overrides or (), path), err=True)
         raise typer.Exit(INTERRUPTED) from None
