@@ -15,7 +15,7 @@ LINES = {
     "dissipations": 293,
     "dynamics": 1245,
     "energies": 676,
-    "external": 2093,
+    "external": 2097,
     "fitting": 2026,
     "growth": 775,
     "inference": 2180,

@@ -106,9 +106,9 @@ def run_jobs(
     def one(job: Job) -> Result | None:
         try:
             with ledger_of(job.simulator).run():
-                return run_in_process(partial(_on_cpu, job), timeout) if processes else job()
+                return _in_process(job, timeout) if processes else job()
         except Exception as error:
-            reasons.append(_as_error(error, timeout))
+            reasons.append(_as_error(error))
             return None
 
     # Requests with NaN, for example from a relaxation that failed before, are not run.
@@ -157,21 +157,25 @@ def _on_cpu(job: Job) -> Result:
     return job()
 
 
-def _as_error(error: Exception, timeout: float | None) -> SimulatorError:
-    if isinstance(error, SimulatorError):
-        return error
-    text = f"{type(error).__name__}: {error}"
-    if isinstance(error, ProcessDied):
-        text = (
+def _in_process(job: Job, timeout: float | None) -> Result:
+    try:
+        return run_in_process(partial(_on_cpu, job), timeout)
+    except ProcessDied as error:
+        raise SimulatorError(
             "The process that ran the program died. If it died at its start: a script with a simulator in "
             'processes needs `if __name__ == "__main__":` around its code.'
-        )
-    if isinstance(error, ProcessKilled):
-        text = (
+        ) from error
+    except ProcessKilled as error:
+        raise SimulatorError(
             f"The program was not done after {timeout:g} s, and its process was killed. If that is too "
             "short, raise `timeout`."
-        )
-    wrapped = SimulatorError(text)
+        ) from error
+
+
+def _as_error(error: Exception) -> SimulatorError:
+    if isinstance(error, SimulatorError):
+        return error
+    wrapped = SimulatorError(f"{type(error).__name__}: {error}")
     wrapped.__cause__ = error
     return wrapped
 
