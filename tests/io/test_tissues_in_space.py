@@ -3,13 +3,12 @@
 import itertools
 import json
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from curved_helpers import foam_at_rest
 
 import vertax as vx
-from vertax.energies import AreaElasticity, LineTension
 from vertax.surfaces import HeightMap, SphericalCap
 from vertax.tensions import infer_tensions
 
@@ -157,17 +156,7 @@ def test_edge_tables_in_space(on_cap):
 @pytest.fixture(scope="module")
 def foam(cluster):
     """A foam at rest in the plane, its tensions, and 12 pieces of each edge."""
-    tension = 1 + 0.2 * jax.random.normal(jax.random.key(4), (cluster.n_edges,))
-    energy = AreaElasticity(20.0, 1.0) + LineTension(0.5 * jnp.clip(tension, 0.5))
-    arcs = vx.Tissue(
-        cluster.vertices,
-        cluster.topology,
-        cluster.boundary,
-        angles=np.zeros(cluster.n_edges),
-        inner_arcs=True,
-    )
-    rest = vx.equilibrate(arcs, energy).tissue
-    return rest, np.asarray(jnp.clip(tension, 0.5))
+    return foam_at_rest(cluster)
 
 
 def evolver_file(rest, tension, to_space):
