@@ -86,6 +86,13 @@ def test_a_task_with_a_dead_process_is_repeated_once(tmp_path, recovers):
     assert [type(o.error) for o in outcomes if o.error] == ([] if recovers else [ProcessDied])
 
 
+def test_a_process_works_in_the_folder_of_its_caller(tmp_path, monkeypatch):
+    with LocalProcesses(1) as pool:
+        pool.submit(int).result()  # the process begins in another folder
+        monkeypatch.chdir(tmp_path)
+        assert pool.submit(os.getcwd).result() == str(tmp_path)
+
+
 def test_what_cannot_be_pickled_is_named():
     with LocalProcesses(1) as pool:
         ((_, _, error),) = vx.map_tasks(int, [lambda: 0], executor=pool)

@@ -100,3 +100,9 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
     outcome = CliRunner().invoke(app, ["sweep", "tiny.toml", "--scheduler", "tcp://127.0.0.1:9"])
     assert outcome.exit_code == 2
     assert "No Dask scheduler answers at tcp://127.0.0.1:9 within 10 seconds" in outcome.output
+    (tmp_path / "out").mkdir()  # of an earlier run, which is not removed
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    options = ["--output", "out", "--overwrite", "--scheduler", "tcp://127.0.0.1:9"]
+    outcome = CliRunner().invoke(app, ["run", "tiny.toml", *options])
+    assert outcome.exit_code == 2
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"

@@ -1,7 +1,5 @@
 """Indexing without checks of bounds."""
 
-from __future__ import annotations
-
 from jaxtyping import Array, Int, Shaped
 
 

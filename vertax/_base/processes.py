@@ -54,7 +54,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pool = ProcessPoolExecutor(1, context, initializer=_prepare)
         # (Wait for its start, which takes seconds, so that it does not count towards the first timeout.)
-        self.pool.submit(_no_operation).result()
+        self.pool.submit(os.getcwd).result()
 
     def end(self) -> None:
         """Kill the process."""
@@ -81,7 +81,7 @@ def run_in_process(task: Callable[[], Result], timeout: float | None = None) -> 
     future: Future[Result] | None = None
     try:
         worker = _Worker() if worker is None else worker
-        future = worker.pool.submit(task)
+        future = worker.pool.submit(_in_folder, os.getcwd(), task)
         result = future.result(timeout)
     except BrokenProcessPool as error:
         if worker is not None:
@@ -104,8 +104,9 @@ def _release(worker: _Worker) -> None:
         _IDLE.append(worker)
 
 
-def _no_operation() -> None:
-    pass
+def _in_folder(folder: str, task: Callable[[], Result]) -> Result:
+    os.chdir(folder)  # that of the caller, which may have changed since the process began
+    return task()
 
 
 def _prepare() -> None:

@@ -33,9 +33,8 @@ def cluster(scheduler: str) -> Iterator[Executor]:
     """
     with requires_extra("cluster", "--scheduler"):
         import distributed
-    where: dict[str, Any] = (
-        {"scheduler_file": scheduler} if Path(scheduler).is_file() else {"address": scheduler}
-    )
+    name = "scheduler_file" if Path(scheduler).is_file() else "address"
+    where: dict[str, Any] = {name: scheduler}
     try:
         client = distributed.Client(**where, timeout=_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -66,12 +66,11 @@ class RunFolder:
     - `figures`: formats of the pictures, of `"png"`, `"pdf"` and `"svg"`; each picture is written in all
         of them.
     - `print_steps`: whether `print_step` prints.
+    - `executor`: workers of a cluster (`--scheduler`) for [`map_tasks`][vertax.map_tasks], if there are any.
     """
 
     interrupted: bool
     """Whether a keyboard interrupt ended a fit of this run; no other one begins."""
-    executor: concurrent.futures.Executor | None
-    """Workers of a cluster (`--scheduler`) for [`map_tasks`][vertax.map_tasks]; None without one."""
 
     def __init__(
         self,
@@ -79,11 +78,12 @@ class RunFolder:
         *,
         figures: Sequence[str] = ("png",),
         print_steps: bool = False,
+        executor: concurrent.futures.Executor | None = None,
     ):
         self.path = Path(path)
         self.figure_formats = tuple(figures)
         self.interrupted = False
-        self.executor = None
+        self.executor = executor
         self._print_steps = print_steps
         self._warnings: dict[str, list[str]] = {}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import re
@@ -154,34 +155,33 @@ def sweep(
             f"Cannot use {output} as a folder: {error.strerror}. Choose another with --output."
         ) from None
     with lock, executor or LocalProcesses(workers) as executing:
-        elsewhere = executor is not None
-        function = partial(_execute_elsewhere if elsewhere else execute_run, figures=tuple(figures))
+        call = partial(_execute_elsewhere if executor else _execute_run, figures=tuple(figures))
         # Modules of experiments are imported in the process, by the name of the experiment.
-        tasks = [
-            (run.config.model_dump(mode="json", exclude_none=True), run.folder) for run in waiting
-        ]
-        options: dict[str, Any] = {"executor": executing, "unit": "run", "progress": progress}
+        content = lambda run: run.config.model_dump(mode="json", exclude_none=True)
+        tasks = [(content(run), run.folder) for run in waiting]
+        outcomes = map_tasks(call, tasks, executor=executing, unit="run", progress=progress)
         try:
-            for number, files, error in map_tasks(function, tasks, **options):
-                run = waiting[number]
-                try:
-                    if error is not None:
-                        raise error
-                    if elsewhere:
-                        _write_files(run.folder, files)
-                except Exception as error:  # no error of a run ends the sweep
-                    errors[run.folder.name] = describe_error(error)
+            with contextlib.closing(outcomes):  # an interrupt cancels the runs that wait
+                for number, files, error in outcomes:
+                    run = waiting[number]
+                    try:
+                        if error is not None:
+                            raise error
+                        if executor is not None:
+                            _write_files(run.folder, files)
+                    except Exception as error:  # no error of a run ends the sweep
+                        errors[run.folder.name] = _in_one_line(error)
         finally:
             write_csv(output / "sweep.csv", sweep_table(runs, errors))
     return errors
 
 
-def describe_error(error: Exception) -> str:
+def _in_one_line(error: Exception) -> str:
     """The error of a run in one line."""
     return str(error) if isinstance(error, ProcessDied) else f"{type(error).__name__}: {error}"
 
 
-def execute_run(task: tuple[dict[str, Any], Path], figures: tuple[str, ...] = ("png",)) -> None:
+def _execute_run(task: tuple[dict[str, Any], Path], figures: tuple[str, ...] = ("png",)) -> None:
     """Execute or resume one run of a sweep in this process."""
     content, folder = task
     experiment = find_experiment(content["experiment"])
@@ -198,9 +198,8 @@ def _execute_elsewhere(
     task: tuple[dict[str, Any], Path], figures: tuple[str, ...]
 ) -> dict[str, bytes]:
     """Execute one run on another machine; return its files."""
-    content, _ = task
     with tempfile.TemporaryDirectory() as folder:
-        execute_run((content, Path(folder)), figures)
+        _execute_run((task[0], Path(folder)), figures)
         files = [path for path in Path(folder).rglob("*") if path.is_file()]
         return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 

@@ -145,22 +145,24 @@ def run(
         experiment, settings = load_config(config, overrides or ())
         if not no_cache:
             enable_compilation_cache()
-        if resume is None:
-            path = new_folder(Path("runs") / config.stem, output, overwrite)
-        elif output is not None or overwrite:
-            raise RunFolderError(
-                "--resume goes with neither --output nor --overwrite: leave them out."
-            )
-        else:
-            path = unfinished_folder(resume, settings)
-        folder = RunFolder(path, figures=figures or ("png",), print_steps=not quiet)
-        if not quiet:
-            kept = [part.stem for part in parts(path)]
-            kept = ", ".join(kept) if len(kept) <= 5 else f"{len(kept)} parts"
-            resumed = f" (resumed; kept so far: {kept})" if kept else ""
-            typer.echo(f"{experiment.name}: {config} → {path}{resumed}")
-            announce_in_this_process(f"functions for {experiment.name}")
-        with nullcontext() if scheduler is None else cluster(scheduler) as folder.executor:
+        # (Connected first: a cluster that does not answer changes no folder.)
+        with nullcontext() if scheduler is None else cluster(scheduler) as executor:
+            if resume is None:
+                path = new_folder(Path("runs") / config.stem, output, overwrite)
+            elif output is not None or overwrite:
+                raise RunFolderError(
+                    "--resume goes with neither --output nor --overwrite: leave them out."
+                )
+            else:
+                path = unfinished_folder(resume, settings)
+            options = {"print_steps": not quiet, "executor": executor}
+            folder = RunFolder(path, figures=figures or ("png",), **options)
+            if not quiet:
+                kept = [part.stem for part in parts(path)]
+                kept = ", ".join(kept) if len(kept) <= 5 else f"{len(kept)} parts"
+                resumed = f" (resumed; kept so far: {kept})" if kept else ""
+                typer.echo(f"{experiment.name}: {config} → {path}{resumed}")
+                announce_in_this_process(f"functions for {experiment.name}")
             metrics = execute(experiment, settings, folder, progress=not quiet)
     except KeyboardInterrupt:
         typer.echo(_interrupted(config, overrides or (), path), err=True)
