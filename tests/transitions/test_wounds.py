@@ -67,7 +67,8 @@ def test_a_purse_string_closes_a_wound():
     response = vx.Relaxation(transitions=vx.T1() + vx.T2())
     times = np.linspace(0, 40, 41)
     closed = {}
-    for tension in (0.5, 1.5):
+    # (With a tension of 0.5 the pull of the edges that end at the hole keeps it open at rest.)
+    for tension in (1.0, 3.0):
         cable = PurseString(killed, jnp.asarray(tension))
         evolved = vx.evolve(wounded, left + cable, FRICTION, times, relaxation=response)
         areas = np.asarray(eqx.filter_vmap(lambda t: t.areas)(evolved.frames))[:, hole[0]]
@@ -79,4 +80,4 @@ def test_a_purse_string_closes_a_wound():
         evolved.tissue.topology.validate()
         closed[tension] = times[np.argmax(areas == 0)]
         print(tension, closed[tension], areas[:12].round(2))
-    assert 0 < closed[1.5] < closed[0.5]
+    assert 0 < closed[3.0] < closed[1.0]
