@@ -29,26 +29,20 @@ CACHE = {
 # Each row is a process: folders, and single files that are taken out of their folder. A process takes seven
 # seconds to start. The longest ones come first.
 TOGETHER = (
-    ("fitting",),
-    ("default_mode",),
-    ("_base", "mesh", "energies", "dissipations"),
-    ("surfaces",),
-    ("io", "plotting", "precondition"),
     ("project", "solvers"),
-    ("project/test_spare_slots.py",),
+    ("bayes", "initialise", "runs"),
     ("inference", "tensions"),
-    ("transitions", "growth"),
-    ("adjoints", "external"),
-    ("dynamics", "activities"),
-    ("signals",),
-    ("costs", "mechanics"),
+    ("_base", "mesh", "energies", "dissipations", "surfaces"),
+    ("adjoints", "external", "costs", "mechanics"),
     ("relax",),
-    ("relax/test_free_equilibrium.py", "relax/test_relaxation.py"),
-    ("bayes", "initialise"),
-    ("debug_modes",),
-    ("runs",),
+    ("transitions", "growth", "signals", "dynamics", "activities"),
+    ("io", "plotting", "precondition"),
+    ("default_mode",),
+    ("fitting",),
+    ("project/test_spare_slots.py",),
     ("experiments",),
     ("experiments/test_designs.py", "experiments/test_topologies_and_rigidity.py"),
+    ("debug_modes",),
 )
 # Tests of this folder run as users run JAX: in float32, with the normal optimisation of XLA.
 DEFAULT_MODE = "default_mode"

@@ -61,7 +61,11 @@ class TestEquilibria:
         assert floats(equilibrium) == {"float32"}
 
     @pytest.mark.parametrize(
-        "solver", [vx.solvers.LBFGS(), vx.solvers.FIRE()], ids=["lbfgs", "fire"]
+        "solver",
+        [
+            pytest.param(vx.solvers.LBFGS(), id="lbfgs"),
+            pytest.param(vx.solvers.FIRE(), id="fire", marks=pytest.mark.thorough),
+        ],
     )
     def test_other_solvers_reach_the_same_energy(self, rest, solver):
         tissue, energy = rest
@@ -71,6 +75,7 @@ class TestEquilibria:
         assert equilibrium.converged
         assert float(equilibrium.energy) == pytest.approx(float(energy(tissue)), abs=1e-4)
 
+    @pytest.mark.thorough
     def test_an_energy_without_minimum_ends_the_search(self):
         tissue = random_tissue(9, 0)
         energy = LineTension(jnp.full(tissue.n_edges, -1.0))
@@ -106,7 +111,17 @@ def difference(rest):
 
 
 class TestGradients:
-    @pytest.mark.parametrize("name", ADJOINTS)
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "implicit",
+            "propagation",
+            *(
+                pytest.param(name, marks=pytest.mark.thorough)
+                for name in ("sensitivity", "automatic")
+            ),
+        ],
+    )
     def test_gradient_matches_finite_differences(self, difference, name):
         loss, direction, expected = difference
         relaxation = FIXED_TOPOLOGY
@@ -141,7 +156,11 @@ def problem(rest):
 
 class TestFits:
     @pytest.mark.parametrize(
-        ("optimiser", "epochs"), [(ADAM, 80), (LEAST_SQUARES, 10)], ids=["adam", "least_squares"]
+        ("optimiser", "epochs"),
+        [
+            pytest.param(ADAM, 80, id="adam"),
+            pytest.param(LEAST_SQUARES, 10, id="least_squares", marks=pytest.mark.thorough),
+        ],
     )
     def test_fit_recovers_shape_factors(self, problem, optimiser, epochs):
         fit = vx.fit(problem, optimiser, epochs, progress=False)

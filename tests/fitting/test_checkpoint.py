@@ -145,6 +145,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("message", OTHERS)
 def test_checkpoint_of_another_fit_is_rejected(message, path):
     run("adam", 2, checkpoint=path)

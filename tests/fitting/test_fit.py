@@ -410,6 +410,7 @@ def test_fit_from_a_tissue_with_overlaps_names_them(hidden):
         vx.fit(problem, ADAM, 2, progress=False)
 
 
+@pytest.mark.thorough
 def test_error_of_a_fit_names_an_invalid_gradient_and_not_the_relaxation(hidden):
     target, _, guess, start = hidden
 
@@ -476,7 +477,17 @@ OPTIMISERS = {
 }
 
 
-@pytest.mark.parametrize("name", OPTIMISERS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "labels",
+        *(
+            pytest.param(name, marks=pytest.mark.thorough)
+            for name in OPTIMISERS
+            if name != "labels"
+        ),
+    ],
+)
 def test_optimisers_with_keys_masks_and_several_steps(hidden, name, tmp_path):
     target, _, guess, start = hidden
     problem, optimiser = (

@@ -198,6 +198,7 @@ def stereographic(x):
     return np.concatenate([x, RADIUS * (1 - squared)], axis=1) / (1 + squared)
 
 
+@pytest.mark.thorough
 def test_tensions_of_a_foam_on_a_cap(foam, tmp_path):
     rest, tension = foam
     path = tmp_path / "cap.fe"

@@ -122,6 +122,10 @@ def same_displacements(monkeypatch):
     monkeypatch.setattr(test_spare_slots, "shaken", shaken)
 
 
+# (They compile for 5 to 13 seconds; `equilibrate` and `evolve` stay.)
+LONG = {"growth.grow", "relax.record_relaxation", "transitions.T1", "transitions.T2"}
+
+
 @pytest.mark.parametrize("name", sorted(REJECTED))
 def test_functions_without_a_meaning_on_a_surface_name_it(tissues, name):
     tissue, call = (
@@ -131,7 +135,13 @@ def test_functions_without_a_meaning_on_a_surface_name_it(tissues, name):
         call(tissue)
 
 
-@pytest.mark.parametrize("name", sorted(set(CASES) - REJECTED))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.thorough) if name in LONG else name
+        for name in sorted(set(CASES) - REJECTED)
+    ],
+)
 def test_results_on_a_tilted_plane_are_those_of_the_plane(tissues, same_displacements, name):
     if name in FREE_CALLS:
         assert np.nanmax(FREE_CALLS[name](free_on_surface())) > 0

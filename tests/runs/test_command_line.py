@@ -59,7 +59,8 @@ def test_run_writes_results_and_says_where(tiny):
     assert "runs/tiny/figures/recovery.png" in outcome.output
 
 
-def test_a_second_run_gets_a_new_folder(tiny):
+def test_a_second_run_gets_a_new_folder(tiny, instead):
+    instead(lambda config, folder, *, progress: {"epochs": 3})
     (tiny / "runs" / "tiny").mkdir(parents=True)
     (tiny / "runs" / "tiny" / "metrics.json").write_text("precious")
     outcome = vertax("run", "tiny.toml", "--quiet")
@@ -69,7 +70,8 @@ def test_a_second_run_gets_a_new_folder(tiny):
     assert (tiny / "runs/tiny-2/metrics.json").is_file()
 
 
-def test_a_folder_is_overwritten_only_with_the_option(tiny):
+def test_a_folder_is_overwritten_only_with_the_option(tiny, instead):
+    instead(lambda config, folder, *, progress: {"epochs": 3})
     (tiny / "out").mkdir()
     (tiny / "out" / "config.toml").write_text("")
     (tiny / "out" / "metrics.json").write_text("precious")

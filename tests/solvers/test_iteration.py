@@ -59,6 +59,7 @@ class Descent(AbstractIteration[State]):
         return state.gradient
 
 
+@pytest.mark.thorough
 def test_an_iteration_of_a_user_relaxes_a_tissue_and_continues_after_transitions():
     tissue, energy = random_tissue(12, 3), ShapeFactorEnergy(jnp.full(12, 3.7))
     relaxation = vx.Relaxation(Descent(), tolerance=1e-6, max_steps=6000)

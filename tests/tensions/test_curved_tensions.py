@@ -157,6 +157,7 @@ def test_tensions_of_a_tissue_on_a_surface_use_its_surface():
 
 
 @needs_data
+@pytest.mark.thorough
 def test_areas_of_a_real_epithelium_are_the_published_ones():
     folder = DATA / "curved"
     options = {"height": folder / "heights.tif", "unknown_height": 0, "pixel_size": 0.183}
