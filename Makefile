@@ -63,6 +63,7 @@ notebooks-write: $(VENV)/.dev ## execute the notebooks in full and keep the outp
 lint: $(VENV)/.dev ## style and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python .ci/prose.py
 
 format: $(VENV)/.dev ## mend style and format where a program can
 	$(BIN)/ruff check --fix .

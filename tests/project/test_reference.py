@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 
 import vertax as vx
+from vertax.relax._feasibility import Feasibility
+from vertax.relax._loop import Search
+from vertax.solvers import NewtonCG, TruncatedCG, VertexTrustRegion
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "reference").glob("*.md"))
 DOCUMENTED = [
@@ -58,3 +61,20 @@ def test_paths_on_pages_exist(page):
     folders = "vertax|tests|configs|docs|notebooks|benchmarks"
     paths = re.findall(rf"`((?:{folders})/[\w./]*)`", page.read_text(encoding="utf-8"))
     assert not [path for path in paths if not (ROOT / path).exists()]
+
+
+def test_table_of_constants_is_that_of_the_code():
+    owners: dict[str, object] = {
+        owner.__name__: owner() for owner in (NewtonCG, TruncatedCG, VertexTrustRegion)
+    }
+    owners["relaxation"] = Feasibility(None)
+    owners["search"] = Search  # defaults of a dataclass are attributes of the class
+    table = (ROOT / "docs/solvers.md").read_text(encoding="utf-8").partition("| class | field |")[2]
+    owner, compared = None, 0
+    for row in table.partition("\n\n")[0].splitlines()[2:]:
+        name, fields, values = (entry.strip() for entry in row.split("|")[1:4])
+        owner = owners[name.strip("[`").partition("`")[0]] if name else owner
+        for field, value in zip(fields.split(", "), values.split(", "), strict=True):
+            assert getattr(owner, field.strip("`")) == float(value), field
+            compared += 1
+    assert compared >= 25
