@@ -122,8 +122,16 @@ def same_displacements(monkeypatch):
     monkeypatch.setattr(test_spare_slots, "shaken", shaken)
 
 
-# (They compile for 5 to 13 seconds; `equilibrate` and `evolve` stay.)
-LONG = {"growth.grow", "relax.record_relaxation", "transitions.T1", "transitions.T2"}
+# (They compile for 3 to 13 seconds; `equilibrate` and `evolve` stay.)
+LONG = {
+    "costs.render",
+    "growth.grow",
+    "mechanics.recoil",
+    "relax.record_relaxation",
+    "transitions.T1",
+    "transitions.T2",
+    "transitions.ablate",
+}
 
 
 @pytest.mark.parametrize("name", sorted(REJECTED))

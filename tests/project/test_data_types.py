@@ -73,7 +73,7 @@ CASES = {
 
 
 # These are traced for longer, and use the functions of the others.
-THOROUGH = ("adaptive", "box", "modulus", "noise", "structure", "sum")
+THOROUGH = ("adaptive", "box", "first order", "modulus", "noise", "shear", "structure", "sum")
 
 
 @pytest.mark.parametrize(
