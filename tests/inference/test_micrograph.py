@@ -69,6 +69,7 @@ def test_unknown_choices_are_refused(image):
         micrograph_problem(image, rest_areas="none")
 
 
+@pytest.mark.thorough
 def test_a_cell_of_two_sides_on_a_pinned_outline_is_left_out(image):
     class Sliver(vx.initialise.Watershed):
         def __call__(self, image):

@@ -84,6 +84,7 @@ def test_labels_of_cells_differ_from_that_of_the_exterior(foam, tmp_path):
         np.testing.assert_array_equal(outside, edges["on_outline"])
 
 
+@pytest.mark.thorough
 def test_edges_where_four_cells_meet_name_no_pair():
     """On a square lattice the numbers of the cells decide which two share an edge of length 0."""
     place, tables = np.kron(np.arange(36).reshape(6, 6), np.ones((20, 20), int)), []
@@ -150,6 +151,7 @@ def test_imbalance_is_distinguished_from_noise(foam):
     assert np.nanmedian(result.tension_deviations) > 3 * np.nanmedian(at_rest.tension_deviations)
 
 
+@pytest.mark.thorough
 def test_polygons_have_straight_edges():
     """A Voronoi tissue, which is in balance with straight edges."""
     tissue = vx.initialise.free_voronoi(30, key=jax.random.key(4), lloyd_steps=1)

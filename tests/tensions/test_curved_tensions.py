@@ -109,6 +109,7 @@ def test_a_flat_height_map_changes_nothing(plane):
     assert np.nanmax(np.abs(curved(flat).normal_loads)) < 1e-6
 
 
+@pytest.mark.thorough
 def test_a_tilted_plane_is_the_plane(plane):
     """The image of a plane of slope 1 is compressed to 0.71 along one direction."""
     n = int(PIXELS / 2**0.5)
@@ -205,6 +206,7 @@ def test_labels_on_a_large_sphere_are_those_of_the_plane():
         labels_on_sphere(labels, 0.0)
 
 
+@pytest.mark.thorough
 def test_a_height_map_is_a_surface_of_a_mask():
     corner = np.indices((60, 60))
     mask = 1 + (corner[0] > 30) + (corner[0] > 30) * (corner[1] > 25)
