@@ -136,7 +136,7 @@ def cost_of(flat, name, response, adjoint):
         ),
     ],
 )
-@pytest.mark.parametrize("name", ["bump", "tube", MAP])
+@pytest.mark.parametrize("name", ["bump", pytest.param("tube", marks=pytest.mark.thorough), MAP])
 def test_gradients_by_energy_and_surface_agree_with_differences(
     flat, name, adjoint, response, rtol
 ):
@@ -164,6 +164,7 @@ def test_gradients_of_a_free_tissue_on_a_cap_agree_with_differences():
     np.testing.assert_allclose(gradient, differences, rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_step_across_the_rim_of_a_cap_is_rejected_or_returns():
     # The tissue would be larger than the cap: it stays on its continuation, with finite numbers.
     tissue = free_cluster([0.0, 0.0]).with_surface(SphericalCap(2.6))
@@ -172,6 +173,7 @@ def test_a_step_across_the_rim_of_a_cap_is_rejected_or_returns():
     assert bool(relaxed.converged)
 
 
+@pytest.mark.thorough
 def test_members_of_a_batch_of_surfaces_are_those_one_by_one(flat):
     heights, energy = jnp.array([0.2, 0.5]), elastic(jnp.ones(2))
     run = lambda h: FIXED_TOPOLOGY(flat.with_surface(bump(h)), energy).energy
