@@ -1,15 +1,9 @@
-"""The code blocks in the README and in the documentation run without errors.
-
-The blocks marked as `python` of a page run from top to bottom, in one namespace and an empty folder, and
-contain their imports. A block with a last line `# raises NAME` must raise that exception. Blocks that are not
-run have another mark: `text`, `sh`, `toml`.
-"""
+"""The code blocks in the README and in the documentation run without errors."""
 
 import re
-import textwrap
-from contextlib import nullcontext
 from pathlib import Path
 
+import code_blocks
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import pytest
@@ -17,39 +11,11 @@ import pytest
 import vertax as vx
 
 ROOT = Path(__file__).parents[2]
-BLOCK = re.compile(r"^([ ]*)```python\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
-
-
-def blocks(page: Path) -> list[tuple[int, str]]:
-    """The Python blocks of a page, each with its first line."""
-    text = page.read_text(encoding="utf-8")
-    return [(text[: m.start(2)].count("\n"), textwrap.dedent(m[2])) for m in BLOCK.finditer(text)]
-
-
 PAGES = [
     page.relative_to(ROOT).as_posix()
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    if blocks(page)
+    if code_blocks.blocks(page)
 ]
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch):
-    """A function that runs a page and returns its namespace."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(page: str) -> dict:
-        names = {"__name__": "__main__"}
-        for line, source in blocks(ROOT / page):
-            # Empty lines first, so that a traceback shows the line number of the page.
-            code = compile("\n" * line + source, str(ROOT / page), "exec")
-            raises = re.search(r"^# raises ([\w.]+)\s*\Z", source, re.MULTILINE)
-            with pytest.raises(eval(raises[1], names)) if raises else nullcontext():
-                exec(code, names)
-        return names
-
-    yield run
-    plt.close("all")
 
 
 # Pages with long compilations run in `make test-slow`, the others in `make test-docs`.
@@ -103,8 +69,10 @@ STATED_RESULTS = {
         for page in PAGES
     ],
 )
-def test_code_of_the_page_runs(page, run):
-    names = run(page)
+def test_code_of_the_page_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = code_blocks.run(ROOT / page)
+    plt.close("all")
     assert STATED_RESULTS.get(page, lambda names: True)(names)
 
 

@@ -45,6 +45,17 @@ def test_optional_packages_are_in_their_extras():
         assert not any(entry.startswith(name) for entry in project["dependencies"]), module
 
 
+def test_commands_that_install_vertax_run_in_a_copy_and_name_its_extras():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    folders = [ROOT / name for name in ("docs", "notebooks", "vertax", "configs")]
+    for file in [ROOT / "README.md", *(file for each in folders for file in each.rglob("*.*"))]:
+        if file.suffix in {".md", ".ipynb", ".py", ".toml"}:
+            text = file.read_text(encoding="utf-8")
+            for extras in re.findall(r"pip install [^`\n]*?\.\[([\w,]+)\]", text):
+                assert set(extras.split(",")) <= project["optional-dependencies"].keys(), file
+            assert not re.search(r"pip install (-\S+ )*\\?[\"']?vertax\b", text), file
+
+
 def test_library_works_without_extras():
     code = """
 import jax, optax, vertax as vx
