@@ -1,6 +1,9 @@
 """The code blocks in the README and in the documentation run without errors."""
 
+import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import code_blocks
@@ -18,24 +21,10 @@ PAGES = [
 ]
 
 
-# Pages with long compilations run in `make test-slow`, the others in `make test-docs`.
-SLOW = {
-    "docs/adjoints.md",
-    "docs/cells.md",
-    "docs/concepts.md",
-    "docs/dynamics.md",
-    "docs/errors.md",
-    "docs/extending.md",
-    "docs/index.md",
-    "docs/masks.md",
-    "docs/mechanics.md",
-    "docs/movies.md",
-    "docs/performance.md",
-    "docs/pictures.md",
-    "docs/posteriors.md",
-    "docs/signals.md",
-    "docs/topologies.md",
-    "docs/tyssue.md",
+# Pages with long compilations run in `make test-slow`, these in `make test-docs`.
+QUICK = {"README.md"} | {
+    f"docs/{name}.md"
+    for name in ("checkpoints", "clusters", "external", "solvers", "surfaces", "tensions")
 }
 
 # Results that the text of a page states.
@@ -62,13 +51,13 @@ STATED_RESULTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(page, marks=pytest.mark.slow if page in SLOW else pytest.mark.docs)
-        for page in PAGES
-    ],
-)
+MARKED = [
+    pytest.param(page, marks=pytest.mark.docs if page in QUICK else pytest.mark.slow)
+    for page in PAGES
+]
+
+
+@pytest.mark.parametrize("page", MARKED)
 def test_code_of_the_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = code_blocks.run(ROOT / page)
@@ -77,7 +66,41 @@ def test_code_of_the_page_runs(page, tmp_path, monkeypatch):
 
 
 def test_listed_pages_exist():
-    assert SLOW | STATED_RESULTS.keys() <= set(PAGES)
+    assert QUICK | STATED_RESULTS.keys() <= set(PAGES)
+
+
+# What strict pyright checks with the page on machine learning.
+TYPED = """
+friction = vx.dissipations.SubstrateFriction(1.0)
+moved = vx.evolve(vx.equilibrate(tissue, energy).tissue, energy, friction, [0.0, 1.0])
+guess = vx.energies.ShapeFactorEnergy(moved.tissue.shape_factors)
+problem = vx.InverseProblem(moved.frames, guess, vx.costs.VertexDistance(tissue))
+trajectory = vx.mesh.Trajectory(every=5)
+fit = vx.fit(problem, optimiser, epochs=3, callback=trajectory)
+modulus = vx.mechanics.shear_modulus(fit.tissue, fit.energy) + vx.mechanics.bulk_modulus(tissue, guess)
+inferred = vx.tensions.infer_tensions("mask.tif")
+print(moved.drive, trajectory[0].areas, trajectory.values["cost"], inferred.tensions, inferred.pressures)
+print(fit.energy.target_shape_factor.std(), vx.uncertainty(problem, fit).deviation, modulus.item())
+"""
+
+
+@pytest.mark.docs
+def test_strict_pyright_accepts_the_names_of_vertax(tmp_path):
+    page = code_blocks.blocks(ROOT / "docs/machine_learning.md")
+    lines = ("".join(source for _, source in page) + TYPED).splitlines()
+    (tmp_path / "page.py").write_text("\n".join(lines))
+    settings = {"typeCheckingMode": "strict", "pythonVersion": "3.11", "extraPaths": [str(ROOT)]}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
+    python = sys.executable
+    command = f"{python} -m pyright --pythonpath {python} --outputjson -p {tmp_path}"
+    checked = subprocess.run(command.split(), capture_output=True, check=False)
+    for diagnostic in json.loads(checked.stdout)["generalDiagnostics"]:
+        start = diagnostic["range"]["start"]
+        expression = lines[start["line"]][start["character"] :]
+        # Types that JAX, Equinox and Optax leave unknown, and what follows from them.
+        foreign = re.match(r"(jax|jnp|eqx|optax|energy\.network)\b", expression)
+        follows = r"report(MissingTypeStubs|Unknown(Variable|Argument)Type)"
+        assert foreign or re.fullmatch(follows, diagnostic["rule"]), diagnostic["message"]
 
 
 @pytest.mark.parametrize("page", PAGES)
