@@ -78,9 +78,8 @@ problem = vx.InverseProblem(moved.frames, guess, vx.costs.VertexDistance(tissue)
 trajectory = vx.mesh.Trajectory(every=5)
 fit = vx.fit(problem, optimiser, epochs=3, callback=trajectory)
 modulus = vx.mechanics.shear_modulus(fit.tissue, fit.energy) + vx.mechanics.bulk_modulus(tissue, guess)
-inferred = vx.tensions.infer_tensions("mask.tif")
-print(moved.drive, trajectory[0].areas, trajectory.values["cost"], inferred.tensions, inferred.pressures)
-print(fit.energy.target_shape_factor.std(), vx.uncertainty(problem, fit).deviation, modulus.item())
+print(moved.drive, trajectory[0].areas, vx.tensions.infer_tensions("mask.tif").pressures, modulus.item())
+print(fit.energy.target_shape_factor.std(), vx.uncertainty(problem, fit).deviation)
 """
 
 
@@ -91,12 +90,11 @@ def test_strict_pyright_accepts_the_names_of_vertax(tmp_path):
     (tmp_path / "page.py").write_text("\n".join(lines))
     settings = {"typeCheckingMode": "strict", "pythonVersion": "3.11", "extraPaths": [str(ROOT)]}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
-    python = sys.executable
-    command = f"{python} -m pyright --pythonpath {python} --outputjson -p {tmp_path}"
-    checked = subprocess.run(command.split(), capture_output=True, check=False)
+    command = [python := sys.executable, "-m", "pyright", "--pythonpath", python, "--outputjson"]
+    checked = subprocess.run([*command, "-p", tmp_path], capture_output=True, check=False)
     for diagnostic in json.loads(checked.stdout)["generalDiagnostics"]:
-        start = diagnostic["range"]["start"]
-        expression = lines[start["line"]][start["character"] :]
+        line, character = diagnostic["range"]["start"].values()
+        expression = lines[line][character:]
         # Types that JAX, Equinox and Optax leave unknown, and what follows from them.
         foreign = re.match(r"(jax|jnp|eqx|optax|energy\.network)\b", expression)
         follows = r"report(MissingTypeStubs|Unknown(Variable|Argument)Type)"
