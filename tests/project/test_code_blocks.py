@@ -71,12 +71,10 @@ def test_listed_pages_exist():
 
 # What strict pyright checks with the page on machine learning.
 TYPED = """
-friction = vx.dissipations.SubstrateFriction(1.0)
-moved = vx.evolve(vx.equilibrate(tissue, energy).tissue, energy, friction, [0.0, 1.0])
+moved = vx.evolve(tissue, energy, vx.dissipations.SubstrateFriction(1.0), [0.0, 1.0])
 guess = vx.energies.ShapeFactorEnergy(moved.tissue.shape_factors)
 problem = vx.InverseProblem(moved.frames, guess, vx.costs.VertexDistance(tissue))
-trajectory = vx.mesh.Trajectory(every=5)
-fit = vx.fit(problem, optimiser, epochs=3, callback=trajectory)
+fit = vx.fit(problem, optimiser, epochs=3, callback=(trajectory := vx.mesh.Trajectory(every=5)))
 modulus = vx.mechanics.shear_modulus(fit.tissue, fit.energy) + vx.mechanics.bulk_modulus(tissue, guess)
 print(moved.drive, trajectory[0].areas, vx.tensions.infer_tensions("mask.tif").pressures, modulus.item())
 print(fit.energy.target_shape_factor.std(), vx.uncertainty(problem, fit).deviation)

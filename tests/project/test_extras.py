@@ -81,22 +81,16 @@ except ImportError as error:
     assert process.returncode == 0, process.stderr
     lines = process.stdout.splitlines()
     assert len(lines) == 5
-    assert all(
-        line.startswith('Drawing needs matplotlib: pip install -e ".[plot]"') for line in lines[:2]
-    )
+    assert all('Drawing needs matplotlib: pip install -e ".[plot]"' in line for line in lines[:2])
     assert lines[2].startswith('Sampling a posterior needs blackjax: pip install -e ".[bayes]"')
     assert lines[3].startswith('Signals needs diffrax: pip install -e ".[signals]"')
     assert lines[4].startswith('Reading pictures needs pillow: pip install -e ".[image]"')
 
 
-@pytest.mark.parametrize(
-    "missing",
-    [
-        "typer",
-        pytest.param("tomli_w", marks=pytest.mark.thorough),
-        pytest.param("matplotlib", marks=pytest.mark.thorough),
-    ],
-)
+OTHERS = [pytest.param(name, marks=pytest.mark.thorough) for name in ("tomli_w", "matplotlib")]
+
+
+@pytest.mark.parametrize("missing", ["typer", *OTHERS])
 def test_command_line_names_the_missing_extra(missing, tmp_path):
     (tmp_path / "tiny.toml").write_text('experiment = "infer_shape_factors"\n')
     code = "from vertax.__main__ import main; main()"
