@@ -16,13 +16,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 Task = Callable[[int], Any]
 
 
-def tasks() -> dict[str, Task]:
-    """The tasks by name; a task is a function of a seed."""
+def tasks() -> dict[str, Callable[[], Task]]:
+    """Functions by name that prepare a task, which is a function of a seed."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -86,14 +87,17 @@ def tasks() -> dict[str, Task]:
 
         return task
 
-    def mask(n: int, seed: int) -> np.ndarray:
-        return label_image(n, round(4000 * np.sqrt(n / 5000)), np.random.default_rng(seed))
+    def masks(n: int) -> list[np.ndarray]:
+        side = round(4000 * np.sqrt(n / 5000))
+        return [label_image(n, side, np.random.default_rng(seed)) for seed in (0, 1)]
 
     def from_labels(n: int) -> Task:
-        return lambda seed: vx.initialise.from_labels(mask(n, seed), boundary="free")
+        images = masks(n)
+        return lambda seed: vx.initialise.from_labels(images[seed], boundary="free")
 
     def infer_tensions(n: int) -> Task:
-        return lambda seed: vx.tensions.infer_tensions(mask(n, seed)).tensions
+        images = masks(n)
+        return lambda seed: vx.tensions.infer_tensions(images[seed]).tensions
 
     sizes: dict[Callable[[int], Task], tuple[int, ...]] = {
         relax: (100, 1000, 10_000),
@@ -106,14 +110,15 @@ def tasks() -> dict[str, Task]:
         from_labels: (100, 1000),
         infer_tensions: (100, 1000),
     }
-    return {f"{make.__name__}_{n}": make(n) for make, each in sizes.items() for n in each}
+    return {f"{make.__name__}_{n}": partial(make, n) for make, each in sizes.items() for n in each}
 
 
 def measure(name: str) -> None:
     """Print the row of a task."""
     import jax
 
-    task, seconds = tasks()[name], [time.process_time()]
+    makers, seconds = tasks(), [time.process_time()]
+    task = makers[name]()
     for seed in (0, 1):
         start = time.process_time()
         jax.block_until_ready(jax.tree.leaves(task(seed)))
