@@ -1,11 +1,14 @@
 """Files and pictures of tissues on surfaces."""
 
+from itertools import product
+
 import equinox as eqx
 import jax
 import meshio
 import numpy as np
 import pytest
 from helpers import random_tissue
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 import vertax as vx
 from vertax.surfaces import Cylinder, Graph, HeightMap, SphericalCap
@@ -108,11 +111,16 @@ def test_a_picture_in_space_has_one_polygon_for_each_cell(tube):
     roomy = tube.with_capacity(N_CELLS + 3)
     values = np.arange(roomy.n_cells, dtype=float)
     ax = vx.plotting.plot_surface(roomy, values, label="number")
-    faces = ax.collections[0]
-    np.testing.assert_array_equal(faces.get_array(), np.arange(N_CELLS))
-    shaded = vx.plotting.plot_surface(tube, ax=ax)
-    assert shaded is ax
+    np.testing.assert_array_equal(ax.collections[0].get_array(), np.arange(N_CELLS))
+    assert vx.plotting.plot_surface(tube, ax=ax) is ax
     assert np.unique(ax.collections[1].get_facecolor(), axis=0).shape[0] > 3
+
+
+def test_a_picture_in_space_is_not_cropped(flat):
+    ax = vx.plotting.plot_surface(flat.with_surface(Graph(lambda x: 0.1 * x[0])), elevation=90.0)
+    corners = np.array([*product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim())])
+    projected = np.stack(proj_transform(*corners.T, ax.get_proj())[:2], axis=-1)
+    assert ax.bbox.count_contains(ax.transData.transform(projected)) == len(corners)
 
 
 def test_a_picture_in_space_needs_a_surface(flat):

@@ -1,15 +1,12 @@
-"""The code blocks in the README and in the documentation run without errors.
+"""The code blocks in the README and in the documentation run without errors."""
 
-The blocks marked as `python` of a page run from top to bottom, in one namespace and an empty folder, and
-contain their imports. A block with a last line `# raises NAME` must raise that exception. Blocks that are not
-run have another mark: `text`, `sh`, `toml`.
-"""
-
+import json
 import re
-import textwrap
-from contextlib import nullcontext
+import subprocess
+import sys
 from pathlib import Path
 
+import code_blocks
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import pytest
@@ -17,59 +14,17 @@ import pytest
 import vertax as vx
 
 ROOT = Path(__file__).parents[2]
-BLOCK = re.compile(r"^([ ]*)```python\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
-
-
-def blocks(page: Path) -> list[tuple[int, str]]:
-    """The Python blocks of a page, each with its first line."""
-    text = page.read_text(encoding="utf-8")
-    return [(text[: m.start(2)].count("\n"), textwrap.dedent(m[2])) for m in BLOCK.finditer(text)]
-
-
 PAGES = [
     page.relative_to(ROOT).as_posix()
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    if blocks(page)
+    if code_blocks.blocks(page)
 ]
 
 
-@pytest.fixture
-def run(tmp_path, monkeypatch):
-    """A function that runs a page and returns its namespace."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(page: str) -> dict:
-        names = {"__name__": "__main__"}
-        for line, source in blocks(ROOT / page):
-            # Empty lines first, so that a traceback shows the line number of the page.
-            code = compile("\n" * line + source, str(ROOT / page), "exec")
-            raises = re.search(r"^# raises ([\w.]+)\s*\Z", source, re.MULTILINE)
-            with pytest.raises(eval(raises[1], names)) if raises else nullcontext():
-                exec(code, names)
-        return names
-
-    yield run
-    plt.close("all")
-
-
-# Pages with long compilations run in `make test-slow`, the others in `make test-docs`.
-SLOW = {
-    "docs/adjoints.md",
-    "docs/cells.md",
-    "docs/concepts.md",
-    "docs/dynamics.md",
-    "docs/errors.md",
-    "docs/extending.md",
-    "docs/index.md",
-    "docs/masks.md",
-    "docs/mechanics.md",
-    "docs/movies.md",
-    "docs/performance.md",
-    "docs/pictures.md",
-    "docs/posteriors.md",
-    "docs/signals.md",
-    "docs/topologies.md",
-    "docs/tyssue.md",
+# Pages with long compilations run in `make test-slow`, these in `make test-docs`.
+QUICK = {"README.md"} | {
+    f"docs/{name}.md"
+    for name in ("checkpoints", "clusters", "external", "solvers", "surfaces", "tensions")
 }
 
 # Results that the text of a page states.
@@ -96,20 +51,52 @@ STATED_RESULTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(page, marks=pytest.mark.slow if page in SLOW else pytest.mark.docs)
-        for page in PAGES
-    ],
-)
-def test_code_of_the_page_runs(page, run):
-    names = run(page)
+MARKED = [
+    pytest.param(page, marks=pytest.mark.docs if page in QUICK else pytest.mark.slow)
+    for page in PAGES
+]
+
+
+@pytest.mark.parametrize("page", MARKED)
+def test_code_of_the_page_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = code_blocks.run(ROOT / page)
+    plt.close("all")
     assert STATED_RESULTS.get(page, lambda names: True)(names)
 
 
 def test_listed_pages_exist():
-    assert SLOW | STATED_RESULTS.keys() <= set(PAGES)
+    assert QUICK | STATED_RESULTS.keys() <= set(PAGES)
+
+
+# What strict pyright checks with the page on machine learning.
+TYPED = """
+moved = vx.evolve(tissue, energy, vx.dissipations.SubstrateFriction(1.0), [0.0, 1.0])
+guess = vx.energies.ShapeFactorEnergy(moved.tissue.shape_factors)
+problem = vx.InverseProblem(moved.frames, guess, vx.costs.VertexDistance(tissue))
+fit = vx.fit(problem, optimiser, epochs=3, callback=(trajectory := vx.mesh.Trajectory(every=5)))
+modulus = vx.mechanics.shear_modulus(fit.tissue, fit.energy) + vx.mechanics.bulk_modulus(tissue, guess)
+print(moved.drive, trajectory[0].areas, vx.tensions.infer_tensions("mask.tif").pressures, modulus.item())
+print(fit.energy.target_shape_factor.std(), vx.uncertainty(problem, fit).deviation)
+"""
+
+
+@pytest.mark.docs
+def test_strict_pyright_accepts_the_names_of_vertax(tmp_path):
+    page = code_blocks.blocks(ROOT / "docs/machine_learning.md")
+    lines = ("".join(source for _, source in page) + TYPED).splitlines()
+    (tmp_path / "page.py").write_text("\n".join(lines))
+    settings = {"typeCheckingMode": "strict", "pythonVersion": "3.11", "extraPaths": [str(ROOT)]}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
+    command = [python := sys.executable, "-m", "pyright", "--pythonpath", python, "--outputjson"]
+    checked = subprocess.run([*command, "-p", tmp_path], capture_output=True, check=False)
+    for diagnostic in json.loads(checked.stdout)["generalDiagnostics"]:
+        line, character = diagnostic["range"]["start"].values()
+        expression = lines[line][character:]
+        # Types that JAX, Equinox and Optax leave unknown, and what follows from them.
+        foreign = re.match(r"(jax|jnp|eqx|optax|energy\.network)\b", expression)
+        follows = r"report(MissingTypeStubs|Unknown(Variable|Argument)Type)"
+        assert foreign or re.fullmatch(follows, diagnostic["rule"]), diagnostic["message"]
 
 
 @pytest.mark.parametrize("page", PAGES)

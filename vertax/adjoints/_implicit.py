@@ -64,7 +64,7 @@ class ImplicitDifferentiation(AbstractAdjoint):
     """
 
     mode: Literal["adjoint", "sensitivity"] = eqx.field(static=True, default="adjoint")
-    linear_solver: lx.AbstractLinearSolver = eqx.field(default_factory=MINRES)
+    linear_solver: lx.AbstractLinearSolver[Any] = eqx.field(default_factory=MINRES)
     throw: bool = eqx.field(default=True, kw_only=True)
     outcome: GradientOutcome | None = eqx.field(default=None, kw_only=True)
 

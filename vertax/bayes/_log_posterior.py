@@ -89,7 +89,7 @@ class LogPosterior(eqx.Module):
         of another shape than the residuals.
     """
 
-    problem: InverseProblem
+    problem: InverseProblem[Any]
     prior: dict[str, Distribution]
     noise: Any
     energy: Callable[[Parameters], Any] | None
@@ -97,7 +97,7 @@ class LogPosterior(eqx.Module):
 
     def __init__(
         self,
-        problem: InverseProblem,
+        problem: InverseProblem[Any],
         prior: Mapping[str, Any],
         noise: Any,
         *,

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import Checkpoint
@@ -71,7 +71,7 @@ class Evolution(AbstractResponse):
     times: Float[Array, " times"]
     activity: AbstractActivity | None
     key: PRNGKeyArray | None
-    drive: PyTree[Array]
+    drive: Any
     substeps: int = eqx.field(static=True)
     stepsize_controller: PIController | None
     order: int = eqx.field(static=True)
@@ -86,7 +86,7 @@ class Evolution(AbstractResponse):
         *,
         activity: AbstractActivity | None = None,
         key: PRNGKeyArray | int | None = None,
-        drive: PyTree[Array] = None,
+        drive: Any = None,
         substeps: int = 1,
         stepsize_controller: PIController | None = None,
         order: int = 1,
@@ -214,16 +214,13 @@ class Evolution(AbstractResponse):
         dissipation, activity = material.dissipation, material.activity
         parts = {"dissipation": dissipation, "activity": activity}
         replaced = {name: part for name, part in parts.items() if part is not None}
-        return Evolution(
-            **({f.name: getattr(self, f.name) for f in dataclasses.fields(self)} | replaced)
-        )
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return Evolution(**(fields | replaced))
 
     def traced(self) -> Evolution:
         """A copy with its numbers as arrays: other values need no recompilation."""
-        new = (
-            *traced((self.dissipation, self.activity, self.stepsize_controller)),
-            self.relaxation.traced(),
-        )
+        numbers = traced((self.dissipation, self.activity, self.stepsize_controller))
+        new = (*numbers, self.relaxation.traced())
         parts = lambda e: (e.dissipation, e.activity, e.stepsize_controller, e.relaxation)
         return eqx.tree_at(parts, self, new, is_leaf=lambda x: x is None)
 
@@ -292,7 +289,7 @@ def evolve(
     *,
     activity: AbstractActivity | None = None,
     key: PRNGKeyArray | int | None = None,
-    drive: PyTree[Array] = None,
+    drive: Any = None,
     substeps: int = 1,
     stepsize_controller: PIController | None = None,
     order: int = 1,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.results import RESULTS, checked
 from vertax.mesh import Tissue, Trajectory
@@ -29,7 +31,7 @@ class Evolved(Equilibrium):
     transitions: Int[Array, "*batch times"]
     """T1 transitions since the previous frame."""
 
-    drive: PyTree[Array]
+    drive: Any
     """The final state of the activity and of its random numbers. A run from the last frame with this `drive`
     continues this run, up to rounding. None without an activity."""
     results: RESULTS
@@ -38,7 +40,7 @@ class Evolved(Equilibrium):
     """Sizes of the time steps since the previous frame, padded with 0."""
     num_rejected: Int[Array, "*batch times"]
     """Number of rejected steps since the frame before, see [`PIController`][vertax.dynamics.PIController]."""
-    signals: PyTree[Float[Array, "..."]]
+    signals: Any
     """The concentrations in each frame, shape `(times, species, cells)`, see
     [`Signals`][vertax.signals.Signals]; in general the record of the activity. None without a record."""
 

@@ -71,8 +71,7 @@ class TypeTension(AbstractLocalEnergy):
         tension = jnp.where(inside, self._between(of_first, of_second), 0)
         if self.outline is None:
             return tension
-        # (The cell of an edge on the outline is its first.)
-        outline = jnp.broadcast_to(self.outline, self.n_types)[of_first]
+        outline = jnp.broadcast_to(self.outline, self.n_types)[of_first]  # the cell is the first
         return jnp.where(tissue.topology.on_outline, outline, tension)
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:

@@ -8,7 +8,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from vertax._base.checks import check_number
-from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_cell
+from vertax.energies._energy import AbstractLocalEnergy, OrFloat, as_parameter, per_cell
 from vertax.mesh import Tissue
 
 
@@ -31,10 +31,10 @@ class ShapeFactorEnergy(AbstractLocalEnergy):
     - `ValueError` for a mean area that is not positive.
     """
 
-    target_shape_factor: float | Float[Array, "*cells"] = eqx.field(
+    target_shape_factor: OrFloat[Float[Array, "*cells"]] = eqx.field(
         converter=partial(as_parameter, "target_shape_factor")
     )
-    mean_area: float | Float[Array, "*cells"] = eqx.field(
+    mean_area: OrFloat[Float[Array, "*cells"]] = eqx.field(
         default=1.0, converter=partial(as_parameter, "mean_area")
     )
 
@@ -63,10 +63,10 @@ class AreaElasticity(AbstractLocalEnergy):
     - `ValueError` for a negative stiffness, for which the energy has no minimum.
     """
 
-    stiffness: float | Float[Array, "*cells"] = eqx.field(
+    stiffness: OrFloat[Float[Array, "*cells"]] = eqx.field(
         converter=partial(as_parameter, "stiffness")
     )
-    target_area: float | Float[Array, "*cells"] = eqx.field(
+    target_area: OrFloat[Float[Array, "*cells"]] = eqx.field(
         converter=partial(as_parameter, "target_area")
     )
 
@@ -100,10 +100,10 @@ class PerimeterElasticity(AbstractLocalEnergy):
     - `ValueError` for a negative stiffness, for which the energy has no minimum.
     """
 
-    stiffness: float | Float[Array, "*cells"] = eqx.field(
+    stiffness: OrFloat[Float[Array, "*cells"]] = eqx.field(
         converter=partial(as_parameter, "stiffness")
     )
-    target_perimeter: float | Float[Array, "*cells"] = eqx.field(
+    target_perimeter: OrFloat[Float[Array, "*cells"]] = eqx.field(
         converter=partial(as_parameter, "target_perimeter")
     )
 

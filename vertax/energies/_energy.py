@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -33,8 +33,7 @@ class AbstractEnergy(eqx.Module):
     and edges, subclass [`AbstractLocalEnergy`][vertax.AbstractLocalEnergy] instead: candidate T1
     transitions are then evaluated in one batch.
 
-    Do not use `jax.custom_vjp` inside: implicit differentiation needs forward mode through the gradient.
-    `jax.custom_jvp` works.
+    Use `jax.custom_jvp`, not `jax.custom_vjp`: implicit differentiation needs forward mode.
     """
 
     def __check_init__(self):
@@ -113,7 +112,12 @@ def _terms(energy: AbstractEnergy) -> tuple[AbstractEnergy, ...]:
     return energy.terms if isinstance(energy, Sum | LocalSum) else (energy,)
 
 
-Parameter: TypeAlias = float | Float[Array, "*shape"]
+_Value = TypeVar("_Value")
+if TYPE_CHECKING:  # An array to type checkers: it is a float only where the user passes one.
+    OrFloat: TypeAlias = Annotated[_Value, "or a float"]
+else:
+    OrFloat = float | _Value
+Parameter: TypeAlias = OrFloat[Float[Array, "*shape"]]
 """A parameter of an energy: an array, which a fit adjusts by default, or a constant float."""
 
 
@@ -133,7 +137,7 @@ def as_parameter(name: str, value: ArrayLike) -> Parameter:
     - `ValueError` for NaN and infinity.
     """
     array = as_real(name, value)
-    return float(value) if isinstance(value, int | float) else array
+    return cast(Any, float(value)) if isinstance(value, int | float) else array
 
 
 def per_cell(values: Parameter, tissue: Tissue, name: str) -> Parameter:

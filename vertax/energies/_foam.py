@@ -26,8 +26,7 @@ def foam_energy(
     - `tension`: $\gamma$, scalar array or one an edge.
     - `target_area`: $A^0$, scalar or one a cell.
     - `stiffness`: $K$.
-    - `low`, `high`: bounds of the tensions. If the largest is more than twice the smallest, some junctions of
-        three edges cannot balance, and collapse to four-fold vertices.
+    - `low`, `high`: bounds of the tensions. If `high > 2 * low`, some junctions of three edges may collapse.
 
     **Returns:** the sum of an [`AreaElasticity`][vertax.energies.AreaElasticity] and a
     [`BoundedTension`][vertax.energies.BoundedTension]; these two are its `terms`.

@@ -30,9 +30,7 @@ def mean_stiffness(tissue: Tissue, energy: Callable[[Tissue], Array]) -> Float[A
     at = lambda x: MeasuredTissue(tissue.with_configuration(unravel(x)))
     gradient = jax.grad(lambda x: real_scalar(energy(at(x))))
     direction = probe_vector(y)
-    if (
-        tissue.topology.spare
-    ):  # vertices of spare slots have no stiffness and must not enter the mean
+    if tissue.topology.spare:  # their vertices have no stiffness and must not enter the mean
         weights = tissue.by_row(tissue.topology.alive_vertices.astype(y.dtype))
         weigh = lambda x, w: (x.T * w).T
         direction, _ = ravel_pytree(jax.tree.map(weigh, unravel(direction), weights))

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from vertax._base.checks import as_real, check_number
 from vertax._base.tracing import is_concrete
-from vertax.energies._energy import AbstractLocalEnergy, as_parameter, per_edge
+from vertax.energies._energy import AbstractLocalEnergy, OrFloat, as_parameter, per_edge
 from vertax.mesh import Tissue
 
 
@@ -26,7 +26,7 @@ class LineTension(AbstractLocalEnergy):
     - `tension`: line tension $\gamma$, energy per length; scalar or one per edge.
     """
 
-    tension: float | Float[Array, "*edges"] = eqx.field(converter=partial(as_parameter, "tension"))
+    tension: OrFloat[Float[Array, "*edges"]] = eqx.field(converter=partial(as_parameter, "tension"))
 
     def edge_terms(self, tissue: Tissue) -> Float[Array, " edges"]:
         """Energy of each edge."""

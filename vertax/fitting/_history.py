@@ -7,7 +7,7 @@ from typing import Any, Generic
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from vertax._base.results import RESULTS
 from vertax.fitting._inverse import Energy
@@ -98,7 +98,7 @@ class Record(Facts):
     ```
     """
 
-    parameters: PyTree[Array]
+    parameters: Any
     """The fitted leaves of the energy at which the cost was evaluated; the others are None. With a
     least-squares solver, those of its last accepted step."""
     tissue: Tissue

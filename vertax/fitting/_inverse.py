@@ -40,7 +40,7 @@ class Evaluation(eqx.Module):
 
     cost: Float[Array, ""]
     equilibrium: Equilibrium
-    gradient: PyTree[Array]
+    gradient: Any
     """With respect to the trainable leaves of the energy; the others are None."""
     shift_gradient: Float[Array, 2] | None
     """With respect to the displacement of the tissue; None without displacement."""
@@ -82,7 +82,7 @@ class InverseProblem(eqx.Module, Generic[Energy]):
     tissue: Tissue
     energy: Energy
     cost: AbstractCost
-    trainable: PyTree[bool] | Callable[[Any], bool] = eqx.is_inexact_array
+    trainable: Any | Callable[[Any], bool] = eqx.is_inexact_array
     fit_position: bool = False
     response: AbstractResponse = eqx.field(default_factory=Relaxation)
     adjoint: AbstractAdjoint = eqx.field(default_factory=ImplicitDifferentiation)

@@ -15,7 +15,7 @@ from vertax._base.checks import check_number
 from vertax._base.tracing import is_concrete, traced
 from vertax.energies import AbstractEnergy
 from vertax.fitting._history import Fit
-from vertax.fitting._inverse import InverseProblem
+from vertax.fitting._inverse import Energy, InverseProblem
 from vertax.mesh import Tissue
 
 
@@ -37,8 +37,8 @@ class Uncertainty(eqx.Module):
 
 
 def uncertainty(
-    problem: InverseProblem,
-    fit: Fit,
+    problem: InverseProblem[Energy],
+    fit: Fit[Energy],
     *,
     prior: float | None = None,
     n_independent: float | int | None = None,

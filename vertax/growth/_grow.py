@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.checks import as_key, as_times, check_integer, describe
@@ -37,13 +37,13 @@ class Grown(eqx.Module):
 
     tissue: Tissue
     """The final tissue."""
-    cells: PyTree[Array]
+    cells: Any
     """The final cell states, see [`AbstractLifeCycle`][vertax.growth.AbstractLifeCycle]."""
     times: Float[Array, "*batch times"]
     """The times of the frames; the first is the initial time."""
     frames: Tissue
     """The tissue at these times, with a leading axis."""
-    cells_then: PyTree[Array]
+    cells_then: Any
     """The cell states at these times, with a leading axis."""
     number: Int[Array, "*batch times cells"]
     """Index in the lineage of the cell in each slot; -1 for spare slots."""
@@ -63,7 +63,7 @@ class Grown(eqx.Module):
     """Log-likelihood of the discrete random choices of the life cycle, see
     [`score_function`][vertax.growth.score_function]."""
 
-    signals: PyTree[Float[Array, "..."]]
+    signals: Any
     """The concentrations in each frame, shape `(times, species, cells)`, 0 in spare slots; see
     [`Signals`][vertax.signals.Signals]. In general the record of the activity, None without one."""
 
@@ -221,8 +221,8 @@ class _State(eqx.Module):
     """State of the loop over time steps."""
 
     tissue: Tissue
-    cells: PyTree[Array]
-    drive: PyTree[Array]
+    cells: Any
+    drive: Any
     number: Int[Array, " cells"]
     lineage: Lineage
     result: RESULTS

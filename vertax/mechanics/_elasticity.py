@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -32,7 +33,7 @@ def elastic_tensor(
     energy: AbstractEnergy,
     *,
     affine: bool = False,
-    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    linear_solver: lx.AbstractLinearSolver[Any] = MINRES(),
     throw: bool = True,
 ) -> Float[Array, "3 3"]:
     r"""The elastic tensor of a tissue at rest, in Voigt's notation, energy per area.
@@ -57,8 +58,7 @@ def elastic_tensor(
 
     **Arguments:**
 
-    - `tissue`: a periodic tissue at rest. The contact energy between vertices that nearly meet is not
-        included.
+    - `tissue`: a periodic tissue at rest. The contact energy of vertices that nearly meet is left out.
     - `energy`: the energy of which the tissue is at a minimum.
     - `affine`: if True, vertices follow the affine strain and do not relax.
     - `linear_solver`: for systems with the Hessian, [`MINRES`][vertax.MINRES] by default; if it fails, as it
@@ -88,7 +88,7 @@ def shear_modulus(
     *,
     angle: ArrayLike | None = None,
     affine: bool = False,
-    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    linear_solver: lx.AbstractLinearSolver[Any] = MINRES(),
     throw: bool = True,
 ) -> Float[Array, ""]:
     r"""Shear modulus $G$ of a tissue at rest: stress over shear angle, energy per area.
@@ -115,11 +115,10 @@ def bulk_modulus(
     energy: AbstractEnergy,
     *,
     affine: bool = False,
-    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    linear_solver: lx.AbstractLinearSolver[Any] = MINRES(),
     throw: bool = True,
 ) -> Float[Array, ""]:
-    r"""Bulk modulus $B$ of a tissue at rest: $A\,\mathrm d^2 E / \mathrm d A^2$ at a given shape of the
-    box.
+    r"""Bulk modulus $B$ of a tissue at rest: $A\,\mathrm d^2 E / \mathrm d A^2$ at a fixed box shape.
 
     **Arguments:**
 
@@ -141,7 +140,7 @@ def youngs_modulus(
     *,
     angle: ArrayLike = 0.0,
     affine: bool = False,
-    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    linear_solver: lx.AbstractLinearSolver[Any] = MINRES(),
     throw: bool = True,
 ) -> Float[Array, ""]:
     r"""Young's modulus along a direction: uniaxial stress over strain, at zero stress across.
@@ -185,7 +184,7 @@ def shear_part(tensor: Float[Array, "3 3"], angle: ArrayLike | None = None) -> F
 class _Elasticity(eqx.Module):
     """The elastic tensor as a stationary value over the non-affine motions of the vertices."""
 
-    solver: lx.AbstractLinearSolver
+    solver: lx.AbstractLinearSolver[Any]
     affine: bool = eqx.field(static=True)
 
     def solve(self, args: tuple[Tissue, AbstractEnergy]) -> PyTree[Array]:

@@ -40,7 +40,7 @@ class Modes(eqx.Module):
 
     values: Float[Array, " modes"]
     """Eigenvalues of the Hessian, energy per length squared. Differentiable, if they are distinct."""
-    vectors: PyTree[Float[Array, "modes ..."]]
+    vectors: Any
     """Unit eigenvectors as changes of the configuration (with arcs a pair); not differentiated."""
     n_movable: Int[Array, ""]
     """Number of vertices that move: neither pinned nor spare."""

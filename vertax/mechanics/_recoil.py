@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -26,7 +28,7 @@ def velocities(
     energy: AbstractEnergy,
     dissipation: AbstractDissipation,
     *,
-    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    linear_solver: lx.AbstractLinearSolver[Any] = MINRES(),
     throw: bool = True,
 ) -> Float[Array, "vertices 2"]:
     r"""Velocities of vertices, $\Gamma\,\dot x = - \nabla_X E$ with the matrix $\Gamma$ of the dissipation.
@@ -58,9 +60,8 @@ def velocities(
     check_system(tissue, energy)
     check_dissipation(dissipation)
     check_linear_solver(linear_solver)
-    velocity = _velocities(
-        *traced((tissue, energy, dissipation), tissue.vertices.dtype), linear_solver
-    )
+    arguments = traced((tissue, energy, dissipation), tissue.vertices.dtype)
+    velocity = _velocities(*arguments, linear_solver)
     return checked(velocity, _REASON) if throw else velocity
 
 
@@ -69,7 +70,7 @@ def _velocities(
     tissue: Tissue,
     energy: AbstractEnergy,
     dissipation: AbstractDissipation,
-    solver: lx.AbstractLinearSolver,
+    solver: lx.AbstractLinearSolver[Any],
 ) -> Float[Array, "vertices 2"]:
     gradient = jax.grad(lambda y: real_scalar(energy(tissue.with_configuration(y))))
     forces = jax.tree.map(jnp.negative, gradient(tissue.configuration))
@@ -85,7 +86,7 @@ def recoil(
     dissipation: AbstractDissipation,
     edge: int | Int[Array, ""],
     *,
-    linear_solver: lx.AbstractLinearSolver = MINRES(),
+    linear_solver: lx.AbstractLinearSolver[Any] = MINRES(),
     throw: bool = True,
 ) -> Float[Array, "vertices 2"]:
     r"""Initial velocities of all vertices after the tension of an edge is removed, as by laser ablation.
@@ -134,10 +135,9 @@ def _recoil(
     energy: AbstractEnergy,
     edge: Int[Array, ""],
     dissipation: AbstractDissipation,
-    solver: lx.AbstractLinearSolver,
+    solver: lx.AbstractLinearSolver[Any],
 ) -> Float[Array, "vertices 2"]:
     tension = tensions(tissue, energy)[edge]
-
     return _velocities(tissue, _WithoutTension(energy, edge, tension), dissipation, solver)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.indexing import take
 from vertax._base.model_checks import check_planar
@@ -351,14 +351,14 @@ class Tissue(eqx.Module):
         return find_overlaps(self.topology, self.sides, self.areas)
 
     @property
-    def configuration(self) -> PyTree[Float[Array, "..."]]:
+    def configuration(self) -> Any:
         """The degrees of freedom of a relaxation: `vertices`.
 
         With arcs a pair, `(vertices, angles * angle_length)`.
         """
         return self.vertices if self.arcs is None else (self.vertices, self.arcs.scaled)
 
-    def with_configuration(self, configuration: PyTree[Float[Array, "..."]]) -> Tissue:
+    def with_configuration(self, configuration: Any) -> Tissue:
         """The tissue with other degrees of freedom.
 
         Pinned and spare vertices and angles of straight edges do not change.
@@ -373,7 +373,7 @@ class Tissue(eqx.Module):
         angles = jnp.where(self.is_arc, scaled / self.arcs.length, self.arcs.angles)
         return moved.with_angles(angles)
 
-    def by_row(self, values: Float[Array, " vertices"]) -> PyTree[Float[Array, "..."]]:
+    def by_row(self, values: Float[Array, " vertices"]) -> Any:
         """Values of vertices as values of the rows of `configuration`; of an arc the minimum of its ends."""
         if self.arcs is None:
             return values
@@ -444,7 +444,7 @@ class Tissue(eqx.Module):
         of_vertices, of_edges = (lambda x: x[vertices]), (lambda x: x[edges])
         return self._with(topology, of_vertices(self.vertices), of_vertices, of_edges)
 
-    def drift(self, configuration: PyTree[Float[Array, "..."]]) -> Float[Array, " modes"]:
+    def drift(self, configuration: Any) -> Float[Array, " modes"]:
         """Displacement of a configuration from that of this tissue along directions without energy.
 
         These are the rigid motions, see [`AbstractBoundary`][vertax.AbstractBoundary], and the degrees of
@@ -523,7 +523,7 @@ class Tissue(eqx.Module):
         return jnp.where(alive, vertices, middle)
 
     def _split(
-        self, configuration: PyTree[Float[Array, "..."]]
+        self, configuration: Any
     ) -> tuple[Float[Array, "vertices 2"], Float[Array, " edges"] | None]:
         return (configuration, None) if self.arcs is None else configuration
 

@@ -18,7 +18,7 @@ _UNKNOWN = (0.5, 0.5, 0.5, 1.0)
 _WIDTH = 0.08
 
 
-def tension_layer(inferred: InferredTensions, *, colours: str = "plasma") -> tuple[Any, dict, str]:
+def tension_layer(inferred: InferredTensions, *, colours: str = "plasma") -> tuple[Any, Any, str]:
     """The edges of an image, coloured by their tension, as a layer for napari.
 
     ```python

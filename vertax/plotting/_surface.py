@@ -80,7 +80,7 @@ def plot_surface(
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         # A long tissue fills the width of the figure already. (Matplotlib declares an integer.)
         size = np.maximum(high - low, 1e-3 * (high - low).max())
-        zoom: Any = 1.3 * min(1.0, np.sort(size)[1] / size.max() + 0.15)
+        zoom: Any = 0.95 * min(1.0, np.sort(size)[1] / size.max() + 0.15)
         ax.set_box_aspect(size, zoom=zoom)
         ax.view_init(elev=float(elevation), azim=float(azimuth))
         ax.set_axis_off()

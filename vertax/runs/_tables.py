@@ -46,7 +46,7 @@ def concatenate(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {name: np.concatenate([table[name] for table in tables]) for name in names}
 
 
-def fit_metrics(outcome: Fit) -> dict[str, Any]:
+def fit_metrics(outcome: Fit[Any]) -> dict[str, Any]:
     """The metrics of a fit.
 
     **Arguments:**

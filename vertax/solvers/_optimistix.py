@@ -50,7 +50,7 @@ class Wrapped(AbstractSolver):
     - `TypeError` for anything else.
     """
 
-    solver: optx.AbstractMinimiser
+    solver: optx.AbstractMinimiser[Any, Any, Any]
 
     def __check_init__(self):
         check_solver(self.solver)
