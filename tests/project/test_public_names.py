@@ -39,7 +39,7 @@ PACKAGES = {
     "Segmentation Watershed "
     "free_voronoi from_labels from_microscopy from_polygons hexagonal labels_from_skeleton "
     "periodic_voronoi",
-    "io": "BoundedTables Foam Tables cell_table edge_table from_edge_table from_tables "
+    "io": "BoundedTables Foam Tables append_parquet cell_table edge_table from_edge_table from_tables "
     "from_tyssue load_energy load_problem load_tissue load_trajectory pixel_aspect pixel_sides pixel_size "
     "read_force_inference "
     "read_geojson read_image read_stack read_surface_evolver read_table save_energy save_problem save_tissue "

@@ -4,6 +4,7 @@ from vertax._base.pixels import pixel_sides as pixel_sides
 from vertax.io._bounded_tables import BoundedTables as BoundedTables
 from vertax.io._chaste import write_chaste as write_chaste
 from vertax.io._data_tables import (
+    append_parquet as append_parquet,
     cell_table as cell_table,
     edge_table as edge_table,
     write_csv as write_csv,
