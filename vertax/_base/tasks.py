@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import jax
 from tqdm import tqdm
 
+from vertax._base.compilation_cache import enable_compilation_cache
 from vertax._base.processes import LocalProcesses, ProcessDied
 
 
@@ -89,7 +90,9 @@ def map_tasks(
         if executor is None:
             executor = stack.enter_context(LocalProcesses())
         if not isinstance(executor, ThreadPoolExecutor) or isinstance(executor, LocalProcesses):
-            function = partial(_run, function, jax.config.read("jax_enable_x64"), result_limit)
+            cached = jax.config.values["jax_compilation_cache_dir"] is not None
+            settings = jax.config.values["jax_enable_x64"], cached, result_limit
+            function = partial(_run, function, *settings)
         name = str(
             getattr(executor, "_client", type(executor).__name__)
         )  # of Dask, with its address
@@ -151,10 +154,19 @@ def _end(future: Future[Any]) -> tuple[Any, Exception | None]:
         return None, ProcessDied() if type(error).__name__ == "KilledWorker" else error  # of Dask
 
 
-def _run(function: Callable[[Any], Any], x64: bool, limit: int, task: Any) -> Any:
-    """Run a task in another process, in the precision of the caller."""
+def _run(function: Callable[[Any], Any], x64: bool, cached: bool, limit: int, task: Any) -> Any:
+    """Run a task in another process, with the precision and the compilation cache of the caller."""
     jax.config.update("jax_enable_x64", x64)
-    result, buffers, size = function(task), [], 0
+    if cached:
+        enable_compilation_cache()
+    try:
+        result, buffers, size = function(task), [], 0
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # would end the process that receives it
+            raise RuntimeError(f"{type(error).__name__}: {error}") from None
+        raise
     with contextlib.suppress(Exception):  # some executors send what `pickle` does not
         size = len(pickle.dumps(result, 5, buffer_callback=buffers.append))
     size += sum(buffer.raw().nbytes for buffer in buffers)

@@ -68,6 +68,15 @@ class ExperimentConfig(Section):
             )
         return self
 
+    def __reduce__(self) -> Any:  # pickle does not find the class that `with_name` makes
+        return _restored, (self.experiment, self.model_dump(mode="json", exclude_none=True))
+
+
+def _restored(name: str, content: dict[str, Any]) -> ExperimentConfig:
+    from vertax.runs._registry import find_experiment
+
+    return validate(find_experiment(name).config, content)
+
 
 Model = TypeVar("Model", bound=Section)
 
