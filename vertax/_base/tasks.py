@@ -160,13 +160,19 @@ def _run(function: Callable[[Any], Any], x64: bool, cached: bool, limit: int, ta
     if cached:
         enable_compilation_cache()
     try:
-        result, buffers, size = function(task), [], 0
+        return _checked(function(task), limit)
     except Exception as error:
         try:
             pickle.loads(pickle.dumps(error))
-        except Exception:  # would end the process that receives it
-            raise RuntimeError(f"{type(error).__name__}: {error}") from None
-        raise
+        except Exception:
+            text = f"{type(error).__name__}: {error}"
+        else:
+            raise
+    raise RuntimeError(text)  # in place of an error that would end the process that receives it
+
+
+def _checked(result: Any, limit: int) -> Any:
+    size, buffers = 0, []
     with contextlib.suppress(Exception):  # some executors send what `pickle` does not
         size = len(pickle.dumps(result, 5, buffer_callback=buffers.append))
     size += sum(buffer.raw().nbytes for buffer in buffers)
