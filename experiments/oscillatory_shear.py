@@ -19,7 +19,7 @@ import scipy.optimize
 from pydantic import Field, field_validator
 
 import vertax as vx
-from experiments._shared import HEXAGON
+from experiments._shared import HEXAGON, scan
 from vertax import mechanics, plotting, runs
 from vertax.dissipations import SubstrateFriction
 from vertax.energies import AreaElasticity, PerimeterElasticity
@@ -90,7 +90,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     metrics: dict[str, Any] = {}
     for name, (tissue, energy, expected) in samples.items():
         compute = partial(measure, config, tissue, energy)
-        values: Any = folder.scan(name, config.frequencies, compute, progress=progress)["modulus"]
+        values: Any = scan(folder, name, config.frequencies, compute, progress=progress)["modulus"]
         measured[name] = values
         for label, moduli in (("measured", values), ("expected", expected)):
             table |= {f"{name}_storage_{label}": moduli.real, f"{name}_loss_{label}": moduli.imag}

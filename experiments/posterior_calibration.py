@@ -18,7 +18,7 @@ from pydantic import Field
 from scipy import stats
 
 import vertax as vx
-from experiments._shared import fitted_noise
+from experiments._shared import fitted_noise, scan
 from vertax import bayes, plotting, runs
 from vertax.energies import ShapeFactorEnergy
 
@@ -63,7 +63,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         warnings.simplefilter("ignore", UserWarning)  # the metrics count what they state
         for kind, n in (("vertices", config.replicates), ("image", config.image_replicates)):
             compute = partial(calibrate, config, kind)
-            ranks[kind] = folder.scan(kind, range(n), compute, progress=progress)
+            ranks[kind] = scan(folder, kind, range(n), compute, progress=progress)
         rows = [cost(config, n) for n in config.cost_sizes]
     for kind, groups in ranks.items():
         for key in ("rejected trajectories", "draws with a short edge"):

@@ -19,7 +19,7 @@ from pydantic import Field
 
 import vertax as vx
 from experiments._replicates import series_colours
-from experiments._shared import FLUID
+from experiments._shared import FLUID, scan
 from experiments._transition import fit_onset, fit_transition
 from vertax import plotting, runs
 from vertax.energies import ShapeFactorEnergy
@@ -76,7 +76,7 @@ class Curve(NamedTuple):
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """Transitions and onsets after the quench and after driving, with 95 % intervals of a bootstrap."""
     began = time.perf_counter()
-    results = folder.scan("p0", config.shape_factors, partial(measure, config), progress=progress)
+    results = scan(folder, "p0", config.shape_factors, partial(measure, config), progress=progress)
     seconds, energies = time.perf_counter() - began, results["energy"] / config.tissue.n_cells
     zero, converged, x = energies < config.zero_energy, results["converged"], np.asarray(config.shape_factors)
     metrics: dict[str, Any] = {}

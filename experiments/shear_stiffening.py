@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
-from experiments._shared import columns, spread_of
+from experiments._shared import columns, scan, spread_of
 from vertax import mechanics, plotting, runs
 from vertax.energies import ShapeFactorEnergy
 from vertax.plotting import INK, SERIES
@@ -80,7 +80,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         return {"sheared": 0}
     settings = jnp.asarray(strains), jnp.asarray(config.zero_stress), fixed
     compute = partial(shear_all, edges, settings)
-    curves = folder.scan("excess", config.excess, compute, progress=progress)
+    curves = scan(folder, "excess", config.excess, compute, progress=progress)
     pairs, rows = [], []
     for i, k in np.ndindex(len(config.excess), len(edges)):
         one = {name: values[i, k] for name, values in curves.items()}

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
-from experiments._shared import FLUID, HEXAGON
+from experiments._shared import FLUID, HEXAGON, scan
 from vertax import mechanics, plotting, runs
 from vertax.plotting import INK, SERIES
 
@@ -45,7 +45,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     """Mean moduli, the fraction of solid tissues, and the shape factor at which half of them are solid."""
     began, shape_factors = time.perf_counter(), np.asarray(config.shape_factors)
     compute = partial(measure_replicates, config)
-    measured = folder.scan("p0", config.shape_factors, compute, progress=progress)
+    measured = scan(folder, "p0", config.shape_factors, compute, progress=progress)
     valid = measured["converged"] & np.isfinite(measured["shear"])
     values = {name: np.where(valid, measured[name], np.nan) for name in NAMES}
     means = {name: mean(value) for name, value in values.items()}

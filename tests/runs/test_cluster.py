@@ -187,8 +187,11 @@ def test_what_arrived_before_the_death_of_a_scheduler_is_kept(tmp_path):
         scheduler.kill()
 
     try:
+        while not os.path.exists(file):
+            time.sleep(0.1)
+        distributed.Client(scheduler_file=file, timeout=60).wait_for_workers(2, timeout=60)
         with chosen_executor(None, file, None) as folder.executor:
-            threading.Thread(target=kill).start()
+            threading.Thread(target=kill, daemon=True).start()
             with pytest.raises(RuntimeError, match=r"'tcp://.*runs no more tasks .CancelledError"):
                 folder.map_parts(slow, tasks, progress=False)
     finally:

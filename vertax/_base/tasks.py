@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import pickle
 import uuid
 from collections.abc import Callable, Generator, Iterable
@@ -15,7 +16,6 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -79,7 +79,6 @@ def map_tasks(
 
     - `RuntimeError` if the executor no longer runs tasks: its scheduler or its processes died. It comes after
         all results that have arrived.
-    - `TypeError` if a task cannot be pickled.
     """
     total = len(tasks) if hasattr(tasks, "__len__") else None  # pyright: ignore[reportArgumentType]
     remaining = ((number, task, 0) for number, task in enumerate(tasks))
@@ -89,25 +88,36 @@ def map_tasks(
     with contextlib.ExitStack() as stack:
         if executor is None:
             executor = stack.enter_context(LocalProcesses())
-        if not isinstance(executor, ThreadPoolExecutor) or isinstance(executor, LocalProcesses):
-            cached = jax.config.values["jax_compilation_cache_dir"] is not None
-            settings = jax.config.values["jax_enable_x64"], cached, result_limit
-            function = partial(_run, function, *settings)
-        name = str(
-            getattr(executor, "_client", type(executor).__name__)
-        )  # of Dask, with its address
+        remote = not isinstance(executor, ThreadPoolExecutor) or isinstance(
+            executor, LocalProcesses
+        )
+        cached = jax.config.values["jax_compilation_cache_dir"] is not None
+        settings = jax.config.values["jax_enable_x64"], cached, result_limit
+        dask = getattr(executor, "_client", None)
+        dumps = importlib.import_module("cloudpickle" if dask else "pickle").dumps
+        name, group = str(dask or type(executor).__name__), uuid.uuid4().hex
         bar = stack.enter_context(tqdm(total=total, unit=unit, disable=None if progress else True))
         stack.callback(lambda: [future.cancel() for future in waiting])
-        group = f"task-{uuid.uuid4().hex}"
         while True:
             while dead is None and len(waiting) < at_once:
-                new = next(remaining, None)
-                if new is None and repeated and not waiting:
-                    new = repeated.pop()
+                new = next(remaining, None) or (
+                    repeated.pop() if repeated and not waiting else None
+                )
                 if new is None:
                     break
+                number, task, deaths = new
+                # By this key, equal tasks of Dask are not one task, and queue at the scheduler.
+                key = {"key": (f"task-{group}", number, deaths)} if dask else {}
                 try:
-                    waiting[_submit(executor, function, *new, group)] = new
+                    call = (
+                        (_run, dumps((function, task)), *settings) if remote else (function, task)
+                    )
+                except Exception as error:  # pickle raises errors of many types
+                    text = f"Task {number} cannot be sent to a worker, by pickle: {error}"
+                    yield Outcome(number, None, TypeError(text))
+                    continue
+                try:
+                    waiting[executor.submit(*call, **key)] = new
                 except BrokenExecutor as error:
                     dead = error
             # (Of a dead executor, results that have arrived come before the error.)
@@ -116,14 +126,19 @@ def map_tasks(
                 break
             for future in done:
                 number, task, deaths = waiting.pop(future)
-                value, error = _end(future)
-                if isinstance(error, BrokenExecutor | CancelledError):
-                    dead = error
-                elif isinstance(error, ProcessDied) and deaths < retries:
+                error = None if future.cancelled() else future.exception()
+                if error is not None and not isinstance(error, Exception):  # Ctrl-C in a thread
+                    raise error
+                if future.cancelled() or isinstance(error, BrokenExecutor):
+                    dead = error or CancelledError()
+                    continue
+                if type(error).__name__ == "KilledWorker":  # of Dask
+                    error = ProcessDied()
+                if isinstance(error, ProcessDied) and deaths < retries:
                     repeated.append((number, task, deaths + 1))
-                else:
-                    bar.update()
-                    yield Outcome(number, value, error)
+                    continue
+                bar.update()
+                yield Outcome(number, future.result() if error is None else None, error)
     if dead is not None:
         raise RuntimeError(
             f"The executor {name} runs no more tasks ({type(dead).__name__}): its scheduler or its processes "
@@ -131,34 +146,12 @@ def map_tasks(
         ) from dead
 
 
-def _submit(
-    executor: Executor,
-    function: Callable[[Any], Any],
-    number: int,
-    task: Any,
-    deaths: int,
-    group: str,
-) -> Future:
-    # Dask: equal tasks are not one task, and those of a group queue at the scheduler, not at the workers.
-    key = {"key": (group, number, deaths)} if hasattr(executor, "_client") else {}
-    try:
-        return executor.submit(function, task, **key)
-    except (TypeError, AttributeError, ValueError) as error:  # of pickle
-        raise TypeError(f"Task {number} cannot be sent to a worker: {error}") from error
-
-
-def _end(future: Future[Any]) -> tuple[Any, Exception | None]:
-    try:
-        return future.result(), None
-    except Exception as error:  # (also that of a cancelled future)
-        return None, ProcessDied() if type(error).__name__ == "KilledWorker" else error  # of Dask
-
-
-def _run(function: Callable[[Any], Any], x64: bool, cached: bool, limit: int, task: Any) -> Any:
+def _run(content: bytes, x64: bool, cached: bool, limit: int) -> Any:
     """Run a task in another process, with the precision and the compilation cache of the caller."""
-    jax.config.update("jax_enable_x64", x64)
+    jax.config.update("jax_enable_x64", x64)  # before arrays are unpickled, which it may round
     if cached:
         enable_compilation_cache()
+    function, task = pickle.loads(content)
     try:
         return _checked(function(task), limit)
     except Exception as error:

@@ -8,7 +8,6 @@ import logging
 import platform
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -44,36 +43,33 @@ def chosen_executor(
     given = [name for name, value in options.items() if value is not None]
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)} exclude each other. Pass one of them.")
-    if scheduler is None and file is None:
-        with nullcontext() if workers is None else LocalProcesses(workers) as executor:
-            yield executor
-        return
-    with requires_extra("cluster", given[0]):
-        import distributed
-    # Of a scheduler that dies, `map_tasks` states the error.
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
-        if file is not None:
-            where: dict[str, Any] = {"address": stack.enter_context(_start(file))}
-        else:
-            where = {"scheduler_file" if Path(str(scheduler)).is_file() else "address": scheduler}
+        if scheduler is None and file is None:
+            yield None if workers is None else stack.enter_context(LocalProcesses(workers))
+            return
+        with requires_extra("cluster", given[0]):
+            import distributed
+        # (If the scheduler dies, `map_tasks` raises the error.)
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+        where = scheduler if file is None else stack.enter_context(_start(file))
+        name = "scheduler_file" if scheduler and Path(scheduler).is_file() else "address"
+        place: Any = {name: where, "timeout": _TIMEOUT, "set_as_default": False}
         try:
-            client: Any = distributed.Client(**where, timeout=_TIMEOUT, set_as_default=False)
+            client: Any = stack.enter_context(distributed.Client(**place))
         except (OSError, ValueError) as error:
             raise ConfigError(
-                f"No Dask scheduler answers at {scheduler} within {_TIMEOUT} seconds ({error}). Start one by "
+                f"No Dask scheduler answers at {where} within {_TIMEOUT} seconds ({error}). Start one by "
                 "`dask scheduler`, or correct the address after --scheduler."
             ) from None
-        stack.enter_context(client)
         if file is not None:
             client.wait_for_workers(1)  # a queue may take hours
-        workers_versions, expected = client.run(_versions), _versions()
-        if not workers_versions:
+        installed = client.run(_versions)
+        if not installed:
             raise ConfigError(
-                f"The scheduler at {scheduler} has no workers. Start one by `dask worker {scheduler}`."
+                f"The scheduler at {where} has no workers. Start one by `dask worker {where}`."
             )
-        for worker, versions in workers_versions.items():
-            if versions != expected:
+        for worker, versions in installed.items():
+            if versions != (expected := _versions()):
                 raise ConfigError(
                     f"The worker {worker} has {versions}, but this process has {expected}. Install the same "
                     "versions in both."

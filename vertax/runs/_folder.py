@@ -193,28 +193,24 @@ class RunFolder:
 
         **Raises:** as `fit` and `map_in_threads`.
         """
-
         names = [f"{name} {index}" for index in range(len(problems))]
         options: dict[str, Any] = {"progress": progress, "unit": "fit"}
-        if self.executor is not None:  # workers send finished checkpoints
-            tasks = list(zip(names, problems, strict=True))
-            tasks = [task for task in tasks if not self._part_file(task[0]).exists()]
-            call = partial(_finished_checkpoint, fitting=fitting, notes=notes)
+        if self.executor is not None:  # workers send checkpoints of finished fits
+            tasks = [
+                t for t in zip(names, problems, strict=True) if not self._part_file(t[0]).exists()
+            ]
+            call = partial(_checkpoint, fitting=fitting, notes=notes)
             for number, content in self._map(call, tasks, self.executor, **options):
                 with atomic_write(self._part_file(tasks[number][0]), "wb") as file:
                     file.write(content)
-        fit_one = lambda k: self._fit_one(names[k], problems[k], fitting, notes)
-        return stack_fits(
-            self.map_in_threads(fit_one, len(names), **options), at_once=num_threads()
-        )
 
-    def _fit_one(
-        self, name: str, problem: InverseProblem[Any], fitting: Fitting, notes: Notes | None
-    ) -> Fit[Any]:
-        options: dict[str, Any] = {"progress": False}
-        if notes is not None:
-            options["callback"] = lambda _, record: notes(problem, record)
-        return self.fit(name, problem, fitting.build(), fitting.epochs, **options)
+        def fit_one(index: int) -> Fit[Any]:
+            watch: Any = (compute := notes) and (lambda _, record: compute(problems[index], record))
+            arguments = problems[index], fitting.build(), fitting.epochs
+            return self.fit(names[index], *arguments, callback=watch, progress=False)
+
+        fits = self.map_in_threads(fit_one, len(names), **options)
+        return stack_fits(fits, at_once=num_threads())
 
     def map_in_threads(
         self,
@@ -260,19 +256,17 @@ class RunFolder:
         progress: bool = True,
         unit: str = "part",
     ) -> dict[str, dict[str, Shaped[np.ndarray, "..."]]]:
-        """Arrays of independent tasks, such as replicates, from the workers of the run or else from threads.
-
-        A resumed run keeps those that are computed.
+        """Arrays of many tasks, such as replicates, from the workers of the run or else from threads.
 
         **Arguments:**
 
         - `compute`: returns the arrays of a task by name; picklable, such as a function of a module.
-        - `tasks`: the tasks by the names of their parts, unique in the run.
+        - `tasks`: the tasks by unique names; a resumed run keeps those that are computed.
         - `progress`, `unit`: as of `map_in_threads`.
 
-        **Returns:** the arrays of each part by name.
+        **Returns:** the arrays of each task by name.
 
-        **Raises:** as `map_in_threads`, and as [`map_tasks`][vertax.map_tasks].
+        **Raises:** as `map_in_threads`.
         """
         missing = [name for name in tasks if not self._part_file(name).exists()]
         values = [tasks[name] for name in missing]
@@ -282,26 +276,15 @@ class RunFolder:
         return {name: self.part(name, dict) for name in tasks}
 
     def _map(
-        self,
-        function: Callable[[Any], Result],
-        tasks: Sequence[Any],
-        executor: concurrent.futures.Executor | None,
-        *,
-        progress: bool,
-        unit: str,
+        self, function: Callable[[Any], Result], tasks: Sequence[Any], executor: Any, **options: Any
     ) -> Iterator[tuple[int, Result]]:
         """Number and result of each task, as they end; in threads the first one runs alone."""
         first = 1 if executor is None else 0
-        with contextlib.ExitStack() as stack:
-            if executor is None:
-                executor = concurrent.futures.ThreadPoolExecutor(num_threads())
-                stack.enter_context(executor)
+        threads = concurrent.futures.ThreadPoolExecutor
+        with contextlib.nullcontext(executor) if executor else threads(num_threads()) as pool:
             try:
                 for begin, some in ((0, tasks[:first]), (first, tasks[first:])):
-                    shown = progress and begin == first
-                    outcomes = map_tasks(
-                        function, some, executor=executor, progress=shown, unit=unit
-                    )
+                    outcomes = map_tasks(function, some, executor=pool, **options)
                     with contextlib.closing(outcomes):
                         for number, value, error in outcomes:
                             if error is not None:
@@ -310,29 +293,6 @@ class RunFolder:
             except KeyboardInterrupt:
                 self.interrupted = True
                 raise
-
-    def scan(
-        self,
-        name: str,
-        values: Sequence[float],
-        compute: Callable[[float], Mapping[str, np.ndarray]],
-        *,
-        progress: bool = True,
-    ) -> dict[str, Shaped[np.ndarray, "values ..."]]:
-        """Arrays at each of several values of a parameter, see `map_parts`.
-
-        **Arguments:**
-
-        - `name`: the name of the parameter, and of the parts of the run.
-        - `values`: its values, all different.
-        - `compute`: returns the arrays at one value by name; their shapes are the same at all values.
-        - `progress`: show a progress bar (only on a terminal).
-
-        **Returns:** the arrays by name, with a leading axis of the values.
-        """
-        tasks = {f"{name} {float(value)}": float(value) for value in values}
-        results = [*self.map_parts(compute, tasks, progress=progress, unit="value").values()]
-        return {key: np.stack([result[key] for result in results]) for key in results[0]}
 
     def part(
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
@@ -414,11 +374,12 @@ class RunFolder:
             self.save_tissue(f"fitted_{name}", outcome.tissue)
 
 
-def _finished_checkpoint(
-    task: tuple[str, InverseProblem[Any]], *, fitting: Fitting, notes: Notes | None
+def _checkpoint(
+    task: tuple[str, InverseProblem[Any]], fitting: Fitting, notes: Notes | None
 ) -> bytes:
-    """The checkpoint of a fit at its end, from a worker."""
+    """The checkpoint of a finished fit, from a worker."""
+    name, problem = task
     with tempfile.TemporaryDirectory() as path:
         folder = RunFolder(path)
-        folder._fit_one(*task, fitting, notes)
-        return folder._part_file(task[0]).read_bytes()
+        folder.fit_in_threads(name, [problem], fitting, notes=notes, progress=False)
+        return folder._part_file(f"{name} 0").read_bytes()
