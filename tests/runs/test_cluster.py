@@ -171,13 +171,14 @@ def slow(number):
 
 
 def test_what_arrived_before_the_death_of_a_scheduler_is_kept(tmp_path):
+    options = {"env": os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}}
     start = lambda *words: subprocess.Popen(
-        [sys.executable, "-m", *words, "--no-dashboard"], stderr=subprocess.DEVNULL
+        [sys.executable, "-m", *words, "--no-dashboard"], stderr=subprocess.DEVNULL, **options
     )
     file, folder = str(tmp_path / "scheduler.json"), RunFolder(tmp_path)
     scheduler = start("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", file)
-    options = ("--scheduler-file", file, "--nworkers", "2", "--nthreads", "1")
-    worker = start("distributed.cli.dask_worker", *options)
+    words = ("--scheduler-file", file, "--nworkers", "2", "--nthreads", "1")
+    worker = start("distributed.cli.dask_worker", *words)
     tasks = {f"task {k}": k for k in range(40)}
     parts = lambda: {part: part.stat().st_mtime_ns for part in folder.parts.glob("*.npz")}
 

@@ -109,7 +109,7 @@ def map_tasks(
                 # By this key, equal tasks of Dask are not one task, and queue at the scheduler.
                 key = {"key": (f"task-{group}", number, deaths)} if dask else {}
                 try:
-                    call = (
+                    call: Any = (
                         (_run, dumps((function, task)), *settings) if remote else (function, task)
                     )
                 except Exception as error:  # pickle raises errors of many types
