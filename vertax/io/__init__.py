@@ -22,10 +22,7 @@ from vertax.io._module_file import (
 from vertax.io._pixel_size import pixel_aspect as pixel_aspect, pixel_size as pixel_size
 from vertax.io._read_geojson import read_geojson as read_geojson
 from vertax.io._read_table import read_table as read_table
-from vertax.io._surface_evolver import (
-    Foam as Foam,
-    read_surface_evolver as read_surface_evolver,
-)
+from vertax.io._surface_evolver import Foam as Foam, read_surface_evolver as read_surface_evolver
 from vertax.io._tables import Tables as Tables, from_tables as from_tables, to_tables as to_tables
 from vertax.io._tissue_file import load_tissue as load_tissue, save_tissue as save_tissue
 from vertax.io._trajectory import (

@@ -126,8 +126,8 @@ def append_parquet(folder: str | os.PathLike[str], table: Mapping[str, Column]) 
     - `ImportError` if PyArrow is not installed: `pip install -e ".[cluster]"`.
     """
     with requires_extra("cluster", "Writing Parquet files"):
-        import pyarrow
-        import pyarrow.parquet
+        import pyarrow  # pyright: ignore[reportMissingImports]
+        import pyarrow.parquet  # pyright: ignore[reportMissingImports]
     masked = {
         name: (np.ma.getdata(x), np.ma.getmaskarray(x)) for name, x in _columns(table).items()
     }

@@ -79,7 +79,7 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Shaped[np.ndarray, " r
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     with requires_extra("cluster", "Reading Parquet files"):
-        import pyarrow.parquet
+        import pyarrow.parquet  # pyright: ignore[reportMissingImports]
     try:
         table = pyarrow.parquet.read_table(path)
     except ValueError as error:

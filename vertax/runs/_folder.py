@@ -213,12 +213,7 @@ class RunFolder:
         return stack_fits(fits, at_once=num_threads())
 
     def map_in_threads(
-        self,
-        function: Callable[[int], Result],
-        n: int,
-        *,
-        progress: bool = True,
-        unit: str = "run",
+        self, function: Callable[[int], Result], n: int, *, progress: bool = True, unit: str = "run"
     ) -> list[Result]:
         """Call a function for each of 0 … n - 1 in threads, one per core.
 

@@ -8,6 +8,7 @@ import inspect
 import os
 import warnings
 import zipfile
+from collections import UserDict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
@@ -99,9 +100,8 @@ class TensionsOfMasks(eqx.Module):
         **Arguments:**
 
         - `folder`: the folder; it is made if it does not exist. Tables in it are replaced.
-        - `format`: `"csv"` for files `cells.csv` and so on; `"parquet"` for folders `cells` and so on with a
-            Parquet file for every 64 masks (none for a part without rows), which
-            [`read_table`][vertax.io.read_table] reads as one table.
+        - `format`: `"csv"` for files `cells.csv` and so on; `"parquet"` for folders `cells` and so on, with a
+            file for 64 masks that have rows: [`read_table`][vertax.io.read_table] reads a folder as one table.
 
         **Returns:** the files and folders.
 
@@ -120,10 +120,8 @@ class TensionsOfMasks(eqx.Module):
             for file in path.glob("*.parquet"):
                 file.unlink()
         with contextlib.ExitStack() as stack:
-            files: dict[str, Any] = {}
-            if format == "csv":
-                for name, path in paths.items():
-                    files[name] = stack.enter_context(atomic_write(path, newline=""))
+            opened = lambda path: stack.enter_context(atomic_write(path, newline=""))
+            files = {name: opened(path) for name, path in paths.items() if path.suffix == ".csv"}
             for number, part in enumerate(self._parts()):
                 tables = {name: getattr(part, f"{name[:-1]}_table")() for name in _TABLES}
                 if number == 0:
@@ -144,23 +142,14 @@ class TensionsOfMasks(eqx.Module):
             yield TensionsOfMasks(results, failures, self.length_unit)
 
 
-class _Stored(Mapping[str | int, InferredTensions]):
+class _Stored(UserDict[str | int, Any]):
     """Results in the files of a cache, each read when it is used."""
 
-    def __init__(self, results: Mapping[str | int, Path | InferredTensions]):
-        self._results = results
-
     def __getitem__(self, name: str | int) -> InferredTensions:
-        result = self._results[name]
+        result = self.data[name]
         if isinstance(result, InferredTensions):
             return result
         return load_module(result, "tensions", InferredTensions, _CLASSES)
-
-    def __iter__(self) -> Iterator[str | int]:
-        return iter(self._results)
-
-    def __len__(self) -> int:
-        return len(self._results)
 
 
 @announce_compilations("measurements of a tissue")
