@@ -101,7 +101,7 @@ class TensionsOfMasks(eqx.Module):
 
         - `folder`: the folder; it is made if it does not exist. Tables in it are replaced.
         - `format`: `"csv"` for files `cells.csv` and so on; `"parquet"` for folders `cells` and so on, with a
-            file for 64 masks that have rows: [`read_table`][vertax.io.read_table] reads a folder as one table.
+            file for 64 masks that have rows: [`read_table`][vertax.io.read_table] reads each as one table.
 
         **Returns:** the files and folders.
 
