@@ -2,7 +2,7 @@
 
 - overhead: seconds until the first outcome, and milliseconds for each further one, of empty tasks.
 - speed-up: seconds of 40 tasks of a fifth of a second of work, with one and with two local processes.
-- masks: memory of the caller with many masks of 100 cells, whose inference is left out, and their tables.
+- masks: memory of the caller with many masks of 100 cells, without their inference, and of tables.
 - continue: seconds to find that all masks and all runs of a sweep are finished.
 - classes: seconds of a mask in a new process, without and with the compiled functions of another one, and in
     the same process again.
