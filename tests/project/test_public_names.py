@@ -43,7 +43,8 @@ PACKAGES = {
     "from_tyssue load_energy load_problem load_tissue load_trajectory pixel_aspect pixel_sides pixel_size "
     "read_force_inference "
     "read_geojson read_image read_stack read_surface_evolver read_table save_energy save_problem save_tissue "
-    "save_trajectory to_tables write_chaste write_csv write_geojson write_vtk write_vtk_series",
+    "save_trajectory to_tables write_chaste write_csv write_geojson write_rows write_vtk "
+    "write_vtk_series",
     "mechanics": "BoxRelaxation Modes Ramp SelfStress bulk_modulus cell_stress compatibility "
     "complex_modulus deformed density_of_states elastic_tensor modes pressures "
     "principal pure_shear ramp recoil self_stresses shear_modulus simple_shear "

@@ -8,6 +8,7 @@ from vertax.io._data_tables import (
     cell_table as cell_table,
     edge_table as edge_table,
     write_csv as write_csv,
+    write_rows as write_rows,
 )
 from vertax.io._edge_table import from_edge_table as from_edge_table
 from vertax.io._force_inference import read_force_inference as read_force_inference

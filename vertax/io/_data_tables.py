@@ -97,7 +97,16 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
 
 
 def write_rows(file: IO[str], table: Mapping[str, Column], *, names: bool = True) -> None:
-    """Write the rows of a table to an open CSV file, below the names of the columns."""
+    """Write a part of a table to an open CSV file.
+
+    **Arguments:**
+
+    - `file`: the file, open for text with `newline=""`.
+    - `table`: as of [`write_csv`][vertax.io.write_csv].
+    - `names`: write the names of the columns first.
+
+    **Raises:** as [`write_csv`][vertax.io.write_csv].
+    """
     columns = _columns(table)
     texts = [[_text(name, value) for value in column] for name, column in columns.items()]
     writer = csv.writer(file, lineterminator="\n")

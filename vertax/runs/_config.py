@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import importlib
 import json
 import os
 import re
@@ -65,13 +66,12 @@ class ExperimentConfig(Section):
         return self
 
     def __reduce__(self) -> Any:  # pickle does not find the class that `with_name` makes
-        return _restored, (self.experiment, self.model_dump(mode="json", exclude_none=True))
+        content = self.model_dump(mode="json", exclude_none=True)
+        return _restored, (type(self).__module__, self.experiment, content)
 
 
-def _restored(name: str, content: dict[str, Any]) -> ExperimentConfig:
-    from vertax.runs._registry import find_experiment
-
-    return validate(find_experiment(name).config, content)
+def _restored(module: str, name: str, content: dict[str, Any]) -> ExperimentConfig:
+    return validate(with_name(importlib.import_module(module).Config, name), content)
 
 
 Model = TypeVar("Model", bound=Section)

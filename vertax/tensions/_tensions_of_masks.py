@@ -28,8 +28,7 @@ from vertax._base.pixels import pixel_length, pixel_sides
 from vertax._base.tasks import map_tasks
 from vertax._base.threads import num_threads
 from vertax.initialise import MaskChange, MaskReport
-from vertax.io import append_parquet, write_csv
-from vertax.io._data_tables import write_rows
+from vertax.io import append_parquet, write_csv, write_rows
 from vertax.io._module_file import load_module, save_module
 from vertax.tensions._columns import column_descriptions
 from vertax.tensions._find_masks import MaskFrame, MaskSource, find_masks
