@@ -1,6 +1,6 @@
 """Functions that several experiments use."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -21,6 +21,20 @@ def columns(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def fitted_noise(parameters: Any) -> Any:
     """The noise of a posterior is one of its parameters."""
     return parameters["noise"]
+
+
+def scan(
+    folder: runs.RunFolder,
+    name: str,
+    values: Sequence[float],
+    compute: Callable[[float], dict[str, np.ndarray]],
+    *,
+    progress: bool = True,
+) -> dict[str, np.ndarray]:
+    """Arrays at each of several values of a parameter, all different, with a leading axis of the values."""
+    tasks = {f"{name} {float(value)}": float(value) for value in values}
+    results = [*folder.map_parts(compute, tasks, progress=progress, unit="value").values()]
+    return {key: np.stack([result[key] for result in results]) for key in results[0]}
 
 
 FLUID = 3.81

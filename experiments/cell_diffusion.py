@@ -9,6 +9,7 @@ only).
 """
 
 import time
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -53,14 +54,13 @@ class Config(runs.ExperimentConfig):
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """Relative diffusion, rates of transitions, onsets of diffusion, and the fraction of valid frames."""
     began, shape = time.perf_counter(), (len(config.speeds), len(config.shape_factors), config.replicates)
-
-    def one(index: int) -> dict[str, np.ndarray]:
-        i, j, k = np.unravel_index(index, shape)
-        speed, p0 = config.speeds[i], config.shape_factors[j]
-        name = f"v0 {speed:g} p0 {p0:g} tissue {k}"
-        return folder.part(name, lambda: measure(config, speed, p0, int(k)))
-
-    results = folder.map_in_threads(one, int(np.prod(shape)), progress=progress, unit="run")
+    tasks = {
+        f"v0 {speed:g} p0 {p0:g} tissue {k}": (speed, p0, k)
+        for speed in config.speeds
+        for p0 in config.shape_factors
+        for k in range(config.replicates)
+    }
+    results = [*folder.map_parts(partial(measure, config), tasks, progress=progress, unit="run").values()]
     join = lambda name: np.stack([r[name] for r in results]).reshape(*shape, *results[0][name].shape)
     squared, rate, valid = np.nanmean(join("squared"), axis=2), join("t1_rate"), join("converged")
     rate = np.nanmean(rate, axis=2) / config.tissue.n_cells
@@ -87,8 +87,9 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     }
 
 
-def measure(config: Config, speed: float, p0: float, replicate: int) -> dict[str, np.ndarray]:
+def measure(config: Config, task: tuple[float, float, int]) -> dict[str, np.ndarray]:
     """Mean squared displacements, rate of transitions, and the fraction of frames before a step failed."""
+    speed, p0, replicate = task
     first, noise = jax.random.split(replicate_keys(config.seed, config.replicates)[replicate])
     tissue = vx.initialise.periodic_voronoi(key=first, **config.tissue.model_dump())
     n_frames = max(round(config.duration / config.interval), 4)

@@ -7,6 +7,7 @@ cells.
 """
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,13 +50,15 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     panels: dict[str, Any] = {}
     metrics: dict[str, Any] = {}
     for number, test in enumerate(config.tests):
-
-        def one(index: int, test: str = test, number: int = number) -> dict[str, np.ndarray]:
-            key = config.seed + index + 1000 * number
-            vtk = folder.path / f"{test}.pvd" if config.vtk and index == 0 else None
-            return folder.part(f"{test} {index}", lambda: simulate(config, test, times, key, vtk))
-
-        parts = folder.map_in_threads(one, config.replicates, progress=progress)
+        tasks = {
+            f"{test} {k}": (
+                config.seed + k + 1000 * number,
+                folder.path / f"{test}.pvd" if config.vtk and k == 0 else None,
+            )
+            for k in range(config.replicates)
+        }
+        compute = partial(simulate, config, test, times)
+        parts = [*folder.map_parts(compute, tasks, progress=progress, unit="run").values()]
         series[test] = np.stack([part["unlike"] for part in parts])
         folder.save_table(test, {"time": times} | {f"seed {k}": x for k, x in enumerate(series[test])})
         rows = [
@@ -75,10 +78,10 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
 
 
 def simulate(
-    config: Config, test: str, times: np.ndarray, key: int, vtk: Path | None
+    config: Config, test: str, times: np.ndarray, task: tuple[int, Path | None]
 ) -> dict[str, np.ndarray]:
     """The unlike length, centroids, the last outlines, and the number of transitions of a run."""
-    model = config.model
+    (key, vtk), model = task, config.model
     start = honeycomb(model.across)
     movie = model.evolution(times, key=key)(start, model.energy(test), throw=False)
     frames = movie.trajectory

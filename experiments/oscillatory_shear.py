@@ -8,6 +8,7 @@ lattice of irregular hexagons is a Maxwell fluid; $G^*$ of a disordered tissue f
 """
 
 import time
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +19,7 @@ import scipy.optimize
 from pydantic import Field, field_validator
 
 import vertax as vx
-from experiments._shared import HEXAGON
+from experiments._shared import HEXAGON, scan
 from vertax import mechanics, plotting, runs
 from vertax.dissipations import SubstrateFriction
 from vertax.energies import AreaElasticity, PerimeterElasticity
@@ -88,13 +89,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     table: dict[str, Any] = {"frequency": frequencies}
     metrics: dict[str, Any] = {}
     for name, (tissue, energy, expected) in samples.items():
-
-        def one(index: int, name: str = name, tissue: Any = tissue, energy: Any = energy) -> Any:
-            compute = lambda: {"modulus": measure(config, tissue, energy, frequencies[index])}
-            return folder.part(f"{name} {frequencies[index]:g}", compute)["modulus"]
-
-        parts = folder.map_in_threads(one, len(frequencies), progress=progress, unit="frequency")
-        values: Any = np.stack(parts)
+        compute = partial(measure, config, tissue, energy)
+        values: Any = scan(folder, name, config.frequencies, compute, progress=progress)["modulus"]
         measured[name] = values
         for label, moduli in (("measured", values), ("expected", expected)):
             table |= {f"{name}_storage_{label}": moduli.real, f"{name}_loss_{label}": moduli.imag}
@@ -164,7 +160,7 @@ def fluid_lattice(config: Config, lattice: Any, frequencies: np.ndarray) -> Samp
     return tissue, energy, config.stiffness * float(a) ** 2 * x / (1 + x)
 
 
-def measure(config: Config, tissue: Any, energy: vx.AbstractEnergy, frequency: float) -> np.ndarray:
+def measure(config: Config, tissue: Any, energy: Any, frequency: float) -> dict[str, np.ndarray]:
     """The complex modulus of the last period."""
     steps = config.steps
     times = 2 * np.pi / frequency * np.arange(config.cycles * steps + 1) / steps
@@ -173,7 +169,8 @@ def measure(config: Config, tissue: Any, energy: vx.AbstractEnergy, frequency: f
     movie = vx.Evolution(SubstrateFriction(config.friction), times, **options)(tissue, energy)
     stresses = all_stresses(movie.frames, energy) - mechanics.stress(tissue, energy)
     stress, phase = np.asarray(stresses)[-steps:, 0, 1], frequency * times[-steps:]
-    return np.asarray(2 * np.mean(stress * (np.sin(phase) + 1j * np.cos(phase))) / config.strain)
+    modulus = 2 * np.mean(stress * (np.sin(phase) + 1j * np.cos(phase))) / config.strain
+    return {"modulus": np.asarray(modulus)}
 
 
 @eqx.filter_jit

@@ -7,6 +7,7 @@ Laplace approximation. The cost is that of one effective draw, against random-wa
 
 import time
 import warnings
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from pydantic import Field
 from scipy import stats
 
 import vertax as vx
-from experiments._shared import fitted_noise
+from experiments._shared import fitted_noise, scan
 from vertax import bayes, plotting, runs
 from vertax.energies import ShapeFactorEnergy
 
@@ -61,8 +62,8 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the metrics count what they state
         for kind, n in (("vertices", config.replicates), ("image", config.image_replicates)):
-            compute = lambda number, kind=kind: calibrate(config, kind, int(number))
-            ranks[kind] = folder.scan(kind, [*map(float, range(n))], compute, progress=progress)
+            compute = partial(calibrate, config, kind)
+            ranks[kind] = scan(folder, kind, range(n), compute, progress=progress)
         rows = [cost(config, n) for n in config.cost_sizes]
     for kind, groups in ranks.items():
         for key in ("rejected trajectories", "draws with a short edge"):
@@ -114,8 +115,9 @@ def density(config: Config, kind: Literal["vertices", "image"], n: int, seed: in
     return bayes.LogPosterior(problem, prior, fitted_noise), truth
 
 
-def calibrate(config: Config, kind: Any, seed: int) -> dict[str, np.ndarray]:
+def calibrate(config: Config, kind: Any, number: float) -> dict[str, np.ndarray]:
     """Ranks of the true parameters among draws of the sampler and of the Laplace approximation."""
+    seed = int(number)
     posterior_density, truth = density(config, kind, config.n_cells, seed)
     options: Any = {"draws": 2 * config.draws, "warmup": config.warmup, "chains": 1, "progress": False}
     posterior = bayes.sample(posterior_density, seed, **options)

@@ -8,6 +8,7 @@ kept if its energy is smaller.
 """
 
 import time
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from pydantic import Field
 
 import vertax as vx
 from experiments._replicates import series_colours
-from experiments._shared import FLUID
+from experiments._shared import FLUID, scan
 from experiments._transition import fit_onset, fit_transition
 from vertax import plotting, runs
 from vertax.energies import ShapeFactorEnergy
@@ -74,20 +75,8 @@ class Curve(NamedTuple):
 
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """Transitions and onsets after the quench and after driving, with 95 % intervals of a bootstrap."""
-    began, response = time.perf_counter(), config.relaxation.build()
-
-    def compute(value: float) -> dict[str, np.ndarray]:
-        index, p0 = config.shape_factors.index(value), jnp.asarray(value)
-        key = jax.random.fold_in(jax.random.key(config.seed), index)
-        keys = jax.random.split(key, config.replicates + 1)
-        first, arguments = config.tissue.draw(keys[1:]), (response, config.driving, config.at_once)
-        results, tissues = jax.block_until_ready(relax(first, p0, keys[0], *arguments))
-        shapes = np.asarray(jax.vmap(lambda t: t.shape_factors)(tissues)).mean(axis=1)
-        some = jax.tree.map(lambda x: x[: config.modes], tissues)
-        modes = np.asarray(count_zero_modes(some, p0), float) if config.modes else np.zeros(0)
-        return {name: np.asarray(x) for name, x in results.items()} | {"shapes": shapes, "modes": modes}
-
-    results = folder.scan("p0", config.shape_factors, compute, progress=progress)
+    began = time.perf_counter()
+    results = scan(folder, "p0", config.shape_factors, partial(measure, config), progress=progress)
     seconds, energies = time.perf_counter() - began, results["energy"] / config.tissue.n_cells
     zero, converged, x = energies < config.zero_energy, results["converged"], np.asarray(config.shape_factors)
     metrics: dict[str, Any] = {}
@@ -117,6 +106,19 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         "num_t1": int(results["num_t1"].sum()),
     }
     return metrics
+
+
+def measure(config: Config, value: float) -> dict[str, np.ndarray]:
+    """Energies, transitions, shapes and modes of all replicates at one target shape factor."""
+    index, p0 = config.shape_factors.index(value), jnp.asarray(value)
+    key = jax.random.fold_in(jax.random.key(config.seed), index)
+    keys = jax.random.split(key, config.replicates + 1)
+    arguments = config.relaxation.build(), config.driving, config.at_once
+    results, tissues = jax.block_until_ready(relax(config.tissue.draw(keys[1:]), p0, keys[0], *arguments))
+    shapes = np.asarray(jax.vmap(lambda t: t.shape_factors)(tissues)).mean(axis=1)
+    some = jax.tree.map(lambda x: x[: config.modes], tissues)
+    modes = np.asarray(count_zero_modes(some, p0), float) if config.modes else np.zeros(0)
+    return {name: np.asarray(x) for name, x in results.items()} | {"shapes": shapes, "modes": modes}
 
 
 @eqx.filter_jit

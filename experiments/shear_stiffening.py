@@ -13,6 +13,7 @@ solid phase and keep their topology. The target shape factor of each is increase
 transition, and the tissue is sheared in both directions: $\gamma_c$ is half of the distance of both onsets.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
-from experiments._shared import columns, spread_of
+from experiments._shared import columns, scan, spread_of
 from vertax import mechanics, plotting, runs
 from vertax.energies import ShapeFactorEnergy
 from vertax.plotting import INK, SERIES
@@ -77,13 +78,9 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     edges = [(tissue, p0) for tissue, p0 in edges if fewest_sides(tissue) > 4]
     if not edges:
         return {"sheared": 0}
-
-    def compute(excess: float) -> dict[str, np.ndarray]:
-        settings = jnp.asarray(strains), jnp.asarray(config.zero_stress), fixed
-        courses = [shear(tissue, p0 + excess, *settings) for tissue, p0 in edges]
-        return columns(courses)
-
-    curves = folder.scan("excess", config.excess, compute, progress=progress)
+    settings = jnp.asarray(strains), jnp.asarray(config.zero_stress), fixed
+    compute = partial(shear_all, edges, settings)
+    curves = scan(folder, "excess", config.excess, compute, progress=progress)
     pairs, rows = [], []
     for i, k in np.ndindex(len(config.excess), len(edges)):
         one = {name: values[i, k] for name, values in curves.items()}
@@ -106,6 +103,11 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         "factor": by_excess("factor", spread_of),
         "factor_median": by_excess("factor", lambda values: float(np.median(values))),
     }
+
+
+def shear_all(edges: list[Any], settings: tuple[Any, ...], excess: float) -> dict[str, np.ndarray]:
+    """The curves of all tissues, at one excess of the shape factor over that of the transition."""
+    return columns([shear(tissue, p0 + excess, *settings) for tissue, p0 in edges])
 
 
 def fewest_sides(tissue: vx.Tissue) -> int:

@@ -7,6 +7,7 @@ doi:10.1088/1367-2630/aaaa13); the affine one, without displacements of the vert
 """
 
 import time
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -16,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 import vertax as vx
-from experiments._shared import FLUID, HEXAGON
+from experiments._shared import FLUID, HEXAGON, scan
 from vertax import mechanics, plotting, runs
 from vertax.plotting import INK, SERIES
 
@@ -42,16 +43,9 @@ class Config(runs.ExperimentConfig):
 
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
     """Mean moduli, the fraction of solid tissues, and the shape factor at which half of them are solid."""
-    began, response = time.perf_counter(), config.relaxation.build()
-    shape_factors = np.asarray(config.shape_factors)
-
-    def compute(p0: float) -> dict[str, np.ndarray]:
-        # The same first tissues at each shape factor.
-        first = config.tissue.draw(jax.random.split(jax.random.key(config.seed), config.replicates))
-        measured = measure(first, jnp.asarray(p0), response)
-        return {name: np.asarray(value) for name, value in measured.items()}
-
-    measured = folder.scan("p0", config.shape_factors, compute, progress=progress)
+    began, shape_factors = time.perf_counter(), np.asarray(config.shape_factors)
+    compute = partial(measure_replicates, config)
+    measured = scan(folder, "p0", config.shape_factors, compute, progress=progress)
     valid = measured["converged"] & np.isfinite(measured["shear"])
     values = {name: np.where(valid, measured[name], np.nan) for name in NAMES}
     means = {name: mean(value) for name, value in values.items()}
@@ -70,6 +64,13 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         "known_fraction": float(valid.mean()),
         "seconds": time.perf_counter() - began,
     }
+
+
+def measure_replicates(config: Config, p0: float) -> dict[str, np.ndarray]:
+    """The moduli of all replicates, from the same first tissues at each shape factor."""
+    first = config.tissue.draw(jax.random.split(jax.random.key(config.seed), config.replicates))
+    measured = measure(first, jnp.asarray(p0), config.relaxation.build())
+    return {name: np.asarray(value) for name, value in measured.items()}
 
 
 @eqx.filter_jit

@@ -18,6 +18,7 @@ Both are applied to each wing, to all together, and to synthetic wings with give
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -80,11 +81,13 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     first = next(iter(wings.values()))
     for number, noise in enumerate(config.synthetic_noise):
         sets[f"synthetic, noise {noise:g}"] = [padded(synthetic(first, truth, noise, number), capacity)]
-    rows = []
-    for name, members in sets.items():
-        for likelihood, sampler in (("forward", forward), ("force balance", force_balance)):
-            part = folder.part(f"{name}, {likelihood}", lambda: sampler(config, members))  # noqa: B023
-            rows.append({"data": name, "likelihood": likelihood} | summary(part))
+    names = [(name, likelihood) for name in sets for likelihood in SAMPLERS]
+    tasks = {f"{name}, {likelihood}": (sets[name], likelihood) for name, likelihood in names}
+    parts = folder.map_parts(partial(draw, config), tasks, progress=progress, unit="posterior")
+    rows = [
+        {"data": name, "likelihood": likelihood} | summary(parts[f"{name}, {likelihood}"])
+        for name, likelihood in names
+    ]
     folder.save_table("posteriors", columns(rows))
     expected = {"contrast": float((1 - truth["targets"]) / truth["tension"]), "share": float(truth["share"])}
     folder.save_figure("posteriors", plot(rows, expected))
@@ -142,6 +145,15 @@ def force_balance(config: Config, wings: Sequence[Wing]) -> dict[str, np.ndarray
     )
     chain.run(jax.random.key(config.seed))
     return {name: np.asarray(x) for name, x in chain.get_samples(group_by_chain=True).items()}
+
+
+SAMPLERS = {"forward": forward, "force balance": force_balance}
+
+
+def draw(config: Config, task: tuple[Sequence[Wing], str]) -> dict[str, np.ndarray]:
+    """Draws of one of the posteriors."""
+    wings, likelihood = task
+    return SAMPLERS[likelihood](config, wings)
 
 
 def summary(draws: dict[str, np.ndarray]) -> dict[str, Any]:

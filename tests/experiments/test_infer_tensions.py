@@ -104,6 +104,10 @@ def test_several_masks_have_one_table_and_an_animation(several, tmp_path):
             assert file.readline().strip().split(",") == described
     pictures = {file.name for file in (folder / "figures").iterdir()}
     assert pictures == {"m2.npy.png", "m10.npy.png"}
+    (several.parent / "one.toml").write_text(several.read_text() + "\nmaps = 1")
+    one, metrics = run(several.parent / "one.toml", tmp_path / "one")
+    assert "Maps of 1 of 2 masks (key maps)." in metrics["warnings"]
+    assert [file.name for file in (one / "figures").iterdir()] == ["m2.npy.png"]
     with Image.open(folder / "tensions.gif") as movie:
         assert movie.n_frames == 2
         first = np.asarray(movie.convert("RGB")).astype(int)

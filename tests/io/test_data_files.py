@@ -12,7 +12,7 @@ import meshio
 import numpy as np
 import pytest
 from free_helpers import cluster
-from helpers import random_tissue
+from helpers import counted_compilations, random_tissue
 
 import vertax as vx
 from vertax.io import cell_table, edge_table, write_csv, write_geojson, write_vtk
@@ -43,6 +43,14 @@ def tissue(request):
 @pytest.fixture(scope="module")
 def periodic():
     return made("periodic float64")
+
+
+def test_tables_of_similar_tissues_share_compiled_functions():
+    names, tissues = [], [cluster(n) for n in (12, 13)]
+    cell_table(tissues[0]), edge_table(tissues[0])
+    with counted_compilations(names):
+        cell_table(tissues[1]), edge_table(tissues[1])
+    assert names == []
 
 
 def area_of(ring):

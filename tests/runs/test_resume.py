@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from experiments._shared import scan
 from vertax.fitting._descent import Descent
 from vertax.runs import RunFolder
 from vertax.runs.command_line import app
@@ -176,7 +177,6 @@ def test_parts_are_computed_once(tmp_path):
 
 def test_values_of_a_scan_are_told_apart_in_all_digits(tmp_path):
     values = [3.8, 3.8 + 1e-9]
-    scanned = RunFolder(tmp_path).scan(
-        "p0", values, lambda p0: {"p0": np.array(p0)}, progress=False
-    )
+    compute = lambda p0: {"p0": np.array(p0)}
+    scanned = scan(RunFolder(tmp_path), "p0", values, compute, progress=False)
     np.testing.assert_array_equal(scanned["p0"], values)

@@ -149,16 +149,15 @@ def counted(monkeypatch):
 
 def test_failed_runs_are_repeated_and_finished_ones_kept(tiny, counted):
     runs = sweep_runs(["tiny.toml"], {"seed": ["0", "3"]}, "out")
-    options = {"executor": None, "progress": False}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_sweep, "LocalProcesses", ThreadPoolExecutor)
-        assert sweep(runs, tiny / "out", workers=1, **options) == {
+        assert sweep(runs, tiny / "out", executor=ThreadPoolExecutor(1), progress=False) == {
             "tiny-seed_3": "ValueError: It broke."
         }
         assert [run.is_finished for run in runs] == [True, False]
         # The table has the failure also in a process that did not execute the run.
         assert sweep_table(runs, {})["error"] == ["", "It broke."]
-        sweep(runs, tiny / "out", workers=1, **options)
+        sweep(runs, tiny / "out", executor=ThreadPoolExecutor(1), progress=False)
     assert counted == [0, 3, 3]
 
 

@@ -7,7 +7,14 @@ from test_damaged_masks import mask as mask
 
 import vertax as vx
 from vertax.io import read_table
-from vertax.tensions import MaskFrame, find_masks, infer_tensions, infer_tensions_of_masks
+from vertax.tensions import (
+    MaskFrame,
+    TensionsOfMasks,
+    _tensions_of_masks,
+    find_masks,
+    infer_tensions,
+    infer_tensions_of_masks,
+)
 
 
 def test_one_table_of_a_folder_with_a_file_that_cannot_be_read(mask, tmp_path):
@@ -69,8 +76,9 @@ def test_finished_masks_are_read_from_the_cache(mask, tmp_path, monkeypatch):
     )
     second = infer_tensions_of_masks(masks, **options)
     assert calls == []
-    assert jax.tree.structure(first) == jax.tree.structure(second)
-    jax.tree.map(np.testing.assert_array_equal, first, second)  # NaN is equal to NaN
+    one, two = dict(first.results), dict(second.results)
+    assert jax.tree.structure(one) == jax.tree.structure(two)
+    jax.tree.map(np.testing.assert_array_equal, one, two)  # NaN is equal to NaN
     for one, other in zip(first.write(tmp_path / "a"), second.write(tmp_path / "b"), strict=True):
         assert one.read_text() == other.read_text()
     assert len(first.change_table()["kind"]) > 0
@@ -82,6 +90,25 @@ def test_finished_masks_are_read_from_the_cache(mask, tmp_path, monkeypatch):
     monkeypatch.setattr(vx, "__version__", "another", raising=False)
     infer_tensions_of_masks(masks, **options)
     assert len(calls) == 5
+
+
+@pytest.mark.parametrize("format", ["csv", "parquet"])
+def test_tables_in_parts_are_one_table(mask, tmp_path, monkeypatch, format):
+    if format == "parquet":
+        pytest.importorskip("pyarrow", reason="needs PyArrow, of the extra [cluster]")
+    damaged = np.where(mask == 3, 0, mask)
+    tensions = infer_tensions_of_masks(
+        [mask, damaged, np.zeros_like(mask)], cache=tmp_path / "cache", progress=False
+    )
+    for number in range(2):  # the second time another part size, which leaves no old part
+        monkeypatch.setattr(_tensions_of_masks, "_MASKS_PER_PART", 1 + number)
+        paths = tensions.write(tmp_path / "tables", format=format)
+    for name, path in zip(("cell", "edge", "change", "frame"), paths, strict=False):
+        written, table = read_table(path), getattr(tensions, f"{name}_table")()
+        assert list(written) == list(table)
+        for column, values in table.items():
+            np.testing.assert_array_equal(written[column], values)
+    assert list(written["error"] != "") == [False, False, True]
 
 
 def test_masks_in_subfolders_are_found_with_a_pattern(tmp_path):
@@ -132,6 +159,8 @@ def test_wrong_options_and_empty_sources_raise(mask, tmp_path):
 def test_masks_of_another_kind_raise(without_type_checks):
     with pytest.raises(TypeError, match=r"`masks` must be a folder, .* but is None"):
         find_masks(None)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match='`format` must be "csv" or "parquet"'):
+        TensionsOfMasks({}, {}).write("x", format="xlsx")  # pyright: ignore[reportArgumentType]
 
 
 def test_two_holes_are_not_mirrored_cells(mask):

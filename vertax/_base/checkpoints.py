@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+import wadler_lindig
 from jaxtyping import PyTree, Shaped
 
 from vertax._base.archive import as_jax, read_archive, write_archive
@@ -127,6 +128,11 @@ class CheckpointFile:
 def without_addresses(text: str) -> str:
     """Remove memory addresses from a text, which differ between processes."""
     return re.sub(r" at 0x[0-9a-f]+", "", text)
+
+
+def layout(tree: PyTree) -> str:
+    """Sizes, classes and settings of a pytree, defaults too: after pickling they are other objects."""
+    return without_addresses(wadler_lindig.pformat(tree, width=100, hide_defaults=False))
 
 
 def digest(tree: PyTree) -> str:

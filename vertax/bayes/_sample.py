@@ -25,7 +25,7 @@ from vertax._base.checkpoints import (
     Progress,
     columns_of,
     digest,
-    without_addresses,
+    layout,
 )
 from vertax._base.checks import as_key, check_integer
 from vertax._base.fingerprint import fingerprint
@@ -103,9 +103,7 @@ def sample(
 
     def identity() -> dict[str, str]:
         return {
-            "density (sizes, classes or settings)": without_addresses(
-                eqx.tree_pformat(log_posterior, short_arrays=True, width=100)
-            ),
+            "density (sizes, classes or settings)": layout(log_posterior),
             "density (numbers in its arrays)": digest((log_posterior, start)),
             f"density ({COMPUTATION})": fingerprint(
                 lambda density: evaluate(density, density.start()), log_posterior

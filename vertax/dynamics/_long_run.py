@@ -21,7 +21,7 @@ from vertax._base.checkpoints import (
     Progress,
     Row,
     digest,
-    without_addresses,
+    layout,
 )
 from vertax._base.fingerprint import fingerprint
 from vertax._base.results import RESULTS
@@ -179,9 +179,7 @@ def _identity(tissue: Tissue, energy: Any, evolution: Any) -> dict[str, str]:
     parts = (tissue, energy, without_times)
     two_times = eqx.tree_at(lambda e: e.times, evolution, evolution.times[:2])
     return {
-        "tissue, energy or setting": without_addresses(
-            eqx.tree_pformat(parts, short_arrays=True, width=100)
-        ),
+        "tissue, energy or setting": layout(parts),
         "tissue, energy or setting (numbers in its arrays)": digest(parts),
         f"tissue, energy or setting ({COMPUTATION})": fingerprint(
             _first_step, tissue, energy, two_times

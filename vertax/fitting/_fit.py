@@ -26,7 +26,7 @@ from vertax._base.checkpoints import (
     Row,
     columns_of,
     digest,
-    without_addresses,
+    layout,
 )
 from vertax._base.fingerprint import fingerprint
 from vertax._base.results import RESULTS, index_of, result_of, where_is
@@ -248,9 +248,8 @@ def _identity_of(
     problem: PyTree, truth: PyTree, method: AbstractMethod, batched: bool
 ) -> dict[str, str]:
     """Texts and digests that identify a fit, by their names in messages."""
-    layout = eqx.tree_pformat((problem, truth), short_arrays=True, width=100)
     return {
-        "problem (sizes, classes or settings)": without_addresses(layout),
+        "problem (sizes, classes or settings)": layout((problem, truth)),
         "problem (numbers in its arrays)": digest((problem, truth)),
         "optimiser": method.description(),
         "setting of `batched`": str(batched),

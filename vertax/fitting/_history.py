@@ -81,7 +81,7 @@ class Fit(eqx.Module, Generic[Energy]):
 class FitError(RuntimeError):
     """A fit that failed; `fit` holds the result up to then, or None."""
 
-    def __init__(self, message: str, fit: Fit | None):
+    def __init__(self, message: str, fit: Fit | None = None):
         super().__init__(message)
         self.fit = fit
 

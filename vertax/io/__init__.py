@@ -4,9 +4,11 @@ from vertax._base.pixels import pixel_sides as pixel_sides
 from vertax.io._bounded_tables import BoundedTables as BoundedTables
 from vertax.io._chaste import write_chaste as write_chaste
 from vertax.io._data_tables import (
+    append_parquet as append_parquet,
     cell_table as cell_table,
     edge_table as edge_table,
     write_csv as write_csv,
+    write_rows as write_rows,
 )
 from vertax.io._edge_table import from_edge_table as from_edge_table
 from vertax.io._force_inference import read_force_inference as read_force_inference
@@ -21,10 +23,7 @@ from vertax.io._module_file import (
 from vertax.io._pixel_size import pixel_aspect as pixel_aspect, pixel_size as pixel_size
 from vertax.io._read_geojson import read_geojson as read_geojson
 from vertax.io._read_table import read_table as read_table
-from vertax.io._surface_evolver import (
-    Foam as Foam,
-    read_surface_evolver as read_surface_evolver,
-)
+from vertax.io._surface_evolver import Foam as Foam, read_surface_evolver as read_surface_evolver
 from vertax.io._tables import Tables as Tables, from_tables as from_tables, to_tables as to_tables
 from vertax.io._tissue_file import load_tissue as load_tissue, save_tissue as save_tissue
 from vertax.io._trajectory import (

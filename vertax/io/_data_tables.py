@@ -8,7 +8,8 @@ import math
 import numbers
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from pathlib import Path
+from typing import IO, Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +17,8 @@ from jaxtyping import Array, Shaped
 
 from vertax._base.atomic import atomic_write
 from vertax._base.checks import check_concrete, describe
-from vertax.mesh import Drawing, Tissue
+from vertax._base.extras import requires_extra
+from vertax.mesh import Drawing, Tissue, pad
 
 Column: TypeAlias = Array | np.ndarray | Sequence[Any]
 
@@ -90,6 +92,65 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
     - `ValueError` for columns of different lengths, or of more than one dimension.
     - `TypeError` if `table` is not a table, or holds other things than numbers, booleans, text and dates.
     """
+    with atomic_write(path, newline="") as file:
+        write_rows(file, table)
+
+
+def write_rows(file: IO[str], table: Mapping[str, Column], *, names: bool = True) -> None:
+    """Write a part of a table to an open CSV file.
+
+    **Arguments:**
+
+    - `file`: the file, open for text with `newline=""`.
+    - `table`: as of [`write_csv`][vertax.io.write_csv].
+    - `names`: write the names of the columns first.
+
+    **Raises:** as [`write_csv`][vertax.io.write_csv].
+    """
+    columns = _columns(table)
+    texts = [[_text(name, value) for value in column] for name, column in columns.items()]
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerows([columns] if names else [])
+    writer.writerows(zip(*texts, strict=True))
+
+
+def append_parquet(folder: str | os.PathLike[str], table: Mapping[str, Column]) -> Path:
+    """Append rows to a table in a folder of Parquet files: each call writes one file, atomically.
+
+    [`read_table`][vertax.io.read_table], pandas, Polars and Dask read the folder as one table.
+
+    ```python
+    finished = set(vx.io.read_table("results")["task"])  # of an earlier run: continue with the others
+    ```
+
+    **Arguments:**
+
+    - `folder`: the folder; it is made if it does not exist.
+    - `table`: as of [`write_csv`][vertax.io.write_csv]; some thousand rows at a time make few files.
+
+    **Returns:** the file. Files are numbered.
+
+    **Raises:** as [`write_csv`][vertax.io.write_csv], and
+
+    - `ImportError` if PyArrow is not installed: `pip install -e ".[cluster]"`.
+    """
+    with requires_extra("cluster", "Writing Parquet files"):
+        import pyarrow  # pyright: ignore[reportMissingImports]
+        import pyarrow.parquet  # pyright: ignore[reportMissingImports]
+    masked = {
+        name: (np.ma.getdata(x), np.ma.getmaskarray(x)) for name, x in _columns(table).items()
+    }
+    arrays = {name: pyarrow.array(data, mask=mask) for name, (data, mask) in masked.items()}
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    number = 1 + max((int(file.stem) for file in folder.glob("*.parquet")), default=-1)
+    with atomic_write(folder / f"{number:06}.parquet", "wb") as file:
+        pyarrow.parquet.write_table(pyarrow.table(arrays), file)
+    return folder / f"{number:06}.parquet"
+
+
+def _columns(table: Mapping[str, Column]) -> dict[str, np.ndarray]:
+    """The columns of a table as arrays of one dimension and one length."""
     if not isinstance(table, Mapping):
         raise TypeError(
             f"Argument `table` must hold columns by name, as a dictionary does, but is {describe(table)}."
@@ -106,29 +167,24 @@ def write_csv(path: str | os.PathLike[str], table: Mapping[str, Column]) -> None
         raise ValueError(
             f"Argument `table` must hold columns of one length, but they have {lengths}."
         )
-    texts = [[_text(name, value) for value in column] for name, column in columns.items()]
-    rows = zip(*texts, strict=True)
-    with atomic_write(path, newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
+    return columns
 
 
 def cell_columns(
     tissue: Tissue, drawing: Drawing, columns: Mapping[str, Column]
 ) -> dict[str, np.ndarray]:
     """The columns of `cell_table`, cells placed as in a drawing."""
-    m = tissue.topology
-    outline = np.asarray(m.edge_cells)[np.asarray(m.on_outline)]
+    n, padded = tissue.n_cells, pad(tissue)  # tissues of similar size share compiled functions
+    outline = np.asarray(padded.topology.edge_cells)[np.asarray(padded.topology.on_outline)]
     table = {
-        "cell": np.arange(tissue.n_cells),
+        "cell": np.arange(n),
         "x": drawing.centroids[:, 0],
         "y": drawing.centroids[:, 1],
-        "area": tissue.areas,
-        "perimeter": tissue.perimeters,
-        "shape_factor": tissue.shape_factors,
-        "sides": tissue.neighbour_counts,
-        "on_outline": np.isin(np.arange(tissue.n_cells), outline),
+        "area": padded.areas,
+        "perimeter": padded.perimeters,
+        "shape_factor": padded.shape_factors,
+        "sides": padded.neighbour_counts,
+        "on_outline": np.isin(np.arange(n), outline),
     }
     table = _joined(table, columns, "cell", tissue.n_cells)
     return {name: column[drawing.alive] for name, column in table.items()}
@@ -138,15 +194,16 @@ def edge_columns(
     tissue: Tissue, drawing: Drawing, columns: Mapping[str, Column]
 ) -> dict[str, np.ndarray]:
     """The columns of `edge_table`, edges placed as in a drawing."""
-    m = tissue.topology
-    cells, vertices = np.asarray(m.edge_cells), np.asarray(m.edge_vertices)
-    cells = np.where(cells == tissue.n_cells, -1, cells)
+    n, padded = tissue.n_edges, pad(tissue)
+    m = padded.topology
+    cells, vertices = np.asarray(m.edge_cells)[:n], np.asarray(m.edge_vertices)[:n]
+    cells = np.where(cells == padded.n_cells, -1, cells)
     # The end of an edge is the start of the next half-edge of the cell, exactly; the end of the line that
     # draws an arc is rounded.
     start = drawing.lines[drawing.half_edge, 0]
     end = drawing.lines[drawing.following[drawing.half_edge], 0]
     table = {
-        "edge": np.arange(tissue.n_edges),
+        "edge": np.arange(n),
         "left_cell": cells[:, 0],
         "right_cell": cells[:, 1],
         "start_vertex": vertices[:, 0],
@@ -155,8 +212,8 @@ def edge_columns(
         "start_y": start[:, 1],
         "end_x": end[:, 0],
         "end_y": end[:, 1],
-        "length": tissue.edge_lengths,
-        "angle": tissue.edge_angles,
+        "length": padded.edge_lengths,
+        "angle": padded.edge_angles,
         "on_outline": m.on_outline,
     }
     table = _joined(table, columns, "edge", tissue.n_edges)
@@ -179,7 +236,7 @@ def check_single(tissue: Tissue) -> None:
 def _joined(
     table: Mapping[str, Any], columns: Mapping[str, Column], what: str, size: int
 ) -> dict[str, np.ndarray]:
-    joined = {name: np.asarray(column) for name, column in table.items()}
+    joined = {name: np.asarray(column)[:size] for name, column in table.items()}
     if not isinstance(columns, Mapping):
         raise TypeError(
             f"Columns of the {what}s must be given by name, as in a dictionary, but are {describe(columns)}."

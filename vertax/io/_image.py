@@ -109,9 +109,7 @@ def _read(file: Path) -> tuple[np.ndarray, str]:
             raise ValueError(f"its axes are {axes} with shape {pixels.shape}")
     except ImportError:
         raise
-    except (
-        Exception
-    ) as error:  # each reader raises other exceptions for files that it cannot decode
+    except Exception as error:  # of another type for each reader
         raise ValueError(
             f"Argument `path` must name an image file, but {file} cannot be read as one: {error}"
         ) from error
@@ -126,10 +124,7 @@ def _read_tiff(file: Path) -> tuple[np.ndarray, str]:
         axes = series.axes
         try:
             pixels = series.asarray()
-        except (
-            ValueError,
-            ImportError,
-        ) as error:  # a compression that tifffile leaves to imagecodecs
+        except (ValueError, ImportError) as error:  # a compression for imagecodecs
             try:
                 pixels = _decoded_by_pillow(file, series)
             except Exception:

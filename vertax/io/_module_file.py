@@ -323,10 +323,7 @@ class _Reader:
     """Rebuild the modules that `_Writer` wrote; everything in the file is checked."""
 
     def __init__(
-        self,
-        file: str,
-        arrays: dict[str, np.ndarray],
-        user_classes: dict[str, type[eqx.Module]],
+        self, file: str, arrays: dict[str, np.ndarray], user_classes: dict[str, type[eqx.Module]]
     ):
         self.file = file
         self.arrays = arrays

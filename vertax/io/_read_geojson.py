@@ -70,9 +70,7 @@ def read_geojson(
     if tolerance is None:
         tolerance = 1e-6 * size_of_cells(corner[:, :2], cells, images, None)
     names = Names(
-        f"The polygons of {path}",
-        _at(corner),
-        lambda cell: f"feature {features[cell]['number']}",
+        f"The polygons of {path}", _at(corner), lambda cell: f"feature {features[cell]['number']}"
     )
     polygons = tissue_from_near_corners(
         corner,

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from vertax._base.checks import describe
+from vertax._base.extras import requires_extra
 from vertax.io._chaste import read_chaste
 from vertax.io._read_vtk import read_vtk
 
@@ -29,10 +30,10 @@ _HEADERS = 5
 
 
 def read_table(path: str | os.PathLike[str]) -> dict[str, Shaped[np.ndarray, " rows"]]:
-    """Read the columns of a CSV file, the properties of a GeoJSON file, or polygons of Chaste or VTK.
+    """Read the columns of a CSV or Parquet file, properties of a GeoJSON file, or polygons of Chaste or VTK.
 
-    It reads what [`write_csv`][vertax.io.write_csv] and [`write_geojson`][vertax.io.write_geojson] write:
-    numbers are the same to the last bit.
+    It reads what [`write_csv`][vertax.io.write_csv], [`append_parquet`][vertax.io.append_parquet] and
+    [`write_geojson`][vertax.io.write_geojson] write: numbers are the same to the last bit.
 
     ```python
     table = vx.io.read_table("cells.csv")
@@ -47,6 +48,7 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Shaped[np.ndarray, " r
 
     - `path`: the file. Files that end in `.geojson` or `.json` are GeoJSON; nested properties are columns
         with both names, such as `classification.name`, and lists are left out, with a warning. A folder holds
+        Parquet files, the parts of one table in the order of their names, or
         results of Chaste: `results.viznodes`, `results.vizelements` and, if there are, `results.vizlabels` or
         `results.vizcelltypes` and `loggedcell.dat`; a last line without an end is left out, with a warning.
         `.pvd` and `.vtu` files are polygons of VTK in a plane, read through meshio (`pip install -e
@@ -61,9 +63,11 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Shaped[np.ndarray, " r
 
     - `OSError` if the file cannot be read.
     - `ValueError`, naming the file and the line or feature, if it is no such table.
-    - `ImportError` for VTK files if meshio is not installed.
+    - `ImportError` for VTK files if meshio is not installed, and for Parquet files if PyArrow is not.
     """
     path = Path(path)
+    if path.suffix == ".parquet" or (path.is_dir() and any(path.glob("*.parquet"))):
+        return _read_parquet(path)
     if path.is_dir():
         return read_chaste(path)
     if path.suffix in (".pvd", ".vtu"):
@@ -71,6 +75,19 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Shaped[np.ndarray, " r
     if path.suffix.lower() in (".geojson", ".json"):
         return properties(read_features(path), path)
     return _read_csv(path)
+
+
+def _read_parquet(path: Path) -> dict[str, np.ndarray]:
+    with requires_extra("cluster", "Reading Parquet files"):
+        import pyarrow.parquet  # pyright: ignore[reportMissingImports]
+    try:
+        table = pyarrow.parquet.read_table(path)
+    except ValueError as error:
+        raise ValueError(f"{path} is no Parquet table: {error}.") from error
+    arrays = {name: table[name].to_numpy() for name in table.column_names}
+    return {
+        name: _from_json(x.tolist()) if x.dtype.kind == "O" else x for name, x in arrays.items()
+    }
 
 
 def column(table: Any, name: str, argument: str) -> Shaped[np.ndarray, " rows"]:

@@ -116,6 +116,10 @@ class Config(runs.ExperimentConfig):
     """Standard deviation of the position of an edge, in pixels; left out, the distance of pixels to arcs."""
     prior: float | None = Field(default=None, gt=0)
     """Standard deviation of relative tensions without the image; left out, twice as much as they differ."""
+    tables: Literal["csv", "parquet"] = "csv"
+    """Format of the tables of all masks; Parquet needs the extra [cluster]."""
+    maps: int = Field(default=500, ge=0)
+    """Largest number of masks with a map, the first ones, which are the frames of the animation."""
 
 
 def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dict[str, Any]:
@@ -142,7 +146,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         executor=folder.executor,
         progress=progress,
     )
-    masks.write(folder.path)
+    masks.write(folder.path, format=config.tables)
     for name, result in masks.results.items():
         for warning in result.warnings:
             folder.warn(warning, str(name) if len(frames) > 1 else None)
@@ -150,8 +154,12 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         folder.warn(f"no result: {error.removesuffix('.')}", str(name))
     if len(frames) > 1:
         folder.print_step("maps")
-        maps = draw_maps(folder, frames, masks, reading)
-        plotting.animate_figures(maps, folder.path / "tensions.gif", fps=4)
+        chosen = [frame for frame in frames if frame.name in masks.results][: config.maps]
+        if len(chosen) < len(masks.results):
+            folder.warn(f"maps of {len(chosen)} of {len(masks.results)} masks (key maps)")
+        maps = draw_maps(folder, chosen, masks, reading)
+        if chosen:
+            plotting.animate_figures(maps, folder.path / "tensions.gif", fps=4)
         return measure_masks(masks)
     (result,) = masks.results.values()
     folder.save_tissue("seen", result.tissue)
@@ -187,21 +195,17 @@ def draw_maps(
     reading: dict[str, Any],
 ) -> Iterator[Figure]:
     """A map of each mask, all with the same limits of the colours."""
-    limits: dict[str, float] = {}
-    for prefix, table, key in (
-        ("", masks.cell_table(), "pressure"),
-        ("edge_", masks.edge_table(), "tension"),
-    ):
-        values = table[key][table["determined"]]
-        if values.size:
-            limits |= {f"{prefix}vmin": values.min(), f"{prefix}vmax": values.max()}
+    extremes: dict[str, list[float]] = {"": [], "edge_": []}
+    for result in map(masks.results.__getitem__, (frame.name for frame in frames)):
+        extremes[""] += result.pressures[result.pressures_determined].tolist()
+        extremes["edge_"] += result.tensions[result.determined].tolist()
+    limits = {f"{x}vmin": min(values) for x, values in extremes.items() if values}
+    limits |= {f"{x}vmax": max(values) for x, values in extremes.items() if values}
     for frame in frames:
-        if frame.name in masks.results:
-            mask = frame.mask(**reading)
-            figure = plotting.plot_tensions(masks.results[frame.name], mask, **limits)
-            figure.axes[0].set_title(str(frame.name))
-            folder.save_figure(str(frame.name).replace("/", "_"), figure)
-            yield figure
+        figure = plotting.plot_tensions(masks.results[frame.name], frame.mask(**reading), **limits)
+        figure.axes[0].set_title(str(frame.name))
+        folder.save_figure(str(frame.name).replace("/", "_"), figure)
+        yield figure
 
 
 def draw_cluster(config: Config) -> tuple[tuple[Any, Any], np.ndarray]:
@@ -308,14 +312,10 @@ def measure(result: InferredTensions) -> dict[str, Any]:
     if result.mask_report is not None:
         summary = result.mask_report.summary()
         metrics |= {f"mask_{name}": value for name, value in summary.items()}
+    pressures = result.pressures, result.pressure_deviations, result.pressures_determined
     for name, values, deviations, determined in (
         ("tension", result.tensions, result.tension_deviations, result.determined),
-        (
-            "pressure",
-            result.pressures,
-            result.pressure_deviations,
-            result.pressures_determined,
-        ),
+        ("pressure", *pressures),
     ):
         if determined.any():
             inferred = values[determined]

@@ -33,14 +33,10 @@ def geometry_of(tissue: Tissue) -> Geometry:
     m = tissue.topology
     sizes = (m.n_edges, m.n_edges, m.n_half_edges, m.n_edges, m.n_edges, m.n_edges, m.n_cells)
     geometry = Geometry(*(x[:size] for x, size in zip(parts, sizes, strict=True)))
-    cells = geometry.edge_cells
-    return geometry._replace(
-        edge_cells=np.where(cells == padded.n_cells, tissue.n_cells, cells),
-        edge_vectors=geometry.edge_vectors.astype(float),
-        edge_lengths=geometry.edge_lengths.astype(float),
-        edge_angles=geometry.edge_angles.astype(float),
-        areas=geometry.areas.astype(float),
-    )
+    cells = np.where(geometry.edge_cells == padded.n_cells, tissue.n_cells, geometry.edge_cells)
+    names = ("edge_vectors", "edge_lengths", "edge_angles", "areas")
+    floats = {name: getattr(geometry, name).astype(float) for name in names}
+    return geometry._replace(edge_cells=cells, **floats)
 
 
 @announced_jit

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.indexing import take
 from vertax.mesh._boundary import Periodic
+from vertax.mesh._padding import pad
 from vertax.mesh._tissue import Tissue
 
 _POINTS_PER_ARC = 24
@@ -55,8 +56,10 @@ class Drawing(eqx.Module):
         near: Float[np.ndarray, "cells 2"] | None = None,
     ):
         m = tissue.topology
-        geometry = (np.asarray(x) for x in _geometry(tissue, points_per_arc))
-        lines, centroids, areas, following = geometry
+        sizes = (m.n_half_edges, m.n_cells, m.n_cells, m.n_half_edges, m.n_cells, m.n_edges)
+        # (Padded, so that tissues of similar size share the compiled function.)
+        parts = zip(_geometry(pad(tissue), points_per_arc), sizes, strict=True)
+        lines, centroids, areas, following, *alive = (np.asarray(x)[:n] for x, n in parts)
         image = np.zeros((m.n_faces, 2), int)
         shift = np.zeros((m.n_faces, 2))
         self.box = self.lattice = None
@@ -79,7 +82,7 @@ class Drawing(eqx.Module):
         self.image = np.asarray(m.frame) + image[self.cell]
         self.n_cells = tissue.n_cells
         self.n_edges = tissue.n_edges
-        self.alive, self.alive_edges = np.asarray(tissue.alive), np.asarray(m.alive_edges)
+        self.alive, self.alive_edges = alive
         self.centroids = centroids.astype(float) + shift[: tissue.n_cells]
         self.centroids[~self.alive] = np.nan
         self.following = following
@@ -150,11 +153,11 @@ def cell_polygons(
 
 
 @eqx.filter_jit  # one compilation instead of one for each operation
-def _geometry(tissue: Tissue, points_per_arc: int) -> tuple[Array, Array, Array, Array]:
+def _geometry(tissue: Tissue, points_per_arc: int) -> tuple[Array, ...]:
     m = tissue.topology
     fractions = jnp.linspace(0, 1, 2 if tissue.angles is None else points_per_arc + 1)
     points = take(tissue.edge_points(fractions.astype(tissue.vertices.dtype)), m.edge)
     points = jnp.where(m.forward[:, None, None], points, points[:, ::-1])
     # (In this order a line starts exactly at its corner: files keep vertices to the last bit.)
     lines = tissue.corners[:, None] + (points - points[:, :1])
-    return lines, tissue.centroids, tissue.areas, m.next
+    return lines, tissue.centroids, tissue.areas, m.next, tissue.alive, m.alive_edges

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import importlib
 import json
 import os
 import re
@@ -30,11 +31,7 @@ class Section(pydantic.BaseModel):
     """
 
     model_config = pydantic.ConfigDict(
-        extra="forbid",
-        strict=True,
-        frozen=True,
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
     # An experiment may change the defaults of a shared table, `fit: Fitting = Fitting(epochs=150)`.
@@ -67,6 +64,14 @@ class ExperimentConfig(Section):
                 f"with precision float32, `seed` must be below 2**32, but is {self.seed}"
             )
         return self
+
+    def __reduce__(self) -> Any:  # pickle does not find the class that `with_name` makes
+        content = self.model_dump(mode="json", exclude_none=True)
+        return _restored, (type(self).__module__, self.experiment, content)
+
+
+def _restored(module: str, name: str, content: dict[str, Any]) -> ExperimentConfig:
+    return validate(with_name(importlib.import_module(module).Config, name), content)
 
 
 Model = TypeVar("Model", bound=Section)

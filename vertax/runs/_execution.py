@@ -40,6 +40,7 @@ _FILES = (
     "*.geojson",
     "*.npz",
     "*.npy",
+    "*/*.parquet",
     *_FIGURES,
     f"{PARTS}/*.npz",
     CONFIG,

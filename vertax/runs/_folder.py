@@ -7,7 +7,9 @@ import contextlib
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,6 +49,7 @@ _UNDATED: dict[str, dict[str, None]] = {"pdf": {"CreationDate": None}, "svg": {"
 _VECTOR_STYLE: Any = {"pdf.fonttype": 42, "svg.hashsalt": "vertax"}
 
 Callback = Callable[[int, Record], Mapping[str, ArrayLike] | None]
+Notes = Callable[[InverseProblem[Any], Record], Mapping[str, ArrayLike]]
 Result = TypeVar("Result")
 
 
@@ -66,7 +69,7 @@ class RunFolder:
     - `figures`: formats of the pictures, of `"png"`, `"pdf"` and `"svg"`; each picture is written in all
         of them.
     - `print_steps`: whether `print_step` prints.
-    - `executor`: workers of a cluster (`--scheduler`) for [`map_tasks`][vertax.map_tasks], if there are any.
+    - `executor`: workers (of `--workers`, `--scheduler` or `--cluster`) for [`map_tasks`][vertax.map_tasks].
     """
 
     interrupted: bool
@@ -169,10 +172,10 @@ class RunFolder:
         problems: Sequence[InverseProblem[Any]],
         fitting: Fitting,
         *,
-        notes: Callable[[InverseProblem[Any], Record], Mapping[str, ArrayLike]] | None = None,
+        notes: Notes | None = None,
         progress: bool = True,
     ) -> Fit[Any]:
-        """Fit problems of one shape in threads.
+        """Fit problems of one shape in threads, or on the workers of the run.
 
         In a batch each epoch takes as many steps as its slowest relaxation, which with T1 transitions is many
         times the median.
@@ -190,24 +193,27 @@ class RunFolder:
 
         **Raises:** as `fit` and `map_in_threads`.
         """
+        names = [f"{name} {index}" for index in range(len(problems))]
+        options: dict[str, Any] = {"progress": progress, "unit": "fit"}
+        if self.executor is not None:  # workers send checkpoints of finished fits
+            tasks = [
+                t for t in zip(names, problems, strict=True) if not self._part_file(t[0]).exists()
+            ]
+            call = partial(_checkpoint, fitting=fitting, notes=notes)
+            for number, content in self._map(call, tasks, self.executor, **options):
+                with atomic_write(self._part_file(tasks[number][0]), "wb") as file:
+                    file.write(content)
 
         def fit_one(index: int) -> Fit[Any]:
-            problem = problems[index]
-            options: dict[str, Any] = {"progress": False}
-            if (compute := notes) is not None:
-                options["callback"] = lambda _, record: compute(problem, record)
-            return self.fit(f"{name} {index}", problem, fitting.build(), fitting.epochs, **options)
+            watch: Any = (compute := notes) and (lambda _, record: compute(problems[index], record))
+            arguments = problems[index], fitting.build(), fitting.epochs
+            return self.fit(names[index], *arguments, callback=watch, progress=False)
 
-        fits = self.map_in_threads(fit_one, len(problems), progress=progress, unit="fit")
+        fits = self.map_in_threads(fit_one, len(names), **options)
         return stack_fits(fits, at_once=num_threads())
 
     def map_in_threads(
-        self,
-        function: Callable[[int], Result],
-        n: int,
-        *,
-        progress: bool = True,
-        unit: str = "run",
+        self, function: Callable[[int], Result], n: int, *, progress: bool = True, unit: str = "run"
     ) -> list[Result]:
         """Call a function for each of 0 … n - 1 in threads, one per core.
 
@@ -234,48 +240,54 @@ class RunFolder:
             self._check_interrupt()
             return function(index)
 
-        results: dict[int, Result] = {}
-        try:
-            with concurrent.futures.ThreadPoolExecutor(num_threads()) as pool:
-                options: dict[str, Any] = {"executor": pool, "unit": unit}
-                for numbers, shown in ((range(min(n, 1)), False), (range(1, n), progress)):
-                    outcomes = map_tasks(call, numbers, progress=shown, **options)
+        results = dict(self._map(call, range(n), None, progress=progress, unit=unit))
+        return [results[index] for index in range(n)]
+
+    def map_parts(
+        self,
+        compute: Callable[[Any], Mapping[str, np.ndarray]],
+        tasks: Mapping[str, Any],
+        *,
+        progress: bool = True,
+        unit: str = "part",
+    ) -> dict[str, dict[str, Shaped[np.ndarray, "..."]]]:
+        """Arrays of many tasks, such as replicates, from the workers of the run or else from threads.
+
+        **Arguments:**
+
+        - `compute`: returns the arrays of a task by name; picklable, such as a function of a module.
+        - `tasks`: the tasks by unique names; a resumed run keeps those that are computed.
+        - `progress`, `unit`: as of `map_in_threads`.
+
+        **Returns:** the arrays of each task by name.
+
+        **Raises:** as `map_in_threads`.
+        """
+        missing = [name for name in tasks if not self._part_file(name).exists()]
+        values = [tasks[name] for name in missing]
+        options: Any = {"progress": progress, "unit": unit}
+        for number, arrays in self._map(compute, values, self.executor, **options):
+            write_archive(self._part_file(missing[number]), "part", 1, arrays)
+        return {name: self.part(name, dict) for name in tasks}
+
+    def _map(
+        self, function: Callable[[Any], Result], tasks: Sequence[Any], executor: Any, **options: Any
+    ) -> Iterator[tuple[int, Result]]:
+        """Number and result of each task, as they end; in threads the first one runs alone."""
+        first = 1 if executor is None else 0
+        threads = concurrent.futures.ThreadPoolExecutor
+        with contextlib.nullcontext(executor) if executor else threads(num_threads()) as pool:
+            try:
+                for begin, some in ((0, tasks[:first]), (first, tasks[first:])):
+                    outcomes = map_tasks(function, some, executor=pool, **options)
                     with contextlib.closing(outcomes):
                         for number, value, error in outcomes:
                             if error is not None:
                                 raise error
-                            results[numbers[number]] = value
-        except KeyboardInterrupt:
-            self.interrupted = True
-            raise
-        return [results[index] for index in range(n)]
-
-    def scan(
-        self,
-        name: str,
-        values: Sequence[float],
-        compute: Callable[[float], Mapping[str, np.ndarray]],
-        *,
-        progress: bool = True,
-    ) -> dict[str, Shaped[np.ndarray, "values ..."]]:
-        """Arrays at each of several values of a parameter; a resumed run keeps those that are computed.
-
-        **Arguments:**
-
-        - `name`: the name of the parameter, and of the parts of the run.
-        - `values`: its values, all different.
-        - `compute`: returns the arrays at one value by name; their shapes are the same at all values.
-        - `progress`: show a progress bar (only on a terminal).
-
-        **Returns:** the arrays by name, with a leading axis of the values.
-        """
-
-        def compute_one(index: int) -> dict[str, np.ndarray]:
-            value = float(values[index])
-            return self.part(f"{name} {value}", lambda: compute(value))
-
-        results = self.map_in_threads(compute_one, len(values), progress=progress, unit="value")
-        return {key: np.stack([result[key] for result in results]) for key in results[0]}
+                            yield begin + number, value
+            except KeyboardInterrupt:
+                self.interrupted = True
+                raise
 
     def part(
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
@@ -355,3 +367,14 @@ class RunFolder:
         self.save_table(f"history_{name}", history_table(outcome.history))
         if outcome.history.cost.ndim == 1:
             self.save_tissue(f"fitted_{name}", outcome.tissue)
+
+
+def _checkpoint(
+    task: tuple[str, InverseProblem[Any]], fitting: Fitting, notes: Notes | None
+) -> bytes:
+    """The checkpoint of a finished fit, from a worker."""
+    name, problem = task
+    with tempfile.TemporaryDirectory() as path:
+        folder = RunFolder(path)
+        folder.fit_in_threads(name, [problem], fitting, notes=notes, progress=False)
+        return folder._part_file(f"{name} 0").read_bytes()

@@ -21,7 +21,7 @@ from vertax._base.compilation_cache import enable_compilation_cache
 from vertax._base.processes import LocalProcesses, ProcessDied
 from vertax._base.tasks import map_tasks
 from vertax.io import write_csv
-from vertax.runs._config import ConfigError, ExperimentConfig, validate
+from vertax.runs._config import ConfigError, ExperimentConfig
 from vertax.runs._execution import (
     CONFIG,
     FAILED,
@@ -122,7 +122,6 @@ def sweep(
     output: Path,
     *,
     executor: Executor | None = None,
-    workers: int | None = None,
     figures: Sequence[str] = ("png",),
     progress: bool = True,
 ) -> dict[str, str]:
@@ -134,8 +133,7 @@ def sweep(
     **Arguments:**
 
     - `runs`, `output`: the runs, and the folder of all.
-    - `executor`: runs them on other machines, which send their files back when they end; by default `workers`
-        local processes write them.
+    - `executor`: by default local processes, which write the files; other executors send them back.
     - `figures`, `progress`: as of `vertax run`.
 
     **Returns:** the error messages of the runs that failed, by the name of the run.
@@ -154,12 +152,11 @@ def sweep(
         raise RunFolderError(
             f"Cannot use {output} as a folder: {error.strerror}. Choose another with --output."
         ) from None
-    with lock, executor or LocalProcesses(workers) as executing:
-        call = partial(_execute_elsewhere if executor else _execute_run, figures=tuple(figures))
-        # Modules of experiments are imported in the process, by the name of the experiment.
-        content = lambda run: run.config.model_dump(mode="json", exclude_none=True)
-        tasks = [(content(run), run.folder) for run in waiting]
-        outcomes = map_tasks(call, tasks, executor=executing, unit="run", progress=progress)
+    with lock, executor or LocalProcesses() as executor:
+        local = isinstance(executor, LocalProcesses)
+        call = partial(_execute_run if local else _execute_elsewhere, figures=tuple(figures))
+        tasks = [(run.config, run.folder) for run in waiting]
+        outcomes = map_tasks(call, tasks, executor=executor, unit="run", progress=progress)
         try:
             with contextlib.closing(outcomes):  # an interrupt cancels the runs that wait
                 for number, files, error in outcomes:
@@ -167,7 +164,7 @@ def sweep(
                     try:
                         if error is not None:
                             raise error
-                        if executor is not None:
+                        if not local:
                             _write_files(run.folder, files)
                     except Exception as error:  # no error of a run ends the sweep
                         errors[run.folder.name] = _in_one_line(error)
@@ -181,21 +178,20 @@ def _in_one_line(error: Exception) -> str:
     return str(error) if isinstance(error, ProcessDied) else f"{type(error).__name__}: {error}"
 
 
-def _execute_run(task: tuple[dict[str, Any], Path], figures: tuple[str, ...] = ("png",)) -> None:
+def _execute_run(task: tuple[ExperimentConfig, Path], figures: tuple[str, ...] = ("png",)) -> None:
     """Execute or resume one run of a sweep in this process."""
-    content, folder = task
-    experiment = find_experiment(content["experiment"])
-    config = validate(experiment.config, content)
+    config, folder = task
     if (folder / CONFIG).is_file() and not (folder / FAILED).is_file():
         unfinished_folder(folder, config)
     else:
         new_folder(folder, folder)
     enable_compilation_cache()
+    experiment = find_experiment(config.experiment)
     execute(experiment, config, RunFolder(folder, figures=figures), progress=False)
 
 
 def _execute_elsewhere(
-    task: tuple[dict[str, Any], Path], figures: tuple[str, ...]
+    task: tuple[ExperimentConfig, Path], figures: tuple[str, ...]
 ) -> dict[str, bytes]:
     """Execute one run on another machine; return its files."""
     with tempfile.TemporaryDirectory() as folder:

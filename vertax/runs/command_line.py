@@ -5,7 +5,6 @@ from __future__ import annotations
 import enum
 import shlex
 from collections.abc import Iterable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -39,12 +38,14 @@ _NO_CACHE = (
     "VERTAX_CACHE names another folder, or is off)."
 )
 
-_SCHEDULER = (
-    "Run sweeps and many masks on the workers of a Dask cluster: the address of its scheduler, or its "
-    "scheduler file."
-)
+_WORKERS = "Number of local processes for many masks, replicates or the runs of a sweep."
+_SCHEDULER = "Use the workers of a Dask cluster instead: the address of its scheduler, or its scheduler file."
+_CLUSTER = "Start the Dask cluster that this TOML file describes, and close it at the end."
 
 Format = enum.StrEnum("Format", {name: name for name in ("png", "pdf", "svg")})
+Workers = Annotated[int | None, typer.Option(min=1, help=_WORKERS)]
+Scheduler = Annotated[str | None, typer.Option(metavar="ADDRESS", help=_SCHEDULER)]
+Cluster = Annotated[Path | None, typer.Option("--cluster", metavar="FILE", help=_CLUSTER)]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help=_SET)]
 Figures = Annotated[
     list[Format] | None,
@@ -125,7 +126,9 @@ def run(
         bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
     ] = False,
     resume: Annotated[Path | None, typer.Option(metavar="RUN", help=_RESUME)] = None,
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help=_SCHEDULER)] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    cluster: Cluster = None,
     figures: Figures = None,
     no_cache: Annotated[bool, typer.Option("--no-cache", help=_NO_CACHE)] = False,
     quiet: Quiet = False,
@@ -135,7 +138,7 @@ def run(
     from vertax import FitError, enable_compilation_cache
     from vertax._base.announce import announce_in_this_process
     from vertax.runs import ConfigError, RunFolder, load_config
-    from vertax.runs._cluster import cluster
+    from vertax.runs._cluster import chosen_executor
     from vertax.runs._execution import execute, new_folder, parts, unfinished_folder
     from vertax.runs._folder import RunFolderError
     from vertax.runs._tables import summary
@@ -146,7 +149,7 @@ def run(
         if not no_cache:
             enable_compilation_cache()
         # (Connected first: a cluster that does not answer changes no folder.)
-        with nullcontext() if scheduler is None else cluster(scheduler) as executor:
+        with chosen_executor(workers, scheduler, cluster) as executor:
             if resume is None:
                 path = new_folder(Path("runs") / config.stem, output, overwrite)
             elif output is not None or overwrite:
@@ -191,16 +194,15 @@ def sweep(
             help="Folder of all runs; by default runs/NAME-sweep. Finished runs are kept."
         ),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Number of local processes; by default one per core.")
-    ] = None,
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help=_SCHEDULER)] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    cluster: Cluster = None,
     figures: Figures = None,
     quiet: Quiet = False,
 ) -> None:
     """Run one configuration, or several, with different keys."""
     from vertax.runs import ConfigError
-    from vertax.runs._cluster import cluster
+    from vertax.runs._cluster import chosen_executor
     from vertax.runs._folder import RunFolderError
     from vertax.runs._sweep import parse_grid, sweep as execute_all, sweep_runs
 
@@ -211,8 +213,8 @@ def sweep(
             finished = sum(run.is_finished for run in runs)
             kept = f", {finished} of them finished before" if finished else ""
             typer.echo(f"{len(runs)} runs{kept} → {folder}")
-        with nullcontext() if scheduler is None else cluster(scheduler) as executor:
-            options = {"executor": executor, "workers": workers, "progress": not quiet}
+        with chosen_executor(workers, scheduler, cluster) as executor:
+            options = {"executor": executor, "progress": not quiet}
             errors = execute_all(runs, folder, figures=figures or ("png",), **options)
     except KeyboardInterrupt:
         typer.echo("Interrupted. To continue, give the same command again.", err=True)

@@ -147,9 +147,7 @@ def _frames_of(file: Path) -> list[MaskFrame]:
         return single
     try:
         pixels = load_array(file) if file.suffix == ".npy" else read_stack(file)
-    except (
-        ValueError
-    ):  # colours, or a file that cannot be read: the reader of masks has the message
+    except ValueError:  # colours, or no image: the reader of masks has the message
         return single
     frames = _planes(without_single_axes(pixels))
     return single if len(frames) == 1 else [frame._replace(file=file) for frame in frames]

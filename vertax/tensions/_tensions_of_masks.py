@@ -7,11 +7,13 @@ import hashlib
 import inspect
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+import zipfile
+from collections import UserDict
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,13 +21,14 @@ import numpy as np
 
 import vertax
 from vertax._base.announce import announce_compilations
+from vertax._base.atomic import atomic_write
 from vertax._base.blas import one_blas_thread
 from vertax._base.checkpoints import digest as arrays_digest
 from vertax._base.pixels import pixel_length, pixel_sides
 from vertax._base.tasks import map_tasks
 from vertax._base.threads import num_threads
 from vertax.initialise import MaskChange, MaskReport
-from vertax.io import write_csv
+from vertax.io import append_parquet, write_csv, write_rows
 from vertax.io._module_file import load_module, save_module
 from vertax.tensions._columns import column_descriptions
 from vertax.tensions._find_masks import MaskFrame, MaskSource, find_masks
@@ -33,15 +36,18 @@ from vertax.tensions._infer_tensions import infer_tensions
 from vertax.tensions._inferred import CurvedGeometry, InferredTensions
 from vertax.tensions._mean_stress import MeanStress
 
+_TABLES = ("cells", "edges", "changes", "frames")
+_MASKS_PER_PART = 64
 _CLASSES = (InferredTensions, CurvedGeometry, MeanStress, MaskReport, MaskChange)
 
 
 class TensionsOfMasks(eqx.Module):
     """Tensions of many masks, as one table of cells and one of edges."""
 
-    results: dict[str | int, InferredTensions]
-    """The result of each mask, by the name of its file or its number."""
-    failures: dict[str | int, str]
+    results: Mapping[str | int, InferredTensions]
+    """The result of each mask, by the name of its file or its number. With a cache each is read from its file
+    whenever it is used, so that memory does not limit their number."""
+    failures: Mapping[str | int, str]
     """The message of the error of each mask without a result."""
     length_unit: str = eqx.field(static=True, default="root of the mean cell area")
     """Unit of lengths in the tables."""
@@ -84,28 +90,65 @@ class TensionsOfMasks(eqx.Module):
         frames = np.array([*self.results, *self.failures])
         return {"frame": frames} | {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
-    def write(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write the tables `cells.csv`, `edges.csv`, `changes.csv` (of the masks) and `frames.csv`, and
+    def write(
+        self, folder: str | os.PathLike[str], *, format: Literal["csv", "parquet"] = "csv"
+    ) -> list[Path]:
+        """Write the tables `cells`, `edges`, `changes` (of the masks) and `frames`, 64 masks at a time, and
         `columns.csv`, which has the unit and the meaning of each column.
 
         **Arguments:**
 
-        - `folder`: the folder; it is made if it does not exist.
+        - `folder`: the folder; it is made if it does not exist. Tables in it are replaced.
+        - `format`: `"csv"` for files `cells.csv` and so on; `"parquet"` for folders `cells` and so on, with a
+            file for 64 masks that have rows: [`read_table`][vertax.io.read_table] reads each as one table.
 
-        **Returns:** the files.
+        **Returns:** the files and folders.
+
+        **Raises:**
+
+        - `ValueError` for another format.
+        - `ImportError` for Parquet files if PyArrow is not installed: `pip install -e ".[cluster]"`.
         """
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        tables = {
-            "cells": self.cell_table(),
-            "edges": self.edge_table(),
-            "changes": self.change_table(),
-            "frames": self.frame_table(),
-        }
-        tables["columns"] = column_descriptions(tables, self.length_unit)
-        for name, table in tables.items():
-            write_csv(folder / f"{name}.csv", table)
-        return [folder / f"{name}.csv" for name in tables]
+        if format not in ("csv", "parquet"):
+            raise ValueError(f'Argument `format` must be "csv" or "parquet", but is {format!r}.')
+        ending = ".csv" if format == "csv" else ""
+        paths = {name: Path(folder) / f"{name}{ending}" for name in _TABLES}
+        columns = Path(folder) / "columns.csv"
+        columns.parent.mkdir(parents=True, exist_ok=True)
+        for path in paths.values():
+            for file in path.glob("*.parquet"):
+                file.unlink()
+        with contextlib.ExitStack() as stack:
+            opened = lambda path: stack.enter_context(atomic_write(path, newline=""))
+            files = {name: opened(path) for name, path in paths.items() if path.suffix == ".csv"}
+            for number, part in enumerate(self._parts()):
+                tables = {name: getattr(part, f"{name[:-1]}_table")() for name in _TABLES}
+                if number == 0:
+                    write_csv(columns, column_descriptions(tables, self.length_unit))
+                for name, table in tables.items():
+                    if name in files:
+                        write_rows(files[name], table, names=number == 0)
+                    elif len(table["frame"]):
+                        append_parquet(paths[name], table)
+        return [*paths.values(), columns]
+
+    def _parts(self) -> Iterator[TensionsOfMasks]:
+        """Parts of 64 masks, in memory; the failures are in the last one."""
+        names = [*self.results]
+        for begin in range(0, len(names), _MASKS_PER_PART):
+            results = {name: self.results[name] for name in names[begin : begin + _MASKS_PER_PART]}
+            failures = {} if begin + len(results) < len(names) else self.failures
+            yield TensionsOfMasks(results, failures, self.length_unit)
+
+
+class _Stored(UserDict[str | int, Any]):
+    """Results in the files of a cache, each read when it is used."""
+
+    def __getitem__(self, name: str | int) -> InferredTensions:
+        result = self.data[name]
+        if isinstance(result, InferredTensions):
+            return result
+        return load_module(result, "tensions", InferredTensions, _CLASSES)
 
 
 @announce_compilations("measurements of a tissue")
@@ -132,9 +175,9 @@ def infer_tensions_of_masks(
 
     - `masks`: a folder, a pattern, a movie or a list, see [`find_masks`][vertax.tensions.find_masks].
     - `plane`: of files with several planes, the one to take; by default a single file is a movie.
-    - `cache`: a folder where the result of each mask is stored as soon as it is computed. A later call, such
-        as after an interrupt, reads the results of the same pixels, options and version of vertax from it. An
-        entry that cannot be read is computed anew, with a warning.
+    - `cache`: a folder where the result of each mask is stored as soon as it is computed, and stays: memory
+        does not limit the number of masks. A later call, such as after an interrupt, finds there the results
+        of the same pixels, options and version of vertax. A truncated file is computed anew, with a warning.
     - `executor`: where masks are computed, as of [`map_tasks`][vertax.map_tasks]; by default threads, as many
         as the environment variable `VERTAX_THREADS` says or one per core. Workers on other machines need
         access to files that are given by name; the `cache` is used by the caller alone.
@@ -157,20 +200,19 @@ def infer_tensions_of_masks(
         Path(cache).mkdir(parents=True, exist_ok=True)
     if plane is not None:
         options["plane"] = plane
-    results: dict[str | int, InferredTensions] = {}
+    results: dict[str | int, Any] = {}
     failures: dict[str | int, str] = {}
     missing: list[tuple[MaskFrame, Path | None]] = []
     for frame in frames:
         entry = None
-        try:
-            entry = None if cache is None else Path(cache) / _entry_name(frame, options)
-            cached = None if entry is None else _load(entry, frame)
-        except OSError:  # the file cannot be read: the error is that of its task
-            cached = None
-        if cached is None:
-            missing.append((frame, entry))
+        if cache is not None:
+            # (Of a file that cannot be read, the error is that of its task.)
+            with contextlib.suppress(OSError):
+                entry = Path(cache) / _entry_name(frame, options)
+        if entry is not None and _is_stored(entry, frame):
+            results[frame.name] = entry
         else:
-            results[frame.name] = cached
+            missing.append((frame, entry))
     tasks = [frame for frame, _ in missing]
     with contextlib.ExitStack() as stack:
         if executor is None:
@@ -186,8 +228,7 @@ def infer_tensions_of_masks(
                 continue
             if entry is not None:
                 save_module(entry, "tensions", result, InferredTensions, _CLASSES)
-                result = load_module(entry, "tensions", InferredTensions, _CLASSES)
-            results[frame.name] = result
+            results[frame.name] = result if entry is None else entry
     # In the order of the masks, not of the threads.
     order = [frame.name for frame in frames]
     results = {name: results[name] for name in order if name in results}
@@ -199,7 +240,7 @@ def infer_tensions_of_masks(
             f"{name}: {message}"
         )
     unit = {} if options.get("pixel_size") is None else {"length_unit": "unit of `pixel_size`"}
-    return TensionsOfMasks(results, failures, **unit)
+    return TensionsOfMasks(results if cache is None else _Stored(results), failures, **unit)
 
 
 @one_blas_thread()
@@ -224,16 +265,13 @@ def _entry_name(frame: MaskFrame, options: Mapping[str, Any]) -> str:
     return f"{hashlib.sha256(pixels + given.encode()).hexdigest()[:32]}.npz"
 
 
-def _load(entry: Path, frame: MaskFrame) -> InferredTensions | None:
-    """The result in the cache, if it is there and can be read."""
-    if not entry.exists():
-        return None
-    try:
-        return load_module(entry, "tensions", InferredTensions, _CLASSES)
-    except ValueError as error:  # truncated, damaged, or of another version
-        text = f"The entry of the cache for {frame.name} is computed anew: {error}"
+def _is_stored(entry: Path, frame: MaskFrame) -> bool:
+    """Whether the result is in the cache, as a file that is not truncated."""
+    if entry.exists() and not zipfile.is_zipfile(entry):
+        text = f"The entry of the cache for {frame.name} is computed anew: {entry} is truncated."
         warnings.warn(text, stacklevel=4)
-        return None
+        entry.unlink()
+    return entry.exists()
 
 
 def _joined(tables: Mapping[str | int, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
