@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from _arguments import count
 
 import vertax as vx
-from vertax._base.fast_compilation import OPTIONS
 
 jax.config.update("jax_enable_x64", True)
 
@@ -72,7 +71,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cells", type=count, nargs="*", default=[100, 400])
     parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=list(PARTS))
-    parser.add_argument("--fast", action="store_true", help="as enable_fast_compilation does")
     chosen = parser.parse_args()
     print(f"{'part':>20} {'cells':>6} {'trace':>7} {'lower':>7} {'XLA':>7} {'kernels':>8}")
     for n_cells in chosen.cells:
@@ -85,8 +83,7 @@ def main() -> None:
             times.append(time.perf_counter())
             lowered = traced.lower()
             times.append(time.perf_counter())
-            options: Any = OPTIONS if chosen.fast else None
-            program = lowered.compile(compiler_options=options)
+            program = lowered.compile()
             times.append(time.perf_counter())
             trace, lower, xla = (b - a for a, b in pairwise(times))
             kernels = (program.as_text() or "").count(" fusion(")

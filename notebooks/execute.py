@@ -12,8 +12,6 @@ import nbformat
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
-from vertax._base.fast_compilation import OPTIONS, has_options
-
 FOLDER = Path(__file__).resolve().parent
 
 
@@ -65,9 +63,9 @@ def main() -> None:
         parser.error("the outputs that are kept are those of the full setting")
     if options.light:
         os.environ["VERTAX_LIGHT"] = "1"
-        if has_options():  # Compilation takes most of the time.
-            flags = (f"--{name}={str(value).lower()}" for name, value in OPTIONS.items())
-            os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
+        # Compilation takes most of the time.
+        flags = os.environ.get("XLA_FLAGS", "")
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_optimization_level=1"
     else:
         os.environ.pop("VERTAX_LIGHT", None)
 

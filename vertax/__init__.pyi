@@ -24,7 +24,6 @@ from . import (
     transitions as transitions,
 )
 from ._base.compilation_cache import enable_compilation_cache as enable_compilation_cache
-from ._base.fast_compilation import enable_fast_compilation as enable_fast_compilation
 from ._base.results import RESULTS as RESULTS
 from ._base.tasks import map_tasks as map_tasks
 from .activities import AbstractActivity as AbstractActivity

@@ -119,7 +119,8 @@ def test_a_picture_in_space_has_one_polygon_for_each_cell(tube):
 def test_a_picture_in_space_is_not_cropped(flat):
     ax = vx.plotting.plot_surface(flat.with_surface(Graph(lambda x: 0.1 * x[0])), elevation=90.0)
     corners = np.array([*product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim())])
-    projected = np.stack(proj_transform(*corners.T, ax.get_proj())[:2], axis=-1)
+    x, y, z = corners.T
+    projected = np.stack(proj_transform(x, y, z, ax.get_proj())[:2], axis=-1)
     assert ax.bbox.count_contains(ax.transData.transform(projected)) == len(corners)
 
 

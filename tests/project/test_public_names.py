@@ -11,7 +11,7 @@ AbstractLocalEnergy AbstractResponse AbstractTransitions AutomaticDifferentiatio
 Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Free
 GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic RESULTS Record
 Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate bayes costs dissipations
-dynamics enable_compilation_cache enable_fast_compilation energies equilibrate evolve external
+dynamics enable_compilation_cache energies equilibrate evolve external
 fit fitting growth inference initialise io load_tissue map_tasks mechanics mesh plot_history plot_recovery
 plot_tissue plotting relax runs save_tissue signals solvers surfaces tensions transitions uncertainty
 """

@@ -171,9 +171,9 @@ def slow(number):
 
 
 def test_what_arrived_before_the_death_of_a_scheduler_is_kept(tmp_path):
-    options = {"env": os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     start = lambda *words: subprocess.Popen(
-        [sys.executable, "-m", *words, "--no-dashboard"], stderr=subprocess.DEVNULL, **options
+        [sys.executable, "-m", *words, "--no-dashboard"], stderr=subprocess.DEVNULL, env=environment
     )
     file, folder = str(tmp_path / "scheduler.json"), RunFolder(tmp_path)
     scheduler = start("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", file)

@@ -100,9 +100,11 @@ def test_tables_in_parts_are_one_table(mask, tmp_path, monkeypatch, format):
     tensions = infer_tensions_of_masks(
         [mask, damaged, np.zeros_like(mask)], cache=tmp_path / "cache", progress=False
     )
+    paths = []
     for number in range(2):  # the second time another part size, which leaves no old part
         monkeypatch.setattr(_tensions_of_masks, "_MASKS_PER_PART", 1 + number)
         paths = tensions.write(tmp_path / "tables", format=format)
+    written = {}
     for name, path in zip(("cell", "edge", "change", "frame"), paths, strict=False):
         written, table = read_table(path), getattr(tensions, f"{name}_table")()
         assert list(written) == list(table)

@@ -12,8 +12,6 @@ from typing import Any, TypeVar
 import equinox as eqx
 from tqdm import tqdm
 
-from vertax._base.fast_compilation import OPTIONS, compiles_fast
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 DELAY = 1.0
@@ -55,12 +53,10 @@ def announced_jit(function: Function, *, inline: bool = False, label: str = "") 
         return function(*args, **kwargs)
 
     jit: Any = eqx.filter_jit
-    optimised = jit(traced, inline=inline)
-    fast = jit(traced, inline=inline, compiler_options=OPTIONS)
+    compiled = jit(traced, inline=inline)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        compiled = fast if compiles_fast((args, kwargs)) else optimised
         job = _thread.job
         if job is None and (_label_of_process or _is_watched()):
             job = _Job(_label_of_process[0] if _label_of_process else label)
