@@ -114,12 +114,8 @@ class TestGradients:
     @pytest.mark.parametrize(
         "name",
         [
-            "implicit",
-            "propagation",
-            *(
-                pytest.param(name, marks=pytest.mark.thorough)
-                for name in ("sensitivity", "automatic")
-            ),
+            pytest.param(name, marks=() if name == "implicit" else pytest.mark.thorough)
+            for name in ADJOINTS
         ],
     )
     def test_gradient_matches_finite_differences(self, difference, name):

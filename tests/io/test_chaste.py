@@ -181,6 +181,7 @@ def test_trajectories_are_written_and_read(tmp_path, kind):
         assert node[:, 3].sum() > 0
 
 
+@pytest.mark.thorough
 def test_cells_keep_their_numbers_with_spare_slots(tmp_path):
     tissue = cluster(9, 2).with_capacity(12)
     less = vx.transitions.remove(tissue, 4).tissue

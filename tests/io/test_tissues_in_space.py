@@ -231,6 +231,7 @@ def test_tensions_of_a_foam_on_a_cap(foam, tmp_path):
     assert projected > 3 * error(lifted, read)
 
 
+@pytest.mark.thorough
 def test_files_of_foams_in_space(foam, tmp_path):
     path, (rest, tension) = tmp_path / "foam.fe", foam
     level = evolver_file(rest, tension, lambda x: np.column_stack([x, np.full(len(x), 2.0)]))
