@@ -128,6 +128,7 @@ def test_checkpoint_of_a_density_with_another_function_is_rejected(linear, tmp_p
         run(2.0)
 
 
+@pytest.mark.thorough
 def test_proposals_without_equilibrium_are_rejected_and_counted(linear):
     density = density_of(linear, 0.2, MEAN + 0.5 * SPREAD)
     start = {NAME: jnp.full(N_CELLS, MEAN)}

@@ -164,6 +164,7 @@ def test_derivatives_by_vertices_and_surface_agree_with_differences(flat, surfac
     assert float(sum(jax.tree.leaves(slope))) == pytest.approx(float(difference), rel=1e-7)
 
 
+@pytest.mark.thorough
 def test_spare_slots_change_nothing_and_keep_the_surface(flat):
     tissue = flat.with_surface(bump(0.5))
     roomy = tissue.with_capacity(20)

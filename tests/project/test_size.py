@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2319,
     "surfaces": 630,
     "tensions": 4361,
-    "tests": 31871,
+    "tests": 31876,
     "transitions": 1333,
 }
 # Largest number of lines of a file, and of the files that have more.

@@ -75,7 +75,7 @@ def test_a_foam_comes_to_rest_on_a_steep_surface_with_transitions():
     assert relaxed.tissue.surface is not None
 
 
-@pytest.mark.parametrize("name", ["bump", "tube", MAP])
+@pytest.mark.parametrize("name", [pytest.param("bump", marks=pytest.mark.thorough), "tube", MAP])
 def test_translations_are_zero_modes_only_where_the_surface_is_homogeneous(flat, name):
     (make, number), free = SURFACES[name], name == "tube"
     tissue, energy = flat.with_surface(make(number)), elastic(jnp.ones(2))
@@ -190,6 +190,7 @@ def test_float32_comes_to_rest(flat):
     assert float(relaxed.energy) == pytest.approx(float(exact), rel=1e-4)
 
 
+@pytest.mark.thorough
 def test_evolution_lowers_the_energy_with_velocities_in_space(flat):
     tissue, energy = flat.with_surface(bump(0.4)), elastic(jnp.ones(2))
     run = vx.evolve(tissue, energy, FRICTION, [0.0, 1e-4, 2e-4, 1.0], relaxation=FIXED_TOPOLOGY)

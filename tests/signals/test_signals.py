@@ -148,6 +148,7 @@ class TestExchange:
 
 
 class TestEvolution:
+    @pytest.mark.thorough
     def test_dilution_keeps_the_amount_of_diluted_species_and_the_others_constant(self):
         tissue = initial_tissue()
         start = jnp.linspace(1, 2, 12).reshape(2, 6)
@@ -187,6 +188,7 @@ class TestEvolution:
                 )
         assert movie.converged
 
+    @pytest.mark.thorough
     def test_couple_is_called_once_in_each_traced_step(self):
         calls = []
 
