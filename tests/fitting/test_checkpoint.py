@@ -136,7 +136,7 @@ def test_short_fit_is_saved_once(path, monkeypatch):
 
 OTHERS = {
     "with another optimiser": {"optimiser": optax.adam(2e-2)},
-    "sizes.*: the default and not max_steps=300": {
+    "sizes.*: max_steps=2000 and not max_steps=300": {
         "problem": problem_of(response=dataclasses.replace(FIXED_TOPOLOGY, max_steps=300))[0]
     },
     "numbers in its arrays": {"problem": problem_of(2)[0]},
