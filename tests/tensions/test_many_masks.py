@@ -7,14 +7,7 @@ from test_damaged_masks import mask as mask
 
 import vertax as vx
 from vertax.io import read_table
-from vertax.tensions import (
-    MaskFrame,
-    TensionsOfMasks,
-    _tensions_of_masks,
-    find_masks,
-    infer_tensions,
-    infer_tensions_of_masks,
-)
+from vertax.tensions import MaskFrame, find_masks, infer_tensions, infer_tensions_of_masks
 
 
 def test_one_table_of_a_folder_with_a_file_that_cannot_be_read(mask, tmp_path):
@@ -100,11 +93,10 @@ def test_tables_in_parts_are_one_table(mask, tmp_path, monkeypatch, format):
     tensions = infer_tensions_of_masks(
         [mask, damaged, np.zeros_like(mask)], cache=tmp_path / "cache", progress=False
     )
-    paths = []
+    written, paths = {}, []
     for number in range(2):  # the second time another part size, which leaves no old part
-        monkeypatch.setattr(_tensions_of_masks, "_MASKS_PER_PART", 1 + number)
+        monkeypatch.setattr("vertax.tensions._tensions_of_masks._MASKS_PER_PART", 1 + number)
         paths = tensions.write(tmp_path / "tables", format=format)
-    written = {}
     for name, path in zip(("cell", "edge", "change", "frame"), paths, strict=False):
         written, table = read_table(path), getattr(tensions, f"{name}_table")()
         assert list(written) == list(table)
@@ -124,7 +116,15 @@ def test_masks_in_subfolders_are_found_with_a_pattern(tmp_path):
         find_masks(tmp_path)
 
 
-@pytest.mark.parametrize("damage", [lambda entry: entry[: len(entry) // 2], lambda entry: b""])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda entry: entry[: len(entry) // 2],
+        lambda entry: b"",
+        lambda entry: entry[: len(entry) // 2] + b"0123456789" + entry[len(entry) // 2 + 10 :],
+    ],
+    ids=["truncated", "empty", "overwritten"],
+)
 def test_a_damaged_entry_of_the_cache_is_computed_anew(mask, tmp_path, damage):
     options = {"cache": tmp_path, "progress": False}
     first = infer_tensions_of_masks([mask], **options)
@@ -162,7 +162,7 @@ def test_masks_of_another_kind_raise(without_type_checks):
     with pytest.raises(TypeError, match=r"`masks` must be a folder, .* but is None"):
         find_masks(None)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match='`format` must be "csv" or "parquet"'):
-        TensionsOfMasks({}, {}).write("x", format="xlsx")  # pyright: ignore[reportArgumentType]
+        vx.tensions.TensionsOfMasks({}, {}).write("x", format="xlsx")  # pyright: ignore[reportArgumentType]
 
 
 def test_two_holes_are_not_mirrored_cells(mask):

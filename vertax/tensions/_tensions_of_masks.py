@@ -7,7 +7,6 @@ import hashlib
 import inspect
 import os
 import warnings
-import zipfile
 from collections import UserDict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -141,14 +140,15 @@ class TensionsOfMasks(eqx.Module):
             yield TensionsOfMasks(results, failures, self.length_unit)
 
 
+_load = partial(load_module, what="tensions", kind=InferredTensions, classes=_CLASSES)
+
+
 class _Stored(UserDict[str | int, Any]):
     """Results in the files of a cache, each read when it is used."""
 
     def __getitem__(self, name: str | int) -> InferredTensions:
         result = self.data[name]
-        if isinstance(result, InferredTensions):
-            return result
-        return load_module(result, "tensions", InferredTensions, _CLASSES)
+        return _load(result) if isinstance(result, Path) else result
 
 
 @announce_compilations("measurements of a tissue")
@@ -175,9 +175,9 @@ def infer_tensions_of_masks(
 
     - `masks`: a folder, a pattern, a movie or a list, see [`find_masks`][vertax.tensions.find_masks].
     - `plane`: of files with several planes, the one to take; by default a single file is a movie.
-    - `cache`: a folder where the result of each mask is stored as soon as it is computed, and stays: memory
-        does not limit the number of masks. A later call, such as after an interrupt, finds there the results
-        of the same pixels, options and version of vertax. A truncated file is computed anew, with a warning.
+    - `cache`: a folder that stores the result of each mask as soon as it is computed: memory does not limit
+        the number of masks. A later call finds there the results of the same pixels, options and version of
+        vertax. A file that cannot be read is computed anew, with a warning.
     - `executor`: where masks are computed, as of [`map_tasks`][vertax.map_tasks]; by default threads, as many
         as the environment variable `VERTAX_THREADS` says or one per core. Workers on other machines need
         access to files that are given by name; the `cache` is used by the caller alone.
@@ -206,8 +206,7 @@ def infer_tensions_of_masks(
     for frame in frames:
         entry = None
         if cache is not None:
-            # (Of a file that cannot be read, the error is that of its task.)
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # of a mask, which its task raises
                 entry = Path(cache) / _entry_name(frame, options)
         if entry is not None and _is_stored(entry, frame):
             results[frame.name] = entry
@@ -266,12 +265,13 @@ def _entry_name(frame: MaskFrame, options: Mapping[str, Any]) -> str:
 
 
 def _is_stored(entry: Path, frame: MaskFrame) -> bool:
-    """Whether the result is in the cache, as a file that is not truncated."""
-    if entry.exists() and not zipfile.is_zipfile(entry):
-        text = f"The entry of the cache for {frame.name} is computed anew: {entry} is truncated."
+    """Whether the result is in the cache and can be read."""
+    try:
+        return entry.exists() and _load(entry) is not None
+    except ValueError as error:  # truncated or damaged
+        text = f"The entry of the cache for {frame.name} is computed anew: {error}"
         warnings.warn(text, stacklevel=4)
-        entry.unlink()
-    return entry.exists()
+        return False
 
 
 def _joined(tables: Mapping[str | int, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
