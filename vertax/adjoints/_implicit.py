@@ -124,10 +124,45 @@ class _System(eqx.Module):
         self, root: PyTree[Array], inputs: PyTree, rhs: PyTree[Array], *, strict: bool = False
     ) -> tuple[PyTree[Array], GradientOutcome]:
         operator = lx.JacobianLinearOperator(self.force, root, inputs, tags=self.tags)
-        settings = (self.adjoint.linear_solver, self.min_stiffness, self.broken)
-        solver = _ReportingSolver(*settings, strict)
-        solution = lx.linear_solve(operator, rhs, solver, throw=False)
-        return solution.value, solution.stats["outcome"]
+        return jax.lax.custom_linear_solve(
+            operator.mv,
+            rhs,
+            lambda _, vector: self._solve_once(operator, vector, strict),
+            symmetric=True,
+            has_aux=True,
+        )
+
+    def _solve_once(
+        self, operator: lx.AbstractLinearOperator, vector: PyTree[Array], strict: bool
+    ) -> tuple[PyTree[Array], GradientOutcome]:
+        """The solution and its outcome; raises an error for an unreliable outcome if `strict`.
+
+        If the relaxation ended with NaN, the solution is 0: the other members of a batch are right.
+        """
+        solver = self.adjoint.linear_solver
+        solution, result, stats = solver.compute(solver.init(operator, {}), vector, {})
+        stat = lambda name: jnp.asarray(stats.get(name, -1.0), float)
+        residual, failed = stat("residual_norm"), result != lx.RESULTS.successful
+        rhs, response = optx.two_norm(vector), optx.two_norm(solution)
+        soft = (rhs > 0) & (rhs < self.min_stiffness * response)
+        # The residual of MINRES decreases in each step. A final residual above |b|, or stagnation at a large
+        # residual, occurs only if rounding errors along null vectors grow without bound.
+        large = (residual > 1) | ((stat("stagnated") == 1) & (residual > MAX_RELATIVE_RESIDUAL))
+        diverged = failed & (large | (result == lx.RESULTS.singular))
+        degenerate = (
+            soft | diverged | ((stat("inconsistent") == 1) & (residual > MAX_RELATIVE_RESIDUAL))
+        )
+        solved = RESULTS.where(failed, RESULTS.linear_solve_failed, RESULTS.successful)
+        outcome = GradientOutcome(
+            residual,
+            stat("num_steps"),
+            stat("negative_curvature"),
+            index_of(RESULTS.where(degenerate, RESULTS.degenerate, solved)),
+        )
+        outcome = jax.tree.map(lambda x: x.astype(float), outcome)
+        if strict:
+            solution = outcome.result.error_if(solution, ~outcome.converged & ~self.broken)
+        return jax.tree.map(lambda x: jnp.where(self.broken, 0, x), solution), outcome
 
     def tangent(
         self, root: PyTree[Array], inputs: PyTree, t_inputs: PyTree, *, strict: bool = False
@@ -152,60 +187,6 @@ class _System(eqx.Module):
             return self.tangent(root, inputs, t, strict=strict)
 
         return jax.vmap(one)(jnp.eye(flat.size, dtype=flat.dtype))
-
-
-class _ReportingSolver(lx.AbstractLinearSolver):
-    """A linear solver that returns a `GradientOutcome` in its statistics, and always reports success.
-
-    If `strict`, it raises an error for an unreliable outcome. (Lineax raises errors in transposed solves
-    even with `throw=False`, and its messages do not mention the equilibrium.) If the relaxation ended
-    with NaN, the solution is 0: Lineax raises an error for NaN, and the other members of a batch are right.
-    """
-
-    solver: lx.AbstractLinearSolver
-    min_stiffness: Array
-    broken: Array
-    strict: bool = eqx.field(static=True)
-
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        return self.solver.init(operator, options)
-
-    def compute(
-        self, state: Any, vector: PyTree[Array], options: dict[str, Any]
-    ) -> tuple[PyTree[Array], lx.RESULTS, dict[str, Any]]:
-        solution, result, stats = self.solver.compute(state, vector, options)
-        stat = lambda name: jnp.asarray(stats.get(name, -1.0), float)
-        residual, failed = stat("residual_norm"), result != lx.RESULTS.successful
-        rhs, response = optx.two_norm(vector), optx.two_norm(solution)
-        soft = (rhs > 0) & (rhs < self.min_stiffness * response)
-        # The residual of MINRES decreases in each step. A final residual above |b|, or stagnation at a large
-        # residual, occurs only if rounding errors along null vectors grow without bound.
-        large = (residual > 1) | ((stat("stagnated") == 1) & (residual > MAX_RELATIVE_RESIDUAL))
-        diverged = failed & (large | (result == lx.RESULTS.singular))
-        degenerate = (
-            soft | diverged | ((stat("inconsistent") == 1) & (residual > MAX_RELATIVE_RESIDUAL))
-        )
-        solved = RESULTS.where(failed, RESULTS.linear_solve_failed, RESULTS.successful)
-        outcome = GradientOutcome(
-            residual,
-            stat("num_steps"),
-            stat("negative_curvature"),
-            index_of(RESULTS.where(degenerate, RESULTS.degenerate, solved)),
-        )
-        outcome = jax.tree.map(lambda x: x.astype(float), outcome)
-        if self.strict:
-            solution = outcome.result.error_if(solution, ~outcome.converged & ~self.broken)
-        solution = jax.tree.map(lambda x: jnp.where(self.broken, 0, x), solution)
-        return solution, lx.RESULTS.successful, stats | {"outcome": outcome}
-
-    def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return self.solver.transpose(state, options)
-
-    def conj(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return self.solver.conj(state, options)
-
-    def assume_full_rank(self) -> bool:
-        return self.solver.assume_full_rank()
 
 
 def _min_stiffness(options: dict[str, Any], root: PyTree[Array]) -> Array:
