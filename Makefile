@@ -11,6 +11,9 @@ WORKERS ?= 2
 # cores. Others by `make test-newest CORE="costs io"`.
 CORE ?= _base mesh energies adjoints solvers fitting relax/test_relaxation.py project/test_compilations.py
 
+# Python compiles a module when it imports it first. (To compile all of them takes 20 s and more.)
+PIP_INSTALL := -m pip install --quiet --no-compile --editable
+
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
@@ -95,17 +98,17 @@ clean: ## remove the environment, caches and builds, but no results
 # is installed in place, so changes of its code need no new set-up.
 $(VENV)/.base: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV); this takes a minute or two and happens once."
-	$(BIN)/python -m pip install --quiet --editable '.[run]'
+	$(BIN)/python $(PIP_INSTALL) '.[run]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV) for development; this takes a few minutes and happens once."
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python $(PIP_INSTALL) '.[dev]'
 	@touch $@ $(VENV)/.base
 
 $(VENV)/.docs: pyproject.toml | $(BIN)/python
 	@echo "Setting up $(VENV) for the documentation; this takes a minute or two and happens once."
-	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	$(BIN)/python $(PIP_INSTALL) '.[docs]'
 	@touch $@
 
 # Made anew each time, so that it has the newest versions; without a newer Python there is none, and no stamp.
@@ -115,7 +118,7 @@ $(NEWEST)/.dev: pyproject.toml | $(BIN)/python
 	if [ -n "$$python" ]; then \
 	    echo "Setting up $(NEWEST) with $$python; this takes a few minutes and happens once."; \
 	    "$$python" -m venv $(NEWEST) && \
-	    $(NEWEST)/bin/python -m pip install --quiet --editable '.[dev]' && \
+	    $(NEWEST)/bin/python $(PIP_INSTALL) '.[dev]' && \
 	    touch $@; \
 	fi
 
