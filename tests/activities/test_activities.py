@@ -140,7 +140,10 @@ class TestThermalNoise:
 
 
 class TestSelfPropulsion:
-    @pytest.mark.parametrize("make", [lambda: solid()[0], lambda: cluster(9, 2)])
+    @pytest.mark.parametrize(
+        "make",
+        [lambda: cluster(9, 2), pytest.param(lambda: solid()[0], marks=pytest.mark.thorough)],
+    )
     def test_vertex_forces_sum_to_cell_forces(self, make):
         tissue = make()
         activity = SelfPropulsion(jnp.linspace(0.1, 1.0, tissue.n_cells), 0.0)

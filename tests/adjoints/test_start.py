@@ -65,7 +65,9 @@ def pinned(tissue, *vertices):
             id="sensitivity",
             marks=pytest.mark.thorough,
         ),
-        pytest.param(vx.EquilibriumPropagation(), PRECISE, id="propagation"),
+        pytest.param(
+            vx.EquilibriumPropagation(), PRECISE, id="propagation", marks=pytest.mark.thorough
+        ),
         pytest.param(
             vx.AutomaticDifferentiation(), MOMENTUM, id="automatic", marks=pytest.mark.thorough
         ),

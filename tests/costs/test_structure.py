@@ -174,7 +174,9 @@ def test_cost_of_a_tissue_with_itself_is_zero():
     assert cost(moved, energy) == pytest.approx(float(cost(tissue, energy)), abs=1e-9)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    "dtype", [pytest.param(jnp.float32, marks=pytest.mark.thorough), jnp.float64]
+)
 def test_structural_cost_derivatives_match_finite_differences(dtype):
     tissue, target = (
         jax.tree.map(

@@ -154,29 +154,6 @@ def test_optimiser_state_persists_over_epochs(hidden):
     )
 
 
-def test_epochs_compile_once(hidden):
-    target, _, _, start = hidden
-    traces = []
-
-    class Counting(vx.AbstractEnergy):
-        p0: Float[Array, " cells"]
-
-        def __call__(self, tissue):
-            traces.append(1)
-            return ShapeFactorEnergy(self.p0)(tissue)
-
-    counts = []
-    vx.fit(
-        inverse_problem(start, Counting(jnp.full(10, 3.7)), VertexDistance(target)),
-        optax.adam(1e-2),
-        5,
-        progress=False,
-        callback=lambda *_: counts.append(len(traces)),
-    )
-    assert counts[0] > 0
-    assert len(set(counts)) == 1
-
-
 @pytest.mark.thorough
 def test_levenberg_marquardt_converges_in_twelve_steps(hidden):
     target, truth, guess, start = hidden

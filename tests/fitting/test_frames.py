@@ -91,6 +91,7 @@ def test_each_epoch_starts_at_the_first_frame():
 
 
 class TestInvalidInput:
+    @pytest.mark.thorough
     def test_settings_for_equilibria_are_rejected(self):
         _, _, problem = movie_problem()
         arguments = (problem.tissue, problem.energy, problem.cost)

@@ -7,7 +7,14 @@ from label_helpers import SHAPE, clear_seeds, rasterise
 from vertax.initialise import from_labels
 
 
-@pytest.mark.parametrize("boundary", ["free", "periodic", "mirrored"])
+@pytest.mark.parametrize(
+    "boundary",
+    [
+        "free",
+        pytest.param("periodic", marks=pytest.mark.thorough),
+        pytest.param("mirrored", marks=pytest.mark.thorough),
+    ],
+)
 def test_arcs_of_all_edges_hold_the_areas_of_the_pixels(boundary):
     labels = rasterise(clear_seeds(20, SHAPE, 1), SHAPE, periodic=boundary == "periodic")
     if boundary == "free":

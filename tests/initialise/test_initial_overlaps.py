@@ -6,7 +6,14 @@ from brute_force_overlaps import faces_that_overlap
 import vertax as vx
 
 
-@pytest.mark.parametrize("options", [{}, {"random_angles": True}, {"inner_arcs": True}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param({"random_angles": True}, marks=pytest.mark.thorough),
+        pytest.param({"inner_arcs": True}, marks=pytest.mark.thorough),
+    ],
+)
 def test_free_clusters_have_no_overlaps(options):
     # With these seeds, arcs that preserve the cell areas cross before the repair.
     for seed in (6, 7, 19, 28):

@@ -85,7 +85,6 @@ SOLVER = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
 BATCH = lambda: stack([problem(), problem()])
 FIT = lambda p, optimiser, **options: vx.fit(p, optimiser, 2, progress=False, **options)
 CALLS = {
-    "equilibrate": lambda: vx.equilibrate(random_tissue(N, 1), ShapeFactorEnergy(jnp.full(N, 3.7))),
     "value_and_gradient": lambda: problem().value_and_gradient(),
     "fit": lambda: FIT(problem(), OPTIMISER),
     "fit of a batch": lambda: FIT(BATCH(), OPTIMISER, batched=True),

@@ -50,7 +50,6 @@ def evolved(**options):
 
 
 CASES = {
-    "equilibrate": lambda t: vx.equilibrate(t, ENERGY),
     "box": lambda t: mechanics.BoxRelaxation()(t, ENERGY),
     "implicit": perimeters(vx.ImplicitDifferentiation()),
     "sensitivity": perimeters(vx.ImplicitDifferentiation(mode="sensitivity")),
@@ -72,13 +71,13 @@ CASES = {
 }
 
 
-# These are traced for longer, and use the functions of the others.
-THOROUGH = ("adaptive", "box", "first order", "modulus", "noise", "shear", "structure", "sum")
+# The others are traced for longer, and use the functions of these.
+ALWAYS = ("implicit", "fit", "signals", "modes")
 
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=pytest.mark.thorough if name in THOROUGH else ()) for name in CASES],
+    [pytest.param(name, marks=() if name in ALWAYS else pytest.mark.thorough) for name in CASES],
 )
 def test_results_in_float32_while_64_bit_types_are_enabled(name):
     result = eqx.filter_eval_shape(CASES[name], single(TISSUE))

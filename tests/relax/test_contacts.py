@@ -32,6 +32,7 @@ def shapes(targets) -> vx.AbstractEnergy:
     return vx.energies.ShapeFactorEnergy(jnp.asarray(targets))
 
 
+@pytest.mark.thorough
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6), low=st.floats(3.0, 4.5), spread=st.floats(0, 0.5))
 def test_a_random_tissue_stays_valid(seed, low, spread):

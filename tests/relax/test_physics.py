@@ -76,7 +76,12 @@ def test_area_stiffness_of_the_hexagonal_lattice(lattice):
 
 
 @pytest.mark.parametrize(
-    ("contractility", "expected"), [(0.0, 0.29246), (0.04, 0.17975), (0.08, 0.08704)]
+    ("contractility", "expected"),
+    [
+        pytest.param(0.0, 0.29246, marks=pytest.mark.thorough),
+        pytest.param(0.04, 0.17975, marks=pytest.mark.thorough),
+        (0.08, 0.08704),
+    ],
 )
 def test_collapse_of_the_hexagonal_ground_state(lattice, contractility, expected):
     # Farhadifar et al. 2007: above this line tension the collapsed network has the lower energy.

@@ -181,6 +181,7 @@ def test_an_edge_flips_back_only_if_it_grows():
             assert (counts[edge] == 2) == flips_again
 
 
+@pytest.mark.thorough
 def test_sweeps_vmap_over_tissues():
     batch = [random_tissue(40, s) for s in range(4)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *batch)
