@@ -46,7 +46,7 @@ test-newest: $(NEWEST)/.dev ## the core tests with the newest Python of this mac
 	    $(NEWEST)/bin/python -c "import jax, platform; print('Python', platform.python_version(), 'and JAX', jax.__version__)"; \
 	    $(NEWEST)/bin/python tests/run.py --workers $(WORKERS) $(addprefix --only ,$(CORE)) $(PYTEST_OPTIONS); \
 	else \
-	    echo "Not tested: this machine has no newer Python than $(VENV), which has $$($(BIN)/python -V)."; \
+	    echo "Not tested: this machine has no Python 3.12 to 3.14."; \
 	fi
 
 # Each part runs even if one before it fails; the last lines name the parts that failed.
@@ -111,10 +111,14 @@ $(VENV)/.docs: pyproject.toml | $(BIN)/python
 	$(BIN)/python $(PIP_INSTALL) '.[docs]'
 	@touch $@
 
-# Made anew each time, so that it has the newest versions; without a newer Python there is none, and no stamp.
+# Made anew each time, so that it has the newest versions; without Python 3.12 there is none, and no stamp. (pyenv
+# finds a version only if it is active.)
 $(NEWEST)/.dev: pyproject.toml | $(BIN)/python
 	@rm -rf $(NEWEST)
-	@python=$$($(BIN)/python tests/newest_python.py) || exit 1; \
+	@python=$$(for version in 3.14 3.13 3.12; do \
+	    PYENV_VERSION=$$(pyenv whence python$$version 2>/dev/null | tail -n 1) \
+	        python$$version -c 'import ensurepip, sys; print(sys.executable)' 2>/dev/null && break; \
+	done); \
 	if [ -n "$$python" ]; then \
 	    echo "Setting up $(NEWEST) with $$python; this takes a few minutes and happens once."; \
 	    "$$python" -m venv $(NEWEST) && \

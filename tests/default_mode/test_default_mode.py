@@ -14,6 +14,7 @@ from helpers import (
     central_difference,
     random_tissue,
 )
+from movie_helpers import rows_of, table_of
 
 import vertax as vx
 from vertax import mechanics
@@ -262,6 +263,55 @@ class TestInputAndOutput:
         true = np.asarray(tension)[inferred.determined]
         estimate = inferred.tensions[inferred.determined]
         np.testing.assert_allclose(estimate / estimate.mean(), true / true.mean(), rtol=0.05)
+
+
+class TestSurfacesSignalsAndMovies:
+    @pytest.mark.thorough
+    def test_a_tissue_on_a_tilted_plane_is_the_stretched_tissue(self):
+        flat, energy = vx.initialise.free_voronoi(6, key=0), ShapeFactorEnergy(3.6)
+        heights = np.broadcast_to(0.75 * 0.5 * np.arange(16), (16, 16))
+        slope = vx.surfaces.HeightMap(heights, 0.5, origin=(-4.0, -4.0))
+        chart = flat.vertices / jnp.array([1.25, 1.0])
+        tilted = vx.Tissue(chart, flat.topology, flat.boundary, surface=slope)
+        plane = vx.Tissue(flat.vertices, flat.topology, flat.boundary)
+        ends = [FIXED_TOPOLOGY(t.with_capacity(9), energy) for t in (tilted, plane)]
+        assert floats(ends[0]) == {"float32"}
+        np.testing.assert_allclose(ends[0].energy, ends[1].energy, atol=1e-5)
+        np.testing.assert_allclose(*(end.tissue.areas for end in ends), atol=2e-3)
+
+    def test_tensions_of_a_mask_with_heights(self):
+        row = np.arange(200)[:, None] // 40
+        bricks = 5 * row + (np.arange(200) + 20 * (row % 2)) // 40 % 5 + 1
+        heights = np.broadcast_to(0.75 * np.arange(200), (200, 200))
+        inferred = vx.tensions.infer_tensions(bricks, height=heights)
+        np.testing.assert_allclose(inferred.curved.areas / inferred.tissue.areas, 1.25, rtol=1e-4)
+        assert inferred.determined.sum() > 10
+        assert np.isfinite(inferred.tensions[inferred.determined]).all()
+
+    @pytest.mark.thorough
+    def test_amounts_of_signals_are_conserved(self, rest):
+        tissue, _ = rest
+        start = np.pad(1 + np.sin(np.arange(N)), (0, 2))[None]
+        movie = vx.evolve(
+            tissue.with_capacity(N + 2),
+            ShapeFactorEnergy(3.7),
+            FRICTION,
+            jnp.linspace(0, 1, 3),
+            activity=vx.signals.Signals(None, [0.5], initial=start),
+            relaxation=FIXED_TOPOLOGY,
+        )
+        before, after = (np.asarray(movie.signals)[k, 0] for k in (0, -1))
+        amount = np.sum(before[:N] * tissue.areas)
+        np.testing.assert_allclose(np.sum(after * movie.tissue.areas), amount, rtol=1e-5)
+        assert np.ptp(after[:N]) < 0.8 * np.ptp(before[:N])
+
+    def test_a_movie_is_read_from_its_table(self, rest):
+        tissue, _ = rest
+        moved = tissue.with_vertices(tissue.vertices + 0.4)  # corners leave the box
+        table = table_of(rows_of(tissue, 0) + rows_of(moved, 1))
+        movie = vx.inference.movie_from_table(table, box=tissue.boundary.lattice)
+        assert movie.events == ()
+        np.testing.assert_allclose(movie.frame(1).areas, tissue.areas, rtol=1e-5)
 
 
 class TestTransitions:

@@ -203,7 +203,7 @@ def _check_jumps(frames: list[_Frame], largest: float) -> None:
             elapsed = now - np.array([last[cell] for cell in cells])
             if (jumps := np.flatnonzero(away > largest * elapsed)).size:
                 k = int(jumps[0])
-                _raise_jump(cells[k], now, last[cells[k]], away[k])
+                _raise_jump(cells[k], now, last[cells[k]], float(away[k]))
         last |= dict.fromkeys(frame.places, now)
 
 

@@ -100,7 +100,7 @@ class HeightMap(AbstractSurface):
         down, across = (
             _operator(n, width, periodic) for n, width in zip(values.shape, widths, strict=True)
         )
-        dtype = jnp.result_type(values.dtype, jnp.float32)
+        dtype = jnp.result_type(values, jnp.float32)
         product = jnp.linalg.multi_dot([down, values, across.T], precision="highest")
         self.coefficients = product.astype(dtype) * plane_distance
         self.sides = jnp.asarray(sides, dtype)
