@@ -35,7 +35,8 @@ def triangulate(polygon: Float[np.ndarray, "corners 2"]) -> Int[np.ndarray, "tri
 
     - `polygon`: its corners, counter-clockwise. Some may lie at the same place or in one line.
 
-    **Returns:** numbers of the corners of each triangle, counter-clockwise; triangles of area 0 are left out.
+    **Returns:** numbers of the corners of each triangle, counter-clockwise. Corners in one line are those of
+    triangles of area 0: without these the outline of the triangles would not be the polygon.
     """
     rest = list(range(len(polygon)))
     tolerance = _rounding(polygon)
@@ -52,9 +53,7 @@ def triangulate(polygon: Float[np.ndarray, "corners 2"]) -> Int[np.ndarray, "tri
         # The next corner but one: neighbouring ears in turn would make a fan of slivers.
         place, misses = (place + 1) % (size - 1), 0
     triangles += [(rest[0], rest[k], rest[k + 1]) for k in range(1, len(rest) - 1)]
-    corners = np.array(triangles)
-    area = _turn(*(polygon[corners[:, k]] for k in range(3)))
-    return corners[np.abs(area) > tolerance]
+    return np.array(triangles)
 
 
 def _is_ear(
@@ -92,4 +91,4 @@ def _turn(
 def _rounding(polygon: Float[np.ndarray, "corners 2"]) -> float:
     """Rounding error of the area of a triangle of its corners."""
     extent = float(np.max(np.ptp(polygon, axis=0)))
-    return 16 * np.finfo(float).eps * float(np.max(np.abs(polygon))) * extent
+    return 16 * float(np.finfo(polygon.dtype).eps) * float(np.max(np.abs(polygon))) * extent

@@ -99,9 +99,8 @@ def _cell_blocks(polygons: list[Float[np.ndarray, "_ 2"]]) -> list[_Block]:
     elements, first = [], 0
     for row, polygon in enumerate(polygons):
         polygon_corners = np.arange(len(polygon))[None]
-        triangles = polygon_corners[:0] if is_convex(polygon) else triangulate(polygon)
-        # (A cell of area 0 has no triangles.)
-        kind, corners = ("triangle", triangles) if len(triangles) else ("polygon", polygon_corners)
+        one = is_convex(polygon)
+        kind, corners = ("polygon", polygon_corners) if one else ("triangle", triangulate(polygon))
         elements += [(kind, first + each, row) for each in corners]
         first += len(polygon)
     # Successive elements of one kind and size share a block, so the order of the cells stays.
