@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[2]
 LINES = {
     "_base": 2922,
     "activities": 436,
-    "adjoints": 1012,
+    "adjoints": 993,
     "bayes": 1090,
     "costs": 1639,
     "dissipations": 293,
@@ -20,11 +20,11 @@ LINES = {
     "growth": 775,
     "inference": 2180,
     "initialise": 4001,
-    "io": 4002,
+    "io": 4000,
     "jobs": 935,
     "mechanics": 2216,
     "mesh": 2908,
-    "plotting": 2425,
+    "plotting": 2245,
     "precondition": 716,
     "relax": 2148,
     "runs": 1996,
@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2319,
     "surfaces": 630,
     "tensions": 4361,
-    "tests": 31876,
+    "tests": 31757,
     "transitions": 1333,
 }
 # Largest number of lines of a file, and of the files that have more.

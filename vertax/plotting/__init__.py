@@ -19,11 +19,6 @@ with _requires_extra("plot", "Drawing"):
         plot_mode as plot_mode,
         plot_stress as plot_stress,
     )
-    from vertax.plotting._moduli import (
-        plot_density_of_states as plot_density_of_states,
-        plot_moduli as plot_moduli,
-        plot_stress_strain as plot_stress_strain,
-    )
     from vertax.plotting._napari import tension_layer as tension_layer
     from vertax.plotting._panels import plot_tissues as plot_tissues
     from vertax.plotting._recovery import plot_recovery as plot_recovery
